@@ -9,7 +9,7 @@ from itertools import count
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
 from dejavu_torch.data.arrays import as_traverse
 from dejavu_torch.data.ground_truth import find_ground_truth
@@ -30,13 +30,14 @@ from dejavu_torch.maps.frame_table import FrameTable
 from dejavu_torch.maps.spectral import SpectralMapper, code_chunk
 from dejavu_torch.maps.spectral_map import LARGEST, Chunk, SpectralMap
 from dejavu_torch.model import DejaVu
-from dejavu_torch.model_file import difference, recipe_of, run_key
+from dejavu_torch.model_file import Recipe, difference, recipe_of, run_key, weights_of
 from dejavu_torch.motion.resampling import ResampledTraverse, source_of
 from dejavu_torch.types import InputError, Traverse
 
 log = logging.getLogger("dejavu_torch")
 
 EXACT = 2**24  # places whose positions float32 tells apart
+NO_PART = Recipe("none", {})
 
 
 @torch.no_grad()
@@ -330,16 +331,11 @@ def _another(name: str, known: dict[str, SpectralMap]) -> str:
 def _unlike(first: DejaVu, other: DejaVu) -> str:
     """What of two models makes other descriptors, or other scores, in words; "" if nothing does."""
     for what in ("preprocess", "features", "whitening", "velocity"):
-        one, two = getattr(first, what), getattr(other, what)
-        if one is None and two is None:
-            continue
-        if one is None or two is None:
-            has = [f"has {'no ' if part is None else ''}{what}" for part in (one, two)]
-            return f"the one {has[0]}, the other {has[1]}; expected the same"
-        stored, given = recipe_of(one), recipe_of(two)
+        parts = (getattr(model, what) for model in (first, other))
+        stored, given = (NO_PART if part is None else recipe_of(part) for part in parts)
         if stored != given:
             return f"their {what} differ: {difference(stored, given)}"
-        if _digest(one) != _digest(two):
+        if checksums(weights_of(first, what), None) != checksums(weights_of(other, what), None):
             way = "--whitening" if what == "whitening" else "--descriptor"
             learned = f"as `dejavu learn ROUTE {way} MAP` takes it from another map"
             return f"their {what} were learned apart, with other numbers; expected the same, {learned}"
@@ -358,11 +354,6 @@ def _unlike(first: DejaVu, other: DejaVu) -> str:
         known, seen = (" x ".join(map(str, shape or ())) for shape in shapes)
         return f"they were learned from frames of {known} and of {seen}; expected the same size"
     return ""
-
-
-def _digest(module: nn.Module) -> dict[str, str]:
-    state = module.state_dict().items()
-    return checksums({name: value for name, value in state if isinstance(value, Tensor)}, None)
 
 
 def _joined_names(parts: list[list[str]], frames: list[int]) -> list[str]:

