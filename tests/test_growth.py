@@ -501,23 +501,6 @@ def test_a_visit_is_averaged_into_a_map() -> None:
     assert (spectral(model).decode(0)[:45] - means[:45]).abs().mean() < 2 * coded[0].step
 
 
-def test_averaging_makes_what_is_found_again_surer() -> None:
-    route = walk(400)
-    visits = [noisy(route, seed) for seed in range(4)]
-    query = noisy(route, 9)
-    here = torch.arange(400)
-    plain = learned(visits[0], 100)
-    mean = learned(visits[0], 100)
-    for seen in visits[1:]:
-        average(mean, associate(mean, None, ArrayTraverse(seen, "seen")))
-    whole = DejaVu(whitening="none", mapper=SpectralMapper(4.0, chunk=100))
-    learn_mean(whole, visits[0], Views(ArrayTraverse(torch.cat(visits[1:]), "all"), here.repeat(3)))
-    right = [float((m.localize(query).index - here).abs().le(3).float().mean()) for m in (plain, mean, whole)]
-    assert right[1] > right[0] + 0.03
-    assert right[2] > right[0] + 0.03
-    assert mean.map.visit_counts.tolist() == whole.map.visit_counts.tolist() == [4] * 400
-
-
 def test_counts_follow_where_a_map_grows(tmp_path: Path) -> None:
     route = walk(200)
     model = learned(route[:100], 50)
