@@ -1,10 +1,12 @@
-"""`DejaVu` itself goes through torch.export and torch.compile, with the eager scores whatever the batch."""
+"""`DejaVu` as a graph: torch.export and torch.compile give the eager scores whatever the batch, and `forward`
+never waits for a number, so that its operations can be queued on a device without a stop."""
 
 from __future__ import annotations
 
 import io
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
@@ -12,6 +14,8 @@ import pytest
 import torch
 from helpers import Fixed
 from torch import Tensor, nn
+from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from dejavu_torch import (
     HOG,
@@ -142,12 +146,108 @@ def test_the_model_compiled_by_inductor_scores_frames_as_the_model_does() -> Non
 
 
 @pytest.mark.parametrize("training", [True, False])
-def test_the_weights_of_the_features_count(training: bool) -> None:
+def test_the_weights_of_the_features_count(training: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     model, queries = of_chunks(), torch.rand(5, 4)
     before = model(queries)
     model.map.trainable(weights=True, start=torch.tensor([0.5, 1.0, 2.0, 0.0]))
     if not training:
         model.map.freeze()
-    expected = model(queries)
+    with host_synchronisations(monkeypatch) as found:
+        expected = model(queries)
+    assert found == []
     assert not torch.allclose(expected[:, :20], before[:, :20])
     torch.testing.assert_close(exported(model, queries[:2]).module()(queries), expected, rtol=0, atol=1e-6)
+
+
+# what the host reads
+
+
+# operations whose result, or the size of it, the host has to read
+READING = {
+    "_local_scalar_dense",
+    "is_nonzero",
+    "equal",
+    "nonzero",
+    "masked_select",
+    "unique_consecutive",
+    "unique_dim",
+    "_unique2",
+    "bincount",
+}
+METHODS = ("item", "tolist", "numpy", "__bool__", "__int__", "__float__", "__index__", "__array__", "cpu")
+
+
+class ReadingOperations(TorchDispatchMode):
+    def __init__(self, found: list[str]) -> None:
+        super().__init__()
+        self.found = found
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        name = func.overloadpacket.__name__
+        masked = name.startswith("index") and any(
+            isinstance(index, Tensor) and index.dtype == torch.bool
+            for argument in args
+            if isinstance(argument, (list, tuple))
+            for index in argument
+        )
+        if name in READING or masked:
+            self.found.append(name)
+        return func(*args, **(kwargs or {}))
+
+
+@contextmanager
+def host_synchronisations(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+    """The names of all operations and methods that read a number from a tensor."""
+    found: list[str] = []
+
+    def counted(name: str, method: Callable[..., Any]) -> Callable[..., Any]:
+        def wrapper(self: Tensor, *args: Any, **kwargs: Any) -> Any:
+            found.append(f"Tensor.{name}")
+            return method(self, *args, **kwargs)
+
+        return wrapper
+
+    with monkeypatch.context() as patched, ReadingOperations(found):
+        for name in METHODS:
+            patched.setattr(Tensor, name, counted(name, getattr(Tensor, name)))
+        yield found
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_forward_reads_no_number(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = MODELS[kind]()
+    for count in (5, 96):
+        queries = queries_of(model, count)
+        with host_synchronisations(monkeypatch) as found:
+            scores = model(queries)
+        assert found == []
+        with FakeTensorMode(allow_non_fake_inputs=True) as mode:  # which has shapes, and no values
+            assert model(mode.from_tensor(queries)).shape == scores.shape
+
+
+def test_backward_reads_no_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    mapper = TemplateMapper(ImposedPeriods([3, 4, 5], bin=4), temperature=0.5, trainable=True)
+    model = DejaVu(mapper=mapper).learn(torch.rand(60, 3, 32, 24))
+    with host_synchronisations(monkeypatch) as found:
+        model(queries_of(model, 5)).sum().backward()
+    assert found == []
+    assert model.map.templates.grad is not None
+
+
+READERS: dict[str, Callable[[Tensor], Any]] = {
+    "item": lambda x: x.sum().item(),
+    "numpy": lambda x: x.numpy(),
+    "bool": lambda x: bool(x.any()),
+    "index": lambda x: [1, 2, 3][x[0].long()],
+    "mask": lambda x: x[x > 0.5],
+    "nonzero": lambda x: x.nonzero(),
+    "unique": lambda x: x.unique(),
+    "equal": lambda x: torch.equal(x, x),
+}
+
+
+@pytest.mark.parametrize("reads", READERS.values(), ids=READERS)
+def test_the_counter_sees_them(reads: Callable[[Tensor], Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    with host_synchronisations(monkeypatch) as found:
+        reads(torch.tensor([1.0, 0.0, 1.0]))
+    assert found
