@@ -136,15 +136,6 @@ def test_so_many_features_are_told_of(
 # training and deployment give equal scores
 
 
-@pytest.mark.parametrize("metric", ["l1", "l2", "cosine"])
-def test_forward_and_localize_agree(metric: str) -> None:
-    model = wave_model(metric=metric, reduction="sum").learn(pictures())
-    query = pictures() + 0.2 * torch.rand_like(pictures())
-    match, expected = model.localize(query), best_match(model(query))
-    assert torch.equal(match.index, expected.index)
-    torch.testing.assert_close(match.score, expected.score, rtol=0, atol=1e-6)
-
-
 @pytest.mark.parametrize("training", [True, False])
 def test_training_and_deployed_path_give_equal_scores(training: bool) -> None:
     torch.manual_seed(0)
@@ -270,14 +261,6 @@ def test_few_scores_are_held_at_once(monkeypatch: pytest.MonkeyPatch, largest_te
         found = model.localize(query)
     assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
     assert largest.numel <= 200
-
-
-def test_nothing_of_queries_times_phases_times_features_is_built(largest_tensor: Any) -> None:
-    features, phases, queries = 50, 8 + 9, 40
-    model = template_model(periods=layers(8, 9, features=features)).learn(torch.rand(72, features))
-    with largest_tensor() as seen:
-        model.localize(torch.rand(queries, features))
-    assert seen.numel < queries * phases * features / 4
 
 
 # a route in which nothing repeats, and bad input
