@@ -252,17 +252,6 @@ def test_state_dict_goes_into_a_fresh_model() -> None:
 # memory
 
 
-def test_few_scores_are_held_at_once(monkeypatch: pytest.MonkeyPatch, largest_tensor: Any) -> None:
-    model = wave_model().learn(waves())
-    query = waves()[::2] + torch.rand(36, 2)
-    expected = model.localize(query)
-    monkeypatch.setattr("dejavu_torch.recognition.search.SCORES_AT_ONCE", 200)
-    with largest_tensor() as largest:
-        found = model.localize(query)
-    assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
-    assert largest.numel <= 200
-
-
 # a route in which nothing repeats, and bad input
 
 
