@@ -37,7 +37,6 @@ from dejavu_torch.types import InputError, Traverse
 log = logging.getLogger("dejavu_torch")
 
 EXACT = 2**24  # places whose positions float32 tells apart
-NO_PART = Recipe("none", {})
 
 
 @torch.no_grad()
@@ -332,7 +331,7 @@ def _unlike(first: DejaVu, other: DejaVu) -> str:
     """What of two models makes other descriptors, or other scores, in words; "" if nothing does."""
     for what in ("preprocess", "features", "whitening", "velocity"):
         parts = (getattr(model, what) for model in (first, other))
-        stored, given = (NO_PART if part is None else recipe_of(part) for part in parts)
+        stored, given = (Recipe(f"no {what}", {}) if part is None else recipe_of(part) for part in parts)
         if stored != given:
             return f"their {what} differ: {difference(stored, given)}"
         if checksums(weights_of(first, what), None) != checksums(weights_of(other, what), None):

@@ -390,7 +390,7 @@ def test_maps_that_cannot_be_merged() -> None:
     templates = template_model(whitening="none").learn(walk(90))
     for pair, words in (
         ((one, other), ("a and b", "whitening", "learned apart", "--whitening MAP")),
-        ((one, plain), ("whitening", "Whitening; got none")),
+        ((one, plain), ("whitening", "Whitening; got no whitening")),
         ((plain, wide), ("6 and 7",)),
         ((plain, l2), ("metric", "cosine", "l2")),
         ((plain, cells), ("features", "cell=8", "cell=4")),
