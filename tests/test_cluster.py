@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from types import ModuleType
@@ -27,7 +27,7 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.source import open_source
 from dejavu_torch.features.views import Views
 from dejavu_torch.growth import learn_mean, merge
-from dejavu_torch.learning import Checkpoint, Sample
+from dejavu_torch.learning import Checkpoint, ChunkCoder, Sample
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import Chunk, SpectralMap
 from dejavu_torch.model import DejaVu
@@ -101,21 +101,16 @@ def file_of(model: DejaVu, folder: Path) -> bytes:
     return (folder / "map.safetensors").read_bytes()
 
 
-@pytest.mark.parametrize("kind", ["array", "stream"])
-def test_workers_write_the_file_of_one_process(kind: str, cluster: Cluster, tmp_path: Path) -> None:
-    traverse = route() if kind == "array" else Stream(route())
-    whitened = DejaVu(mapper=SpectralMapper(6.0, chunk=CHUNK)).learn(traverse)  # type: ignore[arg-type]
-    other = DejaVu(mapper=SpectralMapper(6.0, chunk=CHUNK))
-    other.learn(traverse, code=partial(code_on, cluster))  # type: ignore[arg-type]
-    assert file_of(other, tmp_path) == file_of(whitened, tmp_path)
-
-
-def test_workers_average_a_second_traverse_in(cluster: Cluster, tmp_path: Path) -> None:
-    visits = Views(ArrayTraverse(route() + 0.1), torch.arange(PLACES))
-    models = [DejaVu(None, "none", SpectralMapper(6.0, chunk=CHUNK)) for _ in range(2)]
-    here = learn_mean(models[0], route(), visits)
-    there = learn_mean(models[1], route(), visits, code=partial(code_on, cluster))
-    assert file_of(there, tmp_path) == file_of(here, tmp_path)
+@pytest.mark.parametrize("kind", [ArrayTraverse, Stream])
+def test_workers_write_the_file_of_one_process(
+    kind: Callable[[Tensor], Traverse], cluster: Cluster, tmp_path: Path
+) -> None:
+    """Whitened, and with a second traverse averaged in."""
+    visits, files = Views(kind(route() + 0.1), torch.arange(PLACES)), []
+    for code in (ChunkCoder.chunks, partial(code_on, cluster)):
+        model = DejaVu(mapper=SpectralMapper(6.0, chunk=CHUNK))
+        files.append(file_of(learn_mean(model, kind(route()), visits, code=code), tmp_path))
+    assert files[0] == files[1]
 
 
 def test_a_worker_that_is_killed_is_made_up_for(cluster: Cluster, watched: nn.Module, tmp_path: Path) -> None:

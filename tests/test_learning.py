@@ -332,16 +332,23 @@ def test_descriptors_of_a_long_route_in_one_chunk_lie_in_a_file(monkeypatch: pyt
 
 def test_places_appended_to_a_map_are_kept_as_well(tmp_path: Path, made: list[int]) -> None:
     first, rest = route()[:500], route()[500:]
+    visits = Views(ArrayTraverse(rest + 0.1), torch.arange(len(rest)))
 
-    whole = file_of(growth.append(learned(first), rest), tmp_path)
+    def grown(**work: object) -> DejaVu:
+        model = learned(first)
+        made.clear()
+        return growth.append(model, rest, visits=visits, **work)  # type: ignore[arg-type]
+
+    whole = grown()
+    assert made == [CHUNK] * 10 + [30]
+    assert whole.map.visits.tolist() == [[500, 1], [PLACES - 500, 2]]
     with pytest.raises(KeyboardInterrupt):
-        growth.append(learned(first), rest, checkpoint=Checkpoint(tmp_path / "m"), code=stopped(4))
-    model = learned(first)
-    made.clear()
-    assert file_of(growth.append(model, rest, checkpoint=Checkpoint(tmp_path / "m")), tmp_path) == whole
+        grown(checkpoint=Checkpoint(tmp_path / "m"), code=stopped(4))
+    again = grown(checkpoint=Checkpoint(tmp_path / "m"))
     assert sum(made) == PLACES - 500 - 4 * CHUNK
+    assert file_of(again, tmp_path) == file_of(whole, tmp_path)
     with refused("m.part", "map"):  # it has more places by now
-        growth.append(model, rest, checkpoint=Checkpoint(tmp_path / "m"))
+        growth.append(again, rest, visits=visits, checkpoint=Checkpoint(tmp_path / "m"))
 
 
 def visits_of(places: Tensor, kind: type[Traverse] = ArrayTraverse) -> Views:
@@ -380,20 +387,6 @@ def test_visits_are_averaged_in_chunk_by_chunk(tmp_path: Path, made: list[int]) 
     assert sum(made) == PLACES - 8 * CHUNK
     with refused("353", "of 400"):
         growth.learn_mean(model(), route(), visits_of(places)._replace(places=torch.arange(PLACES)))
-
-
-def test_visits_to_appended_places_are_averaged_in_chunk_by_chunk(tmp_path: Path, made: list[int]) -> None:
-    def grown(**settings: object) -> DejaVu:
-        model = learned(route()[:500])
-        made.clear()
-        visits = Views(ArrayTraverse(route()[500:] + 0.1), torch.arange(PLACES - 500))
-        return growth.append(model, route()[500:], visits=visits, **settings)  # type: ignore[arg-type]
-
-    whole = grown(checkpoint=Checkpoint(tmp_path / "m"))
-    assert made == [CHUNK] * 10 + [30]
-    assert whole.map.visits.tolist() == [[500, 1], [PLACES - 500, 2]]
-    assert file_of(grown(checkpoint=Checkpoint(tmp_path / "m")), tmp_path) == file_of(whole, tmp_path)
-    assert made == []
 
 
 def test_a_long_route_of_ready_features_holds_their_variance(
