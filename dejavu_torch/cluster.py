@@ -211,10 +211,6 @@ class _Searcher:
         torch.set_num_threads(1)
         self.part, self.first = part, first
 
-    def process(self) -> int:
-        """The number of this process."""
-        return os.getpid()
-
     def search(self, queries: Any, n: int) -> tuple[Any, Any]:
         """See `search`: scores and places as arrays."""
         score, place = search(self.part, torch.from_numpy(queries.copy()), n, "scan")

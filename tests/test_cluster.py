@@ -234,7 +234,8 @@ def test_probabilities_are_those_of_the_whole_map_whatever_happens_to_a_worker(c
         assert torch.equal(found.accepted, whole.accepted)
         assert torch.equal(found.index, whole.index)
         if not killed:
-            os.kill(cluster.ray.get(search.actors[0].process.remote()), signal.SIGKILL)
+            process = search.actors[0].__ray_call__.remote(lambda _: os.getpid())
+            os.kill(cluster.ray.get(process), signal.SIGKILL)
     assert 0 < int(whole.accepted.sum()) < len(queries)
     with refused("templates", "spectral"):
         ClusterSearch(
