@@ -438,7 +438,13 @@ def learn_map(
         second, visits, checkpoint, code: see `DejaVu.learn`. key: digests of the run, see `Checkpoint`.
     """
     mapper = mapper.with_overhead(positions_of(traverse).nbytes, is_ready(traverse))
-    counts = visits and observation_counts(visits, traverse.count())
+    counts: Tensor | None = None
+    if visits is not None:
+        if not isinstance(mapper, SpectralMapper):
+            seen = f"{type(mapper).__name__} makes templates, which are means of many places already"
+            raise InputError(f"{seen}; expected a SpectralMapper to average visits for")
+        describer.check_sizes(traverse, visits.traverse)
+        counts = observation_counts(visits, traverse.count())
     route: PlaceMap
     if isinstance(mapper, SpectralMapper) and traverse.count() > max(SAMPLE, mapper.chunk):
         long = mapper.empty().to(describer.device)
