@@ -27,7 +27,7 @@ from dejavu_torch.learning import (
 )
 from dejavu_torch.maps.file import checksums, digests
 from dejavu_torch.maps.frame_table import FrameTable
-from dejavu_torch.maps.spectral import code_chunk
+from dejavu_torch.maps.spectral import SpectralMapper, code_chunk
 from dejavu_torch.maps.spectral_map import LARGEST, Chunk, SpectralMap
 from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import Recipe, difference, recipe_of, run_key, weights_of
@@ -132,6 +132,9 @@ def learn_mean(
         tensor([[ 50,   1],
                 [150,   2]], dtype=torch.int32)
     """
+    if not isinstance(model.mapper, SpectralMapper):
+        seen = f"{type(model.mapper).__name__} makes templates, which are means of many places already"
+        raise InputError(f"{seen}; expected a SpectralMapper to average visits for")
     return model.learn(traverse, progress, second, checkpoint, code, visits)
 
 

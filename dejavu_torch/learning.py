@@ -417,55 +417,12 @@ class Checkpoint:
         raise InputError(f"{seen}; expected the command that began it, or the file removed")
 
 
-def learn_map(
-    describer: Describer,
-    mapper: Mapper,
-    traverse: Traverse,
-    second: Views | None = None,
-    visits: Views | None = None,
-    progress: str | None = None,
-    checkpoint: Checkpoint | None = None,
-    key: Callable[[], Mapping[str, str]] = dict,
-    code: Code = ChunkCoder.chunks,
-) -> PlaceMap:
-    """The map of a traverse; the describer's whitening is learned for it.
-
-    A route of up to `SAMPLE` frames, or of one chunk, is described and coded as a whole. A longer one is
-    appended to an empty map that is fitted on a sample, or to the partial map of a run that was interrupted:
-    memory holds a chunk, the sample and the map.
-
-    Args:
-        second, visits, checkpoint, code: see `DejaVu.learn`. key: digests of the run, see `Checkpoint`.
-    """
-    mapper = mapper.with_overhead(positions_of(traverse).nbytes, is_ready(traverse))
-    counts: Tensor | None = None
-    if visits is not None:
-        if not isinstance(mapper, SpectralMapper):
-            seen = f"{type(mapper).__name__} makes templates, which are means of many places already"
-            raise InputError(f"{seen}; expected a SpectralMapper to average visits for")
-        describer.check_sizes(traverse, visits.traverse)
-        counts = observation_counts(visits, traverse.count())
-    route: PlaceMap
-    if isinstance(mapper, SpectralMapper) and traverse.count() > max(SAMPLE, mapper.chunk):
-        long = mapper.empty().to(describer.device)
-        with in_one_thread():
-            if checkpoint is None or not checkpoint.open(key(), traverse, long, describer.whitening):
-                long = fit(mapper, describer, traverse, second, visits, progress)
-        append_places(long, describer, traverse, 0, visits, progress, checkpoint, code)
-        _log_reached(long, mapper)
-        route = long
-    else:
-        if checkpoint is not None:
-            checkpoint.check_unused()
-        rows = describer.reference(traverse, second, progress, isinstance(mapper, SpectralMapper))
-        if visits is not None:
-            rows = describer.averaged(rows, visits, progress)
-        route = learn_descriptors(mapper, rows)
-    if counts is not None:
-        route.count_visits(1 + counts)
-    return route
+def is_long(traverse: Traverse, chunk: int) -> bool:
+    """Whether a route, coded in chunks of so many places, is learned from a sample and chunk by chunk."""
+    return traverse.count() > max(SAMPLE, chunk)
 
 
+@in_one_thread()
 def fit(
     mapper: SpectralMapper,
     describer: Describer,
@@ -550,7 +507,7 @@ def learn_descriptors(mapper: Mapper, descriptors: Tensor) -> PlaceMap:
     return route
 
 
-def _log_reached(route: SpectralMap, mapper: SpectralMapper) -> None:
+def log_reached(route: SpectralMap, mapper: SpectralMapper) -> None:
     """The bytes of a long route, and the variance that it holds, if the sample promised other bytes."""
     wanted, places, summary = mapper.budget, route.places, route.summary()
     if wanted is None or summary.route_bytes - summary.route["lines"] >= wanted * places:

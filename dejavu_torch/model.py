@@ -7,7 +7,6 @@ import inspect
 import logging
 import math
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -28,10 +27,14 @@ from dejavu_torch.learning import (
     ChunkCoder,
     Code,
     Describer,
+    append_places,
     calibration_of,
+    fit,
+    is_long,
     is_ready,
     learn_descriptors,
-    learn_map,
+    log_reached,
+    observation_counts,
     positions_of,
 )
 from dejavu_torch.maps.file import checked_fields
@@ -204,8 +207,30 @@ class DejaVu(nn.Module):
         """
         traverse = self.resample(as_traverse(traverse), progress=progress)
         describer, text = self._describer_of(traverse), "learning" if progress else None
-        key = partial(run_key, self, traverse, second, visits)
-        route = learn_map(describer, self.mapper, traverse, second, visits, text, checkpoint, key, code)
+        mapper = self.mapper.with_overhead(positions_of(traverse).nbytes, is_ready(traverse))
+        route: PlaceMap
+        counts: Tensor | None = None
+        if visits is not None:
+            describer.check_sizes(traverse, visits.traverse)
+            counts = observation_counts(visits, traverse.count())
+        if isinstance(mapper, SpectralMapper) and is_long(traverse, mapper.chunk):
+            route = mapper.empty().to(describer.device)
+            resumed = checkpoint is not None and checkpoint.open(
+                run_key(self, traverse, second, visits), traverse, route, describer.whitening
+            )
+            if not resumed:
+                route = fit(mapper, describer, traverse, second, visits, text)
+            append_places(route, describer, traverse, 0, visits, text, checkpoint, code)
+            log_reached(route, mapper)
+        else:
+            if checkpoint is not None:
+                checkpoint.check_unused()
+            rows = describer.reference(traverse, second, text, isinstance(mapper, SpectralMapper))
+            if visits is not None:
+                rows = describer.averaged(rows, visits, text)
+            route = learn_descriptors(mapper, rows)
+        if counts is not None:
+            route.count_visits(1 + counts)
         self._keep(describer.whitening)
         return self._take(route, traverse)
 
