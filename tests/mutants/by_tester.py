@@ -409,8 +409,8 @@ MUTANTS = [
     Mutant(
         "A run that goes on makes no chunk again that FILE.part holds.",
         "dejavu_torch/learning.py",
-        "code(coder, traverse, len(route.chunks), progress)",
-        "code(coder, traverse, 0, progress)",
+        "missing = range(-(-(route.places - start) // route.chunk), coder.total)",
+        "missing = range(coder.total)",
         ("tests/test_learning.py::test_finished_chunks_are_not_made_again",),
     ),
     Mutant(
