@@ -81,15 +81,12 @@ def test_gradients_of_local_contrast_are_right_and_finite_on_a_flat_frame() -> N
 
 
 @pytest.mark.parametrize("size", [(16, 24), (40, 31)])
-@pytest.mark.parametrize("channels", [1, 3])
-def test_frames_of_any_size_give_d_features(channels: int, size: tuple[int, int]) -> None:
-    features = small(channels=channels)(torch.rand(5, channels, *size))
+@pytest.mark.parametrize(("channels", "resize"), [(1, (16, 24)), (3, (17, 23)), (3, (1, 1))])
+def test_frames_of_any_size_give_d_features(
+    channels: int, resize: tuple[int, int], size: tuple[int, int]
+) -> None:
+    features = small(channels=channels, resize=resize).eval()(torch.rand(5, channels, *size))
     assert (features.shape, features.dtype) == ((5, 6), torch.float32)
-
-
-@pytest.mark.parametrize("resize", [(17, 23), (1, 1)])
-def test_any_resize_fits_the_linear_layer(resize: tuple[int, int]) -> None:
-    assert small(resize=resize).eval()(torch.rand(2, 3, 30, 30)).shape == (2, 6)
 
 
 def test_features_of_the_training_frames_are_standardised() -> None:
@@ -114,20 +111,12 @@ def test_frames_in_double_precision_are_described_in_that_of_the_weights() -> No
     torch.testing.assert_close(of_any(frames.double()), of_any(frames))
 
 
-def test_light_changes_little_unless_the_contrast_is_left_as_it_is() -> None:
-    frames, net, change = torch.rand(4, 3, 16, 24), small().eval(), {}
-    for net.cell in (8, 0):
-        with torch.no_grad():
-            before, after = net(frames), net(0.5 * frames + 0.2)
-        change[net.cell] = (after - before).norm() / (before - before.mean(0)).norm()
-    assert change[8] < 0.02
-    assert change[0] > 0.2
-
-
-def test_features_know_where_things_are() -> None:
-    frames = torch.rand(2, 3, 16, 24)
-    net = small().eval()
-    assert not torch.allclose(net(frames.flip(3)), net(frames), atol=1e-3)
+def test_the_contrast_is_that_of_local_contrast_unless_it_is_left() -> None:
+    frames, net = torch.rand(4, 3, 16, 24), small().eval()
+    found, net.cell = net(frames), 0
+    assert torch.equal(found, net(local_contrast(frames, 8)))
+    assert not torch.allclose(found, net(frames))
+    assert not torch.allclose(net(frames.flip(3)), net(frames), atol=1e-3)  # it knows where things are
 
 
 def test_gradients_reach_every_parameter_and_the_frames() -> None:
@@ -149,24 +138,18 @@ def test_state_dict_round_trip() -> None:
 @pytest.mark.parametrize(
     "settings",
     [
-        {"dimension": 0},
-        {"channels": 0},
-        {"resize": (0, 24)},
-        {"resize": (16,)},
-        {"widths": ()},
-        {"widths": (4, 0)},
-        {"squeeze": 0},
-        {"cell": -1},
+        *({name: 0} for name in ("dimension", "channels", "squeeze")),
+        *({"resize": (0, 24)}, {"resize": (16,)}, {"widths": ()}, {"widths": (4, 0)}, {"cell": -1}),
     ],
     ids=str,
 )
 def test_settings_that_make_no_sense_are_refused(settings: dict[str, Any]) -> None:
-    name, value = next(iter(settings.items()))
+    ((name, value),) = settings.items()
     with refused(f"{name}={value}", "at least 1 each"):
         small(**settings)
 
 
-@pytest.mark.parametrize("shape", [(2, 1, 16, 24), (2, 4, 16, 24), (3, 16, 24)])
+@pytest.mark.parametrize("shape", [(2, 1, 16, 24), (3, 16, 24)])
 def test_frames_of_other_channels_are_refused(shape: tuple[int, ...]) -> None:
     with refused(str(shape), "(B,3,H,W)", "channels=3"):
         small()(torch.rand(shape))
