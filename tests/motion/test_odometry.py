@@ -102,19 +102,16 @@ JOURNEY = travelled(
 )
 
 
-class Shown(Traverse):
+def shown(frames: Tensor, place: Tensor | None = None) -> ArrayTraverse:
     """Frames with known places."""
-
-    def __init__(self, frames: Tensor, place: Tensor | None = None) -> None:
-        self.frames, self.place, self.length, self.name = frames, place, len(frames), "the drive"
-
-    def batches(self, size: int):  # type: ignore[no-untyped-def]
-        yield from self.frames.split(size)
+    traverse = ArrayTraverse(frames, "the drive")
+    traverse.place = place
+    return traverse
 
 
 @cache
-def journey() -> Shown:
-    return Shown(drive(JOURNEY), JOURNEY)
+def journey() -> ArrayTraverse:
+    return shown(drive(JOURNEY), JOURNEY)
 
 
 @cache
@@ -123,10 +120,10 @@ def measured() -> Odometry:
 
 
 @cache
-def short() -> Shown:
+def short() -> ArrayTraverse:
     """Twelve frames at 5 pixels of ground a frame."""
     position = travelled((5, 5, 11))
-    return Shown(drive(position), position)
+    return shown(drive(position), position)
 
 
 # --- the patch
@@ -195,14 +192,14 @@ def test_patches_of_any_size() -> None:
 
 
 def test_the_way_back_is_the_negative() -> None:
-    patches = ground_patch(journey().frames)
+    patches = ground_patch(journey().values)
     there, back = shift_between(patches[:-1], patches[1:]), shift_between(patches[1:], patches[:-1])
     torch.testing.assert_close(there[0], -back[0], rtol=0, atol=0.1)
     torch.testing.assert_close(there[1], back[1], rtol=0, atol=0.02)
 
 
 def test_confidence_tells_the_same_ground_from_another() -> None:
-    patches = ground_patch(journey().frames, size=(96, 96))
+    patches = ground_patch(journey().values, size=(96, 96))
     _, same = shift_between(patches[:-1], patches[1:])
     unrelated = torch.rand(40, 2, 1, 96, 96)
     _, other = shift_between(unrelated[:, 0], unrelated[:, 1])
@@ -251,7 +248,7 @@ def test_motion_blur(sleepers: float) -> None:
     """The shutter stays open all the time: each frame is smeared by as much as the ground moves."""
     position = travelled((20, 20, 30))
     frames = drive(position, texture=0.05, sleepers=sleepers, blur=1.0)
-    assert path_error(GroundOdometry().distances(Shown(frames)).distance, position) < 0.02
+    assert path_error(GroundOdometry().distances(shown(frames)).distance, position) < 0.02
 
 
 @settings(max_examples=3)
@@ -267,7 +264,7 @@ def test_a_drop_out_gets_its_neighbours_velocity(caplog: pytest.LogCaptureFixtur
     frames = drive(position)
     frames[9], frames[15] = 0, math.nan  # two steps each see nothing
     with caplog.at_level(logging.WARNING, "dejavu_torch"):
-        measured = GroundOdometry().distances(Shown(frames))
+        measured = GroundOdometry().distances(shown(frames))
     (message,) = caplog.messages
     assert "the drive: no common ground in frames 8 to 10, 14 to 16 (4 of 20 steps)" in message
     assert (measured.confidence < 0.4).nonzero()[:, 0].tolist() == [8, 9, 14, 15]
@@ -277,7 +274,7 @@ def test_a_drop_out_gets_its_neighbours_velocity(caplog: pytest.LogCaptureFixtur
 def test_a_cut_is_told(caplog: pytest.LogCaptureFixture) -> None:
     position = travelled((6, 6, 8), (900, 900, 1), (6, 6, 8))
     with caplog.at_level(logging.WARNING, "dejavu_torch"):
-        way = GroundOdometry().distances(Shown(drive(position))).distance
+        way = GroundOdometry().distances(shown(drive(position))).distance
     assert "frames 8 to 9 (1 of 17 steps)" in caplog.text
     torch.testing.assert_close(way.diff(), torch.full((17,), 6.0).double(), rtol=0, atol=0.1)
 
@@ -322,7 +319,7 @@ def test_a_patch_finer_than_the_frames_is_told(
     shape: tuple[int, int], settings: dict[str, Any], told: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     frames = torch.rand(1, 1, *shape).expand(4, -1, -1, -1)
-    GroundOdometry(**settings).distances(Shown(frames), batch_size=2)
+    GroundOdometry(**settings).distances(shown(frames), batch_size=2)
     assert len(caplog.messages) == bool(told)
     assert told in caplog.text
 
@@ -336,7 +333,7 @@ def test_a_drive_by_optical_flow(flow: str) -> None:
     assert (measured.distance.diff()[JOURNEY.diff() == 0] == 0).all()
     position = travelled((20, 20, 12))
     smeared = drive(position, texture=0.05, blur=1.0)
-    assert path_error(GroundOdometry(flow=flow).distances(Shown(smeared)).distance, position) < 0.01
+    assert path_error(GroundOdometry(flow=flow).distances(shown(smeared)).distance, position) < 0.01
 
 
 # --- even spacing
@@ -354,19 +351,19 @@ def test_places_are_evenly_spaced() -> None:
     assert (true - 8 * torch.arange(even.length)).abs().max() < 16 / 2 + 0.01 * furthest
     assert (even.frame.diff() >= 0).all()
     assert torch.equal(even.place, true)
-    assert torch.equal(all_of(even), journey().frames[even.frame])
+    assert torch.equal(all_of(even), journey().values[even.frame])
 
 
 def test_the_median_step_of_moving_frames_is_the_default() -> None:
     position = travelled((5, 5, 11), (0, 0, 30))
-    even = ResampledTraverse(Shown(drive(position)), GroundOdometry())
+    even = ResampledTraverse(shown(drive(position)), GroundOdometry())
     assert abs(even.length - 12) <= 1
     assert even.step == pytest.approx(5, abs=0.05)
     assert even.place is None
 
 
 def test_a_camera_that_looks_back() -> None:
-    even = ResampledTraverse(Shown(short().frames.flip(0)), GroundOdometry(step=5.0))
+    even = ResampledTraverse(shown(short().values.flip(0)), GroundOdometry(step=5.0))
     assert abs(even.length - 12) <= 1
     assert even.frame[0] == 0
 
@@ -390,7 +387,7 @@ def test_few_frames_are_in_memory(largest_tensor: type) -> None:
         even = ResampledTraverse(traverse, GroundOdometry(step=8.0), batch_size=4)
         for _ in even.batches(4):
             pass
-    assert seen.numel < traverse.frames.numel() / 8
+    assert seen.numel < traverse.values.numel() / 8
 
 
 # --- what is refused
@@ -430,11 +427,11 @@ def resampled(traverse: Callable[[], Traverse], **choice: Any) -> Callable[[], A
         ),
         (lambda: ground_patch(torch.rand(1, 1, 1, 80)), ("1 x 80 pixels", "at least 2 x 2")),
         (
-            resampled(lambda: Shown(torch.zeros(5, 1, 60, 80))),
+            resampled(lambda: shown(torch.zeros(5, 1, 60, 80))),
             ("none of 4 steps", "expected corners on the ground"),
         ),
-        (resampled(lambda: Shown(short().frames[:1])), ("the drive has 1 frame;", "at least 2")),
-        (lambda: GroundOdometry()(short().frames[:1]), ("the input has 1 frame;", "at least 2")),
+        (resampled(lambda: shown(short().values[:1])), ("the drive has 1 frame;", "at least 2")),
+        (lambda: GroundOdometry()(short().values[:1]), ("the input has 1 frame;", "at least 2")),
         (resampled(lambda: ArrayTraverse(torch.rand(5, 7))), ("features", "(5, 7)", "frames (B,C,H,W)")),
     ],
 )
