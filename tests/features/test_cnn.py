@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -136,20 +137,20 @@ def test_state_dict_round_trip() -> None:
 
 
 @pytest.mark.parametrize(
-    "settings",
+    ("call", "facts"),
     [
-        *({name: 0} for name in ("dimension", "channels", "squeeze")),
-        *({"resize": (0, 24)}, {"resize": (16,)}, {"widths": ()}, {"widths": (4, 0)}, {"cell": -1}),
+        (lambda: small(dimension=0), ("dimension=0", "at least 1 each")),
+        (lambda: small(channels=0), ("channels=0", "at least 1 each")),
+        (lambda: small(resize=(0, 24)), ("resize=(0, 24)", "at least 1 each")),
+        (lambda: small(resize=(16,)), ("resize=(16,)", "at least 1 each")),
+        (lambda: small(widths=()), ("widths=()", "at least 1 each")),
+        (lambda: small(widths=(4, 0)), ("widths=(4, 0)", "at least 1 each")),
+        (lambda: small(squeeze=0), ("squeeze=0", "at least 1 each")),
+        (lambda: small(cell=-1), ("cell=-1", "cell 0 or more")),
+        (lambda: small()(torch.rand(2, 1, 16, 24)), ("(2, 1, 16, 24)", "(B,3,H,W)", "channels=3")),
+        (lambda: small()(torch.rand(3, 16, 24)), ("(3, 16, 24)", "(B,3,H,W)", "channels=3")),
     ],
-    ids=str,
 )
-def test_settings_that_make_no_sense_are_refused(settings: dict[str, Any]) -> None:
-    ((name, value),) = settings.items()
-    with refused(f"{name}={value}", "at least 1 each"):
-        small(**settings)
-
-
-@pytest.mark.parametrize("shape", [(2, 1, 16, 24), (3, 16, 24)])
-def test_frames_of_other_channels_are_refused(shape: tuple[int, ...]) -> None:
-    with refused(str(shape), "(B,3,H,W)", "channels=3"):
-        small()(torch.rand(shape))
+def test_what_is_refused(call: Callable[[], Any], facts: tuple[str, ...]) -> None:
+    with refused(*facts):
+        call()

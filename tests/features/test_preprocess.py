@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -125,12 +126,6 @@ def test_clahe_of_any_size_and_grid(height: int, width: int, rows: int, columns:
         assert ((even >= 0) & (even <= 1)).all()
 
 
-def test_clahe_spreads_a_dull_frame_and_clipping_holds_it_back() -> None:
-    frames = 0.45 + 0.1 * torch.rand(1, 1, 64, 64)
-    spread = [equalise(frames, limit, (2, 2)).std() for limit in (1.0, 3.0, 0.0)]
-    assert frames.std() < spread[0] < spread[1] < spread[2]
-
-
 def test_clahe_passes_gradients_straight_through_without_other_values() -> None:
     frames = uneven(32, 40)
     weights = torch.randn_like(frames)
@@ -164,36 +159,36 @@ def test_module_equals_functions() -> None:
     assert torch.equal(module(frames), equalise(frames, 3.0, (2, 3)))
 
 
-def settings(**choice: Any) -> Callable[[], Any]:
-    return lambda: Preprocess(**choice)
+def applied(frames: Tensor, **choice: Any) -> Tensor:
+    return Preprocess(**choice)(frames)
 
 
-def applied(frames: Tensor, **choice: Any) -> Callable[[], Any]:
-    return lambda: Preprocess(**choice)(frames)
+CHANNELS, WIDE = torch.rand(1, 4, 8, 8), torch.rand(1, 1, 8, 20)
 
 
 @pytest.mark.parametrize(
     ("call", "facts"),
     [
-        *(
-            (settings(channel=name), (f"channel {name!r} is unknown", "'grey', 'R', 'G', 'B'", "'R-B'"))
-            for name in ("", "gray2", "R-", "R-R", "R-G-B", "R-grey")
-        ),
-        (settings(contrast="retinex"), ("contrast 'retinex' is unknown", "'patch'", "'clahe'")),
-        *((settings(patch=patch), (f"patch is {patch}", "odd", "at least 3")) for patch in (-3, 1, 8)),
-        *((settings(grid=grid), (f"grid is {grid}", "(rows, columns)")) for grid in ((0, 8), (8,), (2.5, 2))),
-        *((settings(clip_limit=a), (f"clip_limit is {a}", "at least 0")) for a in (-1.0, float("nan"))),
-        (applied(torch.rand(1, 1, 8, 8), channel="R"), ("'R'", "1 channels", "RGB")),
-        (applied(torch.rand(1, 4, 8, 8), channel="G-B"), ("'G-B'", "4 channels", "RGB")),
-        (applied(torch.rand(1, 1, 8, 20), contrast="patch"), ("8 x 20 pixels", "9 x 9")),
-        (applied(torch.rand(1, 1, 20, 8), contrast="patch"), ("20 x 8 pixels", "9 x 9")),
-        *(
-            (
-                applied(torch.full((1, 1, 16, 16), value), contrast="clahe"),
-                (f"values from {value} to", "[0, 1]"),
-            )
-            for value in (1.5, -0.25, float("nan"))
-        ),
+        (lambda: Preprocess("gray2"), ("channel 'gray2' is unknown", "'grey', 'R', 'G', 'B'", "'R-B'")),
+        (lambda: Preprocess("R-"), ("channel 'R-' is unknown",)),
+        (lambda: Preprocess("R-R"), ("channel 'R-R' is unknown",)),
+        (lambda: Preprocess("R-G-B"), ("channel 'R-G-B' is unknown",)),
+        (lambda: Preprocess("R-grey"), ("channel 'R-grey' is unknown",)),
+        (lambda: Preprocess(contrast="retinex"), ("contrast 'retinex' is unknown", "'patch'", "'clahe'")),
+        (lambda: Preprocess(patch=1), ("patch is 1", "odd", "at least 3")),
+        (lambda: Preprocess(patch=8), ("patch is 8", "odd", "at least 3")),
+        (lambda: Preprocess(grid=(0, 8)), ("grid is (0, 8)", "(rows, columns)")),
+        (lambda: Preprocess(grid=(8,)), ("grid is (8,)", "(rows, columns)")),
+        (lambda: Preprocess(grid=(2.5, 2)), ("grid is (2.5, 2)", "(rows, columns)")),
+        (lambda: Preprocess(clip_limit=-1.0), ("clip_limit is -1.0", "at least 0")),
+        (lambda: Preprocess(clip_limit=math.nan), ("clip_limit is nan", "at least 0")),
+        (lambda: applied(CHANNELS[:, :1], channel="R"), ("'R'", "1 channels", "RGB")),
+        (lambda: applied(CHANNELS, channel="G-B"), ("'G-B'", "4 channels", "RGB")),
+        (lambda: applied(WIDE, contrast="patch"), ("8 x 20 pixels", "9 x 9")),
+        (lambda: applied(WIDE.mT, contrast="patch"), ("20 x 8 pixels", "9 x 9")),
+        (lambda: applied(WIDE + 1, contrast="clahe", grid=(2, 2)), ("values from 1", "[0, 1]")),
+        (lambda: applied(WIDE - 1, contrast="clahe", grid=(2, 2)), ("values from -", "[0, 1]")),
+        (lambda: applied(WIDE / 0, contrast="clahe", grid=(2, 2)), ("to inf", "[0, 1]")),
     ],
 )
 def test_what_is_refused(call: Callable[[], Any], facts: tuple[str, ...]) -> None:
