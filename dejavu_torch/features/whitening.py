@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from dejavu_torch.features.augmentation import Augmentation
-from dejavu_torch.features.preprocess import settings_of
+from dejavu_torch.text import settings_of
 from dejavu_torch.types import InputError
 
 log = logging.getLogger("dejavu_torch")

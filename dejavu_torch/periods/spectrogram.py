@@ -5,13 +5,13 @@ from __future__ import annotations
 import logging
 import math
 from fractions import Fraction
-from inspect import signature
 from typing import Any, Literal, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from dejavu_torch.periods.finder import PeriodFinder
+from dejavu_torch.text import settings_of
 from dejavu_torch.types import FrequencyLayer, InputError, Plan
 
 torchaudio: Any
@@ -230,5 +230,4 @@ class SpectrogramAnalysis(PeriodFinder):
             log.warning(message)
             self._logged.add(message)
 
-    def extra_repr(self) -> str:
-        return ", ".join(f"{name}={getattr(self, name)!r}" for name in signature(type(self)).parameters)
+    extra_repr = settings_of
