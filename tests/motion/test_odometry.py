@@ -271,14 +271,6 @@ def test_a_drop_out_gets_its_neighbours_velocity(caplog: pytest.LogCaptureFixtur
     assert path_error(measured.distance, position) < 0.01
 
 
-def test_a_cut_is_told(caplog: pytest.LogCaptureFixture) -> None:
-    position = travelled((6, 6, 8), (900, 900, 1), (6, 6, 8))
-    with caplog.at_level(logging.WARNING, "dejavu_torch"):
-        way = GroundOdometry().distances(shown(drive(position))).distance
-    assert "frames 8 to 9 (1 of 17 steps)" in caplog.text
-    torch.testing.assert_close(way.diff(), torch.full((17,), 6.0).double(), rtol=0, atol=0.1)
-
-
 @pytest.mark.parametrize(
     ("lost", "told"),
     [
