@@ -98,6 +98,15 @@ def route(places: int = 600, features: int = 40, rank: int = 12) -> tuple[Tensor
     return own @ basis + 3, own @ basis + 3 + light
 
 
+PLACES, VIEWS = route()
+
+
+def learned(places: Tensor = PLACES, views: Tensor | None = VIEWS, **settings: Any) -> Whitening:
+    whitening = Whitening(**settings)
+    whitening.learn(places, None if views is None else [(views, torch.arange(len(views)))])
+    return whitening
+
+
 def found(whitening: Whitening, views: Tensor, places: Tensor) -> float:
     similar = whitening(views) @ whitening(places).T
     return float((similar.argmax(1) == torch.arange(len(places))).float().mean())
@@ -105,33 +114,26 @@ def found(whitening: Whitening, views: Tensor, places: Tensor) -> float:
 
 @pytest.mark.parametrize("bits", [4, 8, 16])
 def test_what_changes_between_visits_is_whitened_away(bits: int) -> None:
-    places, views = route()
-    plain, whitening = Whitening(bits=bits), Whitening(numbers=10, bits=bits)
-    plain.learn(places)
-    whitening.learn(
-        places[:300], [(views[:100], torch.arange(100)), (views[100:300], torch.arange(100, 300))]
-    )
-    assert found(whitening, views[300:], places[300:]) > 0.95 > 0.5 > found(plain, views[300:], places[300:])
-    torch.testing.assert_close(whitening(views).norm(dim=1), torch.ones(600))
+    plain, whitening = learned(views=None, bits=bits), Whitening(numbers=10, bits=bits)
+    batches = [(VIEWS[:100], torch.arange(100)), (VIEWS[100:300], torch.arange(100, 300))]
+    whitening.learn(PLACES[:300], batches)
+    assert found(whitening, VIEWS[300:], PLACES[300:]) > 0.95 > 0.5 > found(plain, VIEWS[300:], PLACES[300:])
+    torch.testing.assert_close(whitening(VIEWS).norm(dim=1), torch.ones(600))
     assert whitening.projection.nbytes == 40 * 10 * bits // 8
 
 
 def test_a_power_of_whitened_numbers() -> None:
-    places, views = route()
-    plain, roots = (Whitening(numbers=10, power=power) for power in (1.0, 0.5))
-    for whitening in (plain, roots):
-        whitening.learn(places, [(views, torch.arange(600))])
-    whitened = plain(views)
+    plain, roots = (learned(numbers=10, power=power) for power in (1.0, 0.5))
+    whitened = plain(VIEWS)
     expected = torch.nn.functional.normalize(whitened.sign() * whitened.abs().sqrt(), dim=1)
-    torch.testing.assert_close(roots(views), expected)
+    torch.testing.assert_close(roots(VIEWS), expected)
     middle = (roots.offset / roots.scale).double() @ torch.linalg.pinv(roots.whole.double())
     middle = middle[None].requires_grad_()  # whitened to zeros
     roots(middle).sum().backward()
     assert middle.grad is not None
     assert middle.grad.isfinite().all()
-    for whitening in (plain, roots):
-        whitening.learn(places)  # components stay as they are
-    assert torch.equal(plain(views), roots(views))
+    one, other = (learned(views=None, power=power) for power in (1.0, 0.5))
+    assert torch.equal(one(VIEWS), other(VIEWS))  # components stay as they are
 
 
 def test_numbers_of_four_bits_come_back_from_their_bytes() -> None:
@@ -148,38 +150,23 @@ def test_numbers_of_four_bits_come_back_from_their_bytes() -> None:
 
 
 def test_without_views_components_keep_their_variances() -> None:
-    places, _ = route()
-    whitening = Whitening(bits=16)
-    whitening.learn(places)
-    described = whitening(places)
+    described = learned(views=None, bits=16)(PLACES)
     assert described.shape == (600, 13)  # the rank, and one constant number
     torch.testing.assert_close(described.norm(dim=1), torch.ones(600))
-    number = ((places - places.mean(0)).square().sum(1).mean() / 12).sqrt()  # the constant, before that
+    number = ((PLACES - PLACES.mean(0)).square().sum(1).mean() / 12).sqrt()  # the constant, before that
     components = described[:, :-1] / described[:, -1:] * number
     distances = torch.cdist(components, components)
-    torch.testing.assert_close(distances, torch.cdist(places, places), rtol=1e-2, atol=5e-2)
-
-
-def test_without_views_there_are_at_most_256_numbers() -> None:
-    places = torch.randn(400, 300, generator=torch.Generator().manual_seed(0))
-    for whitening, numbers in ((Whitening(), 256), (Whitening(numbers=20), 20)):
-        whitening.learn(places)
-        assert len(whitening.scale) == numbers
+    torch.testing.assert_close(distances, torch.cdist(PLACES, PLACES), rtol=1e-2, atol=5e-2)
 
 
 def test_numbers_follow_the_rank_and_the_length_of_the_route(caplog: pytest.LogCaptureFixture) -> None:
-    places, views = route()
-    whitening = Whitening()
-    whitening.learn(places[:40], [(views[:40], torch.arange(40))])
-    assert len(whitening.scale) == 10  # a quarter of the places
+    assert len(learned(PLACES[:40], VIEWS[:40]).scale) == 10  # a quarter of the places
+    assert len(learned(PLACES[:, :8], VIEWS[:, :8]).scale) == 8  # all there are
+    many = torch.randn(400, 300, generator=torch.Generator().manual_seed(0))
+    assert [len(learned(many, None, numbers=count).scale) for count in (None, 20)] == [256, 20]
     assert not caplog.text
-    whitening.learn(places, [(views, torch.arange(600))])
-    assert len(whitening.scale) == 12
+    assert len(learned().scale) == 12
     assert "rank 12" in caplog.text
-    caplog.clear()
-    whitening.learn(places[:, :8], [(views[:, :8], torch.arange(600))])
-    assert len(whitening.scale) == 8  # all there are
-    assert not caplog.text
 
 
 def test_short_routes_are_looked_at_more_often() -> None:
@@ -190,27 +177,22 @@ def test_short_routes_are_looked_at_more_often() -> None:
     assert Whitening(views=2).copies(60, 1764) == 2
 
 
-def test_a_state_of_any_size_is_loaded() -> None:
-    for bits in (4, 8, 16):
-        for numbers in (5, 8):
-            places, views = route()
-            one, other = Whitening(numbers, bits=bits), Whitening()
-            one.learn(places, [(views, torch.arange(600))])
-            other.learn(places[:, :9])
-            other.load_state_dict(one.state_dict())
-            assert torch.equal(other(views), one(views))
-            assert not Whitening().learned
-            assert torch.equal(Whitening()(views), views)
+@pytest.mark.parametrize("bits", [4, 8, 16])
+@pytest.mark.parametrize("numbers", [5, 8])
+def test_a_state_of_any_size_is_loaded(bits: int, numbers: int) -> None:
+    one, other = learned(numbers=numbers, bits=bits), learned(PLACES[:, :9], None)
+    other.load_state_dict(one.state_dict())
+    assert torch.equal(other(VIEWS), one(VIEWS))
+    assert not Whitening().learned
+    assert torch.equal(Whitening()(VIEWS), VIEWS)
 
 
 @pytest.mark.parametrize("power", [1.0, 0.5])
 def test_gradients_reach_the_features(power: float) -> None:
     places, views = route(200, 6, 4)
-    for own in ([(views, torch.arange(200))], None):
-        whitening = Whitening(numbers=3, power=power)
-        whitening.learn(places, own)
+    for seen in (views, None):
         some = views[:3].double().requires_grad_()
-        assert torch.autograd.gradcheck(whitening, (some,))
+        assert torch.autograd.gradcheck(learned(places, seen, numbers=3, power=power), (some,))
 
 
 @pytest.mark.parametrize("features", [30, 300])
@@ -226,15 +208,6 @@ def test_principal_components_are_those_of_the_covariance(features: int) -> None
     assert agreement.min() > 0.99
 
 
-PLACES, SEEN = route()
-
-
-def learned(places: Tensor = PLACES, views: Tensor | None = None, **settings: Any) -> Whitening:
-    whitening = Whitening(**settings)
-    whitening.learn(places, None if views is None else [(views, torch.arange(len(views)))])
-    return whitening
-
-
 @pytest.mark.parametrize(
     ("call", "facts"),
     [
@@ -246,13 +219,13 @@ def learned(places: Tensor = PLACES, views: Tensor | None = None, **settings: An
         (lambda: Whitening(power=0.0), ("power=0.0", "above 0")),
         (lambda: Whitening(power=1.5), ("power=1.5", "at most 1")),
         (lambda: Whitening(strengths="all"), ("strengths", "'all'")),
-        (lambda: learned(torch.ones(600, 4)), ("600 descriptors", "all alike")),
-        (lambda: learned(PLACES[:1]), ("(1, 40)", "N at least 2")),
+        (lambda: learned(torch.ones(600, 4), None), ("600 descriptors", "all alike")),
+        (lambda: learned(PLACES[:1], None), ("(1, 40)", "N at least 2")),
         (lambda: Whitening().learn(PLACES, []), ("no views", "None for none")),
         (lambda: learned(views=PLACES), ("views", "augmentation")),
-        (lambda: learned(views=SEEN, numbers=20), ("numbers is 20", "rank 12")),
-        (lambda: learned(views=SEEN[:, :7]), ("7 features", "expected 40")),
-        (lambda: learned()(SEEN[:, :7]), ("(600, 7)", "(B, 40)")),
+        (lambda: learned(numbers=20), ("numbers is 20", "rank 12")),
+        (lambda: learned(views=VIEWS[:, :7]), ("7 features", "expected 40")),
+        (lambda: learned()(VIEWS[:, :7]), ("(600, 7)", "(B, 40)")),
     ],
 )
 def test_what_is_refused(call: Callable[[], Any], facts: tuple[str, ...]) -> None:
@@ -263,11 +236,7 @@ def test_what_is_refused(call: Callable[[], Any], facts: tuple[str, ...]) -> Non
 @pytest.mark.parametrize("bits", [4, 8])
 @pytest.mark.parametrize("name", ["projection", "scale", "offset", "length"])
 def test_a_state_that_does_not_fit_is_refused(name: str, bits: int) -> None:
-    places, views = route()
-    whitening, other = Whitening(numbers=4, bits=bits), Whitening()
-    whitening.learn(places, [(views, torch.arange(600))])
-    state = whitening.state_dict()
-    columns = bits // 2
+    state, other, columns = learned(numbers=4, bits=bits).state_dict(), Whitening(), bits // 2
     state[name] = torch.ones(3) if name == "length" else state[name][..., : columns - 1]
     with refused("(K,)", f"(40, {columns - 1})" if name == "projection" else f"(40, {columns})"):
         other.load_state_dict(state)
