@@ -30,18 +30,18 @@ ORDER = [
     {"cli"},
 ]
 RANK = {room: rank for rank, rooms in enumerate(ORDER) for room in rooms}
-ONLY = {"motion": {"types", "memory", "data"}}  # rooms that use less than all to their left
+ONLY = {"motion": {"text", "types", "memory", "data"}}  # rooms that use less than all to their left
 # what each room uses: a new arrow between two rooms is a decision, and is written down here
 ARROWS = {
     "types": "text",
     "memory": "types",
     "resize": "types",
     "data": "text types memory resize",
-    "features": "types resize",
-    "periods": "types memory",
+    "features": "text types resize",
+    "periods": "text types memory",
     "maps": "types memory data periods",
     "recognition": "types maps",
-    "motion": "types memory data",
+    "motion": "text types memory data",
     "learning": "types memory data features maps recognition motion",
     "model_file": "text version types data features periods maps recognition motion learning",
     "model": "types memory resize data features maps recognition motion learning model_file",
