@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from kornia.enhance import equalize_clahe
 from torch import Tensor
 
-from dejavu_torch.features.preprocess import Preprocess, equalise, normalise_patches, select_channel
+from dejavu_torch.features.preprocess import Preprocess, equalise, normalise_patches
 
 
 def patch_oracle(image: np.ndarray, patch: int) -> np.ndarray:
@@ -49,17 +49,7 @@ def test_channels() -> None:
         "Grey": 0.299 * red + 0.587 * green + 0.114 * blue,
     }.items():
         torch.testing.assert_close(Preprocess(channel=name)(frames), expected)
-
-
-def test_grey_frames_pass_as_grey() -> None:
-    frames = torch.rand(2, 1, 4, 5)
-    assert torch.equal(select_channel(frames, "grey"), frames)
-
-
-def test_gradients_of_channels() -> None:
-    frames = torch.rand(1, 3, 2, 2, dtype=torch.float64, requires_grad=True)
-    for name in ("grey", "G", "R-B"):
-        assert torch.autograd.gradcheck(lambda x, name=name: select_channel(x, name), frames)
+    assert torch.equal(Preprocess("grey")(red), red)
 
 
 # --- patch normalisation
@@ -137,12 +127,6 @@ def test_clahe_passes_gradients_straight_through_without_other_values() -> None:
     torch.testing.assert_close(leaf.grad, weights)
 
 
-def test_a_difference_is_moved_into_range_ahead_of_clahe() -> None:
-    frames = torch.rand(2, 3, 32, 32)
-    even = Preprocess(channel="R-B", contrast="clahe", grid=(2, 2))(frames)
-    torch.testing.assert_close(even, equalise((frames[:, :1] - frames[:, 2:] + 1) / 2, grid=(2, 2)))
-
-
 # --- the module
 
 
@@ -157,6 +141,8 @@ def test_module_equals_functions() -> None:
     assert torch.equal(module(frames), normalise_patches(frames[:, 1:2], 5))
     module = Preprocess(contrast="clahe", clip_limit=3.0, grid=(2, 3))
     assert torch.equal(module(frames), equalise(frames, 3.0, (2, 3)))
+    difference = Preprocess("R-B", "clahe", grid=(2, 2))(frames)  # moved into range
+    torch.testing.assert_close(difference, equalise((frames[:, :1] - frames[:, 2:] + 1) / 2, grid=(2, 2)))
 
 
 def applied(frames: Tensor, **choice: Any) -> Tensor:
