@@ -104,15 +104,10 @@ def read_array(path: Path) -> ArrayTraverse:
 
 
 def as_traverse(source: Traverse | Tensor) -> Traverse:
-    """A tensor or array of frames or features as a traverse; a traverse as it is.
-
-    Raises:
-        InputError: anything else, such as the address of a source.
-    """
+    """A tensor or array of frames or features as a traverse; a traverse as it is."""
+    if isinstance(source, Tensor | np.ndarray):
+        return ArrayTraverse(source)
     if isinstance(source, Traverse):
         return source
-    if not isinstance(source, Tensor | np.ndarray):
-        raise InputError(
-            f"got a {type(source).__name__}; expected a Traverse, such as open_source gives, or a tensor"
-        )
-    return ArrayTraverse(source)
+    expected = "a Traverse, such as open_source gives, or a tensor"
+    raise InputError(f"got a {type(source).__name__}; expected {expected}")

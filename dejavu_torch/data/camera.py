@@ -12,9 +12,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from torch import Tensor
 
+from dejavu_torch.data.files import why
 from dejavu_torch.data.video import FORMATS, check_alike, pixels_of, seconds_of, stream_of
 from dejavu_torch.resize import is_stretched
-from dejavu_torch.text import one_line, printable
+from dejavu_torch.text import printable
 from dejavu_torch.types import InputError, Traverse
 
 PIPE = "-"  # standard input
@@ -98,12 +99,9 @@ class Camera:
         except InputError:
             raise
         except Exception as error:  # FFmpeg's, of any type
-            why = one_line(getattr(error, "strerror", None) or str(error) or type(error).__name__)
-            if number:
-                raise InputError(
-                    f"{self.name} broke off after {number} frames: {why}; expected it to go on"
-                ) from error
-            raise InputError(f"{self.name} cannot be read: {why}; expected {self._expected}") from error
+            seen = f"broke off after {number} frames" if number else "cannot be read"
+            expected = "it to go on" if number else self._expected
+            raise InputError(f"{self.name} {seen}: {why(error)}; expected {expected}") from error
         if not number:
             raise InputError(f"{self.name} gave no frames; expected {self._expected}")
         if not self.ends:
@@ -139,12 +137,7 @@ def _mode_is(path: str, test: Any) -> bool:
 
 
 def stretched(name: str, own: tuple[int, int], size: tuple[int, int] | None) -> str:
-    """A line on frames of one size (height, width) that are brought to one of another shape; else "".
-
-    Example:
-        >>> stretched("clip", (480, 640), (120, 160)), bool(stretched("clip", (480, 640), (90, 160)))
-        ('', True)
-    """
+    """A line on frames of one size (height, width) that are brought to one of another shape; else ""."""
     if size is None or not is_stretched(own, size):
         return ""
     seen = f"frames of {own[0]} x {own[1]} pixels are brought to the map's {size[0]} x {size[1]}"

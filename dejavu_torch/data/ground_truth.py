@@ -61,16 +61,10 @@ def check_table(queries: int, places: int) -> None:
 
 
 def offset_truth(queries: int | Tensor, frames: int | None, offset: int = 0) -> Tensor:
-    """Query i is frame i + offset; -1, no right answer, if there is no such frame.
+    """Query i is frame i + offset, (Q,1) int64; -1, no right answer, if there is no such frame.
 
     Args:
         queries: how many, or (Q,) int64 the number of each. frames: of the reference, None where unknown.
-
-    Shape: -> (Q,1) int64.
-
-    Example:
-        >>> offset_truth(3, 3, offset=1).flatten().tolist()
-        [1, 2, -1]
     """
     frame = (torch.arange(queries) if isinstance(queries, int) else queries) + offset
     there = frame >= 0 if frames is None else (frame >= 0) & (frame < frames)
@@ -80,12 +74,8 @@ def offset_truth(queries: int | Tensor, frames: int | None, offset: int = 0) -> 
 def position_truth(reference: Tensor, query: Tensor) -> Tensor:
     """The reference frame nearest to each query by position along the route.
 
-    Args:
-        reference: (N,) positions of the reference frames. query: (Q,) positions of the queries, in
-            the same unit.
-
-    Shape: -> (Q,1) int64, -1 for a query further than the widest step of the reference from all
-        of its frames.
+    Shape: reference (N,), query (Q,), of one unit -> (Q,1) int64, -1 for a query further than the widest step
+        of the reference from all of its frames.
     """
     ordered, order = reference.double().sort()
     slot = torch.searchsorted(ordered, query.double()).clamp(1, max(1, len(ordered) - 1))
@@ -98,17 +88,9 @@ def position_truth(reference: Tensor, query: Tensor) -> Tensor:
 
 
 def near_truth(reference: Tensor, query: Tensor, radius: float) -> Tensor:
-    """Every reference frame within a distance of each query.
+    """Every reference frame within a radius, inclusive, of each query.
 
-    Args:
-        reference: (N,K) coordinates of the reference frames. query: (Q,K) those of the queries.
-        radius: inclusive, in the unit of the coordinates.
-
-    Shape: -> (Q,R) int64, -1 as padding.
-
-    Example:
-        >>> near_truth(torch.tensor([[0.0, 0.0], [3.0, 4.0]]), torch.zeros(1, 2), radius=5.0).tolist()
-        [[0, 1]]
+    Shape: coordinates reference (N,K), query (Q,K), of the radius' unit -> (Q,R) int64, -1 as padding.
     """
     rows: list[Tensor] = []
     for part in query.double().split(max(1, PAIRS_AT_ONCE // max(1, len(reference)))):
@@ -148,11 +130,7 @@ def ground_truth_in_places(truth: GroundTruth, place_of: Callable[[Tensor], Tens
 
 
 def check_ground_truth(truth: str, interpolate: bool = False) -> int | float | Path:
-    """What a text says: an offset, a radius in metres, or a file; refused early, before long work.
-
-    Raises:
-        InputError: none of these, a file that cannot be opened, or interpolation of anything but a .csv.
-    """
+    """What a text says: an offset, a radius in metres, or a file that is there; refused before long work."""
     path = Path(str(truth))  # an offset may be a number, as of YAML
     suffix = path.suffix.lower()
     if interpolate and suffix != ".csv":
@@ -187,8 +165,8 @@ def find_ground_truth(
 
             - an integer offset: place = query + offset;
             - a `.csv` of `query,place[,place...]`, with or without such a header: every listed place is
-              right. A query listed without a place, or with -1, has no right answer; a query not listed is
-              not known, and is left out of the scores;
+              right. A query listed without a place, or with -1, has no right answer; one that is not listed
+              is left out of the scores;
             - an `.npz` with the boolean matrices (reference frames, query frames) `GThard` and/or `GTsoft`,
               as in the visual place recognition tutorial of Schubert et al. What is in GThard is right (in
               GTsoft, if that is the only one); what is in GTsoft only counts neither way;
@@ -262,12 +240,6 @@ def say_aligned(reference: Traverse, query: Traverse, frames: int) -> bool:
 
     They do if both were cut alike, each out of a long image, or if their frames have the same names, all
     different. Times, as of the frames of a video, are no such names: any two recordings share them.
-
-    Example:
-        >>> from dejavu_torch.data.source import open_source
-        >>> one, two = (open_source(f"sim:aerial?frames=8&traverse={i}") for i in (0, 1))
-        >>> say_aligned(one, two, 8)  # they have positions, but no names
-        False
     """
     if reference.cut is not None:
         return reference.cut == query.cut
@@ -280,15 +252,7 @@ def say_aligned(reference: Traverse, query: Traverse, frames: int) -> bool:
 
 
 def describe_ground_truth(truth: str | None, interpolate: bool = False, positions: bool = False) -> str:
-    """What `find_ground_truth` takes for the ground truth, in words.
-
-    Args:
-        positions: whether both traverses carry their positions.
-
-    Example:
-        >>> describe_ground_truth("12"), describe_ground_truth(None)
-        ('place = query + 12', 'place = query, as the sources say themselves')
-    """
+    """What `find_ground_truth` takes for the truth, in words; `positions`: both traverses carry them."""
     if truth is None:
         carried = "the positions that both traverses carry"
         return carried if positions else "place = query, as the sources say themselves"
@@ -312,11 +276,7 @@ def offset_of(truth: str | None, positions: bool = False) -> int | None:
 
 
 def utm_coordinates(traverse: Traverse) -> Tensor:
-    """Easting and northing in the names of a traverse's images, metres: (N,2) float64.
-
-    Raises:
-        InputError: no folder of images, or a name without them.
-    """
+    """Easting and northing in the names of a traverse's images, metres: (N,2) float64."""
     names = [traverse.frame_name(i) for i in range(traverse.length or 0)]
     if not any(names):
         raise InputError(f"{traverse.name} has no image names; expected folders of images for truth utm")

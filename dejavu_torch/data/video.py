@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.files import check_regular, reading, state_of
+from dejavu_torch.data.files import check_regular, reading, state_of, why
 from dejavu_torch.data.folder import check_pixels, check_size, fitted_size
 from dejavu_torch.data.names import clock_time
 from dejavu_torch.resize import MOST_PIXELS
@@ -49,8 +49,8 @@ class Video(Traverse):
     Shape: frames (B,3,H,W), RGB also where the video is grey, upright where the file says how the
         camera was turned.
 
-    Convention: where the time from frame to frame varies (dropped frames, a variable frame rate), a line of
-        warning says so when the file was first read to its end.
+    Convention: a frame's name is its time, such as 0:01:23.480. A frame rate that varies is warned of once
+        the file was read to its end.
 
     Raises:
         InputError: width or height out of range; no video, or one that is cut off; while reading, a damaged
@@ -87,7 +87,8 @@ class Video(Traverse):
                 first = first or (frame.height, frame.width)
                 check_alike(self.name, i, frame, first)
                 if i in frames:
-                    batch.append(self._pixels(frame))
+                    with reading(self.path, "cannot be resized", "less"):
+                        batch.append(pixels_of(frame, self.path, self.width, self.height))
                 if len(batch) == size:
                     yield _as_tensor(batch)
                     batch = []
@@ -103,12 +104,10 @@ class Video(Traverse):
         return state_of(self.path)
 
     def frame_name(self, i: int) -> str:
-        """The time of frame i, such as 0:01:23.480; "" where the file has none."""
         seconds = self.frame_time(i)
         return clock_time(seconds) if math.isfinite(seconds) else ""
 
     def frame_time(self, i: int) -> float:
-        """The time of frame i in seconds; NaN where the file has none."""
         if not self._complete and i >= len(self._seconds):
             self._read_times()
         return self._seconds[i]
@@ -118,32 +117,12 @@ class Video(Traverse):
             self._read_times()
         return len(self._seconds) if self.length is None else self.length
 
-    @property
-    def times(self) -> Tensor:
-        """(N,) float64, seconds of each frame from its timestamp in the file, increasing.
-
-        Known once the video was read to the end; before, it is read through for them.
-
-        Raises:
-            InputError: the file has no timestamps, or they run backwards.
-        """
-        if not self._complete:
-            self._read_times()
-        times = torch.tensor(self._seconds, dtype=torch.float64)
-        if times.isnan().any() or (times.diff() < 0).any():
-            raise InputError(f"{self.name} has no increasing timestamps; expected one for each frame")
-        return times
-
     def _read_times(self) -> None:
         for _ in self._frames(decode=self.length is None):
             pass
 
     def _frames(self, decode: bool = True) -> Generator[VideoFrame, None, None]:
-        """Every frame; at the end its time is known, and that none is missing.
-
-        Args:
-            decode: False yields nothing: only the timestamps are read.
-        """
+        """Every frame, or none if only the timestamps are to be read; at the end, whether all were there."""
         seconds: list[float] = []
         packets = 0
         try:
@@ -174,7 +153,7 @@ class Video(Traverse):
         except InputError:
             raise
         except Exception as error:  # of any type
-            raise self._broken(len(seconds), getattr(error, "strerror", None) or str(error)) from error
+            raise self._broken(len(seconds), why(error)) from error
         if not self._complete:
             self._seconds = seconds if in_order else sorted(seconds)
             self._complete = True
@@ -182,21 +161,16 @@ class Video(Traverse):
 
     def _warn_uneven(self) -> None:
         """Warn of times from frame to frame that vary by more than the rounding of timestamps."""
-        intervals = torch.tensor(self._seconds, dtype=torch.float64).diff()
+        intervals = 1e3 * torch.tensor(self._seconds, dtype=torch.float64).diff()
         if not len(intervals) or not (intervals >= 0).all():
             return
-        middle, longest = float(intervals.median()), float(intervals.max())
-        if longest > UNEVEN * middle + 1e-6:
+        shortest, middle, longest = map(float, (intervals.min(), intervals.median(), intervals.max()))
+        if longest > UNEVEN * middle + 1e-3:
             log.warning(
                 "%s: the frame rate varies, %.0f to %.0f ms from frame to frame (median %.0f): periods in "
                 "frames mean nothing here unless the footage is resampled by distance",
-                *(self.name, 1e3 * float(intervals.min()), 1e3 * longest, 1e3 * middle),
+                *(self.name, shortest, longest, middle),
             )
-
-    def _pixels(self, frame: VideoFrame) -> np.ndarray:
-        """One frame, upright and resized, (H,W,3) uint8."""
-        with reading(self.path, f"cannot be resized to {self.height} x {self.width} pixels", "less"):
-            return pixels_of(frame, self.path, self.width, self.height)
 
     @contextmanager
     def _open(self) -> Iterator[tuple[InputContainer, VideoStream]]:

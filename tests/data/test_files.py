@@ -65,7 +65,7 @@ def test_a_text_without_its_mark_and_one_that_is_none(
     path = tmp_path / "a.csv"
     path.write_bytes(b"\xef\xbb\xbfa\r\nb")
     assert read_text(path, "lines") == "a\nb"
-    for content, words in ((b"\xff\xfe1", "no UTF-8 text"), (b"a\0b", "no text")):
+    for content, words in ((b"\xff\xfe1", "UTF-8 text"), (b"a\0b", "null character")):
         path.write_bytes(content)
         with refused(str(path), words, "expected lines"):
             read_text(path, "lines")
