@@ -163,13 +163,7 @@ def _paint_plot(canvas: Canvas, random: Random, kind: str, x: float, side: int) 
 
 
 def road_markings(columns: int, scale: int = 1) -> tuple[Tensor, Tensor]:
-    """Coverage of the markings that repeat: lane dashes and chevrons.
-
-    Column x of either equals column x + its period, exactly.
-
-    Args:
-        columns: width of the image, in columns of one frame step each.
-        scale: samples per image pixel.
+    """Coverage of the markings that repeat exactly, lane dashes and chevrons, at `scale` samples a pixel.
 
     Shape: two (HEIGHT * scale, columns * scale) float32 in [0,1].
     """
@@ -210,11 +204,7 @@ def _paint_road(canvas: Canvas, random: Random, tone: Tensor, lanes: list[tuple[
 
 
 def paint_route(frames: int, seed: int = 0) -> Tensor:
-    """Paint the route from above, without the traffic of any one flight.
-
-    Args:
-        frames: number of camera positions, one image column apart.
-        seed: chooses everything except the markings, which are the same for every seed.
+    """Paint the route from above, without the traffic of any one flight; the seed chooses all but markings.
 
     Shape: (3, HEIGHT, frames + VIEW + 2 * MARGIN) float32 in [0,1].
     """
@@ -249,11 +239,8 @@ def paint_route(frames: int, seed: int = 0) -> Tensor:
 def paint_tiles(seed: int = 0) -> tuple[Tensor, Tensor]:
     """Paint the two tiles of ground that repeats: one lies above the middle of the road, one below.
 
-    Columns [0, P) of either go on as its columns [P, 2P), and so on. Both show their half of a road that is
-    the same in every column, and beyond it the roadside of a route of their own.
-
-    Args:
-        seed: chooses the roadsides.
+    Both show their half of a road that is the same in every column, and beyond it the roadside of a route of
+    their own.
 
     Shape: two (3, HEIGHT / 2, TILES[k]) float32 in [0,1], row 0 the one that is nearest to the middle.
     """
@@ -286,9 +273,6 @@ class AerialRoad(SimulatedRoute):
         ground: "once": the lane dashes and chevrons repeat, everything else occurs once. "repeat": the upper
             half of the view repeats every `TILES[0]` frames and the lower half every `TILES[1]`, without
             traffic: a place is the pair of its phases.
-
-    Raises:
-        InputError: an argument that is no number or out of its range.
 
     Example:
         >>> next(AerialRoad(traverse=1, frames=3).batches(8)).shape
@@ -339,9 +323,8 @@ class AerialRoad(SimulatedRoute):
 
     @cached_property
     def _tiles(self) -> tuple[Tensor, Tensor]:
-        """The two halves of the ground that repeats as (3, HEIGHT, P + margins), each mirrored at the middle.
-
-        So a sample near the middle, which mixes two rows, finds its own tile on both sides.
+        """The two halves of the ground that repeats as (3, HEIGHT, P + margins), each mirrored at the middle:
+        a sample near the middle, which mixes two rows, finds its own tile on both sides.
         """
         ahead = VIEW + 2 * MARGIN
         tiles = (torch.cat([tile.flip(1), tile], 1) for tile in paint_tiles(self.seed))
