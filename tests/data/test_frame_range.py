@@ -24,26 +24,13 @@ def test_a_part_is_a_slice_however_the_frames_are_read(part: tuple[int, int, int
     expected = VALUES[start : stop or None : step]
     for traverse in (Stream(VALUES), ArrayTraverse(VALUES), FrameRange(Stream(VALUES))):
         some = FrameRange(traverse, start, stop, step)
-        assert torch.equal(all_of(some, size), expected)
-        assert max(len(batch) for batch in some.batches(size)) <= size
+        frames = range(start, stop or len(VALUES), step)
+        for batches in (list(some.batches(size)), list(traverse.select(frames, size))):
+            assert torch.equal(torch.cat(batches), expected)
+            assert {len(batch) for batch in batches[:-1]} <= {size}
         assert some.length in (None, len(expected))
         inner = torch.cat([VALUES[:0], *some.between(1, 4)])
         assert torch.equal(inner, expected[1:4])
-
-
-@given(PARTS, st.integers(1, 50))
-def test_selected_frames_come_in_whole_batches(part: tuple[int, int, int], size: int) -> None:
-    start, stop, step = part
-    frames = range(start, stop or len(VALUES), step)
-    for traverse in (
-        Stream(VALUES),
-        ArrayTraverse(VALUES),
-        FrameRange(Stream(VALUES)),
-        FrameRange(ArrayTraverse(VALUES)),
-    ):
-        batches = list(traverse.select(frames, size))
-        assert torch.equal(torch.cat(batches), VALUES[frames.start : frames.stop : step])
-        assert all(len(batch) == size for batch in batches[:-1])
 
 
 def test_parts_of_parts_name_both() -> None:
@@ -76,7 +63,3 @@ def test_large_frames_are_read_a_few_at_a_time(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(types, "FRAME_NUMBERS", 19)
     with refused("frames of 1 x 4 x 5 numbers", "expected at most 19"):
         frames.batch_size(64)
-
-
-def test_a_traverse_without_names_has_empty_ones() -> None:
-    assert Stream(VALUES).frame_name(3) == ""
