@@ -8,7 +8,7 @@ from collections.abc import Generator, Iterator
 from contextlib import closing, contextmanager
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 import torch
@@ -34,7 +34,7 @@ SUFFIXES = {
 }
 # what these files are, and nothing else that FFmpeg knows, such as a list of other files or addresses
 FORMATS = "mov,mp4,matroska,webm,avi,mpeg,mpegts,mpegvideo,m4v,h264,hevc,asf,flv,live_flv,ogg,mjpeg"
-EBML = b"\x1a\x45\xdf\xa3"  # how Matroska files begin; the identifier of their segment is as long
+EBML, SEGMENT, CLUSTER = b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67", b"\x1f\x43\xb6\x75"  # of Matroska
 UNEVEN = 1.5  # longest interval over the median one; rounded to ticks of half a frame or less it is less
 
 
@@ -67,7 +67,7 @@ class Video(Traverse):
         self._complete = False  # whether these are all frames
         with self._open() as (container, stream):
             entries = stream.index_entries
-            if _is_cut(self.path) or any(entry.pos + entry.size > container.size for entry in entries):
+            if not _is_whole(self.path) or any(entry.pos + entry.size > container.size for entry in entries):
                 raise InputError(f"{path} is cut off or damaged; expected a whole video file")
             # only this family lists every frame, and which of them an edit list hides
             if container.format.name.startswith("mov") and stream.frames:
@@ -236,18 +236,33 @@ def _as_tensor(frames: list[np.ndarray]) -> Tensor:
     return torch.from_numpy(np.stack(frames)).permute(0, 3, 1, 2).float().div_(255)
 
 
-def _is_cut(path: Path) -> bool:
-    """Whether a Matroska file ends before its segment does; FFmpeg reads what is left without a word."""
+def _is_whole(path: Path) -> bool:
+    """Whether a file, if it is a Matroska one, is neither cut nor has holes, of which FFmpeg says no word."""
     with path.open("rb") as file:
-        head, stop = file.read(4096), file.seek(0, 2)
-    if not head.startswith(EBML):
-        return False
-    end = length = most = 0
-    for _ in ("the header", "the segment"):  # an identifier of 4 bytes, a length, and as many bytes
-        at = end + length + len(EBML)
-        if at >= len(head):
-            return True
-        end = at + 9 - head[at].bit_length()  # the zero bits a length starts with tell how long it is
-        most = (1 << 7 * (end - at)) - 1
-        length = int.from_bytes(head[at:end]) & most
-    return end + length > stop and length < most  # all ones if it is not known, as of a live recording
+        is_matroska = file.read(len(EBML)) == EBML
+        return not is_matroska or _elements_fit(file, 0, file.seek(0, 2))
+
+
+def _elements_fit(file: BinaryIO, start: int, stop: int) -> bool:
+    """Whether the Matroska elements from `start` on, one after another, end exactly at `stop`."""
+    while start < stop:
+        file.seek(start)
+        head = file.read(12)
+        # an identifier and a length; the zero bits they start with tell how long they are
+        i = 9 - head[0].bit_length()
+        j = i + 9 - head[i].bit_length() if i <= 4 and i < len(head) else 13
+        if j > len(head):
+            return False
+        unknown = (1 << 7 * (j - i)) - 1
+        length = int.from_bytes(head[i:j]) & unknown
+        if length == unknown:  # recorded live: nothing to check against
+            return head[:i] in (SEGMENT, CLUSTER)
+        end = start + j + length
+        if end > stop:
+            return False
+        if head[:i] in (SEGMENT, CLUSTER) and not _elements_fit(file, start + j, end):
+            return False
+        if head[:i] == SEGMENT:
+            return True  # what follows is not ours
+        start = end
+    return True
