@@ -34,6 +34,7 @@ from dejavu_torch.data.ground_truth import (
     is_right,
     near_truth,
     offset_truth,
+    padded,
     position_truth,
 )
 from dejavu_torch.data.positions import look_up
@@ -95,6 +96,16 @@ def test_any_right_place_will_do_and_minus_one_is_none(
     expected = [i >= 0 and any(t >= 0 and abs(i - t) <= tolerance for t in truth) for i, truth in rows]
     index, truth = torch.tensor([i for i, _ in rows]), torch.tensor([t for _, t in rows])
     assert is_right(index, truth, tolerance).tolist() == expected
+
+
+@given(st.lists(st.lists(st.integers(0, 9), max_size=4), min_size=1, max_size=8))
+def test_padded_holds_each_row_in_order(rows: list[list[int]]) -> None:
+    table = padded(torch.tensor(places, dtype=torch.int64) for places in rows)
+    assert table.dtype == torch.int64
+    assert table.shape == (len(rows), max(map(len, rows)))
+    assert [[p for p in line if p >= 0] for line in table.tolist()] == rows
+    # the padding stands behind the places
+    assert [line[: len(places)] for line, places in zip(table.tolist(), rows, strict=True)] == rows
 
 
 POINTS = st.lists(st.tuples(st.integers(-6, 6), st.integers(-6, 6)), min_size=1, max_size=12)
