@@ -19,22 +19,24 @@ from __future__ import annotations
 
 import argparse
 import gc
-import json
 import logging
+import multiprocessing
 import os
 import resource
-import select
 import shlex
 import shutil
 import signal
+import stat
 import sys
 import tempfile
 import time
 import traceback
 import warnings
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, suppress
 from itertools import pairwise
+from multiprocessing.connection import Connection
 from pathlib import Path
 from random import Random
 from typing import Any, NamedTuple
@@ -206,15 +208,14 @@ def _named(words: Sequence[str], folder: Path) -> Callable[[str], bool]:
 
 
 def _files(folder: Path) -> dict[str, Any]:
-    """Every file and folder, and the size and time of files."""
+    """Every file and folder by its path, and the size and time of files."""
     found: dict[str, Any] = {}
-    for inside, folders, files in os.walk(folder):
-        found |= {os.path.join(inside, name).removeprefix(str(folder)): None for name in folders}
-        for name in files:
-            path = os.path.join(inside, name)
-            status = os.lstat(path)
-            found[path.removeprefix(str(folder)).lstrip("/")] = (status.st_size, status.st_mtime_ns)
-    return {name.lstrip("/"): value for name, value in found.items()}
+    for path in folder.rglob("*"):
+        status = path.lstat()
+        found[str(path.relative_to(folder))] = (
+            None if stat.S_ISDIR(status.st_mode) else (status.st_size, status.st_mtime_ns)
+        )
+    return found
 
 
 def _address_space() -> int:
@@ -244,14 +245,8 @@ def _prepare(root: Path) -> None:
     torch.set_num_threads(1)
 
 
-def _work(reader: Reader, seed: int, numbers: Iterable[int], root: Path, pipe: int) -> None:
+def _work(reader: Reader, seed: int, numbers: Sequence[int], root: Path, told: Connection) -> None:
     """Run cases, telling of each when it begins and when it has ended."""
-
-    def tell(message: Any) -> None:
-        data = json.dumps(message).encode() + b"\n"
-        while data:
-            data = data[os.write(pipe, data) :]
-
     _prepare(root)
     for maker in reader.makers:
         folder = root / "made" / maker.__name__
@@ -263,13 +258,12 @@ def _work(reader: Reader, seed: int, numbers: Iterable[int], root: Path, pipe: i
             torch.manual_seed(0)
             maker(root / "making")
             (root / "making").rename(folder)
-    sys.stderr.flush()
     base = _address_space()
     resource.setrlimit(resource.RLIMIT_AS, (base + MEMORY, resource.RLIM_INFINITY))
     for number in numbers:
-        tell(number)
+        told.send(number)
         result = _run_case(reader, seed, number, root)
-        tell(result)
+        told.send(result)
         if any(f.kind in ("Hang", "MemoryError") for f in result.findings) or _address_space() > base + GROWN:
             return  # the next case in a process that has nothing of this one
 
@@ -279,60 +273,30 @@ def _work(reader: Reader, seed: int, numbers: Iterable[int], root: Path, pipe: i
 
 def run(reader: Reader, seed: int, numbers: Iterable[int], root: Path) -> Iterator[Result]:
     """The results of the cases of a reader, in order."""
-    waiting = list(numbers)
+    waiting, forked = list(numbers), multiprocessing.get_context("fork")
     while waiting:
-        reading, writing = os.pipe()
-        child = os.fork()
-        if not child:
-            status = 1
-            try:
-                os.close(reading)
-                _work(reader, seed, waiting, root, writing)
-                status = 0
-            except BaseException:
-                traceback.print_exc()
-                sys.stderr.flush()
-            finally:
-                os._exit(status)
-        os.close(writing)
-        begun, hung = None, False
-        with open(reading, "rb", buffering=0) as pipe:
-            for line in _lines(pipe):
-                if line is None:
-                    hung = True
-                    os.kill(child, signal.SIGKILL)
-                    break
-                message = json.loads(line)
-                if isinstance(message, int):
-                    begun = message
-                    continue
-                case, outcome, findings, seconds = message
-                waiting.remove(case)
-                begun = None
-                yield Result(case, outcome, [Finding(*one) for one in findings], seconds)
-        status = os.waitpid(child, 0)[1]
+        reading, writing = forked.Pipe(duplex=False)
+        child = forked.Process(target=_work, args=(reader, seed, waiting, root, writing))
+        child.start()
+        writing.close()
+        begun = None
+        with suppress(EOFError):
+            while reading.poll(SILENT):
+                message = reading.recv()
+                begun = message if isinstance(message, int) else None
+                if begun is None:
+                    waiting.remove(message.case)
+                    yield message
+            child.kill()  # it says nothing any more
+        child.join()
+        text = (root / "stderr").read_text(errors="replace")
         if begun is not None:
             waiting.remove(begun)
-            how = "hang" if hung else "killed" if os.WIFSIGNALED(status) else "ended"
-            number = os.WTERMSIG(status) if os.WIFSIGNALED(status) else os.WEXITSTATUS(status)
-            told = (root / "stderr").read_text(errors="replace")[-2 * MOST :]
-            yield Result(begun, "broken", [Finding(f"process {how}", f"{number}", told)], 0.0)
-        elif status:
-            raise RuntimeError(f"{reader.name} made no input: {(root / 'stderr').read_text()[-3000:]}")
-
-
-def _lines(pipe: Any) -> Iterator[bytes | None]:
-    """Lines as they come; None where none comes for too long."""
-    rest = b""
-    while True:
-        if not select.select([pipe], [], [], SILENT)[0]:
-            yield None
-            return
-        data = pipe.read(65536)
-        if not data:
-            return
-        *whole, rest = (rest + data).split(b"\n")
-        yield from whole
+            how = "killed" if (child.exitcode or 0) < 0 else "ended"
+            finding = Finding(f"process {how} {abs(child.exitcode or 0)}", "", text[-2 * MOST :])
+            yield Result(begun, "broken", [finding], 0.0)
+        elif child.exitcode:
+            raise RuntimeError(f"{reader.name} made no input: {text[-3000:]}")
 
 
 def shares(cases: int, names: Iterable[str]) -> dict[str, int]:
@@ -348,27 +312,23 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--reader", action="append", choices=[*READERS], help="only this; may be given again")
     parser.add_argument("--case", type=int, help="only the case of this number, and all that it says")
-    parser.add_argument("--keep", help="a folder to leave the case's files in")
+    parser.add_argument("--keep", type=Path, help="a folder to leave the case's files in")
     chosen = parser.parse_args(arguments)
     print("reader               cases  accepted  refused  findings  seconds", flush=True)
     distinct: dict[tuple[str, str], list[tuple[str, int, Finding]]] = defaultdict(list)
-    total = [0] * 4
-    root = Path(tempfile.mkdtemp(prefix="fuzz-")) if chosen.keep is None else Path(chosen.keep).resolve()
-    root.mkdir(exist_ok=True)
-    try:
+    total: Counter[str] = Counter()
+    with ExitStack() as stack:
+        root = chosen.keep or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="fuzz-")))
+        root.mkdir(exist_ok=True)
         for name, count in shares(chosen.cases, chosen.reader or READERS).items():
             numbers = range(count) if chosen.case is None else [chosen.case]
-            outcomes, began = defaultdict(int), time.perf_counter()
-            for result in run(READERS[name], chosen.seed, numbers, root):
+            outcomes, began = Counter(cases=len(numbers)), time.perf_counter()
+            for result in run(READERS[name], chosen.seed, numbers, root.resolve()):
                 outcomes[result.outcome] += 1
                 for finding in result.findings:
                     distinct[finding.kind, finding.where].append((name, result.case, finding))
-            counts = [len(numbers), *(outcomes[one] for one in ("accepted", "refused", "broken"))]
-            total = [a + b for a, b in zip(total, counts, strict=True)]
-            print(_row(name, counts), f"{time.perf_counter() - began:8.1f}", flush=True)
-    finally:
-        if chosen.keep is None:
-            shutil.rmtree(root, ignore_errors=True)
+            total += outcomes
+            print(_row(name, outcomes), f"{time.perf_counter() - began:8.1f}", flush=True)
     print(_row("all", total))
     for (kind, where), found in sorted(distinct.items(), key=lambda item: -len(item[1])):
         name, case, finding = found[0]
@@ -380,6 +340,6 @@ def main(arguments: list[str] | None = None) -> int:
     return 1 if distinct else 0
 
 
-def _row(name: str, counts: list[int]) -> str:
-    cases, accepted, refused, broken = counts
+def _row(name: str, counts: Counter[str]) -> str:
+    cases, accepted, refused, broken = (counts[one] for one in ("cases", "accepted", "refused", "broken"))
     return f"{name:<20} {cases:5}  {accepted:8}  {refused:7}  {broken:8}"
