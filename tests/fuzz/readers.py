@@ -11,6 +11,7 @@ import io
 import json
 import math
 import os
+import re
 import shutil
 import struct
 import threading
@@ -166,10 +167,9 @@ def localize(model: DejaVu, queries: Traverse, random: Random) -> None:
 def same_model(first: DejaVu, second: DejaVu) -> bool:
     """Whether two maps hold the same tensors and settings."""
     (tensors, header), (others, other) = contents_of(first), contents_of(second)
-    headers = {json.dumps(one, sort_keys=True) for one in (header, other)}
-    if len(headers) > 1 or tensors.keys() != others.keys():
-        return False
-    return all(same_tensor(tensors[name], others[name]) for name in tensors)
+    settings = json.dumps(header, sort_keys=True) == json.dumps(other, sort_keys=True)
+    alike = settings and tensors.keys() == others.keys()
+    return alike and all(same_tensor(tensors[name], others[name]) for name in tensors)
 
 
 def same_tensor(one: Tensor, other: Tensor) -> bool:
@@ -281,8 +281,7 @@ def codec(case: Case) -> None:
     if act < 0.5:
         data = mutate_bytes(random, data)
     elif act < 0.9:
-        odd = (0, -1, rows + 1, columns - 1, 1000, 10**6, 10**9, 2**31, 2**62)
-        sizes[random.randrange(2)] = random.choice(odd)
+        sizes[random.randrange(2)] = random.choice((0, -1, rows + 1, columns - 1, 1000, 10**6, 10**9, 2**62))
     else:
         checksum = random.choice((0, -1, checksum ^ 1, 2**62))
     case.begin()
@@ -317,21 +316,20 @@ def mutated_checkpoint(random: Random, data: bytes) -> tuple[bytes, bool]:
 
         return rewritten(data, zipfile.ZIP_STORED, change), True
     held = torch.load(io.BytesIO(data), weights_only=True)
-    plain = {name: value for name, value in held.items() if name not in ("state_dict", "optimizer_states")}
-    if random.random() < 0.5:
-        tensors = {name: value for name, value in held["state_dict"].items() if isinstance(value, Tensor)}
-        held["state_dict"] = {**held["state_dict"], **mutate_tensors(random, tensors)}
-        for name in set(tensors) - set(held["state_dict"]):
-            del held["state_dict"][name]
-    elif random.random() < 0.5:
+    state = held["state_dict"]
+    tensors = {name: value for name, value in state.items() if isinstance(value, Tensor)}
+    others = {name: value for name, value in state.items() if name not in tensors}
+    if act < 0.8:
+        held["state_dict"] = others | mutate_tensors(random, tensors)
+    elif act < 0.9:
         name = random.choice(sorted(held))
         held[name] = odd_value(random, held[name])
         if random.random() < 0.2:
             held["hyper_parameters"] = {"_class_path": f"{CANARY}.Module", "_instantiator": f"{CANARY}.run"}
     else:
+        plain = {name: held[name] for name in held if name not in ("state_dict", "optimizer_states")}
         held |= mutate_json(random, plain)
-        state = {name: value for name, value in held["state_dict"].items() if not isinstance(value, Tensor)}
-        held["state_dict"].update(mutate_json(random, state))
+        held["state_dict"] = tensors | mutate_json(random, others)
     written = io.BytesIO()
     torch.save(held, written)
     return written.getvalue(), True
@@ -383,17 +381,15 @@ SETTINGS = ("0", "1", "2", "0.5", "null", "true", "l2", "mean", "[2,2]", "16", "
 
 def mutated_yaml(random: Random, text: str) -> bytes:
     act = random.random()
-    if act < 0.03:
-        return (BOMB + text).encode()
     if act < 0.06:
-        return (text + "\na: " * 2 + "[" * 20_000).encode()
-    if act < 0.4:
-        lines = text.splitlines()
-        at = random.randrange(len(lines))
-        name = lines[at].partition(":")[0]
-        lines[at] = f"{name}: {random.choice(random.choice((TAGS, NUMBERS, SETTINGS)))}"
-        return "\n".join(lines).encode()
-    return mutate_text(random, text)
+        return random.choice((BOMB + text, text + "\na: " * 2 + "[" * 20_000)).encode()
+    if act > 0.4:
+        return mutate_text(random, text)
+    lines = text.splitlines()
+    at = random.randrange(len(lines))
+    name = lines[at].partition(":")[0]
+    lines[at] = f"{name}: {random.choice(random.choice((TAGS, NUMBERS, SETTINGS)))}"
+    return "\n".join(lines).encode()
 
 
 @reader("config", inputs, share=1.5)
@@ -401,14 +397,11 @@ def config(case: Case) -> None:
     random = case.random
     text = (FOLDER / f"{random.choice(('default', 'local_maxima', 'paper'))}.yaml").read_text()
     lines = [line.partition("#")[0].rstrip() for line in text.splitlines()]
-    text = "\n".join(filter(str.strip, lines))
-    Path("in/config.yaml").write_bytes(mutated_yaml(random, text))
-    learn = ["in/frames.npy", "--map", "out/m.safetensors"]
-    compare = ["in/frames.npy", "in/query.npy", "--out", "out/report"]
-    name, words = random.choice((("learn", learn), ("compare", compare)))
+    Path("in/config.yaml").write_bytes(mutated_yaml(random, "\n".join(filter(str.strip, lines))))
     chosen = "in/config.yaml"
     if random.random() < 0.1:
         chosen = mutate_text(random, "local_maxima").decode(errors="surrogateescape").replace("\0", "")
+    name, *words = random.choice((LINES[0], SLOW_LINES[0])).split()
     case.begin()
     parse(name, getattr(commands, f"run_{name}"), [*words, "--config", chosen])
 
@@ -456,16 +449,9 @@ compare in/frames.npy in/query.npy --out out/r --truth 0 --distractors in/photos
 """.strip().splitlines()
 
 
-def groups(line: Sequence[str]) -> list[list[str]]:
+def groups(line: str) -> list[list[str]]:
     """The words of a line, each option with its value."""
-    found: list[list[str]] = []
-    for word in line:
-        after_option = bool(found) and len(found[-1]) == 1 and found[-1][0].startswith("--")
-        if after_option and "=" not in found[-1][0] and not word.startswith("--"):
-            found[-1].append(word)
-        else:
-            found.append([word])
-    return found
+    return [group.split() for group in re.findall(r"--[^\s=]+\s+(?!--)\S+|\S+", line)]
 
 
 ODD_WORDS = """
@@ -485,7 +471,7 @@ in/empty in/a_file in out missing utm:25 in/last.ckpt in/fifo.csv in/fifo.npy in
 --out in/query.npy --out in/spectral.safetensors --out in/truth.csv --out in
 """
 OTHERS = [
-    *(group for line in (*LINES, *SLOW_LINES, ODD_WORDS) for group in groups(line.split())),
+    *(group for line in (*LINES, *SLOW_LINES, ODD_WORDS) for group in groups(line)),
     *(["x" * 300 + ".safetensors"], ["\udcff.npy"], [""], ["--out", "\udcff.csv"], ["--out", "a\nb.csv"]),
 ]
 TRAIN_WORDS = """
@@ -496,7 +482,7 @@ fit validate test export in/a_file -c null --help
 --ckpt_path in/spectral.safetensors --config in/config.yaml --model.backbone.dimension=4
 --model.learning_rate nan --trainer null --data 3 --model []
 """
-TRAIN_OTHERS = groups(TRAIN_WORDS.split())
+TRAIN_OTHERS = groups(TRAIN_WORDS)
 
 
 def copy_inputs(case: Case) -> None:
@@ -510,9 +496,8 @@ def copy_inputs(case: Case) -> None:
 def run_words(case: Case, lines: Sequence[str]) -> None:
     """A mutated command line; what takes minutes is not begun."""
     copy_inputs(case)
-    split = [line.split() for line in lines]
-    line = case.random.choice(split)
-    own = [group for other in split if other[0] == line[0] for group in groups(other[1:])] or OTHERS
+    line = case.random.choice(lines).split()
+    own = [group for other in lines if other.split()[0] == line[0] for group in groups(other)[1:]] or OTHERS
     words = [line[0], *mutate_words(case.random, line[1:], case.random.choice((own, OTHERS)))]
     if case.random.random() < 0.05:
         words = mutate_words(case.random, line, OTHERS)
@@ -671,14 +656,12 @@ def live_frame(case: Case) -> None:
     fits = good.shape[1:]
     any_shape = tuple(random.choice((0, 1, 3, 16, 40)) for _ in range(3))
     odd: Any = noise.random(random.choice((fits, fits, (*fits, 3), (3, *fits), (1,), (0, 0), any_shape)))
-    odd *= random.choice((1, 1, 1, 255, -1, 1e30))
-    if odd.size and random.random() < 0.2:
-        odd.flat[random.randrange(odd.size)] = random.choice((np.nan, np.inf))
+    odd *= random.choice((1, 1, 1, 1, 1, 255, -1, 1e30, np.nan, np.inf))
     kind = random.choice(("u1", "u1", "f4", "f4", "f8", ">f4", "f2", "i8", "?", "c8", "O", "U3"))
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         odd = odd.astype(kind)
-    if random.random() < 0.3 and odd.ndim > 1:
+    if random.random() < 0.3:
         odd = odd[::-1].T
     if random.random() < 0.3 and kind in ("u1", "f4", "f8", "i8", "?"):
         odd = torch.from_numpy(odd.copy())
