@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 from helpers import refused
@@ -62,31 +63,38 @@ def test_a_file_or_folder_of_any_name_appears_whole(tmp_path: Path, name: str) -
     assert sorted(file.name for file in tmp_path.iterdir()) == sorted([name, "a"])
 
 
-@pytest.mark.parametrize("before", ["", "old"])
+def file_in(folder: Path) -> AbstractContextManager[Path]:
+    return whole_file(folder / "a")
+
+
+def whole(folder: Path) -> AbstractContextManager[Path]:
+    return whole_folder(folder, ["earlier"])
+
+
 @pytest.mark.parametrize("problem", [RuntimeError("bug"), KeyboardInterrupt(), InputError("bad")])
-def test_an_exception_leaves_what_was_there(tmp_path: Path, before: str, problem: BaseException) -> None:
-    target = tmp_path / "a.txt"
-    if before:
-        target.write_text(before)
+@pytest.mark.parametrize(
+    ("kind", "before"),
+    [(file_in, {}), (file_in, {"a": "old"}), (whole, None), (whole, {"a": "old", "earlier": "old"})],
+)
+def test_an_exception_leaves_what_was_there(
+    tmp_path: Path, kind: Callable[[Path], Any], before: dict[str, str] | None, problem: BaseException
+) -> None:
+    folder = tmp_path / "new" / "folder"
+    if before is not None:
+        folder.mkdir(parents=True)
+        for name, text in before.items():
+            (folder / name).write_text(text)
 
     def write_half() -> None:
-        with whole_file(target) as temporary:
-            temporary.write_text("half")
+        with kind(folder) as temporary:
+            (temporary / "a" if temporary.is_dir() else temporary).write_text("half")
             raise problem
 
     with pytest.raises(type(problem)):
         write_half()
-    assert list(held(tmp_path).values()) == [before] * bool(before)
-    assert len(list(tmp_path.iterdir())) == bool(before)
-
-
-def test_a_full_disk_while_renaming_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    target = tmp_path / "a.txt"
-    target.write_text("old")
-    monkeypatch.setattr(Path, "replace", full_disk)
-    with refused(str(target), "No space left on device"), whole_file(target) as temporary:
-        temporary.write_text("new")
-    assert held(tmp_path) == {"a.txt": "old"}
+    left = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")}
+    assert left == set() if before is None else held(folder) == before
+    assert len(left) == (0 if before is None else 2 + len(before))
 
 
 @pytest.mark.parametrize(
@@ -251,34 +259,16 @@ def test_a_folder_keeps_its_other_files(tmp_path: Path) -> None:
     assert mode_of(tmp_path / "kept") == 0o600
 
 
-@pytest.mark.parametrize("problem", [KeyboardInterrupt(), InputError("bad")])
-@pytest.mark.parametrize("before", [{}, {"a": "old", "earlier": "old"}])
-def test_an_exception_leaves_a_folder_as_it_was(
-    tmp_path: Path, before: dict[str, str], problem: BaseException
+def test_a_full_disk_or_a_folder_in_the_way_leaves_what_was_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    target = tmp_path / "new" / "target"
-    if before:
-        target.mkdir(parents=True)
-    for name, text in before.items():
-        (target / name).write_text(text)
-
-    def write_half() -> None:
-        with whole_folder(target, ["earlier"]) as temporary:
-            (temporary / "a").write_text("new")
-            raise problem
-
-    with pytest.raises(type(problem)):
-        write_half()
-    assert (held(target) if before else {}) == before
-    assert list(tmp_path.iterdir()) == ([tmp_path / "new"] if before else [])
-
-
-def test_a_full_disk_or_a_folder_in_the_way_leaves_a_folder_as_it_was(tmp_path: Path) -> None:
     (tmp_path / "a").write_text("old")
     (tmp_path / "b").mkdir()
-    with refused(str(tmp_path), "No space left"), whole_folder(tmp_path) as temporary:
-        (temporary / "a").write_text("new")
-        full_disk()
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", full_disk)
+        for kind in (whole_file(tmp_path / "a"), whole_folder(tmp_path)):
+            with refused(str(tmp_path), "No space left"), kind as temporary:
+                (temporary / "a" if temporary.is_dir() else temporary).write_text("new")
     with refused(str(tmp_path / "b"), "folder"), whole_folder(tmp_path) as temporary:
         (temporary / "a").write_text("new")
         (temporary / "b").write_text("new")
