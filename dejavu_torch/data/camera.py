@@ -24,15 +24,11 @@ OPENING = 10.0  # seconds that an address may take to answer
 
 
 class Frame(NamedTuple):
-    """A frame of a stream.
+    """A frame of a stream."""
 
-    number: from 0, of all frames that came. seconds: of its timestamp, NaN where it has none. pixels: (H,W,3)
-    uint8, or (C,H,W) float in [0, 1].
-    """
-
-    number: int
-    seconds: float
-    pixels: np.ndarray | Tensor
+    number: int  # from 0, of all frames that came
+    seconds: float  # of its timestamp, NaN where it has none
+    pixels: np.ndarray | Tensor  # (H,W,3) uint8, or (C,H,W) float in [0, 1]
 
 
 def is_stream(source: str) -> bool:
@@ -43,12 +39,7 @@ def is_stream(source: str) -> bool:
 
 
 def without_password(source: str) -> str:
-    """A source as messages name it, printable: an address without what only its user is to know.
-
-    Example:
-        >>> without_password("rtsp://me:secret@192.168.0.7/stream?token=1")
-        'rtsp://192.168.0.7/stream'
-    """
+    """A source as messages name it, printable: an address without what only its user is to know."""
     kind, mark, rest = source.partition("://")
     shown = re.split("[?#]", rest)[0].rpartition("@")[2]  # a password may hold anything but an @
     return printable(f"{kind}://{shown}" if mark else source)

@@ -92,10 +92,8 @@ class ImageFolder(IndexedTraverse):
 def check_size(path: Path, width: int, height: int) -> None:
     """Refuse a size in pixels below 0, which stands for the frames' own, or beyond any frame."""
     if min(width, height) < 0 or max(width, height) > MOST_PIXELS:
-        raise InputError(
-            f"{path}: width={width}, height={height}; expected width and height of at least 0 each, at most "
-            f"{MOST_PIXELS} pixels"
-        )
+        expected = f"width and height of at least 0 each, at most {MOST_PIXELS} pixels"
+        raise InputError(f"{path}: width={width}, height={height}; expected {expected}")
 
 
 def check_pixels(path: Path, rows: int, columns: int, most: int) -> None:

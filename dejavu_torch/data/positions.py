@@ -71,12 +71,6 @@ def borders(positions: Tensor) -> Tensor:
     return torch.cat([shown, shown.new_tensor([len(positions)])])
 
 
-def nearest_places(positions: Tensor) -> Tensor:
-    """The place nearest to each frame, -1 for one behind the first: (F,) -> (F,) int64."""
-    last = int(float(positions.max()) + NEAR)
-    return positions.double().round().long().clamp(-1, last)
-
-
 def unit_of(positions: Tensor) -> str:
     """What tolerances and periods count: frames, or the places of a map with such a table; (0,) is none."""
     return "places at even steps" if len(positions) else "frames"
@@ -88,5 +82,6 @@ def look_up(table: Tensor, index: Tensor) -> Tensor:
 
 
 def place_of(positions: Tensor, frames: Tensor) -> Tensor:
-    """The place nearest to each frame; -1 for one behind the first place, and for -1. int64 of any shape."""
-    return look_up(nearest_places(positions), frames)
+    """The place nearest to each frame; -1 for one before the first place, and for -1. int64 of any shape."""
+    nearest = positions.double().round().long().clamp(-1, count_places(positions) - 1)
+    return look_up(nearest, frames)

@@ -1,7 +1,4 @@
-"""What every simulated route shares: checked options, an address, frames on demand, repeatable draws.
-
-A new route is one subclass of `SimulatedRoute`, named in `SIMULATORS` (`simulate/__init__.py`).
-"""
+"""What every simulated route shares: checked options, an address, frames on demand, repeatable draws."""
 
 from __future__ import annotations
 

@@ -76,16 +76,13 @@ class Railway(SimulatedRoute):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not 0.5 <= self.width / self.height <= 4:
-            raise InputError(
-                f"sim:{self.kind} has height={self.height} and width={self.width}; "
-                "expected a width of 0.5 to 4 times the height"
-            )
+            seen = f"sim:{self.kind} has height={self.height} and width={self.width}"
+            raise InputError(f"{seen}; expected a width of 0.5 to 4 times the height")
         reference = self._ride(0)
         distance = self._ride(self.traverse) if self.traverse else reference
         if self.frames > len(distance):
-            raise InputError(
-                f"sim:{self.kind} has frames={self.frames}; expected at most the {len(distance)} of its route"
-            )
+            expected = f"at most the {len(distance)} of its route"
+            raise InputError(f"sim:{self.kind} has frames={self.frames}; expected {expected}")
         self.size = self.height, self.width
         self.length = self.frames or len(distance)
         self.distance = distance[: self.length]
