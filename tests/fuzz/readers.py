@@ -661,7 +661,7 @@ def live_frame(case: Case) -> None:
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         odd = odd.astype(kind)
-    if random.random() < 0.3:
+    if random.random() < 0.3 and odd.ndim > 1:
         odd = odd[::-1].T
     if random.random() < 0.3 and kind in ("u1", "f4", "f8", "i8", "?"):
         odd = torch.from_numpy(odd.copy())
