@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import random
-from typing import Any
 
 import pytest
 import torch
@@ -109,20 +108,11 @@ def test_a_smaller_frame_shows_the_same_view() -> None:
     assert (F.avg_pool2d(quiet[2], 2) - quiet[0]).abs().mean() < 0.02
 
 
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
-        ({"frames": 0}, f"1 <= frames <= {math.lcm(*TILES)}, a whole number"),
-        ({"frames": 40.5}, "a whole number"),
-        ({"seed": -1}, "seed >= 0"),
-        ({"noise": float("nan")}, "0 <= noise <= 1"),
-        ({"ground": "sand"}, "once or repeat"),
-    ],
-)
-def test_bad_arguments_are_refused_in_one_line(arguments: dict[str, Any], expected: str) -> None:
-    ((key, value),) = arguments.items()
-    with refused(f"{key}={value}; expected", expected):
-        AerialRoad(**arguments)
+def test_bad_arguments_are_refused_in_one_line() -> None:
+    with refused("frames=0; expected", f"1 <= frames <= {math.lcm(*TILES)}, a whole number"):
+        AerialRoad(frames=0)
+    with refused("ground=sand; expected", "once or repeat"):
+        AerialRoad(ground="sand")
 
 
 @pytest.fixture(scope="module")
