@@ -66,12 +66,14 @@ class Video(Traverse):
         self._seconds: list[float] = []  # of the frames that were read so far
         self._complete = False  # whether these are all frames
         with self._open() as (container, stream):
-            entries = stream.index_entries
-            if not _is_whole(self.path) or any(entry.pos + entry.size > container.size for entry in entries):
-                raise InputError(f"{path} is cut off or damaged; expected a whole video file")
+            whole = _is_whole(self.path)
             # only this family lists every frame, and which of them an edit list hides
             if container.format.name.startswith("mov") and stream.frames:
+                entries = stream.index_entries
                 self.length = sum(not entry.is_discard for entry in entries)
+                whole = all(entry.pos + entry.size <= container.size for entry in entries)
+        if not whole:
+            raise InputError(f"{path} is cut off or damaged; expected a whole video file")
 
     def batches(self, size: int) -> Iterator[Tensor]:
         yield from self.select(range(2**62), size)
