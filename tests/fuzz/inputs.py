@@ -48,7 +48,7 @@ def maps(folder: Path) -> None:
     features = torch.from_numpy(np.random.default_rng(1).normal(size=(40, 12))).float()
     periods = ImposedPeriods([3, 4, 5], bin=2)
     write_images(folder / "photos", pictures(40))
-    ground = footage(40)
+    ground = pictures(40, 48)[::-1].swapaxes(1, 2).copy()  # comes nearer, down the frame
     small = {"channels": 1, "resize": (16, 16), "widths": (4, 8), "squeeze": 4}
     odometry = GroundOdometry(((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)), (48, 48), step=6.0)
     templates = TemplateMapper(periods)
@@ -74,17 +74,10 @@ def maps(folder: Path) -> None:
     shutil.rmtree(folder / "photos")
 
 
-def footage(count: int, side: int = 48) -> np.ndarray:
-    """(count,side,side) uint8, a camera that looks straight down and comes 4 pixels forward a frame."""
-    drawn = torch.rand(1, 1, count + side // 4, side // 4, generator=torch.Generator().manual_seed(0))
-    ground = torch.nn.functional.interpolate(drawn, scale_factor=4, mode="bicubic")[0, 0].clamp(0, 1).mul(255)
-    return torch.stack([ground[4 * i : 4 * i + side] for i in reversed(range(count))]).byte().numpy()
-
-
-def write_images(folder: Path, images: np.ndarray, suffix: str = ".png") -> None:
+def write_images(folder: Path, images: np.ndarray) -> None:
     folder.mkdir()
     for i, image in enumerate(images):
-        Image.fromarray(image).save(folder / f"{i}{suffix}")
+        Image.fromarray(image).save(folder / f"{i}.png")
 
 
 def images(folder: Path) -> None:

@@ -182,24 +182,15 @@ def _left(root: Path, case: Case, outcome: str, before: dict[str, Any], temporar
 
 
 def _named(words: Sequence[str], folder: Path) -> Callable[[str], bool]:
-    """Whether a command line names a file as output, or a folder that it lies in, and not also as input.
-
-    Args:
-        folder: that its words are relative to.
-    """
+    """Whether a command line, run in `folder`, names a file, or its folder, as output and not as input."""
     outputs, inputs = set(), set()
     for before, word in pairwise(["", *words]):
         option, equals, value = word.partition("=") if word.startswith("--") else (before, "=", word)
-        if not equals:
-            continue  # its value is the next word
         written = option in OUTPUTS or (option == "--map" and words[0] == "learn")
         address = value.removeprefix("strip:").partition("?")[0]
-        (outputs if written else inputs).add(os.path.normpath(folder / address))
-
-    def named(name: str) -> bool:
-        return name not in inputs and any(Path(name).is_relative_to(place) for place in outputs)
-
-    return named
+        if equals:  # else its value is the next word
+            (outputs if written else inputs).add(os.path.normpath(folder / address))
+    return lambda name: name not in inputs and any(Path(name).is_relative_to(place) for place in outputs)
 
 
 def _files(folder: Path) -> dict[str, Any]:
@@ -207,9 +198,8 @@ def _files(folder: Path) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for path in folder.rglob("*"):
         status = path.lstat()
-        found[str(path.relative_to(folder))] = (
-            None if stat.S_ISDIR(status.st_mode) else (status.st_size, status.st_mtime_ns)
-        )
+        told = None if stat.S_ISDIR(status.st_mode) else (status.st_size, status.st_mtime_ns)
+        found[str(path.relative_to(folder))] = told
     return found
 
 
@@ -294,12 +284,6 @@ def run(reader: Reader, seed: int, numbers: Iterable[int], root: Path) -> Iterat
             raise RuntimeError(f"{reader.name} made no input: {text[-3000:]}")
 
 
-def shares(cases: int, names: Iterable[str]) -> dict[str, int]:
-    """How many of the cases each reader gets, at least one."""
-    chosen = {name: READERS[name].share for name in names}
-    return {name: max(1, round(cases * share / sum(chosen.values()))) for name, share in chosen.items()}
-
-
 def main(arguments: list[str] | None = None) -> int:
     """The command; 1 where there are findings."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__.partition("\n")[0])
@@ -315,15 +299,17 @@ def main(arguments: list[str] | None = None) -> int:
     with ExitStack() as stack:
         root = chosen.keep or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="fuzz-")))
         root.mkdir(exist_ok=True)
-        for name, count in shares(chosen.cases, chosen.reader or READERS).items():
-            numbers = range(count) if chosen.case is None else [chosen.case]
+        readers = [READERS[name] for name in chosen.reader or READERS]
+        for reader in readers:
+            count = chosen.cases * reader.share / sum(one.share for one in readers)
+            numbers = range(max(1, round(count))) if chosen.case is None else [chosen.case]
             outcomes, began = Counter(cases=len(numbers)), time.perf_counter()
-            for result in run(READERS[name], chosen.seed, numbers, root.resolve()):
+            for result in run(reader, chosen.seed, numbers, root.resolve()):
                 outcomes[result.outcome] += 1
                 for finding in result.findings:
-                    distinct[finding.kind, finding.where].append((name, result.case, finding))
+                    distinct[finding.kind, finding.where].append((reader.name, result.case, finding))
             total += outcomes
-            print(_row(name, outcomes), f"{time.perf_counter() - began:8.1f}", flush=True)
+            print(_row(reader.name, outcomes), f"{time.perf_counter() - began:8.1f}", flush=True)
     print(_row("all", total))
     for (kind, where), found in sorted(distinct.items(), key=lambda item: -len(item[1])):
         name, case, finding = found[0]
