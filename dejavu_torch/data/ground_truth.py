@@ -131,7 +131,8 @@ def ground_truth_in_places(truth: GroundTruth, place_of: Callable[[Tensor], Tens
 
 def check_ground_truth(truth: str, interpolate: bool = False) -> int | float | Path:
     """What a text says: an offset, a radius in metres, or a file that is there; refused before long work."""
-    path = Path(str(truth))  # an offset may be a number, as of YAML
+    truth = str(truth)  # an offset may be a number, as of YAML
+    path = Path(truth)
     suffix = path.suffix.lower()
     if interpolate and suffix != ".csv":
         raise InputError(f"truth {truth} cannot be interpolated; expected a .csv of query,place")
@@ -141,7 +142,7 @@ def check_ground_truth(truth: str, interpolate: bool = False) -> int | float | P
     offset = offset_of(truth)
     if offset is not None:
         return offset
-    name, colon, radius = str(truth).partition(":")
+    name, colon, radius = truth.partition(":")
     metres = as_number(radius) if colon else 25.0
     if name != "utm" or metres is None or metres < 0:
         raise InputError(f"truth {truth!r} is not known; expected {EXPECTED}")

@@ -93,20 +93,21 @@ def check_not_read(out: Path, *sources: str | Path | None) -> None:
 
 def _split(text: str) -> tuple[str, str]:
     """The address of a source, and its options."""
-    if "?" not in text or os.path.exists(text):  # False also of what can be no path
+    prefixed = text.startswith(("sim:", "strip:"))
+    if "?" not in text or (not prefixed and os.path.exists(text)):  # False also of what can be no path
         return text, ""
-    address, _, query = text.partition("?") if text.startswith(("sim:", "strip:")) else text.rpartition("?")
+    address, _, query = text.partition("?") if prefixed else text.rpartition("?")
     return address, query
 
 
 def _reader(text: str, address: str) -> Callable[..., Traverse]:
     """What opens an address, its options left open."""
-    kind, _, name = address.partition(":")
-    if kind == "sim":
+    kind, colon, name = address.partition(":")
+    if kind + colon == "sim:":
         if name not in SIMULATORS:
             raise InputError(f"there is no simulator {name!r}; expected {', '.join(sorted(SIMULATORS))}")
         return SIMULATORS[name]
-    if kind == "strip":
+    if kind + colon == "strip:":
         return partial(read_strip, Path(name))
     path = Path(address)
     if not address or not os.path.exists(path):

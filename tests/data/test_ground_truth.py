@@ -260,7 +260,7 @@ def test_numbered_queries_get_their_own_rows() -> None:
 
 # any text
 
-NO_TRUTH = ["x", "", "1.5", "utm:", "utm:far", "utm:-1", "utm:nan", "utm2", "9" * 30, "truth.txt"]
+NO_TRUTH = ["x", "", "1.5", "utm:", "utm:far", "utm:-1", "utm:nan", "utm2", "9" * 30, "truth.txt", "nan"]
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import chdir
 from pathlib import Path
 
 import numpy as np
@@ -84,6 +85,9 @@ def test_a_folder_takes_the_options_of_a_video(tmp_path: Path) -> None:
     source = open_source(f"{tmp_path}?width=30&step=2")
     assert (source.length, source.frame_shape, source.name) == (2, (3, 20, 30), f"{tmp_path}[0::2]")
     assert isinstance(open_source(tmp_path), ImageFolder)
+    tmp_path.rename(tmp_path.with_name("sim"))
+    with chdir(tmp_path.parent):  # no simulator, as no colon follows
+        assert isinstance(open_source("sim"), ImageFolder)
 
 
 # part of a source
