@@ -116,7 +116,7 @@ def test_convention_2_no_place_or_no_score_reports_nothing(tmp_path: Path) -> No
         ("query,place,score\n", ("no matches",)),
         ("", ("no matches",)),
         (b"\x89PNG\r\n\x1a\n", ("UTF-8",)),
-        (b"query,place,score\n\x00", ("no text",)),
+        (b"query,place,score\n\x00", ("null character",)),
         (RANKED[:32] + "4,7,1,1,0\n", ("line 2", "rank is '0'", "at least 1")),
         (RANKED[:32] + "4,7,1,1,2\n", ("line 2", "rank 2 of query 4", "expected rank 1")),
         (RANKED + "9,8,1,1,4\n", ("line 6", "rank 4 of query 9", "rank 3 of query 9")),

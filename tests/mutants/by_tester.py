@@ -256,8 +256,8 @@ MUTANTS = [
     Mutant(
         "A frame behind the first place shows none.",
         "dejavu_torch/data/positions.py",
-        ".clamp(-1, last)",
-        ".clamp(0, last)",
+        ".clamp(-1, count_places(positions) - 1)",
+        ".clamp(0, count_places(positions) - 1)",
         ("tests/motion/test_resampling.py::test_the_way_back_belongs_to_the_places_it_passes",),
     ),
     Mutant(
