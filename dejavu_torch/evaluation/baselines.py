@@ -177,11 +177,11 @@ def baselines_of(
         index, score, *_ = leave_out_match(model, reference, leave_out)
         itself = Match(index, score, score.isfinite())
         found["leave_out"] = Baseline(f"reference on itself, +-{leave_out} left out", itself)
-    pair, size = (run.reference, run.query), model.batch_size
+    pair, batch = (run.reference, run.query), model.batch_size
     if not _is_plain_hog(model):
-        found |= hog_baselines(*pair, size, run.tolerance, progress, matching)
+        found |= hog_baselines(*pair, batch, run.tolerance, progress, matching)
     if run.sequence is not None:  # SeqSLAM compares the grey pixels of small frames by L1
-        plain = DejaVu(PatchPixels(), "none", batch_size=size, preprocess=Preprocess("grey"))
+        plain = DejaVu(PatchPixels(), "none", batch_size=batch, preprocess=Preprocess("grey"))
         names = {"seqslam": ("SeqSLAM's pixels: grey, patches normalised", 1)}
         found |= _described_baselines(plain, "pixels", names, pair, progress, matching)
     return found
@@ -271,7 +271,7 @@ def _described_baselines(
     except InputError as error:
         log.info("no %s to compare with: %s", what, error)
         return {}
-    size = partial(stride_bytes, *stored.shape, stored.element_size())
+    size = partial(stride_bytes, len(stored), stored.shape[1], stored.element_size())
     return {
         key: Baseline(name, nearest_frames(stored, queries, k, "l1", text, matching), size(k), k)
         for key, (name, k) in names.items()

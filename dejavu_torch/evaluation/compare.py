@@ -190,8 +190,7 @@ def compare(
         found = other.localize_descriptors(other.extract_all(query), matching)
         contenders[key] = _contend(run, name, found, other)
 
-    route = model.map
-    scored = ours.scores is not None and isinstance(route, SpectralMap)
+    route, scored = model.map, ours.scores is not None and isinstance(model.map, SpectralMap)
     storage = coded_at_sizes(run, seed=seed, progress=progress) if storage_curve and scored else None
     pictures = draw_pictures(run, {"map": ours, **contenders}, storage)
     pictures |= draw_reliability(run.scored, known, tolerance)
@@ -207,7 +206,7 @@ def compare(
         **rejection_facts(run.scored, known, tolerance, off_map),
         **{name: dict(picture.numbers) for name, picture in pictures.items() if picture.numbers},
     }
-    if scored and len(route.chunks) == 1:
+    if scored and isinstance(route, SpectralMap) and len(route.chunks) == 1:
         facts["noise_over_map"] = noise_over_map(route, run.reference_features, seed)
     return Comparison(Report(ours, contenders, facts), pictures, run, candidates)
 
@@ -274,12 +273,12 @@ def _contend(run: Localization, name: str, found: Match, model: DejaVu) -> Conte
 
 def _beside(run: Localization, key: str, baseline: Baseline) -> Contender:
     """A baseline by its key in report.json, scored as the map is."""
-    name, found, *stored = baseline
+    name, found, bytes, k, fixed = baseline
     route, truth = run.model.map, run.truth
     if key == "leave_out":  # its queries are the places themselves
         own = route.frame_of(torch.arange(route.places))[:, None]
         truth = ground_truth_in_places(as_ground_truth(own), route.place_of)
-    return contend(name, found.renumbered(route.table.scored), truth, run.tolerance, *stored)
+    return contend(name, found.renumbered(route.table.scored), truth, run.tolerance, bytes, k, fixed)
 
 
 @contextmanager
