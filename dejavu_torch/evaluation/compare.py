@@ -152,7 +152,7 @@ def compare(
     with timed(seconds, "describe" if has_map else "learn"):
         if has_map:
             if reference.length is not None:
-                _check_places(model, reference.length, reference.name)
+                check_places(model, reference.length, reference.name)
             places = model.extract_all(reference, text)
             _check_given_map(model, places, reference.name, tolerance)
         else:
@@ -228,7 +228,8 @@ def _check_leave_out(model: DejaVu, leave_out: int | None) -> None:
         )
 
 
-def _check_places(model: DejaVu, places: int, name: str) -> None:
+def check_places(model: DejaVu, places: int, name: str) -> None:
+    """Refuse a reference of another number of places than the map's."""
     if places != model.map.places:
         raise InputError(
             f"{name} gives {places} places, the map holds {model.map.places}; "
@@ -238,7 +239,7 @@ def _check_places(model: DejaVu, places: int, name: str) -> None:
 
 def _check_given_map(model: DejaVu, places: Tensor, name: str, tolerance: int) -> None:
     """Whether the map is of these descriptors (N,K): refuse another number, and warn of another route."""
-    _check_places(model, len(places), name)
+    check_places(model, len(places), name)
     sample = torch.arange(0, len(places), max(1, len(places) // SAMPLED))
     away = (model.localize_descriptors(places[sample]).index - sample).abs()
     found = int((away <= max(tolerance, NEAR)).sum())
