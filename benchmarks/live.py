@@ -15,7 +15,7 @@ from torch.nn.functional import interpolate
 from torch.utils.benchmark import Timer
 from tqdm import tqdm
 
-from benchmarks.measure import Column, Row, table, write_bench
+from benchmarks.measure import Column, Row, new_row, table, write_bench
 from benchmarks.plots import plot_ratios
 from dejavu_torch.data.camera import shots_of
 from dejavu_torch.data.video import Video
@@ -52,9 +52,9 @@ def bench_live(
     """Localize the frames of a video one by one on a map of many places, with HOG and the filter.
 
     Args:
-        places: of the map. frames: of the video.
+        places: of the map. frames: of the video, of the size `camera`.
         sizes: (height, width) of the frames that a map is learned from, a case each.
-        camera: size of the video's frames. numbers: of a descriptor.
+        numbers: of a descriptor.
 
     Convention: the route is the video once, and for the rest its descriptors turned at random, block by
         block: other places that change as a real route does. Only the time is of interest: the frames are
@@ -94,21 +94,12 @@ def live_row(video: Video, camera: tuple[int, int], places: int, numbers: int) -
         for shot in feed:
             localizer(shot.pixels)
     height, width = video.frame_shape[1:]
-    return {
-        "case": f"{camera[0]} x {camera[1]} on a map of {height} x {width}",
-        "contender": "dejavu",
-        "seconds": p50,
-        "seconds_p99": p99,
-        "rate": rate,
-        "cpu_seconds": cpu,
-        "frames": frames,
-        "dropped": feed.dropped,
-        "recall_at_1": found / frames,
-        "places": places,
-        "route_bytes_per_place": model.map.summary().route_bytes / places,
-        "threads": torch.get_num_threads(),
-        "parts": parts_of(model, video),
-    }
+    case = f"{camera[0]} x {camera[1]} on a map of {height} x {width}"
+    facts = {"seconds": p50, "seconds_p99": p99, "rate": rate, "cpu_seconds": cpu, "frames": frames}
+    facts |= {"dropped": feed.dropped, "recall_at_1": found / frames, "places": places}
+    size = model.map.summary().route_bytes / places
+    facts |= {"route_bytes_per_place": size, "threads": torch.get_num_threads()}
+    return new_row(case, "dejavu", (), **facts, parts=parts_of(model, video))
 
 
 def write_drive(path: Path, frames: int, size: tuple[int, int]) -> None:
@@ -187,15 +178,11 @@ def run_live(*, out: Path) -> list[str]:
         out: folder for bench.json and bench.png
     """
     rows = bench_live()
-    drawn = {
-        row["case"]: {
-            name: 1e3 * value for name, value in ({"dejavu": row["seconds"]} | row["parts"]).items()
-        }
-        for row in rows
-    }
+    parts = {row["case"]: {"dejavu": row["seconds"]} | row["parts"] for row in rows}
+    drawn = {case: {name: 1e3 * value for name, value in own.items()} for case, own in parts.items()}
     picture = plot_ratios(drawn, "milliseconds a frame (p50), and of each part by itself")
     write_bench(out, rows, picture, rate=RATE)
-    parts: dict[str, Column] = {name: (name, ".1f", 1e-3) for row in rows for name in row["parts"]}
-    figures = table([row | row["parts"] for row in rows], COLUMNS | parts, "{case}")
+    columns: dict[str, Column] = {name: (name, ".1f", 1e-3) for row in rows for name in row["parts"]}
+    figures = table([row | row["parts"] for row in rows], COLUMNS | columns, "{case}")
     note = "100000 places; found: within 5; from decoding on: milliseconds of each part by itself"
     return [figures, note]

@@ -97,7 +97,7 @@ def evaluate_file(
         places = place_map.places
         frames = len(positions) if resampled else places
     queries, match, candidates = read_matches(matches, route)
-    elsewhere = match.index == ELSEWHERE, candidates == ELSEWHERE
+    elsewhere = candidates == ELSEWHERE
     if frames is not None and int(candidates.max()) >= frames:
         raise InputError(f"{matches} reports place {int(candidates.max())}; expected one below {frames}")
     known = find_ground_truth(truth, reference, query, frames, queries, interpolate, resampled)
@@ -107,27 +107,22 @@ def evaluate_file(
     own = own_facts(match, queries, tolerance, True, offset_of(truth, carried))
     if place_map is not None:
         known = ground_truth_in_places(known, place_map.place_of)
-        match = match._replace(index=place_map.place_of(match.index))
         candidates = place_map.place_of(candidates)
+    here = match._replace(index=candidates[:, 0].masked_fill(elsewhere[:, 0], -1))
     if route is not None:  # other routes lie behind all of this one, and all that its truth has
         highest = max(int(table.max()) for table in (candidates, known.positives) if table.numel())
-        behind = max(places or 0, 1 + highest) + tolerance
-        match = match._replace(index=match.index.masked_fill(elsewhere[0], behind))
-        candidates = candidates.masked_fill(elsewhere[1], behind)
+        candidates = candidates.masked_fill(elsewhere, max(places or 0, 1 + highest) + tolerance)
+    match = match._replace(index=candidates[:, 0])
     described = describe_ground_truth(truth, interpolate, carried)
     facts = evaluation_facts(match, known, tolerance, positions, described) | own
     accepted = facts["accepted"]
     facts |= candidate_facts(candidates, known, tolerance)
     facts |= rejection_facts(match, known, tolerance, {})
-    facts |= {
-        "accepted_precision": facts["accepted_right"] / accepted if accepted else None,
-        "matches": str(matches),
-        "places": places,
-    }
+    facts["accepted_precision"] = facts["accepted_right"] / accepted if accepted else None
+    facts |= {"matches": str(matches), "places": places}
     if route is not None:
-        facts |= {"route": route, "elsewhere": int(elsewhere[0].sum())}
+        facts |= {"route": route, "elsewhere": int(elsewhere[:, 0].sum())}
     ours = contend(printable(matches.name), match, known, tolerance)
-    here = match._replace(index=match.index.masked_fill(elsewhere[0], -1))
     seen = places or 1 + max(int(table.max()) for table in (here.index, known.positives))
     borders = torch.tensor([seen]) if place_map is None else place_map.table.borders
     pictures = draw_curves({"map": ours}, f"{tolerance} {facts['unit']}")

@@ -126,44 +126,29 @@ def read_matches(path: Path, route: str | None = None) -> Matches:
         InputError: what cannot be read, with the number of the line, or a route where there is no such
             column, or none where there is one.
     """
-    routes: dict[str, None] = {}
-    queries: list[int] = []
-    seen: set[int] = set()
-    reports: list[tuple[int, float, bool, float]] = []
+    answers: list[_Answer] = []  # of rank 1
     ranked: list[list[int]] = []
+    seen: set[int] = set()
+    routes: dict[str, None] = {}
     for where, cells in _rows(path):
-        query, place = (
-            _whole(cells[name], name, least, where) for name, least in (("query", 0), ("place", -1))
-        )
-        rank = _whole(cells.get("rank", "1"), "rank", 1, where)
-        if rank > 1 and not (ranked and query == queries[-1] and rank == len(ranked[-1]) + 1):
-            follows = f" or rank {len(ranked[-1]) + 1} of query {queries[-1]}" if ranked else ""
+        answer = _answer(where, cells)
+        query, rank, last = answer.query, answer.rank, answers[-1].query if answers else None
+        if rank > 1 and not (query == last and rank == len(ranked[-1]) + 1):
+            follows = f" or rank {len(ranked[-1]) + 1} of query {last}" if ranked else ""
             raise InputError(f"{where}: rank {rank} of query {query}; expected rank 1{follows}")
-        if rank == 1 and query in seen and query != queries[-1]:
+        if rank == 1 and query in seen and query != last:
             raise InputError(f"{where}: query {query} is there twice; expected each once")
-        score = _score(cells["score"], where)
-        accepted = _ACCEPTED.get(cells.get("accepted", "1").lower())
-        if accepted is None:
-            raise InputError(f"{where}: accepted is {cells['accepted']!r}; expected 1 or 0")
         if route is not None and "route" not in cells:
             raise InputError(f"{where}: no column route for --route {route}; expected none")
-        nothing = place < 0 or math.isinf(score)
-        if "route" in cells and not nothing:
+        if "route" in cells and answer.place >= 0:
             routes[cells["route"]] = None
-            place = place if cells["route"] == route else ELSEWHERE
-        unknown = nothing or rank > 1
-        probability = 0.0 if unknown else as_number(cells.get("probability", "0"))
-        if probability is None or not 0 <= probability <= 1:
-            seen_ = f"probability is {cells['probability']!r}"
-            raise InputError(f"{where}: {seen_}; expected a number from 0 to 1")
-        if rank > 1:
-            ranked[-1].append(-1 if nothing else place)
-            continue
-        ranked.append([-1 if nothing else place])
-        queries.append(query)
-        seen.add(query)
-        reports.append((-1, math.inf, False, 0.0) if nothing else (place, score, accepted, probability))
-    if not queries:
+            answer = answer if cells["route"] == route else answer._replace(place=ELSEWHERE)
+        if rank == 1:
+            answers.append(answer)
+            seen.add(query)
+            ranked.append([])
+        ranked[-1].append(answer.place)
+    if not answers:
         raise InputError(f"{path} holds no matches; expected a line for each query")
     if route is None and "route" in cells:
         known = f", with answers on {', '.join(routes)}" if routes else ""
@@ -171,15 +156,49 @@ def read_matches(path: Path, route: str | None = None) -> Matches:
     if route is not None and route not in routes:
         known = f"; it has answers on {', '.join(routes)}" if routes else ""
         log.warning("%s: no answer is on route %s%s", path, route, known)
-    for query, places in zip(queries, ranked, strict=True):
+    for one, places in zip(answers, ranked, strict=True):
         if len(places) != len(ranked[0]):
-            seen_ = f"query {query} has {len(places)} ranks"
-            raise InputError(f"{path}: {seen_}; expected {len(ranked[0])}, as query {queries[0]} has")
-    index, scores, accepted_, right = zip(*reports, strict=True)
-    match = Match(torch.tensor(index), torch.tensor(scores, dtype=torch.float64), torch.tensor(accepted_))
+            found = f"query {one.query} has {len(places)} ranks"
+            raise InputError(f"{path}: {found}; expected {len(ranked[0])}, as query {answers[0].query} has")
+    queries, _, index, scores, accepted, probability = zip(*answers, strict=True)
+    match = Match(torch.tensor(index), torch.tensor(scores, dtype=torch.float64), torch.tensor(accepted))
     if "probability" in cells:
-        match = match._replace(probability=torch.tensor(right, dtype=torch.float64))
+        match = match._replace(probability=torch.tensor(probability, dtype=torch.float64))
     return Matches(torch.tensor(queries), match, torch.tensor(ranked))
+
+
+class _Answer(NamedTuple):
+    """A row; the defaults are of one that reports nothing. The probability is of rank 1 alone."""
+
+    query: int
+    rank: int
+    place: int = -1
+    score: float = math.inf
+    accepted: bool = False
+    probability: float = 0.0
+
+
+def _answer(where: str, cells: dict[str, str]) -> _Answer:
+    query = _whole(cells["query"], "query", 0, where)
+    place = _whole(cells["place"], "place", -1, where)
+    rank = _whole(cells.get("rank", "1"), "rank", 1, where)
+    try:
+        score = float(cells["score"])
+    except ValueError:
+        score = math.nan
+    if math.isnan(score) or score == -math.inf:
+        seen = f"score is {cells['score']!r}"
+        raise InputError(f"{where}: {seen}; expected a number, or inf where nothing is reported")
+    accepted = _ACCEPTED.get(cells.get("accepted", "1").lower())
+    if accepted is None:
+        raise InputError(f"{where}: accepted is {cells['accepted']!r}; expected 1 or 0")
+    if place < 0 or math.isinf(score):
+        return _Answer(query, rank)
+    probability = as_number(cells.get("probability", "0")) if rank == 1 else 0.0
+    if probability is None or not 0 <= probability <= 1:
+        seen = f"probability is {cells['probability']!r}"
+        raise InputError(f"{where}: {seen}; expected a number from 0 to 1")
+    return _Answer(query, rank, place, score, accepted, probability)
 
 
 def _rows(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
@@ -203,13 +222,3 @@ def _whole(text: str, name: str, least: int, where: str) -> int:
     if value is None or value % 1 or value < least:
         raise InputError(f"{where}: {name} is {text!r}; expected a whole number of at least {least}")
     return int(value)
-
-
-def _score(text: str, where: str) -> float:
-    try:
-        score = float(text)
-    except ValueError:
-        score = math.nan
-    if math.isnan(score) or score == -math.inf:
-        raise InputError(f"{where}: score is {text!r}; expected a number, or inf where nothing is reported")
-    return score
