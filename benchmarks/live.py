@@ -51,11 +51,6 @@ def bench_live(
 ) -> list[Row]:
     """Localize the frames of a video one by one on a map of many places, with HOG and the filter.
 
-    Args:
-        places: of the map. frames: of the video, of the size `camera`.
-        sizes: (height, width) of the frames that a map is learned from, a case each.
-        numbers: of a descriptor.
-
     Convention: the route is the video once, and for the rest its descriptors turned at random, block by
         block: other places that change as a real route does. Only the time is of interest: the frames are
         those that were learned.

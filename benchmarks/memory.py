@@ -134,9 +134,6 @@ def paint_drives(folder: Path, places: int) -> None:
     """Two drives over pieces of `sim:aerial`, one behind the other, the second in other light and with noise.
 
     Each is one long image, of which a frame is a window: thousands of frames take no memory of their own.
-
-    Raises:
-        InputError: no room for the files.
     """
     columns = places + VIEW
     pieces = [paint_route(PIECE, seed)[..., :PIECE] for seed in range(-(-columns // PIECE))]
@@ -155,11 +152,7 @@ def paint_drives(folder: Path, places: int) -> None:
 
 
 class Drive(IndexedTraverse):
-    """The frames of a drive at some places.
-
-    Args:
-        image: of the drive, (VIEW,W,3). shown: (N,) the first column of each frame.
-    """
+    """The frames of a drive, one image (VIEW,W,3), whose first columns are shown (N,)."""
 
     def __init__(self, image: NDArray[np.uint8], shown: Tensor) -> None:
         self.name, self.length = "drive", len(shown)
@@ -214,18 +207,12 @@ def measure(contender: str, places: int, queries: int, threads: int, folder: Pat
 def bench_memory(places: Sequence[int] = (), queries: Sequence[int] = QUERIES) -> Iterator[Row]:
     """Memory that each contender takes to learn routes and to localize on one, each time in a new process.
 
-    Args:
-        places: frames of the routes that are learned, `PLACES` where none is given. Queries are localized
-            on the route of the middle size.
-        queries: how many are localized at once, of frames of a second drive, evenly along the route.
+    Queries are frames of a second drive, evenly along the route of the middle size.
 
     Yields:
         A row for each case and contender. peak_bytes: most memory during the run beyond what the process
         held before, when it had done all on `TRIAL` frames; a row "programs loaded" has that itself. bytes:
         of the file. seconds: of the only run.
-
-    Raises:
-        InputError: fewer than `FEWEST` places.
     """
     sizes = sorted(set(places or PLACES))
     if sizes[0] < FEWEST:

@@ -15,7 +15,16 @@ from torch import Tensor
 from tqdm import tqdm
 
 from benchmarks.coded_video import CodedVideo
-from benchmarks.measure import Contender, Row, failure, new_row, peak_memory, with_ratios, write_bench
+from benchmarks.measure import (
+    Contender,
+    Row,
+    failure,
+    new_row,
+    peak_memory,
+    truth_of,
+    with_ratios,
+    write_bench,
+)
 from benchmarks.plots import plot_frontiers
 from benchmarks.quantisers import Kept, ProductQuantiser, every_kth, principal, signs, spectral
 from dejavu_torch.data.ground_truth import GroundTruth
@@ -28,7 +37,6 @@ from dejavu_torch.evaluation.report import text_table
 from dejavu_torch.evaluation.reproduce import paper_model
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.model import DejaVu
-from dejavu_torch.motion.resampling import ground_truth_of
 from dejavu_torch.recognition.localizer import Matching
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.text import printable
@@ -118,9 +126,6 @@ def run_storage(
         codebooks: another route, where codebooks and a whitening are learned that count nothing
         whitening: a map whose whitening describes all routes; each learns its own if not given
         places: frames of the built-in sim:aerial; 3072 and 10000 if not given
-
-    Raises:
-        InputError: sources that are no pairs or do not fit each other, and what the sources raise.
     """
     given = None if map is None else DejaVu.load(map)
     shared = None if whitening is None else DejaVu.load(whitening)
@@ -212,17 +217,6 @@ def check(model: DejaVu, reference: Traverse, query: Traverse) -> None:
         truth_of(reference, query, reference.length, query.length)
     if model.map.places and reference.length is not None:
         check_places(model, reference.length, reference.name)
-
-
-def truth_of(reference: Traverse, query: Traverse, frames: int, queries: int) -> GroundTruth:
-    """What the sources say, or frame i is place i."""
-    truth = ground_truth_of(None, reference, query, frames, queries, aligned=True)
-    if truth is None:
-        raise InputError(
-            f"{reference.name} has {frames} frames and {query.name} {queries}; expected as many, frame i "
-            "being place i"
-        )
-    return truth
 
 
 def described(

@@ -13,7 +13,7 @@ import torch
 from torch import nn
 from tqdm import tqdm
 
-from benchmarks.measure import Row, write_bench
+from benchmarks.measure import Row, new_row, truth_of, write_bench
 from benchmarks.plots import plot_ratios
 from dejavu_torch.data.ground_truth import GroundTruth
 from dejavu_torch.data.source import open_source
@@ -22,7 +22,6 @@ from dejavu_torch.evaluation.report import text_table
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.maps.spectral import SpectralMapper
-from dejavu_torch.motion.resampling import ground_truth_of
 from dejavu_torch.types import InputError, Traverse
 
 ROUTE = ("sim:aerial?frames=1000", "sim:aerial?frames=1000&traverse=1")
@@ -104,16 +103,9 @@ def trained(
             continue
         scores = evaluate(model.localize_descriptors(queries), truth, TOLERANCE)
         auc[f"{budget:g}"], recall[f"{budget:g}"] = scores.auc, scores.recall_at_1
-    return {
-        "case": f"{reference.name}, {steps} steps",
-        "contender": rung.name,
-        "seed": seed,
-        "steps": steps,
-        "seconds": timer.time_elapsed("train"),
-        "auc": auc,
-        "recall_at_1": recall,
-        "threads": torch.get_num_threads(),
-    }
+    facts = {"seed": seed, "steps": steps, "seconds": timer.time_elapsed("train"), "auc": auc}
+    facts |= {"recall_at_1": recall, "threads": torch.get_num_threads()}
+    return new_row(f"{reference.name}, {steps} steps", rung.name, (), **facts)
 
 
 def run_train(
@@ -142,12 +134,7 @@ def run_train(
         seen = f"bench train got {steps} steps and seeds {list(seeds)}"
         raise InputError(f"{seen}; expected at least one each, and seeds from 0 to 2^32 - 1")
     reference, query = (open_source(source) for source in sources or ROUTE)
-    truth = ground_truth_of(None, reference, query, aligned=True)
-    if truth is None:
-        raise InputError(
-            f"nothing tells the places of {query.name}: it has {query.length} frames, {reference.name} "
-            f"{reference.length}; expected as many"
-        )
+    truth = truth_of(reference, query)
     logging.getLogger("pytorch_lightning").setLevel(logging.WARNING)
     works = tqdm([(rung, seed) for rung in ladder() for seed in seeds], "train", disable=None, leave=False)
     rows = [trained(rung, seed, reference, query, truth, steps) for rung, seed in works]
