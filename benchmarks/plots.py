@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from textwrap import fill
 from types import MappingProxyType
@@ -84,16 +85,17 @@ def plot_growth(
 
 def _growth_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
     """A style of each contender: of its family the colour, of its own the mark and the line."""
-    families = {name: name.partition(",")[0] for name in names}
     colours: dict[str, str] = {}
-    for family in dict.fromkeys(families.values()):
-        kind = family.partition(" ")[0]
-        among = _GROWTH.get(kind, _OTHERS)
-        used = sum(colour in among for colour in colours.values())
-        colours[family] = among[used % len(among)]
+    members: Counter[str] = Counter()
     styles = {}
-    for i, (name, family) in enumerate(families.items()):
-        order = list(families.values())[:i].count(family)  # in its family
+    for name in names:
+        family = name.partition(",")[0]
+        if family not in colours:
+            among = _GROWTH.get(family.partition(" ")[0], _OTHERS)
+            used = sum(colour in among for colour in colours.values())
+            colours[family] = among[used % len(among)]
+        order = members[family]
+        members[family] += 1
         styles[name] = {
             "color": colours[family],
             "marker": "os^Dv"[order % 5],

@@ -240,14 +240,18 @@ def contenders_of(route: Route, given: DejaVu | None = None) -> Iterator[Contend
     assert route.model.whitening is not None
     if not route.model.whitening.fixed:  # else it was given, and there is none to change
         for name in (*WHITENINGS, "of another route"):
-            answer = partial(partial, by_other_whitening, route, name)
-            yield Contender(f"dejavu {WHITENED:g}, whitening {name}", answer, family=OTHERS)
+            answer = partial(by_other_whitening, route, name)
+            yield ready(f"dejavu {WHITENED:g}, whitening {name}", OTHERS, answer)
     if given is not None:
-        found = partial(partial, by_map, route, lambda: given)
-        yield Contender("dejavu, the map that was given", found, family="dejavu, given")
+        yield ready("dejavu, the map that was given", "dejavu, given", partial(by_map, route, lambda: given))
     # template means of the features themselves at frequencies found in them, frame by frame
-    paper = partial(partial, by_map, route, lambda: paper_model().learn(route.reference))
-    yield Contender("the paper", paper, family="the paper")
+    paper = partial(by_map, route, lambda: paper_model().learn(route.reference))
+    yield ready("the paper", "the paper", paper)
+
+
+def ready(name: str, family: str, answer: Callable[[], Answer]) -> Contender:
+    """A contender that needs nothing to be made ready."""
+    return Contender(name, lambda: answer, family=family)
 
 
 def stores_of(route: Route) -> Iterator[Contender]:
@@ -255,7 +259,7 @@ def stores_of(route: Route) -> Iterator[Contender]:
     places, numbers = route.places, route.places.shape[1]
 
     def store(family: str, name: str, keep: Callable[..., Kept], *given: Any, **settings: Any) -> Contender:
-        return Contender(name, partial(partial, among, route, partial(keep, *given, **settings)), 1, family)
+        return ready(name, family, partial(among, route, partial(keep, *given, **settings)))
 
     for budget in BUDGETS:
         yield store(OURS, f"dejavu {budget:g}", spectral, places, budget)

@@ -292,6 +292,15 @@ def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
 
 def _map_facts(summary: MapSummary, features: Tensor) -> dict[str, Any]:
     """What report.json holds of the map, whose places have these features (N,D)."""
+    chunks: list[dict[str, Any]] = [
+        {
+            "start": chunk.start,
+            "stop": chunk.stop,
+            "periods": [plain_number(period) for period in chunk.periods],
+            "features": list(chunk.features),
+        }
+        for chunk in summary.chunks
+    ]
     return {
         "frames": len(features),
         "kind": summary.kind,
@@ -301,20 +310,12 @@ def _map_facts(summary: MapSummary, features: Tensor) -> dict[str, Any]:
         "route_bytes": summary.route_bytes,
         "bytes_per_place": summary.bytes_per_place,
         "route_bytes_per_place": summary.route_bytes / len(features),
-        "full_bytes": features.numel() * features.element_size(),
+        "full_bytes": features.nbytes,
         "templates": summary.templates,
         "template_numbers": summary.template_numbers,
         "lines": summary.lines,
-        "periods": sorted({plain_number(period) for chunk in summary.chunks for period in chunk.periods}),
-        "chunks": [
-            {
-                "start": chunk.start,
-                "stop": chunk.stop,
-                "periods": [plain_number(period) for period in chunk.periods],
-                "features": list(chunk.features),
-            }
-            for chunk in summary.chunks
-        ],
+        "periods": sorted({period for chunk in chunks for period in chunk["periods"]}),
+        "chunks": chunks,
     }
 
 
