@@ -145,15 +145,6 @@ def test_a_map_of_another_route_is_warned_of(caplog: pytest.LogCaptureFixture) -
     assert re.fullmatch(r"the map finds \d+ of 240 frames of one; expected the reference .*", message)
 
 
-def test_the_template_that_is_drawn_is_called_what_it_is(trained: DejaVu) -> None:
-    pair = ArrayTraverse(route(0)), ArrayTraverse(route(1))
-    fresh = with_mapper(trained, trained.mapper)
-    for model, thick in ((trained, "the trained template"), (fresh, "their mean")):
-        picture = compare(*pair, "0", model=model).pictures["templates"]
-        assert f"thick: {thick}" in picture.plot[1][0].get_title(loc="left")
-        assert ("that training made of it" in picture.caption) == (model is trained)
-
-
 def test_a_map_of_even_steps_is_compared_at_its_own_step() -> None:
     """Not at the one that its reference would get of itself."""
     reference, query = ArrayTraverse(ground(REFERENCE)), ArrayTraverse(ground(QUERY))

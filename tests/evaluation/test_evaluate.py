@@ -18,7 +18,6 @@ from dejavu_torch.data.folder import ImageFolder
 from dejavu_torch.evaluation.curves import RECALL_DEFINITION, evaluate
 from dejavu_torch.evaluation.evaluate import Evaluation, evaluate_file
 from dejavu_torch.evaluation.matches import write_matches
-from dejavu_torch.evaluation.report import write_report
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.types import Match
 
@@ -151,23 +150,6 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "gt.npz", GThard=np.eye(9, 1, dtype=bool), GTsoft=soft)
     with refused("none is left to judge"):
         evaluate_file(only, str(tmp_path / "gt.npz"))
-
-
-def test_report_of_an_evaluation(tmp_path: Path) -> None:
-    truth = written(tmp_path, "0,0\n1,1\n2,2\n4,4\n", "truth.csv")
-    result = evaluate_file(written(tmp_path, MATCHES), str(truth), tolerance=3)
-    write_report(tmp_path, result.report, result.pictures, "matches <judged>", "dejavu evaluate matches.csv")
-    page = (tmp_path / "index.html").read_text()
-    for text in (
-        "matches &lt;judged&gt;",
-        "5 queries; right within 3 frames of the truth (",
-        "truth.csv). 4 of the queries are in the truth. 4 of the queries have a right answer. ",
-        "Of 4 scored 3 are accepted, 2 correctly.",
-    ):
-        assert text in page
-    # nothing was learnt, and nothing stands beside it
-    for text in ("Learning", "the map", "Null", "bytes", "None"):
-        assert text not in page
 
 
 # a map of resampled places
