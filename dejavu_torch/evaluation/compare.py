@@ -25,10 +25,10 @@ from dejavu_torch.data.ground_truth import (
 from dejavu_torch.evaluation.answers import own_facts
 from dejavu_torch.evaluation.baselines import Baseline, baselines_of
 from dejavu_torch.evaluation.contenders import Contender, contend, lengths_beside
-from dejavu_torch.evaluation.evaluate import RANKS, candidate_facts, evaluation_facts
+from dejavu_torch.evaluation.evaluate import RANKS, evaluation_facts
 from dejavu_torch.evaluation.pictures import Localization, draw_pictures
 from dejavu_torch.evaluation.plots import Picture
-from dejavu_torch.evaluation.rejection import draw_reliability, rejection_facts
+from dejavu_torch.evaluation.rejection import draw_reliability
 from dejavu_torch.evaluation.report import Report, as_html
 from dejavu_torch.evaluation.storage import coded_at_sizes, noise_over_map
 from dejavu_torch.features.views import Views
@@ -196,14 +196,12 @@ def compare(
     pictures |= draw_reliability(run.scored, known, tolerance)
     carried = all(source_of(one).place is not None for one in (reference, query))
     described = describe_ground_truth(truth, interpolate, carried)
-    shown = match._replace(index=route.frame_of(match.index))
+    shown, ranked = match._replace(index=route.frame_of(match.index)), route.table.scored(candidates.index)
     facts = {
         **_map_facts(model.summary(), run.reference_features),
         **_run_facts(run, seconds),
-        **evaluation_facts(run.scored, known, tolerance, route.positions, described),
+        **evaluation_facts(run.scored, ranked, known, tolerance, route.positions, described, off_map),
         **own_facts(shown, run.query_frames, tolerance, known is not None, offset_of(truth, carried)),
-        **candidate_facts(route.table.scored(candidates.index), known, tolerance),
-        **rejection_facts(run.scored, known, tolerance, off_map),
         **{name: dict(picture.numbers) for name, picture in pictures.items() if picture.numbers},
     }
     if scored and isinstance(route, SpectralMap) and len(route.chunks) == 1:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import torch
@@ -114,10 +115,8 @@ def evaluate_file(
         candidates = candidates.masked_fill(elsewhere, max(places or 0, 1 + highest) + tolerance)
     match = match._replace(index=candidates[:, 0])
     described = describe_ground_truth(truth, interpolate, carried)
-    facts = evaluation_facts(match, known, tolerance, positions, described) | own
+    facts = evaluation_facts(match, candidates, known, tolerance, positions, described) | own
     accepted = facts["accepted"]
-    facts |= candidate_facts(candidates, known, tolerance)
-    facts |= rejection_facts(match, known, tolerance, {})
     facts["accepted_precision"] = facts["accepted_right"] / accepted if accepted else None
     facts |= {"matches": str(matches), "places": places}
     if route is not None:
@@ -132,14 +131,21 @@ def evaluate_file(
 
 
 def evaluation_facts(
-    match: Match, truth: GroundTruth | None, tolerance: int, positions: Tensor, described: str
+    match: Match,
+    candidates: Tensor,
+    truth: GroundTruth | None,
+    tolerance: int,
+    positions: Tensor,
+    described: str,
+    off_map: Mapping[str, Tensor] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """What every report.json holds beside the scores.
 
     Args:
-        truth: None where nothing tells the right places.
+        candidates: (Q,K), best first, places as a ground truth counts them.
+        truth: None where nothing tells the right places. described: the same in words.
         positions: of the map's places, empty where they are the frames; see `PlaceMap`.
-        described: the ground truth in words.
+        off_map: see `rejection_facts`.
     """
     facts: dict[str, Any] = {
         "queries": len(match.index),
@@ -150,16 +156,11 @@ def evaluation_facts(
         "version": __version__,
         "torch": torch.__version__,
     }
+    for first in RANKS:
+        found = None if truth is None else recall_at(candidates, truth, tolerance, first)
+        facts[f"recall_at_{first}"] = found
     if truth is not None:
         facts |= count_queries(match, truth, tolerance)
         facts["truth"] = described
         facts["threshold_of_full_precision"] = threshold_of_full_precision(curve_of(match, truth, tolerance))
-    return facts
-
-
-def candidate_facts(candidates: Tensor, truth: GroundTruth | None, tolerance: int) -> dict[str, float | None]:
-    """What every report.json holds of candidates (Q,K), best first, places as a ground truth counts them."""
-    return {
-        f"recall_at_{first}": None if truth is None else recall_at(candidates, truth, tolerance, first)
-        for first in RANKS
-    }
+    return facts | rejection_facts(match, truth, tolerance, off_map)

@@ -76,10 +76,10 @@ def write_matches(
     start = next(matches, None)
     known = start is not None and start.probability is not None
     with whole_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        told = (("probability", known), ("rank", ranks is not None), ("route", bool(routes)))
-        also = [name for name, is_told in told if is_told]
-        writer.writerow([*NUMBERS, *also, *NAMES])
+        told = {"probability": known, "rank": ranks is not None, "route": bool(routes)}
+        columns = [*NUMBERS, *(name for name, is_told in told.items() if is_told), *NAMES]
+        writer = csv.DictWriter(file, columns, extrasaction="ignore")
+        writer.writeheader()
         for match in () if start is None else itertools.chain([start], matches):
             digits = 17 if match.score.dtype == torch.float64 else 9  # so that reading gives the same number
             first, total = total, total + len(match.index) // each
@@ -87,16 +87,21 @@ def write_matches(
             places = match.index if frame_of is None else frame_of(match.index)
             rank = torch.arange(each).repeat(len(queries)) + 1
             right = match.score if match.probability is None else match.probability
-            columns = (queries.repeat_interleave(each), places, match.score, match.accepted, right, rank)
-            rows = zip(*(column.tolist() for column in columns), strict=True)
-            for query, place, score, good, p, at in rows:
-                names = _name(query_name, query), _name(place_name, place)
-                route = bisect_right(starts, place) - 1 if routes and place >= 0 else -1
-                sure = "" if math.isnan(p) else f"{p:.6g}"
-                cells = (sure, at, printable(routes[route].name) if route >= 0 else "")
-                also = [cell for cell, (_, is_told) in zip(cells, told, strict=True) if is_told]
-                own = place - starts[route] if route >= 0 else place
-                writer.writerow([query, own, f"{score:.{digits}g}", int(good), *also, *names])
+            numbers = (queries.repeat_interleave(each), places, match.score, match.accepted, right, rank)
+            for query, place, score, good, p, at in zip(*(one.tolist() for one in numbers), strict=True):
+                on = bisect_right(starts, place) - 1 if routes and place >= 0 else -1
+                row = {
+                    "query": query,
+                    "place": place - starts[on] if on >= 0 else place,
+                    "score": f"{score:.{digits}g}",
+                    "accepted": int(good),
+                    "probability": "" if math.isnan(p) else f"{p:.6g}",
+                    "rank": at,
+                    "route": printable(routes[on].name) if on >= 0 else "",
+                    "query_name": _name(query_name, query),
+                    "place_name": _name(place_name, place),
+                }
+                writer.writerow(row)
                 accepted += good and at == 1
     return total, accepted
 
