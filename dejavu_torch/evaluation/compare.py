@@ -96,9 +96,8 @@ def compare(
         reference: the traverse to learn. query: a second traverse of the route.
         truth: see `find_ground_truth`. Without one, and where the sources have none, there are matches and
             pictures, but neither scores nor baselines.
-        model: settings; None is DejaVu with its defaults. A model with a map keeps it and is evaluated as it
-            is: the map has to be of this reference. The model is on the CPU afterwards, where baselines, null
-            and pictures are computed.
+        model: settings; None is DejaVu with its defaults. A map that it has is kept and evaluated as it is:
+            it has to be of this reference. The model is on the CPU afterwards.
         tolerance: places within which a match is right, inclusive.
         leave_out: also query the reference with itself, without the frames within this many of the query in
             any mean; a diagnostic.

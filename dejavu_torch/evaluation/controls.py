@@ -53,8 +53,7 @@ def null_control(
     Args:
         reference: (N,D) features. query: (Q,D) features.
         same_plan: keep the layers of the model's template map and learn only the templates anew. Otherwise
-            the periods are sought anew too; the default preset then finds none, since shuffled frames are
-            noise in time, and reports nothing.
+            the periods are sought anew too, and a finder that tests them finds none in noise.
         sequence: as of `DejaVu.localize`.
 
     Returns:

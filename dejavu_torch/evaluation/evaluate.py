@@ -70,10 +70,10 @@ def evaluate_file(
         truth: see `find_ground_truth`; None needs both traverses.
         tolerance: frames within which a report is right, inclusive; places where the map's are resampled.
         interpolate: see `find_ground_truth`.
-        reference, query: the traverses, where the ground truth lies in them; a reference also says how many
-            frames there are: without it, an offset gives every query a right answer.
-        map: file of a map of the reference. It says how many frames there are as well; where its places are
-            resampled by distance, matches and ground truth are turned from frames into places.
+        reference, query: the traverses, where the ground truth lies in them. Without a reference or a map
+            nothing says how many frames there are: an offset gives every query a right answer.
+        map: file of a map of the reference; where its places are resampled by distance, matches and ground
+            truth are turned from frames into places.
         route: of matches on a merged map, the route that `truth` and `reference` are of: answers on other
             routes are wrong.
 

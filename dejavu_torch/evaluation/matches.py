@@ -54,15 +54,11 @@ def write_matches(
     """Write matches that come in parts as a csv; returns how many (queries, accepted at their first rank).
 
     Args:
-        matches: one a query, in order; with `ranks`, that many a query, as `Found.ranked` gives. Where a
-            probability is NaN its cell is empty.
-        query_frames: (Q,) int64, the frame of its source that each query shows; None where query i is
-            frame i.
-        frame_of: the reference frame that each place shows, as `PlaceMap.frame_of`; None where place i is
-            frame i.
-        query_name, place_name: the name of a frame of the query's and of the reference's source, as
-            `Traverse.frame_name`; None leaves the column empty. A character that is not printable, such as a
-            line break, is escaped.
+        matches: one a query, in order; with `ranks`, that many a query, as `Found.ranked` gives.
+        query_frames: (Q,) int64, the frame of its source that each query shows; None: query i is frame i.
+        frame_of: the reference frame that each place shows, as `PlaceMap.frame_of`; None: place i is frame i.
+        query_name, place_name: the name of a frame, as `Traverse.frame_name`; None leaves the column empty. A
+            character that is not printable, such as a line break, is escaped.
         ranks: how many matches each query has; None is one, and no column for the rank.
         routes: of a merged map, which get a column with the name of each: the place is then a frame of that
             route, while `frame_of` and `place_name` count through all of them.
@@ -114,14 +110,14 @@ def read_matches(path: Path, route: str | None = None) -> Matches:
     """The matches of a csv, which may come from any method.
 
     Args:
-        path: a csv with a header. query: number of the query frame, in any order, each once or in lines that
-            follow one another, as where resampled footage shows a frame several times. place: number of the
-            reported frame of the reference, -1 for none. score: lower is better, inf for none. accepted: 1 or
-            0; where the column is missing, every match with a finite score is accepted. probability: of being
-            right, from 0 to 1; where the column is missing, none is known. rank: where there is
-            such a column, the lines of a query are its candidates, ranks 1 to K in this order with one K for
-            all queries, and the first is its match, whose probability alone counts. route: where there is
-            such a column, the name of the route whose frame the place is. Other columns are ignored.
+        path: a csv with a header, of these columns; others are ignored.
+            query: number of the query frame, in any order, each once or in lines that follow one another, as
+            where resampled footage shows a frame several times. place: number of the reported frame of the
+            reference, -1 for none. score: lower is better, inf for none.
+            accepted: 1 or 0; without it every match with a finite score is. probability: of being right.
+            rank: the lines of a query are its candidates, ranks 1 to K in this order with one K for all
+            queries; the first is its match, whose probability alone counts.
+            route: whose frame the place is.
         route: whose places count, of a file with that column.
 
     Convention: a row whose place is -1 or whose score is inf reports nothing: place -1, score inf, not
