@@ -258,13 +258,7 @@ def bars(rows: Sequence[Row], key: str = "ratio_to_ours", unit: float = 1.0, **l
 
 
 def table(rows: Sequence[Row], columns: Mapping[str, Column], name: str = "{case}: {contender}") -> str:
-    """The figures as aligned text, the header first, and at the end why there are none.
-
-    Example:
-        >>> print(table([{"case": "l1", "contender": "dejavu", "bytes": 2e6}], {"MB": ("bytes", ".1f", 1e6)}))
-                     MB
-        l1: dejavu  2.0
-    """
+    """The figures as aligned text, the header first, and at the end why there are none."""
 
     def text(value: float | None, form: str, unit: float = 1.0) -> str:
         return "" if value is None else format(value / unit, form)

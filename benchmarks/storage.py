@@ -365,14 +365,7 @@ def judged(route: Route, contender: Contender) -> Row:
 
 
 def front(rows: Sequence[Row], length: int = 1) -> list[tuple[float, float]]:
-    """What no other row reaches with fewer bytes, by ascending bytes; of sequences of T queries.
-
-    Example:
-        >>> sizes = {2.0: 0.7, 1.0: 0.5, 4.0: 0.6}
-        >>> front([{"route_bytes_per_place": size, "sequences": {"1": {"auc": auc}}}
-        ...        for size, auc in sizes.items()])
-        [(1.0, 0.5), (2.0, 0.7)]
-    """
+    """What no other row reaches with fewer bytes, by ascending bytes; of sequences of T queries."""
     points = [(row["route_bytes_per_place"], area(row, length) or 0.0) for row in rows]
     best: list[tuple[float, float]] = []
     for size, auc in sorted(points, key=lambda point: (point[0], -point[1])):
@@ -391,10 +384,6 @@ def bytes_for(auc: float, points: Points) -> float | None:
     """Bytes per place at which a front reaches an area, on straight lines over the logarithm of bytes.
 
     None where it never does. Where its smallest point does, that point's, which it may need less than.
-
-    Example:
-        >>> bytes_for(0.6, [(1.0, 0.5), (4.0, 0.7)])
-        2.0
     """
     i = next((i for i, point in enumerate(points) if point[1] >= auc), None)
     if i is None:
@@ -475,8 +464,7 @@ def storage_tables(rows: Sequence[Row], at: float = AT) -> Iterator[str]:
     for case, own in by("case", rows).items():
         table = [["route bytes per place:", *(f"{budget:g}" for budget in SHOWN)]]
         for name, some in families(own).items():
-            sizes = [(row["route_bytes_per_place"], row["auc"]) for row in some]
-            fits = ([auc for size, auc in sizes if size <= NEAR * budget] for budget in SHOWN)
+            fits = ([auc for size, auc in front(some) if size <= NEAR * budget] for budget in SHOWN)
             table.append([name, *(f"{max(areas):.3f}" if areas else "" for areas in fits)])
         yield f"{printable(case)}: AUC\n{text_table(table)}\n"
         ours = {T: front(families(own).get(OURS, ()), T) for T in LENGTHS}
@@ -505,7 +493,8 @@ def skipped_lines(rows: Sequence[Row]) -> list[str]:
     for row in rows:
         if row["skipped"]:
             reasons.setdefault((row["case"], row["skipped"]), []).append(row["contender"])
-    return [
-        printable(f"{case}: skipped {names[0]}{f' and {len(names) - 1} more' * (len(names) > 1)}: {reason}")
-        for (case, reason), names in reasons.items()
-    ]
+    lines = []
+    for (case, reason), (first, *others) in reasons.items():
+        more = f" and {len(others)} more" if others else ""
+        lines.append(printable(f"{case}: skipped {first}{more}: {reason}"))
+    return lines

@@ -17,8 +17,8 @@ from matplotlib.colors import to_rgb
 from torch import Tensor
 
 from benchmarks import matcher
-from benchmarks.matcher import bench_matcher
-from benchmarks.measure import Contender, Row, Run, benchmark, new_row
+from benchmarks.matcher import COLUMNS, bench_matcher
+from benchmarks.measure import Contender, Row, Run, benchmark, new_row, table
 from benchmarks.plots import plot_growth, plot_ratios
 from benchmarks.scale_contenders import CONTENDERS
 from benchmarks.template_search import OURS, SCAN, bench_templates, random_map
@@ -154,6 +154,13 @@ def test_what_is_written_and_printed(
     shown = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
     assert f"{L1}: torch.compile skipped: RuntimeError: not asked for" in shown
     assert shown[-1].endswith(f"next: open {tmp_path / 'new' / 'bench.png'}")
+
+
+def test_the_table() -> None:
+    ours = new_row("l1", "dejavu", seconds=0.5, ratio_to_ours=1.0, threads=2, bytes=2_000_000, difference=0.0)
+    slow = new_row("l1", "slow", seconds=0.25, measured_rows=7)
+    shown = [" ".join(line.split()) for line in table([ours, slow], COLUMNS).splitlines()]
+    assert shown[-2:] == ["l1: dejavu 0.500 1.0 2 2.0 0.0e+00", "l1: slow 0.250 7 measured"]
 
 
 def test_a_bar_for_each_contender_in_its_colour() -> None:

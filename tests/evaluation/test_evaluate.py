@@ -10,11 +10,9 @@ import pytest
 import torch
 from footage import QUERY, REFERENCE, camera, everything, footage
 from helpers import Fixed, refused, template_model
-from PIL import Image
 
 from dejavu_torch import FrequencyLayer
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.folder import ImageFolder
 from dejavu_torch.evaluation.curves import RECALL_DEFINITION, evaluate
 from dejavu_torch.evaluation.evaluate import Evaluation, evaluate_file
 from dejavu_torch.evaluation.matches import write_matches
@@ -114,17 +112,7 @@ def test_numbered_queries_in_any_order(tmp_path: Path) -> None:
 
 
 def test_truth_that_lies_in_the_traverses(tmp_path: Path) -> None:
-    reference, query = tmp_path / "reference", tmp_path / "query"
-    for folder, easts in ((reference, range(0, 600, 10)), (query, (0, 40, 20, 30, 300))):
-        folder.mkdir()
-        for i, east in enumerate(easts):
-            Image.new("L", (2, 2)).save(folder / f"{i}@{east}@0@.png")
     path = written(tmp_path, MATCHES)
-    pair = {"reference": ImageFolder(reference), "query": ImageFolder(query)}
-    facts = evaluate_file(path, "utm:5", tolerance=0, **pair).report.facts
-    assert (facts["with_answer"], facts["accepted_right"]) == (5, 3)
-    with refused("utm", "both traverses"):
-        evaluate_file(path, "utm:5")
     stored, seen = ArrayTraverse(torch.rand(60, 2)), ArrayTraverse(torch.rand(5, 2))
     with refused("no ground truth"):
         evaluate_file(path, None, reference=stored, query=seen)
