@@ -15,7 +15,7 @@ from torch.nn.functional import interpolate
 from torch.utils.benchmark import Timer
 from tqdm import tqdm
 
-from benchmarks.measure import Column, Row, new_row, table, write_bench
+from benchmarks.measure import Column, Row, table, write_bench
 from benchmarks.plots import plot_ratios
 from dejavu_torch.data.camera import shots_of
 from dejavu_torch.data.video import Video
@@ -89,12 +89,21 @@ def live_row(video: Video, camera: tuple[int, int], places: int, numbers: int) -
         for shot in feed:
             localizer(shot.pixels)
     height, width = video.frame_shape[1:]
-    case = f"{camera[0]} x {camera[1]} on a map of {height} x {width}"
-    facts = {"seconds": p50, "seconds_p99": p99, "rate": rate, "cpu_seconds": cpu, "frames": frames}
-    facts |= {"dropped": feed.dropped, "recall_at_1": found / frames, "places": places}
-    size = model.map.summary().route_bytes / places
-    facts |= {"route_bytes_per_place": size, "threads": torch.get_num_threads()}
-    return new_row(case, "dejavu", (), **facts, parts=parts_of(model, video))
+    return {
+        "case": f"{camera[0]} x {camera[1]} on a map of {height} x {width}",
+        "contender": "dejavu",
+        "seconds": p50,
+        "seconds_p99": p99,
+        "rate": rate,
+        "cpu_seconds": cpu,
+        "frames": frames,
+        "dropped": feed.dropped,
+        "recall_at_1": found / frames,
+        "places": places,
+        "route_bytes_per_place": model.map.summary().route_bytes / places,
+        "threads": torch.get_num_threads(),
+        "parts": parts_of(model, video),
+    }
 
 
 def write_drive(path: Path, frames: int, size: tuple[int, int]) -> None:

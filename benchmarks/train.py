@@ -13,7 +13,7 @@ import torch
 from torch import nn
 from tqdm import tqdm
 
-from benchmarks.measure import Row, new_row, truth_of, write_bench
+from benchmarks.measure import Row, truth_of, write_bench
 from benchmarks.plots import plot_ratios
 from dejavu_torch.data.ground_truth import GroundTruth
 from dejavu_torch.data.source import open_source
@@ -103,9 +103,16 @@ def trained(
             continue
         scores = evaluate(model.localize_descriptors(queries), truth, TOLERANCE)
         auc[f"{budget:g}"], recall[f"{budget:g}"] = scores.auc, scores.recall_at_1
-    facts = {"seed": seed, "steps": steps, "seconds": timer.time_elapsed("train"), "auc": auc}
-    facts |= {"recall_at_1": recall, "threads": torch.get_num_threads()}
-    return new_row(f"{reference.name}, {steps} steps", rung.name, (), **facts)
+    return {
+        "case": f"{reference.name}, {steps} steps",
+        "contender": rung.name,
+        "seed": seed,
+        "steps": steps,
+        "seconds": timer.time_elapsed("train"),
+        "auc": auc,
+        "recall_at_1": recall,
+        "threads": torch.get_num_threads(),
+    }
 
 
 def run_train(
