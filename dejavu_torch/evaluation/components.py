@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
 from fractions import Fraction
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,23 +14,16 @@ from dejavu_torch.maps.spectrum import from_spectrum, period_of
 COUNTS = (1, 4, 16)  # strongest periods that are added up, beside all
 
 
-class Component(NamedTuple):
-    """periods: those added up, the strongest first. scores: (W,) of the chunk's places with these alone."""
-
-    periods: tuple[Fraction, ...]
-    scores: Tensor
-
-
 @torch.no_grad()
 def components(
-    route: SpectralMap, query: Tensor, chunk: int = 0, counts: Sequence[int] = COUNTS
-) -> list[Component]:
-    """Scores of a query with its strongest periods only, and with all, which are the map's own scores.
+    route: SpectralMap, query: Tensor, chunk: int = 0
+) -> list[tuple[tuple[Fraction, ...], Tensor]]:
+    """Scores of a query with its 1, 4 and 16 strongest periods only, and with all: the map's own scores.
 
     The product of a query with all descriptors of a chunk is a sum of waves, one for each period, besides a
     constant; the strongest have the largest energy. Cosine and sine of a period count together.
 
-    Shape: query (K,) -> scores (W,), of the places of the chunk.
+    Shape: query (K,) -> periods, the strongest first, and scores (W,) of the places of the chunk, each.
 
     Convention: the constant, and what the metric does with products and norms, are part of every sum.
     """
@@ -50,7 +41,7 @@ def components(
             lines_of[period_of(line, stop - start, route.transform)].append(line)
     strongest = sorted(lines_of, key=lambda period: -float(lines[lines_of[period]].square().sum()))
     found = []
-    for count in (*(count for count in counts if count < len(strongest)), len(strongest)):
+    for count in (*(count for count in COUNTS if count < len(strongest)), len(strongest)):
         kept = torch.zeros_like(lines)
         for chosen in ([0], *(lines_of[period] for period in strongest[:count])):
             kept[chosen] = lines[chosen]
@@ -59,5 +50,5 @@ def components(
             scores = 1 - products * route.inverse_norms(start, stop)
         else:
             scores = length.square() - 2 * products + route.norms[start:stop].square()
-        found.append(Component(tuple(strongest[:count]), scores.cpu()))
+        found.append((tuple(strongest[:count]), scores.cpu()))
     return found
