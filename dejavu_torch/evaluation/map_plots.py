@@ -24,6 +24,7 @@ from dejavu_torch.evaluation.plots import (
     Plot,
     canvas,
     label,
+    picture,
     pixels,
     show_frame,
 )
@@ -69,15 +70,9 @@ def draw_spectrum(run: Localization, route: SpectralMap) -> dict[str, Picture]:
     kept[lines.feature.cpu(), lines.line.cpu()] = True
     periods = [float(period_of(j, stop - start, route.transform)) for j in range(1, stop - start)]
     features = {int(j): Lines(own[1:], kept[j, 1:]) for j, own in zip(chosen, amplitudes, strict=True)}
-    where = f" of the chunk of frames {run.borders[start]} to {run.borders[stop]}" * (len(route.chunks) > 1)
-    picture = Picture(
-        plot_spectrum(features, torch.tensor(periods), float(route.steps[chunk]), run.unit),
-        "what the map keeps",
-        f"The spectrum{where} of the numbers of the descriptor that the map keeps most of. A dot is a line, "
-        "the sine or the cosine of one period. Kept is what is larger than about two thirds of the step, in "
-        "whole steps; all numbers of the descriptor share the step.",
-    )
-    return {"spectrum": picture}
+    plot = plot_spectrum(features, torch.tensor(periods), float(route.steps[chunk]), run.unit)
+    edges = run.borders[[start, stop]].tolist() if len(route.chunks) > 1 else None
+    return picture("spectrum", plot, chunk=edges)
 
 
 def plot_spectrum(features: Mapping[int, Lines], periods: Tensor, step: float, unit: str) -> Plot:
@@ -123,22 +118,17 @@ def draw_components(run: Localization, route: SpectralMap) -> dict[str, Picture]
         title = first if len(periods) == 1 else f"{len(periods)} strongest periods"
         curves.append((title, scores, DARK))
     curves.append((f"all {len(all_periods)} periods", all_scores, BLUE))
-    caption = (
-        "How much one query differs from each place, if only the periods that answer it most strongly are "
-        "added up, and all of them: each is a wave along the route, and at the right place they agree."
-    )
     numbers = {}
     if places:
         right = [place - start for place in places]
         better = [better_places(scores, right, run.tolerance) for _, scores, _ in curves]
         numbers["places_that_fit_better"] = better
-        caption += " Written above: how many wrong places fit better than the right one."
         curves = [
             (fill(f"{title}: {count} places fit better", LETTERS), scores, colour)
             for (title, scores, colour), count in zip(curves, better, strict=True)
         ]
     plot = plot_answers(run, query, (start, stop), places, curves, sharey=True)
-    return {"components": Picture(plot, "a query's score as a sum of periods", caption, numbers)}
+    return picture("components", plot, numbers, truth=places)
 
 
 def better_places(scores: Tensor, right: Sequence[int], tolerance: int) -> int:
@@ -207,26 +197,13 @@ def draw_motion(run: Localization) -> dict[str, Picture]:
     show_frame(right, ground_patch(frame[None], corners, odometry.size)[0], "from above")
     x, y = (torch.tensor([*edge, edge[0]]) for edge in zip(*corners, strict=True))
     left.plot(x * (width - 1), y * (height - 1), color=LAYERS[0], linewidth=1.5)
-    ground = Picture(
-        (figure, (left, right)),
-        "the ground that is measured",
-        "The corners are right if what lies straight ahead runs straight down the view from above, and what "
-        "repeats along the route repeats at even distances there.",
-    )
+    ground = picture("ground", (figure, (left, right)))
     distances = {
         label(f"{role}: {one.name}"): one.positions * one.step
         for role, one in (("reference", reference), ("query", run.query))
         if isinstance(one, ResampledTraverse)
     }
-    velocity = Picture(
-        plot_velocity(distances, reference.step),
-        "how fast the ground moves",
-        "The motion of the ground from frame to frame, forward above the grey line. Places are even steps "
-        "along it: a camera that stands, or goes back and forth, adds none. A vehicle's speed changes "
-        "smoothly: a curve that jumps, or falls below the line, is a sign of corners that show no clear "
-        "ground.",
-    )
-    return {"ground": ground, "velocity": velocity}
+    return ground | picture("velocity", plot_velocity(distances, reference.step))
 
 
 def plot_velocity(distances: Mapping[str, Tensor], step: float) -> Plot:

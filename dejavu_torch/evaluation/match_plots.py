@@ -32,6 +32,7 @@ from dejavu_torch.evaluation.plots import (
     canvas,
     empty,
     label,
+    picture,
     show_cells,
     show_frame,
 )
@@ -76,19 +77,8 @@ def draw_pairs(run: Localization) -> dict[str, Picture]:
         elif run.truth is not None:
             frames["right:\nnone is known"] = None
         rows.append((f"{why}, score {float(run.match.score[query]):.3g}", frames))
-    known = "" if run.truth is None else ", and at the right what it should have been"
-    last = (
-        "Surest not accepted: the best match of those that are rejected."
-        if any("not accepted" in why for why in examples.values())
-        else "All are accepted; the least sure answer has the worst score."
-    )
-    picture = Picture(
-        plot_rows(rows),
-        "queries and what was found",
-        f"A query, beside it the reference frame of the place reported{known}. The lower the score, the "
-        f"surer the match. {last}",
-    )
-    return {"pairs": picture}
+    rejected = any("not accepted" in why for why in examples.values())
+    return picture("pairs", plot_rows(rows), truth=run.truth, rejected=rejected)
 
 
 def example_queries(match: Match, truth: GroundTruth | None, tolerance: int) -> dict[int, str]:
@@ -137,8 +127,7 @@ def draw_frames(run: Localization) -> dict[str, Picture]:
             f"second, frame {run.query_frames[query]}": frame_at(run.query, query),
         }
         rows.append(("", frames))
-    caption = "The same places on the reference and on the second traverse."
-    return {"frames": Picture(plot_rows(rows), "the route", caption)}
+    return picture("frames", plot_rows(rows))
 
 
 def plot_rows(rows: Sequence[tuple[str, Mapping[str, Tensor | None]]]) -> Plot:
@@ -174,9 +163,9 @@ def draw_coverage(
 ) -> dict[str, Picture]:
     """Where along the route each query was put, right or wrong (coverage plot of the paper, figure 9)."""
     figure, axis = canvas(3.8)
-    caption = "Where along the route each query was found."
     reported, frames = match.index >= 0, int(borders[-1])
     shown = borders[match.index] if len(borders) > 1 else match.index
+    probable = truth is None and match.probability is not None and bool(reported.any())
     missing, groups = ~reported, []
     if truth is not None:
         scored = counted(match.index, truth, tolerance)
@@ -185,18 +174,16 @@ def draw_coverage(
         groups.append((reported & ~scored, GREY, 3, f"{(~scored).sum()} not scored"))
         groups.append((wrong, WRONG, 3, f"{wrong.sum()} wrong"))
         groups.append((right, RIGHT, 4, f"{right.sum()} right"))
-        caption += " A query in its right place is green, in a wrong one red."
         axis.set_title(f"right within {tolerance} {unit}", fontsize=10)
         missing = missing & scored
-    elif match.probability is None or not reported.any():
-        groups.append((reported, COLOURS["map"], 3, f"{reported.sum()} reported"))
-    else:
+    elif match.probability is not None and reported.any():
         order = match.probability.argsort()  # the surest above the others
         order = order[reported[order]]
         style: dict[str, Any] = {"cmap": "viridis_r", "vmin": 0, "vmax": 1, "linewidths": 0}
         points = axis.scatter(queries[order], shown[order], s=9, c=match.probability[order], **style)
         figure.colorbar(points, ax=axis, pad=0.01, aspect=30, label="probability of being right")
-        caption += " The darker a dot, the more probable its place."
+    else:
+        groups.append((reported, COLOURS["map"], 3, f"{reported.sum()} reported"))
     for which, colour, size, name in groups:
         if which.any():
             axis.plot(queries[which], shown[which], ".", color=colour, markersize=size, label=name)
@@ -208,7 +195,7 @@ def draw_coverage(
     axis.set(xlim=(first, max(last, first + 1)), ylim=(-0.01 * frames, frames))
     if axis.get_legend_handles_labels()[0]:
         figure.legend(loc="outside lower left", ncols=2, frameon=False, markerscale=3)
-    return {"coverage": Picture((figure, axis), "places reported", caption)}
+    return picture("coverage", (figure, axis), truth=truth, probable=probable)
 
 
 def draw_scores(run: Localization, cells: int = CELLS) -> dict[str, Picture]:
@@ -225,7 +212,7 @@ def draw_scores(run: Localization, cells: int = CELLS) -> dict[str, Picture]:
     values = torch.cat(parts)
     if values.isinf().all():
         return {}
-    found, text = (run.match.index >= 0).nonzero()[:, 0], ""
+    found = (run.match.index >= 0).nonzero()[:, 0]
     zoomed = isinstance(run.sequence, SequenceMatcher) and len(found) > 0
     figure, axes = canvas(6.9, 2) if zoomed else canvas(3.8, squeeze=False)
     above, below = axes.flat[0], axes.flat[-1]
@@ -234,15 +221,10 @@ def draw_scores(run: Localization, cells: int = CELLS) -> dict[str, Picture]:
     image = _show_scores(above, run, x, torch.cat([borders[:-1:block], borders[-1:]]), values)
     bar = figure.colorbar(image, ax=above, pad=0.01, aspect=30, ticks=[0, 1], label="score within a query")
     bar.ax.set_yticklabels(["best", "median"])
-    if run.sequence is not None:
-        text = " Of single queries; the matches are of sequences."
+    facts: dict[str, Any] = {"sequence": run.sequence}
     if zoomed:
         query = int(found[(found - len(queries) // 2).abs().argmin()])
-        count = _show_added_up(above, below, run, query)
-        text += (
-            f" Below, enlarged, an example: for the query of frame {queries[query]} and the place reported "
-            f"for it, the {count} cells of which the sequence takes the mean."
-        )
+        facts |= {"query": int(queries[query]), "cells": _show_added_up(above, below, run, query)}
     handles, names = below.get_legend_handles_labels()
     style = {"ncols": len(names), "markerscale": 1 if zoomed else 4, "handlelength": 1.5, "columnspacing": 1}
     figure.legend(handles, names, loc="outside lower left", frameon=False, **style)
@@ -251,13 +233,7 @@ def draw_scores(run: Localization, cells: int = CELLS) -> dict[str, Picture]:
         shares.append(f"{len(chosen)} of the queries")
     if block > 1:
         shares.append(f"of {block} neighbouring places the one that fits best")
-    if shares:
-        text += f" Drawn{' above' * zoomed}: {'; '.join(shares)}."
-    caption = (
-        "Dark: the place fits the query about as well as its best one does. What repeats shows as lines "
-        f"beside the right places.{text}"
-    )
-    return {"scores": Picture((figure, axes), "how well each place fits each query", caption)}
+    return picture("scores", (figure, axes), drawn="; ".join(shares), **facts)
 
 
 def _score_rows(run: Localization, numbers: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
@@ -345,9 +321,6 @@ def draw_posterior(run: Localization, cells: int = PIXELS) -> dict[str, Picture]
     image = show_cells(axis, x, y, values.T.clamp(LEAST, 1), cmap="gray_r", norm=norm)
     figure.colorbar(image, ax=axis, pad=0.01, aspect=30, label="probability of a place")
     below.plot(queries, off, color=COLOURS["map"], linewidth=1)
-    caption = (
-        "The probability of each place, from a query and all before it. Below, that of being off the map."
-    )
     if truth is not None:
         right, some = _right_frames(truth, borders), slice(None, None, -(-len(queries) // MARKS))
         style = {"color": RIGHT, "markersize": 5, "markerfacecolor": "none", "clip_on": False}
@@ -356,10 +329,7 @@ def draw_posterior(run: Localization, cells: int = PIXELS) -> dict[str, Picture]
         nowhere = truth.judged & right.isnan().all(1)
         if nowhere.any():
             below.fill_between(queries, 0, 1, where=nowhere.numpy(), step="mid", color=GREY, linewidth=0)
-        caption += " Circles are around some of the right places; grey: none is right."
-    if max(block, width) > 1:
-        caption += f" A pixel shows the most probable of {block} queries and {width} places."
     axis.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]), ylabel=PLACE)
     below.set(ylim=(0, 1), xlabel=QUERY, ylabel="off the map")
-    heading = "where the filter takes the camera to be"
-    return {"posterior": Picture((figure, (axis, below)), heading, caption)}
+    plot = figure, (axis, below)
+    return picture("posterior", plot, truth=truth, queries=block, places=width)

@@ -18,6 +18,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from dejavu_torch.evaluation.prose import sentences
 from dejavu_torch.text import printable
 
 Plot = tuple[Figure, Any]
@@ -43,6 +44,14 @@ class Picture(NamedTuple):
     heading: str
     caption: str
     numbers: Mapping[str, Any] = MappingProxyType({})
+
+
+def picture(
+    name: str, plot: Plot, numbers: Mapping[str, Any] | None = None, **facts: Any
+) -> dict[str, Picture]:
+    """A plot by its name in a report, with the words that captions.html.j2 has for it and these facts."""
+    heading, _, caption = sentences("captions.html.j2", name=name, **facts).partition(" | ")
+    return {name: Picture(plot, heading, caption, numbers or {})}
 
 
 def label(name: str) -> str:

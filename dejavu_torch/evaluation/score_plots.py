@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from dejavu_torch.evaluation.contenders import COLOURS, Contender, colour_of, distinct, sequences_as_json
 from dejavu_torch.evaluation.curves import Scores
-from dejavu_torch.evaluation.plots import LETTERS, LINE, Picture, Plot, canvas, label
+from dejavu_torch.evaluation.plots import LETTERS, LINE, Picture, Plot, canvas, label, picture
 
 _SHADES = (COLOURS["map"], "#00406b", "#5aa9d6")  # one map on several datasets
 NOTICED = 0.001  # of an area: less is no gain
@@ -75,14 +75,7 @@ def draw_curves(contenders: Mapping[str, Contender], tolerance: str) -> dict[str
     axis.set_title(f"right within {tolerance}", fontsize=10)
     axis.grid(alpha=0.25)
     figure.legend(reverse=True, loc="outside lower left", frameon=False, fontsize=9)
-    pictures = {
-        "pr": Picture(
-            (figure, axis),
-            "precision and recall",
-            "How many of the reported places are right, against how many of the queries are answered right, "
-            "as the threshold rises. The higher and the further to the right, the better.",
-        )
-    }
+    pictures = picture("pr", (figure, axis))
     if len(shown) == 1:
         return pictures
     figure, axis = canvas(0.9 + 0.55 * len(shown))
@@ -96,14 +89,7 @@ def draw_curves(contenders: Mapping[str, Contender], tolerance: str) -> dict[str
     axis.set(xlim=(0, 1.1), yticks=[], xticks=[0, 0.25, 0.5, 0.75, 1])
     axis.set_xlabel("area under the precision-recall curve")
     axis.spines["bottom"].set_bounds(0, 1)
-    pictures["auc"] = Picture(
-        (figure, axis),
-        "area under each curve",
-        "The curves above in one number each: this map, baselines that store features as they are, and nulls, "
-        "in which nothing repeats. A curve starts at the queries of the best score; nothing counts to its "
-        "left.",
-    )
-    return pictures
+    return pictures | picture("auc", (figure, axis))
 
 
 def plot_lengths(datasets: Mapping[str, Sequence[Length]]) -> Plot:
@@ -162,19 +148,10 @@ def draw_storage(
     axis.set_title(f"right within {tolerance}", fontsize=10)
     axis.grid(alpha=0.25)
     figure.legend(loc="outside lower left", frameon=False, fontsize=9)
-    caption = (
-        "The same descriptors coded to several sizes, fixed bytes such as the whitening's not counted: this "
-        "map, which gains from what is smooth and from what repeats; its null, for which nothing is smooth "
-        "and nothing repeats; keyframes, which gain from what is smooth."
-    )
     factors = [null / ours for ours, null in equally_good(*(storage.get(key, ()) for key in ("map", "null")))]
-    if factors:
-        least, most = (f"{limit:.2g}" for limit in (min(factors), max(factors)))
-        times = least if least == most else f"{least} to {most}"
-        caption += f" For the same area the null takes {times} times the bytes of this map."
     numbers: dict[str, Any] = {key: [one.as_json() for one in points] for key, points in storage.items()}
     numbers["null_over_map"] = factors
-    return {"storage": Picture((figure, axis), "what more bytes are worth", caption, numbers)}
+    return picture("storage", (figure, axis), numbers, factors=factors)
 
 
 def draw_sequences(
@@ -219,13 +196,7 @@ def draw_sequences(
     axis.set(xlabel="queries matched together, T")
     axis.set_title(f"right within {tolerance}", fontsize=10)
     figure.legend(loc="outside lower left", frameon=False, fontsize=9)
-    picture = Picture(
-        (figure, axis),
-        "what more queries are worth",
-        "One query by itself, and the last T together, their scores added up along constant speeds. From 0.9 "
-        "to 0.99 is as far as from 0.99 to 0.999; what is beyond the ends of the axis lies on them.",
-    )
-    return {"sequences": picture}
+    return picture("sequences", (figure, axis))
 
 
 def equally_good(ours: Sequence[Stored], others: Sequence[Stored]) -> list[tuple[float, float]]:

@@ -26,6 +26,7 @@ from dejavu_torch.evaluation.plots import (
     Picture,
     canvas,
     period_axis,
+    picture,
     show_cells,
 )
 from dejavu_torch.features.hog import HOG
@@ -119,17 +120,11 @@ def kept_periods(plan: Plan, chunk: tuple[int, int], feature: int) -> list[float
 def draw_chunks(plan: Plan, borders: Tensor, unit: str) -> dict[str, Picture]:
     """Chunks along the route and the periods found in each; the wider a bar, the more features."""
     figure, axis = canvas(3.6)
-    picture = Picture(
-        (figure, axis),
-        "the map's periods along the route",
-        "Dotted lines cut the route into chunks. Each bar is a layer: the features that repeat with one "
-        "period in one chunk; the wider, the more features.",
-    )
     axis.set(xlim=(0, int(borders[-1])), xlabel=PLACE, ylabel=f"period ({unit})")
     if not plan:
         axis.set(yticks=[])
         axis.text(0.5, 0.5, "this route does not repeat: no layers", ha="center", transform=axis.transAxes)
-        return {"chunks": picture}
+        return picture("chunks", (figure, axis))
     most = max(len(layer.features) for layer in plan)
     chunks = sorted({(layer.start, layer.stop) for layer in plan})
     for chunk in chunks:
@@ -150,7 +145,7 @@ def draw_chunks(plan: Plan, borders: Tensor, unit: str) -> dict[str, Picture]:
     periods = [float(layer.period) for layer in plan]
     period_axis(axis, min(periods) / 1.2, max(periods) * 1.2, unit)
     axis.set_title(f"widest bar: {most} features", fontsize=10, loc="left")
-    return {"chunks": picture}
+    return picture("chunks", (figure, axis))
 
 
 def draw_layers(layers: Sequence[FrequencyLayer], borders: Tensor, unit: str) -> dict[str, Picture]:
@@ -170,13 +165,7 @@ def draw_layers(layers: Sequence[FrequencyLayer], borders: Tensor, unit: str) ->
     axis.set(xlabel=PLACE, ylabel=f"period ({unit})")
     axis.set_title(f"phase in {len(shown)} of {len(layers)} layers", loc="left", fontsize=10)
     figure.colorbar(image, ax=axis, label="phase / period", pad=0.01, aspect=20)
-    picture = Picture(
-        (figure, axis),
-        "layers and their phases",
-        "One chunk of the map: a row a layer, the colour its phase. A column of phases names a place; the "
-        "next place where all are the same is the least common multiple of the periods away.",
-    )
-    return {"layers": picture}
+    return picture("layers", (figure, axis))
 
 
 def draw_autocorrelogram(
@@ -197,13 +186,7 @@ def draw_autocorrelogram(
     axis.set_title(f"feature {feature} against itself", loc="left", fontsize=10)
     if periods:
         axis.legend(loc="upper right", ncols=2, frameon=False, fontsize=9)
-    picture = Picture(
-        (figure, axis),
-        "a feature against itself",
-        "How alike a feature is to itself so many places later: where it repeats, it is high at every "
-        "multiple of its period.",
-    )
-    return {"autocorrelogram": picture}
+    return picture("autocorrelogram", (figure, axis))
 
 
 def draw_spectrogram(run: Localization, plan: Plan, feature: int) -> dict[str, Picture]:
@@ -245,13 +228,7 @@ def draw_spectrogram(run: Localization, plan: Plan, feature: int) -> dict[str, P
     period_axis(below, analysis.min_period, longest, run.unit)
     below.set(xlim=(0, int(borders[-1])), xlabel=PLACE)
     below.set_title("power at each period; circles: kept", loc="left", fontsize=10)
-    picture = Picture(
-        (figure, axes),
-        "a feature and its spectrogram",
-        "One feature along the route, and how its power is spread over periods in each chunk. The map keeps "
-        "the strongest periods, circled: they put the feature into a layer each.",
-    )
-    return {"spectrogram": picture}
+    return picture("spectrogram", (figure, axes))
 
 
 def draw_templates(
@@ -293,16 +270,7 @@ def draw_templates(
     below.set_yticks(mark, [str(feature)] * len(mark))
     below.set(xlabel=f"phase, of a period of {period:.4g} ({run.unit})", ylabel="feature")
     below.set_xlim(-0.5, period - 0.5)
-    made = (
-        "the template that training made of it" if run.model.trained else "their mean, which the map stores"
-    )
-    picture = Picture(
-        (figure, (above, below)),
-        "places of equal phase become templates",
-        f"Above, the same feature cut into cycles of one period and laid over each other, and {made}. Below, "
-        "the templates of the layer's features, a row each.",
-    )
-    return {"templates": picture}
+    return picture("templates", (figure, (above, below)), trained=run.model.trained)
 
 
 def draw_features(run: Localization, layers: Sequence[FrequencyLayer]) -> dict[str, Picture]:
@@ -337,13 +305,7 @@ def draw_features(run: Localization, layers: Sequence[FrequencyLayer]) -> dict[s
         axis.add_collection(lines)
         axis.set_axis_off()
         axis.set_title(f"period {float(layer.period):.4g},\n{len(layer.features)} features", fontsize=10)
-    picture = Picture(
-        (figure, axes),
-        "where the features of a layer look",
-        f"The HOG features that take part in each layer, drawn on frame {run.borders[middle]} as the edges "
-        "they respond to; the stronger a line, the more of the overlapping blocks have it in the layer.",
-    )
-    return {"features": picture}
+    return picture("features", (figure, axes), frame=int(run.borders[middle]))
 
 
 def as_hog_sees(model: DejaVu, frame: Tensor) -> Tensor:
@@ -391,11 +353,6 @@ def draw_activations(run: Localization, route: TemplateMap, leading: Sequence[in
     scores.append(run.scores(torch.tensor([query]))[0, start:stop])
     titles = [f"period {float(layer.period):.4g}, {len(layer.features)} features" for layer in layers]
     titles.append("all layers fused")
-    covering = sum((layer.start, layer.stop) == (start, stop) for layer in plan)
-    caption = (
-        "How much one query differs from each place of a chunk: a layer alone fits one place a period, all "
-        f"{covering} of the chunk together one."
-    )
     numbers: dict[str, Any] = {}
     if run.truth is not None:
         found = run.query_features, run.scored.index
@@ -403,17 +360,12 @@ def draw_activations(run: Localization, route: TemplateMap, leading: Sequence[in
         titles = [f"{title}:\n{rate.describe()}" for title, rate in zip(titles, rates, strict=True)]
         *alone, fused = (rate._asdict() for rate in rates)
         numbers = {"start": start, "stop": stop, "layers": alone, "fused": fused}
-        caption += f" Right: within {run.tolerance} {run.unit}, for a layer in phase."
-        if fused["outside"] is not None:
-            caption += (
-                " Elsewhere: queries from other chunks, the layer's phase counted on; near chance where its "
-                "period ends with the chunk."
-            )
-        caption += " All layers fused choose from the whole route."
     curves = list(zip(titles, scores, (*LAYERS, BLUE), strict=True))
     strip = slit_scan(source_of(run.reference), int(run.borders[start]), int(run.borders[stop]))
     plot = plot_answers(run, query, (start, stop), places, curves, strip)
-    return {"activations": Picture(plot, "two layers, and all layers fused", caption, numbers)}
+    covering = sum((layer.start, layer.stop) == (start, stop) for layer in plan)
+    facts = {"layers": covering, "within": f"{run.tolerance} {run.unit}", "rates": numbers}
+    return picture("activations", plot, numbers, **facts)
 
 
 def slit_scan(traverse: Traverse, start: int, stop: int) -> Tensor | None:
