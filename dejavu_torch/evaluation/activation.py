@@ -47,7 +47,7 @@ def activation_rates(
     truth: GroundTruth,
     tolerance: int,
 ) -> list[Rate]:
-    """How often each of the chosen layers of one chunk answers in phase, and, last, how often the map is right.
+    """How often each of some layers of one chunk answers in phase, and, last, how often the map is right.
 
     A query of known truth is *inside* where one of its right places lies in the chunk, *outside*
     where it has right places but none in the chunk.

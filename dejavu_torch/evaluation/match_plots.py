@@ -154,12 +154,7 @@ def plot_rows(rows: Sequence[tuple[str, Mapping[str, Tensor | None]]]) -> Plot:
 
 
 def draw_coverage(
-    match: Match,
-    truth: GroundTruth | None,
-    tolerance: int,
-    borders: Tensor,
-    queries: Tensor,
-    unit: str,
+    match: Match, truth: GroundTruth | None, tolerance: int, borders: Tensor, queries: Tensor, unit: str
 ) -> dict[str, Picture]:
     """Where along the route each query was put, right or wrong (coverage plot of the paper, figure 9)."""
     figure, axis = canvas(3.8)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any
 
@@ -44,45 +45,49 @@ ROWS, CYCLES, MARKED = 64, 100, 12  # templates, cycles and multiples of a perio
 
 def draw_template_map(run: Localization, route: TemplateMap) -> dict[str, Picture]:
     """Every picture of a template map; those of layers are left out where it has none."""
-    pictures, leading = draw_chunks(route.plan, run.borders, run.unit), leading_layers(route.plan)
-    if not leading:
+    plan, pictures = route.plan, draw_chunks(route.plan, run.borders, run.unit)
+    shown = shown_chunk(plan)
+    if not shown:
         return pictures
-    layers, templates = [route.plan[j] for j in leading], feature_templates(route, leading[0])
+    layers, templates = [plan[j] for j in shown[:2]], feature_templates(route, shown[0])
     chosen = best_explained(run.reference_features, layers[0], templates)
-    pictures |= draw_spectrogram(run, route.plan, layers[0].features[chosen])
+    pictures |= draw_spectrogram(run, plan, layers[0].features[chosen])
     pictures |= draw_templates(run, layers[0], templates, chosen)
-    pictures |= draw_features(run, layers)
-    return pictures | draw_activations(run, route, leading)
+    return pictures | draw_features(run, layers) | draw_activations(run, route, shown)
 
 
 def draw_paper(run: Localization, route: TemplateMap) -> dict[str, Picture]:
     """The autocorrelogram of a feature, and the layers of its chunk; nothing for a map without layers."""
-    leading = leading_layers(route.plan)
-    if not leading:
+    shown = shown_chunk(route.plan)
+    if not shown:
         return {}
-    layer, templates = route.plan[leading[0]], feature_templates(route, leading[0])
+    layer, templates = route.plan[shown[0]], feature_templates(route, shown[0])
     feature = layer.features[best_explained(run.reference_features, layer, templates)]
-    chunk = layer.start, layer.stop
-    periods = kept_periods(route.plan, chunk, feature)
-    values = run.reference_features[slice(*chunk), feature].cpu()
-    layers = [one for one in route.plan if (one.start, one.stop) == chunk]
+    values = run.reference_features[layer.start : layer.stop, feature].cpu()
+    layers = [route.plan[j] for j in sorted(shown)]
+    periods = [float(one.period) for one in layers if feature in one.features]
     pictures = draw_autocorrelogram(values, periods, feature, run.unit)
     return pictures | draw_layers(layers, run.borders, run.unit)
 
 
-def leading_layers(plan: Plan) -> list[int]:
-    """Positions of the two layers of one chunk that pictures show, the one of most features first.
+def layers_by_chunk(plan: Plan) -> dict[tuple[int, int], list[int]]:
+    """Positions of the layers of each chunk, those of most features first."""
+    chunks = defaultdict(list)
+    for j in sorted(range(len(plan)), key=lambda j: -len(plan[j].features)):
+        chunks[plan[j].start, plan[j].stop].append(j)
+    return chunks
 
-    The chunk is the longest that has two layers, else the longest; of equals the first. A chunk of one
-    layer gives one; a map without layers none.
+
+def shown_chunk(plan: Plan) -> list[int]:
+    """Positions of the layers of the chunk that pictures show, those of most features first.
+
+    The chunk is the longest that has two layers, else the longest; of equals the first.
     """
-    chunks: dict[tuple[int, int], list[int]] = {}
-    for j, layer in enumerate(plan):
-        chunks.setdefault((layer.start, layer.stop), []).append(j)
-    if not chunks:
-        return []
-    best = max(chunks, key=lambda chunk: (len(chunks[chunk]) > 1, chunk[1] - chunk[0], -chunk[0]))
-    return sorted(chunks[best], key=lambda j: -len(plan[j].features))[:2]
+    chunks = layers_by_chunk(plan)
+    best = max(
+        chunks, key=lambda edges: (len(chunks[edges]) > 1, edges[1] - edges[0], -edges[0]), default=None
+    )
+    return [] if best is None else chunks[best]
 
 
 def feature_templates(route: TemplateMap, j: int) -> Tensor:
@@ -108,15 +113,6 @@ def best_explained(values: Tensor, layer: FrequencyLayer, templates: Tensor) -> 
     return int(candidates[share.nan_to_num(-1, neginf=-1).argmax()])
 
 
-def kept_periods(plan: Plan, chunk: tuple[int, int], feature: int) -> list[float]:
-    """The periods with which the map has a feature in a chunk."""
-    return [
-        float(layer.period)
-        for layer in plan
-        if (layer.start, layer.stop) == chunk and feature in layer.features
-    ]
-
-
 def draw_chunks(plan: Plan, borders: Tensor, unit: str) -> dict[str, Picture]:
     """Chunks along the route and the periods found in each; the wider a bar, the more features."""
     figure, axis = canvas(3.6)
@@ -126,20 +122,17 @@ def draw_chunks(plan: Plan, borders: Tensor, unit: str) -> dict[str, Picture]:
         axis.text(0.5, 0.5, "this route does not repeat: no layers", ha="center", transform=axis.transAxes)
         return picture("chunks", (figure, axis))
     most = max(len(layer.features) for layer in plan)
-    chunks = sorted({(layer.start, layer.stop) for layer in plan})
-    for chunk in chunks:
+    chunks = layers_by_chunk(plan)
+    for chunk, members in chunks.items():
         first, last = (int(borders[edge]) for edge in chunk)
-        members = [layer for layer in plan if (layer.start, layer.stop) == chunk]
-        members.sort(key=lambda layer: -len(layer.features))
-        for layer in members:
-            share = len(layer.features) / most
+        for j in members:
+            share = len(plan[j].features) / most
             style = {"linewidth": 0.6 + 7 * share, "alpha": 0.35 + 0.65 * share}
-            axis.hlines(float(layer.period), first, last, color=BLUE, **style)
-        for layer, along in zip(members, (0.3, 0.7), strict=False):
-            if len(chunks) <= LABELLED:
-                place, period = first + along * (last - first), float(layer.period)
-                style = {"fontsize": 9, "ha": "center", "va": "center_baseline", "bbox": BOX}
-                axis.text(place, period, f"{period:.4g}", **style)
+            axis.hlines(float(plan[j].period), first, last, color=BLUE, **style)
+        for j, along in zip(members if len(chunks) <= LABELLED else (), (0.3, 0.7), strict=False):
+            where = first + along * (last - first), float(plan[j].period)
+            text = axis.text(*where, f"{where[1]:.4g}", fontsize=9, ha="center", bbox=BOX)
+            text.set_va("center_baseline")
     for edge in {edge for chunk in chunks for edge in chunk}:
         axis.axvline(int(borders[edge]), color=GREY, linewidth=0.8, linestyle=":")
     periods = [float(layer.period) for layer in plan]
@@ -216,13 +209,15 @@ def draw_spectrogram(run: Localization, plan: Plan, feature: int) -> dict[str, P
         mesh = below.pcolormesh([left, right], between.numpy(), share.numpy() * 100, norm=norm, cmap="Blues")
         for axis in axes:
             axis.axvline(left, color=GREY, linewidth=0.8, linestyle=":")
-        for period in kept_periods(plan, (start, stop), feature):
-            at = (left + right) / 2, period
+        for layer in plan:
+            if (layer.start, layer.stop) != (start, stop) or feature not in layer.features:
+                continue
+            at = (left + right) / 2, float(layer.period)
             size = 11 if len(spectra) <= LABELLED else 3
             below.plot(*at, "o", color=LAYERS[0], markersize=size, markerfacecolor="none")
             if len(spectra) <= LABELLED:
                 style = {"textcoords": "offset points", "va": "center", "fontsize": 9, "bbox": BOX}
-                below.annotate(f"{period:.4g}", at, (10, 0), **style)
+                below.annotate(f"{at[1]:.4g}", at, (10, 0), **style)
     figure.colorbar(mesh, ax=below, label="% of its power", pad=0.01, aspect=30)
     longest = max((stop - start) / 1.5 for start, stop, _ in spectra)
     period_axis(below, analysis.min_period, longest, run.unit)
@@ -301,7 +296,7 @@ def draw_features(run: Localization, layers: Sequence[FrequencyLayer]) -> dict[s
         edges, count = edges_seen(torch.tensor(layer.features), (height, width), *layout)
         strength = count / count.max()
         lines = LineCollection(list(edges.numpy()), colors=colour, alpha=(0.3 + 0.7 * strength).tolist())
-        lines.set_linewidths((points * (0.02 + 0.07 * strength)).tolist())
+        lines.set_linewidth((points * (0.02 + 0.07 * strength)).tolist())
         axis.add_collection(lines)
         axis.set_axis_off()
         axis.set_title(f"period {float(layer.period):.4g},\n{len(layer.features)} features", fontsize=10)
@@ -337,34 +332,33 @@ def edges_seen(
     return torch.stack([middle - along, middle + along], 1), count
 
 
-def draw_activations(run: Localization, route: TemplateMap, leading: Sequence[int]) -> dict[str, Picture]:
+def draw_activations(run: Localization, route: TemplateMap, chunk: Sequence[int]) -> dict[str, Picture]:
     """Scores of one query over a chunk: two layers of it, and all fused (figure 17 of the paper).
 
     Nothing where the chunk has one layer.
     """
-    if len(leading) < 2:
+    if len(chunk) < 2:
         return {}
-    plan = route.plan
-    layers = [plan[j] for j in leading]
+    plan, chosen = route.plan, chunk[:2]
+    layers = [plan[j] for j in chosen]
     start, stop = layers[0].start, layers[0].stop
     query, places = run.example_query(start, stop)
     one = run.query_features[query : query + 1]
-    scores = [layer_distances(route, one, j)[0, plan[j].place_phases] for j in leading]
+    scores = [layer_distances(route, one, j)[0, plan[j].place_phases] for j in chosen]
     scores.append(run.scores(torch.tensor([query]))[0, start:stop])
     titles = [f"period {float(layer.period):.4g}, {len(layer.features)} features" for layer in layers]
     titles.append("all layers fused")
     numbers: dict[str, Any] = {}
     if run.truth is not None:
         found = run.query_features, run.scored.index
-        rates = activation_rates(route, leading, *found, run.truth, run.tolerance)
+        rates = activation_rates(route, chosen, *found, run.truth, run.tolerance)
         titles = [f"{title}:\n{rate.describe()}" for title, rate in zip(titles, rates, strict=True)]
         *alone, fused = (rate._asdict() for rate in rates)
         numbers = {"start": start, "stop": stop, "layers": alone, "fused": fused}
     curves = list(zip(titles, scores, (*LAYERS, BLUE), strict=True))
     strip = slit_scan(source_of(run.reference), int(run.borders[start]), int(run.borders[stop]))
     plot = plot_answers(run, query, (start, stop), places, curves, strip)
-    covering = sum((layer.start, layer.stop) == (start, stop) for layer in plan)
-    facts = {"layers": covering, "within": f"{run.tolerance} {run.unit}", "rates": numbers}
+    facts = {"layers": len(chunk), "within": f"{run.tolerance} {run.unit}", "rates": numbers}
     return picture("activations", plot, numbers, **facts)
 
 
