@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from textwrap import fill
 from typing import Any
 
+import numpy as np
 import torch
 from matplotlib.colors import LogNorm
 from matplotlib.patches import Rectangle
@@ -150,7 +151,7 @@ def plot_rows(rows: Sequence[tuple[str, Mapping[str, Tensor | None]]]) -> Plot:
         axes.append(part.subplots(1, columns, squeeze=False)[0])
         for axis, title, frame in zip(axes[-1], above, frames.values(), strict=True):
             show_frame(axis, frame, title)
-    return figure, axes
+    return figure, np.stack(axes)
 
 
 def draw_coverage(
@@ -249,7 +250,8 @@ def _show_scores(axis: Any, run: Localization, x: Tensor, y: Tensor, values: Ten
     """Draw scores (h,w) between the frames x (h+1,) and y (w+1,), the places reported, and those right."""
     axis.set_facecolor(GREY)  # where nothing covers
     values = values.masked_fill(values.isinf(), torch.nan)
-    image = show_cells(axis, x - 0.5, y - 0.5, values.T, cmap="gray", vmin=0, vmax=1)
+    x, y = x - 0.5, y - 0.5
+    image = show_cells(axis, x, y, values.T, cmap="gray", vmin=0, vmax=1)
     index, queries = run.scored.index, run.query_frames
     found = index >= 0
     style: dict[str, Any] = {"color": COLOURS["map"], "markersize": dots, "label": "reported place"}
@@ -258,7 +260,7 @@ def _show_scores(axis: Any, run: Localization, x: Tensor, y: Tensor, values: Ten
         style = {"color": RIGHT, "linewidth": 1, "dashes": (4, 4)}
         axis.plot(queries, _right_frames(run.truth, run.borders), **style)
         axis.plot([], [], label="right place", **style)
-    axis.set(xlim=(x[0] - 0.5, x[-1] - 0.5), ylim=(y[0] - 0.5, y[-1] - 0.5), ylabel=PLACE)
+    axis.set(xlim=x[[0, -1]].tolist(), ylim=y[[0, -1]].tolist(), ylabel=PLACE)
     return image
 
 
@@ -324,7 +326,7 @@ def draw_posterior(run: Localization, cells: int = PIXELS) -> dict[str, Picture]
         nowhere = truth.judged & right.isnan().all(1)
         if nowhere.any():
             below.fill_between(queries, 0, 1, where=nowhere.numpy(), step="mid", color=GREY, linewidth=0)
-    axis.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]), ylabel=PLACE)
+    axis.set(xlim=x[[0, -1]].tolist(), ylim=y[[0, -1]].tolist(), ylabel=PLACE)
     below.set(ylim=(0, 1), xlabel=QUERY, ylabel="off the map")
     plot = figure, (axis, below)
     return picture("posterior", plot, truth=truth, queries=block, places=width)
