@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from fractions import Fraction
 from textwrap import fill
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from dejavu_torch.evaluation.components import components
 from dejavu_torch.evaluation.contenders import COLOURS
 from dejavu_torch.evaluation.localization import Localization, frame_at
 from dejavu_torch.evaluation.plots import (
@@ -29,12 +30,13 @@ from dejavu_torch.evaluation.plots import (
     show_frame,
 )
 from dejavu_torch.maps.spectral_map import SpectralMap
-from dejavu_torch.maps.spectrum import period_of, spectrum
+from dejavu_torch.maps.spectrum import from_spectrum, period_of, spectrum
 from dejavu_torch.motion.ground_plane import ground_patch
 from dejavu_torch.motion.resampling import ResampledTraverse
 
 BLUE = COLOURS["map"]
 STRONGEST = 3  # numbers of the descriptor whose spectrum is shown
+COUNTS = (1, 4, 16)  # strongest periods that are added up, beside all
 FAINTEST = 0.02  # of a step: what is below is drawn there
 
 
@@ -129,6 +131,46 @@ def draw_components(run: Localization, route: SpectralMap) -> dict[str, Picture]
         ]
     plot = plot_answers(run, query, (start, stop), places, curves, sharey=True)
     return picture("components", plot, numbers, truth=places)
+
+
+@torch.no_grad()
+def components(
+    route: SpectralMap, query: Tensor, chunk: int = 0
+) -> list[tuple[tuple[Fraction, ...], Tensor]]:
+    """Scores of a query with its 1, 4 and 16 strongest periods only, and with all: the map's own scores.
+
+    The product of a query with all descriptors of a chunk is a sum of waves, one for each period, besides a
+    constant; the strongest have the largest energy. Cosine and sine of a period count together.
+
+    Shape: query (K,) -> periods, the strongest first, and scores (W,) of the places of the chunk, each.
+
+    Convention: the constant, and what the metric does with products and norms, are part of every sum.
+    """
+    start, stop = route.chunks[chunk]
+    kept_lines = route.lines(chunk)
+    query = query.to(kept_lines.value)
+    length = torch.linalg.vector_norm(query)
+    if route.metric == "cosine":
+        query = query / torch.where(length > 0, length, 1)
+    terms = query[kept_lines.feature] * kept_lines.value
+    lines = query.new_zeros(stop - start).index_add(0, kept_lines.line, terms)
+    lines_of: dict[Fraction, list[int]] = defaultdict(list)
+    for line in range(1, stop - start):
+        if lines[line]:
+            lines_of[period_of(line, stop - start, route.transform)].append(line)
+    strongest = sorted(lines_of, key=lambda period: -float(lines[lines_of[period]].square().sum()))
+    found = []
+    for count in (*(count for count in COUNTS if count < len(strongest)), len(strongest)):
+        kept = torch.zeros_like(lines)
+        for chosen in ([0], *(lines_of[period] for period in strongest[:count])):
+            kept[chosen] = lines[chosen]
+        products = from_spectrum(kept, route.transform) + query @ route.means[0].to(query)
+        if route.metric == "cosine":
+            scores = 1 - products * route.inverse_norms(start, stop)
+        else:
+            scores = length.square() - 2 * products + route.norms[start:stop].square()
+        found.append((tuple(strongest[:count]), scores.cpu()))
+    return found
 
 
 def better_places(scores: Tensor, right: Sequence[int], tolerance: int) -> int:
