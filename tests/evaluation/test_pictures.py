@@ -171,28 +171,17 @@ def sequenced(run: Localization, model: SequenceModel) -> Localization:
 def test_a_sequence_shows_what_it_adds_up(run: Localization) -> None:
     run = sequenced(run, SequenceMatcher(5))
     run.match.index[58:63] = -1  # the example is the nearest to the middle that is reported
-    pictures = draw_pictures(run, {})
-    assert "posterior" not in pictures
-    assert "frame 57" in pictures["scores"].caption
-    assert "5 cells" in pictures["scores"].caption
-    line, place = pictures["scores"].plot[1][1].lines[-1], int(run.match.index[57])
-    assert line.get_xdata().tolist() == list(range(57, 52, -1))
-    assert line.get_ydata().tolist() == list(range(place, place - 5, -1))
+    caption = draw_pictures(run, {})["scores"].caption
+    assert "frame 57" in caption
+    assert "5 cells" in caption
     run.match.index.fill_(-1)
     assert "cells" not in draw_pictures(run, {})["scores"].caption
 
 
 def test_a_filter_shows_its_posterior(run: Localization) -> None:
-    model = PlaceFilter()
-    pictures = draw_pictures(sequenced(run, model), {})
+    pictures = draw_pictures(sequenced(run, PlaceFilter()), {})
     assert list(pictures)[2:4] == ["scores", "posterior"]
     assert "cells" not in pictures["scores"].caption
-    with torch.no_grad():
-        posterior = model.posterior(run.model.map.scores(run.query_features))
-    axis, below = pictures["posterior"].plot[1]
-    shown = torch.as_tensor(axis.images[0].get_array())
-    assert torch.allclose(shown, posterior[:, :-1].T.clamp(min=1e-6))
-    assert torch.allclose(torch.as_tensor(below.lines[0].get_ydata()), posterior[:, -1])
     assert "Circles" in pictures["posterior"].caption
 
 

@@ -53,25 +53,14 @@ def test_convention_11_axes_along_the_route_count_frames_and_periods_count_place
     assert {"place (frame)", "period (places)"} <= set(texts(figure))
     assert axis.images[0].get_array().shape[:2] == (1, 4)
     run = run_of(torch.rand(1, 8), borders=STANDS, query_frames=torch.tensor([77]))
-    curves, strip = [("one layer", torch.rand(4), "black")], torch.rand(1, 6, 4)
+    curves, strip = [("one layer", torch.tensor([3.0, 2, 0, 1]), "black")], torch.rand(1, 6, 4)
     figure, rows = plot_answers(run, 0, (4, 8), [6], curves, strip)
     assert rows[-1].lines[0].get_xdata().tolist() == [31, 32, 33, 34]
+    assert rows[-1].lines[1].get_xdata().tolist() == [33]  # the best
     assert rows[-1].get_xlim() == (31, 35)
     assert [line.get_xdata()[0] for line in rows[0].lines] == [33]
     assert rows[0].images[0].get_extent()[:2] == [31, 35]
     assert "difference of query 77 (lower is better)" in texts(figure)
-
-
-def test_answers_show_the_scores_and_mark_the_best() -> None:
-    curves = [(f"way {j}", values, "black") for j, values in enumerate(torch.rand(3, 8))]
-    figure, rows = plot_answers(run_of(torch.rand(1, 20)), 0, (8, 16), [11], curves)
-    for axis, (title, values, _) in zip(rows, curves, strict=True):
-        curve, best = axis.lines[:2]
-        assert axis.get_title(loc="left") == title
-        assert curve.get_xdata().tolist() == list(range(8, 16))
-        assert curve.get_ydata().tolist() == values.tolist()
-        assert float(best.get_xdata()[0]) == 8 + int(values.argmin())
-    assert "true place" in texts(figure)
 
 
 def test_layers_show_their_phases() -> None:
