@@ -26,12 +26,7 @@ class Rate(NamedTuple):
     chance: float
 
     def describe(self) -> str:
-        """In words.
-
-        Example:
-            >>> Rate(0.912, None, 0.064).describe()
-            'right 91 %, by chance 6 %'
-        """
+        """In words, such as "right 91 %, by chance 6 %"."""
         here = "" if self.inside is None else f"{self.inside:.0%}"
         elsewhere = "" if self.outside is None else f"{self.outside:.0%} elsewhere"
         between = " here, " if here and elsewhere else ""

@@ -111,24 +111,22 @@ def draw_components(run: Localization, route: SpectralMap) -> dict[str, Picture]
     chunk = longest_chunk(route)
     start, stop = route.chunks[chunk]
     query, places = run.example_query(start, stop)
-    *some, (all_periods, all_scores) = components(route, run.query_features[query], chunk)
-    if not all_periods:
+    sums = components(route, run.query_features[query], chunk)
+    if not sums[-1][0]:
         return {}
-    curves = []
-    for periods, scores in some:
-        first = f"strongest period, {float(periods[0]):.4g} {run.unit}"
-        title = first if len(periods) == 1 else f"{len(periods)} strongest periods"
-        curves.append((title, scores, DARK))
-    curves.append((f"all {len(all_periods)} periods", all_scores, BLUE))
-    numbers = {}
-    if places:
-        right = [place - start for place in places]
-        better = [better_places(scores, right, run.tolerance) for _, scores, _ in curves]
-        numbers["places_that_fit_better"] = better
-        curves = [
-            (fill(f"{title}: {count} places fit better", LETTERS), scores, colour)
-            for (title, scores, colour), count in zip(curves, better, strict=True)
-        ]
+    curves, better = [], []
+    for number, (periods, scores) in enumerate(sums, 1):
+        title = f"{len(periods)} strongest periods"
+        if number == len(sums):
+            title = f"all {len(periods)} periods"
+        elif len(periods) == 1:
+            title = f"strongest period, {float(periods[0]):.4g} {run.unit}"
+        if places:
+            right = [place - start for place in places]
+            better.append(better_places(scores, right, run.tolerance))
+            title += f": {better[-1]} places fit better"
+        curves.append((fill(title, LETTERS), scores, BLUE if number == len(sums) else DARK))
+    numbers = {"places_that_fit_better": better} if places else {}
     plot = plot_answers(run, query, (start, stop), places, curves, sharey=True)
     return picture("components", plot, numbers, truth=places)
 
@@ -196,13 +194,13 @@ def plot_answers(
     begin, end = (int(run.borders[edge]) for edge in chunk)
     above = strip is not None
     count = len(curves) + above
-    figure, rows = canvas(1.4 + 0.9 * count, count, squeeze=False, sharex=True)
+    figure, rows = canvas(1.4 + 0.9 * count, count, squeeze=False, sharex=True, sharey=sharey)
     rows = rows[:, 0]
     if strip is not None:
         rows[0].imshow(pixels(strip), extent=(begin, end, 0, 1), aspect="auto")
         rows[0].set_yticks([])
         rows[0].set_title("middle image column of each frame", loc="left", fontsize=10)
-    where, every = run.borders[slice(*chunk)], torch.cat([values for _, values, _ in curves])
+    where = run.borders[slice(*chunk)]
     for axis, (title, values, colour) in zip(rows[above:], curves, strict=True):
         axis.plot(where, values, color=colour, linewidth=1.1)
         best = int(values.argmin())
@@ -210,19 +208,14 @@ def plot_answers(
         axis.plot(where[best], values[best], "v", **style)
         axis.set_title(title, loc="left", fontsize=9)
         axis.set_yticks([])
-        if sharey:
-            room = 0.06 * float(every.max() - every.min()) or 1.0
-            axis.set_ylim(float(every.min()) - room, float(every.max()) + room)
     for axis in rows:
         for place in places:
-            axis.axvline(
-                int(run.borders[place]), color=DARK, linewidth=0.9, linestyle="--", label="true place"
-            )
+            style = {"color": DARK, "linewidth": 0.9, "linestyle": "--", "label": "true place"}
+            axis.axvline(int(run.borders[place]), **style)
     handles, labels = rows[-1].get_legend_handles_labels()
     unique = dict(zip(labels, handles, strict=True))
     figure.legend(unique.values(), unique.keys(), ncols=2, frameon=False, loc="outside lower right")
-    label = f"difference of query {run.query_frames[query]} (lower is better)"
-    figure.supylabel(label, fontsize=10)
+    figure.supylabel(f"difference of query {run.query_frames[query]} (lower is better)", fontsize=10)
     rows[-1].set(xlabel=PLACE, xlim=(begin, end))
     return figure, rows
 

@@ -87,12 +87,6 @@ def example_queries(match: Match, truth: GroundTruth | None, tolerance: int) -> 
 
     The last is the surest that is not accepted, or, where all are, the least sure of all.
     Without ground truth the surest of all stands for the first two.
-
-    Example:
-        >>> from dejavu_torch.data.ground_truth import as_ground_truth
-        >>> match = Match(torch.tensor([0, 9]), torch.tensor([0.1, 0.2]), torch.tensor([True, False]))
-        >>> example_queries(match, as_ground_truth(torch.tensor([[0], [1]])), tolerance=0)
-        {0: 'surest right answer', 1: 'surest wrong answer, surest not accepted'}
     """
     reported = match.index >= 0
     rejected = reported & ~match.accepted
@@ -161,7 +155,7 @@ def draw_coverage(
     figure, axis = canvas(3.8)
     reported, frames = match.index >= 0, int(borders[-1])
     shown = borders[match.index] if len(borders) > 1 else match.index
-    probable = truth is None and match.probability is not None and bool(reported.any())
+    probability = match.probability if truth is None and reported.any() else None
     missing, groups = ~reported, []
     if truth is not None:
         scored = counted(match.index, truth, tolerance)
@@ -172,11 +166,11 @@ def draw_coverage(
         groups.append((right, RIGHT, 4, f"{right.sum()} right"))
         axis.set_title(f"right within {tolerance} {unit}", fontsize=10)
         missing = missing & scored
-    elif match.probability is not None and reported.any():
-        order = match.probability.argsort()  # the surest above the others
+    elif probability is not None:
+        order = probability.argsort()  # the surest above the others
         order = order[reported[order]]
         style: dict[str, Any] = {"cmap": "viridis_r", "vmin": 0, "vmax": 1, "linewidths": 0}
-        points = axis.scatter(queries[order], shown[order], s=9, c=match.probability[order], **style)
+        points = axis.scatter(queries[order], shown[order], s=9, c=probability[order], **style)
         figure.colorbar(points, ax=axis, pad=0.01, aspect=30, label="probability of being right")
     else:
         groups.append((reported, COLOURS["map"], 3, f"{reported.sum()} reported"))
@@ -191,7 +185,7 @@ def draw_coverage(
     axis.set(xlim=(first, max(last, first + 1)), ylim=(-0.01 * frames, frames))
     if axis.get_legend_handles_labels()[0]:
         figure.legend(loc="outside lower left", ncols=2, frameon=False, markerscale=3)
-    return picture("coverage", (figure, axis), truth=truth, probable=probable)
+    return picture("coverage", (figure, axis), truth=truth, probable=probability is not None)
 
 
 def draw_scores(run: Localization, cells: int = CELLS) -> dict[str, Picture]:

@@ -60,17 +60,17 @@ def _style(key: str) -> dict[str, Any]:
 
 def draw_curves(contenders: Mapping[str, Contender], tolerance: str) -> dict[str, Picture]:
     """Precision over recall (figures 8 to 10 of the paper) and, of several curves, the areas below them."""
-    # leave_out has other queries
-    shown = {key: one for key, one in distinct(contenders).items() if one.curve and key != "leave_out"}
+    shown = [
+        (key, label(one.name), one.curve, one.scores.auc)
+        for key, one in distinct(contenders).items()
+        if one.curve and one.scores and key != "leave_out"  # which has other queries
+    ]
     if not shown:
         return {}
-    names = {key: label(one.name) for key, one in shown.items()}
-    figure, axis = canvas(3.4 + 1.1 * LINE * sum(len(wrap(name, LETTERS - 8)) for name in names.values()))
-    for key, one in reversed(shown.items()):  # the first on top
-        assert one.curve is not None
-        silent = " (reports nothing)" if len(one.curve.recall) == 0 else ""
-        name = fill(names[key] + silent, LETTERS - 8)
-        axis.plot(one.curve.recall, one.curve.precision, label=name, **_style(key))
+    figure, axis = canvas(3.4 + 1.1 * LINE * sum(len(wrap(name, LETTERS - 8)) for _, name, *_ in shown))
+    for key, name, curve, _ in reversed(shown):  # the first on top
+        silent = " (reports nothing)" if len(curve.recall) == 0 else ""
+        axis.plot(curve.recall, curve.precision, label=fill(name + silent, LETTERS - 8), **_style(key))
     axis.set(xlim=(0, 1.01), ylim=(0, 1.02), xlabel="recall (of all queries)", ylabel="precision")
     axis.set_title(f"right within {tolerance}", fontsize=10)
     axis.grid(alpha=0.25)
@@ -79,11 +79,10 @@ def draw_curves(contenders: Mapping[str, Contender], tolerance: str) -> dict[str
     if len(shown) == 1:
         return pictures
     figure, axis = canvas(0.9 + 0.55 * len(shown))
-    for row, (key, one) in enumerate(shown.items()):
-        assert one.scores is not None
-        area, hatch = one.scores.auc, _HATCHES.get(key.partition("_")[0])
+    for row, (key, name, _, area) in enumerate(shown):
+        hatch = _HATCHES.get(key.partition("_")[0])
         axis.barh(row, area, height=0.42, facecolor=colour_of(key), hatch=hatch, edgecolor="white")
-        axis.text(0.008, row - 0.24, fill(names[key], LETTERS), fontsize=9, va="bottom")
+        axis.text(0.008, row - 0.24, fill(name, LETTERS), fontsize=9, va="bottom")
         axis.text(area + 0.01, row, f"{area:.3f}", fontsize=9, va="center")
     axis.invert_yaxis()
     axis.set(xlim=(0, 1.1), yticks=[], xticks=[0, 0.25, 0.5, 0.75, 1])
@@ -128,18 +127,19 @@ def draw_storage(
     curves = {key: points for key, points in storage.items() if points}
     if not curves:
         return {}
-    levels = [(key, contenders[key]) for key in ("uncompressed", "hog") if key in contenders]
-    levels = [(key, one) for key, one in levels if one.scores]
+    levels = [
+        (key, one.name, one.scores.auc)
+        for key, one in contenders.items()
+        if key in ("uncompressed", "hog") and one.scores
+    ]
     figure, axis = canvas(3.4 + 1.1 * LINE * (len(curves) + len(levels)))
     every = [one.route_bytes_per_place for points in curves.values() for one in points]
     for key, points in curves.items():
         sizes, areas = [one.route_bytes_per_place for one in points], [one.auc for one in points]
         style = _style(key) | {"linestyle": "-", "marker": "o", "markersize": 5}
         axis.plot(sizes, areas, label=names[key], zorder=3, **style)
-    for key, one in levels:
-        assert one.scores is not None
-        style = {"linestyle": "--", "linewidth": 1.2, "color": colour_of(key)}
-        axis.axhline(one.scores.auc, label=one.name, **style)
+    for key, name, area in levels:
+        axis.axhline(area, label=name, linestyle="--", linewidth=1.2, color=colour_of(key))
     ticks = [2**k for k in range(-6, 20) if min(every) / 1.5 <= 2**k <= 1.5 * max(every)]
     axis.set_xscale("log")
     axis.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
@@ -164,13 +164,9 @@ def draw_sequences(
     lines = {key: one for key, one in distinct(contenders).items() if one.sequences}
     if not lines:
         return {}
-    drawn = [
-        (one.name, one.sequences, _style(key) | {"marker": "o", "linewidth": 1.4})
-        for key, one in lines.items()
-    ]
+    drawn = [(one.name, one.sequences, _style(key) | {"linewidth": 1.4}) for key, one in lines.items()]
     if "map" in lines and coded:
-        own = (lines["map"].route_bytes or 0) / places
-        style = _style("map") | {"marker": "o"}
+        own, style = (lines["map"].route_bytes or 0) / places, _style("map")
         drawn[0] = (f"this map, {own:.3g} route bytes per place", lines["map"].sequences, style)
         sizes = [own]
         for budget in SHOWN:
@@ -180,22 +176,17 @@ def draw_sequences(
                 mark = {"marker": "osD^"[len(sizes)], "markerfacecolor": "white", "linewidth": 1.0}
                 drawn.insert(len(sizes), (f"the same in {size:.3g} bytes", nearest.sequences, style | mark))
                 sizes.append(size)
-    names = [fill(name, LETTERS - 8) for name, *_ in drawn]
-    figure, axis = canvas(3.6 + 1.1 * LINE * sum(len(name.splitlines()) for name in names))
-    for order, (name, (_, found, style)) in enumerate(zip(names, drawn, strict=True)):
+    figure, axis = canvas(3.6 + 1.1 * LINE * sum(len(wrap(name, LETTERS - 8)) for name, *_ in drawn))
+    for name, found, style in reversed(drawn):  # the first on top
         areas = drawn_areas([scores.auc for scores in found.values()])
-        style = {
-            "label": name,
-            "markersize": 4.5,
-            "zorder": 3 - order / len(drawn),
-        } | style  # the first on top
-        axis.plot(list(found), areas, **style)
+        style = {"marker": "o", "markersize": 4.5} | style
+        axis.plot(list(found), areas, label=fill(name, LETTERS - 8), **style)
     ticks = sorted({T for _, found, _ in drawn for T in found})
     axis.set_xticks(ticks, [str(T) for T in ticks])
     area_axis(axis)
     axis.set(xlabel="queries matched together, T")
     axis.set_title(f"right within {tolerance}", fontsize=10)
-    figure.legend(loc="outside lower left", frameon=False, fontsize=9)
+    figure.legend(reverse=True, loc="outside lower left", frameon=False, fontsize=9)
     return picture("sequences", (figure, axis))
 
 
