@@ -8,6 +8,7 @@ import io
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
+from itertools import zip_longest
 from pathlib import Path
 from textwrap import wrap
 from typing import Any, NamedTuple
@@ -121,17 +122,11 @@ def text_table(rows: list[list[str]]) -> str:
     """
     if not rows:
         return ""
-    headings = [wrap(cell, HEADING, break_long_words=False) for cell in rows[0]]
-    height = max(1, *(len(lines) for lines in headings))
-    padded = [[""] * (height - len(lines)) + lines for lines in headings]
-    rows = [*(list(line) for line in zip(*padded, strict=True)), *rows[1:]]
-    widths = [max(len(row[j]) for row in rows) for j in range(len(rows[0]))]
+    headings = [wrap(cell, HEADING, break_long_words=False)[::-1] for cell in rows[0]]
+    lines = [*reversed([*zip_longest(*headings, fillvalue="")]), *rows[1:]]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return "\n".join(
-        "  ".join(
-            cell.ljust(w) if j == 0 else cell.rjust(w)
-            for j, (cell, w) in enumerate(zip(row, widths, strict=True))
-        )
-        for row in rows
+        "  ".join([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])]) for line in lines
     )
 
 

@@ -11,6 +11,7 @@ import torch
 from matplotlib.collections import LineCollection
 from matplotlib.colors import PowerNorm
 from torch import Tensor
+from torch.nn.functional import max_pool1d
 
 from dejavu_torch.evaluation.activation import activation_rates, layer_distances
 from dejavu_torch.evaluation.localization import Localization, frame_at
@@ -40,6 +41,7 @@ from dejavu_torch.types import FrequencyLayer, Plan, Traverse
 
 CANDIDATES = 16  # features of a layer from which the one to show is chosen
 SHOWN = 12  # layers of a chunk
+DOTS = 2000  # along a picture, at least; a longer line is drawn as the range that it covers
 ROWS, CYCLES, MARKED = 64, 100, 12  # templates, cycles and multiples of a period drawn at most
 
 
@@ -196,7 +198,9 @@ def draw_spectrogram(run: Localization, plan: Plan, feature: int) -> dict[str, P
     spectra = analysis(values)
     figure, axes = canvas(4.4, 2, sharex=True, height_ratios=(1, 1.7))
     above, below = axes
-    above.plot(borders[:-1], values, color=DARK, linewidth=0.7)
+    step = max(1, len(values) // DOTS)
+    low, high = (sign * max_pool1d(sign * values.T, step, ceil_mode=True)[0] for sign in (-1, 1))
+    above.fill_between(borders[:-1:step], low, high, color=DARK, linewidth=0.4)
     above.set_title(f"feature {feature} through time", loc="left", fontsize=10)
     above.set(ylabel="value")
     shares = [(power[2:] / power[1:].sum()).nan_to_num() for _, _, power in spectra]
