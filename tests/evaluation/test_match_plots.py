@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from drawn import matched, run_of, texts
@@ -167,35 +168,33 @@ def test_what_a_sequence_adds_up_may_reach_off_the_map_and_before_the_first_quer
     assert torch.isclose(scores[query, place].mean(), matcher(scores[:3])[-1, 1])
 
 
-def test_a_posterior_is_pooled_as_it_comes(monkeypatch: pytest.MonkeyPatch, largest_tensor: type) -> None:
+def test_a_posterior_is_pooled_as_it_comes_and_shows_some_right_places(
+    monkeypatch: pytest.MonkeyPatch, largest_tensor: type
+) -> None:
+    monkeypatch.setattr("dejavu_torch.evaluation.match_plots.SCORES_AT_ONCE", 450)
     scores, model = torch.rand(130, 75), PlaceFilter()
     with torch.no_grad():
         posterior = model.posterior(scores)
-    monkeypatch.setattr("dejavu_torch.evaluation.match_plots.SCORES_AT_ONCE", 450)
+    right = torch.arange(130).masked_fill(torch.arange(130) >= 70, -1)
+    borders, queries = torch.arange(0, 152, 2), torch.arange(0, 390, 3)  # convention 11
+    parts = {"borders": borders, "query_frames": queries, "truth": as_ground_truth(right[:, None])}
+    run = run_of(scores, sequence=model, **parts)
     with largest_tensor() as seen:
-        picture = draw_posterior(run_of(scores, sequence=model), cells=40)["posterior"]
+        picture = draw_posterior(run, cells=40)["posterior"]
     assert seen.numel <= 38 * 33  # queries by places of the image
     assert "the most probable of 4 queries and 2 places" in picture.caption
-    axis, below = picture.plot[1]
-    for row, queries in zip(image(axis), posterior[:, :-1].split(4), strict=True):
-        for value, places in zip(row, queries.split(2, 1), strict=True):
+    figure, (axis, below) = picture.plot
+    for row, some in zip(image(axis), posterior[:, :-1].split(4), strict=True):
+        for value, places in zip(row, some.split(2, 1), strict=True):
             assert value == places.max().clamp(min=1e-6)
-    assert torch.equal(torch.as_tensor(below.lines[0].get_ydata()), posterior[:, -1])
-
-
-def test_a_posterior_is_drawn_with_some_right_places_and_where_there_is_none() -> None:
-    truth = as_ground_truth(torch.tensor([[0, -1], [2, 4], [3, -1], [4, -1], [-1, -1], [-1, -1]]))
-    borders, queries = torch.arange(0, 12, 2), torch.arange(0, 18, 3)  # convention 11
-    parts = {"borders": borders, "query_frames": queries, "sequence": PlaceFilter()}
-    run = run_of(torch.rand(6, 5), truth=truth, **parts)
-    figure, (axis, below) = draw_posterior(run)["posterior"].plot
-    assert (axis.get_xlim(), axis.get_ylim()) == ((-0.5, 15.5), (-0.5, 9.5))
-    marked = [(x, y) for line in axis.lines for x, y in zip(*line.get_data(), strict=True) if float(y) == y]
-    assert marked == [(0, 0), (3, 4), (6, 6), (9, 8), (3, 8)]
-    assert all(line.get_markerfacecolor() == "none" for line in axis.lines)  # what is below is seen
-    assert below.lines[0].get_xdata().tolist() == queries.tolist()
+    assert (axis.get_xlim(), axis.get_ylim()) == ((-0.5, 387.5), (-0.5, 149.5))
+    (marks,) = axis.lines
+    assert marks.get_xdata().tolist() == [3 * query for query in range(0, 130, 6)]
+    assert marks.get_ydata()[:12].tolist() == [2 * query for query in range(0, 70, 6)]
+    assert marks.get_markerfacecolor() == "none"  # what is below is seen
+    assert np.array_equal(below.lines[0].get_data(), [queries, posterior[:, -1]])
     (nowhere,) = below.collections
-    assert nowhere.get_datalim(below.transData).intervalx.tolist() == [12, 15]
+    assert nowhere.get_datalim(below.transData).intervalx.tolist() == [210, 387]
     assert {"query (frame)", "place (frame)", "off the map", "right place"} <= set(texts(figure))
     run.truth = None
     axis, below = draw_posterior(run)["posterior"].plot[1]
