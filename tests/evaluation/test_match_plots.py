@@ -57,11 +57,7 @@ def test_coverage_leaves_grey_what_is_not_scored() -> None:
     queries = torch.tensor([10, 20, 30, 40, 50])
     picture = draw_coverage(matched(0, 1, 7, -1, 9), truth, 0, torch.arange(11), queries, "frames")
     figure, axis = picture["coverage"].plot
-    assert dots(axis) == {
-        "3 not scored": [(20, 1), (30, 7)],
-        "1 wrong": [(50, 9)],
-        "1 right": [(10, 0)],
-    }
+    assert dots(axis) == {"3 not scored": [(20, 1), (30, 7)], "1 wrong": [(50, 9)], "1 right": [(10, 0)]}
     assert axis.get_xlim() == (10, 50)
     assert {"3 not scored", "right within 0 frames"} <= set(texts(figure))
 

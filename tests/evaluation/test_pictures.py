@@ -11,15 +11,7 @@ from footage import QUERY, REFERENCE, STEP, camera, footage
 from helpers import Fixed, template_model
 from torch import Tensor, nn
 
-from dejavu_torch import (
-    HOG,
-    DejaVu,
-    Match,
-    PlaceFilter,
-    Preprocess,
-    SequenceMatcher,
-    SpectrogramAnalysis,
-)
+from dejavu_torch import HOG, DejaVu, Match, PlaceFilter, Preprocess, SequenceMatcher, SpectrogramAnalysis
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth, offset_truth
 from dejavu_torch.data.positions import place_of

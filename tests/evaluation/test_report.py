@@ -27,13 +27,7 @@ from dejavu_torch.evaluation.report import (
 from dejavu_torch.types import Match
 
 SCORES = Scores(0.5, 0.6, 0.1, 0.2, 0.7, 0.75)
-FACTS = {
-    "queries": 20,
-    "tolerance": 3,
-    "recall_definition": "TP / all",
-    "version": "1",
-    "torch": "2",
-}
+FACTS = {"queries": 20, "tolerance": 3, "recall_definition": "TP / all", "version": "1", "torch": "2"}
 
 
 def report(facts: dict[str, Any] | None = None, **contenders: Contender) -> Report:
