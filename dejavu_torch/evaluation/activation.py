@@ -44,19 +44,16 @@ def activation_rates(
 ) -> list[Rate]:
     """How often each of some layers of one chunk answers in phase, and, last, how often the map is right.
 
-    A query of known truth is *inside* where one of its right places lies in the chunk, *outside*
-    where it has right places but none in the chunk.
+    A query of known truth is *inside* where one of its right places lies in the chunk, *outside* where it has
+    right places but none in the chunk.
 
-    For a layer, the rate is the share of the queries whose best phase (argmin over k of eq. 3) is
-    within the tolerance of the phase of a right place (`in_phase`): inside, a right place in the
-    chunk; outside, any, with the phase it would have if the layer went on. Outside the layer holds
-    nothing: a rate near chance says that its period ends with the chunk, or slips there; a rate as
-    inside, that it goes on. Chance is the share of phases within the tolerance of any one phase,
-    (2 * tolerance + 1) / period where phases = period, at most 1.
+    A layer is right where its best phase (argmin over k of eq. 3) is within the tolerance of the phase of a
+    right place (`in_phase`): inside, one in the chunk; outside, any, as if the layer went on, so that a rate
+    near chance says that its period ends with the chunk, or slips there. Chance is the share of phases within
+    the tolerance of any one, (2 * tolerance + 1) / period where phases = period.
 
-    For the fusion, the rate is the share of the queries whose reported place is right within the
-    tolerance; outside, that is the work of the layers of other chunks. Chance is
-    (2 * tolerance + 1) / places, at most 1.
+    The map is right where the reported place is within the tolerance of a right one; outside, that is the
+    work of the layers of other chunks. Chance is (2 * tolerance + 1) / places.
 
     Shape: queries (Q,D), index (Q,) the places reported for them.
     """
