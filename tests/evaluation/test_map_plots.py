@@ -12,12 +12,9 @@ from torch import Tensor
 from dejavu_torch import DejaVu
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import as_ground_truth, offset_truth
-from dejavu_torch.evaluation.contenders import COLOURS, contend
+from dejavu_torch.evaluation.contenders import COLOURS
 from dejavu_torch.evaluation.localization import Localization
 from dejavu_torch.evaluation.map_plots import components, draw_components, draw_spectrum
-from dejavu_torch.evaluation.pictures import draw_pictures
-from dejavu_torch.evaluation.report import PICTURES
-from dejavu_torch.evaluation.score_plots import Stored
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.spectrum import period_of
@@ -117,12 +114,3 @@ def test_the_strongest_period_alone_is_a_wave() -> None:
     wave = 10 - 8 * (2 * torch.pi * (torch.arange(PLACES) - 100) / 24).cos()
     assert torch.allclose(first, wave, atol=0.05)
     assert int(every.argmin()) % 120 == 100  # both waves begin anew after 120 places
-
-
-def test_every_picture_of_a_spectral_map() -> None:
-    run, _ = localized()
-    contenders = {key: contend(key, run.match, run.truth, 2) for key in ("map", "null")}
-    pictures = draw_pictures(run, contenders, {"map": [Stored(1, 0.5, 0.5)]})
-    assert list(pictures) == ["coverage", "scores", "pr", "auc", "storage", "spectrum", "components"]
-    assert pictures.keys() <= set(PICTURES)
-    assert all(picture.caption.endswith(".") for picture in pictures.values())

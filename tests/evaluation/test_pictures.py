@@ -85,20 +85,7 @@ def test_every_picture_of_frames_that_repeat(run: Localization) -> None:
     best = torch.tensor(pictures["scores"].plot[1].flat[0].images[0].get_array()).argmin(0)
     assert torch.equal(best, run.match.index)
     assert [name for name, picture in pictures.items() if picture.numbers] == ["activations"]
-    numbers = pictures["activations"].numbers
-    assert (numbers["start"], numbers["stop"]) == (0, 60)
-    assert all(0 <= rate["inside"] <= 1 and 0 <= rate["outside"] <= 1 for rate in numbers["layers"])
-    assert 0 <= numbers["fused"]["inside"] <= 1
     assert "Elsewhere" in pictures["activations"].caption
-
-
-def test_the_rates_are_those_of_the_layers_they_stand_beside() -> None:
-    """Two layers that each answer for their own period only: swapped, neither would be in phase."""
-    values = (torch.arange(90)[:, None] % torch.tensor([9.0, 9.0, 10.0])) + torch.tensor([0.0, 1.0, 2.0])
-    model = template_model(periods=Fixed(layer(9, 0, 90, 0, 1), layer(10, 0, 90, 2)))
-    rates = drawn(localized(model, values, values, same_places(90)))["activations"].numbers["layers"]
-    assert [rate["inside"] for rate in rates] == [1.0, 1.0]
-    assert [rate["chance"] for rate in rates] == [pytest.approx(5 / 9), 0.5]
 
 
 RIGHT, NUMBERS = offset_truth(120, 120), torch.arange(120)

@@ -77,7 +77,6 @@ def test_the_storage_picture_shows_the_points_and_what_the_null_takes() -> None:
     assert "null takes 4 times the bytes" in picture.caption
     assert picture.numbers["null_over_map"] == [4.0]
     assert picture.numbers["map"][0] == {"route_bytes_per_place": 1, "auc": 0.5, "recall_at_1": 0.5}
-    assert picture.numbers["interpolated"] == []
     assert draw_storage({}, {}, "2 frames") == draw_storage({}, {"map": []}, "2 frames") == {}
 
 
