@@ -25,7 +25,7 @@ from dejavu_torch.recognition.localizer import SINGLE, Localizer, Matching
 from dejavu_torch.types import InputError, Match, Traverse
 
 if TYPE_CHECKING:  # training needs the baselines of HOG, and no plots
-    from dejavu_torch.evaluation.pictures import Localization
+    from dejavu_torch.evaluation.localization import Localization
 
 log = logging.getLogger("dejavu_torch")
 

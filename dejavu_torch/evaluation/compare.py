@@ -26,7 +26,8 @@ from dejavu_torch.evaluation.answers import own_facts
 from dejavu_torch.evaluation.baselines import Baseline, baselines_of
 from dejavu_torch.evaluation.contenders import Contender, contend, lengths_beside
 from dejavu_torch.evaluation.evaluate import RANKS, evaluation_facts
-from dejavu_torch.evaluation.pictures import Localization, draw_pictures
+from dejavu_torch.evaluation.localization import Localization
+from dejavu_torch.evaluation.pictures import draw_pictures
 from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.rejection import draw_reliability
 from dejavu_torch.evaluation.report import Report, as_html
