@@ -16,7 +16,7 @@ from dejavu_torch.cluster import Cluster, code_on
 from dejavu_torch.data.arrays import read_array
 from dejavu_torch.data.frame_range import FrameRange
 from dejavu_torch.data.simulate.aerial import AerialRoad
-from dejavu_torch.learning import ChunkCoder, encode_local
+from dejavu_torch.learning import ChunkCoder
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import Chunk, SpectralMap
 from dejavu_torch.model import DejaVu
@@ -63,20 +63,21 @@ def run_cluster(*, out: Path) -> list[str]:
 
 def contenders_of(coder: ChunkCoder, route: Traverse, cluster: Cluster) -> list[Contender]:
     """What makes all chunks; threads: of all processes together."""
+    every = range(coder.total)
 
     def threaded() -> list[Chunk]:
         with threads(cluster.workers):
-            return list(coder.chunks(route, range(coder.total)))
+            return list(coder.chunks(route, every))
 
     def works(name: str, count: int, work: Callable[[], list[Chunk]]) -> Contender:
         return Contender(name, lambda: work, count)
 
     workers = cluster.workers
     return [
-        works("dejavu, one process", 1, lambda: [*encode_local(coder, route, 0)]),
+        works("dejavu, one process", 1, lambda: [*coder.chunks(route, every)]),
         works(f"dejavu, one process, {workers} threads", workers, threaded),
-        works("dejavu, 1 worker", 1, lambda: [*code_on(cluster, coder, route, 0, together=coder.total)]),
-        works(f"dejavu, {workers} workers", workers, lambda: [*code_on(cluster, coder, route, 0)]),
+        works("dejavu, 1 worker", 1, lambda: [*code_on(cluster, coder, route, every, together=coder.total)]),
+        works(f"dejavu, {workers} workers", workers, lambda: [*code_on(cluster, coder, route, every)]),
     ]
 
 

@@ -23,18 +23,10 @@ WITHOUT_END = 10**6  # frames between key frames: one, the first
 
 
 class CodedVideo(IndexedTraverse):
-    """Every k-th frame of a traverse, made small, encoded and decoded, and made large again.
+    """Every step-th frame of a traverse, made small, encoded and decoded, and made large again.
 
-    Args:
-        traverse: of frames. codec: "libx264" or "libx265". crf: its quality, 0 to 51, 51 the worst.
-        step: k.
-        longest: pixels of the longer side of what is encoded.
-
-    Attributes:
-        bytes: of all packets.
-
-    Raises:
-        InputError: ready features instead of frames. ValueError: the codec is not there.
+    codec: "libx264" or "libx265". crf: its quality, 0 to 51, 51 the worst. longest: pixels of the longer side
+    of what is encoded. bytes: of all packets. A codec that is not there raises ValueError.
     """
 
     def __init__(self, traverse: Traverse, codec: str, crf: int, step: int = 1, longest: int = 64) -> None:

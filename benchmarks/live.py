@@ -51,11 +51,6 @@ def bench_live(
 ) -> list[Row]:
     """Localize the frames of a video one by one on a map of many places, with HOG and the filter.
 
-    Args:
-        places: of the map. frames: of the video.
-        sizes: (height, width) of the frames that a map is learned from, a case each.
-        camera: size of the video's frames. numbers: of a descriptor.
-
     Convention: the route is the video once, and for the rest its descriptors turned at random, block by
         block: other places that change as a real route does. Only the time is of interest: the frames are
         those that were learned.
@@ -187,15 +182,11 @@ def run_live(*, out: Path) -> list[str]:
         out: folder for bench.json and bench.png
     """
     rows = bench_live()
-    drawn = {
-        row["case"]: {
-            name: 1e3 * value for name, value in ({"dejavu": row["seconds"]} | row["parts"]).items()
-        }
-        for row in rows
-    }
+    parts = {row["case"]: {"dejavu": row["seconds"]} | row["parts"] for row in rows}
+    drawn = {case: {name: 1e3 * value for name, value in own.items()} for case, own in parts.items()}
     picture = plot_ratios(drawn, "milliseconds a frame (p50), and of each part by itself")
     write_bench(out, rows, picture, rate=RATE)
-    parts: dict[str, Column] = {name: (name, ".1f", 1e-3) for row in rows for name in row["parts"]}
-    figures = table([row | row["parts"] for row in rows], COLUMNS | parts, "{case}")
+    columns: dict[str, Column] = {name: (name, ".1f", 1e-3) for row in rows for name in row["parts"]}
+    figures = table([row | row["parts"] for row in rows], COLUMNS | columns, "{case}")
     note = "100000 places; found: within 5; from decoding on: milliseconds of each part by itself"
     return [figures, note]

@@ -36,16 +36,7 @@ class Likeness(NamedTuple):
 
 
 def likeness(places: Tensor, queries: Tensor, truth: Tensor) -> Likeness:
-    """Measure a route and a second traverse of it.
-
-    Args:
-        truth: the place that each query shows.
-
-    Shape: (N,K), (Q,K), (Q,).
-
-    Raises:
-        InputError: fewer than 16 places or queries.
-    """
+    """Measure a route (N,K) and a second traverse (Q,K); truth (Q,): the place that each query shows."""
     if min(len(places), len(queries)) < 16:
         raise InputError(
             f"{len(places)} places and {len(queries)} queries to measure; expected at least 16 each"
@@ -83,10 +74,6 @@ def _filters(series: Tensor) -> Tensor:
 
 class MadeRoute(IndexedTraverse):
     """Descriptors with the covariance, and the spectrum along the route, of one that was measured.
-
-    Args:
-        like: see `likeness`.
-        length: N. seed: of the random numbers.
 
     Convention: Gaussian, then scaled to length 1 as whitened descriptors are. A place depends on its number
         and the seed alone: any part of the route can be made by itself, and is not held.

@@ -71,15 +71,10 @@ def bench_matcher(
     frames one by one beside the same in onnxruntime.
 
     Args:
-        frames: grey frames to describe, of each size in `images` (height, width in pixels).
-        repeats: timed runs of each contender, in turn; the best counts.
-        distances: queries, features and templates of each case of L1.
-        sequences: queries, queries of a sequence and places of each case of a template map whose sequences
-            are matched in one batch, beside a query at a time.
-        filters: queries and places of each case of a filter that searches all places for every 50th query,
-            beside one that does for every query; the difference is one of probabilities.
-        exports: frames, their height and width, and places of each case of single frames, found one behind
-            the other on a spectral map, beside its ONNX file.
+        frames: of each HOG case. repeats: timed runs of each contender, in turn; the best counts.
+        images: height, width. distances: queries, features, templates. sequences: queries, T, places.
+        filters: queries, places; the difference is one of probabilities.
+        exports: frames, height, width, places.
         torch_compile: also a sum that `torch.compile` makes a loop of; compiling takes its time.
 
     Convention: one process, float32, and the same number of threads, torch.get_num_threads(), for all

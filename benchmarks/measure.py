@@ -25,11 +25,14 @@ from tqdm import tqdm
 import dejavu_torch
 from benchmarks.plots import plot_ratios
 from dejavu_torch.data.frame_range import IndexedTraverse
+from dejavu_torch.data.ground_truth import GroundTruth
 from dejavu_torch.data.output import whole_folder
 from dejavu_torch.evaluation.plots import Plot
 from dejavu_torch.evaluation.report import text_table
 from dejavu_torch.maps.distance import l1_backend
+from dejavu_torch.motion.resampling import ground_truth_of
 from dejavu_torch.text import one_line
+from dejavu_torch.types import InputError, Traverse
 
 COMPARED = ("torch", "numpy", "numba", "scikit-image", "scipy", "faiss-cpu", "onnxruntime")
 PROCESS = Path("/proc/self")
@@ -46,10 +49,10 @@ Find = Callable[[Tensor], tuple[Tensor, Tensor]]  # of queries the best score, l
 
 
 class Contender(NamedTuple):
-    """What is measured side by side.
+    """What is measured side by side; the names of ours start with "dejavu".
 
-    name: ours start with "dejavu". prepare: imports what it needs and returns what does the work; what it
-    raises says why there are no figures. threads: that it may use. family: of those that make one front.
+    prepare: imports what it needs and returns what does the work; what it raises says why there are no
+    figures. threads: that it may use. family: of those that make one front.
     """
 
     name: str
@@ -205,6 +208,23 @@ def end_with_parent() -> None:
     ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
 
 
+def truth_of(
+    reference: Traverse, query: Traverse, frames: int | None = None, queries: int | None = None
+) -> GroundTruth:
+    """What the sources say, or frame i is place i; frames, queries: of those that do not know their length.
+
+    Raises:
+        InputError: nothing tells the right places.
+    """
+    truth = ground_truth_of(None, reference, query, frames, queries, aligned=True)
+    if truth is None:
+        seen = f"{reference.name} has {frames or reference.length} frames"
+        raise InputError(
+            f"{seen} and {query.name} {queries or query.length}; expected as many, frame i being place i"
+        )
+    return truth
+
+
 def write_bench(out: Path, rows: Sequence[Row], picture: Plot | None = None, **facts: Any) -> None:
     """Write bench.json, and bench.png where there is a picture, into a folder: all of it or nothing.
 
@@ -238,13 +258,7 @@ def bars(rows: Sequence[Row], key: str = "ratio_to_ours", unit: float = 1.0, **l
 
 
 def table(rows: Sequence[Row], columns: Mapping[str, Column], name: str = "{case}: {contender}") -> str:
-    """The figures as aligned text, the header first, and at the end why there are none.
-
-    Example:
-        >>> print(table([{"case": "l1", "contender": "dejavu", "bytes": 2e6}], {"MB": ("bytes", ".1f", 1e6)}))
-                     MB
-        l1: dejavu  2.0
-    """
+    """The figures as aligned text, the header first, and at the end why there are none."""
 
     def text(value: float | None, form: str, unit: float = 1.0) -> str:
         return "" if value is None else format(value / unit, form)

@@ -8,7 +8,7 @@ import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -68,22 +68,19 @@ class Held(Store):
     """Descriptors of all frames in float32, compared with those of each query by one matrix product."""
 
     def __init__(self, whitened: bool) -> None:
-        self.whitened = whitened
-
-    def model(self) -> DejaVu:
-        return DejaVu(whitening=Whitening() if self.whitened else "none").eval()
+        self.model = DejaVu(whitening=Whitening() if whitened else "none").eval()
 
     def learn(self, route: IndexedTraverse, path: Path) -> int:
-        model, fixed = self.model(), {}
+        model, fixed = self.model, {}
         if model.whitening is None:
-            held = gathered(model.describer.descriptors(route), route)
+            held = model.extract_all(route)
         else:
             held, fixed = model.describe_reference(route), model.whitening.state_dict()
         save_file({"held": held, **fixed}, path)
         return held.nbytes
 
     def load(self, path: Path, device: str = "cpu") -> Find:
-        model, state = self.model(), load_file(path)
+        model, state = self.model, load_file(path)
         held = state.pop("held")
         if model.whitening is not None:
             model.whitening.load_state_dict(state)
@@ -122,55 +119,21 @@ CONTENDERS: dict[str, Store] = {
 @torch.no_grad()
 def localize(store: Store, path: Path, queries: Traverse) -> Tensor:
     """The place of each query on the route of a file, (Q,)."""
-    find = store.load(path)
-    return gathered((find(part)[1] for part in queries.batches(BATCH)), queries)
+    find, found = store.load(path), []
+    for part in queries.batches(BATCH):  # tensors that stay between large ones would keep the heap from reuse
+        found += find(part)[1].tolist()
+    return torch.tensor(found)
 
 
-def gathered(parts: Iterator[Tensor], traverse: Traverse) -> Tensor:
-    """What is made of all frames of a traverse of known length, batch by batch, each written once.
-
-    Many small tensors between large ones would keep the heap from being used again.
-    """
-    whole, done = torch.empty(0), 0
-    for part in parts:
-        whole = whole if done else part.new_empty(traverse.length or 0, *part.shape[1:])
-        whole[done : done + len(part)] = part
-        done += len(part)
-    return whole
-
-
-class Task(NamedTuple):
-    """What one process measures.
-
-    contender: of `CONTENDERS`. places: of the route; 0 only loads the programs. queries: that are localized;
-    0 learns. threads: of torch.
-    """
-
-    contender: str
-    places: int
-    queries: int
-    threads: int
-
-    @property
-    def case(self) -> str:
-        if not self.places:
-            return LOADED
-        if not self.queries:
-            return f"learn {self.places} frames"
-        return f"localize {self.queries} queries, {self.places} places"
-
-    def file(self, folder: Path) -> Path:
-        """What the contender keeps of the route."""
-        return folder / f"{list(CONTENDERS).index(self.contender)}-{self.places}"
+def kept(folder: Path, contender: str, places: int) -> Path:
+    """What a contender keeps of a route."""
+    return folder / f"{list(CONTENDERS).index(contender)}-{places}"
 
 
 def paint_drives(folder: Path, places: int) -> None:
     """Two drives over pieces of `sim:aerial`, one behind the other, the second in other light and with noise.
 
     Each is one long image, of which a frame is a window: thousands of frames take no memory of their own.
-
-    Raises:
-        InputError: no room for the files.
     """
     columns = places + VIEW
     pieces = [paint_route(PIECE, seed)[..., :PIECE] for seed in range(-(-columns // PIECE))]
@@ -189,11 +152,7 @@ def paint_drives(folder: Path, places: int) -> None:
 
 
 class Drive(IndexedTraverse):
-    """The frames of a drive at some places.
-
-    Args:
-        image: of the drive, (VIEW,W,3). shown: (N,) the first column of each frame.
-    """
+    """The frames of a drive, one image (VIEW,W,3), whose first columns are shown (N,)."""
 
     def __init__(self, image: NDArray[np.uint8], shown: Tensor) -> None:
         self.name, self.length = "drive", len(shown)
@@ -210,75 +169,67 @@ def shown_by(queries: int, places: int) -> Tensor:
     return torch.arange(queries) * max(1, places // queries) % places
 
 
-def measure(task: Task, folder: Path) -> dict[str, Any]:
-    """Do the work of a task and watch the memory of this process, which has done nothing else.
+def measure(contender: str, places: int, queries: int, threads: int, folder: Path) -> dict[str, Any]:
+    """Watch the memory of this process, which has done nothing else: what it knows of a row.
+
+    Args:
+        places: of the route; 0 only loads the programs. queries: that are localized; 0 learns.
 
     Convention: a trial on few frames goes ahead, which loads what is loaded late; what it leaves free is
         given back, so that the run cannot use it.
-
-    Returns:
-        What it knows of a row.
     """
-    torch.set_num_threads(task.threads)
-    contender, file = CONTENDERS[task.contender], task.file(folder)
-    route, queries = (np.load(folder / f"{name}.npy") for name in NAMES)
+    torch.set_num_threads(threads)
+    store, file = CONTENDERS[contender], kept(folder, contender, places)
+    route, second = (np.load(folder / f"{name}.npy") for name in NAMES)
     trial = file.with_suffix(".trial")
-    contender.learn(Drive(route, torch.arange(TRIAL)), trial)
-    localize(contender, trial, Drive(queries, torch.arange(1)))
+    store.learn(Drive(route, torch.arange(TRIAL)), trial)
+    localize(store, trial, Drive(second, torch.arange(1)))
     trial.unlink()
     l1_backend()
     give_back()
-    if not task.places:
+    if not places:
         return {"peak_bytes": resident() if PROCESS.exists() else None}
-    shown = shown_by(task.queries or task.places, task.places)
-    frames = Drive(queries if task.queries else route, shown)
-    found = torch.empty(0)
+    shown = shown_by(queries or places, places)
+    frames = Drive(second if queries else route, shown)
+    found: list[Any] = []
 
     def run() -> None:
-        nonlocal found
-        if task.queries:
-            found = localize(contender, file, frames)
-        else:
-            contender.learn(frames, file)
+        found.append(localize(store, file, frames) if queries else store.learn(frames, file))
 
     began = time.perf_counter()
     peak = peak_memory(run)
     facts = {"seconds": time.perf_counter() - began, "peak_bytes": peak, "bytes": file.stat().st_size}
-    if task.queries:
-        facts["recall_at_1"] = float(((found - shown).abs() <= TOLERANCE).double().mean())
+    if queries:
+        facts["recall_at_1"] = float(((found[0] - shown).abs() <= TOLERANCE).double().mean())
     return facts
 
 
 def bench_memory(places: Sequence[int] = (), queries: Sequence[int] = QUERIES) -> Iterator[Row]:
     """Memory that each contender takes to learn routes and to localize on one, each time in a new process.
 
-    Args:
-        places: frames of the routes that are learned, `PLACES` where none is given. Queries are localized
-            on the route of the middle size.
-        queries: how many are localized at once, of frames of a second drive, evenly along the route.
+    Queries are frames of a second drive, evenly along the route of the middle size.
 
     Yields:
         A row for each case and contender. peak_bytes: most memory during the run beyond what the process
         held before, when it had done all on `TRIAL` frames; a row "programs loaded" has that itself. bytes:
         of the file. seconds: of the only run.
-
-    Raises:
-        InputError: fewer than `FEWEST` places.
     """
     sizes = sorted(set(places or PLACES))
     if sizes[0] < FEWEST:
         raise InputError(f"bench memory got places {sizes}; expected at least {FEWEST} each")
     threads, middle = torch.get_num_threads(), sizes[len(sizes) // 2]
-    cases = [(n, 0) for n in sizes] + [(middle, q) for q in queries]
-    tasks = [Task(OURS, 0, 0, threads)]
-    tasks += [Task(name, n, q, threads) for n, q in cases for name in CONTENDERS]
+    learned = [(f"learn {n} frames", name, n, 0) for n in sizes for name in CONTENDERS]
+    found = [
+        (f"localize {q} queries, {middle} places", name, middle, q) for q in queries for name in CONTENDERS
+    ]
+    tasks = [(LOADED, OURS, 0, 0), *learned, *found]
     with temporary_folder(Path(tempfile.gettempdir())) as folder:
         paint_drives(folder, sizes[-1])
-        for task in tqdm(tasks, "memory", disable=None, leave=False):
-            facts = in_process(__name__, [task, str(folder)])
-            if not task.queries and task.places != middle:
-                task.file(folder).unlink(missing_ok=True)
-            yield new_row(task.case, task.contender, **{"threads": threads} | facts)
+        for case, name, n, q in tqdm(tasks, "memory", disable=None, leave=False):
+            facts = in_process(__name__, [name, n, q, threads, str(folder)])
+            if n != middle:  # no queries
+                kept(folder, name, n).unlink(missing_ok=True)
+            yield new_row(case, name, **{"threads": threads} | facts)
 
 
 def run_memory(*, out: Path, places: Sequence[int] = ()) -> list[str]:
@@ -295,5 +246,5 @@ def run_memory(*, out: Path, places: Sequence[int] = ()) -> list[str]:
 
 
 if __name__ == "__main__":
-    given, place = json.loads(sys.argv[1])
-    sys.stdout.write(json.dumps(measure(Task(*given), Path(place))) + "\n")
+    name, places, queries, threads, folder = json.loads(sys.argv[1])
+    sys.stdout.write(json.dumps(measure(name, places, queries, threads, Path(folder))) + "\n")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from textwrap import fill
 from types import MappingProxyType
@@ -36,12 +37,7 @@ FAMILIES = {  # of `plot_frontiers`: colour and line
 
 
 def plot_ratios(cases: Mapping[str, Mapping[str, float]], label: str = RATIO) -> Plot:
-    """A figure of each contender, its time over ours if not said otherwise: one bar each, grouped by case.
-
-    Args:
-        cases: at least one: case -> contender -> figure. Names that start with "dejavu" are ours.
-        label: what is drawn.
-    """
+    """A figure of each contender by case, its time over ours if not said otherwise: one bar each."""
     bars = [len(ratios) for ratios in cases.values()]
     height = 0.5 + 0.42 * sum(bars) + 0.5 * len(bars)
     figure, axes = canvas(height, len(bars), squeeze=False, height_ratios=bars)
@@ -62,13 +58,10 @@ def plot_ratios(cases: Mapping[str, Mapping[str, float]], label: str = RATIO) ->
 def plot_growth(
     panels: Mapping[str, Mapping[str, Sequence[tuple[float, float]]]], linear: Collection[str] = ()
 ) -> Plot:
-    """Figures of contenders over the number of places, a panel each, both axes logarithmic.
+    """Figures (places, figure) of contenders over the number of places, a panel each, both axes logarithmic.
 
-    Args:
-        panels: at least one: what is drawn -> contender -> places and figure. What stands before the first
-            comma of a name is its family, which gives the colour; a mark is of one contender. Families that
-            start with "dejavu" are ours, those with "null" nulls.
-        linear: panels of shares, 0 to 1, on a linear axis.
+    What stands before the first comma of a name is its family, which gives the colour; a mark is of one
+    contender. Families that start with "dejavu" are ours. linear: panels of shares, 0 to 1.
     """
     names = list(dict.fromkeys(name for lines in panels.values() for name in lines))
     styles = _growth_styles(names)
@@ -92,16 +85,17 @@ def plot_growth(
 
 def _growth_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
     """A style of each contender: of its family the colour, of its own the mark and the line."""
-    families = {name: name.partition(",")[0] for name in names}
     colours: dict[str, str] = {}
-    for family in dict.fromkeys(families.values()):
-        kind = family.partition(" ")[0]
-        among = _GROWTH.get(kind, _OTHERS)
-        used = sum(colour in among for colour in colours.values())
-        colours[family] = among[used % len(among)]
+    members: Counter[str] = Counter()
     styles = {}
-    for i, (name, family) in enumerate(families.items()):
-        order = list(families.values())[:i].count(family)  # in its family
+    for name in names:
+        family = name.partition(",")[0]
+        if family not in colours:
+            among = _GROWTH.get(family.partition(" ")[0], _OTHERS)
+            used = sum(colour in among for colour in colours.values())
+            colours[family] = among[used % len(among)]
+        order = members[family]
+        members[family] += 1
         styles[name] = {
             "color": colours[family],
             "marker": "os^Dv"[order % 5],
@@ -122,7 +116,7 @@ def plot_frontiers(
     Convention: areas below `LOWEST` and above `HIGHEST` are drawn as these.
 
     Args:
-        cases: at least one: case -> family -> bytes per place and area, ascending.
+        cases: case -> family -> bytes per place and area, ascending.
         whitenings: case -> name, fixed bytes and area of a map by each; a panel below that of the case.
     """
     names = list(dict.fromkeys(name for families in cases.values() for name in families))

@@ -20,11 +20,10 @@ Code = Callable[[Tensor], Tensor]  # descriptors (n,K) -> what a store gives bac
 
 
 class Kept(NamedTuple):
-    """Descriptors of all places as a store gives them back, and what it takes.
+    """Descriptors (N,K) of all places as a store gives them back, and the bytes that it takes.
 
-    descriptors: (N,K). route: bytes that grow with the route, and codebooks fitted on it. fixed: bytes that
-    do not grow with it, beside the whitening. apart: k, where only every k-th place is stored, and the others
-    are given back as the one before them.
+    route: those that grow with the route, codebooks fitted on it included. fixed: the others, beside the
+    whitening. apart: k, if only every k-th place is stored and the others are given back as the one before.
     """
 
     descriptors: Tensor
@@ -34,14 +33,7 @@ class Kept(NamedTuple):
 
 
 def spectral(places: Tensor, budget: float, seed: int | None = None) -> Kept:
-    """The spectral map of so many route bytes per place.
-
-    Args:
-        seed: codes the places in an order shuffled by it, and gives them back in their own: the null.
-
-    Raises:
-        InputError: a budget that cannot be met.
-    """
+    """The spectral map of so many route bytes per place; with a seed that of shuffled places, the null."""
     order = torch.arange(len(places)) if seed is None else shuffled(places, seed)[0]
     route = SpectralMapper(budget)(places[order])
     back = torch.empty_like(places)
@@ -52,12 +44,9 @@ def spectral(places: Tensor, budget: float, seed: int | None = None) -> Kept:
 def every_kth(
     places: Tensor, k: int, each: int, code: Code | None = None, between: bool = False, beside: int = 0
 ) -> Kept:
-    """Every k-th place.
+    """Every k-th place, at `each` bytes and `beside` bytes once; `code` is what the store gives back of them.
 
-    Args:
-        each: bytes of a stored place. code: what the store gives back of the stored ones; None all of it.
-        between: also store the last place, and give back straight lines between the stored ones.
-        beside: bytes that the code takes once, fitted on the route.
+    between: also store the last place, and give back straight lines between the stored ones.
     """
     count = len(places)
     chosen = keyframes(count, k) if between else torch.arange(0, count, k)
@@ -73,15 +62,11 @@ def principal(places: Tensor, numbers: int, k: int = 1) -> Kept:
 
     The mean and the axes, a byte a number, count as fixed, though they are fitted on the route: axes of
     another one would do nearly as well.
-
-    Raises:
-        InputError: more numbers than a descriptor has, or than there are places.
     """
     if numbers > min(places.shape):
         raise InputError(f"{numbers} principal components of descriptors {tuple(places.shape)}")
     mean = places.mean(0)
-    axes = torch.linalg.svd(places - mean, full_matrices=False).Vh[:numbers]
-    axes = as_int8(axes)
+    axes = as_int8(torch.linalg.svd(places - mean, full_matrices=False).Vh[:numbers])
     scores = (places - mean) @ axes.T
     scale = scores.abs().amax(0).clamp(min=1e-30) / 127
     back = ((scores / scale).round() * scale) @ axes + mean
@@ -97,17 +82,8 @@ def signs(places: Tensor) -> Tensor:
 class ProductQuantiser:
     """Codes of m bytes, each the nearest of 256 centroids of a part of the descriptor (Jegou et al., 2011).
 
-    Args:
-        training: (n,K) descriptors that the codebooks are trained on.
-        m: bytes of a code; descriptors are padded with zeros to a multiple of it.
-        rotated: train a rotation ahead of it too (OPQ: Ge et al., 2013).
-        int8: keep codebooks and rotation in int8, where they count: it changes next to nothing.
-
-    Attributes:
-        bytes: of codebooks and rotation, a byte a number.
-
-    Raises:
-        ImportError: no faiss. InputError: fewer descriptors than centroids.
+    rotated: trains a rotation ahead of it too (OPQ: Ge et al., 2013). int8: keeps codebooks and rotation in
+    int8, if they count; it changes next to nothing. bytes: of codebooks and rotation, a byte a number.
     """
 
     def __init__(self, training: Tensor, m: int, rotated: bool = False, int8: bool = False) -> None:

@@ -22,16 +22,10 @@ ROWS = 8192
 
 @torch.no_grad()
 def tiles_of(model: DejaVu) -> dict[str, Tensor]:
-    """What each tile adds to whitened descriptors ahead of their scaling to length 1, by phase.
+    """What each tile adds to whitened descriptors of HOG ahead of their scaling to length 1, by phase: (P,K).
 
     Blocks of HOG see one tile or the road between them, which is the same everywhere: so a descriptor of a
     frame without noise, drift and yaw is a sum of two.
-
-    Args:
-        model: HOG with its defaults and a whitening.
-
-    Returns:
-        first, second: (P,K), the arguments of `TiledRoute`.
     """
     assert isinstance(model.features, HOG)
     assert model.whitening is not None
@@ -45,11 +39,7 @@ def tiles_of(model: DejaVu) -> dict[str, Tensor]:
 
 
 class TiledRoute(IndexedTraverse):
-    """Descriptors of two tiles, over and over.
-
-    Args:
-        first, second: see `tiles_of`. length: N.
-    """
+    """Descriptors of two tiles, over and over; first, second: see `tiles_of`."""
 
     def __init__(self, first: Tensor, second: Tensor, length: int) -> None:
         self.first, self.second, self.length = first, second, length

@@ -81,11 +81,6 @@ def exponents(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
     """How each figure of each contender grows with N, by kind of case: the slope of a line in logarithms.
 
     Convention: a line is fitted to 3 sizes or more, of what `grown` tells.
-
-    Example:
-        >>> rows = [scale_row(f"places={n}", "dejavu", n, seconds=1e-6 * n**0.5) for n in (100, 400, 1600)]
-        >>> round(exponents(rows)["places"]["dejavu"]["seconds"], 3)
-        0.5
     """
     found: dict[str, dict[str, dict[str, float]]] = {}
     for kind in dict.fromkeys(map(kind_of, rows)):

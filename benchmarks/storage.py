@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,19 +15,28 @@ from torch import Tensor
 from tqdm import tqdm
 
 from benchmarks.coded_video import CodedVideo
-from benchmarks.measure import Contender, Row, failure, new_row, peak_memory, with_ratios, write_bench
+from benchmarks.measure import (
+    Contender,
+    Row,
+    failure,
+    new_row,
+    peak_memory,
+    truth_of,
+    with_ratios,
+    write_bench,
+)
 from benchmarks.plots import plot_frontiers
 from benchmarks.quantisers import Kept, ProductQuantiser, every_kth, principal, signs, spectral
 from dejavu_torch.data.ground_truth import GroundTruth
 from dejavu_torch.data.source import open_source
 from dejavu_torch.evaluation.baselines import as_int8, between_keyframes, every, nearest_frames
+from dejavu_torch.evaluation.compare import check_places
 from dejavu_torch.evaluation.contenders import LENGTHS, evaluate_each, lengths_beside, sequences_as_json
 from dejavu_torch.evaluation.plots import Plot
 from dejavu_torch.evaluation.report import text_table
 from dejavu_torch.evaluation.reproduce import paper_model
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.model import DejaVu
-from dejavu_torch.motion.resampling import ground_truth_of
 from dejavu_torch.recognition.localizer import Matching
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.text import printable
@@ -58,7 +68,6 @@ KEYS = (
 )
 OURS, NULL, OTHERS = "dejavu", "null", "dejavu, other whitenings"
 
-Store = tuple[str, str, Callable[[], Kept]]  # name, family, and what it gives back of the descriptors
 Answer = tuple[Match, int, int]  # what a contender finds, its bytes that grow with the route, and all others
 Points = Sequence[tuple[float, float]]  # bytes per place and area
 
@@ -66,8 +75,8 @@ Points = Sequence[tuple[float, float]]  # bytes per place and area
 class Route(NamedTuple):
     """A route described: places (N,K) and queries (Q,K), whitened alike.
 
-    reference: the frames of the places. fixed: bytes of the whitening, which every contender needs. other:
-    the route of the free codebooks and of a whitening that is shared; None leaves them out, and says so.
+    reference: the frames of the places. other: the route of the free codebooks and of a whitening that is
+    shared; None leaves them out, and says so.
     """
 
     name: str
@@ -77,8 +86,19 @@ class Route(NamedTuple):
     places: Tensor
     queries: Tensor
     truth: GroundTruth
-    fixed: int
     other: Traverse | None
+
+    @property
+    def fixed(self) -> int:
+        """Bytes of the whitening, which every contender needs."""
+        assert self.model.whitening is not None
+        return sum(buffer.nbytes for buffer in self.model.whitening.buffers())
+
+    @property
+    def matching(self) -> Matching:
+        """Single queries, and sequences of each T that there is room for."""
+        sequence = SequenceMatcher(max(length for length in LENGTHS if length <= len(self.places)))
+        return Matching(sequence, lengths_beside(sequence, len(self.queries), len(self.places)))
 
     def another(self, what: str) -> Traverse:
         """The other route, which something is learned on."""
@@ -106,9 +126,6 @@ def run_storage(
         codebooks: another route, where codebooks and a whitening are learned that count nothing
         whitening: a map whose whitening describes all routes; each learns its own if not given
         places: frames of the built-in sim:aerial; 3072 and 10000 if not given
-
-    Raises:
-        InputError: sources that are no pairs or do not fit each other, and what the sources raise.
     """
     given = None if map is None else DejaVu.load(map)
     shared = None if whitening is None else DejaVu.load(whitening)
@@ -174,10 +191,9 @@ def routes_of(
     for kind, sizes in (BUILT_IN | ({"aerial": tuple(places)} if places else {})).items():
         for size in sizes:
             address = f"sim:{kind}?" + (f"frames={size}&" if size else "")
-            a, b, other = (
-                open_source(f"{address}seed={s}&traverse={t}") for s, t in ((0, 0), (0, 1), (1, 0))
-            )
-            found.append((f"sim:{kind}, {a.length} places", a, b, other))
+            seen = ("seed=0&traverse=0", "seed=0&traverse=1", "seed=1&traverse=0")
+            reference, query, other = (open_source(address + one) for one in seen)
+            found.append((f"sim:{kind}, {reference.length} places", reference, query, other))
     return found
 
 
@@ -199,22 +215,8 @@ def check(model: DejaVu, reference: Traverse, query: Traverse) -> None:
         )
     if reference.length is not None and query.length is not None:
         truth_of(reference, query, reference.length, query.length)
-    if model.map.places and reference.length is not None and model.map.places != reference.length:
-        raise InputError(
-            f"the map holds {model.map.places} places and {reference.name} {reference.length}; expected the "
-            "reference that it was made of"
-        )
-
-
-def truth_of(reference: Traverse, query: Traverse, frames: int, queries: int) -> GroundTruth:
-    """What the sources say, or frame i is place i."""
-    truth = ground_truth_of(None, reference, query, frames, queries, aligned=True)
-    if truth is None:
-        raise InputError(
-            f"{reference.name} has {frames} frames and {query.name} {queries}; expected as many, frame i "
-            "being place i"
-        )
-    return truth
+    if model.map.places and reference.length is not None:
+        check_places(model, reference.length, reference.name)
 
 
 def described(
@@ -226,63 +228,57 @@ def described(
 ) -> Route:
     """A route's descriptors by a model, which learns its whitening where it has none; None is the default."""
     model = DejaVu() if model is None else model
-    assert model.whitening is not None  # of the defaults
     places = model.describe_reference(reference, None, "describing")
     queries = model.extract_all(query, "describing the query")
     truth = truth_of(reference, query, len(places), len(queries))
-    fixed = sum(buffer.nbytes for buffer in model.whitening.buffers())
-    return Route(name, model, reference, query, places.float(), queries.float(), truth, fixed, other)
+    return Route(name, model, reference, query, places.float(), queries.float(), truth, other)
 
 
 def contenders_of(route: Route, given: DejaVu | None = None) -> Iterator[Contender]:
     """All that is set side by side on a route, ours first; given: see `run_storage`."""
-    for name, family, keep in stores_of(route):
-        yield Contender(name, partial(partial, among, route, keep), family=family)
+    yield from stores_of(route)
     assert route.model.whitening is not None
     if not route.model.whitening.fixed:  # else it was given, and there is none to change
         for name in (*WHITENINGS, "of another route"):
-            answer = partial(partial, by_other_whitening, route, name)
-            yield Contender(f"dejavu {WHITENED:g}, whitening {name}", answer, family=OTHERS)
+            answer = partial(by_other_whitening, route, name)
+            yield ready(f"dejavu {WHITENED:g}, whitening {name}", OTHERS, answer)
     if given is not None:
-        found = partial(partial, by_map, route, lambda: given)
-        yield Contender("dejavu, the map that was given", found, family="dejavu, given")
+        yield ready("dejavu, the map that was given", "dejavu, given", partial(by_map, route, lambda: given))
     # template means of the features themselves at frequencies found in them, frame by frame
-    paper = partial(partial, by_map, route, lambda: paper_model().learn(route.reference))
-    yield Contender("the paper", paper, family="the paper")
+    paper = partial(by_map, route, lambda: paper_model().learn(route.reference))
+    yield ready("the paper", "the paper", paper)
 
 
-def stores_of(route: Route) -> Iterator[Store]:
+def ready(name: str, family: str, answer: Callable[[], Answer]) -> Contender:
+    """A contender that needs nothing to be made ready."""
+    return Contender(name, lambda: answer, family=family)
+
+
+def stores_of(route: Route) -> Iterator[Contender]:
     """Ways to keep the very same descriptors."""
     places, numbers = route.places, route.places.shape[1]
+
+    def store(family: str, name: str, keep: Callable[..., Kept], *given: Any, **settings: Any) -> Contender:
+        return ready(name, family, partial(among, route, partial(keep, *given, **settings)))
+
     for budget in BUDGETS:
-        yield f"dejavu {budget:g}", OURS, partial(spectral, places, budget)
+        yield store(OURS, f"dejavu {budget:g}", spectral, places, budget)
     for budget in BUDGETS:
-        yield f"null {budget:g}", NULL, partial(spectral, places, budget, seed=0)
+        yield store(NULL, f"null {budget:g}", spectral, places, budget, seed=0)
     for k in SPACED:
         name = "whole database" if k == 1 else every(k, "frame")
-        yield f"{name}, float", "frames", partial(every_kth, places, k, 4 * numbers)
-        yield f"{name}, int8", "frames", partial(every_kth, places, k, numbers, as_int8)
+        yield store("frames", f"{name}, float", every_kth, places, k, 4 * numbers)
+        yield store("frames", f"{name}, int8", every_kth, places, k, numbers, as_int8)
     for k in BETWEEN:
-        keep = partial(every_kth, places, k, numbers, as_int8, between=True)
-        yield f"{every(k, 'frame')}, int8, interpolated", "interpolated", keep
-    for count in COMPONENTS:
-        for k in COMPONENT_SPACED:
-            name = f"PCA, {count} numbers of {every(k, 'frame')}, int8{', interpolated' * (k > 1)}"
-            yield name, "PCA", partial(principal, places, count, k)
+        name = f"{every(k, 'frame')}, int8, interpolated"
+        yield store("interpolated", name, every_kth, places, k, numbers, as_int8, between=True)
+    for count, k in product(COMPONENTS, COMPONENT_SPACED):
+        name = f"PCA, {count} numbers of {every(k, 'frame')}, int8{', interpolated' * (k > 1)}"
+        yield store("PCA", name, principal, places, count, k)
     for k in BIT_SPACED:
         for between in (False, True) if k > 1 else (False,):
-            keep = partial(every_kth, places, k, -(-numbers // 8), signs, between)
-            yield f"signs of {every(k, 'frame')}{', interpolated' * between}", "binary", keep
-    yield from product_quantisers(route)
-    for codec in ("libx264", "libx265"):
-        for crf in QUALITIES:
-            for k in VIDEO_SPACED:
-                name = f"{codec[3:]}, crf {crf}, {every(k, 'frame')}{', interpolated' * (k > 1)}"
-                yield name, "video", partial(video, route, codec, crf, k)
-
-
-def product_quantisers(route: Route) -> Iterator[Store]:
-    """PQ and OPQ, by codebooks of another route, which count nothing, and by the route's own, which do."""
+            name = f"signs of {every(k, 'frame')}{', interpolated' * between}"
+            yield store("binary", name, every_kth, places, k, -(-numbers // 8), signs, between)
 
     @cache
     def elsewhere() -> Tensor:
@@ -290,18 +286,21 @@ def product_quantisers(route: Route) -> Iterator[Store]:
 
     @cache  # one training for all strides
     def quantiser(m: int, rotated: bool, own: bool) -> ProductQuantiser:
-        return ProductQuantiser(route.places if own else elsewhere(), m, rotated, int8=own)
+        return ProductQuantiser(places if own else elsewhere(), m, rotated, int8=own)
 
-    def keep(k: int, m: int, rotated: bool, own: bool, between: bool) -> Kept:
+    def quantised(k: int, m: int, rotated: bool, own: bool, between: bool) -> Kept:
         code = quantiser(m, rotated, own)
-        return every_kth(route.places, k, m, code, between, code.bytes if own else 0)
+        return every_kth(places, k, m, code, between, code.bytes if own else 0)
 
-    for own, rotated, m in ((o, r, m) for o in (False, True) for r in (False, True) for m in CODE_BYTES):
+    both = (False, True)
+    for own, rotated, m, k, between in product(both, both, CODE_BYTES, CODE_SPACED, both):
         family = "PQ, own codebooks" if own else "PQ, codebooks of another route"
-        for k, between in ((k, b) for k in CODE_SPACED for b in (False, True)):
-            name = f"{'O' * rotated}PQ, {m} bytes of {every(k, 'frame')}"
-            name += f"{', interpolated' * between}{', own codebooks' * own}"
-            yield name, family, partial(keep, k, m, rotated, own, between)
+        name = f"{'O' * rotated}PQ, {m} bytes of {every(k, 'frame')}"
+        name += f"{', interpolated' * between}{', own codebooks' * own}"
+        yield store(family, name, quantised, k, m, rotated, own, between)
+    for codec, crf, k in product(("libx264", "libx265"), QUALITIES, VIDEO_SPACED):
+        name = f"{codec[3:]}, crf {crf}, {every(k, 'frame')}{', interpolated' * (k > 1)}"
+        yield store("video", name, video, route, codec, crf, k)
 
 
 def video(route: Route, codec: str, crf: int, k: int) -> Kept:
@@ -313,7 +312,7 @@ def video(route: Route, codec: str, crf: int, k: int) -> Kept:
     return Kept(between_keyframes(keys, count, k) if k > 1 else keys, coded.bytes)
 
 
-def by_other_whitening(route: Route, name: str, matching: Matching) -> Answer:
+def by_other_whitening(route: Route, name: str) -> Answer:
     """The map of the same frames by another whitening."""
     model = DejaVu(whitening=Whitening(**WHITENINGS.get(name, {})))
     if name not in WHITENINGS:
@@ -321,20 +320,20 @@ def by_other_whitening(route: Route, name: str, matching: Matching) -> Answer:
         source.describe_reference(route.another("learn a whitening on"))
         model.take_whitening(source)
     again = described(route.name, route.reference, route.query, model)
-    return among(again, partial(spectral, again.places, WHITENED), matching)
+    return among(again, partial(spectral, again.places, WHITENED))
 
 
-def among(route: Route, keep: Callable[[], Kept], matching: Matching) -> Answer:
+def among(route: Route, keep: Callable[[], Kept]) -> Answer:
     """Nearest of the descriptors that a store gives back, by cosine."""
     kept = keep()
-    found = nearest_frames(kept.descriptors, route.queries, kept.apart, "cosine", matching=matching)
+    found = nearest_frames(kept.descriptors, route.queries, kept.apart, "cosine", None, route.matching)
     return found, kept.route, kept.fixed + route.fixed
 
 
-def by_map(route: Route, made: Callable[[], DejaVu], matching: Matching) -> Answer:
+def by_map(route: Route, made: Callable[[], DejaVu]) -> Answer:
     """A map on descriptors of its own."""
     model = made()
-    found = model.localize_descriptors(model.extract_all(route.query), matching)
+    found = model.localize_descriptors(model.extract_all(route.query), route.matching)
     summary = model.summary()
     return found.renumbered(model.map.table.scored), summary.route_bytes, summary.fixed_bytes
 
@@ -342,14 +341,10 @@ def by_map(route: Route, made: Callable[[], DejaVu], matching: Matching) -> Answ
 def judged(route: Route, contender: Contender) -> Row:
     """Store a route, match all queries, and score them: single ones, and sequences of each T with room."""
     row = new_row(route.name, contender.name, KEYS, family=contender.family)
-    count = len(route.places)
-    sequence = SequenceMatcher(max(length for length in LENGTHS if length <= count))
-    matching = Matching(sequence, lengths_beside(sequence, len(route.queries), count))
     answers: list[Answer] = []
     began = time.perf_counter()
     try:
-        answer_of = contender.prepare()
-        peak = peak_memory(lambda: answers.append(answer_of(matching)))
+        peak = peak_memory(lambda: answers.append(contender.prepare()()))
     except InputError as error:
         return row | {"skipped": str(error)}
     except (ImportError, ValueError) as error:  # a program that is not installed, a codec that is not there
@@ -362,7 +357,7 @@ def judged(route: Route, contender: Contender) -> Row:
         "bytes": size + fixed,
         "fixed_bytes": fixed,
         "route_bytes": size,
-        "route_bytes_per_place": size / count,
+        "route_bytes_per_place": size / len(route.places),
         "recall_at_1": scores[1].recall_at_1,
         "auc": scores[1].auc,
         "sequences": sequences_as_json(scores),
@@ -370,16 +365,8 @@ def judged(route: Route, contender: Contender) -> Row:
 
 
 def front(rows: Sequence[Row], length: int = 1) -> list[tuple[float, float]]:
-    """What no other row reaches with fewer bytes, by ascending bytes; of sequences of T queries.
-
-    Example:
-        >>> sizes = {2.0: 0.7, 1.0: 0.5, 4.0: 0.6}
-        >>> front([{"route_bytes_per_place": size, "sequences": {"1": {"auc": auc}}, "skipped": None}
-        ...        for size, auc in sizes.items()])
-        [(1.0, 0.5), (2.0, 0.7)]
-    """
-    ran = [row for row in rows if row["skipped"] is None]
-    points = [(row["route_bytes_per_place"] or 0.0, area(row, length) or 0.0) for row in ran]
+    """What no other row reaches with fewer bytes, by ascending bytes; of sequences of T queries."""
+    points = [(row["route_bytes_per_place"], area(row, length) or 0.0) for row in rows]
     best: list[tuple[float, float]] = []
     for size, auc in sorted(points, key=lambda point: (point[0], -point[1])):
         if not best or auc > best[-1][1]:
@@ -388,8 +375,8 @@ def front(rows: Sequence[Row], length: int = 1) -> list[tuple[float, float]]:
 
 
 def area(row: Row, length: int) -> float | None:
-    """The AUC of sequences of T queries."""
-    auc: float | None = (row["sequences"] or {}).get(str(length), {}).get("auc")
+    """The AUC of sequences of T queries; None where the route has no room for them."""
+    auc: float | None = row["sequences"].get(str(length), {}).get("auc")
     return auc
 
 
@@ -397,10 +384,6 @@ def bytes_for(auc: float, points: Points) -> float | None:
     """Bytes per place at which a front reaches an area, on straight lines over the logarithm of bytes.
 
     None where it never does. Where its smallest point does, that point's, which it may need less than.
-
-    Example:
-        >>> bytes_for(0.6, [(1.0, 0.5), (4.0, 0.7)])
-        2.0
     """
     i = next((i for i, point in enumerate(points) if point[1] >= auc), None)
     if i is None:
@@ -440,20 +423,13 @@ def equal_areas(rows: Sequence[Row]) -> list[dict[str, Any]]:
             fronts = {name: front(some, length) for name, some in families(own).items() if name != OURS}
             for row in families(own).get(OURS, ()):
                 auc, size = area(row, length), row["route_bytes_per_place"]
-                if auc is None or size is None:
+                if auc is None:
                     continue
                 needed = {name: bytes_for(auc, points) for name, points in fronts.items()}
                 null = needed.get(NULL)
-                found.append(
-                    {
-                        "case": case,
-                        "T": length,
-                        "auc": auc,
-                        "route_bytes_per_place": size,
-                        "bytes_per_place": needed,
-                        "null_over_ours": None if null is None else null / size,
-                    }
-                )
+                entry = {"case": case, "T": length, "auc": auc, "route_bytes_per_place": size}
+                entry |= {"bytes_per_place": needed, "null_over_ours": null and null / size}
+                found.append(entry)
     return found
 
 
@@ -461,12 +437,11 @@ def whitenings(rows: Sequence[Row]) -> dict[str, list[tuple[str, int, float]]]:
     """Name, fixed bytes and area of our map by each whitening, for each route with others than its own."""
     found = {}
     for case, own in by("case", rows).items():
-        ours = [row for row in own if row["contender"] == f"{OURS} {WHITENED:g}"]
+        ours = [("the default", row) for row in own if row["contender"] == f"{OURS} {WHITENED:g}"]
         others = [row for row in own if row["family"] == OTHERS]
         if others and ours:
-            names = ["the default", *(row["contender"].rpartition("whitening ")[2] for row in others)]
-            shown = zip(names, ours + others, strict=True)
-            found[case] = [(name, row["fixed_bytes"] or 0, row["auc"] or 0) for name, row in shown]
+            named = ours + [(row["contender"].rpartition("whitening ")[2], row) for row in others]
+            found[case] = [(name, row["fixed_bytes"], row["auc"]) for name, row in named]
     return found
 
 
@@ -489,19 +464,17 @@ def storage_tables(rows: Sequence[Row], at: float = AT) -> Iterator[str]:
     for case, own in by("case", rows).items():
         table = [["route bytes per place:", *(f"{budget:g}" for budget in SHOWN)]]
         for name, some in families(own).items():
-            sizes = [(row["route_bytes_per_place"] or 0, row["auc"] or 0) for row in some]
-            fits = ([auc for size, auc in sizes if size <= NEAR * budget] for budget in SHOWN)
+            fits = ([auc for size, auc in front(some) if size <= NEAR * budget] for budget in SHOWN)
             table.append([name, *(f"{max(areas):.3f}" if areas else "" for areas in fits)])
         yield f"{printable(case)}: AUC\n{text_table(table)}\n"
-        ours = {
-            T: [p[1] for p in front(families(own).get(OURS, ()), T) if p[0] <= NEAR * at] for T in LENGTHS
-        }
-        levels = {length: min(max(areas), LEVEL) for length, areas in ours.items() if areas}
+        ours = {T: front(families(own).get(OURS, ()), T) for T in LENGTHS}
+        near = {T: [auc for size, auc in points if size <= NEAR * at] for T, points in ours.items()}
+        levels = {T: min(max(areas), LEVEL) for T, areas in near.items() if areas}
         if levels:
-            table = [["queries together:", *(f"T = {length}" for length in levels)]]
+            table = [["queries together:", *(f"T = {T}" for T in levels)]]
             table.append(["AUC", *(f"{level:.3f}" for level in levels.values())])
             for name, some in families(own).items():
-                table.append([name, *(needed(auc, front(some, length)) for length, auc in levels.items())])
+                table.append([name, *(needed(auc, front(some, T)) for T, auc in levels.items())])
             yield f"route bytes per place for an AUC\n{text_table(table)}\n"
         if case in others:
             table = [["whitening:", "fixed kB", "AUC"]]
@@ -520,7 +493,8 @@ def skipped_lines(rows: Sequence[Row]) -> list[str]:
     for row in rows:
         if row["skipped"]:
             reasons.setdefault((row["case"], row["skipped"]), []).append(row["contender"])
-    return [
-        printable(f"{case}: skipped {names[0]}{f' and {len(names) - 1} more' * (len(names) > 1)}: {reason}")
-        for (case, reason), names in reasons.items()
-    ]
+    lines = []
+    for (case, reason), (first, *others) in reasons.items():
+        more = f" and {len(others)} more" if others else ""
+        lines.append(printable(f"{case}: skipped {first}{more}: {reason}"))
+    return lines

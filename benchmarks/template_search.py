@@ -24,9 +24,6 @@ OURS, SCAN = "dejavu two layers", "scan"
 def bench_templates(places: Sequence[int], queries: int = 8, repeats: int = 5) -> Iterator[Row]:
     """Time the best place of single queries on maps of two layers, a row at a time.
 
-    Args:
-        places: N of each map. queries: matched one behind the other. repeats: of which the best counts.
-
     Convention: seconds, those of the first run too, are of a single query, in one thread, with its distances
         to all templates. `file_bytes` are what grows of the map's file: the templates and their layers.
     """

@@ -13,7 +13,7 @@ import torch
 from torch import nn
 from tqdm import tqdm
 
-from benchmarks.measure import Row, write_bench
+from benchmarks.measure import Row, truth_of, write_bench
 from benchmarks.plots import plot_ratios
 from dejavu_torch.data.ground_truth import GroundTruth
 from dejavu_torch.data.source import open_source
@@ -22,7 +22,6 @@ from dejavu_torch.evaluation.report import text_table
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.maps.spectral import SpectralMapper
-from dejavu_torch.motion.resampling import ground_truth_of
 from dejavu_torch.types import InputError, Traverse
 
 ROUTE = ("sim:aerial?frames=1000", "sim:aerial?frames=1000&traverse=1")
@@ -61,35 +60,6 @@ def ladder() -> list[Rung]:
     if has_bf16():
         rungs.append(rungs[-1]._replace(name="16 bits", precision="bf16-mixed"))
     return [*rungs, rungs[-1]._replace(name="a rate in the loss", rate=RATE)]
-
-
-def bench_train(
-    reference: Traverse, query: Traverse, steps: int, seeds: Sequence[int], rungs: Sequence[Rung]
-) -> list[Row]:
-    """Train a descriptor of the reference in several ways, on the CPU, and find the query on maps of it.
-
-    Args:
-        reference, query: traverses of one route. steps: of each training. seeds: a training each.
-
-    Returns:
-        seconds: of the steps alone. auc, recall_at_1: by route bytes per place of the map, where they suffice
-        for one.
-
-    Raises:
-        InputError: no steps or seeds, or nothing that tells the right places.
-    """
-    if steps < 1 or not all(0 <= seed < 2**32 for seed in seeds):
-        seen = f"bench train got {steps} steps and seeds {list(seeds)}"
-        raise InputError(f"{seen}; expected at least one each, and seeds from 0 to 2^32 - 1")
-    truth = ground_truth_of(None, reference, query, aligned=True)
-    if truth is None:
-        raise InputError(
-            f"nothing tells the places of {query.name}: it has {query.length} frames, {reference.name} "
-            f"{reference.length}; expected as many"
-        )
-    logging.getLogger("pytorch_lightning").setLevel(logging.WARNING)
-    works = tqdm([(rung, seed) for rung in rungs for seed in seeds], "train", disable=None, leave=False)
-    return [trained(rung, seed, reference, query, truth, steps) for rung, seed in works]
 
 
 def trained(
@@ -156,36 +126,43 @@ def run_train(
         steps: those of each training; 600 if not given
         seeds: a training each; 0, 1 and 2 if not given
 
+    Convention: on the CPU; seconds are of the steps alone; auc and recall_at_1 are by route bytes per place
+        of the map, where they suffice for one.
+
     Raises:
-        InputError: as `bench_train`, or other than two sources.
+        InputError: other than two sources, no steps or seeds, or nothing that tells the right places.
     """
     from dejavu_torch.training.export import has_bf16
 
+    steps, seeds = STEPS if steps is None else steps, seeds or SEEDS
     if len(sources) not in (0, 2):
         raise InputError(f"bench train got {len(sources)} sources; expected REFERENCE QUERY, or none")
+    if steps < 1 or not all(0 <= seed < 2**32 for seed in seeds):
+        seen = f"bench train got {steps} steps and seeds {list(seeds)}"
+        raise InputError(f"{seen}; expected at least one each, and seeds from 0 to 2^32 - 1")
     reference, query = (open_source(source) for source in sources or ROUTE)
-    rows = bench_train(reference, query, STEPS if steps is None else steps, seeds or SEEDS, ladder())
-    means = {name: sum(row["seconds"] for row in own) / len(own) for name, own in by_rung(rows).items()}
-    picture = plot_ratios({f"{rows[0]['steps']} steps": means}, "seconds of a training, mean of the seeds")
+    truth = truth_of(reference, query)
+    logging.getLogger("pytorch_lightning").setLevel(logging.WARNING)
+    works = tqdm([(rung, seed) for rung in ladder() for seed in seeds], "train", disable=None, leave=False)
+    rows = [trained(rung, seed, reference, query, truth, steps) for rung, seed in works]
+    rungs: dict[str, list[Row]] = {}
+    for row in rows:
+        rungs.setdefault(row["contender"], []).append(row)
+    means = {name: sum(row["seconds"] for row in own) / len(own) for name, own in rungs.items()}
+    picture = plot_ratios({f"{steps} steps": means}, "seconds of a training, mean of the seeds")
     write_bench(out, rows, picture, bf16=has_bf16())
-    seeded = ", ".join(dict.fromkeys(str(row["seed"]) for row in rows))
-    seen = f"{rows[0]['case']}, seeds {seeded}, threads: {rows[0]['threads']}"
-    return [train_table(rows, means), f"{seen}; each row changes one thing of the row above"]
-
-
-def by_rung(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    names = dict.fromkeys(row["contender"] for row in rows)
-    return {name: [row for row in rows if row["contender"] == name] for name in names}
-
-
-def train_table(rows: Sequence[Row], means: dict[str, float]) -> str:
-    """The figures as aligned text: means of the seeds, and their lowest and highest."""
     table = [["", "seconds", *(f"AUC at {budget:g} B" for budget in BUDGETS)]]
-    for name, own in by_rung(rows).items():
-        line = [name, f"{means[name]:.1f}"]
-        for budget in BUDGETS:
-            found = [row["auc"][f"{budget:g}"] for row in own if f"{budget:g}" in row["auc"]]
-            told = f"{sum(found) / len(found):.3f} ({min(found):.3f}-{max(found):.3f})" if found else "-"
-            line.append(told)
-        table.append(line)
-    return text_table(table)
+    for name, own in rungs.items():
+        areas = ([row["auc"][key] for row in own if key in row["auc"]] for key in map("{:g}".format, BUDGETS))
+        table.append([name, f"{means[name]:.1f}", *map(spread, areas)])
+    seen = (
+        f"{rows[0]['case']}, seeds {', '.join(map(str, dict.fromkeys(seeds)))}, threads: {rows[0]['threads']}"
+    )
+    return [text_table(table), f"{seen}; each row changes one thing of the row above"]
+
+
+def spread(values: list[float]) -> str:
+    """Their mean, the lowest and the highest."""
+    if not values:
+        return "-"
+    return f"{sum(values) / len(values):.3f} ({min(values):.3f}-{max(values):.3f})"

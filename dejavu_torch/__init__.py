@@ -38,96 +38,73 @@ from typing import TYPE_CHECKING, Any
 from dejavu_torch.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from dejavu_torch.data.source import open_source
-    from dejavu_torch.evaluation.compare import compare
-    from dejavu_torch.evaluation.curves import evaluate, pr_curve
-    from dejavu_torch.features.embedding import Embedding
-    from dejavu_torch.features.hog import HOG, hog
-    from dejavu_torch.features.preprocess import Preprocess
-    from dejavu_torch.features.whitening import Whitening
-    from dejavu_torch.live.localizer import LiveLocalizer
-    from dejavu_torch.maps.distance import phase_distances
-    from dejavu_torch.maps.place_map import PlaceMap
-    from dejavu_torch.maps.spectral import SpectralMapper
-    from dejavu_torch.maps.template_map import TemplateMap, TemplateMapper
-    from dejavu_torch.maps.templates import PhaseTemplates, phase_mask
-    from dejavu_torch.model import DejaVu
-    from dejavu_torch.motion.odometry import GroundOdometry
-    from dejavu_torch.periods.imposed import ImposedPeriods
-    from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
-    from dejavu_torch.recognition.filter import PlaceFilter
-    from dejavu_torch.recognition.select import best_match
-    from dejavu_torch.recognition.sequence import SequenceMatcher
-    from dejavu_torch.training.datamodule import RouteData
-    from dejavu_torch.training.task import PlaceRecognitionTask
-    from dejavu_torch.types import FrequencyLayer, InputError, Match, Traverse
-
-__all__ = [
-    "HOG",
-    "DejaVu",
-    "Embedding",
-    "FrequencyLayer",
-    "GroundOdometry",
-    "ImposedPeriods",
-    "InputError",
-    "LiveLocalizer",
-    "Match",
-    "PhaseTemplates",
-    "PlaceFilter",
-    "PlaceMap",
-    "PlaceRecognitionTask",
-    "Preprocess",
-    "RouteData",
-    "SequenceMatcher",
-    "SpectralMapper",
-    "SpectrogramAnalysis",
-    "TemplateMap",
-    "TemplateMapper",
-    "Traverse",
-    "Whitening",
-    "best_match",
-    "compare",
-    "evaluate",
-    "hog",
-    "open_source",
-    "phase_distances",
-    "phase_mask",
-    "pr_curve",
-]
+    from dejavu_torch.data.source import open_source as open_source
+    from dejavu_torch.evaluation.compare import compare as compare
+    from dejavu_torch.evaluation.curves import evaluate as evaluate
+    from dejavu_torch.evaluation.curves import pr_curve as pr_curve
+    from dejavu_torch.features.embedding import Embedding as Embedding
+    from dejavu_torch.features.hog import HOG as HOG
+    from dejavu_torch.features.hog import hog as hog
+    from dejavu_torch.features.preprocess import Preprocess as Preprocess
+    from dejavu_torch.features.whitening import Whitening as Whitening
+    from dejavu_torch.live.localizer import LiveLocalizer as LiveLocalizer
+    from dejavu_torch.maps.distance import phase_distances as phase_distances
+    from dejavu_torch.maps.place_map import PlaceMap as PlaceMap
+    from dejavu_torch.maps.spectral import SpectralMapper as SpectralMapper
+    from dejavu_torch.maps.template_map import TemplateMap as TemplateMap
+    from dejavu_torch.maps.template_map import TemplateMapper as TemplateMapper
+    from dejavu_torch.maps.templates import PhaseTemplates as PhaseTemplates
+    from dejavu_torch.maps.templates import phase_mask as phase_mask
+    from dejavu_torch.model import DejaVu as DejaVu
+    from dejavu_torch.motion.odometry import GroundOdometry as GroundOdometry
+    from dejavu_torch.periods.imposed import ImposedPeriods as ImposedPeriods
+    from dejavu_torch.periods.spectrogram import SpectrogramAnalysis as SpectrogramAnalysis
+    from dejavu_torch.recognition.filter import PlaceFilter as PlaceFilter
+    from dejavu_torch.recognition.select import best_match as best_match
+    from dejavu_torch.recognition.sequence import SequenceMatcher as SequenceMatcher
+    from dejavu_torch.training.datamodule import RouteData as RouteData
+    from dejavu_torch.training.task import PlaceRecognitionTask as PlaceRecognitionTask
+    from dejavu_torch.types import (
+        FrequencyLayer as FrequencyLayer,
+    )
+    from dejavu_torch.types import (
+        InputError as InputError,
+    )
+    from dejavu_torch.types import (
+        Match as Match,
+    )
+    from dejavu_torch.types import (
+        Traverse as Traverse,
+    )
 
 # where each name lives: a room is imported when one of its names is first asked for
-_HOMES = {
-    "DejaVu": "model",
-    "Embedding": "features.embedding",
-    "FrequencyLayer": "types",
-    "GroundOdometry": "motion.odometry",
-    "HOG": "features.hog",
-    "ImposedPeriods": "periods.imposed",
-    "InputError": "types",
-    "LiveLocalizer": "live.localizer",
-    "Match": "types",
-    "PhaseTemplates": "maps.templates",
-    "PlaceFilter": "recognition.filter",
-    "PlaceMap": "maps.place_map",
-    "PlaceRecognitionTask": "training.task",
-    "Preprocess": "features.preprocess",
-    "RouteData": "training.datamodule",
-    "SequenceMatcher": "recognition.sequence",
-    "SpectralMapper": "maps.spectral",
-    "SpectrogramAnalysis": "periods.spectrogram",
-    "TemplateMap": "maps.template_map",
-    "TemplateMapper": "maps.template_map",
-    "Traverse": "types",
-    "Whitening": "features.whitening",
-    "best_match": "recognition.select",
-    "compare": "evaluation.compare",
-    "evaluate": "evaluation.curves",
-    "hog": "features.hog",
-    "open_source": "data.source",
-    "phase_distances": "maps.distance",
-    "phase_mask": "maps.templates",
-    "pr_curve": "evaluation.curves",
+_NAMES = {
+    "data.source": "open_source",
+    "evaluation.compare": "compare",
+    "evaluation.curves": "evaluate pr_curve",
+    "features.embedding": "Embedding",
+    "features.hog": "HOG hog",
+    "features.preprocess": "Preprocess",
+    "features.whitening": "Whitening",
+    "live.localizer": "LiveLocalizer",
+    "maps.distance": "phase_distances",
+    "maps.place_map": "PlaceMap",
+    "maps.spectral": "SpectralMapper",
+    "maps.template_map": "TemplateMap TemplateMapper",
+    "maps.templates": "PhaseTemplates phase_mask",
+    "model": "DejaVu",
+    "motion.odometry": "GroundOdometry",
+    "periods.imposed": "ImposedPeriods",
+    "periods.spectrogram": "SpectrogramAnalysis",
+    "recognition.filter": "PlaceFilter",
+    "recognition.select": "best_match",
+    "recognition.sequence": "SequenceMatcher",
+    "training.datamodule": "RouteData",
+    "training.task": "PlaceRecognitionTask",
+    "types": "FrequencyLayer InputError Match Traverse",
 }
+_HOMES = {name: module for module, names in _NAMES.items() for name in names.split()}
+__all__ = sorted(_HOMES)
 
 
 def __getattr__(name: str) -> Any:

@@ -11,12 +11,13 @@ import sys
 import sysconfig
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -36,13 +37,6 @@ RETRIES = 3  # of a task whose worker died
 AHEAD = 2  # tasks for each processor that are submitted at a time
 TASK = 1024  # places at least, whose chunks one task makes
 QUIET = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}  # no telemetry, no advice
-
-
-class Failure(NamedTuple):
-    """Why a task ended early, and on which host; None if its worker died, and took that along."""
-
-    why: str
-    host: str | None
 
 
 class Cluster:
@@ -87,53 +81,53 @@ class Cluster:
     def __exit__(self, *_: object) -> None:
         self.ray.shutdown()  # with the workers that `auto` started
 
-    def run(
-        self, function: Callable[..., Iterable[Any]], tasks: Sequence[Any], *shared: object
-    ) -> Generator[tuple[Any, list[Any], Failure | None], None, None]:
-        """Go through `function(task, *shared)` for all tasks: each with its results, as tasks are finished.
+    def code(
+        self, coder: ChunkCoder, traverse: Traverse, tasks: Sequence[range]
+    ) -> Iterator[tuple[range, list[Chunk], str]]:
+        """Code chunks of a traverse: each task, the numbers of some, with its chunks, as tasks are finished.
 
         A task whose worker dies is run again, `RETRIES` times.
 
         Returns:
-            A task, what the function gave, and what ended it early, if anything did.
+            A task, its chunks, and what ended it before the last, if anything did, else "".
         """
-        remote = self.ray.remote(num_cpus=1, max_retries=RETRIES)(_run)
-        with _by_value(self.ray, shared):
-            sent = [self.ray.put(shared)]
-        waiting, running = deque(tasks), dict[Any, Any]()
+        remote = self.ray.remote(num_cpus=1, max_retries=RETRIES)(_code)
+        with _by_value(self.ray, (coder, traverse)):
+            sent = [self.ray.put((coder, traverse))]
+        waiting, running = deque(tasks), dict[Any, range]()
         try:
             while waiting or running:
                 while waiting and len(running) < AHEAD * self.workers:
                     task = waiting.popleft()
-                    running[remote.remote(function, sent, task, os.getcwd())] = task
+                    running[remote.remote(sent, task, os.getcwd())] = task
                 done, _ = self.ray.wait(list(running))
                 for one in done:
-                    yield running.pop(one), *self._results(one)
+                    yield running.pop(one), *self._chunks(one)
         finally:
             for one in running:
                 with suppress(Exception):
                     self.ray.cancel(one, force=True)
 
-    def _results(self, reference: Any) -> tuple[list[Any], Failure | None]:
+    def _chunks(self, reference: Any) -> tuple[list[Chunk], str]:
         try:
-            results: tuple[list[Any], Failure | None] = self.ray.get(reference)
+            results: tuple[list[Chunk], str] = self.ray.get(reference)
             return results
         except self.ray.exceptions.RayTaskError:  # an error of ours
             raise
         except self.ray.exceptions.RayError as error:
             seen = f"its worker died, {RETRIES + 1} times ({one_line(error)[:100]})"
-            return [], Failure(f"{seen}; expected workers that live, and memory for them", None)
+            return [], f": {seen}; expected workers that live, and memory for them"
 
 
 def code_on(
     cluster: Cluster,
     coder: ChunkCoder,
     traverse: Traverse,
-    first: int,
+    wanted: range,
     progress: str | None = None,
     together: int = 0,
 ) -> Iterator[Chunk]:
-    """As `encode_local`, by a cluster: the same bytes in the same order.
+    """As `ChunkCoder.chunks`, by a cluster: the same bytes in the same order.
 
     A traverse that cannot seek is read from its beginning by every worker, so that its chunks are divided
     into few tasks.
@@ -146,32 +140,26 @@ def code_on(
     """
     together = together or max(1, TASK // coder.chunk)
     if not traverse.seeks:
-        together = max(together, -(-(coder.total - first) // cluster.workers))
-    tasks = [
-        range(start, min(start + together, coder.total)) for start in range(first, coder.total, together)
-    ]
-    total = len(range(*coder.span(range(first, coder.total))))
+        together = max(together, -(-len(wanted) // cluster.workers))
+    tasks = [wanted[i : i + together] for i in range(0, len(wanted), together)]
+    total = len(range(*coder.span(wanted)))
     done: dict[int, Chunk] = {}
-    failed: dict[int, tuple[range, Failure]] = {}
-    following = first
+    failed: dict[int, str] = {}
+    following = wanted.start
     with tqdm(
         total=total, desc=progress, unit="frame", disable=None if progress else True, leave=False
     ) as bar:
-        runs = cluster.run(lambda task, coder, source: coder.chunks(source, task), tasks, coder, traverse)
-        for task, made, failure in runs:
+        for task, made, failure in cluster.code(coder, traverse, tasks):
             done |= zip(task, made, strict=False)
             bar.update(sum(chunk.places for chunk in made))
-            if failure is not None:
-                rest = range(task.start + len(made), task.stop)
-                failed[rest.start] = rest, failure
+            if failure:
+                start, stop = coder.span(task[len(made) :])
+                failed[task[len(made)]] = f"frames {start} to {stop - 1}{failure}"
             while following in done:
                 yield done.pop(following)
                 following += 1
             if following in failed:
-                rest, failure = failed[following]
-                start, stop = coder.span(rest)
-                read = "" if failure.host is None else f", read on {failure.host}"
-                raise InputError(f"frames {start} to {stop - 1}{read}: {failure.why}")
+                raise InputError(failed[following])
 
 
 class ClusterSearch:
@@ -230,10 +218,6 @@ class _Searcher:
         self.part, self.first = part, first
         self.find = None if method == "scan" else coarse_search(part, memory, method == "exact")
 
-    def process(self) -> int:
-        """The number of this process."""
-        return os.getpid()
-
     def search(self, queries: Any, wanted: Wanted) -> tuple[Any, Any]:
         """Scores and places in which the wanted candidates of the part are, as arrays."""
         own = torch.from_numpy(queries.copy())
@@ -263,29 +247,25 @@ def _processors() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-_shared: dict[str, Any] = {}  # of a worker process: what it was sent last
+@lru_cache(1)
+def _received(reference: Any) -> Any:
+    """What this worker process was sent last: coder and traverse are unpacked once, not for each task."""
+    return check_installed().get(reference)
 
 
-def _run(
-    function: Callable[..., Iterable[Any]], sent: list[Any], task: Any, folder: str
-) -> tuple[list[Any], Failure | None]:
-    """A task, in a worker."""
-    import ray
-
+def _code(sent: list[Any], task: range, folder: str) -> tuple[list[Chunk], str]:
+    """The chunks of a task, in a worker, and what ended it early, else ""."""
     with suppress(OSError):
         os.chdir(folder)
-    key = sent[0].hex()
-    if key not in _shared:
-        _shared.clear()
-        _shared[key] = ray.get(sent[0])
-    results: list[Any] = []
+    coder, traverse = _received(sent[0])
+    chunks: list[Chunk] = []
     try:
-        for result in function(task, *_shared[key]):
-            results.append(result)
+        for chunk in coder.chunks(traverse, task):
+            chunks.append(chunk)
     except (InputError, OSError, RuntimeError, MemoryError) as error:
         kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
-        return results, Failure(kind + one_line(error), socket.gethostname())
-    return results, None
+        return chunks, f", read on {socket.gethostname()}: {kind}{one_line(error)}"
+    return chunks, ""
 
 
 @contextmanager

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 from collections.abc import Sequence
 from itertools import count
 
 import torch
-from torch import Tensor, nn
+import torch.nn.functional as F
+from torch import Tensor
 
 from dejavu_torch.data.arrays import as_traverse
 from dejavu_torch.data.ground_truth import find_ground_truth
@@ -18,8 +20,7 @@ from dejavu_torch.learning import (
     Checkpoint,
     ChunkCoder,
     Code,
-    encode_local,
-    extend,
+    append_places,
     observation_counts,
     positions_of,
     with_visits,
@@ -29,7 +30,7 @@ from dejavu_torch.maps.frame_table import FrameTable
 from dejavu_torch.maps.spectral import SpectralMapper, code_chunk
 from dejavu_torch.maps.spectral_map import LARGEST, Chunk, SpectralMap
 from dejavu_torch.model import DejaVu
-from dejavu_torch.model_file import difference, recipe_of, run_key
+from dejavu_torch.model_file import Recipe, difference, recipe_of, run_key, weights_of
 from dejavu_torch.motion.resampling import ResampledTraverse, source_of
 from dejavu_torch.types import InputError, Traverse
 
@@ -44,7 +45,7 @@ def append(
     traverse: Traverse | Tensor,
     progress: bool = False,
     checkpoint: Checkpoint | None = None,
-    code: Code = encode_local,
+    code: Code = ChunkCoder.chunks,
     visits: Views | None = None,
 ) -> DejaVu:
     """Add the places of a traverse after those of a model's map, which stay as they are.
@@ -74,26 +75,26 @@ def append(
         >>> append(model, wave[400:]).localize(wave[[50, 450]]).index
         tensor([ 50, 450])
     """
-    route, describer = one_route(model, "append to"), model.describer
+    route = one_route(model, "append to")
     added = model.resample(as_traverse(traverse), model.step, progress, model.frame_shape)
     _check_alike(model, added)
     places = added.count()
     positions = positions_of(added).to(route.positions.device)
     _check_count(route.places + places, model.step is not None)
-    counts = torch.ones(places, dtype=torch.int64)
+    counts = None
     if visits is not None:
         _check_alike(model, visits.traverse)
-        counts += observation_counts(visits, places)
-    text = "learning" if progress else None
-    part = SpectralMap(route.means, **route.settings(), step=route.step)
+        counts = observation_counts(visits, places)
+    grown = copy.deepcopy(route)
+    grown.positions = route.positions[:0]  # those of all places follow when all are there
     if checkpoint is not None:
-        sums = checksums(route.packed(), route.get_extra_state())
-        key = run_key(model, added, visits=visits) | digests(map=sums)
-        checkpoint.open(key, added, part, model.whitening)
-    coder = ChunkCoder.like(route, describer, places, visits and describer.seekable(visits, text))
-    extend(part, coder, added, text, checkpoint, code)
-    grown = route.of_chunks([*route.coded(), *part.coded()])
-    grown.count_visits(torch.cat([route.visit_counts, counts.to(route.visits.device)]))
+        own = digests(map=checksums(route.packed(), route.get_extra_state()))
+        checkpoint.open(run_key(model, added, visits=visits) | own, added, grown, model.whitening)
+    text = "learning" if progress else None
+    append_places(grown, model.describer, added, route.places, visits, text, checkpoint, code)
+    if counts is not None:
+        before = grown.visit_counts
+        grown.count_visits(before + F.pad(counts.to(before), (route.places, 0)))
     if len(positions):
         grown.positions = torch.cat([route.positions, positions_behind(positions, route.places)])
     grown.check()
@@ -110,7 +111,7 @@ def learn_mean(
     progress: bool = False,
     second: Views | None = None,
     checkpoint: Checkpoint | None = None,
-    code: Code = encode_local,
+    code: Code = ChunkCoder.chunks,
 ) -> DejaVu:
     """As `DejaVu.learn`, of the mean of several visits to each place: what changes between them cancels out.
 
@@ -134,9 +135,7 @@ def learn_mean(
     if not isinstance(model.mapper, SpectralMapper):
         seen = f"{type(model.mapper).__name__} makes templates, which are means of many places already"
         raise InputError(f"{seen}; expected a SpectralMapper to average visits for")
-    reference = model.resample(as_traverse(traverse), progress=progress)
-    model.describer.check_sizes(reference, visits.traverse)
-    return model.learn(reference, progress, second, checkpoint, code, visits)
+    return model.learn(traverse, progress, second, checkpoint, code, visits)
 
 
 @torch.no_grad()
@@ -159,7 +158,7 @@ def average(model: DejaVu, visits: Views, progress: bool = False) -> int:
     route = one_route(model, "average visits into")
     _check_alike(model, visits.traverse)
     counts, seen = route.visit_counts.cpu(), observation_counts(visits, route.places)
-    described, shown = model.describer.visits(visits, route.dimension, "averaging" if progress else None)
+    described, shown = model.describer.visits(visits, "averaging" if progress else None)
 
     def averaged(g: int, chunk: Chunk) -> Chunk:
         start, stop = route.chunks[g]
@@ -329,16 +328,11 @@ def _another(name: str, known: dict[str, SpectralMap]) -> str:
 def _unlike(first: DejaVu, other: DejaVu) -> str:
     """What of two models makes other descriptors, or other scores, in words; "" if nothing does."""
     for what in ("preprocess", "features", "whitening", "velocity"):
-        one, two = getattr(first, what), getattr(other, what)
-        if one is None and two is None:
-            continue
-        if one is None or two is None:
-            has = [f"has {'no ' if part is None else ''}{what}" for part in (one, two)]
-            return f"the one {has[0]}, the other {has[1]}; expected the same"
-        stored, given = recipe_of(one), recipe_of(two)
+        parts = (getattr(model, what) for model in (first, other))
+        stored, given = (Recipe(f"no {what}", {}) if part is None else recipe_of(part) for part in parts)
         if stored != given:
             return f"their {what} differ: {difference(stored, given)}"
-        if _digest(one) != _digest(two):
+        if checksums(weights_of(first, what), None) != checksums(weights_of(other, what), None):
             way = "--whitening" if what == "whitening" else "--descriptor"
             learned = f"as `dejavu learn ROUTE {way} MAP` takes it from another map"
             return f"their {what} were learned apart, with other numbers; expected the same, {learned}"
@@ -357,11 +351,6 @@ def _unlike(first: DejaVu, other: DejaVu) -> str:
         known, seen = (" x ".join(map(str, shape or ())) for shape in shapes)
         return f"they were learned from frames of {known} and of {seen}; expected the same size"
     return ""
-
-
-def _digest(module: nn.Module) -> dict[str, str]:
-    state = module.state_dict().items()
-    return checksums({name: value for name, value in state if isinstance(value, Tensor)}, None)
 
 
 def _joined_names(parts: list[list[str]], frames: list[int]) -> list[str]:

@@ -112,20 +112,21 @@ class Describer(NamedTuple):
             self.warn_of_bright(frames, traverse.name)
             check_alone(self.pipeline, frames, features, traverse.name)
 
-        many = learns and spectral and (traverse.length is None or traverse.length > SAMPLE)
-        if many and (frames := traverse.count()):
-            one = next(self.features(Selection(traverse, torch.zeros(1, dtype=torch.int64))))
-            many = frames > SAMPLE and frames * one.nbytes > IN_MEMORY
-        if learns and not many:
-            features = concatenate(self.features(traverse, progress, check_first))
-            self._learn_whitening(features, traverse, second, progress)
-            return concatenate(self.whitened(part.to(self.device)) for part in features.split(ROWS))
-        if learns:
+        if learns and spectral and self._exceeds_memory(traverse):
             sample = Sample.of(traverse.count(), SAMPLE)
             own = second and sample.views(second)
             self.reference(Selection(traverse, sample.frame), own, progress and "sampling")
-        batches = self.descriptors(traverse, progress, None if learns else check_first)
+        elif learns:
+            features = concatenate(self.features(traverse, progress, check_first))
+            self._learn_whitening(features, traverse, second, progress)
+            return concatenate(self.whitened(part.to(self.device)) for part in features.split(ROWS))
+        batches = self.descriptors(traverse, progress, check_first)
         return concatenate(batches, FEW, self.whitening is not None) if spectral else concatenate(batches)
+
+    def _exceeds_memory(self, traverse: Traverse) -> bool:
+        """Whether the float32 features of a traverse of over `SAMPLE` frames are too many to keep."""
+        frames = traverse.count()
+        return frames > SAMPLE and 4 * frames * self.count_features(traverse) > IN_MEMORY
 
     def _learn_whitening(
         self, features: Tensor, traverse: Traverse, second: Views | None, progress: str | None
@@ -146,21 +147,22 @@ class Describer(NamedTuple):
             whitening.learn(features, _with_places(batches, second.places.to(self.device)))
         whitening.to(self.device)
 
-    def visits(self, views: Views, dimension: int, progress: str | None = None) -> tuple[Tensor, Tensor]:
-        """Descriptors (n,K) of the frames that show a place, and these places (n,); others are refused."""
-        name = views.traverse.name
+    def visits(self, views: Views, progress: str | None = None) -> tuple[Tensor, Tensor]:
+        """Descriptors (n,K) of the frames that show a place, and these places (n,)."""
         rows = concatenate(self.descriptors(views.traverse, progress and "averaging"))
-        if rows.shape != (len(views.places), dimension):
-            seen = f"{name} gives descriptors {tuple(rows.shape)} of {len(views.places)} places"
-            raise InputError(f"{seen}; expected one of {dimension} numbers for each")
-        if not bool(rows.isfinite().all()):
-            raise InputError(f"{name} gives NaN or infinite descriptors; expected finite numbers")
+        if len(rows) != len(views.places):
+            seen = (
+                f"{views.traverse.name} gives descriptors {tuple(rows.shape)} of {len(views.places)} places"
+            )
+            raise InputError(f"{seen}; expected one for each")
         shown = views.places.to(rows.device) >= 0
         return rows[shown], views.places[shown.to(views.places.device)]
 
     def averaged(self, rows: Tensor, visits: Views, progress: str | None = None) -> Tensor:
         """Descriptors (N,K) of places, averaged with those of visits to them."""
-        return with_visits(rows.float(), torch.ones(len(rows)), *self.visits(visits, rows.shape[1], progress))
+        if not len(visits.places):
+            return rows
+        return with_visits(rows.float(), torch.ones(len(rows)), *self.visits(visits, progress))
 
     def seekable(self, views: Views, progress: str | None = None) -> Views:
         """Views of a traverse that seeks: as they are, or the features of all, which may lie in a file."""
@@ -213,20 +215,21 @@ class Sample(NamedTuple):
         starts = torch.arange(count) * last // (count - 1) * stretch
         return cls((starts[:, None] + torch.arange(stretch)).flatten(), stretch)
 
-    def shown(self, views: Views) -> Views:
-        """What another traverse shows of the sample, with places that count in it."""
-        places = views.places.cpu()
-        at = torch.searchsorted(self.frame, places).clamp(max=len(self.frame) - 1)
-        shown = (self.frame[at] == places).nonzero().flatten()
-        return Views(Selection(views.traverse, shown), at[shown])
-
     def views(self, second: Views) -> Views:
-        """As `shown`; a traverse that shows nothing of the sample is refused."""
-        found = self.shown(second)
+        """What a second traverse shows of the sample; one that shows nothing of it is refused."""
+        found = shown_of(second, self.frame)
         if not len(found.places):
             seen = f"{second.traverse.name} shows none of the {len(self.frame)} frames that are learned from"
             raise InputError(f"{seen}, in stretches of {self.stretch} all along the route; expected some")
         return found
+
+
+def shown_of(views: Views, frames: Tensor) -> Views:
+    """What a traverse shows of some frames of a route (n,), increasing, with places that count in these."""
+    places = views.places.cpu()
+    at = torch.searchsorted(frames, places).clamp(max=len(frames) - 1)
+    shown = (frames[at] == places).nonzero().flatten()
+    return Views(Selection(views.traverse, shown), at[shown])
 
 
 class ChunkCoder(NamedTuple):
@@ -280,26 +283,14 @@ class ChunkCoder(NamedTuple):
                 held.append(rows)
                 done += len(rows)
                 if done % self.chunk == 0 or done == stop:
-                    rows = torch.cat(held)
-                    yield self.code(self._averaged(rows, done - len(rows)))
-                    held = []
+                    rows, held = torch.cat(held), []
+                    if self.visits is not None:
+                        shown = shown_of(self.visits, torch.arange(done - len(rows), done))
+                        rows = self.describer.averaged(rows, shown)
+                    yield self.code(rows)
         if done < stop:
             seen = f"{traverse.name} ended at frame {done}"
             raise InputError(f"{seen}; expected {self.frames} frames, as it had before")
-
-    def _averaged(self, rows: Tensor, start: int) -> Tensor:
-        """Descriptors (n,K) of the places from `start` on, averaged with those of the visits."""
-        if self.visits is None:
-            return rows
-        traverse, places = self.visits.traverse, self.visits.places.cpu() - start
-        frames = ((places >= 0) & (places < len(rows))).nonzero()[:, 0]
-        if not len(frames):
-            return rows
-        seen = torch.cat([*self.describer.descriptors(Selection(traverse, frames))])
-        if len(seen) != len(frames):
-            problem = f"{traverse.name} has fewer than the {int(frames[-1]) + 1} frames"
-            raise InputError(f"{problem} that it is to show places with; expected these")
-        return with_visits(rows, torch.ones(len(rows)), seen, places[frames])
 
 
 class _ByChunks(Traverse):
@@ -331,15 +322,8 @@ class _ByChunks(Traverse):
         return self.traverse.frame_shape
 
 
-#: the chunks of a traverse in order, from this number on: here, or by the workers of a cluster
-Code = Callable[[ChunkCoder, Traverse, int, str | None], Iterator[Chunk]]
-
-
-def encode_local(
-    coder: ChunkCoder, traverse: Traverse, first: int, progress: str | None = None
-) -> Iterator[Chunk]:
-    """The chunks of a traverse from number `first` on, coded in this process."""
-    return coder.chunks(traverse, range(first, coder.total), progress)
+#: the chunks of a traverse with these numbers, in order: here, or by the workers of a cluster
+Code = Callable[[ChunkCoder, Traverse, range, str | None], Iterator[Chunk]]
 
 
 @contextmanager
@@ -375,7 +359,7 @@ class Checkpoint:
         """Load what the run of this key has finished of a traverse; False if nothing.
 
         Args:
-            route: an empty map, and `whitening`, to load into.
+            route: the map before the traverse, and `whitening`, to load into.
 
         Raises:
             InputError: the file is of a run with another key, or of none, or finished frames were changed.
@@ -391,7 +375,7 @@ class Checkpoint:
         if known != key:
             other = [name for name in {**key, **known} if key.get(name) != known.get(name)]
             self._refuse(f": its {', '.join(other)} {'differs' if len(other) == 1 else 'differ'}")
-        if state["seen"] != traverse.state(0, state["map"]["places"]):
+        if state["seen"] != traverse.state(0, state["map"]["places"] - route.places):
             self._refuse(": frames of its source were changed")
         if whitening is not None:
             whitening.load_state_dict(part_of(tensors, "whitening"))
@@ -409,21 +393,19 @@ class Checkpoint:
         """Whether the partial map was last written over `SAVED` seconds ago."""
         return monotonic() - self.written > SAVED
 
-    def save(self, route: SpectralMap, whitening: Whitening | None, traverse: Traverse) -> None:
-        """Write the partial map of a traverse, if it has places.
+    def save(self, route: SpectralMap, whitening: Whitening | None, traverse: Traverse, places: int) -> None:
+        """Write the partial map, which holds so many places of a traverse.
 
         Raises:
             InputError: the system refuses it; what was there before stays.
         """
-        if not route.places:
-            return
         tensors = {f"map.{name}": tensor for name, tensor in route.packed().items()}
         if whitening is not None:
             tensors |= {f"whitening.{name}": tensor for name, tensor in whitening.state_dict().items()}
         state = {name: getattr(route, name) for name in ("needed", "energy", "error")}
-        state |= {"map": route.get_extra_state(), "seen": traverse.state(0, route.places)}
+        state |= {"map": route.get_extra_state(), "seen": traverse.state(0, places)}
         write_map(self.path, tensors, {"run": dict(self.key), "state": state})
-        self.written, self.kept = monotonic(), route.places
+        self.written, self.kept = monotonic(), places
 
     def remove(self) -> None:
         """Remove the file, if it is of this run."""
@@ -435,87 +417,57 @@ class Checkpoint:
         raise InputError(f"{seen}; expected the command that began it, or the file removed")
 
 
-def learn_map(
+def is_long(traverse: Traverse, chunk: int) -> bool:
+    """Whether a route, coded in chunks of so many places, is learned from a sample and chunk by chunk."""
+    return traverse.count() > max(SAMPLE, chunk)
+
+
+@in_one_thread()
+def fit(
+    mapper: SpectralMapper,
     describer: Describer,
-    mapper: Mapper,
     traverse: Traverse,
     second: Views | None = None,
     visits: Views | None = None,
     progress: str | None = None,
-    checkpoint: Checkpoint | None = None,
-    key: Callable[[], Mapping[str, str]] = dict,
-    code: Code = encode_local,
-) -> PlaceMap:
-    """The map of a traverse; the describer's whitening is learned for it.
-
-    A route of up to `SAMPLE` frames, or of one chunk, is described and coded as a whole. Of a longer one a
-    sample is described and fitted, and then each chunk described, coded and added, so that memory holds a
-    chunk, the sample and the map.
-
-    Args:
-        second, visits, checkpoint, code: see `DejaVu.learn`. key: digests of the run, see `Checkpoint`.
-    """
-    mapper = mapper.with_overhead(positions_of(traverse).nbytes, is_ready(traverse))
-    spectral = isinstance(mapper, SpectralMapper)
-    if isinstance(mapper, SpectralMapper) and (frames := traverse.count()) > max(SAMPLE, mapper.chunk):
-        counts = visits and observation_counts(visits, frames)
-        long = mapper.empty().to(describer.device)
-        with in_one_thread():
-            if checkpoint is None or not checkpoint.open(key(), traverse, long, describer.whitening):
-                sample = Sample.of(frames, mapper.chunk)
-                own = second and sample.views(second)
-                rows = describer.reference(Selection(traverse, sample.frame), own, progress and "sampling")
-                if visits is not None and len((shown := sample.shown(visits)).places):
-                    rows = describer.averaged(rows, shown)
-                # of what the file holds once, the sample pays its share alone
-                share, once = len(rows) / frames, 2 * rows.shape[1]
-                counted = round(share * mapper.overhead - (1 - share) * once)
-                fitted = mapper.with_overhead(counted, mapper.ready).fit(rows, sample.stretch)
-                long = fitted.to(describer.device)
-        coder = ChunkCoder.like(long, describer, frames, visits and describer.seekable(visits, progress))
-        extend(long, coder, traverse, progress, checkpoint, code)
-        _log_reached(long, mapper)
-        route: PlaceMap = long
-    else:
-        if checkpoint is not None:
-            checkpoint.check_unused()
-        descriptors = describer.reference(traverse, second, progress, spectral)
-        counts = visits and observation_counts(visits, len(descriptors))
-        if visits is not None:
-            descriptors = describer.averaged(descriptors, visits, progress)
-        route = learn_descriptors(mapper, descriptors)
-    if counts is not None:
-        route.count_visits(1 + counts)
-    return route
+) -> SpectralMap:
+    """A map without places: whitening, mean and step of a traverse of over `SAMPLE` frames, by its sample."""
+    frames = traverse.count()
+    sample = Sample.of(frames, mapper.chunk)
+    own = second and sample.views(second)
+    rows = describer.reference(Selection(traverse, sample.frame), own, progress and "sampling")
+    if visits is not None:
+        rows = describer.averaged(rows, shown_of(visits, sample.frame))
+    # of what the file holds once, the sample pays its share alone
+    share, once = len(rows) / frames, 2 * rows.shape[1]
+    counted = round(share * mapper.overhead - (1 - share) * once)
+    fitted = mapper.with_overhead(counted, mapper.ready).fit(rows, sample.stretch)
+    return fitted.to(describer.device)
 
 
-@torch.no_grad()
-def learn_descriptors(mapper: Mapper, descriptors: Tensor) -> PlaceMap:
-    """The map that a mapper makes from descriptors (N,K); one of other sizes is refused."""
-    route: PlaceMap = mapper(descriptors)
-    if (route.places, route.dimension) != tuple(descriptors.shape):
-        raise InputError(
-            f"{type(mapper).__name__} made a map of {route.places} places of {route.dimension} "
-            f"features from features {tuple(descriptors.shape)}; expected as many"
-        )
-    return route
-
-
-def extend(
+def append_places(
     route: SpectralMap,
-    coder: ChunkCoder,
+    describer: Describer,
     traverse: Traverse,
+    start: int = 0,
+    visits: Views | None = None,
     progress: str | None = None,
     checkpoint: Checkpoint | None = None,
-    code: Code = encode_local,
+    code: Code = ChunkCoder.chunks,
 ) -> None:
-    """Extend a map by the chunks of a traverse that it does not have yet, with a partial file each minute.
+    """Add the places of a traverse to a map, as coded chunks; the partial map is kept once a minute.
+
+    Args:
+        start: places of the map that precede the traverse; those behind them are there already, as after a
+            kill, and are not made again.
 
     Raises:
         InputError: frames that cannot be read, or a full disk; what is finished is kept.
     """
-    if len(route.chunks) == coder.total:  # as after a kill at the end
-        return
+    coder = ChunkCoder.like(
+        route, describer, traverse.count(), visits and describer.seekable(visits, progress)
+    )
+    missing = range(-(-(route.places - start) // route.chunk), coder.total)
     held: list[Chunk] = []
 
     def add() -> None:
@@ -523,10 +475,10 @@ def extend(
             chunks, held[:] = [*held], []  # if this is interrupted, they are not added again
             route.extend(chunks)
             if checkpoint is not None:
-                checkpoint.save(route, coder.describer.whitening, traverse)
+                checkpoint.save(route, describer.whitening, traverse, route.places - start)
 
     try:
-        for chunk in code(coder, traverse, len(route.chunks), progress):
+        for chunk in code(coder, traverse, missing, progress) if missing else ():
             held.append(chunk)
             # short chunks together, since the map grows by copies
             if sum(one.places for one in held) >= SAMPLE or (checkpoint is not None and checkpoint.due):
@@ -543,7 +495,19 @@ def extend(
         raise InputError(f"{error}; {kept}") from error
 
 
-def _log_reached(route: SpectralMap, mapper: SpectralMapper) -> None:
+@torch.no_grad()
+def learn_descriptors(mapper: Mapper, descriptors: Tensor) -> PlaceMap:
+    """The map that a mapper makes from descriptors (N,K); one of other sizes is refused."""
+    route: PlaceMap = mapper(descriptors)
+    if (route.places, route.dimension) != tuple(descriptors.shape):
+        raise InputError(
+            f"{type(mapper).__name__} made a map of {route.places} places of {route.dimension} "
+            f"features from features {tuple(descriptors.shape)}; expected as many"
+        )
+    return route
+
+
+def log_reached(route: SpectralMap, mapper: SpectralMapper) -> None:
     """The bytes of a long route, and the variance that it holds, if the sample promised other bytes."""
     wanted, places, summary = mapper.budget, route.places, route.summary()
     if wanted is None or summary.route_bytes - summary.route["lines"] >= wanted * places:

@@ -7,7 +7,6 @@ import inspect
 import logging
 import math
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,13 +24,17 @@ from dejavu_torch.features.views import Views
 from dejavu_torch.features.whitening import WIDEST, Whitening
 from dejavu_torch.learning import (
     Checkpoint,
+    ChunkCoder,
     Code,
     Describer,
+    append_places,
     calibration_of,
-    encode_local,
+    fit,
+    is_long,
     is_ready,
     learn_descriptors,
-    learn_map,
+    log_reached,
+    observation_counts,
     positions_of,
 )
 from dejavu_torch.maps.file import checked_fields
@@ -151,7 +154,7 @@ class DejaVu(nn.Module):
         if whitening is None and self.mapper.whitens:
             whitening = Whitening()
         self.whitening = whitening if isinstance(whitening, Whitening) else None
-        self._made: tuple[Whitening, ...] = ()  # the whitening, if `_describer_of` made it for a route
+        self._whitens = self.whitening is not None  # if not, wide features get their own
         self.threshold = None if threshold is None else float(min(threshold, HIGHEST))
         self.precision = precision
         self.batch_size = batch_size
@@ -182,7 +185,7 @@ class DejaVu(nn.Module):
         progress: bool = False,
         second: Views | None = None,
         checkpoint: Checkpoint | None = None,
-        code: Code = encode_local,
+        code: Code = ChunkCoder.chunks,
         visits: Views | None = None,
     ) -> DejaVu:
         """Section III-A: features, what repeats in them, and the map.
@@ -194,7 +197,7 @@ class DejaVu(nn.Module):
             progress: show a progress bar on a terminal, elsewhere a line a minute, on stderr.
             checkpoint: keeps the partial map of a long route, from which learning continues after a kill; it
                 is the caller's to remove.
-            code: what codes the chunks of a long route: `encode_local`, or a cluster.
+            code: what codes the chunks of a long route: this process, or a cluster.
             visits: see `growth.learn_mean`.
 
         Returns:
@@ -211,8 +214,30 @@ class DejaVu(nn.Module):
         """
         traverse = self.resample(as_traverse(traverse), progress=progress)
         describer, text = self._describer_of(traverse), "learning" if progress else None
-        key = partial(run_key, self, traverse, second, visits)
-        route = learn_map(describer, self.mapper, traverse, second, visits, text, checkpoint, key, code)
+        mapper = self.mapper.with_overhead(positions_of(traverse).nbytes, is_ready(traverse))
+        route: PlaceMap
+        counts: Tensor | None = None
+        if visits is not None:
+            describer.check_sizes(traverse, visits.traverse)
+            counts = observation_counts(visits, traverse.count())
+        if isinstance(mapper, SpectralMapper) and is_long(traverse, mapper.chunk):
+            route = mapper.empty().to(describer.device)
+            resumed = checkpoint is not None and checkpoint.open(
+                run_key(self, traverse, second, visits), traverse, route, describer.whitening
+            )
+            if not resumed:
+                route = fit(mapper, describer, traverse, second, visits, text)
+            append_places(route, describer, traverse, 0, visits, text, checkpoint, code)
+            log_reached(route, mapper)
+        else:
+            if checkpoint is not None:
+                checkpoint.check_unused()
+            rows = describer.reference(traverse, second, text, isinstance(mapper, SpectralMapper))
+            if visits is not None:
+                rows = describer.averaged(rows, visits, text)
+            route = learn_descriptors(mapper, rows)
+        if counts is not None:
+            route.count_visits(1 + counts)
         self._keep(describer.whitening)
         return self._take(route, traverse)
 
@@ -257,7 +282,7 @@ class DejaVu(nn.Module):
 
         Ready features too wide for a spectral map become principal components without whitening, too.
         """
-        whitening = None if self._made == (self.whitening,) else self.whitening
+        whitening = self.whitening if self._whitens else None
         if whitening is not None and not whitening.fixed:
             whitening = copy.deepcopy(whitening)
         wide = is_ready(traverse) and traverse.frame_shape[0] > WIDEST
@@ -266,10 +291,10 @@ class DejaVu(nn.Module):
         return self.describer._replace(whitening=whitening)
 
     def _keep(self, learned: Whitening | None) -> None:
-        if self.whitening is None or self._made == (self.whitening,) or learned is None:
-            self.whitening, self._made = learned, (learned,) if learned else ()
-        else:
+        if self._whitens and self.whitening is not None and learned is not None:
             self.whitening.load_state_dict(learned.state_dict())  # it may be the user's, too
+        else:
+            self.whitening = learned
 
     def take_whitening(self, other: DejaVu) -> None:
         """Describe as another model does: its preprocess, features and whitening, which stays as it is.
@@ -280,7 +305,7 @@ class DejaVu(nn.Module):
         if other.whitening is None or not other.whitening.learned:
             raise InputError("its map was learned without whitening; expected one that was learned with it")
         self.take_descriptor(other)
-        self.whitening, self._made = other.whitening, ()
+        self.whitening, self._whitens = other.whitening, True
         self.whitening.fixed = True
 
     def take_descriptor(self, other: DejaVu) -> None:
@@ -329,7 +354,10 @@ class DejaVu(nn.Module):
             return traverse
         if shape is None:
             longest = None if traverse.sized else self.preprocess.size
-            size, why = reduced_size(own, longest, least_size(self.features)), "see preprocess.size"
+            least = own_size(self.features)
+            if least is None and type(self.features) is HOG:
+                least = (self.features.cell * self.features.block,) * 2
+            size, why = reduced_size(own, longest, least), "see preprocess.size"
         else:
             size, why = size_like(own, shape), "the size of the map's frames"
         if size == own:
@@ -661,15 +689,6 @@ class DejaVu(nn.Module):
 def own_size(features: nn.Module) -> tuple[int, int] | None:
     """The size (height, width) that features resize frames to, if a class of this package does."""
     return getattr(features, "resize", None) if type(features) in CLASSES else None
-
-
-def least_size(features: nn.Module) -> tuple[int, int] | None:
-    """The least size that features can be made of, where that is known."""
-    return (
-        (features.cell * features.block,) * 2
-        if type(features) is HOG and not features.resize
-        else own_size(features)
-    )
 
 
 def check_precision(precision: float | None) -> None:

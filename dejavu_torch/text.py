@@ -1,8 +1,13 @@
-"""Text from elsewhere, such as the names of files, as part of messages."""
+"""Text as part of messages: from elsewhere, such as the names of files, and of settings."""
 
 from __future__ import annotations
 
+from inspect import signature
+from typing import TYPE_CHECKING
 from unicodedata import category
+
+if TYPE_CHECKING:
+    from torch import nn
 
 
 def printable(text: object) -> str:
@@ -16,3 +21,9 @@ def printable(text: object) -> str:
 def one_line(text: object) -> str:
     """A text without line breaks, each run of blanks one space."""
     return " ".join(str(text).split())
+
+
+def settings_of(module: nn.Module, *hidden: str) -> str:
+    """The constructor's arguments, as `extra_repr` shows them."""
+    names = (name for name in signature(type(module)).parameters if name not in hidden)
+    return ", ".join(f"{name}={getattr(module, name)!r}" for name in names)

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import io
 from fractions import Fraction
+from types import SimpleNamespace
+from typing import Any
 
 import torch
 from matplotlib.figure import Figure
 from PIL import Image
+from torch import Tensor
 
 from dejavu_torch.evaluation.plots import WIDTH
 from dejavu_torch.types import FrequencyLayer, Match
@@ -20,6 +23,21 @@ def layer(period: Fraction | int, start: int, stop: int, features: int = 2) -> F
 def matched(*index: int) -> Match:
     place = torch.tensor(index)
     return Match(place, torch.zeros(len(place)), place >= 0)
+
+
+def run_of(scores: Tensor, **parts: Any) -> Any:
+    """What pictures take of a `Localization`: scores (Q,N) of single queries, and these parts of it."""
+    queries, places = scores.shape
+    known: dict[str, Any] = {
+        "scores": lambda numbers: scores[numbers],
+        "borders": torch.arange(places + 1),
+        "query_frames": torch.arange(queries),
+        "match": matched(*[0] * queries),
+        "unit": "frames",
+        **dict.fromkeys(("truth", "sequence")),
+    }
+    known |= parts
+    return SimpleNamespace(**known, scored=known["match"])
 
 
 def render(figure: Figure) -> Image.Image:

@@ -15,8 +15,8 @@ import pytest
 import torch
 from command_line import fails, frames, run, write_images
 
-from dejavu_torch.cli import commands, main
-from dejavu_torch.learning import ChunkCoder, encode_local
+from dejavu_torch.cli import main
+from dejavu_torch.learning import ChunkCoder
 from dejavu_torch.maps.spectral_map import Chunk
 from dejavu_torch.model import DejaVu
 from dejavu_torch.types import Traverse
@@ -59,11 +59,13 @@ def test_a_killed_run_goes_on_where_it_was(
     assert not out.exists()
     began: list[int] = []
 
-    def noted(coder: ChunkCoder, traverse: Traverse, first: int, text: str | None = None) -> Iterator[Chunk]:
-        began.append(first)
-        return encode_local(coder, traverse, first, text)
+    code = ChunkCoder.chunks
 
-    monkeypatch.setattr(commands, "encode_local", noted)
+    def noted(coder: ChunkCoder, traverse: Traverse, wanted: range, text: str | None) -> Iterator[Chunk]:
+        began.append(wanted.start)
+        return code(coder, traverse, wanted, text)
+
+    monkeypatch.setattr(ChunkCoder, "chunks", noted)
     run(*words)
     assert 0 < began[0] < LONG / 250
     assert out.read_bytes() == whole.read_bytes()

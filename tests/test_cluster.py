@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from types import ModuleType
@@ -27,7 +27,7 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.source import open_source
 from dejavu_torch.features.views import Views
 from dejavu_torch.growth import learn_mean, merge
-from dejavu_torch.learning import Checkpoint, Sample
+from dejavu_torch.learning import Checkpoint, ChunkCoder, Sample
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import Chunk, SpectralMap
 from dejavu_torch.model import DejaVu
@@ -101,21 +101,16 @@ def file_of(model: DejaVu, folder: Path) -> bytes:
     return (folder / "map.safetensors").read_bytes()
 
 
-@pytest.mark.parametrize("kind", ["array", "stream"])
-def test_workers_write_the_file_of_one_process(kind: str, cluster: Cluster, tmp_path: Path) -> None:
-    traverse = route() if kind == "array" else Stream(route())
-    whitened = DejaVu(mapper=SpectralMapper(6.0, chunk=CHUNK)).learn(traverse)  # type: ignore[arg-type]
-    other = DejaVu(mapper=SpectralMapper(6.0, chunk=CHUNK))
-    other.learn(traverse, code=partial(code_on, cluster))  # type: ignore[arg-type]
-    assert file_of(other, tmp_path) == file_of(whitened, tmp_path)
-
-
-def test_workers_average_a_second_traverse_in(cluster: Cluster, tmp_path: Path) -> None:
-    visits = Views(ArrayTraverse(route() + 0.1), torch.arange(PLACES))
-    models = [DejaVu(None, "none", SpectralMapper(6.0, chunk=CHUNK)) for _ in range(2)]
-    here = learn_mean(models[0], route(), visits)
-    there = learn_mean(models[1], route(), visits, code=partial(code_on, cluster))
-    assert file_of(there, tmp_path) == file_of(here, tmp_path)
+@pytest.mark.parametrize("kind", [ArrayTraverse, Stream])
+def test_workers_write_the_file_of_one_process(
+    kind: Callable[[Tensor], Traverse], cluster: Cluster, tmp_path: Path
+) -> None:
+    """Whitened, and with a second traverse averaged in."""
+    visits, files = Views(kind(route() + 0.1), torch.arange(PLACES)), []
+    for code in (ChunkCoder.chunks, partial(code_on, cluster)):
+        model = DejaVu(mapper=SpectralMapper(6.0, chunk=CHUNK))
+        files.append(file_of(learn_mean(model, kind(route()), visits, code=code), tmp_path))
+    assert files[0] == files[1]
 
 
 def test_a_worker_that_is_killed_is_made_up_for(cluster: Cluster, watched: nn.Module, tmp_path: Path) -> None:
@@ -161,7 +156,7 @@ def test_what_cannot_be_made_is_named_and_what_precedes_it_is_kept(
     began: list[int] = []
 
     def code(*work: object) -> Iterator[Chunk]:
-        began.append(work[2])  # type: ignore[arg-type]
+        began.append(work[2].start)  # type: ignore[attr-defined]
         return code_on(cluster, *work)  # type: ignore[arg-type]
 
     def learn() -> DejaVu:
@@ -239,7 +234,8 @@ def test_probabilities_are_those_of_the_whole_map_whatever_happens_to_a_worker(c
         assert torch.equal(found.accepted, whole.accepted)
         assert torch.equal(found.index, whole.index)
         if not killed:
-            os.kill(cluster.ray.get(search.actors[0].process.remote()), signal.SIGKILL)
+            process = search.actors[0].__ray_call__.remote(lambda _: os.getpid())
+            os.kill(cluster.ray.get(process), signal.SIGKILL)
     assert 0 < int(whole.accepted.sum()) < len(queries)
     with refused("templates", "spectral"):
         ClusterSearch(

@@ -1,13 +1,13 @@
 from __future__ import annotations
 
 import errno
-import os
 import subprocess
 import sys
 import tempfile
 import weakref
 from collections.abc import Iterator
 from pathlib import Path
+from unittest import mock
 
 import pytest
 import torch
@@ -21,11 +21,14 @@ from dejavu_torch.memory import concatenate
 
 
 @given(
-    rows=st.integers(1, 40), width=st.integers(1, 5), batch=st.integers(1, 9), in_memory=st.integers(0, 500)
+    rows=st.integers(1, 40), batch=st.integers(1, 9), block=st.integers(0, 300), in_memory=st.integers(0, 500)
 )
-def test_whatever_the_memory_the_rows_are_the_same(rows: int, width: int, batch: int, in_memory: int) -> None:
-    features = torch.randn(rows, width)
-    assert torch.equal(concatenate(features.split(batch), in_memory), features)
+def test_whatever_the_memory_the_rows_are_the_same(rows: int, batch: int, block: int, in_memory: int) -> None:
+    features = torch.randn(rows, 3)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(memory, "BLOCK", block)
+        assert torch.equal(concatenate(features.split(batch)), features)
+        assert torch.equal(concatenate(features.split(batch), in_memory), features)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -37,15 +40,6 @@ def test_spilled_rows_keep_their_type_and_can_be_changed_without_harm(dtype: tor
     spilled[0] = 7
     assert torch.equal(spilled[1:], features[1:])
     assert spilled[0].eq(7).all()
-
-
-@given(rows=st.integers(1, 40), batch=st.integers(1, 9), block=st.integers(0, 300))
-def test_blocks_change_nothing(rows: int, batch: int, block: int) -> None:
-    features = torch.randn(rows, 3)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(memory, "BLOCK", block)
-        assert torch.equal(concatenate(features.split(batch)), features)
-        assert torch.equal(concatenate(features.split(batch), in_memory=200), features)
 
 
 def test_what_fits_is_not_held_twice() -> None:
@@ -82,25 +76,17 @@ def test_batches_that_do_not_lie_in_a_row_spill_as_they_read() -> None:
     assert torch.equal(concatenate(features.split(5), in_memory=0), features)
 
 
-def test_a_full_disk_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Full:
-        def flush(self) -> None: ...
-
-        def write(self, _: object) -> None:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(tempfile, "TemporaryFile", Full)
-    with refused("do not fit into a temporary file", "No space left on device", "TMPDIR"):
-        concatenate(torch.rand(4, 4).split(1), in_memory=0)
-
-
-def test_no_folder_for_the_file_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    def nowhere() -> None:
-        raise FileNotFoundError(errno.ENOENT, "No usable temporary directory found in ['/nowhere']")
-
-    monkeypatch.setattr(tempfile, "TemporaryFile", nowhere)
-    with refused("do not fit into a temporary file", "No usable temporary directory", "TMPDIR"):
-        concatenate(torch.rand(4, 4).split(1), in_memory=0)
+def test_no_room_for_the_file_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    full, nowhere = (
+        OSError(errno.ENOSPC, "No space left"),
+        FileNotFoundError(errno.ENOENT, "No usable folder"),
+    )
+    file = mock.Mock()
+    file.write.side_effect = full
+    for made, error in ((mock.Mock(return_value=file), full), (mock.Mock(side_effect=nowhere), nowhere)):
+        monkeypatch.setattr(tempfile, "TemporaryFile", made)
+        with refused("do not fit into a temporary file", error.strerror, "TMPDIR"):
+            concatenate(torch.rand(4, 4).split(1), in_memory=0)
 
 
 def test_what_the_traverse_complains_about_passes() -> None:

@@ -34,7 +34,7 @@ from dejavu_torch.recognition.select import best_candidates
 from dejavu_torch.types import SequenceModel
 
 SEQUENCES = [PlaceFilter(), PlaceFilter(search_every=5), SequenceMatcher(3), None]
-ELSEWHERE = ["cuda"] if not torch.cuda.is_available() else [f"cuda:{torch.cuda.device_count()}"]
+ELSEWHERE = f"cuda:{torch.cuda.device_count()}"  # the first that is not there
 
 
 def models() -> dict[str, DejaVu]:
@@ -122,10 +122,8 @@ def test_a_map_calibrated_on_a_gpu_is_as_sure_as_that_of_the_cpu(device: str, fr
     assert expected is not None
     assert found is not None
     assert expected.single is not None
-    for one, other in zip(expected, found, strict=True):
-        assert (one is None) == (other is None)
-        if one is not None:
-            assert tuple(other) == pytest.approx(tuple(one), rel=1e-2)
+    assert found.single == pytest.approx(expected.single, rel=1e-2)
+    assert found.filter == pytest.approx(expected.filter, rel=1e-2)
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -188,8 +186,7 @@ COMMANDS = {
 
 
 @pytest.mark.parametrize(
-    ("command", "device"),
-    [*zip(COMMANDS, [*ELSEWHERE, "tpu", "cpu:1", "cuda:x"], strict=True)],
+    ("command", "device"), [*zip(COMMANDS, [ELSEWHERE, "tpu", "cpu:1", "cuda:x"], strict=True)]
 )
 def test_a_device_that_is_not_there_is_one_line(
     command: str,

@@ -1,10 +1,12 @@
-"""`DejaVu` itself goes through torch.export and torch.compile, with the eager scores whatever the batch."""
+"""`DejaVu` as a graph: torch.export and torch.compile give the eager scores whatever the batch, and `forward`
+never waits for a number, so that its operations can be queued on a device without a stop."""
 
 from __future__ import annotations
 
 import io
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
@@ -12,6 +14,8 @@ import pytest
 import torch
 from helpers import Fixed
 from torch import Tensor, nn
+from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from dejavu_torch import (
     HOG,
@@ -28,7 +32,6 @@ from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.preprocess import VALUES_AT_ONCE
 from dejavu_torch.types import FrequencyLayer, Plan
 
-BATCHES = (1, 8, 100)
 CHUNKS: Plan = (  # overlapping, with gaps, and a rational period
     FrequencyLayer(4, 4, 0, 20, (0, 2)),
     FrequencyLayer("5/2", 3, 5, 25, (0, 1)),
@@ -36,81 +39,58 @@ CHUNKS: Plan = (  # overlapping, with gaps, and a rational period
     FrequencyLayer(7, 7, 30, 50, (1, 2, 3)),
 )
 UNCOVERED = [*range(25, 30), *range(50, 60)]
-BACKBONES: dict[str, Callable[[], nn.Module]] = {
-    "HOG": HOG,
-    "HOG resized": lambda: HOG(resize=(24, 16), bins="linear"),
-    "PatchPixels": lambda: PatchPixels((16, 24)),
-    "SmallCNN": lambda: SmallCNN(8, channels=3, resize=(16, 16), widths=(4, 8), squeeze=4),
-    "Embedding": lambda: Embedding(nn.Conv2d(3, 4, 3), dimension=8, resize=(16, 16), grid=2, cell=4),
-}
-SPECTRAL: dict[str, dict[str, Any]] = {
-    "default": {},
-    "chunks": {"chunk": 25},
-    "dct, l2": {"transform": "dct", "metric": "l2"},
-}
-SETTINGS: dict[str, dict[str, Any]] = {
-    "l1, sum": {"metric": "l1", "reduction": "sum"},
-    "l2": {"metric": "l2"},
-    "cosine, sum": {"metric": "cosine", "reduction": "sum"},
-    "l1, temperature": {"temperature": 0.1},
-}
 
 
-def spectral(backbone: str) -> DejaVu:
+def embedding() -> Embedding:
+    return Embedding(nn.Conv2d(3, 4, 3), dimension=8, resize=(16, 16), grid=2, cell=4)
+
+
+def spectral(features: Callable[[], nn.Module], size: tuple[int, int] = (32, 24)) -> DejaVu:
     """The default, a spectral map of whitened descriptors, of a route of 60 colour frames."""
-    model = DejaVu(BACKBONES[backbone](), Whitening(views=1), SpectralMapper(16.0))
-    return model.learn(torch.rand(60, 3, 32, 24)).eval()
+    model = DejaVu(features(), Whitening(views=1), SpectralMapper(16.0))
+    return model.learn(torch.rand(60, 3, *size)).eval()
 
 
-def learned(backbone: str) -> DejaVu:
-    """A model of a route of 60 colour frames."""
-    periods = ImposedPeriods([3, 4, 5], bin=4)
-    return (
-        DejaVu(BACKBONES[backbone](), mapper=TemplateMapper(periods)).learn(torch.rand(60, 3, 32, 24)).eval()
-    )
+def templates(features: Callable[[], nn.Module], **settings: Any) -> DejaVu:
+    """Templates of a route of 60 colour frames."""
+    mapper = TemplateMapper(ImposedPeriods([3, 4, 5], bin=4))
+    return DejaVu(features(), mapper=mapper, **settings).learn(torch.rand(60, 3, 32, 24)).eval()
 
 
-def of_chunks(**settings: Any) -> DejaVu:
+def of_chunks(plan: Plan = CHUNKS, **settings: Any) -> DejaVu:
     """A model of 4 features and several chunks, with places that no layer covers."""
-    mapper = TemplateMapper(Fixed(*CHUNKS), **settings)
-    return DejaVu(mapper=mapper).learn_features(torch.rand(60, 4)).eval()
+    mapper = TemplateMapper(Fixed(*plan), **settings)
+    return DejaVu(mapper=mapper).learn(torch.rand(60, 4)).eval()
+
+
+def whitened(**settings: Any) -> DejaVu:
+    return DejaVu(mapper=SpectralMapper(16.0, **settings)).learn(torch.rand(60, 8)).eval()
+
+
+MODELS: dict[str, Callable[[], DejaVu]] = {
+    "HOG": partial(templates, HOG),
+    "HOG resized": partial(templates, lambda: HOG(resize=(24, 16), bins="linear")),
+    "PatchPixels": partial(templates, lambda: PatchPixels((16, 24))),
+    "SmallCNN": partial(
+        templates, lambda: SmallCNN(8, channels=3, resize=(16, 16), widths=(4, 8), squeeze=4)
+    ),
+    "grey": partial(templates, HOG, preprocess=Preprocess("grey")),
+    "patches": partial(templates, HOG, preprocess=Preprocess("R-B", "patch")),
+    "spectral": partial(spectral, HOG),
+    "spectral Embedding": partial(spectral, embedding),
+    "in parts": partial(spectral, HOG, (64, 64)),  # eagerly HOG takes 42 frames of this size at a time
+    "spectral chunks": partial(whitened, chunk=25),
+    "spectral dct, l2": partial(whitened, transform="dct", metric="l2"),
+    "no layers": partial(of_chunks, ()),
+    "l1, sum": partial(of_chunks, metric="l1", reduction="sum"),
+    "l2": partial(of_chunks, metric="l2"),
+    "cosine, sum": partial(of_chunks, metric="cosine", reduction="sum"),
+    "l1, temperature": partial(of_chunks, temperature=0.1),
+}
 
 
 def exported(model: DejaVu, queries: Tensor) -> torch.export.ExportedProgram:
     return torch.export.export(model, (queries,), dynamic_shapes={"queries": {0: torch.export.Dim("batch")}})
-
-
-@pytest.mark.figures
-@pytest.mark.skipif(not (shutil.which("g++") or shutil.which("c++")), reason="no C++ compiler")
-def test_the_model_compiled_by_inductor_scores_frames_as_the_model_does() -> None:
-    model = learned("HOG")
-    torch.compiler.reset()
-    run = torch.compile(model, fullgraph=True, dynamic=True)
-    for batch in (8, 100):
-        queries = torch.rand(batch, 3, 32, 24)
-        torch.testing.assert_close(run(queries), model(queries), rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize("training", [True, False])
-def test_the_weights_of_the_features_count(training: bool) -> None:
-    model, queries = of_chunks(), torch.rand(5, 4)
-    before = model(queries)
-    model.map.trainable(weights=True, start=torch.tensor([0.5, 1.0, 2.0, 0.0]))
-    if not training:
-        model.map.freeze()
-    expected = model(queries)
-    assert not torch.allclose(expected[:, :20], before[:, :20])
-    torch.testing.assert_close(exported(model, queries[:2]).module()(queries), expected, rtol=0, atol=1e-6)
-
-
-def assert_scores_alike(
-    run: Callable[[Tensor], Tensor], model: DejaVu, *shape: int, atol: float = 1e-5
-) -> None:
-    for batch in BATCHES:
-        queries = torch.rand(batch, *shape)
-        scores = run(queries)
-        assert scores.dtype == torch.float32
-        torch.testing.assert_close(scores, model(queries), rtol=0, atol=atol)
 
 
 def saved(program: torch.export.ExportedProgram) -> Any:
@@ -121,65 +101,153 @@ def saved(program: torch.export.ExportedProgram) -> Any:
     return torch.export.load(buffer).module()
 
 
-OF_FRAMES: dict[str, Callable[[], DejaVu]] = {
-    **{name: partial(learned, name) for name in BACKBONES},
-    "spectral": partial(spectral, "HOG"),
-    "spectral Embedding": partial(spectral, "Embedding"),
+def queries_of(model: DejaVu, batch: int) -> Tensor:
+    assert model.frame_shape is not None
+    return torch.rand(batch, *model.frame_shape)
+
+
+def assert_scores_alike(run: Callable[[Tensor], Tensor], model: DejaVu) -> None:
+    for batch in (1, 8, 100):
+        queries = queries_of(model, batch)
+        scores = run(queries)
+        assert scores.dtype == torch.float32
+        torch.testing.assert_close(scores, model(queries), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_the_exported_model_scores_as_the_model_does(kind: str) -> None:
+    model = MODELS[kind]()
+    program = exported(model, queries_of(model, 2))
+    # torch does not read a split into nothing
+    assert_scores_alike(program.module() if kind == "no layers" else saved(program), model)
+
+
+@pytest.mark.parametrize("kind", ["HOG", "SmallCNN", "spectral", "no layers", "l1, temperature"])
+def test_the_compiled_model_scores_as_the_model_does(kind: str) -> None:
+    model = MODELS[kind]()
+    torch.compiler.reset()
+    assert_scores_alike(torch.compile(model, fullgraph=True, backend="eager"), model)
+
+
+def test_places_that_nothing_covers_and_frames_that_run_in_parts_are_among_them() -> None:
+    assert of_chunks()(torch.rand(3, 4))[:, UNCOVERED].isposinf().all()
+    assert VALUES_AT_ONCE < 100 * 3 * 64 * 64
+
+
+@pytest.mark.figures
+@pytest.mark.skipif(not (shutil.which("g++") or shutil.which("c++")), reason="no C++ compiler")
+def test_the_model_compiled_by_inductor_scores_frames_as_the_model_does() -> None:
+    model = MODELS["HOG"]()
+    torch.compiler.reset()
+    run = torch.compile(model, fullgraph=True, dynamic=True)
+    for batch in (8, 100):
+        queries = queries_of(model, batch)
+        torch.testing.assert_close(run(queries), model(queries), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_the_weights_of_the_features_count(training: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    model, queries = of_chunks(), torch.rand(5, 4)
+    before = model(queries)
+    model.map.trainable(weights=True, start=torch.tensor([0.5, 1.0, 2.0, 0.0]))
+    if not training:
+        model.map.freeze()
+    with host_synchronisations(monkeypatch) as found:
+        expected = model(queries)
+    assert found == []
+    assert not torch.allclose(expected[:, :20], before[:, :20])
+    torch.testing.assert_close(exported(model, queries[:2]).module()(queries), expected, rtol=0, atol=1e-6)
+
+
+# what the host reads
+
+
+# operations whose result, or the size of it, the host has to read
+READING = {
+    "_local_scalar_dense",
+    "is_nonzero",
+    "equal",
+    "nonzero",
+    "masked_select",
+    "unique_consecutive",
+    "unique_dim",
+    "_unique2",
+    "bincount",
+}
+METHODS = ("item", "tolist", "numpy", "__bool__", "__int__", "__float__", "__index__", "__array__", "cpu")
+
+
+class ReadingOperations(TorchDispatchMode):
+    def __init__(self, found: list[str]) -> None:
+        super().__init__()
+        self.found = found
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        name = func.overloadpacket.__name__
+        masked = name.startswith("index") and any(
+            isinstance(index, Tensor) and index.dtype == torch.bool
+            for argument in args
+            if isinstance(argument, (list, tuple))
+            for index in argument
+        )
+        if name in READING or masked:
+            self.found.append(name)
+        return func(*args, **(kwargs or {}))
+
+
+@contextmanager
+def host_synchronisations(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+    """The names of all operations and methods that read a number from a tensor."""
+    found: list[str] = []
+
+    def counted(name: str, method: Callable[..., Any]) -> Callable[..., Any]:
+        def wrapper(self: Tensor, *args: Any, **kwargs: Any) -> Any:
+            found.append(f"Tensor.{name}")
+            return method(self, *args, **kwargs)
+
+        return wrapper
+
+    with monkeypatch.context() as patched, ReadingOperations(found):
+        for name in METHODS:
+            patched.setattr(Tensor, name, counted(name, getattr(Tensor, name)))
+        yield found
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_forward_reads_no_number(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = MODELS[kind]()
+    for count in (5, 96):
+        queries = queries_of(model, count)
+        with host_synchronisations(monkeypatch) as found:
+            scores = model(queries)
+        assert found == []
+        with FakeTensorMode(allow_non_fake_inputs=True) as mode:  # which has shapes, and no values
+            assert model(mode.from_tensor(queries)).shape == scores.shape
+
+
+def test_backward_reads_no_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    mapper = TemplateMapper(ImposedPeriods([3, 4, 5], bin=4), temperature=0.5, trainable=True)
+    model = DejaVu(mapper=mapper).learn(torch.rand(60, 3, 32, 24))
+    with host_synchronisations(monkeypatch) as found:
+        model(queries_of(model, 5)).sum().backward()
+    assert found == []
+    assert model.map.templates.grad is not None
+
+
+READERS: dict[str, Callable[[Tensor], Any]] = {
+    "item": lambda x: x.sum().item(),
+    "numpy": lambda x: x.numpy(),
+    "bool": lambda x: bool(x.any()),
+    "index": lambda x: [1, 2, 3][x[0].long()],
+    "mask": lambda x: x[x > 0.5],
+    "nonzero": lambda x: x.nonzero(),
+    "unique": lambda x: x.unique(),
+    "equal": lambda x: torch.equal(x, x),
 }
 
 
-@pytest.mark.parametrize("kind", OF_FRAMES)
-def test_the_exported_model_scores_frames_as_the_model_does(kind: str) -> None:
-    model = OF_FRAMES[kind]()
-    program = exported(model, torch.rand(2, 3, 32, 24))
-    assert_scores_alike(program.module(), model, 3, 32, 24)
-    if kind.startswith("spectral"):
-        assert_scores_alike(saved(program), model, 3, 32, 24)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", [*BACKBONES, "spectral"])
-def test_the_compiled_model_scores_frames_as_the_model_does(kind: str) -> None:
-    model = OF_FRAMES[kind]()
-    torch.compiler.reset()
-    assert_scores_alike(torch.compile(model, fullgraph=True, backend="eager"), model, 3, 32, 24)
-
-
-@pytest.mark.parametrize("settings", SPECTRAL.values(), ids=SPECTRAL)
-def test_every_setting_of_a_spectral_map_is_exported(settings: dict[str, Any]) -> None:
-    """Of whitened features."""
-    model = DejaVu(mapper=SpectralMapper(16.0, **settings)).learn(torch.rand(60, 8)).eval()
-    assert_scores_alike(exported(model, torch.rand(2, 8)).module(), model, 8)
-
-
-@pytest.mark.parametrize("settings", SETTINGS.values(), ids=SETTINGS)
-def test_every_setting_of_a_map_is_exported(settings: dict[str, Any]) -> None:
-    model = of_chunks(**settings)
-    program = exported(model, torch.rand(2, 4))
-    assert model(torch.rand(3, 4))[:, UNCOVERED].isposinf().all()
-    for run in (program.module(), saved(program)):
-        assert_scores_alike(run, model, 4, atol=1e-6)
-
-
-@pytest.mark.parametrize("plan", [(), CHUNKS], ids=["no layers", "layers"])
-def test_a_map_is_compiled(plan: Plan) -> None:
-    mapper = TemplateMapper(Fixed(*plan), temperature=0.1)
-    model = DejaVu(mapper=mapper).learn_features(torch.rand(60, 4)).eval()
-    torch.compiler.reset()
-    run = torch.compile(model, fullgraph=True, backend="eager")
-    assert_scores_alike(run, model, 4, atol=1e-6)
-    assert_scores_alike(exported(model, torch.rand(2, 4)).module(), model, 4, atol=1e-6)
-
-
-@pytest.mark.parametrize("preprocess", [Preprocess("grey"), Preprocess("R-B", "patch")], ids=repr)
-def test_preprocessing_is_part_of_the_exported_model(preprocess: Preprocess) -> None:
-    model = DejaVu(mapper=TemplateMapper(ImposedPeriods([3, 4])), preprocess=preprocess)
-    model.learn(torch.rand(40, 3, 32, 24)).eval()
-    assert_scores_alike(exported(model, torch.rand(2, 3, 32, 24)).module(), model, 3, 32, 24)
-
-
-def test_frames_that_run_in_parts_are_exported_whole() -> None:
-    """Eagerly HOG takes 42 frames of this size at a time."""
-    model = DejaVu(HOG(), Whitening(views=1), SpectralMapper(16.0)).learn(torch.rand(60, 3, 64, 64)).eval()
-    assert max(BATCHES) * 3 * 64 * 64 > VALUES_AT_ONCE
-    assert_scores_alike(exported(model, torch.rand(2, 3, 64, 64)).module(), model, 3, 64, 64)
+@pytest.mark.parametrize("reads", READERS.values(), ids=READERS)
+def test_the_counter_sees_them(reads: Callable[[Tensor], Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    with host_synchronisations(monkeypatch) as found:
+        reads(torch.tensor([1.0, 0.0, 1.0]))
+    assert found

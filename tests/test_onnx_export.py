@@ -61,18 +61,6 @@ def flights() -> tuple[Tensor, Tensor]:
     return road, query
 
 
-@pytest.mark.figures  # frames of `flights` are in other tests
-def test_real_frames_score_as_in_torch(data_dir: Path, tmp_path: Path) -> None:
-    strips = (f"strip:{data_dir}/aerial_road/pass{i}.png?halve=1&rows=32:128&width=96" for i in (1, 2))
-    road, query = (torch.cat(list(open_source(strip).between(0, 50))) for strip in strips)
-    model = of_frames(road)
-    export_onnx(model, tmp_path / "map.onnx")
-    session = session_of(str(tmp_path / "map.onnx"))
-    for frames in (query[:1], query):
-        with torch.no_grad():
-            torch.testing.assert_close(run_session(session, frames), model(frames), rtol=0, atol=1e-4)
-
-
 def test_a_file_says_what_it_is(flights: tuple[Tensor, Tensor], tmp_path: Path) -> None:
     import onnx
 

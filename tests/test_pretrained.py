@@ -44,16 +44,6 @@ def test_its_early_blocks_are_a_fortieth_of_it(network: nn.Module) -> None:
     torch.testing.assert_close(program.module()(frames[:2]), net(frames[:2]))
 
 
-def test_it_is_frozen_while_a_map_is_learned(network: nn.Module) -> None:
-    net = Embedding(network.train(), None, resize=(32, 64), layer="_blocks.3")
-    before = {name: value.clone() for name, value in net.state_dict().items()}
-    DejaVu(net, Whitening(numbers=4, views=1)).learn(open_source("sim:aerial?frames=40"))
-    assert all(torch.equal(value, before[name]) for name, value in net.state_dict().items())
-    assert all(parameter.grad is None for parameter in net.parameters())
-    assert not net.training
-    network.eval()
-
-
 def test_on_the_command_line(tmp_path: Path) -> None:
     words = [
         "--features",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 from pathlib import Path
 
 import numpy as np
@@ -54,33 +53,19 @@ def model() -> DejaVu:
     return model.learn(waves())
 
 
-@pytest.mark.parametrize("at_once", [1, 200, 10**6])
-def test_the_first_candidate_is_what_localize_finds(
-    monkeypatch: pytest.MonkeyPatch, model: DejaVu, at_once: int
-) -> None:
+def test_the_first_candidate_is_what_localize_finds(monkeypatch: pytest.MonkeyPatch, model: DejaVu) -> None:
     queries = torch.rand(40, 6, generator=torch.Generator().manual_seed(1))
     index, score, _ = model.candidates(queries, 5, apart=3)
-    monkeypatch.setattr("dejavu_torch.recognition.localizer.SCORES_AT_ONCE", at_once)
+    monkeypatch.setattr("dejavu_torch.recognition.localizer.SCORES_AT_ONCE", 200)
     match = model.localize(queries)
     found = model.candidates(ArrayTraverse(queries), 5, apart=3)
     assert torch.equal(found.index, index)
     assert torch.equal(found.score, score)
     assert torch.equal(index[:, 0], match.index)
     assert torch.equal(score[:, 0], match.score)
-    scores = model(queries)
-    assert torch.equal(scores.gather(1, index), score)
-    assert (score.diff(dim=1) >= 0).all()
-    apart = (index[:, :, None] - index[:, None]).abs() + 99 * torch.eye(5, dtype=torch.int64)
-    assert apart.min() > 3
-
-
-def test_numbers_that_cannot_be_are_refused_in_python(model: DejaVu) -> None:
+    assert torch.equal(model(queries).gather(1, index), score)
     with refused("91 candidates", "90 places"):
         model.candidates(waves(), 91)
-    with refused("0 candidates"):
-        model.candidates(waves(), 0)
-    with refused("no map yet"):
-        DejaVu().candidates(waves(), 3)
 
 
 # in matches.csv
@@ -177,14 +162,6 @@ def test_a_route_of_fewer_places_than_candidates() -> None:
     result = compare(ArrayTraverse(waves), ArrayTraverse(waves + 0.01), "0", model=model, tolerance=0)
     report = result.report.as_json()
     assert (report["recall_at_5"], report["recall_at_10"]) == (1.0, None)
-
-
-def test_without_a_truth_there_is_no_recall(tmp_path: Path) -> None:
-    waves = torch.rand(40, 3)
-    model = template_model(periods=Fixed(FrequencyLayer(40, 40, 0, 40, (0, 1, 2))))
-    report = compare(ArrayTraverse(waves), ArrayTraverse(waves[5:]), model=model).report.as_json()
-    assert (report["recall_at_5"], report["recall_at_10"]) == (None, None)
-    assert json.dumps(report)
 
 
 def test_convention_11_candidates_are_even_steps_apart_and_written_as_frames(tmp_path: Path) -> None:

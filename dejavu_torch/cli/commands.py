@@ -42,7 +42,7 @@ from dejavu_torch.evaluation.answers import next_steps, probable_counts, told_li
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.views import Views
 from dejavu_torch.learning import SAMPLE as SHORT
-from dejavu_torch.learning import Checkpoint, Code, encode_local
+from dejavu_torch.learning import Checkpoint, ChunkCoder, Code
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import SpectralMap
@@ -593,7 +593,7 @@ def _check_cluster(cluster: str, device: str) -> None:
 def _coding(cluster: str | None) -> Iterator[Code]:
     """What makes the chunks of a long route: this process, or a cluster, which ends with the block."""
     if cluster is None:
-        yield encode_local
+        yield ChunkCoder.chunks
         return
     from dejavu_torch.cluster import Cluster, code_on
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from hashlib import blake2b
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.files import LARGEST, reading, state_of
+from dejavu_torch.data.files import reading, state_of
 from dejavu_torch.data.folder import ROUNDING
 from dejavu_torch.data.frame_range import IndexedTraverse
 from dejavu_torch.memory import check_room
@@ -20,7 +19,6 @@ from dejavu_torch.text import printable
 from dejavu_torch.types import InputError, Traverse
 
 UNNAMED = "the array"
-HEADER = 2**14  # bytes; numpy parses no longer header
 EXPECTED = (
     "frames (N,H,W) or (N,H,W,3) uint8, tensors also (N,C,H,W) float in [0, 1], or features (N,D) float"
 )
@@ -98,53 +96,18 @@ def read_array(path: Path) -> ArrayTraverse:
         InputError: not a whole .npy file, an array of another shape or type, or no memory for a frame.
     """
     with reading(path, "is no whole .npy array", EXPECTED):
-        with path.open("rb") as file:
-            shape, kind, by_columns, start = read_header(file.read(HEADER))
-            length = file.seek(0, 2)
-        if start + math.prod(shape) * kind.itemsize > length:
-            raise ValueError(f"{shape} {kind} in {length} bytes")
-        if math.prod(shape):
-            check_room(24.0 * math.prod(shape[1:]), f"a frame of {path}")
-            values: np.ndarray = np.memmap(path, kind, "r", start, shape, "F" if by_columns else "C")
-        else:  # nothing to map
-            values = np.zeros(shape, kind)
+        values = np.lib.format.open_memmap(path, mode="r")
+        check_room(24.0 * math.prod(values.shape[1:]), f"a frame of {path}")
     traverse = ArrayTraverse(values, printable(path))
     traverse.path = path
     return traverse
 
 
-def read_header(head: bytes) -> tuple[tuple[int, ...], np.dtype, bool, int]:
-    """What the first `HEADER` bytes of an .npy array say, before any of its numbers is read.
-
-    Returns:
-        Shape, type, whether columns come first, and the byte where the numbers start.
-
-    Raises:
-        ValueError: no header, a shape that no array has, or a type of anything but plain numbers. What numpy
-            raises of a header that cannot be parsed may be of any type.
-    """
-    file = io.BytesIO(head)
-    version = np.lib.format.read_magic(file)
-    one = version == (1, 0)
-    read = np.lib.format.read_array_header_1_0 if one else np.lib.format.read_array_header_2_0
-    shape, by_columns, kind = read(file)
-    if not all(type(side) is int and 0 <= side < LARGEST for side in shape):
-        raise ValueError(f"shape {shape}")
-    if kind.hasobject or kind.subdtype is not None or kind.names is not None:
-        raise ValueError("no plain numbers")
-    return shape, kind, by_columns, file.tell()
-
-
 def as_traverse(source: Traverse | Tensor) -> Traverse:
-    """A tensor or array of frames or features as a traverse; a traverse as it is.
-
-    Raises:
-        InputError: anything else, such as the address of a source.
-    """
+    """A tensor or array of frames or features as a traverse; a traverse as it is."""
+    if isinstance(source, Tensor | np.ndarray):
+        return ArrayTraverse(source)
     if isinstance(source, Traverse):
         return source
-    if not isinstance(source, Tensor | np.ndarray):
-        raise InputError(
-            f"got a {type(source).__name__}; expected a Traverse, such as open_source gives, or a tensor"
-        )
-    return ArrayTraverse(source)
+    expected = "a Traverse, such as open_source gives, or a tensor"
+    raise InputError(f"got a {type(source).__name__}; expected {expected}")

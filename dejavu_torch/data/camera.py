@@ -12,9 +12,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from torch import Tensor
 
+from dejavu_torch.data.files import why
 from dejavu_torch.data.video import FORMATS, check_alike, pixels_of, seconds_of, stream_of
 from dejavu_torch.resize import is_stretched
-from dejavu_torch.text import one_line, printable
+from dejavu_torch.text import printable
 from dejavu_torch.types import InputError, Traverse
 
 PIPE = "-"  # standard input
@@ -23,15 +24,11 @@ OPENING = 10.0  # seconds that an address may take to answer
 
 
 class Frame(NamedTuple):
-    """A frame of a stream.
+    """A frame of a stream."""
 
-    number: from 0, of all frames that came. seconds: of its timestamp, NaN where it has none. pixels: (H,W,3)
-    uint8, or (C,H,W) float in [0, 1].
-    """
-
-    number: int
-    seconds: float
-    pixels: np.ndarray | Tensor
+    number: int  # from 0, of all frames that came
+    seconds: float  # of its timestamp, NaN where it has none
+    pixels: np.ndarray | Tensor  # (H,W,3) uint8, or (C,H,W) float in [0, 1]
 
 
 def is_stream(source: str) -> bool:
@@ -42,12 +39,7 @@ def is_stream(source: str) -> bool:
 
 
 def without_password(source: str) -> str:
-    """A source as messages name it, printable: an address without what only its user is to know.
-
-    Example:
-        >>> without_password("rtsp://me:secret@192.168.0.7/stream?token=1")
-        'rtsp://192.168.0.7/stream'
-    """
+    """A source as messages name it, printable: an address without what only its user is to know."""
     kind, mark, rest = source.partition("://")
     shown = re.split("[?#]", rest)[0].rpartition("@")[2]  # a password may hold anything but an @
     return printable(f"{kind}://{shown}" if mark else source)
@@ -98,12 +90,9 @@ class Camera:
         except InputError:
             raise
         except Exception as error:  # FFmpeg's, of any type
-            why = one_line(getattr(error, "strerror", None) or str(error) or type(error).__name__)
-            if number:
-                raise InputError(
-                    f"{self.name} broke off after {number} frames: {why}; expected it to go on"
-                ) from error
-            raise InputError(f"{self.name} cannot be read: {why}; expected {self._expected}") from error
+            seen = f"broke off after {number} frames" if number else "cannot be read"
+            expected = "it to go on" if number else self._expected
+            raise InputError(f"{self.name} {seen}: {why(error)}; expected {expected}") from error
         if not number:
             raise InputError(f"{self.name} gave no frames; expected {self._expected}")
         if not self.ends:
@@ -139,12 +128,7 @@ def _mode_is(path: str, test: Any) -> bool:
 
 
 def stretched(name: str, own: tuple[int, int], size: tuple[int, int] | None) -> str:
-    """A line on frames of one size (height, width) that are brought to one of another shape; else "".
-
-    Example:
-        >>> stretched("clip", (480, 640), (120, 160)), bool(stretched("clip", (480, 640), (90, 160)))
-        ('', True)
-    """
+    """A line on frames of one size (height, width) that are brought to one of another shape; else ""."""
     if size is None or not is_stretched(own, size):
         return ""
     seen = f"frames of {own[0]} x {own[1]} pixels are brought to the map's {size[0]} x {size[1]}"

@@ -1,4 +1,4 @@
-"""Files read, whatever they hold."""
+"""Files read, whatever they hold; `expected` is what messages say that a file should hold."""
 
 from __future__ import annotations
 
@@ -19,20 +19,13 @@ BYTES_A_CHARACTER = 64  # that the lines of a table take once they are read
 
 
 def check_regular(path: Path, expected: str) -> int:
-    """The bytes of a file; refuses what is none, such as a fifo or a device, which would be waited for.
-
-    Args:
-        expected: what the file should hold, for messages.
-
-    Raises:
-        InputError: no such file, or no regular one.
-    """
+    """The bytes of a file; refuses what is none, such as a fifo or a device, which would be waited for."""
     try:
         status = path.stat()
     except FileNotFoundError as error:
         raise InputError(f"{path} is not there; expected {expected}") from error
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-        raise InputError(f"{path} cannot be read: {_why(error)}; expected {expected}") from error
+        raise InputError(f"{path} cannot be read: {why(error)}; expected {expected}") from error
     if not stat.S_ISREG(status.st_mode):
         kind = "a folder" if stat.S_ISDIR(status.st_mode) else "no regular file"
         raise InputError(f"{path} is {kind}; expected {expected}")
@@ -40,17 +33,13 @@ def check_regular(path: Path, expected: str) -> int:
 
 
 def state_of(*paths: Path) -> str:
-    """A digest of names, sizes and times of files, which a file that is changed changes.
-
-    Raises:
-        InputError: one of them is not there any more.
-    """
+    """A digest of names, sizes and times of files, which a file that is changed changes."""
     digest = blake2b(digest_size=8)
     for path in paths:
         try:
             status = path.stat()
         except OSError as error:
-            raise InputError(f"{path} cannot be read: {_why(error)}; expected the file as before") from error
+            raise InputError(f"{path} cannot be read: {why(error)}; expected the file as before") from error
         digest.update(f"{path.name}/{status.st_size}/{status.st_mtime_ns}/".encode(errors="surrogateescape"))
     return digest.hexdigest()
 
@@ -61,10 +50,6 @@ def reading(path: Path, seen: str, expected: str) -> Iterator[None]:
 
     Args:
         seen: what a message says of a file that cannot be read, such as "is no image".
-        expected: what the file should hold, for messages.
-
-    Raises:
-        InputError: no regular file, or one that cannot be read; those of the block as they are.
     """
     check_regular(path, expected)
     try:
@@ -74,33 +59,21 @@ def reading(path: Path, seen: str, expected: str) -> Iterator[None]:
     except InputError:
         raise
     except Exception as error:  # a decoder may raise anything: struct.error, KeyError, MemoryError, ..
-        raise InputError(f"{path} {seen}: {_why(error)}; expected {expected}") from error
+        raise InputError(f"{path} {seen}: {why(error)}; expected {expected}") from error
 
 
-def _why(error: Exception) -> str:
+def why(error: Exception) -> str:
     """An exception in words of one line."""
-    text = getattr(error, "strerror", None) or str(error) or type(error).__name__
-    return one_line(text)
+    return one_line(getattr(error, "strerror", None) or str(error) or type(error).__name__)
 
 
 def read_text(path: Path, expected: str) -> str:
-    """A whole text file, without a byte order mark, its lines ended by "\\n".
-
-    Args:
-        expected: what the file should hold, for messages.
-
-    Raises:
-        InputError: it cannot be read, is no text, or larger than the memory.
-    """
+    """A whole text file, without a byte order mark, its lines ended by "\\n"."""
     check_room(BYTES_A_CHARACTER * check_regular(path, expected), f"the text of {path}")
-    try:
+    with reading(path, "cannot be read as UTF-8 text", expected):
         text = path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {_why(error)}; expected {expected}") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path} is no UTF-8 text; expected {expected}") from error
-    if "\0" in text:
-        raise InputError(f"{path} is no text; expected {expected}")
+        if "\0" in text:
+            raise ValueError("there is a null character in it")
     return text
 
 
@@ -109,9 +82,6 @@ def read_rows(path: Path, expected: str) -> list[tuple[int, list[str]]]:
 
     Cells are separated by semicolons, tabs, commas or spaces: by the first of these that the first line with
     several cells has. Where semicolons separate, a comma may be a decimal one, and stays in its cell.
-
-    Raises:
-        InputError: see `read_text`, or quotes that do not fit.
     """
     lines = read_text(path, expected).splitlines()
     separator = next((sign for line in lines for sign in ";\t," if sign in line), " ")

@@ -16,11 +16,7 @@ from dejavu_torch.types import InputError, Traverse
 
 
 class Fitted(Selection):
-    """Frames brought to another shape (C,H,W): sizes are resized, colours made grey or grey ones repeated.
-
-    Raises:
-        InputError: ready features.
-    """
+    """Frames brought to another shape (C,H,W): sizes are resized, colours made grey or grey ones repeated."""
 
     def __init__(self, traverse: Traverse, shape: tuple[int, ...]) -> None:
         if len(traverse.frame_shape) != 3 or len(shape) != 3:
@@ -57,13 +53,7 @@ def fitted(traverse: Traverse, shape: tuple[int, ...]) -> Traverse:
 
 
 def at_size(traverse: Traverse, size: tuple[int, int]) -> Traverse:
-    """The frames of a traverse at another size (height, width): images and videos are decoded at it.
-
-    Example:
-        >>> from dejavu_torch.data.source import open_source
-        >>> at_size(open_source("sim:aerial?frames=40"), (32, 32)).frame_shape
-        (3, 32, 32)
-    """
+    """The frames of a traverse at another size (height, width): images and videos are decoded at it."""
     other = copy.copy(traverse)
     other.sized = True
     if isinstance(other, ImageFolder):

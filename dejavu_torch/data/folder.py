@@ -32,7 +32,6 @@ class ImageFolder(IndexedTraverse):
     of several images in a file only the first counts.
 
     Args:
-        path: the folder.
         width, height: pixels to resize each image to as it is read, antialiased; 0 keeps the image's
             own, or its aspect ratio where only the other is given.
 
@@ -85,18 +84,16 @@ class ImageFolder(IndexedTraverse):
         if shape != expected:
             raise InputError(f"{file} is {shape}; expected {expected} as {name}")
         if self.alike and is_stretched(own, first):
-            sides = [" x ".join(map(str, one)) for one in (own, first)]
-            raise InputError(f"{file} is {sides[0]} pixels; expected the aspect ratio of {name}, {sides[1]}")
+            ratio = f"the aspect ratio of {name}, {first[0]} x {first[1]}"
+            raise InputError(f"{file} is {own[0]} x {own[1]} pixels; expected {ratio}")
         return image
 
 
 def check_size(path: Path, width: int, height: int) -> None:
     """Refuse a size in pixels below 0, which stands for the frames' own, or beyond any frame."""
     if min(width, height) < 0 or max(width, height) > MOST_PIXELS:
-        raise InputError(
-            f"{path}: width={width}, height={height}; expected width and height of at least 0 each, at most "
-            f"{MOST_PIXELS} pixels"
-        )
+        expected = f"width and height of at least 0 each, at most {MOST_PIXELS} pixels"
+        raise InputError(f"{path}: width={width}, height={height}; expected {expected}")
 
 
 def check_pixels(path: Path, rows: int, columns: int, most: int) -> None:
@@ -108,15 +105,7 @@ def check_pixels(path: Path, rows: int, columns: int, most: int) -> None:
 
 
 def fitted_size(path: Path, rows: int, columns: int, width: int, height: int) -> tuple[int, int]:
-    """(rows, columns) of frames resized to width and height; 0 is their own, or what keeps their aspect.
-
-    Raises:
-        InputError: more pixels than a frame can have; `path` is for the message.
-
-    Example:
-        >>> fitted_size(Path("clip.mp4"), 40, 60, width=30, height=0)
-        (20, 30)
-    """
+    """(rows, columns) of frames resized to width and height; 0 is their own, or what keeps their aspect."""
     wide = width or (max(1, round(columns * height / rows)) if height else columns)
     high = height or (max(1, round(rows * width / columns)) if width else rows)
     if (high, wide) != (rows, columns) and high * wide > MOST_PIXELS:
@@ -129,15 +118,12 @@ def fitted_size(path: Path, rows: int, columns: int, width: int, height: int) ->
 def read_image(path: Path, least: int = 0) -> Tensor:
     """One image file as (C,H,W) float32 in [0, 1]; C is 1 for grey images, else 3.
 
-    Of a file of several images it is the first.
-
     Args:
         least: pixels that each side needs, as the image is reduced afterwards: a JPEG is decoded at a half, a
             quarter or an eighth of its size where that has as many. 0 decodes it whole.
 
     Raises:
-        InputError: the file cannot be read as an image, has over 2^28 pixels, more than there is memory for,
-            or numbers outside [0, 1].
+        InputError: no image, over 2^28 pixels, more than there is memory for, or numbers outside [0, 1].
     """
     with (
         reading(path, "cannot be read as an image", "an image such as .png or .jpg"),

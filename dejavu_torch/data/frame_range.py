@@ -47,12 +47,6 @@ class Selection(Traverse):
         frame: (n,) int64, never decreasing, or a range.
 
     Convention: frames count from 0 again. A traverse that does not seek is read through once.
-
-    Example:
-        >>> from dejavu_torch.data.arrays import ArrayTraverse
-        >>> some = Selection(ArrayTraverse(torch.arange(9.0)[:, None]), torch.tensor([1, 2, 6]))
-        >>> torch.cat(list(some.batches(64))).flatten()
-        tensor([1., 2., 6.])
     """
 
     skips = True  # whether a gap is not read, if the traverse seeks
@@ -97,14 +91,7 @@ class Selection(Traverse):
 
 
 class FrameRange(Selection):
-    """The frames [start, stop) of a traverse, every step-th of them; names and positions follow.
-
-    Args:
-        traverse: any traverse.
-        start: the first frame, from 0. stop: the end, which is left out; 0 is that of the traverse.
-        step: how many frames to go on from one to the next.
-
-    Convention: frames count from 0 again; `place` and `cut` keep their values.
+    """The frames [start, stop) of a traverse, every step-th of them; a stop of 0 is the end of the traverse.
 
     Raises:
         InputError: start, stop or step out of range; while reading, a traverse of unknown length that has
@@ -124,11 +111,9 @@ class FrameRange(Selection):
         stops = stop == 0 or start < stop
         beyond = max(start, stop) > LARGEST or (length is not None and max(start + 1, stop) > length)
         if start < 0 or step < 1 or not stops or beyond:
-            given = (("start", start, 0), ("stop", stop, 0), ("step", step, 1))
-            told = ", ".join(f"{name}={value}" for name, value, default in given if value != default)
             part = f"a part of its {'' if length is None else f'{length} '}frames"
             expected = "a step of at least 1" if step < 1 else part
-            raise InputError(f"{traverse.name}: {told}; expected {expected}")
+            raise InputError(f"{traverse.name}: start={start}, stop={stop}, step={step}; expected {expected}")
         end = stop or length or LARGEST
         # a longer step takes one frame as well
         super().__init__(traverse, range(start, end, min(step, max(1, end - start))))
@@ -152,22 +137,10 @@ class FrameRange(Selection):
 
 
 class Chain(Traverse):
-    """The frames of several traverses, one behind the other: parts of one route.
-
-    Args:
-        traverses: at least one; all of frames of one size, or of features of one dimension.
+    """The frames of several traverses, all of one shape, one after the other: parts of one route.
 
     Convention: a frame's name begins with that of its traverse: `morning/0001.png`. Where it truly was is
         not known, as the traverses count for themselves.
-
-    Raises:
-        InputError: frames of different sizes.
-
-    Example:
-        >>> from dejavu_torch.data.arrays import ArrayTraverse
-        >>> parts = [ArrayTraverse(torch.zeros(3, 2)), ArrayTraverse(torch.ones(4, 2))]
-        >>> torch.cat(list(Chain(parts).between(2, 5)))[:, 0]
-        tensor([0., 1., 1.])
     """
 
     def __init__(self, traverses: Sequence[Traverse]) -> None:
@@ -258,12 +231,7 @@ def picked(batches: Iterator[Tensor], span: range, frame: Tensor, size: int) -> 
 
 
 def runs(numbers: Tensor) -> list[range]:
-    """Increasing whole numbers as runs without gaps.
-
-    Example:
-        >>> runs(torch.tensor([1, 2, 3, 7]))
-        [range(1, 4), range(7, 8)]
-    """
+    """Increasing whole numbers as runs without gaps, such as 1, 2, 3, 7 as 1 to 3 and 7."""
     last = torch.cat([numbers.diff() != 1, numbers.new_ones(min(1, len(numbers)), dtype=torch.bool)])
     first = last.roll(1)  # after the last of one run the next begins
     return [range(a, b + 1) for a, b in zip(numbers[first].tolist(), numbers[last].tolist(), strict=True)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import zipfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -13,7 +14,6 @@ import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from dejavu_torch.data.arrays import HEADER, read_header
 from dejavu_torch.data.files import LARGEST, as_number, check_regular, read_rows, reading
 from dejavu_torch.memory import check_room
 from dejavu_torch.types import InputError, Traverse
@@ -61,16 +61,10 @@ def check_table(queries: int, places: int) -> None:
 
 
 def offset_truth(queries: int | Tensor, frames: int | None, offset: int = 0) -> Tensor:
-    """Query i is frame i + offset; -1, no right answer, if there is no such frame.
+    """Query i is frame i + offset, (Q,1) int64; -1, no right answer, if there is no such frame.
 
     Args:
         queries: how many, or (Q,) int64 the number of each. frames: of the reference, None where unknown.
-
-    Shape: -> (Q,1) int64.
-
-    Example:
-        >>> offset_truth(3, 3, offset=1).flatten().tolist()
-        [1, 2, -1]
     """
     frame = (torch.arange(queries) if isinstance(queries, int) else queries) + offset
     there = frame >= 0 if frames is None else (frame >= 0) & (frame < frames)
@@ -80,12 +74,8 @@ def offset_truth(queries: int | Tensor, frames: int | None, offset: int = 0) -> 
 def position_truth(reference: Tensor, query: Tensor) -> Tensor:
     """The reference frame nearest to each query by position along the route.
 
-    Args:
-        reference: (N,) positions of the reference frames. query: (Q,) positions of the queries, in
-            the same unit.
-
-    Shape: -> (Q,1) int64, -1 for a query further than the widest step of the reference from all
-        of its frames.
+    Shape: reference (N,), query (Q,), of one unit -> (Q,1) int64, -1 for a query further than the widest step
+        of the reference from all of its frames.
     """
     ordered, order = reference.double().sort()
     slot = torch.searchsorted(ordered, query.double()).clamp(1, max(1, len(ordered) - 1))
@@ -98,17 +88,9 @@ def position_truth(reference: Tensor, query: Tensor) -> Tensor:
 
 
 def near_truth(reference: Tensor, query: Tensor, radius: float) -> Tensor:
-    """Every reference frame within a distance of each query.
+    """Every reference frame within a radius, inclusive, of each query.
 
-    Args:
-        reference: (N,K) coordinates of the reference frames. query: (Q,K) those of the queries.
-        radius: inclusive, in the unit of the coordinates.
-
-    Shape: -> (Q,R) int64, -1 as padding.
-
-    Example:
-        >>> near_truth(torch.tensor([[0.0, 0.0], [3.0, 4.0]]), torch.zeros(1, 2), radius=5.0).tolist()
-        [[0, 1]]
+    Shape: coordinates reference (N,K), query (Q,K), of the radius' unit -> (Q,R) int64, -1 as padding.
     """
     rows: list[Tensor] = []
     for part in query.double().split(max(1, PAIRS_AT_ONCE // max(1, len(reference)))):
@@ -116,12 +98,8 @@ def near_truth(reference: Tensor, query: Tensor, radius: float) -> Tensor:
         distance = torch.cdist(part, reference.double(), compute_mode="donot_use_mm_for_euclid_dist")
         near = distance <= radius
         check_table(len(query), int(near.sum(1).max()))
-        rows += _true_columns(near)
+        rows += [row.nonzero()[:, 0] for row in near]
     return padded(rows)
-
-
-def _true_columns(which: Tensor) -> list[Tensor]:
-    return [row.nonzero()[:, 0] for row in which]
 
 
 def is_right(index: Tensor, truth: Tensor, tolerance: int) -> Tensor:
@@ -152,26 +130,23 @@ def ground_truth_in_places(truth: GroundTruth, place_of: Callable[[Tensor], Tens
 
 
 def check_ground_truth(truth: str, interpolate: bool = False) -> int | float | Path:
-    """What a text says: an offset, a radius in metres, or a file; refused early, before long work.
-
-    Raises:
-        InputError: none of these, a file that cannot be opened, or interpolation of anything but a .csv.
-    """
+    """What a text says: an offset, a radius in metres, or a file that is there; refused before long work."""
     truth = str(truth)  # an offset may be a number, as of YAML
-    suffix = Path(truth).suffix.lower()
-    said: int | float | Path | None = offset_of(truth)
-    if suffix in (".csv", ".npz"):
-        check_regular(Path(truth), EXPECTED)
-        said = Path(truth)
-    elif said is None:
-        name, colon, radius = truth.partition(":")
-        metres = as_number(radius) if colon else 25.0
-        if name != "utm" or metres is None or metres < 0:
-            raise InputError(f"truth {truth!r} is not known; expected {EXPECTED}")
-        said = metres
+    path = Path(truth)
+    suffix = path.suffix.lower()
     if interpolate and suffix != ".csv":
         raise InputError(f"truth {truth} cannot be interpolated; expected a .csv of query,place")
-    return said
+    if suffix in (".csv", ".npz"):
+        check_regular(path, EXPECTED)
+        return path
+    offset = offset_of(truth)
+    if offset is not None:
+        return offset
+    name, colon, radius = truth.partition(":")
+    metres = as_number(radius) if colon else 25.0
+    if name != "utm" or metres is None or metres < 0:
+        raise InputError(f"truth {truth!r} is not known; expected {EXPECTED}")
+    return metres
 
 
 def find_ground_truth(
@@ -191,8 +166,8 @@ def find_ground_truth(
 
             - an integer offset: place = query + offset;
             - a `.csv` of `query,place[,place...]`, with or without such a header: every listed place is
-              right. A query listed without a place, or with -1, has no right answer; a query not listed is
-              not known, and is left out of the scores;
+              right. A query listed without a place, or with -1, has no right answer; one that is not listed
+              is left out of the scores;
             - an `.npz` with the boolean matrices (reference frames, query frames) `GThard` and/or `GTsoft`,
               as in the visual place recognition tutorial of Schubert et al. What is in GThard is right (in
               GTsoft, if that is the only one); what is in GTsoft only counts neither way;
@@ -227,10 +202,10 @@ def find_ground_truth(
             position = query.place[_below(numbers, len(query.place))]
             return as_ground_truth(position_truth(reference.place, position))
         count = len(numbers) if every else query.length
-        if resampled or count is None or count != frames:
-            return None
-        alike = aligned or say_aligned(reference, query, count)
-        return as_ground_truth(offset_truth(numbers, frames)) if alike else None
+        alike = not resampled and count is not None and count == frames
+        if alike and (aligned or say_aligned(reference, query, count or 0)):
+            return as_ground_truth(offset_truth(numbers, frames))
+        return None
     said = check_ground_truth(truth, interpolate)
     if isinstance(said, int):
         found = as_ground_truth(offset_truth(numbers, frames, said))
@@ -245,13 +220,13 @@ def find_ground_truth(
         found = _read_table(said, numbers, frames, length, interpolate, resampled)
     else:
         found = _read_matrices(said, numbers, frames, every)
-    if not (found.positives >= 0).any():
-        if isinstance(said, int):
-            last = "" if frames is None else f" to {frames - 1 - int(numbers.min())}"
-            expected = f"an offset from {-int(numbers.max())}{last}"
-            raise InputError(f"no query has a right answer with truth {said}; expected {expected}")
+    if (found.positives >= 0).any():
+        return found
+    if not isinstance(said, int):
         raise InputError(f"no query has a right answer: {describe_ground_truth(truth)}")
-    return found
+    last = "" if frames is None else f" to {frames - 1 - int(numbers.min())}"
+    expected = f"an offset from {-int(numbers.max())}{last}"
+    raise InputError(f"no query has a right answer with truth {said}; expected {expected}")
 
 
 def _below(numbers: Tensor, count: int) -> Tensor:
@@ -266,12 +241,6 @@ def say_aligned(reference: Traverse, query: Traverse, frames: int) -> bool:
 
     They do if both were cut alike, each out of a long image, or if their frames have the same names, all
     different. Times, as of the frames of a video, are no such names: any two recordings share them.
-
-    Example:
-        >>> from dejavu_torch.data.source import open_source
-        >>> one, two = (open_source(f"sim:aerial?frames=8&traverse={i}") for i in (0, 1))
-        >>> say_aligned(one, two, 8)  # they have positions, but no names
-        False
     """
     if reference.cut is not None:
         return reference.cut == query.cut
@@ -284,15 +253,7 @@ def say_aligned(reference: Traverse, query: Traverse, frames: int) -> bool:
 
 
 def describe_ground_truth(truth: str | None, interpolate: bool = False, positions: bool = False) -> str:
-    """What `find_ground_truth` takes for the ground truth, in words.
-
-    Args:
-        positions: whether both traverses carry their positions.
-
-    Example:
-        >>> describe_ground_truth("12"), describe_ground_truth(None)
-        ('place = query + 12', 'place = query, as the sources say themselves')
-    """
+    """What `find_ground_truth` takes for the truth, in words; `positions`: both traverses carry them."""
     if truth is None:
         carried = "the positions that both traverses carry"
         return carried if positions else "place = query, as the sources say themselves"
@@ -316,11 +277,7 @@ def offset_of(truth: str | None, positions: bool = False) -> int | None:
 
 
 def utm_coordinates(traverse: Traverse) -> Tensor:
-    """Easting and northing in the names of a traverse's images, metres: (N,2) float64.
-
-    Raises:
-        InputError: no folder of images, or a name without them.
-    """
+    """Easting and northing in the names of a traverse's images, metres: (N,2) float64."""
     names = [traverse.frame_name(i) for i in range(traverse.length or 0)]
     if not any(names):
         raise InputError(f"{traverse.name} has no image names; expected folders of images for truth utm")
@@ -336,22 +293,22 @@ def _read_table(
     path: Path, numbers: Tensor, frames: int | None, length: int | None, interpolate: bool, resampled: bool
 ) -> GroundTruth:
     """A csv of `query,place[,place...]`; `length`: of a query traverse that is resampled."""
-    listed = _listed(path, frames, interpolate)
-    first, last = min(listed), max(listed)
+    places = _listed(path, frames, interpolate)
+    first, last = min(places), max(places)
     queries = numbers.tolist()
     if interpolate:
-        knots = sorted(listed)
-        between = np.interp(numbers.numpy(), knots, [listed[query][0] for query in knots]).tolist()
+        knots = sorted(places)
+        between = np.interp(numbers.numpy(), knots, [places[query][0] for query in knots]).tolist()
         places = {query: [at] for query, at in zip(queries, between, strict=True) if first <= query <= last}
-    else:
-        if length is not None and last >= length:
-            raise InputError(f"{path} lists query {last}; expected frames from 0 to {length - 1}")
-        places = _at_shown(listed, numbers) if resampled else listed
+    elif length is not None and last >= length:
+        raise InputError(f"{path} lists query {last}; expected frames from 0 to {length - 1}")
+    elif resampled:
+        places = _at_shown(places, numbers)
     judged = torch.tensor([query in places for query in queries])
     if not judged.any():
         wanted = f"{int(numbers.min())} to {int(numbers.max())}"
         raise InputError(f"{path} lists queries from {first} to {last}; expected some of {wanted}")
-    rows = ([_rounded(place) for place in places.get(query, ())] for query in queries)
+    rows = [[_rounded(place) for place in places.get(query, ())] for query in queries]
     found = padded(torch.tensor(row, dtype=torch.int64) for row in rows)
     return as_ground_truth(found)._replace(judged=judged)
 
@@ -374,38 +331,37 @@ def _listed(path: Path, frames: int | None, interpolate: bool) -> dict[int, list
     rows = read_rows(path, "lines of query,place")
     if rows and all(as_number(cell) is None for cell in rows[0][1] if cell):
         number, names = rows.pop(0)
-        first, *others = names
         # another column, such as a distance, would count as a right place
-        if first.lower() != "query" or not all(name.lower().startswith("place") for name in others if name):
-            raise InputError(
-                f"{path}, line {number}: columns {','.join(names)}; expected query,place[,place...]"
-            )
+        if names[0].lower() != "query" or not all(re.match("place|$", name.lower()) for name in names[1:]):
+            seen = f"{path}, line {number}: columns {','.join(names)}"
+            raise InputError(f"{seen}; expected query,place[,place...]")
+    end = LARGEST if frames is None else frames
     listed: dict[int, list[float]] = {}
     for line, cells in rows:
-        where = f"{path}, line {line}"
         while not cells[-1]:
             del cells[-1]
-        values = []
-        for cell in cells:
-            value = as_number(cell)
-            if value is None:
-                raise InputError(f"{where}: {cell!r} is no frame number; expected query,place")
-            values.append(value)
-        query, found = values[0], [place for place in values[1:] if place != -1]
-        if query < 0 or query % 1:
-            raise InputError(f"{where}: query {cells[0]}; expected a whole number of at least 0")
-        if query in listed:
-            raise InputError(f"{where}: query {cells[0]} is listed twice; expected each once")
-        for place in found:
-            if place < 0 or (frames is not None and _rounded(place) >= frames):
-                last = "" if frames is None else f" to {frames - 1}"
-                expected = f"a frame of the reference from 0{last}, or -1 for none"
-                raise InputError(f"{where}: place {place:.12g}; expected {expected}")
-            if place % 1 and not interpolate:
-                raise InputError(f"{where}: place {place:.12g}; expected a whole number, or interpolation")
-        if interpolate and len(found) != 1:
-            raise InputError(f"{where}: {len(found)} places; expected one in each line to interpolate")
-        listed[int(query)] = found
+        numbers = [value for value in map(as_number, cells) if value is not None]
+        query, places = (numbers or [-1.0])[0], [place for place in numbers[1:] if place != -1]
+        outside = [place for place in places if place < 0 or _rounded(place) >= end]
+        between = [place for place in places if place % 1 and not interpolate]
+        wrong = ""
+        if len(numbers) < len(cells):
+            odd = next(cell for cell in cells if as_number(cell) is None)
+            wrong = f"{odd!r} is no frame number; expected query,place"
+        elif query < 0 or query % 1:
+            wrong = f"query {cells[0]}; expected a whole number of at least 0"
+        elif query in listed:
+            wrong = f"query {cells[0]} is listed twice; expected each once"
+        elif outside:
+            last = "" if frames is None else f" to {frames - 1}"
+            wrong = f"place {outside[0]:.12g}; expected a frame of the reference from 0{last}, or -1 for none"
+        elif between:
+            wrong = f"place {between[0]:.12g}; expected a whole number, or interpolation"
+        elif interpolate and len(places) != 1:
+            wrong = f"{len(places)} places; expected one in each line to interpolate"
+        if wrong:
+            raise InputError(f"{path}, line {line}: {wrong}")
+        listed[int(query)] = places
     if not listed:
         raise InputError(f"{path} lists no query; expected lines of query,place")
     return listed
@@ -418,8 +374,7 @@ def _rounded(place: float) -> int:
 def _read_matrices(path: Path, numbers: Tensor, frames: int | None, every: bool) -> GroundTruth:
     """An npz of the matrices (reference frames, query frames) GThard and/or GTsoft."""
     expected = "boolean matrices GThard and/or GTsoft"
-    matrices: list[Tensor] = []
-    shapes: set[tuple[int, ...]] = set()
+    matrices: list[np.ndarray] = []
     with reading(path, "is no whole .npz file of arrays", expected), zipfile.ZipFile(path) as archive:
         there = [name.removesuffix(".npy") for name in archive.namelist()]
         for name in ("GThard", "GTsoft"):
@@ -428,44 +383,38 @@ def _read_matrices(path: Path, numbers: Tensor, frames: int | None, every: bool)
             entry = archive.getinfo(f"{name}.npy")
             if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
                 raise ValueError("another compression than numpy's")  # a few bytes of it can be endless
-            with archive.open(entry) as file:
-                shape, kind, by_columns, start = read_header(file.read(HEADER))
-            _check_shape(f"{path}: {name} is {shape} {kind}", shape, kind, numbers, frames, every)
-            count = math.prod(shape)
-            if start + count * kind.itemsize != entry.file_size:
-                raise ValueError(f"{name} is {shape} {kind} in {entry.file_size} bytes")
-            check_room(2.0 * entry.file_size + 16.0 * count, f"{path}: {name} {shape} {kind}")
+            check_room(2.0 * entry.file_size, f"{path}: {name}")
             with archive.open(entry) as file:  # no more than it says, whatever it unpacks to
-                values = np.frombuffer(file.read(entry.file_size), kind, count, start)
-            if not np.isfinite(values).all():
-                raise ValueError(f"{name} holds numbers that are not finite")
-            matrix = values.reshape(shape, order="F" if by_columns else "C")[:, numbers.numpy()]
-            shapes.add(shape)
-            matrices.append(torch.from_numpy(matrix.astype(bool)).T)
+                matrix = np.lib.format.read_array(file, allow_pickle=False)
+                if file.read(1):
+                    raise ValueError(f"{name} is longer than its shape says")
+            _check_shape(f"{path}: {name} is {matrix.shape} {matrix.dtype}", matrix, numbers, frames, every)
+            check_room(16.0 * matrix.size, f"{path}: {name} {matrix.shape}")
+            matrices.append(matrix)
     if not matrices:
         raise InputError(f"{path} holds {', '.join(there) or 'nothing'}; expected {expected}")
-    hard, *soft = matrices
-    if len(shapes) > 1:
+    if len({matrix.shape for matrix in matrices}) > 1:
         raise InputError(f"{path}: GThard and GTsoft differ in shape; expected the same")
-    found = as_ground_truth(padded(_true_columns(hard)))
-    return found._replace(ignored=padded(_true_columns(soft[0] & ~hard))) if soft else found
+    if not all(np.isfinite(matrix).all() for matrix in matrices):
+        raise InputError(f"{path} holds numbers that are not finite; expected {expected}")
+    hard, *soft = (torch.from_numpy(matrix[:, numbers.numpy()] != 0).T for matrix in matrices)
+    found = as_ground_truth(padded(row.nonzero()[:, 0] for row in hard))
+    return found._replace(ignored=padded(row.nonzero()[:, 0] for row in soft[0] & ~hard)) if soft else found
 
 
-def _check_shape(
-    seen: str, shape: tuple[int, ...], kind: np.dtype, numbers: Tensor, frames: int | None, every: bool
-) -> None:
+def _check_shape(seen: str, matrix: np.ndarray, numbers: Tensor, frames: int | None, every: bool) -> None:
     """Refuse what is no matrix (reference frames, query frames), and say if it is transposed."""
     count = int(numbers.max()) + 1
-    rows = "reference frames" if frames is None else frames
-    wanted = f"expected a matrix of ({rows}, {count}), a column a query frame"
-    if len(shape) != 2 or kind.kind not in "biuf":
-        raise InputError(f"{seen}; {wanted}")
 
     def fits(rows: int, columns: int) -> bool:
         # queries that are given by number may be some of those in the matrix
-        enough = columns == count or (columns > count and not every)
-        return enough and frames in (None, rows)
+        return frames in (None, rows) and (columns == count or (columns > count and not every))
 
+    plain = matrix.ndim == 2 and matrix.dtype.kind in "biuf"
     # as many rows as queries speak for a transposed matrix if the reference is not known
-    if not fits(*shape) or (frames is None and shape[1] != count == shape[0]):
-        raise InputError(f"{seen}; {wanted}{'; transposed it fits' if fits(*shape[::-1]) else ''}")
+    turned = plain and frames is None and matrix.shape[1] != count == matrix.shape[0]
+    if not plain or turned or not fits(*matrix.shape):
+        rows = "reference frames" if frames is None else frames
+        wanted = f"expected a matrix of ({rows}, {count}), a column a query frame"
+        hint = "; transposed it fits" if plain and fits(*matrix.shape[::-1]) else ""
+        raise InputError(f"{seen}; {wanted}{hint}")

@@ -29,9 +29,6 @@ def encode_names(names: Sequence[str]) -> str:
 
     File names with a counter, and times at a steady rate, take about a hundred bytes for thousands of frames.
 
-    Raises:
-        InputError: a name of over 4096 characters.
-
     Example:
         >>> files = [f"left_{i:06}.png" for i in range(0, 10_000, 2)]
         >>> code = encode_names(files)
@@ -48,14 +45,7 @@ def encode_names(names: Sequence[str]) -> str:
 
 
 def decode_names(code: str, count: int | None = None) -> list[str]:
-    """The names that `encode_names` gave.
-
-    Args:
-        count: how many there have to be; None takes any.
-
-    Raises:
-        InputError: no such code, or one of another number of names.
-    """
+    """The names that `encode_names` gave; `count`: how many there have to be, None takes any."""
     try:
         text = zlib.decompressobj().decompress(base64.b64decode(code, validate=True), MOST)
         check_room(8 * len(text), "the names of frames")  # as objects
@@ -103,12 +93,7 @@ def _names(numbered: dict[str, Any]) -> list[str]:
 
 
 def clock_time(seconds: float) -> str:
-    """Hours, minutes, seconds and milliseconds, as frames of a video are named.
-
-    Example:
-        >>> clock_time(3723.48)
-        '1:02:03.480'
-    """
+    """Hours, minutes, seconds and milliseconds, as frames of a video are named: 1:02:03.480."""
     whole, thousandths = divmod(abs(round(1000 * seconds)), 1000)
     clock = f"{whole // 3600}:{whole // 60 % 60:02}:{whole % 60:02}.{thousandths:03}"
     return f"-{clock}" if seconds < 0 else clock

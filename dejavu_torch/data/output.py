@@ -29,12 +29,7 @@ _temporary: set[Path] = set()  # the folders of this process that are there now
 
 
 def check_output_file(path: Path) -> None:
-    """Refuse early, before long work, a file that could not be written. A link stands for what it leads to.
-
-    Raises:
-        InputError: the parent folder is missing or not writable, or the path is a folder, a device or the
-            like, a standard stream, too long, or a file that may not be written or replaced.
-    """
+    """Refuse early, before long work, a file that could not be written. A link stands for its target."""
     with _refusing(path, "cannot be written", ValueError):  # a name that the system cannot spell
         _check_name(path)
         target = _target(path)
@@ -68,11 +63,7 @@ def _check_replaced(path: Path, target: Path) -> None:
 
 
 def check_output_folder(path: Path) -> None:
-    """Refuse early, before long work, a folder that could not be made or written in.
-
-    Raises:
-        InputError: something else is in the way, the path is too long, or there is no permission.
-    """
+    """Refuse early, before long work, a folder that could not be made or written in."""
     with _refusing(path, "cannot be made a folder", ValueError):
         _check_name(path)
         there = _existing(path)
@@ -84,11 +75,7 @@ def check_output_folder(path: Path) -> None:
 
 
 def make_output_folder(path: Path) -> None:
-    """Create the folder and its parents.
-
-    Raises:
-        InputError: see `check_output_folder`, or the system refuses it.
-    """
+    """Create the folder and its parents."""
     check_output_folder(path)
     with _refusing(path, "cannot be made a folder"):
         path.mkdir(parents=True, exist_ok=True)
@@ -108,9 +95,6 @@ def whole_file(path: Path) -> Iterator[Path]:
     It has the name of `path`, in a folder of its own beside it. A file that is there keeps its mode; where
     `path` is a link, what it leads to is replaced. On the disk is the old file or the new one, whatever
     happens: what a process that was killed left is removed when the next file is written there.
-
-    Raises:
-        InputError: see `check_output_file`, or the system refuses to write.
 
     Example:
         >>> target = Path(tempfile.mkdtemp()) / "note.txt"
@@ -138,17 +122,6 @@ def whole_folder(path: Path, earlier: Iterable[str] = ()) -> Iterator[Path]:
 
     Args:
         earlier: names of files of an earlier run, which are removed where the block wrote none.
-
-    Raises:
-        InputError: see `check_output_folder`, or the system refuses to write.
-
-    Example:
-        >>> target = Path(tempfile.mkdtemp()) / "report"
-        >>> with whole_folder(target) as temporary:
-        ...     _ = (temporary / "note.txt").write_text("all of it")
-        ...     assert not target.exists()
-        >>> [file.name for file in target.iterdir()]
-        ['note.txt']
     """
     check_output_folder(path)
     with _refusing(path, "was not written"), temporary_folder(_existing(path)) as folder:
@@ -184,15 +157,6 @@ def remove_temporaries() -> None:
 def temporary_folder(parent: Path) -> Iterator[Path]:
     """A folder of this process's own in `parent`, locked while it is in use; removed behind the block, also
     by `remove_temporaries`, or after a kill by the next one in `parent`.
-
-    Raises:
-        OSError: the system refuses it.
-
-    Example:
-        >>> with temporary_folder(Path(tempfile.gettempdir())) as folder:
-        ...     _ = (folder / "note.txt").write_text("for now")
-        >>> folder.exists()
-        False
     """
     # the name, which a folder has from its first moment on, says that it is ours, and of this host: locks of
     # a network file system may hold on one host only
@@ -303,10 +267,8 @@ def _check_name(path: Path) -> None:
     longest = max((len(os.fsencode(part)) for part in path.parts), default=0)
     length = len(os.fsencode(path.absolute()))
     if longest > LONGEST_NAME or length > LONGEST_PATH:
-        raise InputError(
-            f"{path} has a name of {longest} bytes, {length} in all; expected at most {LONGEST_NAME}, "
-            f"{LONGEST_PATH} in all"
-        )
+        expected = f"at most {LONGEST_NAME}, {LONGEST_PATH} in all"
+        raise InputError(f"{path} has a name of {longest} bytes, {length} in all; expected {expected}")
 
 
 def _mode_of_new(folder: Path) -> int:

@@ -18,10 +18,7 @@ NEAR = 1e-4  # steps: a frame so near to a place has reached it
 def shown_frames(positions: Tensor) -> Tensor:
     """The frame nearest to each place, of the two between which it is first reached.
 
-    Args:
-        positions: (F,) float, of each frame.
-
-    Shape: -> (M,) int64, never decreasing; M places.
+    Shape: positions (F,) float -> (M,) int64, never decreasing; M places.
 
     Convention: standing, and going back and forth, add no places.
 
@@ -48,17 +45,12 @@ def positions_behind(positions: Tensor, places: int) -> Tensor:
     """Positions (F,) of frames whose first place is behind so many others, float32.
 
     Convention: frames behind their own first place are moved to it: there are other places behind it now.
-
-    Raises:
-        InputError: more places than float32 can tell apart.
     """
     double = positions.double().clamp(min=0)
     total = places + count_places(double)
     if total > MOST:
-        raise InputError(
-            f"{total} places at even steps, one behind the other; expected at most {MOST}, whose positions "
-            "float32 can tell apart: make several maps, and merge them"
-        )
+        expected = f"at most {MOST}, which float32 can tell apart: make several maps, and merge them"
+        raise InputError(f"{total} places at even steps, one behind the other; expected {expected}")
     moved = (double + places).float()
     # at many places float32 would round some up to the next place
     reached = (double + NEAR).floor() + places
@@ -79,12 +71,6 @@ def borders(positions: Tensor) -> Tensor:
     return torch.cat([shown, shown.new_tensor([len(positions)])])
 
 
-def nearest_places(positions: Tensor) -> Tensor:
-    """The place nearest to each frame, -1 for one behind the first: (F,) -> (F,) int64."""
-    last = int(float(positions.max()) + NEAR)
-    return positions.double().round().long().clamp(-1, last)
-
-
 def unit_of(positions: Tensor) -> str:
     """What tolerances and periods count: frames, or the places of a map with such a table; (0,) is none."""
     return "places at even steps" if len(positions) else "frames"
@@ -96,5 +82,6 @@ def look_up(table: Tensor, index: Tensor) -> Tensor:
 
 
 def place_of(positions: Tensor, frames: Tensor) -> Tensor:
-    """The place nearest to each frame; -1 for one behind the first place, and for -1. int64 of any shape."""
-    return look_up(nearest_places(positions), frames)
+    """The place nearest to each frame; -1 for one before the first place, and for -1. int64 of any shape."""
+    nearest = positions.double().round().long().clamp(-1, count_places(positions) - 1)
+    return look_up(nearest, frames)

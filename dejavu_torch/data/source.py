@@ -37,7 +37,7 @@ def open_source(source: str | Path, size: tuple[int, int] | None = None) -> Trav
             features (N,D) float; `sim:NAME?seed=0&traverse=0&frames=3072`, NAME being aerial, outdoor or
             underground; or `strip:IMAGE?width=96&rows=32:128&halve=1&grey=1`, a window slid along one long
             image. Of all of them `start=`, `stop=` and `step=` take the frames [start, stop) only, every
-            step-th of them, see `FrameRange`.
+            step-th of them.
         size: (height, width) in pixels that images of a folder and frames of a video are brought to where
             the source names neither.
 
@@ -64,15 +64,7 @@ def open_source(source: str | Path, size: tuple[int, int] | None = None) -> Trav
 def routes_of(source: str | Path) -> list[str]:
     """The routes that a source holds: of a folder of nothing but folders each of these, else the source.
 
-    Args:
-        source: as of `open_source`; options behind a folder are those of each route.
-
-    Returns:
-        Sources, sorted by name as images are.
-
-    Example:
-        >>> routes_of("sim:aerial?frames=40")
-        ['sim:aerial?frames=40']
+    They are sorted by name as images are; options behind a folder are those of each route.
     """
     address, query = _split(str(source))
     path = Path(address)
@@ -81,21 +73,14 @@ def routes_of(source: str | Path) -> list[str]:
         inside = [one for one in path.iterdir() if one.name[0] != "."] if address else []
     if not inside or not all(one.is_dir() for one in inside):
         return [str(source)]
-    behind = f"?{query}" if query else ""
-    return [f"{path / name}{behind}" for name in sorted((one.name for one in inside), key=natural)]
+    options = f"?{query}" if query else ""
+    return [f"{one}{options}" for one in sorted(inside, key=lambda one: natural(one.name))]
 
 
 def check_not_read(out: Path, *sources: str | Path | None) -> None:
     """Refuse an output that is what a command reads, or an image of a folder that it reads: it would be lost.
 
-    Args:
-        sources: as of `open_source`, or any other text; of them the paths that are there count.
-
-    Raises:
-        InputError: naming the output.
-
-    Example:
-        >>> check_not_read(Path("scores.csv"), "photos?width=160", "utm:25", None)
+    `sources` are as of `open_source`, or any other text; of them the paths that are there count.
     """
     for source in filter(None, sources):
         place = Path(_split(str(source))[0].removeprefix("strip:"))
@@ -108,24 +93,22 @@ def check_not_read(out: Path, *sources: str | Path | None) -> None:
 
 def _split(text: str) -> tuple[str, str]:
     """The address of a source, and its options."""
-    if text.startswith(("sim:", "strip:")):
-        address, _, query = text.partition("?")
-    elif "?" in text and not os.path.exists(text):  # False also of what can be no path
-        address, _, query = text.rpartition("?")
-    else:
-        address, query = text, ""
+    prefixed = text.startswith(("sim:", "strip:"))
+    if "?" not in text or (not prefixed and os.path.exists(text)):  # False also of what can be no path
+        return text, ""
+    address, _, query = text.partition("?") if prefixed else text.rpartition("?")
     return address, query
 
 
 def _reader(text: str, address: str) -> Callable[..., Traverse]:
     """What opens an address, its options left open."""
-    if address.startswith("sim:"):
-        name = address.removeprefix("sim:")
+    kind, colon, name = address.partition(":")
+    if kind + colon == "sim:":
         if name not in SIMULATORS:
             raise InputError(f"there is no simulator {name!r}; expected {', '.join(sorted(SIMULATORS))}")
         return SIMULATORS[name]
-    if address.startswith("strip:"):
-        return partial(read_strip, Path(address.removeprefix("strip:")))
+    if kind + colon == "strip:":
+        return partial(read_strip, Path(name))
     path = Path(address)
     if not address or not os.path.exists(path):
         raise InputError(f"{text or 'a source without a name'} is not there; expected {EXPECTED}")
@@ -136,9 +119,8 @@ def _reader(text: str, address: str) -> Callable[..., Traverse]:
         return partial(Video, path)
     if suffix == ".npy":
         return partial(read_array, path)
-    if suffix in SUFFIXES:
-        raise InputError(f"{path} is a single image; expected {EXPECTED}")
-    raise InputError(f"{path} is none of the kinds that can be read; expected {EXPECTED}")
+    seen = "a single image" if suffix in SUFFIXES else "none of the kinds that can be read"
+    raise InputError(f"{path} is {seen}; expected {EXPECTED}")
 
 
 def _arguments(text: str, query: str, reader: Callable[..., Traverse]) -> dict[str, Any]:
@@ -155,10 +137,8 @@ def _arguments(text: str, query: str, reader: Callable[..., Traverse]) -> dict[s
         try:
             given[name] = kind(value)
         except ValueError as error:
-            raise InputError(
-                f"{text}: {name} is {value!r}; expected {KINDS.get(kind, kind.__name__)}"
-            ) from error
-    missing = [name for name, default in defaults.items() if default is empty and name not in given]
-    if missing:
-        raise InputError(f"{text}: {', '.join(missing)} is missing; expected {missing[0]}=...")
+            raise InputError(f"{text}: {name} is {value!r}; expected {KINDS[kind]}") from error
+    for name, default in defaults.items():
+        if default is empty and name not in given:
+            raise InputError(f"{text}: {name} is missing; expected {name}=...")
     return given

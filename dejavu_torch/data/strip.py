@@ -20,8 +20,7 @@ class SlidingWindow(IndexedTraverse):
 
     Args:
         strip: (C,H,W) float in [0, 1].
-        width: width of the window, pixels.
-        step: pixels from one frame to the next.
+        width: of the window, pixels. step: pixels from one frame to the next.
         name: what to call it in messages.
 
     Raises:
@@ -37,10 +36,9 @@ class SlidingWindow(IndexedTraverse):
         if strip.ndim != 3 or not strip.is_floating_point():
             raise InputError(f"{name} is {tuple(strip.shape)} {strip.dtype}; expected float (C,H,W)")
         if not 1 <= width <= strip.shape[2] or step < 1:
-            raise InputError(
-                f"{name} is {strip.shape[2]} pixels long, window {width}, step {step}; "
-                f"expected a window of 1 to {strip.shape[2]} pixels and a step of at least 1"
-            )
+            expected = f"a window of 1 to {strip.shape[2]} pixels and a step of at least 1"
+            seen = f"{name} is {strip.shape[2]} pixels long, window {width}, step {step}"
+            raise InputError(f"{seen}; expected {expected}")
         self.name, self.strip, self.step = name, strip, step
         self.windows = strip.unfold(2, width, step).permute(2, 0, 1, 3)  # (N,C,H,width), a view
         self.length = len(self.windows)
@@ -58,22 +56,17 @@ def read_strip(path: Path, width: int, rows: str = "", halve: int = 0, grey: boo
     """A window slid along a long image file.
 
     Args:
-        width: width of the window, pixels after halving.
+        width: of the window, pixels after halving.
         rows: "first:stop" of the rows to keep after halving; "" keeps all.
         halve: how many times to halve the image with a 2 x 2 box filter.
         grey: turn colours to luminance first.
-
-    Raises:
-        InputError: an image that cannot be read, or rows outside it.
     """
     strip = read_image(path)
     if grey and strip.shape[0] == 3:
         strip = (strip * torch.tensor([0.299, 0.587, 0.114])[:, None, None]).sum(0, keepdim=True)
     if halve < 0 or min(strip.shape[1:]) >> halve < 1:
-        raise InputError(
-            f"{path} is {strip.shape[1]} x {strip.shape[2]} pixels, to be halved {halve} times; "
-            "expected at least 0 times, and a pixel to be left"
-        )
+        seen = f"{path} is {strip.shape[1]} x {strip.shape[2]} pixels, to be halved {halve} times"
+        raise InputError(f"{seen}; expected at least 0 times, and a pixel to be left")
     for _ in range(halve):
         strip = torch.nn.functional.avg_pool2d(strip, 2)
     if rows:

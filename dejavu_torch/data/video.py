@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.files import check_regular, reading, state_of
+from dejavu_torch.data.files import check_regular, reading, state_of, why
 from dejavu_torch.data.folder import check_pixels, check_size, fitted_size
 from dejavu_torch.data.names import clock_time
 from dejavu_torch.resize import MOST_PIXELS
@@ -34,8 +34,7 @@ SUFFIXES = {
 }
 # what these files are, and nothing else that FFmpeg knows, such as a list of other files or addresses
 FORMATS = "mov,mp4,matroska,webm,avi,mpeg,mpegts,mpegvideo,m4v,h264,hevc,asf,flv,live_flv,ogg,mjpeg"
-EBML, SEGMENT, CLUSTER = b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67", b"\x1f\x43\xb6\x75"
-BOXES = {b"ftyp", b"free", b"skip", b"wide", b"moov", b"moof", b"mdat", b"mfra", b"sidx", b"styp", b"uuid"}
+EBML, SEGMENT, CLUSTER = b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67", b"\x1f\x43\xb6\x75"  # of Matroska
 UNEVEN = 1.5  # longest interval over the median one; rounded to ticks of half a frame or less it is less
 
 
@@ -50,13 +49,13 @@ class Video(Traverse):
     Shape: frames (B,3,H,W), RGB also where the video is grey, upright where the file says how the
         camera was turned.
 
-    Convention: where the time from frame to frame varies (dropped frames, a variable frame rate), a line of
-        warning says so when the file was first read to its end.
+    Convention: a frame's name is its time, such as 0:01:23.480. A frame rate that varies is warned of once
+        the file was read to its end.
 
     Raises:
         InputError: width or height out of range; no video, or one that is cut off; while reading, a damaged
-            frame, frames that are missing, or frames of different size. Only files that say how long they are
-            (not .ts, .mpg, .flv, .mjpeg) can be found cut off between two frames.
+            frame, frames that are missing, or frames of different size. Of files that do not say how long
+            they are (.ts, .mpg, .flv, .mjpeg) a cut between two frames is not found.
     """
 
     def __init__(self, path: str | Path, width: int = 0, height: int = 0) -> None:
@@ -66,12 +65,15 @@ class Video(Traverse):
         check_regular(self.path, "a video file")
         self._seconds: list[float] = []  # of the frames that were read so far
         self._complete = False  # whether these are all frames
-        if not _is_whole(self.path):
-            raise InputError(f"{path} is cut off or damaged; expected a whole video file")
         with self._open() as (container, stream):
+            whole = _is_whole(self.path)
             # only this family lists every frame, and which of them an edit list hides
             if container.format.name.startswith("mov") and stream.frames:
-                self.length = sum(not entry.is_discard for entry in stream.index_entries)
+                entries = stream.index_entries
+                self.length = sum(not entry.is_discard for entry in entries)
+                whole = all(entry.pos + entry.size <= container.size for entry in entries)
+        if not whole:
+            raise InputError(f"{path} is cut off or damaged; expected a whole video file")
 
     def batches(self, size: int) -> Iterator[Tensor]:
         yield from self.select(range(2**62), size)
@@ -87,7 +89,8 @@ class Video(Traverse):
                 first = first or (frame.height, frame.width)
                 check_alike(self.name, i, frame, first)
                 if i in frames:
-                    batch.append(self._pixels(frame))
+                    with reading(self.path, "cannot be resized", "less"):
+                        batch.append(pixels_of(frame, self.path, self.width, self.height))
                 if len(batch) == size:
                     yield _as_tensor(batch)
                     batch = []
@@ -103,12 +106,10 @@ class Video(Traverse):
         return state_of(self.path)
 
     def frame_name(self, i: int) -> str:
-        """The time of frame i, such as 0:01:23.480; "" where the file has none."""
         seconds = self.frame_time(i)
         return clock_time(seconds) if math.isfinite(seconds) else ""
 
     def frame_time(self, i: int) -> float:
-        """The time of frame i in seconds; NaN where the file has none."""
         if not self._complete and i >= len(self._seconds):
             self._read_times()
         return self._seconds[i]
@@ -118,32 +119,12 @@ class Video(Traverse):
             self._read_times()
         return len(self._seconds) if self.length is None else self.length
 
-    @property
-    def times(self) -> Tensor:
-        """(N,) float64, seconds of each frame from its timestamp in the file, increasing.
-
-        Known once the video was read to the end; before, it is read through for them.
-
-        Raises:
-            InputError: the file has no timestamps, or they run backwards.
-        """
-        if not self._complete:
-            self._read_times()
-        times = torch.tensor(self._seconds, dtype=torch.float64)
-        if times.isnan().any() or (times.diff() < 0).any():
-            raise InputError(f"{self.name} has no increasing timestamps; expected one for each frame")
-        return times
-
     def _read_times(self) -> None:
         for _ in self._frames(decode=self.length is None):
             pass
 
     def _frames(self, decode: bool = True) -> Generator[VideoFrame, None, None]:
-        """Every frame; at the end its time is known, and that none is missing.
-
-        Args:
-            decode: False yields nothing: only the timestamps are read.
-        """
+        """Every frame, or none if only the timestamps are to be read; at the end, whether all were there."""
         seconds: list[float] = []
         packets = 0
         try:
@@ -174,7 +155,7 @@ class Video(Traverse):
         except InputError:
             raise
         except Exception as error:  # of any type
-            raise self._broken(len(seconds), getattr(error, "strerror", None) or str(error)) from error
+            raise self._broken(len(seconds), why(error)) from error
         if not self._complete:
             self._seconds = seconds if in_order else sorted(seconds)
             self._complete = True
@@ -182,21 +163,16 @@ class Video(Traverse):
 
     def _warn_uneven(self) -> None:
         """Warn of times from frame to frame that vary by more than the rounding of timestamps."""
-        intervals = torch.tensor(self._seconds, dtype=torch.float64).diff()
+        intervals = 1e3 * torch.tensor(self._seconds, dtype=torch.float64).diff()
         if not len(intervals) or not (intervals >= 0).all():
             return
-        middle, longest = float(intervals.median()), float(intervals.max())
-        if longest > UNEVEN * middle + 1e-6:
+        shortest, middle, longest = map(float, (intervals.min(), intervals.median(), intervals.max()))
+        if longest > UNEVEN * middle + 1e-3:
             log.warning(
                 "%s: the frame rate varies, %.0f to %.0f ms from frame to frame (median %.0f): periods in "
                 "frames mean nothing here unless the footage is resampled by distance",
-                *(self.name, 1e3 * float(intervals.min()), 1e3 * longest, 1e3 * middle),
+                *(self.name, shortest, longest, middle),
             )
-
-    def _pixels(self, frame: VideoFrame) -> np.ndarray:
-        """One frame, upright and resized, (H,W,3) uint8."""
-        with reading(self.path, f"cannot be resized to {self.height} x {self.width} pixels", "less"):
-            return pixels_of(frame, self.path, self.width, self.height)
 
     @contextmanager
     def _open(self) -> Iterator[tuple[InputContainer, VideoStream]]:
@@ -263,28 +239,10 @@ def _as_tensor(frames: list[np.ndarray]) -> Tensor:
 
 
 def _is_whole(path: Path) -> bool:
-    """Whether the outermost parts of an MP4, AVI or Matroska file end inside the file.
-
-    FFmpeg reads what is left of a truncated file without a word.
-    """
+    """Whether a file, if it is a Matroska one, is neither cut nor has holes, of which FFmpeg says no word."""
     with path.open("rb") as file:
-        stop, start = file.seek(0, 2), 0
-        while start < stop:
-            file.seek(start)
-            head = file.read(16)
-            if head[:4] == EBML:
-                return _elements_fit(file, start, stop)
-            if head[:4] == b"RIFF":
-                length = int.from_bytes(head[4:8], "little")
-                start += 8 + length + length % 2
-            elif head[4:8] in BOXES:
-                length = int.from_bytes(head[:4])
-                if length == 0:  # up to the end
-                    return True
-                start += max(8, int.from_bytes(head[8:]) if length == 1 else length)
-            else:
-                return True
-        return start - 1 <= stop  # the last byte may be padding that was left out
+        is_matroska = file.read(len(EBML)) == EBML
+        return not is_matroska or _elements_fit(file, 0, file.seek(0, 2))
 
 
 def _elements_fit(file: BinaryIO, start: int, stop: int) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -26,12 +26,7 @@ class Rate(NamedTuple):
     chance: float
 
     def describe(self) -> str:
-        """In words.
-
-        Example:
-            >>> Rate(0.912, None, 0.064).describe()
-            'right 91 %, by chance 6 %'
-        """
+        """In words, such as "right 91 %, by chance 6 %"."""
         here = "" if self.inside is None else f"{self.inside:.0%}"
         elsewhere = "" if self.outside is None else f"{self.outside:.0%} elsewhere"
         between = " here, " if here and elsewhere else ""
@@ -39,27 +34,43 @@ class Rate(NamedTuple):
         return f"right {here}{between}{elsewhere}, by chance {chance}".replace("%", " %")
 
 
-class ActivationRates(NamedTuple):
-    """Rates of the layers of the chunk [start, stop), and of all layers fused."""
+def activation_rates(
+    route: TemplateMap,
+    chosen: Sequence[int],
+    queries: Tensor,
+    index: Tensor,
+    truth: GroundTruth,
+    tolerance: int,
+) -> list[Rate]:
+    """How often each of some layers of one chunk answers in phase, and, last, how often the map is right.
 
-    start: int
-    stop: int
-    layers: tuple[Rate, ...]
-    fused: Rate
+    A query of known truth is *inside* where one of its right places lies in the chunk, *outside* where it has
+    right places but none in the chunk.
 
-    def as_json(self) -> dict[str, Any]:
-        """An entry of report.json."""
-        return self._asdict() | {
-            "layers": [rate._asdict() for rate in self.layers],
-            "fused": self.fused._asdict(),
-        }
+    A layer is right where its best phase (argmin over k of eq. 3) is within the tolerance of the phase of a
+    right place (`in_phase`): inside, one in the chunk; outside, any, as if the layer went on, so that a rate
+    near chance says that its period ends with the chunk, or slips there. Chance is the share of phases within
+    the tolerance of any one, (2 * tolerance + 1) / period where phases = period.
 
+    The map is right where the reported place is within the tolerance of a right one; outside, that is the
+    work of the layers of other chunks. Chance is (2 * tolerance + 1) / places.
 
-def layer_distances(route: TemplateMap, queries: Tensor, j: int) -> Tensor:
-    """Eq. 3 for one layer of the map, on the CPU: (Q,D) -> (Q,P)."""
-    with torch.no_grad():
-        (distances,) = route.distances(queries.to(route.templates.device), [j])
-    return distances.cpu()
+    Shape: queries (Q,D), index (Q,) the places reported for them.
+    """
+    start, stop = route.plan[chosen[0]].start, route.plan[chosen[0]].stop
+    right = torch.where(truth.judged[:, None], truth.positives, -1)
+    here = torch.where((right >= start) & (right < stop), right, -1)
+    inside = (here >= 0).any(1)
+    outside = (right >= 0).any(1) & ~inside
+    rates = []
+    for j in chosen:
+        layer, best = route.plan[j], best_phases(route, queries, j)
+        near, far = (in_phase(layer, best, which, tolerance) for which in (here, right))
+        chance = (2 * _phases_within(layer, tolerance) + 1) / layer.phases
+        rates.append(Rate(_share(near, inside), _share(far, outside), min(1.0, chance)))
+    found, judged = is_right(index, right, tolerance), counted(index, truth, tolerance)
+    shares = _share(found, inside & judged), _share(found, outside & judged)
+    return [*rates, Rate(*shares, min(1.0, (2 * tolerance + 1) / route.places))]
 
 
 def best_phases(route: TemplateMap, queries: Tensor, j: int) -> Tensor:
@@ -69,6 +80,13 @@ def best_phases(route: TemplateMap, queries: Tensor, j: int) -> Tensor:
     parts = queries.split(max(1, DISTANCES_AT_ONCE // max(layer.phases, queries.shape[1])))
     nearest = [layer_distances(route, part, j)[:, present].argmin(1) for part in parts]
     return present[torch.cat(nearest)]
+
+
+def layer_distances(route: TemplateMap, queries: Tensor, j: int) -> Tensor:
+    """Eq. 3 for one layer of the map, on the CPU: (Q,D) -> (Q,P)."""
+    with torch.no_grad():
+        (distances,) = route.distances(queries.to(route.templates.device), [j])
+    return distances.cpu()
 
 
 def in_phase(layer: FrequencyLayer, best: Tensor, places: Tensor, tolerance: int) -> Tensor:
@@ -89,47 +107,6 @@ def in_phase(layer: FrequencyLayer, best: Tensor, places: Tensor, tolerance: int
     apart = (best[:, None] - layer.phase(places)).abs()
     apart = torch.minimum(apart, layer.phases - apart)
     return ((apart <= _phases_within(layer, tolerance)) & (places >= 0)).any(1)
-
-
-def activation_rates(
-    layers: Sequence[FrequencyLayer],
-    best: Sequence[Tensor],
-    index: Tensor,
-    truth: GroundTruth,
-    tolerance: int,
-    places: int,
-) -> ActivationRates:
-    """How often each of some layers of one chunk answers in phase, and how often the map is right.
-
-    A query of known truth is *inside* where one of its right places lies in the chunk, *outside*
-    where it has right places but none in the chunk.
-
-    For a layer, the rate is the share of the queries whose best phase (argmin over k of eq. 3) is
-    within the tolerance of the phase of a right place (`in_phase`): inside, a right place in the
-    chunk; outside, any, with the phase it would have if the layer went on. Outside the layer holds
-    nothing: a rate near chance says that its period ends with the chunk, or slips there; a rate as
-    inside, that it goes on. Chance is the share of phases within the tolerance of any one phase,
-    (2 * tolerance + 1) / period where phases = period, at most 1.
-
-    For the fusion, the rate is the share of the queries whose reported place is right within the
-    tolerance; outside, that is the work of the layers of other chunks. Chance is
-    (2 * tolerance + 1) / places, at most 1.
-    """
-    start, stop = layers[0].start, layers[0].stop
-    right = torch.where(truth.judged[:, None], truth.positives, -1)
-    here = torch.where((right >= start) & (right < stop), right, -1)
-    inside = (here >= 0).any(1)
-    outside = (right >= 0).any(1) & ~inside
-    rates = []
-    for layer, phase in zip(layers, best, strict=True):
-        near, far = (in_phase(layer, phase, which, tolerance) for which in (here, right))
-        chance = min(1.0, (2 * _phases_within(layer, tolerance) + 1) / layer.phases)
-        rates.append(Rate(_share(near, inside), _share(far, outside), chance))
-    found = is_right(index, right, tolerance)
-    judged = counted(index, truth, tolerance)
-    chance = min(1.0, (2 * tolerance + 1) / places)
-    fused = Rate(_share(found, inside & judged), _share(found, outside & judged), chance)
-    return ActivationRates(start, stop, tuple(rates), fused)
 
 
 def _phases_within(layer: FrequencyLayer, tolerance: int) -> int:

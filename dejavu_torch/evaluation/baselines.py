@@ -5,13 +5,13 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from functools import partial
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from dejavu_torch.evaluation.controls import leave_out_match, null_model
+from dejavu_torch.evaluation.controls import leave_out_match, null_control
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.preprocess import Preprocess
@@ -19,9 +19,13 @@ from dejavu_torch.maps.distance import Metric, phase_distances
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.template_map import TemplateMap, TemplateMapper
 from dejavu_torch.model import DejaVu
+from dejavu_torch.model_file import recipe_of
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.recognition.localizer import SINGLE, Localizer, Matching
 from dejavu_torch.types import InputError, Match, Traverse
+
+if TYPE_CHECKING:  # training needs the baselines of HOG, and no plots
+    from dejavu_torch.evaluation.localization import Localization
 
 log = logging.getLogger("dejavu_torch")
 
@@ -107,27 +111,20 @@ def fair_stride(frames: int, dimension: int, itemsize: int, map_bytes: int, tole
 
 
 def baselines_of(
-    model: DejaVu,
-    reference: Tensor,
-    query: Tensor,
-    tolerance: int,
-    seed: int = 0,
-    leave_out: int | None = None,
-    progress: bool = False,
-    matching: Matching = SINGLE,
+    run: Localization, seed: int = 0, leave_out: int | None = None, progress: bool = False
 ) -> dict[str, Baseline]:
-    """The baselines and null controls beside every map, by their keys in report.json.
+    """What is set beside the map of a run, by the keys of report.json; see design convention 8.
 
     Args:
-        model: with the map. reference: (N,D) its features. query: (Q,D) those of the queries.
-        tolerance: the coarsest stride is twice as much. seed: of the shuffle of the null controls.
-        leave_out: also query the reference with itself, see `leave_out_match`.
-        progress: show progress bars on a terminal. matching: of all but `leave_out`.
+        seed: of the shuffle of the null controls.
+        leave_out: also query the reference with itself, see `leave_out_match`; single queries.
+        progress: show progress bars on a terminal.
     """
+    model, reference, matching = run.model, run.reference_features, run.matching
     spectral = isinstance(model.map, SpectralMap)
     text = "baselines: what is stored as it is" if progress else None
     one = "place" if len(model.map.positions) else "frame"
-    summary, coarsest, (frames, dimension) = model.summary(), max(1, 2 * tolerance), reference.shape
+    summary, coarsest, (frames, dimension) = model.summary(), max(1, 2 * run.tolerance), reference.shape
     needed = ("backbone", "whitening") if spectral else ("backbone",)  # by whatever is stored
     fixed = sum(summary.fixed.get(part, 0) for part in needed)
     metric: Metric = getattr(model.map, "metric", "l1")
@@ -135,7 +132,7 @@ def baselines_of(
         metric = "cosine"
 
     def nearest(name: str, stored: Tensor, k: int, bytes: int, apart: int = 1) -> Baseline:
-        match = nearest_frames(stored, query, apart, metric, text, matching)
+        match = nearest_frames(stored, run.query_features, apart, metric, text, matching)
         return Baseline(name, match, bytes + fixed, k, fixed)
 
     size, own = partial(stride_bytes, frames, dimension), reference.element_size()
@@ -150,9 +147,9 @@ def baselines_of(
             "interpolated": nearest(lines, between, spaced, keys * dimension),
         }
     else:
-        fair = fair_stride(frames, dimension, own, summary.map_bytes - fixed, tolerance)
+        fair = fair_stride(frames, dimension, own, summary.map_bytes - fixed, run.tolerance)
         of = "" if isinstance(model.features, HOG) else "same features, "
-        skipped = "" if tolerance else ", of which tolerance 0 lets none be left out"
+        skipped = "" if run.tolerance else ", of which tolerance 0 lets none be left out"
         names = {
             "uncompressed": (f"{of}all {frames} {one}s{skipped}", 1),
             "stride": (f"{of}{every(fair, one)} (at least the map's bytes)", fair),
@@ -161,8 +158,8 @@ def baselines_of(
         found = {key: nearest(name, reference, k, size(own, k), k) for key, (name, k) in names.items()}
 
     def null(name: str, same_plan: bool = False) -> Baseline:
-        control, order = null_model(model, reference, seed, same_plan)
-        return Baseline(f"null: {name}", control.localize_descriptors(query, matching, order))
+        match = null_control(model, reference, run.query_features, seed, same_plan, matching)
+        return Baseline(f"null: {name}", match)
 
     foreign = isinstance(model.mapper, TemplateMapper) and model.mapper.periods is None
     if foreign:
@@ -180,7 +177,21 @@ def baselines_of(
         index, score, *_ = leave_out_match(model, reference, leave_out)
         itself = Match(index, score, score.isfinite())
         found["leave_out"] = Baseline(f"reference on itself, +-{leave_out} left out", itself)
+    pair, batch = (run.reference, run.query), model.batch_size
+    if not _is_plain_hog(model):
+        found |= hog_baselines(*pair, batch, run.tolerance, progress, matching)
+    if run.sequence is not None:  # SeqSLAM compares the grey pixels of small frames by L1
+        plain = DejaVu(PatchPixels(), "none", batch_size=batch, preprocess=Preprocess("grey"))
+        names = {"seqslam": ("SeqSLAM's pixels: grey, patches normalised", 1)}
+        found |= _described_baselines(plain, "pixels", names, pair, progress, matching)
     return found
+
+
+def _is_plain_hog(model: DejaVu) -> bool:
+    """Whether the uncompressed baseline is HOG with its defaults, by L1."""
+    pairs = (model.preprocess, Preprocess()), (model.features, HOG())
+    same = all(recipe_of(own) == recipe_of(plain) for own, plain in pairs)
+    return same and model.whitening is None and getattr(model.map, "metric", "l1") == "l1"
 
 
 def as_int8(descriptors: Tensor) -> Tensor:
@@ -232,7 +243,7 @@ def hog_baselines(
     progress: bool = False,
     matching: Matching = SINGLE,
 ) -> dict[str, Baseline]:
-    """What a map of other features is set beside: HOG of all frames, and of every k-th, k = 2 x tolerance.
+    """HOG of all frames, `hog`, and of every k-th, k = 2 x tolerance, by L1.
 
     Nothing where the traverses hold ready features, or frames too small for HOG.
     """
@@ -243,22 +254,6 @@ def hog_baselines(
     return _described_baselines(plain, "HOG", names, (reference, query), progress, matching)
 
 
-def seqslam_baseline(
-    reference: Traverse,
-    query: Traverse,
-    batch_size: int,
-    progress: bool = False,
-    matching: Matching = SINGLE,
-) -> dict[str, Baseline]:
-    """What SeqSLAM compares: the grey pixels of small frames, see `PatchPixels`, by L1.
-
-    Nothing where the traverses hold ready features, or frames too small for a patch.
-    """
-    names = {"seqslam": ("SeqSLAM's pixels: grey, patches normalised", 1)}
-    plain = DejaVu(PatchPixels(), "none", batch_size=batch_size, preprocess=Preprocess("grey"))
-    return _described_baselines(plain, "pixels", names, (reference, query), progress, matching)
-
-
 def _described_baselines(
     plain: DejaVu,
     what: str,
@@ -267,7 +262,7 @@ def _described_baselines(
     progress: bool,
     matching: Matching,
 ) -> dict[str, Baseline]:
-    """Every k-th frame of the first of two traverses, described as another model does; by L1."""
+    """Every k-th frame of the first of two traverses, described by `plain`; by L1."""
     if len(traverses[0].frame_shape) != 3:
         return {}
     text = f"baselines: {what}" if progress else None
@@ -276,8 +271,7 @@ def _described_baselines(
     except InputError as error:
         log.info("no %s to compare with: %s", what, error)
         return {}
-    (frames, dimension), itemsize = stored.shape, stored.element_size()
-    size = partial(stride_bytes, frames, dimension, itemsize)
+    size = partial(stride_bytes, len(stored), stored.shape[1], stored.element_size())
     return {
         key: Baseline(name, nearest_frames(stored, queries, k, "l1", text, matching), size(k), k)
         for key, (name, k) in names.items()

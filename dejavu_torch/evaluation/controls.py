@@ -16,6 +16,7 @@ from dejavu_torch.maps.template_map import TemplateMap, log_posterior
 from dejavu_torch.maps.templates import PhaseTemplates
 from dejavu_torch.memory import concatenate
 from dejavu_torch.model import DejaVu
+from dejavu_torch.recognition.localizer import Matching
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.types import FrequencyLayer, InputError, Match, SequenceModel
 
@@ -42,7 +43,7 @@ def null_control(
     query: Tensor,
     seed: int = 0,
     same_plan: bool = False,
-    sequence: SequenceModel | None = None,
+    sequence: Matching | SequenceModel | None = None,
 ) -> Match:
     """Matches of a map learned from the reference in shuffled order.
 
@@ -52,22 +53,13 @@ def null_control(
     Args:
         reference: (N,D) features. query: (Q,D) features.
         same_plan: keep the layers of the model's template map and learn only the templates anew. Otherwise
-            the periods are sought anew too; the default preset then finds none, since shuffled frames are
-            noise in time, and reports nothing.
+            the periods are sought anew too, and a finder that tests them finds none in noise.
         sequence: as of `DejaVu.localize`.
 
     Returns:
         Match of (Q,) whose index is the reference frame *stored* at the reported place; -1 where
         the map reports nothing.
     """
-    null, order = null_model(model, reference, seed, same_plan)
-    return null.localize_descriptors(query, sequence, order)
-
-
-def null_model(
-    model: DejaVu, reference: Tensor, seed: int = 0, same_plan: bool = False
-) -> tuple[DejaVu, Tensor]:
-    """What `null_control` matches with: the model that learned shuffled frames, and which each is, (N,)."""
     order, mixed = shuffled(reference, seed)
     mapper = model.mapper
     if isinstance(model.map, SpectralMap):  # as many bytes, however the map's own step was chosen
@@ -82,7 +74,7 @@ def null_model(
             null.learn_features(mixed)
         finally:
             log.setLevel(level)
-    return null, order
+    return null.localize_descriptors(query, sequence, order)
 
 
 def shuffled(reference: Tensor, seed: int = 0) -> tuple[Tensor, Tensor]:

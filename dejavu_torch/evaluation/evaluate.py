@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import torch
@@ -29,10 +30,10 @@ from dejavu_torch.evaluation.curves import (
 )
 from dejavu_torch.evaluation.match_plots import draw_coverage
 from dejavu_torch.evaluation.matches import ELSEWHERE, read_matches
-from dejavu_torch.evaluation.pictures import draw_curves
 from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.rejection import draw_reliability, rejection_facts
 from dejavu_torch.evaluation.report import Report
+from dejavu_torch.evaluation.score_plots import draw_curves
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.model_file import read_place_map
 from dejavu_torch.text import printable
@@ -69,10 +70,10 @@ def evaluate_file(
         truth: see `find_ground_truth`; None needs both traverses.
         tolerance: frames within which a report is right, inclusive; places where the map's are resampled.
         interpolate: see `find_ground_truth`.
-        reference, query: the traverses, where the ground truth lies in them; a reference also says how many
-            frames there are: without it, an offset gives every query a right answer.
-        map: file of a map of the reference. It says how many frames there are as well; where its places are
-            resampled by distance, matches and ground truth are turned from frames into places.
+        reference, query: the traverses, where the ground truth lies in them. Without a reference or a map
+            nothing says how many frames there are: an offset gives every query a right answer.
+        map: file of a map of the reference; where its places are resampled by distance, matches and ground
+            truth are turned from frames into places.
         route: of matches on a merged map, the route that `truth` and `reference` are of: answers on other
             routes are wrong.
 
@@ -97,7 +98,7 @@ def evaluate_file(
         places = place_map.places
         frames = len(positions) if resampled else places
     queries, match, candidates = read_matches(matches, route)
-    elsewhere = match.index == ELSEWHERE, candidates == ELSEWHERE
+    elsewhere = candidates == ELSEWHERE
     if frames is not None and int(candidates.max()) >= frames:
         raise InputError(f"{matches} reports place {int(candidates.max())}; expected one below {frames}")
     known = find_ground_truth(truth, reference, query, frames, queries, interpolate, resampled)
@@ -107,27 +108,20 @@ def evaluate_file(
     own = own_facts(match, queries, tolerance, True, offset_of(truth, carried))
     if place_map is not None:
         known = ground_truth_in_places(known, place_map.place_of)
-        match = match._replace(index=place_map.place_of(match.index))
         candidates = place_map.place_of(candidates)
+    here = match._replace(index=candidates[:, 0].masked_fill(elsewhere[:, 0], -1))
     if route is not None:  # other routes lie behind all of this one, and all that its truth has
         highest = max(int(table.max()) for table in (candidates, known.positives) if table.numel())
-        behind = max(places or 0, 1 + highest) + tolerance
-        match = match._replace(index=match.index.masked_fill(elsewhere[0], behind))
-        candidates = candidates.masked_fill(elsewhere[1], behind)
+        candidates = candidates.masked_fill(elsewhere, max(places or 0, 1 + highest) + tolerance)
+    match = match._replace(index=candidates[:, 0])
     described = describe_ground_truth(truth, interpolate, carried)
-    facts = evaluation_facts(match, known, tolerance, positions, described) | own
+    facts = evaluation_facts(match, candidates, known, tolerance, positions, described) | own
     accepted = facts["accepted"]
-    facts |= candidate_facts(candidates, known, tolerance)
-    facts |= rejection_facts(match, known, tolerance, {})
-    facts |= {
-        "accepted_precision": facts["accepted_right"] / accepted if accepted else None,
-        "matches": str(matches),
-        "places": places,
-    }
+    facts["accepted_precision"] = facts["accepted_right"] / accepted if accepted else None
+    facts |= {"matches": str(matches), "places": places}
     if route is not None:
-        facts |= {"route": route, "elsewhere": int(elsewhere[0].sum())}
+        facts |= {"route": route, "elsewhere": int(elsewhere[:, 0].sum())}
     ours = contend(printable(matches.name), match, known, tolerance)
-    here = match._replace(index=match.index.masked_fill(elsewhere[0], -1))
     seen = places or 1 + max(int(table.max()) for table in (here.index, known.positives))
     borders = torch.tensor([seen]) if place_map is None else place_map.table.borders
     pictures = draw_curves({"map": ours}, f"{tolerance} {facts['unit']}")
@@ -137,14 +131,21 @@ def evaluate_file(
 
 
 def evaluation_facts(
-    match: Match, truth: GroundTruth | None, tolerance: int, positions: Tensor, described: str
+    match: Match,
+    candidates: Tensor,
+    truth: GroundTruth | None,
+    tolerance: int,
+    positions: Tensor,
+    described: str,
+    off_map: Mapping[str, Tensor] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """What every report.json holds beside the scores.
 
     Args:
-        truth: None where nothing tells the right places.
+        candidates: (Q,K), best first, places as a ground truth counts them.
+        truth: None where nothing tells the right places. described: the same in words.
         positions: of the map's places, empty where they are the frames; see `PlaceMap`.
-        described: the ground truth in words.
+        off_map: see `rejection_facts`.
     """
     facts: dict[str, Any] = {
         "queries": len(match.index),
@@ -155,16 +156,11 @@ def evaluation_facts(
         "version": __version__,
         "torch": torch.__version__,
     }
+    for first in RANKS:
+        found = None if truth is None else recall_at(candidates, truth, tolerance, first)
+        facts[f"recall_at_{first}"] = found
     if truth is not None:
         facts |= count_queries(match, truth, tolerance)
         facts["truth"] = described
         facts["threshold_of_full_precision"] = threshold_of_full_precision(curve_of(match, truth, tolerance))
-    return facts
-
-
-def candidate_facts(candidates: Tensor, truth: GroundTruth | None, tolerance: int) -> dict[str, float | None]:
-    """What every report.json holds of candidates (Q,K), best first, places as a ground truth counts them."""
-    return {
-        f"recall_at_{first}": None if truth is None else recall_at(candidates, truth, tolerance, first)
-        for first in RANKS
-    }
+    return facts | rejection_facts(match, truth, tolerance, off_map)

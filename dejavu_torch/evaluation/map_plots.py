@@ -1,350 +1,43 @@
-"""Pictures of a map: its periods, features and lines, how they answer a query, and the ground measured."""
+"""Pictures of a spectral map, how it answers a query, and the ground that gives the steps between places."""
 
 from __future__ import annotations
 
-import math
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from fractions import Fraction
 from textwrap import fill
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
-from matplotlib.collections import LineCollection
-from matplotlib.colors import PowerNorm
 from torch import Tensor
 
-from dejavu_torch.evaluation.activation import ActivationRates
 from dejavu_torch.evaluation.contenders import COLOURS
+from dejavu_torch.evaluation.localization import Localization, frame_at
 from dejavu_torch.evaluation.plots import (
     DARK,
     GREY,
-    LABELLED,
     LAYERS,
     LETTERS,
-    LINE,
     PLACE,
     WIDTH,
     WRONG,
+    Picture,
     Plot,
     canvas,
-    period_axis,
+    label,
+    picture,
     pixels,
-    show_cells,
+    show_frame,
 )
-from dejavu_torch.periods.spectrogram import Spectrum
-from dejavu_torch.types import FrequencyLayer, Plan
+from dejavu_torch.maps.spectral_map import SpectralMap
+from dejavu_torch.maps.spectrum import from_spectrum, period_of, spectrum
+from dejavu_torch.motion.ground_plane import ground_patch
+from dejavu_torch.motion.resampling import ResampledTraverse
 
-SHOWN = 12  # layers of a chunk
 BLUE = COLOURS["map"]
-ROWS, CYCLES, MARKED = 64, 100, 12  # templates, cycles and multiples of a period drawn at most
-_BESIDE = {  # a number next to a mark, readable on any colour
-    "textcoords": "offset points",
-    "va": "center",
-    "fontsize": 9,
-    "bbox": {"facecolor": "white", "edgecolor": "none", "pad": 0.8},
-}
-_DOTS = 4000  # along a picture; a longer line is drawn as the range it covers
+STRONGEST = 3  # numbers of the descriptor whose spectrum is shown
+COUNTS = (1, 4, 16)  # strongest periods that are added up, beside all
 FAINTEST = 0.02  # of a step: what is below is drawn there
-
-
-def plot_chunks(plan: Plan, borders: Tensor, unit: str) -> Plot:
-    """Chunks along the route and the periods found in each; the wider a bar, the more features."""
-    figure, axis = canvas(3.6)
-    axis.set(xlim=(0, int(borders[-1])), xlabel=PLACE, ylabel=f"period ({unit})")
-    if not plan:
-        axis.set(yticks=[])
-        axis.text(0.5, 0.5, "this route does not repeat: no layers", ha="center", transform=axis.transAxes)
-        return figure, axis
-    most = max(len(layer.features) for layer in plan)
-    chunks = sorted({(layer.start, layer.stop) for layer in plan})
-    for start, stop in chunks:
-        first, last = (int(borders[edge]) for edge in (start, stop))
-        members = [layer for layer in plan if (layer.start, layer.stop) == (start, stop)]
-        for layer in members:
-            share = len(layer.features) / most
-            style = {"linewidth": 0.6 + 7 * share, "alpha": 0.35 + 0.65 * share}
-            axis.hlines(float(layer.period), first, last, color=BLUE, **style)
-        leading = sorted(members, key=lambda layer: -len(layer.features))[:2]
-        for layer, along in zip(leading, (0.3, 0.7), strict=False):
-            if len(chunks) <= LABELLED:
-                text = f"{float(layer.period):.4g}"
-                box = {"facecolor": "white", "edgecolor": "none", "pad": 0.8}
-                where = first + along * (last - first), float(layer.period)
-                axis.text(*where, text, fontsize=9, ha="center", va="center_baseline", bbox=box)
-    for edge in {edge for chunk in chunks for edge in chunk}:
-        axis.axvline(int(borders[edge]), color=GREY, linewidth=0.8, linestyle=":")
-    periods = [float(layer.period) for layer in plan]
-    period_axis(axis, min(periods) / 1.2, max(periods) * 1.2, unit)
-    axis.set_title(f"widest bar: {most} features", fontsize=10, loc="left")
-    return figure, axis
-
-
-def plot_layers(layers: Sequence[FrequencyLayer], borders: Tensor, unit: str) -> Plot:
-    """Layers of one chunk and their phases along it (figure 2 of the paper).
-
-    Convention: one row a layer, those of most features, by period; the colour is the phase, so that a
-    column of colours is what names a place.
-    """
-    shown = sorted(sorted(layers, key=lambda layer: -len(layer.features))[:SHOWN], key=lambda p: p.period)
-    start, stop = shown[0].start, shown[0].stop
-    figure, axis = canvas(0.24 * len(shown) + 1.5)
-    phases = torch.stack([layer.place_phases / layer.phases for layer in shown])
-    x, y = borders[start : stop + 1] - 0.5, torch.arange(len(shown) + 1) - 0.5
-    image = show_cells(axis, x, y, phases, cmap="twilight", vmin=0, vmax=1)
-    axis.invert_yaxis()
-    axis.set_yticks(range(len(shown)), [f"{float(layer.period):.4g}" for layer in shown])
-    axis.set(xlabel=PLACE, ylabel=f"period ({unit})")
-    axis.set_title(f"phase in {len(shown)} of {len(layers)} layers", loc="left", fontsize=10)
-    figure.colorbar(image, ax=axis, label="phase / period", pad=0.01, aspect=20)
-    return figure, axis
-
-
-def plot_activations(
-    layers: Sequence[FrequencyLayer],
-    scores: Sequence[Tensor],
-    fused: Tensor,
-    query: int,
-    borders: Tensor,
-    places: Sequence[int] = (),
-    strip: Tensor | None = None,
-    rates: ActivationRates | None = None,
-) -> Plot:
-    """Scores of one query over a chunk: two layers, and all layers fused (figure 17 of the paper)."""
-    names = [f"period {float(layer.period):.4g}, {len(layer.features)} features" for layer in layers]
-    texts = [""] * (len(layers) + 1)
-    if rates is not None:
-        texts = [rate.describe() for rate in (*rates.layers, rates.fused)]
-    titles = [
-        f"{name}:\n{text}" if text else name
-        for name, text in zip([*names, "all layers fused"], texts, strict=True)
-    ]
-    curves = list(zip(titles, [*scores, fused], [*LAYERS[: len(layers)], BLUE], strict=True))
-    return plot_answers(curves, query, borders, layers[0].start, layers[0].stop, places, strip)
-
-
-def plot_answers(
-    curves: Sequence[tuple[str, Tensor, str]],
-    query: int,
-    borders: Tensor,
-    start: int,
-    stop: int,
-    places: Sequence[int] = (),
-    strip: Tensor | None = None,
-    sharey: bool = False,
-) -> Plot:
-    """Scores of one query over the places [start, stop), a row for each way to score them."""
-    where, begin, end = borders[start:stop], int(borders[start]), int(borders[stop])
-    above = strip is not None
-    figure, rows = canvas(
-        0.6 + 0.9 * (len(curves) + above) + 0.8, len(curves) + above, squeeze=False, sharex=True
-    )
-    rows = rows[:, 0]
-    axes = rows[above:]
-    if strip is not None:
-        rows[0].imshow(pixels(strip), extent=(begin, end, 0, 1), aspect="auto")
-        rows[0].set_yticks([])
-        rows[0].set_title("middle image column of each frame", loc="left", fontsize=10)
-    for axis, (title, values, colour) in zip(axes, curves, strict=True):
-        axis.plot(where, values, color=colour, linewidth=1.1)
-        best = int(values.argmin())
-        style = {"color": WRONG, "markersize": 7, "clip_on": False, "label": "best (first of equals)"}
-        axis.plot(where[best], values[best], "v", **style)
-        axis.set_title(title, loc="left", fontsize=9)
-        axis.set_yticks([])
-        if sharey:
-            axis.set_ylim(*spread(torch.cat([values for _, values, _ in curves])))
-    for axis in rows:
-        for place in places:
-            axis.axvline(int(borders[place]), color=DARK, linewidth=0.9, linestyle="--", label="true place")
-    handles, labels = axes[-1].get_legend_handles_labels()
-    unique = dict(zip(labels, handles, strict=True))
-    figure.legend(unique.values(), unique.keys(), ncols=2, frameon=False, loc="outside lower right")
-    figure.supylabel(f"difference of query {query} (lower is better)", fontsize=10)
-    rows[-1].set(xlabel=PLACE, xlim=(begin, end))
-    return figure, rows
-
-
-def spread(values: Tensor) -> tuple[float, float]:
-    """Limits of an axis that shows all values."""
-    low, high = float(values.min()), float(values.max())
-    room = 0.06 * (high - low) or 1.0
-    return low - room, high + room
-
-
-def edges_seen(
-    features: Tensor, size: tuple[int, int], orientations: int = 9, cell: int = 8, block: int = 2
-) -> tuple[Tensor, Tensor]:
-    """The edges that HOG features respond to, as line segments, and how many of the features share each.
-
-    Shape: (F,) int64 -> (E,2,2) end points (x, y) in pixels, where (0, 0) is the middle of the first pixel;
-        (E,) int64, in how many (overlapping) blocks the features have this cell and orientation.
-
-    Convention: an edge lies across its gradient, through the middle of its cell. Bin o holds gradients of
-        about (o + 1/2) * 180 / orientations degrees.
-    """
-    rows, columns = (max(0, pixels // cell - block + 1) for pixels in size)
-    shape = (rows, columns, block, block, orientations)
-    row, column, down, right, orientation = torch.unravel_index(features, shape)
-    cells = torch.stack([row + down, column + right, orientation], 1)
-    distinct, count = cells.unique(dim=0, return_counts=True)
-    middle = (distinct[:, :2].flip(1) + 0.5) * cell - 0.5
-    angle = (distinct[:, 2] + 0.5) * math.pi / orientations  # of the gradient, from x towards y
-    along = torch.stack([-angle.sin(), angle.cos()], 1) * (0.45 * cell)
-    return torch.stack([middle - along, middle + along], 1), count
-
-
-def plot_spectrogram(
-    values: Tensor,
-    spectra: Sequence[Spectrum],
-    kept: Sequence[Sequence[float]],
-    shortest: float,
-    feature: int,
-    borders: Tensor,
-    unit: str,
-) -> Plot:
-    """One feature through time, and its spectrogram, a column a chunk (figure 3 of the paper).
-
-    Convention: where chunks overlap, each column ends where the next begins.
-    """
-    figure, (above, below) = canvas(4.4, 2, sharex=True, height_ratios=(1, 1.7))
-    if len(values) > _DOTS:
-        step = -(-len(values) // (_DOTS // 2))
-        low, high = zip(*((float(part.min()), float(part.max())) for part in values.split(step)), strict=True)
-        above.fill_between(borders[:-1:step], low, high, color=DARK, linewidth=0.5)
-    else:
-        above.plot(borders[:-1], values, color=DARK, linewidth=0.7)
-    above.set_title(f"feature {feature} through time", loc="left", fontsize=10)
-    above.set(ylabel="value")
-    shares = [(power[2:] / power[1:].sum()).nan_to_num() for _, _, power in spectra]
-    strongest = max(float(share.max()) for share in shares)
-    norm = PowerNorm(0.5, 0, max(strongest, 1e-6) * 100)
-    ends = [*(spectrum.start for spectrum in spectra[1:]), spectra[-1].stop]
-    mesh: Any = None
-    for (start, stop, _), share, end, periods in zip(spectra, shares, ends, kept, strict=True):
-        left, right = int(borders[start]), int(borders[min(stop, end)])
-        between = (stop - start) / (torch.arange(len(share) + 1) + 1.5)  # two bins
-        mesh = below.pcolormesh([left, right], between.numpy(), share.numpy() * 100, norm=norm, cmap="Blues")
-        for axis in (above, below):
-            axis.axvline(left, color=GREY, linewidth=0.8, linestyle=":")
-        for period in periods:
-            middle = (left + right) / 2
-            size = 11 if len(spectra) <= LABELLED else 3
-            below.plot(middle, period, "o", color=LAYERS[0], markersize=size, markerfacecolor="none")
-            if len(spectra) <= LABELLED:
-                below.annotate(f"{period:.4g}", (middle, period), (10, 0), **_BESIDE)
-    figure.colorbar(mesh, ax=below, label="% of its power", pad=0.01, aspect=30)
-    period_axis(below, shortest, max((stop - start) / 1.5 for start, stop, _ in spectra), unit)
-    below.set(xlim=(0, int(borders[-1])), xlabel=PLACE)
-    below.set_title("power at each period; circles: kept", loc="left", fontsize=10)
-    return figure, (above, below)
-
-
-def plot_autocorrelogram(values: Tensor, periods: Sequence[float], feature: int, unit: str) -> Plot:
-    """How alike a feature is to itself some places later (figure 1 (c) of the paper).
-
-    Convention: the biased autocorrelation of the feature minus its mean, 1 at lag 0.
-    """
-    figure, axis = canvas(3)
-    spectrum = torch.fft.rfft(values.double() - values.double().mean(), n=2 * len(values)).abs().square()
-    correlation = torch.fft.irfft(spectrum)[: len(values)]
-    axis.plot(correlation / correlation[0].clamp(min=1e-30), color=DARK, linewidth=1)
-    for period, colour in zip(periods, LAYERS, strict=False):
-        lags = [k * period for k in range(1, MARKED) if k * period < len(values)]
-        axis.vlines(lags, -1, 1, color=colour, linewidth=0.9, linestyle=":", label=f"multiples of {period:g}")
-    axis.set(xlim=(0, len(values)), ylim=(-1, 1.02), xlabel=f"lag ({unit})", ylabel="autocorrelation")
-    axis.set_title(f"feature {feature} against itself", loc="left", fontsize=10)
-    if periods:
-        axis.legend(loc="upper right", ncols=2, frameon=False, fontsize=9)
-    return figure, axis
-
-
-def plot_templates(
-    layer: FrequencyLayer,
-    values: Tensor,
-    templates: Tensor,
-    chosen: int,
-    unit: str,
-    thick: str = "their mean",
-) -> Plot:
-    """The places of equal phase averaged into templates (figure 4 of the paper).
-
-    Convention: of more than 100 cycles every k-th is drawn. Of more than 64 features those are drawn that
-        vary most from phase to phase; rows are ordered by where in the cycle they are high, each from
-        its lowest (white) to its highest (dark).
-    """
-    figure, (above, below) = canvas(4.8, 2, sharex=True, height_ratios=(1, 1.4))
-    period, number = float(layer.period), layer.features[chosen]
-    places = torch.arange(layer.start, layer.stop)
-    cycle = places * layer.period.denominator // layer.period.numerator
-    within = places - cycle.double() * period
-    parts = torch.unique_consecutive(cycle, return_counts=True)[1].tolist()
-    cycles = list(zip(within.split(parts), values.split(parts), strict=True))
-    for x, y in cycles[:: -(-len(cycles) // CYCLES)]:
-        above.plot(x, y, color=GREY, linewidth=0.6, alpha=0.6)
-    # phase k holds the places that lie from k to k + 1 phases into their cycle
-    phase = (torch.arange(layer.phases) + 0.5) * period / layer.phases - 0.5
-    above.plot(phase, templates[:, chosen], color=BLUE, linewidth=2.2)
-    text = f"feature {number}, {len(cycles)} cycles; thick: {thick}"
-    above.set_title(text, loc="left", fontsize=10)
-    above.set(ylabel="value")
-    rows = templates.var(0, correction=0).argsort(descending=True, stable=True)[:ROWS]
-    wave = torch.fft.fft(templates[:, rows].double(), dim=0)[1 % layer.phases]
-    rows = rows[wave.angle().neg().remainder(2 * math.pi).argsort(stable=True)]
-    picture = templates[:, rows].T
-    low, high = picture.amin(1, keepdim=True), picture.amax(1, keepdim=True)
-    picture = (picture - low) / (high - low).clamp(min=torch.finfo(picture.dtype).tiny)
-    extent = (-0.5, period - 0.5, len(rows) - 0.5, -0.5)
-    below.imshow(picture.numpy(), aspect="auto", extent=extent, cmap="Blues", interpolation="nearest")
-    total = len(layer.features)
-    text = f"{total} features" if len(rows) == total else f"{len(rows)} of {total} features"
-    below.set_title(f"templates of {text}; dark: highest", loc="left", fontsize=10)
-    mark = (rows == chosen).nonzero().flatten().tolist()
-    below.set_yticks(mark, [str(number)] * len(mark))
-    below.set(
-        xlabel=f"phase, of a period of {period:.4g} ({unit})", ylabel="feature", xlim=(-0.5, period - 0.5)
-    )
-    return figure, (above, below)
-
-
-def plot_features(
-    frame: Tensor,
-    layers: Sequence[FrequencyLayer],
-    orientations: int = 9,
-    cell: int = 8,
-    block: int = 2,
-) -> Plot:
-    """HOG features that take part in a layer, on a frame of the route (figures 15 and 16 of the paper).
-
-    Convention: each is drawn as the edge it responds to, across its gradient; the stronger the line, the
-        more of the overlapping blocks have this cell and orientation in the layer.
-    """
-    height, width = frame.shape[-2:]
-    beside = width <= 1.6 * height and width <= 12 * cell
-    rows, columns = (1, len(layers)) if beside else (len(layers), 1)
-    wide = 0.97 * WIDTH / columns
-    figure, axes = canvas(
-        (min(2 * WIDTH, wide * height / width) + 2 * LINE) * rows, rows, columns, squeeze=False
-    )
-    points = 72 * wide * cell / width  # a cell's side
-    grey = frame.mean(0)
-    if grey.min() < 0 or grey.max() > 1:
-        grey = (grey - grey.min()) / (grey.max() - grey.min())
-    for axis, layer, colour in zip(axes.flat, layers, LAYERS * len(layers), strict=False):
-        axis.imshow(
-            (0.35 + 0.65 * grey).numpy(), cmap="gray", vmin=0, vmax=1
-        )  # pale, so that lines stand out
-        edges, count = edges_seen(torch.tensor(layer.features), (height, width), orientations, cell, block)
-        strength = count / count.max()
-        axis.add_collection(
-            LineCollection(
-                list(edges.numpy()),
-                colors=colour,
-                linewidths=(points * (0.02 + 0.07 * strength)).tolist(),
-                alpha=(0.3 + 0.7 * strength).tolist(),
-            )
-        )
-        axis.set_axis_off()
-        axis.set_title(f"period {float(layer.period):.4g},\n{len(layer.features)} features", fontsize=10)
-    return figure, axes
 
 
 class Lines(NamedTuple):
@@ -355,6 +48,33 @@ class Lines(NamedTuple):
 
     amplitudes: Tensor
     kept: Tensor
+
+
+def longest_chunk(route: SpectralMap) -> int:
+    """Its number; the first of equals."""
+    return max(range(len(route.chunks)), key=lambda j: route.chunks[j][1] - route.chunks[j][0])
+
+
+def draw_spectrum(run: Localization, route: SpectralMap) -> dict[str, Picture]:
+    """The spectra of those numbers of the descriptor of which the longest chunk keeps most energy."""
+    chunk = longest_chunk(route)
+    start, stop = route.chunks[chunk]
+    lines = route.lines(chunk)
+    if stop - start < 2 or not len(lines.value):
+        return {}
+    energy = lines.value.new_zeros(route.dimension).index_add(0, lines.feature, lines.value.square())
+    chosen = energy.argsort(descending=True, stable=True)[:STRONGEST].cpu()
+    values = (
+        run.reference_features[start:stop].cpu()[:, chosen].float() - route.means[0].cpu()[chosen].float()
+    )
+    amplitudes = spectrum(values.T, route.transform).abs()
+    kept = torch.zeros(route.dimension, stop - start, dtype=torch.bool)
+    kept[lines.feature.cpu(), lines.line.cpu()] = True
+    periods = [float(period_of(j, stop - start, route.transform)) for j in range(1, stop - start)]
+    features = {int(j): Lines(own[1:], kept[j, 1:]) for j, own in zip(chosen, amplitudes, strict=True)}
+    plot = plot_spectrum(features, torch.tensor(periods), float(route.steps[chunk]), run.unit)
+    edges = run.borders[[start, stop]].tolist() if len(route.chunks) > 1 else None
+    return picture("spectrum", plot, chunk=edges)
 
 
 def plot_spectrum(features: Mapping[int, Lines], periods: Tensor, step: float, unit: str) -> Plot:
@@ -384,6 +104,141 @@ def plot_spectrum(features: Mapping[int, Lines], periods: Tensor, step: float, u
     handles, labels = axis.get_legend_handles_labels()
     figure.legend(handles, labels, ncols=3, frameon=False, loc="outside lower right", markerscale=3)
     return figure, axes[:, 0]
+
+
+def draw_components(run: Localization, route: SpectralMap) -> dict[str, Picture]:
+    """One query's scores with its strongest periods only, and with all; nothing where no period is kept."""
+    chunk = longest_chunk(route)
+    start, stop = route.chunks[chunk]
+    query, places = run.example_query(start, stop)
+    sums = components(route, run.query_features[query], chunk)
+    if not sums[-1][0]:
+        return {}
+    curves, better = [], []
+    for number, (periods, scores) in enumerate(sums, 1):
+        title = f"{len(periods)} strongest periods"
+        if number == len(sums):
+            title = f"all {len(periods)} periods"
+        elif len(periods) == 1:
+            title = f"strongest period, {float(periods[0]):.4g} {run.unit}"
+        if places:
+            right = [place - start for place in places]
+            better.append(better_places(scores, right, run.tolerance))
+            title += f": {better[-1]} places fit better"
+        curves.append((fill(title, LETTERS), scores, BLUE if number == len(sums) else DARK))
+    numbers = {"places_that_fit_better": better} if places else {}
+    plot = plot_answers(run, query, (start, stop), places, curves, sharey=True)
+    return picture("components", plot, numbers, truth=places)
+
+
+@torch.no_grad()
+def components(
+    route: SpectralMap, query: Tensor, chunk: int = 0
+) -> list[tuple[tuple[Fraction, ...], Tensor]]:
+    """Scores of a query with its 1, 4 and 16 strongest periods only, and with all: the map's own scores.
+
+    The product of a query with all descriptors of a chunk is a sum of waves, one for each period, besides a
+    constant; the strongest have the largest energy. Cosine and sine of a period count together.
+
+    Shape: query (K,) -> periods, the strongest first, and scores (W,) of the places of the chunk, each.
+
+    Convention: the constant, and what the metric does with products and norms, are part of every sum.
+    """
+    start, stop = route.chunks[chunk]
+    kept_lines = route.lines(chunk)
+    query = query.to(kept_lines.value)
+    length = torch.linalg.vector_norm(query)
+    if route.metric == "cosine":
+        query = query / torch.where(length > 0, length, 1)
+    terms = query[kept_lines.feature] * kept_lines.value
+    lines = query.new_zeros(stop - start).index_add(0, kept_lines.line, terms)
+    lines_of: dict[Fraction, list[int]] = defaultdict(list)
+    for line in range(1, stop - start):
+        if lines[line]:
+            lines_of[period_of(line, stop - start, route.transform)].append(line)
+    strongest = sorted(lines_of, key=lambda period: -float(lines[lines_of[period]].square().sum()))
+    found = []
+    for count in (*(count for count in COUNTS if count < len(strongest)), len(strongest)):
+        kept = torch.zeros_like(lines)
+        for chosen in ([0], *(lines_of[period] for period in strongest[:count])):
+            kept[chosen] = lines[chosen]
+        products = from_spectrum(kept, route.transform) + query @ route.means[0].to(query)
+        if route.metric == "cosine":
+            scores = 1 - products * route.inverse_norms(start, stop)
+        else:
+            scores = length.square() - 2 * products + route.norms[start:stop].square()
+        found.append((tuple(strongest[:count]), scores.cpu()))
+    return found
+
+
+def better_places(scores: Tensor, right: Sequence[int], tolerance: int) -> int:
+    """How many places score lower than the best of those within the tolerance of a right one."""
+    distance = (torch.arange(len(scores))[:, None] - torch.tensor(right)).abs().amin(1)
+    inside = distance <= tolerance
+    return int((scores[~inside] < scores[inside].min()).sum())
+
+
+def plot_answers(
+    run: Localization,
+    query: int,
+    chunk: tuple[int, int],
+    places: Sequence[int],
+    curves: Sequence[tuple[str, Tensor, str]],
+    strip: Tensor | None = None,
+    sharey: bool = False,
+) -> Plot:
+    """Scores of one query over the places of a chunk: a row for each title, scores and colour.
+
+    places: the right ones. strip: (C,H,W), drawn above along the chunk. sharey: rows have one scale.
+    """
+    begin, end = (int(run.borders[edge]) for edge in chunk)
+    above = strip is not None
+    count = len(curves) + above
+    figure, rows = canvas(1.4 + 0.9 * count, count, squeeze=False, sharex=True, sharey=sharey)
+    rows = rows[:, 0]
+    if strip is not None:
+        rows[0].imshow(pixels(strip), extent=(begin, end, 0, 1), aspect="auto")
+        rows[0].set_yticks([])
+        rows[0].set_title("middle image column of each frame", loc="left", fontsize=10)
+    where = run.borders[slice(*chunk)]
+    for axis, (title, values, colour) in zip(rows[above:], curves, strict=True):
+        axis.plot(where, values, color=colour, linewidth=1.1)
+        best = int(values.argmin())
+        style = {"color": WRONG, "markersize": 7, "clip_on": False, "label": "best (first of equals)"}
+        axis.plot(where[best], values[best], "v", **style)
+        axis.set_title(title, loc="left", fontsize=9)
+        axis.set_yticks([])
+    for axis in rows:
+        for place in places:
+            style = {"color": DARK, "linewidth": 0.9, "linestyle": "--", "label": "true place"}
+            axis.axvline(int(run.borders[place]), **style)
+    handles, labels = rows[-1].get_legend_handles_labels()
+    unique = dict(zip(labels, handles, strict=True))
+    figure.legend(unique.values(), unique.keys(), ncols=2, frameon=False, loc="outside lower right")
+    figure.supylabel(f"difference of query {run.query_frames[query]} (lower is better)", fontsize=10)
+    rows[-1].set(xlabel=PLACE, xlim=(begin, end))
+    return figure, rows
+
+
+def draw_motion(run: Localization) -> dict[str, Picture]:
+    """The ground and its motion; nothing where the reference is not resampled."""
+    reference = run.reference
+    if not isinstance(reference, ResampledTraverse):
+        return {}
+    frame, odometry = frame_at(reference, reference.length // 2), reference.odometry
+    corners, (height, width) = odometry.corners, frame.shape[-2:]
+    figure, (left, right) = canvas(0.65 * WIDTH * height / width + 0.4, 1, 2, width_ratios=(2, 1))
+    show_frame(left, frame, "the ground in a frame")
+    show_frame(right, ground_patch(frame[None], corners, odometry.size)[0], "from above")
+    x, y = (torch.tensor([*edge, edge[0]]) for edge in zip(*corners, strict=True))
+    left.plot(x * (width - 1), y * (height - 1), color=LAYERS[0], linewidth=1.5)
+    ground = picture("ground", (figure, (left, right)))
+    distances = {
+        label(f"{role}: {one.name}"): one.positions * one.step
+        for role, one in (("reference", reference), ("query", run.query))
+        if isinstance(one, ResampledTraverse)
+    }
+    return ground | picture("velocity", plot_velocity(distances, reference.step))
 
 
 def plot_velocity(distances: Mapping[str, Tensor], step: float) -> Plot:

@@ -54,15 +54,11 @@ def write_matches(
     """Write matches that come in parts as a csv; returns how many (queries, accepted at their first rank).
 
     Args:
-        matches: one a query, in order; with `ranks`, that many a query, as `Found.ranked` gives. Where a
-            probability is NaN its cell is empty.
-        query_frames: (Q,) int64, the frame of its source that each query shows; None where query i is
-            frame i.
-        frame_of: the reference frame that each place shows, as `PlaceMap.frame_of`; None where place i is
-            frame i.
-        query_name, place_name: the name of a frame of the query's and of the reference's source, as
-            `Traverse.frame_name`; None leaves the column empty. A character that is not printable, such as a
-            line break, is escaped.
+        matches: one a query, in order; with `ranks`, that many a query, as `Found.ranked` gives.
+        query_frames: (Q,) int64, the frame of its source that each query shows; None: query i is frame i.
+        frame_of: the reference frame that each place shows, as `PlaceMap.frame_of`; None: place i is frame i.
+        query_name, place_name: the name of a frame, as `Traverse.frame_name`; None leaves the column empty. A
+            character that is not printable, such as a line break, is escaped.
         ranks: how many matches each query has; None is one, and no column for the rank.
         routes: of a merged map, which get a column with the name of each: the place is then a frame of that
             route, while `frame_of` and `place_name` count through all of them.
@@ -76,10 +72,10 @@ def write_matches(
     start = next(matches, None)
     known = start is not None and start.probability is not None
     with whole_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        told = (("probability", known), ("rank", ranks is not None), ("route", bool(routes)))
-        also = [name for name, is_told in told if is_told]
-        writer.writerow([*NUMBERS, *also, *NAMES])
+        told = {"probability": known, "rank": ranks is not None, "route": bool(routes)}
+        columns = [*NUMBERS, *(name for name, is_told in told.items() if is_told), *NAMES]
+        writer = csv.DictWriter(file, columns, extrasaction="ignore")
+        writer.writeheader()
         for match in () if start is None else itertools.chain([start], matches):
             digits = 17 if match.score.dtype == torch.float64 else 9  # so that reading gives the same number
             first, total = total, total + len(match.index) // each
@@ -87,16 +83,21 @@ def write_matches(
             places = match.index if frame_of is None else frame_of(match.index)
             rank = torch.arange(each).repeat(len(queries)) + 1
             right = match.score if match.probability is None else match.probability
-            columns = (queries.repeat_interleave(each), places, match.score, match.accepted, right, rank)
-            rows = zip(*(column.tolist() for column in columns), strict=True)
-            for query, place, score, good, p, at in rows:
-                names = _name(query_name, query), _name(place_name, place)
-                route = bisect_right(starts, place) - 1 if routes and place >= 0 else -1
-                sure = "" if math.isnan(p) else f"{p:.6g}"
-                cells = (sure, at, printable(routes[route].name) if route >= 0 else "")
-                also = [cell for cell, (_, is_told) in zip(cells, told, strict=True) if is_told]
-                own = place - starts[route] if route >= 0 else place
-                writer.writerow([query, own, f"{score:.{digits}g}", int(good), *also, *names])
+            numbers = (queries.repeat_interleave(each), places, match.score, match.accepted, right, rank)
+            for query, place, score, good, p, at in zip(*(one.tolist() for one in numbers), strict=True):
+                on = bisect_right(starts, place) - 1 if routes and place >= 0 else -1
+                row = {
+                    "query": query,
+                    "place": place - starts[on] if on >= 0 else place,
+                    "score": f"{score:.{digits}g}",
+                    "accepted": int(good),
+                    "probability": "" if math.isnan(p) else f"{p:.6g}",
+                    "rank": at,
+                    "route": printable(routes[on].name) if on >= 0 else "",
+                    "query_name": _name(query_name, query),
+                    "place_name": _name(place_name, place),
+                }
+                writer.writerow(row)
                 accepted += good and at == 1
     return total, accepted
 
@@ -109,14 +110,14 @@ def read_matches(path: Path, route: str | None = None) -> Matches:
     """The matches of a csv, which may come from any method.
 
     Args:
-        path: a csv with a header. query: number of the query frame, in any order, each once or in lines that
-            follow one another, as where resampled footage shows a frame several times. place: number of the
-            reported frame of the reference, -1 for none. score: lower is better, inf for none. accepted: 1 or
-            0; where the column is missing, every match with a finite score is accepted. probability: of being
-            right, from 0 to 1; where the column is missing, none is known. rank: where there is
-            such a column, the lines of a query are its candidates, ranks 1 to K in this order with one K for
-            all queries, and the first is its match, whose probability alone counts. route: where there is
-            such a column, the name of the route whose frame the place is. Other columns are ignored.
+        path: a csv with a header, of these columns; others are ignored.
+            query: number of the query frame, in any order, each once or in lines that follow one another, as
+            where resampled footage shows a frame several times. place: number of the reported frame of the
+            reference, -1 for none. score: lower is better, inf for none.
+            accepted: 1 or 0; without it every match with a finite score is. probability: of being right.
+            rank: the lines of a query are its candidates, ranks 1 to K in this order with one K for all
+            queries; the first is its match, whose probability alone counts.
+            route: whose frame the place is.
         route: whose places count, of a file with that column.
 
     Convention: a row whose place is -1 or whose score is inf reports nothing: place -1, score inf, not
@@ -126,44 +127,29 @@ def read_matches(path: Path, route: str | None = None) -> Matches:
         InputError: what cannot be read, with the number of the line, or a route where there is no such
             column, or none where there is one.
     """
-    routes: dict[str, None] = {}
-    queries: list[int] = []
-    seen: set[int] = set()
-    reports: list[tuple[int, float, bool, float]] = []
+    answers: list[_Answer] = []  # of rank 1
     ranked: list[list[int]] = []
+    seen: set[int] = set()
+    routes: dict[str, None] = {}
     for where, cells in _rows(path):
-        query, place = (
-            _whole(cells[name], name, least, where) for name, least in (("query", 0), ("place", -1))
-        )
-        rank = _whole(cells.get("rank", "1"), "rank", 1, where)
-        if rank > 1 and not (ranked and query == queries[-1] and rank == len(ranked[-1]) + 1):
-            follows = f" or rank {len(ranked[-1]) + 1} of query {queries[-1]}" if ranked else ""
+        answer = _answer(where, cells)
+        query, rank, last = answer.query, answer.rank, answers[-1].query if answers else None
+        if rank > 1 and not (query == last and rank == len(ranked[-1]) + 1):
+            follows = f" or rank {len(ranked[-1]) + 1} of query {last}" if ranked else ""
             raise InputError(f"{where}: rank {rank} of query {query}; expected rank 1{follows}")
-        if rank == 1 and query in seen and query != queries[-1]:
+        if rank == 1 and query in seen and query != last:
             raise InputError(f"{where}: query {query} is there twice; expected each once")
-        score = _score(cells["score"], where)
-        accepted = _ACCEPTED.get(cells.get("accepted", "1").lower())
-        if accepted is None:
-            raise InputError(f"{where}: accepted is {cells['accepted']!r}; expected 1 or 0")
         if route is not None and "route" not in cells:
             raise InputError(f"{where}: no column route for --route {route}; expected none")
-        nothing = place < 0 or math.isinf(score)
-        if "route" in cells and not nothing:
+        if "route" in cells and answer.place >= 0:
             routes[cells["route"]] = None
-            place = place if cells["route"] == route else ELSEWHERE
-        unknown = nothing or rank > 1
-        probability = 0.0 if unknown else as_number(cells.get("probability", "0"))
-        if probability is None or not 0 <= probability <= 1:
-            seen_ = f"probability is {cells['probability']!r}"
-            raise InputError(f"{where}: {seen_}; expected a number from 0 to 1")
-        if rank > 1:
-            ranked[-1].append(-1 if nothing else place)
-            continue
-        ranked.append([-1 if nothing else place])
-        queries.append(query)
-        seen.add(query)
-        reports.append((-1, math.inf, False, 0.0) if nothing else (place, score, accepted, probability))
-    if not queries:
+            answer = answer if cells["route"] == route else answer._replace(place=ELSEWHERE)
+        if rank == 1:
+            answers.append(answer)
+            seen.add(query)
+            ranked.append([])
+        ranked[-1].append(answer.place)
+    if not answers:
         raise InputError(f"{path} holds no matches; expected a line for each query")
     if route is None and "route" in cells:
         known = f", with answers on {', '.join(routes)}" if routes else ""
@@ -171,15 +157,49 @@ def read_matches(path: Path, route: str | None = None) -> Matches:
     if route is not None and route not in routes:
         known = f"; it has answers on {', '.join(routes)}" if routes else ""
         log.warning("%s: no answer is on route %s%s", path, route, known)
-    for query, places in zip(queries, ranked, strict=True):
+    for one, places in zip(answers, ranked, strict=True):
         if len(places) != len(ranked[0]):
-            seen_ = f"query {query} has {len(places)} ranks"
-            raise InputError(f"{path}: {seen_}; expected {len(ranked[0])}, as query {queries[0]} has")
-    index, scores, accepted_, right = zip(*reports, strict=True)
-    match = Match(torch.tensor(index), torch.tensor(scores, dtype=torch.float64), torch.tensor(accepted_))
+            found = f"query {one.query} has {len(places)} ranks"
+            raise InputError(f"{path}: {found}; expected {len(ranked[0])}, as query {answers[0].query} has")
+    queries, _, index, scores, accepted, probability = zip(*answers, strict=True)
+    match = Match(torch.tensor(index), torch.tensor(scores, dtype=torch.float64), torch.tensor(accepted))
     if "probability" in cells:
-        match = match._replace(probability=torch.tensor(right, dtype=torch.float64))
+        match = match._replace(probability=torch.tensor(probability, dtype=torch.float64))
     return Matches(torch.tensor(queries), match, torch.tensor(ranked))
+
+
+class _Answer(NamedTuple):
+    """A row; the defaults are of one that reports nothing. The probability is of rank 1 alone."""
+
+    query: int
+    rank: int
+    place: int = -1
+    score: float = math.inf
+    accepted: bool = False
+    probability: float = 0.0
+
+
+def _answer(where: str, cells: dict[str, str]) -> _Answer:
+    query = _whole(cells["query"], "query", 0, where)
+    place = _whole(cells["place"], "place", -1, where)
+    rank = _whole(cells.get("rank", "1"), "rank", 1, where)
+    try:
+        score = float(cells["score"])
+    except ValueError:
+        score = math.nan
+    if math.isnan(score) or score == -math.inf:
+        seen = f"score is {cells['score']!r}"
+        raise InputError(f"{where}: {seen}; expected a number, or inf where nothing is reported")
+    accepted = _ACCEPTED.get(cells.get("accepted", "1").lower())
+    if accepted is None:
+        raise InputError(f"{where}: accepted is {cells['accepted']!r}; expected 1 or 0")
+    if place < 0 or math.isinf(score):
+        return _Answer(query, rank)
+    probability = as_number(cells.get("probability", "0")) if rank == 1 else 0.0
+    if probability is None or not 0 <= probability <= 1:
+        seen = f"probability is {cells['probability']!r}"
+        raise InputError(f"{where}: {seen}; expected a number from 0 to 1")
+    return _Answer(query, rank, place, score, accepted, probability)
 
 
 def _rows(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
@@ -203,13 +223,3 @@ def _whole(text: str, name: str, least: int, where: str) -> int:
     if value is None or value % 1 or value < least:
         raise InputError(f"{where}: {name} is {text!r}; expected a whole number of at least {least}")
     return int(value)
-
-
-def _score(text: str, where: str) -> float:
-    try:
-        score = float(text)
-    except ValueError:
-        score = math.nan
-    if math.isnan(score) or score == -math.inf:
-        raise InputError(f"{where}: score is {text!r}; expected a number, or inf where nothing is reported")
-    return score

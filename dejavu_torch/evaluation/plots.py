@@ -3,8 +3,9 @@
 Convention 11: axes along a route count frames of its source. What counts places, such as periods, is labelled
 with the unit of `unit_of`.
 
-In plots `borders` (N+1,) is `FrameTable.borders` of the map, `queries` (Q,) the frame of each query,
+In pictures `borders` (N+1,) is `FrameTable.borders` of the map, `queries` (Q,) the frame of each query,
 `unit` that of periods and tolerance, `truth` None where none is known. A contender's key gives its colour.
+What `draw_...` returns is by the names of report.json; nothing where there is nothing to draw.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from dejavu_torch.evaluation.prose import sentences
 from dejavu_torch.text import printable
 
 Plot = tuple[Figure, Any]
@@ -28,6 +30,7 @@ DARK, GREY = "#333333", "#bbbbbb"
 RIGHT, WRONG = "#4daf7c", "#9e1b32"
 LAYERS = ("#b35806", "#542788")  # the two layers that several pictures show
 LABELLED = 8  # chunks along a route that leave room for numbers
+BOX = {"facecolor": "white", "edgecolor": "none", "pad": 0.8}  # of a number that is readable on any colour
 
 
 class Picture(NamedTuple):
@@ -41,6 +44,14 @@ class Picture(NamedTuple):
     heading: str
     caption: str
     numbers: Mapping[str, Any] = MappingProxyType({})
+
+
+def picture(
+    name: str, plot: Plot, numbers: Mapping[str, Any] | None = None, **facts: Any
+) -> dict[str, Picture]:
+    """A plot by its name in a report, with the words that captions.html.j2 has for it and these facts."""
+    heading, _, caption = sentences("captions.html.j2", name=name, **facts).partition(" | ")
+    return {name: Picture(plot, heading, caption, numbers or {})}
 
 
 def label(name: str) -> str:
@@ -62,11 +73,12 @@ def canvas(height: float, rows: int = 1, columns: int = 1, **grid: Any) -> Plot:
     return figure, axes
 
 
-def show_frame(axis: Any, frame: Tensor, title: str = "") -> None:
-    """Draw a frame (C,H,W) in [0,1] without axes."""
-    axis.imshow(pixels(frame))
+def show_frame(axis: Any, frame: Tensor | None, title: str) -> None:
+    """Draw a frame (C,H,W) in [0,1] without axes; None leaves its room empty."""
     axis.set_axis_off()
     axis.set_title(title, loc="left", fontsize=9, pad=3)
+    if frame is not None:
+        axis.imshow(pixels(frame))
 
 
 def show_cells(axis: Any, x: Tensor, y: Tensor, values: Tensor, **style: Any) -> Any:

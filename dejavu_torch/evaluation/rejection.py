@@ -82,18 +82,14 @@ def draw_reliability(match: Match, truth: GroundTruth | None, tolerance: int) ->
     probability, right = judged(match, truth, tolerance)
     if not len(right):
         return {}
-    bin_of = (probability * BINS).long().clamp(0, BINS - 1)
-    counts = torch.bincount(bin_of, minlength=BINS)
-    means, shares = (
-        torch.zeros(BINS, dtype=torch.float64).index_add_(0, bin_of, one.double()) / counts.clamp(min=1)
-        for one in (probability, right)
-    )
+    counts, told, good = binned(probability, right, BINS)
     figure, (above, below) = canvas(4.2, 2, sharex=True, height_ratios=[3, 1])
     above.plot([0, 1], [0, 1], color=GREY, linewidth=0.8, linestyle=":")
     filled = counts > 0
-    above.plot(means[filled], shares[filled], color=DARK, linewidth=1)
+    means, shares = told[filled] / counts[filled], good[filled] / counts[filled]
+    above.plot(means, shares, color=DARK, linewidth=1)
     sizes = 14 + 120 * (counts[filled] / counts.max()).sqrt()
-    above.scatter(means[filled], shares[filled], s=sizes, color=RIGHT, zorder=3)
+    above.scatter(means, shares, s=sizes, color=RIGHT, zorder=3)
     above.set(ylabel="share that is right", xlim=(-0.03, 1.03), ylim=(-0.06, 1.06))
     below.bar((torch.arange(BINS) + 0.5) / BINS, counts, width=0.9 / BINS, color=GREY)
     below.set(xlabel="probability that the map gives", ylabel="queries", yscale="symlog", ylim=(0, None))
@@ -120,8 +116,13 @@ def calibration_error(probability: Tensor, right: Tensor, bins: int = 10) -> flo
     """
     if not len(right):
         return math.nan
+    _, told, good = binned(probability, right, bins)
+    return float((told - good).abs().sum()) / len(right)
+
+
+def binned(probability: Tensor, right: Tensor, bins: int) -> Tensor:
+    """In each bin of probability: answers, the sum of their probabilities, right ones; (3,bins)."""
     probability = probability.double()
+    columns = torch.stack([torch.ones_like(probability), probability, right.double()])
     bin_of = (probability * bins).long().clamp(0, bins - 1)
-    both = torch.stack([probability, right.double()], 1)
-    sums = torch.zeros(bins, 2, dtype=torch.float64).index_add_(0, bin_of, both)
-    return float((sums[:, 0] - sums[:, 1]).abs().sum()) / len(right)
+    return torch.zeros(3, bins, dtype=torch.float64).index_add_(1, bin_of, columns)

@@ -6,19 +6,18 @@ import base64
 import html
 import io
 import json
-import re
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
+from itertools import zip_longest
 from pathlib import Path
 from textwrap import wrap
 from typing import Any, NamedTuple
-
-import jinja2
 
 from dejavu_torch.data.output import whole_folder
 from dejavu_torch.evaluation.answers import next_steps, told_line, told_probable
 from dejavu_torch.evaluation.contenders import Contender, colour_of, distinct, sequences_as_json
 from dejavu_torch.evaluation.plots import Picture
+from dejavu_torch.evaluation.prose import sentences, templates
 from dejavu_torch.evaluation.rejection import rejection_table
 from dejavu_torch.recognition.select import PROBABLE
 from dejavu_torch.text import printable
@@ -123,48 +122,40 @@ def text_table(rows: list[list[str]]) -> str:
     """
     if not rows:
         return ""
-    headings = [wrap(cell, HEADING, break_long_words=False) for cell in rows[0]]
-    height = max(1, *(len(lines) for lines in headings))
-    padded = [[""] * (height - len(lines)) + lines for lines in headings]
-    rows = [*(list(line) for line in zip(*padded, strict=True)), *rows[1:]]
-    widths = [max(len(row[j]) for row in rows) for j in range(len(rows[0]))]
+    headings = [wrap(cell, HEADING, break_long_words=False)[::-1] for cell in rows[0]]
+    lines = [*reversed([*zip_longest(*headings, fillvalue="")]), *rows[1:]]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return "\n".join(
-        "  ".join(
-            cell.ljust(w) if j == 0 else cell.rjust(w)
-            for j, (cell, w) in enumerate(zip(row, widths, strict=True))
-        )
-        for row in rows
+        "  ".join([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])]) for line in lines
     )
 
 
 def headline(report: Report) -> str:
     """What was done and how good it is, in plain words."""
-    return _sentences(report, "headline")
+    return _told(report, "headline")
 
 
 def summary(report: Report) -> str:
     """What was scored, in a few sentences: those that the facts allow."""
-    return _sentences(report, "summary")
+    return _told(report, "summary")
 
 
-def _sentences(report: Report, macro: str) -> str:
-    """A macro of sentences.html.j2, as plain text of one line."""
+def _told(report: Report, part: str) -> str:
     facts, scores = report.facts, report.ours.scores
     counts = facts.get("probably_right")
-    parts = {
-        "facts": facts,
-        "ours": report.ours,
-        "scores": scores,
-        "baseline": report.contenders.get("uncompressed"),
-        "line": told_line(facts, scores is not None),
-        "probable": told_probable(counts, facts["queries"]) if counts else "",
-        "steps": steps_after(facts),
-        "late": any(is_late(one) for one in report.shown().values()),
-        "late_recall": LATE,
-    }
-    module = _environment(page=False).get_template("sentences.html.j2").make_module(parts)
-    text: str = getattr(module, macro)()
-    return re.sub(r"[ \n]+", " ", text).strip()
+    return sentences(
+        "sentences.html.j2",
+        part=part,
+        facts=facts,
+        ours=report.ours,
+        scores=scores,
+        baseline=report.contenders.get("uncompressed"),
+        line=told_line(facts, scores is not None),
+        probable=told_probable(counts, facts["queries"]) if counts else "",
+        steps=steps_after(facts),
+        late=any(is_late(one) for one in report.shown().values()),
+        late_recall=LATE,
+    )
 
 
 def steps_after(facts: Mapping[str, Any]) -> str:
@@ -174,16 +165,6 @@ def steps_after(facts: Mapping[str, Any]) -> str:
     together = bool(facts.get("filter")) or facts.get("sequence", 1) > 1
     strict = facts.get("threshold") is not None or (facts.get("least_probability") or 0) > PROBABLE
     return "; ".join([*next_steps(together, strict), "--truth scores the answers"])
-
-
-def _sentence(text: str) -> str:
-    """Words as a sentence of their own; "" stays as it is."""
-    return text[:1].upper() + text[1:] + "." * (text[-1:] not in ("", "?"))
-
-
-def _percent(share: float) -> str:
-    """A share in words that stay on one line."""
-    return f"{100 * share:.1f}\xa0%"
 
 
 def as_html(report: Report, pictures: Mapping[str, Picture]) -> str:
@@ -216,27 +197,27 @@ def write_report(
     plan: str | None = None,
 ) -> None:
     """Write report.json, one PNG for each picture, and index.html with all of it inside."""
-    pngs = {name: as_png(picture) for name, picture in pictures.items()}
-    for name, data in pngs.items():
+    facts, shown, embedded = report.facts, report.shown(), []
+    for name, picture in pictures.items():
+        data = as_png(picture)
         (folder / f"{name}.png").write_bytes(data)
-    facts = report.facts
+        embedded.append((picture, _embedded(data)))
+    coded = facts.get("storage", {}).get("map", ())
     _write_page(
         folder,
         title=printable(title),
         lead=headline(report),
         notes=[summary(report)],
         rows=score_table(report),
+        colours=[colour_of(key) for key in shown],
         sequence_rows=sequence_table(report),
-        sequence_colours=[
-            *(colour_of(key) for key, one in report.shown().items() if one.sequences),
-            *(colour_of("map") for _ in facts.get("storage", {}).get("map", ())),
-        ],
+        sequence_colours=[colour_of(key) for key, one in shown.items() if one.sequences]
+        + [colour_of("map")] * len(coded),
         rejection_rows=rejection_table(facts.get("rejection", {})),
         every_row=score_table(report, every=True),
         contenders=report.contenders,
         facts=facts,
-        colours=[colour_of(one) for one in report.shown()],
-        pictures=[(picture, _embedded(pngs[name])) for name, picture in pictures.items()],
+        pictures=embedded,
         plan=plan,
         made_by=f"{printable(command)}\ndejavu_torch {facts['version']}, torch {facts['torch']}",
     )
@@ -254,15 +235,9 @@ def write_index(
     command: str,
 ) -> None:
     """Write index.html over several reports, with one table and one picture, and links to their pages."""
-    _write_page(
-        folder,
-        title=printable(title),
-        notes=notes,
-        links=pages,
-        rows=rows,
-        pictures=[(picture, _embedded(as_png(picture)))],
-        made_by=printable(command),
-    )
+    parts = {"title": printable(title), "notes": notes, "links": pages, "rows": rows}
+    pictures = [(picture, _embedded(as_png(picture)))]
+    _write_page(folder, **parts, pictures=pictures, made_by=printable(command))
 
 
 def as_png(picture: Picture) -> bytes:
@@ -276,14 +251,7 @@ def _embedded(png: bytes) -> str:
     return f"data:image/png;base64,{base64.b64encode(png).decode()}"
 
 
-def _environment(page: bool) -> jinja2.Environment:
-    loader = jinja2.PackageLoader("dejavu_torch", "evaluation")
-    environment = jinja2.Environment(loader=loader, autoescape=page, trim_blocks=page, lstrip_blocks=page)
-    environment.filters |= {"sentence": _sentence, "percent": _percent}
-    return environment
-
-
 def _write_page(folder: Path, **parts: Any) -> None:
-    text = _environment(page=True).get_template("report.html.j2").render(parts)
+    text = templates(page=True).get_template("report.html.j2").render(parts)
     # names may hold what is no text
     (folder / "index.html").write_text(text, encoding="utf-8", errors="backslashreplace")

@@ -83,7 +83,14 @@ def reproduce(
     reference, query = open_source(address), open_source(f"{address}&traverse=1")
     model = paper_model(reference) if model is None else model
     result = compare(reference, query, model=model, tolerance=tolerance, progress=progress)
-    contenders = {**result.report.contenders, **ideal(result, tolerance)}
+    places = result.run.reference_features
+    itself = torch.arange(len(places))[:, None]
+    left_out = f"ideal, +-{tolerance} {result.run.unit} left out"
+    contenders = {
+        **result.report.contenders,
+        "ideal": contend("ideal: the database itself", model.localize(places), itself, tolerance),
+        "ideal_leave_out": contend(left_out, leave_out_match(model, places, tolerance), itself, tolerance),
+    }
     facts: dict[str, Any] = {
         **result.report.facts,
         "published": PUBLISHED[dataset]._asdict(),
@@ -93,7 +100,8 @@ def reproduce(
     if isinstance(first, ResampledTraverse) and isinstance(second, ResampledTraverse):
         distances = {"reference": measured_distance(first), "query": measured_distance(second)}
         facts["measured_distance"] = distances
-    cuts = structure_places(result, structure_cuts(reference))
+    frames_of_cuts = torch.tensor(structure_cuts(reference), dtype=torch.int64)
+    cuts: list[int] = result.run.model.map.place_of(frames_of_cuts).unique().tolist()
     if cuts:
         boundaries = known_boundaries(result, cuts, tolerance)
         contenders |= {key: contender for key, (contender, _) in boundaries.items()}
@@ -105,27 +113,13 @@ def reproduce(
     )
 
 
-def ideal(result: Comparison, tolerance: int) -> dict[str, Contender]:
-    """The database queried with itself: the paper's conditions, and the same with the neighbours left out."""
-    model, features = result.run.model, result.run.reference_features
-    itself = torch.arange(len(features))[:, None]
-    left_out = leave_out_match(model, features, tolerance)
-    name = f"ideal, +-{tolerance} {result.run.unit} left out"
-    return {
-        "ideal": contend("ideal: the database itself", model.localize(features), itself, tolerance),
-        "ideal_leave_out": contend(name, left_out, itself, tolerance),
-    }
-
-
 def chunk_lengths(result: Comparison, tolerance: int = 5, lengths: Sequence[int] = LENGTHS) -> list[Length]:
     """Recall and storage of maps whose chunks have other lengths (section VI)."""
     mapper, places = _mapper(result.run.model), len(result.run.reference_features)
     if result.run.truth is None or mapper is None:
         return []
     rows = []
-    for window in lengths:
-        if window > places:
-            continue
+    for window in (length for length in lengths if length <= places):
         periods = SpectrogramAnalysis(window, **_settings(mapper))
         model = _learned(result, TemplateMapper(periods, mapper.metric, mapper.reduction))
         size = model.summary().map_bytes
@@ -172,13 +166,6 @@ def structure_cuts(reference: Traverse) -> list[int]:
     inside = [edge for edge in metres if float(distance[0]) < edge < float(distance[-1])]
     frames = torch.searchsorted(distance.double(), torch.tensor(inside, dtype=torch.float64))
     return sorted(set(frames.tolist()))
-
-
-def structure_places(result: Comparison, cuts: Sequence[int]) -> list[int]:
-    """Frames of the reference as places of its map, each once."""
-    frames = torch.tensor(cuts, dtype=torch.int64)
-    places: list[int] = result.run.model.map.place_of(frames).unique().tolist()
-    return places
 
 
 class GivenChunks(SpectrogramAnalysis):
@@ -251,19 +238,17 @@ def known_boundaries(
         raise InputError(
             "known boundaries need a ground truth and SpectrogramAnalysis; this comparison has not both"
         )
-    contenders = {
-        "comparable": ("the same chunks, comparable scores", mapper.periods),
-        "known_boundaries": (
-            "chunks cut where structures start and stop, comparable scores",
-            GivenChunks(cuts, **_settings(mapper)),
-        ),
+    same, given = "the same chunks", "chunks cut where structures start and stop"
+    ways = {
+        "comparable": (same, mapper.periods),
+        "known_boundaries": (given, GivenChunks(cuts, **_settings(mapper))),
     }
     found = {}
-    for key, (name, periods) in contenders.items():
+    for key, (name, periods) in ways.items():
         model = _learned(result, TemplateMapper(periods, mapper.metric, "mean"))
         match, summary = _localized(model, result), model.summary()
         size, fixed = summary.map_bytes, summary.fixed_bytes
-        contender = contend(name, match, truth, tolerance, size, fixed=fixed)
+        contender = contend(f"{name}, comparable scores", match, truth, tolerance, size, fixed=fixed)
         found[key] = contender, boundary_effect(match, truth, cuts, tolerance)
     return found
 

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from textwrap import fill
+from textwrap import fill, wrap
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from dejavu_torch.evaluation.contenders import COLOURS, Contender, colour_of, distinct, sequences_as_json
 from dejavu_torch.evaluation.curves import Scores
-from dejavu_torch.evaluation.plots import LETTERS, LINE, Picture, Plot, canvas, label
+from dejavu_torch.evaluation.plots import LETTERS, LINE, Picture, Plot, canvas, label, picture
 
-_OURS = COLOURS["map"]
-_SHADES = (_OURS, "#00406b", "#5aa9d6")  # one map on several datasets
+_SHADES = (COLOURS["map"], "#00406b", "#5aa9d6")  # one map on several datasets
 NOTICED = 0.001  # of an area: less is no gain
 SHOWN = (1.0, 2.5, 5.0)  # route bytes per place at which the map is shown as well
 ALIKE = 1.1  # times the bytes: sizes whose lines would lie on each other
@@ -53,47 +52,43 @@ class Length(NamedTuple):
     bytes_per_place: float
 
 
-def plot_curves(contenders: Mapping[str, Contender], title: str = "") -> Plot:
-    """Precision against recall, a line for each contender that has a curve (figures 8 to 10 of the paper)."""
-    names = {key: label(one.name) for key, one in contenders.items()}
-    for key, one in contenders.items():
-        silent = one.curve is not None and len(one.curve.recall) == 0
-        names[key] = fill(f"{names[key]} (reports nothing)" if silent else names[key], LETTERS - 8)
-    lines = sum(1 + name.count("\n") for name in names.values())
-    figure, axis = canvas(3.4 + 1.1 * LINE * lines)
-    for key, one in reversed(list(contenders.items())):  # the first on top
-        if one.curve is None:
-            continue
-        axis.plot(
-            one.curve.recall,
-            one.curve.precision,
-            _LINES.get(key.partition("_")[0], "-"),
-            color=colour_of(key),
-            label=names[key],
-            linewidth=2.4 if key == "map" else 1.6,
-        )
+def _style(key: str) -> dict[str, Any]:
+    """The colour and line of a contender, by its key."""
+    line = _LINES.get(key.partition("_")[0], "-")
+    return {"color": colour_of(key), "linestyle": line, "linewidth": 2.4 if key == "map" else 1.6}
+
+
+def draw_curves(contenders: Mapping[str, Contender], tolerance: str) -> dict[str, Picture]:
+    """Precision over recall (figures 8 to 10 of the paper) and, of several curves, the areas below them."""
+    shown = [
+        (key, label(one.name), one.curve, one.scores.auc)
+        for key, one in distinct(contenders).items()
+        if one.curve and one.scores and key != "leave_out"  # which has other queries
+    ]
+    if not shown:
+        return {}
+    figure, axis = canvas(3.4 + 1.1 * LINE * sum(len(wrap(name, LETTERS - 8)) for _, name, *_ in shown))
+    for key, name, curve, _ in reversed(shown):  # the first on top
+        silent = " (reports nothing)" if len(curve.recall) == 0 else ""
+        axis.plot(curve.recall, curve.precision, label=fill(name + silent, LETTERS - 8), **_style(key))
     axis.set(xlim=(0, 1.01), ylim=(0, 1.02), xlabel="recall (of all queries)", ylabel="precision")
-    axis.set_title(title, fontsize=10)
+    axis.set_title(f"right within {tolerance}", fontsize=10)
     axis.grid(alpha=0.25)
-    handles, labels = axis.get_legend_handles_labels()
-    figure.legend(handles[::-1], labels[::-1], loc="outside lower left", frameon=False, fontsize=9)
-    return figure, axis
-
-
-def plot_auc(contenders: Mapping[str, Contender]) -> Plot:
-    """Area under the curve of each contender that has scores, as a bar in the colour of its curve."""
-    areas = {key: (label(one.name), one.scores.auc) for key, one in contenders.items() if one.scores}
-    figure, axis = canvas(0.9 + 0.55 * len(areas))
-    bars = axis.barh(range(len(areas)), [area for _, area in areas.values()], height=0.42)
-    for row, (bar, (key, (name, area))) in enumerate(zip(bars, areas.items(), strict=True)):
-        bar.set(facecolor=colour_of(key), hatch=_HATCHES.get(key.partition("_")[0]), edgecolor="white")
+    figure.legend(reverse=True, loc="outside lower left", frameon=False, fontsize=9)
+    pictures = picture("pr", (figure, axis))
+    if len(shown) == 1:
+        return pictures
+    figure, axis = canvas(0.9 + 0.55 * len(shown))
+    for row, (key, name, _, area) in enumerate(shown):
+        hatch = _HATCHES.get(key.partition("_")[0])
+        axis.barh(row, area, height=0.42, facecolor=colour_of(key), hatch=hatch, edgecolor="white")
         axis.text(0.008, row - 0.24, fill(name, LETTERS), fontsize=9, va="bottom")
         axis.text(area + 0.01, row, f"{area:.3f}", fontsize=9, va="center")
     axis.invert_yaxis()
     axis.set(xlim=(0, 1.1), yticks=[], xticks=[0, 0.25, 0.5, 0.75, 1])
     axis.set_xlabel("area under the precision-recall curve")
     axis.spines["bottom"].set_bounds(0, 1)
-    return figure, axis
+    return pictures | picture("auc", (figure, axis))
 
 
 def plot_lengths(datasets: Mapping[str, Sequence[Length]]) -> Plot:
@@ -129,28 +124,22 @@ def draw_storage(
         "null": "null: the same in shuffled order",
         "interpolated": "keyframes in int8, interpolated",
     }
-    curves = {key: (names[key], points) for key, points in storage.items() if points}
+    curves = {key: points for key, points in storage.items() if points}
     if not curves:
         return {}
-    levels = {
-        key: (one.name, one.scores.auc)
-        for key in ("uncompressed", "hog")
-        if (one := contenders.get(key)) and one.scores
-    }
-    factors = [null / ours for ours, null in equally_good(*(storage.get(key, ()) for key in ("map", "null")))]
-    factor = ""
-    if factors:
-        least, most = (f"{limit:.2g}" for limit in (min(factors), max(factors)))
-        times = least if least == most else f"{least} to {most}"
-        factor = f" For the same area the null takes {times} times the bytes of this map."
+    levels = [
+        (key, one.name, one.scores.auc)
+        for key, one in contenders.items()
+        if key in ("uncompressed", "hog") and one.scores
+    ]
     figure, axis = canvas(3.4 + 1.1 * LINE * (len(curves) + len(levels)))
-    for key, (name, area) in levels.items():
-        axis.axhline(area, color=colour_of(key), linestyle=_LINES.get(key, "--"), linewidth=1.2, label=name)
-    for key, (name, points) in curves.items():
+    every = [one.route_bytes_per_place for points in curves.values() for one in points]
+    for key, points in curves.items():
         sizes, areas = [one.route_bytes_per_place for one in points], [one.auc for one in points]
-        width = 2.4 if key == "map" else 1.6
-        axis.plot(sizes, areas, "o-", color=colour_of(key), markersize=5, linewidth=width, label=name)
-    every = [one.route_bytes_per_place for _, points in curves.values() for one in points]
+        style = _style(key) | {"linestyle": "-", "marker": "o", "markersize": 5}
+        axis.plot(sizes, areas, label=names[key], zorder=3, **style)
+    for key, name, area in levels:
+        axis.axhline(area, label=name, linestyle="--", linewidth=1.2, color=colour_of(key))
     ticks = [2**k for k in range(-6, 20) if min(every) / 1.5 <= 2**k <= 1.5 * max(every)]
     axis.set_xscale("log")
     axis.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
@@ -158,67 +147,47 @@ def draw_storage(
     axis.set(ylim=(0, 1.02), xlabel="route bytes per place", ylabel="area under the PR curve")
     axis.set_title(f"right within {tolerance}", fontsize=10)
     axis.grid(alpha=0.25)
-    handles, labels = axis.get_legend_handles_labels()
-    across = len(levels)
-    handles, labels = [*handles[across:], *handles[:across]], [*labels[across:], *labels[:across]]
-    figure.legend(handles, labels, loc="outside lower left", frameon=False, fontsize=9)
+    figure.legend(loc="outside lower left", frameon=False, fontsize=9)
+    factors = [null / ours for ours, null in equally_good(*(storage.get(key, ()) for key in ("map", "null")))]
     numbers: dict[str, Any] = {key: [one.as_json() for one in points] for key, points in storage.items()}
-    return {
-        "storage": Picture(
-            (figure, axis),
-            "what more bytes are worth",
-            "The same descriptors coded to several sizes, fixed bytes such as the whitening's not counted: "
-            "this map, which gains from what is smooth and from what repeats; its null, for which nothing is "
-            f"smooth and nothing repeats; keyframes, which gain from what is smooth.{factor}",
-            numbers | {"null_over_map": factors},
-        )
-    }
+    numbers["null_over_map"] = factors
+    return picture("storage", (figure, axis), numbers, factors=factors)
 
 
 def draw_sequences(
     contenders: Mapping[str, Contender], coded: Sequence[Stored], places: int, tolerance: str
 ) -> dict[str, Picture]:
-    """Areas over the number of queries matched together; nothing where single ones are."""
-    lines = {key: (one.name, one.sequences) for key, one in distinct(contenders).items() if one.sequences}
+    """Areas over the number of queries matched together; nothing where single ones are.
+
+    The map is drawn at some of the sizes that it is coded at as well, unless it has about that size itself.
+    """
+    lines = {key: one for key, one in distinct(contenders).items() if one.sequences}
     if not lines:
         return {}
-    shown: dict[float, tuple[str, Mapping[int, Scores]]] = {}
+    drawn = [(one.name, one.sequences, _style(key) | {"linewidth": 1.4}) for key, one in lines.items()]
     if "map" in lines and coded:
-        own = (contenders["map"].route_bytes or 0) / places
-        lines["map"] = f"this map, {own:.3g} route bytes per place", lines["map"][1]
+        own, style = (lines["map"].route_bytes or 0) / places, _style("map")
+        drawn[0] = (f"this map, {own:.3g} route bytes per place", lines["map"].sequences, style)
+        sizes = [own]
         for budget in SHOWN:
             nearest = min(coded, key=lambda size: abs(size.route_bytes_per_place - budget))
             size = nearest.route_bytes_per_place
-            if all(max(size, other) > ALIKE * min(size, other) for other in (own, *shown)):
-                shown[size] = f"the same in {size:.3g} bytes", nearest.sequences
-    drawn = [
-        (*one, colour_of(key), _LINES.get(key.partition("_")[0], "-"), "o", 2.4 if key == "map" else 1.4)
-        for key, one in lines.items()
-    ]
-    drawn[1:1] = [(*one, _OURS, "-", mark, 1.0) for one, mark in zip(shown.values(), "sD^", strict=False)]
-    names = [fill(name, LETTERS - 8) for name, *_ in drawn]
-    figure, axis = canvas(3.6 + 1.1 * LINE * sum(1 + name.count("\n") for name in names))
-    for order, ((_, found, colour, style, mark, width), name) in enumerate(zip(drawn, names, strict=True)):
-        axis.plot(
-            *(list(found), drawn_areas([scores.auc for scores in found.values()]), style),
-            **{"color": colour, "marker": mark, "markersize": 4.5, "linewidth": width, "label": name},
-            markerfacecolor="white" if mark != "o" else colour,
-            zorder=3 - order / len(drawn),  # the first on top
-        )
-    ticks = sorted({T for _, found, *_ in drawn for T in found})
+            if all(max(size, other) > ALIKE * min(size, other) for other in sizes):
+                mark = {"marker": "osD^"[len(sizes)], "markerfacecolor": "white", "linewidth": 1.0}
+                drawn.insert(len(sizes), (f"the same in {size:.3g} bytes", nearest.sequences, style | mark))
+                sizes.append(size)
+    figure, axis = canvas(3.6 + 1.1 * LINE * sum(len(wrap(name, LETTERS - 8)) for name, *_ in drawn))
+    for name, found, style in reversed(drawn):  # the first on top
+        areas = drawn_areas([scores.auc for scores in found.values()])
+        style = {"marker": "o", "markersize": 4.5} | style
+        axis.plot(list(found), areas, label=fill(name, LETTERS - 8), **style)
+    ticks = sorted({T for _, found, _ in drawn for T in found})
     axis.set_xticks(ticks, [str(T) for T in ticks])
     area_axis(axis)
     axis.set(xlabel="queries matched together, T")
     axis.set_title(f"right within {tolerance}", fontsize=10)
-    figure.legend(loc="outside lower left", frameon=False, fontsize=9)
-    return {
-        "sequences": Picture(
-            (figure, axis),
-            "what more queries are worth",
-            "One query by itself, and the last T together, their scores added up along constant speeds. From "
-            "0.9 to 0.99 is as far as from 0.99 to 0.999; what is beyond the ends of the axis lies on them.",
-        )
-    }
+    figure.legend(reverse=True, loc="outside lower left", frameon=False, fontsize=9)
+    return picture("sequences", (figure, axis))
 
 
 def equally_good(ours: Sequence[Stored], others: Sequence[Stored]) -> list[tuple[float, float]]:

@@ -13,7 +13,7 @@ from dejavu_torch.evaluation.baselines import as_int8, interpolated, nearest_fra
 from dejavu_torch.evaluation.contenders import evaluate_each
 from dejavu_torch.evaluation.controls import shuffled, with_mapper
 from dejavu_torch.evaluation.curves import evaluate
-from dejavu_torch.evaluation.pictures import Localization
+from dejavu_torch.evaluation.localization import Localization
 from dejavu_torch.evaluation.score_plots import Stored
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import SpectralMap

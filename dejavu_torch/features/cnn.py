@@ -7,8 +7,8 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from dejavu_torch.features.preprocess import settings_of
 from dejavu_torch.resize import check_size, resize_frames
+from dejavu_torch.text import settings_of
 from dejavu_torch.types import InputError
 
 FLAT = 2 / 255  # contrast below which nothing is blown up

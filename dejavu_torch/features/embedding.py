@@ -9,10 +9,11 @@ from torch import Tensor, nn
 
 from dejavu_torch.features.cnn import local_contrast
 from dejavu_torch.features.extract import in_mode
-from dejavu_torch.features.preprocess import select_channel, settings_of
+from dejavu_torch.features.preprocess import select_channel
 from dejavu_torch.features.truncate import members_of, run, tensors_in, up_to
 from dejavu_torch.features.whitening import learned_whitening
 from dejavu_torch.resize import check_size, resize_frames
+from dejavu_torch.text import one_line, settings_of
 from dejavu_torch.types import InputError
 
 WIDEST = 256  # cells along a side of a grid
@@ -156,7 +157,7 @@ class Embedding(nn.Module):
             raise
         except Exception as error:  # a network may raise anything
             raise InputError(
-                f"{type(network).__name__} does not take frames {size}: {' '.join(str(error).split())}"
+                f"{type(network).__name__} does not take frames {size}: {one_line(error)}"
             ) from error
         self.linear: nn.Module = nn.Identity()
         self.standardise: nn.Module = nn.Identity()

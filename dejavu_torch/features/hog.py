@@ -7,8 +7,9 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor, nn
 
-from dejavu_torch.features.preprocess import check_frames, in_parts, settings_of
+from dejavu_torch.features.preprocess import check_frames, in_parts
 from dejavu_torch.resize import check_size, resize_frames
+from dejavu_torch.text import settings_of
 from dejavu_torch.types import InputError
 
 MOST_ORIENTATIONS = 360

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from torch import Tensor, nn
 
-from dejavu_torch.features.preprocess import FLAT, check_frames, settings_of
+from dejavu_torch.features.preprocess import FLAT, check_frames
 from dejavu_torch.resize import check_size, resize_frames
+from dejavu_torch.text import settings_of
 from dejavu_torch.types import InputError
 
 

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 from collections.abc import Callable
+from itertools import permutations
 from typing import Literal, get_args
 
 import torch
 from torch import Tensor, nn
 
+from dejavu_torch.text import settings_of
 from dejavu_torch.types import InputError
 
 MOST_CLIP = 1e6
 Contrast = Literal["patch", "clahe"]
 COLOURS = "RGB"
+CHANNELS = ("grey", *COLOURS, *map("-".join, permutations(COLOURS, 2)))
 SIZE = 160  # pixels of the longer side of a frame, unless said otherwise
 FLAT = 1 / 255  # one step of an 8-bit image: a smaller standard deviation says nothing
 VALUES_AT_ONCE = 2**19  # of frames, so that intermediate results stay in the cache
@@ -36,19 +38,10 @@ def in_parts(work: Callable[[Tensor], Tensor], frames: Tensor) -> Tensor:
     return torch.cat([work(part) for part in frames.split(size)])
 
 
-def settings_of(module: nn.Module, *hidden: str) -> str:
-    """The constructor's arguments, as `extra_repr` shows them."""
-    names = [name for name in inspect.signature(type(module)).parameters if name not in hidden]
-    return ", ".join(f"{name}={getattr(module, name)!r}" for name in names)
-
-
 def channel_name(channel: str) -> str:
     """A channel in the case that is stored: "grey", "R", "R-B"."""
-    name = str(channel).strip().upper()
-    letters = name.split("-")
-    if name == "GREY":
-        return "grey"
-    if len(letters) > 2 or len(set(letters)) < len(letters) or not set(letters) <= set(COLOURS):
+    name = str(channel).strip().upper().replace("GREY", "grey")
+    if name not in CHANNELS:
         raise InputError(
             f"channel {channel!r} is unknown; expected 'grey', 'R', 'G', 'B' or a difference such as 'R-B'"
         )

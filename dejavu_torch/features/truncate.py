@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn.modules.module import register_module_forward_hook, register_module_forward_pre_hook
 
 from dejavu_torch.features.extract import in_mode
 from dejavu_torch.types import InputError
@@ -58,25 +59,21 @@ def up_to(network: nn.Module, layer: str, frames: Tensor) -> nn.Module:
         ended = copy.deepcopy(network)
     except RuntimeError as error:
         raise InputError(f"{name} cannot be copied to end at {layer}: {error}") from error
+    last = ended.get_submodule(layer)
+    last.register_forward_hook(_end)
     begun: set[nn.Module] = set()
     done: set[nn.Module] = set()
-    hooks = []
-    for module in ended.modules():
-        hooks.append(module.register_forward_pre_hook(lambda module, *_: begun.add(module)))
-        hooks.append(module.register_forward_hook(lambda module, *_: done.add(module)))
-    ended.get_submodule(layer).register_forward_hook(_end)
-    try:
+    with (
+        register_module_forward_pre_hook(lambda module, *_: begun.add(module)),
+        register_module_forward_hook(lambda module, *_: done.add(module)),  # called ahead of `_end`
+    ):
         expected = _tried(ended, frames)
-    finally:
-        for hook in hooks:
-            hook.remove()
-    if ended.get_submodule(layer) not in begun:
+    if last not in begun:
         raise InputError(f"{name} does not run its layer {layer} as a module; expected another layer")
     smaller = copy.deepcopy(ended)
     _leave_out(ended, smaller, begun, done)
     try:
-        found = _tried(smaller, frames)
-        pairs = zip(found, expected, strict=True)
+        pairs = zip(_tried(smaller, frames), expected, strict=True)
         # a map's network is first made without numbers
         same = all(a.shape == b.shape and (a.is_meta or torch.allclose(a, b, 1e-4, 1e-5)) for a, b in pairs)
     except Exception:  # a network may look at any of its parts
@@ -113,6 +110,6 @@ def members_of(made: object) -> list[object]:
 
 def tensors_in(made: object) -> list[Tensor]:
     """The tensors in what a network made, in order."""
-    if not isinstance(made, (tuple, list, dict)):
-        return [made] if isinstance(made, Tensor) else []
-    return [tensor for member in members_of(made) for tensor in tensors_in(member)]
+    if isinstance(made, (tuple, list, dict)):
+        return [tensor for member in members_of(made) for tensor in tensors_in(member)]
+    return [made] if isinstance(made, Tensor) else []

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from dejavu_torch.features.augmentation import Augmentation
-from dejavu_torch.features.preprocess import settings_of
+from dejavu_torch.text import settings_of
 from dejavu_torch.types import InputError
 
 log = logging.getLogger("dejavu_torch")
@@ -33,7 +33,7 @@ STRENGTHS: Mapping[str, Any] = {  # of augmented copies: those of `Augmentation`
     for name, strength in Augmentation().strengths.items()
     if max(strength)
 }
-LEAST = 1e-12  # absolute value that a power is applied to
+LEAST = 1e-12  # absolute value that a power is applied to: keeps gradients finite
 ROUNDING = 1e-7  # of the largest variance: below it there is none
 
 
@@ -181,9 +181,9 @@ class Whitening(nn.Module):
         """Descriptors (B,D) -> (B,K); `unpacked`: the result of that method, if it is kept."""
         if not self.learned:
             return descriptors
-        if descriptors.ndim != 2 or descriptors.shape[1] != len(self.projection):
-            seen = f"the whitening got descriptors {tuple(descriptors.shape)}"
-            raise InputError(f"{seen}; expected (B, {len(self.projection)})")
+        shape = tuple(descriptors.shape)
+        if shape[1:] != (len(self.projection),):
+            raise InputError(f"the whitening got descriptors {shape}; expected (B, {len(self.projection)})")
         # bf16 is too coarse for the small differences that whitening enlarges
         with torch.autocast(descriptors.device.type, enabled=False):
             exact = descriptors.to(torch.promote_types(descriptors.dtype, torch.float32))
@@ -191,7 +191,7 @@ class Whitening(nn.Module):
             whitened = (exact @ whole.to(exact)) * self.scale.to(exact) - self.offset.to(exact)
             if len(self.length):
                 whitened = torch.cat([whitened, self.length.to(whitened).expand(whitened.shape[0], 1)], 1)
-            elif self.power < 1:  # LEAST keeps gradients finite
+            elif self.power < 1:
                 whitened = whitened.sign() * whitened.abs().clamp(min=LEAST) ** self.power
             return nn.functional.normalize(whitened, dim=1)
 
@@ -221,12 +221,11 @@ class Whitening(nn.Module):
         # many descriptors lie in a file, wherever the model is
         mean, basis, variances = (one.to(self.scale.device) for one in found)
         rank = int((variances > ROUNDING * variances[0]).sum())
-        if kept > rank:
-            if self.numbers is not None:
-                raise InputError(f"numbers is {kept}, but the descriptors of this route have rank {rank}")
-            if views is not None:
-                log.warning("the descriptors of this route have rank %d: as many numbers, not %d", rank, kept)
-            kept = rank
+        if kept > rank and self.numbers is not None:
+            raise InputError(f"numbers is {kept}, but the descriptors of this route have rank {rank}")
+        if kept > rank and views is not None:
+            log.warning("the descriptors of this route have rank %d: as many numbers, not %d", rank, kept)
+        kept = min(kept, rank)
         if views is None:
             self.take(mean, basis[:, :kept], variances[:kept].mean().sqrt())
             return

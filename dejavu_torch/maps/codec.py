@@ -64,14 +64,7 @@ def encode(levels: Tensor) -> Stream:
 
 
 def coded_bytes(levels: Tensor) -> int:
-    """The size of `encode`'s stream, or a byte more, without coding.
-
-    Shape: (W,K) int8 or int32 -> scalar.
-
-    Example:
-        >>> coded_bytes(torch.zeros(500, 20, dtype=torch.int8))
-        1
-    """
+    """The size of `encode`'s stream, or a byte more, without coding: (W,K) int8 or int32."""
     whole = _numbers(levels)
     filled, width = _filled(whole), whole.shape[1]
     counts, rows = np.zeros((CONTEXTS, 2)), max(2, COUNTED // width)

@@ -25,12 +25,12 @@ def compiled(
         for one in calls:
             register_jitable(one)
         try:
-            kernel: Any = numba.njit(signature, cache=True, **options)(function)
+            kernel: Callable[..., Any] = numba.njit(signature, cache=True, **options)(function)
         except Exception:  # there may be no folder for the cache
             kernel = numba.njit(signature, cache=False, **options)(function)
         if kernel is function:
             raise RuntimeError("NUMBA_DISABLE_JIT is set")
-        return kernel  # type: ignore[no-any-return]
+        return kernel
     except Exception as error:  # a broken compiler must not break what works without one
         log.info("%s, not by numba: %s", what, " ".join(str(error).split()))
         return None

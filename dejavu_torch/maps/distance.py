@@ -27,12 +27,6 @@ QUERIES_AT_ONCE = 64  # they stay in cache while the templates stream by
 TASK = 2**23  # |a - b| for one thread at a time, about half a millisecond
 
 
-def check_metric(metric: Metric) -> None:
-    """Refuse an unknown metric by an InputError."""
-    if metric not in get_args(Metric):
-        raise InputError(f"metric {metric!r} is unknown; expected {', '.join(get_args(Metric))}")
-
-
 def phase_distances(query: Tensor, templates: Tensor, metric: Metric = "l1") -> Tensor:
     """Distance of each query to the template of each phase: eq. 3 for all k at once.
 
@@ -52,7 +46,8 @@ def phase_distances(query: Tensor, templates: Tensor, metric: Metric = "l1") -> 
         >>> phase_distances(torch.tensor([[1.0, 2.0]]), torch.tensor([[1.0, 2.0], [0.0, 4.0]]))
         tensor([[0., 3.]])
     """
-    check_metric(metric)
+    if metric not in get_args(Metric):
+        raise InputError(f"metric {metric!r} is unknown; expected {', '.join(get_args(Metric))}")
     if query.ndim != 2 or templates.ndim != 2 or query.shape[1] != templates.shape[1]:
         raise InputError(
             f"phase_distances got {tuple(query.shape)} and {tuple(templates.shape)}; expected (Q,F) and (P,F)"
@@ -144,10 +139,5 @@ def _distances(query: Floats, templates: Floats, out: Floats) -> None:
 
 
 def l1_backend() -> Literal["numba", "torch"]:
-    """What computes large L1 distances on the CPU without gradients; the first call compiles the loop.
-
-    Example:
-        >>> l1_backend() in ("numba", "torch")
-        True
-    """
+    """What computes large L1 distances on the CPU without gradients; the first call compiles the loop."""
     return "torch" if _compiled() is None else "numba"

@@ -10,7 +10,7 @@ from contextlib import suppress
 from hashlib import blake2b
 from inspect import formatannotation
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import safetensors.torch
 import torch
@@ -27,13 +27,6 @@ ZIP = b"PK\x03\x04"  # the first bytes of a checkpoint
 EXPECTED = "a map file, as DejaVu.save writes"
 HEADER = "header"  # the digest that is of no tensor
 SHOWN = 60  # characters of a value in a message
-
-
-class Contents(NamedTuple):
-    """Tensors by their names, which begin with a part of the model and a dot, and a header of JSON values."""
-
-    tensors: dict[str, Tensor]
-    header: dict[str, Any]
 
 
 def checksums(tensors: Mapping[str, Tensor], header: Any) -> dict[str, str]:
@@ -57,7 +50,11 @@ def map_size(tensors: Mapping[str, Tensor], header: dict[str, Any]) -> int:
 
 
 def write_map(path: Path, tensors: Mapping[str, Tensor], header: dict[str, Any]) -> None:
-    """Write the file whole or, with an InputError, not at all; the same contents give the same bytes."""
+    """Write the file whole or, with an InputError, not at all; the same contents give the same bytes.
+
+    Args:
+        tensors: by names that begin with a part of the model and a dot. header: JSON values.
+    """
     with whole_file(path) as temporary:
         try:
             plain, metadata = _sealed(tensors, header)
@@ -85,9 +82,9 @@ def _finite(text: str) -> float:
     return float(text)
 
 
-def read_map(path: Path) -> Contents:
-    """Tensors and header as written; an InputError if the file is missing, truncated, foreign, damaged, or of
-    another format."""
+def read_map(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """What `write_map` wrote; an InputError if the file is missing, truncated, foreign, damaged or of another
+    format."""
     check_regular(path, EXPECTED)
     try:
         with path.open("rb") as file:
@@ -104,9 +101,8 @@ def read_map(path: Path) -> Contents:
             if version != FORMAT:
                 newer = isinstance(version, int) and version > FORMAT
                 cure = "a newer dejavu_torch is needed" if newer else "learn the route anew"
-                raise InputError(
-                    f"{path} has map format {version!r:.40}; this version reads {FORMAT}: {cure}"
-                )
+                problem = f"{path} has map format {version!r:.40}; this version reads {FORMAT}"
+                raise InputError(f"{problem}: {cure}")
             tensors = {name: archive.get_tensor(name) for name in archive.keys()}  # noqa: SIM118
         header, sums = sealed[HEADER], dict(sealed["checksums"] or {})
         seen = checksums(tensors, header)
@@ -117,7 +113,7 @@ def read_map(path: Path) -> Contents:
     damaged = sorted(part for part in {*seen, *sums} if seen.get(part) != sums.get(part))
     if damaged:
         raise InputError(f"{path} is damaged: its {' and '.join(damaged)}; expected it as it was written")
-    return Contents(tensors, header)
+    return tensors, header
 
 
 def part_of(tensors: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
@@ -135,8 +131,6 @@ def checked(value: Any, kind: Any, where: str) -> Any:
         where: names the value in messages.
 
     Example:
-        >>> checked([4, 4], tuple[int, int], "block")
-        (4, 4)
         >>> checked("4", int | None, "block")
         Traceback (most recent call last):
         dejavu_torch.types.InputError: block is '4'; expected int | None
@@ -145,9 +139,6 @@ def checked(value: Any, kind: Any, where: str) -> Any:
     if hasattr(kind, "_fields"):
         return kind(**checked_fields(value, get_type_hints(kind), where))
     if origin in (Union, types.UnionType):
-        named = [one for one in inner if hasattr(one, "_fields")]
-        if named and isinstance(value, dict):
-            return checked(value, named[0], where)
         for one in inner:
             with suppress(InputError):
                 return checked(value, one, where)

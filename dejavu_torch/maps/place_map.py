@@ -16,7 +16,12 @@ from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.types import InputError
 
 EXTRA = "_extra_state"  # where torch keeps what `get_extra_state` gives
-OPTIONAL = ("visits",)  # left out of a file if empty
+
+
+def require(fits: bool, seen: str) -> None:
+    """Refuse, by an InputError, buffers that do not fit together: what was seen, and what was expected."""
+    if not fits:
+        raise InputError(f"the map does not fit together: {seen}")
 
 
 class PlaceMap(nn.Module, ABC):
@@ -51,7 +56,7 @@ class PlaceMap(nn.Module, ABC):
 
     @abstractmethod
     def scores(self, queries: Tensor) -> Tensor:
-        """Scores of all places: (Q,D) -> (Q,N), lower is better, differentiable."""
+        """Scores of all places, differentiable."""
 
     @abstractmethod
     def settings(self) -> dict[str, Any]:
@@ -60,10 +65,6 @@ class PlaceMap(nn.Module, ABC):
     @abstractmethod
     def summary(self) -> MapSummary:
         """What the map can tell apart, and its bytes by part."""
-
-    @abstractmethod
-    def disagreement(self) -> str:
-        """The first buffer that does not fit the others, in words; empty if all fit."""
 
     def loaded(self) -> None:
         """Called when a state was loaded: derive what follows from the buffers."""
@@ -117,26 +118,21 @@ class PlaceMap(nn.Module, ABC):
     def count_visits(self, counts: Tensor) -> None:
         """Keep how many visits each place is the mean of, (N,) int64."""
         values, runs = counts.unique_consecutive(return_counts=True)
-        once = bool((values == 1).all())
-        self.visits = torch.stack([runs, values], 1).int()[: 0 if once else None]
+        self.visits = torch.stack([runs, values], 1).int()[: 0 if (values == 1).all() else None]
 
     def check(self) -> None:
-        """Refuse buffers that do not fit together, by an InputError that names the first."""
-        problem = self.disagreement() or self._table_problem()
-        if problem:
-            raise InputError(f"the map does not fit together: {problem}")
-
-    def _table_problem(self) -> str:
+        """`require` that buffers fit together; a subclass begins with its own."""
         positions, visits = self.positions, self.visits
-        if positions.ndim != 1 or not positions.is_floating_point() or not positions.isfinite().all():
-            return f"positions {tuple(positions.shape)} {positions.dtype}; expected finite floats (F,)"
-        if visits.shape[1:] != (2,) or visits.dtype != torch.int32 or bool((visits < 1).any()):
-            return f"visits {tuple(visits.shape)} {visits.dtype}; expected int32 (V,2) of at least 1"
-        if len(visits) and int(visits[:, 0].sum()) != self.places:
-            return f"visits of {int(visits[:, 0].sum())} places; expected {self.places}"
-        if len(positions) and count_places(self.table.steps) != self.places:
-            return f"positions of {count_places(self.table.steps)} places; expected {self.places}"
-        return ""
+        fits = positions.ndim == 1 and positions.is_floating_point() and bool(positions.isfinite().all())
+        require(fits, f"positions {tuple(positions.shape)} {positions.dtype}; expected finite floats (F,)")
+        fits = visits.shape[1:] == (2,) and visits.dtype == torch.int32 and not (visits < 1).any()
+        require(fits, f"visits {tuple(visits.shape)} {visits.dtype}; expected int32 (V,2) of at least 1")
+        if len(visits):
+            seen = int(visits[:, 0].sum())
+            require(seen == self.places, f"visits of {seen} places; expected {self.places}")
+        if len(positions):
+            seen = count_places(self.table.steps)
+            require(seen == self.places, f"positions of {seen} places; expected {self.places}")
 
     def get_extra_state(self) -> dict[str, Any]:
         """What the state holds beside the tensors."""
@@ -177,22 +173,18 @@ class PlaceMap(nn.Module, ABC):
             raise
 
     def packed(self) -> dict[str, Tensor]:
-        """The tensors of a file: those of the state, without optional ones that are empty."""
-        return {
-            name: value
-            for name, value in self.state_dict().items()
-            if isinstance(value, Tensor) and (len(value) or name not in OPTIONAL)
-        }
+        """The tensors of a file: those of the state, without visits if all places are of one."""
+        left_out = {EXTRA} if len(self.visits) else {EXTRA, "visits"}
+        return {name: value for name, value in self.state_dict().items() if name not in left_out}
 
     def load_packed(self, tensors: dict[str, Tensor], extra: dict[str, Any]) -> None:
-        """Load what `packed` and `get_extra_state` gave; an InputError names tensors that do not belong."""
-        own = self.state_dict()
-        if missing := own.keys() - tensors.keys() - {EXTRA, *OPTIONAL}:
-            raise InputError(f"it does not hold the map's {', '.join(sorted(missing))}")
-        if unknown := tensors.keys() - own.keys():
-            raise InputError(f"it holds {', '.join(sorted(unknown))}, which no map has")
-        optional = {name: own[name][:0] for name in OPTIONAL if name in own}
-        self.load_state_dict({**optional, **tensors, EXTRA: extra})
+        """Load what `packed` and `get_extra_state` gave; other tensors are an InputError."""
+        own = self.state_dict().keys() - {EXTRA}
+        if not own - {"visits"} <= tensors.keys() <= own:
+            seen = f"it holds {', '.join(sorted(tensors)) or 'nothing'}"
+            raise InputError(f"{seen} of a map; expected {', '.join(sorted(own))}")
+        once = {"visits": self.visits[:0]} if "visits" in own else {}
+        self.load_state_dict({**once, **tensors, EXTRA: extra})
 
 
 class Mapper(nn.Module, ABC):

@@ -89,7 +89,7 @@ class RouteLines:
     def levels(self, step: float) -> Iterator[Tensor]:
         """The levels of each chunk, int8, or int32 if some need it."""
         for start, stop in self.chunks:
-            parts = (quantise(lines, step, width) for lines, width in self._blocks(start, stop))
+            parts = (part for _, part in self._quantised(start, stop, step))
             yield torch.cat(
                 [part.to(torch.int8 if part.abs().max() <= 127 else torch.int32) for part in parts]
             )
@@ -100,10 +100,8 @@ class RouteLines:
 
     def error(self, step: float) -> float:
         """The sum of squares of what is missing of lines in such steps."""
-        blocks = self._blocks(0, len(self.lines))
-        return sum(
-            float((part - step * quantise(part, step, width)).square().sum()) for part, width in blocks
-        )
+        parts = self._quantised(0, len(self.lines), step)
+        return sum(float((lines - step * levels).square().sum()) for lines, levels in parts)
 
     def step_of(self, room: float) -> float:
         """The smallest step in which the lines take so many bytes, or fewer; of a long route, about it."""
@@ -129,11 +127,12 @@ class RouteLines:
         """The RMS of the lines."""
         return math.sqrt(self.energy / self.lines.numel())
 
-    def _blocks(self, start: int, stop: int) -> Iterator[tuple[Tensor, Tensor | None]]:
-        """The lines [start, stop) a few at a time, and the width of their dead zones."""
+    def _quantised(self, start: int, stop: int, step: float) -> Iterator[tuple[Tensor, Tensor]]:
+        """The lines [start, stop) some at a time, and their levels."""
         for first in range(start, stop, self.rows):
             rows = slice(first, min(first + self.rows, stop))
-            yield self.lines[rows], None if self.width is None else self.width[rows]
+            width = None if self.width is None else self.width[rows]
+            yield self.lines[rows], quantise(self.lines[rows], step, width)
 
     def _smallest_step(self, value: Callable[[float], float], most: float, close: float = 1.0) -> float:
         """The smallest step whose falling value is at most `most`, by bisection of its logarithm."""

@@ -68,10 +68,8 @@ class SpectralMapper(Mapper):
     ) -> None:
         super().__init__()
         if route_bytes_per_place is not None and step is not None:
-            raise InputError(
-                f"route_bytes_per_place is {route_bytes_per_place} and step is {step}; expected one of them, "
-                "the other None"
-            )
+            seen = f"route_bytes_per_place is {route_bytes_per_place} and step is {step}"
+            raise InputError(f"{seen}; expected one of them, the other None")
         for name, value in (("route_bytes_per_place", route_bytes_per_place), ("step", step)):
             if value is not None and not 0 < value < math.inf:
                 raise InputError(f"{name} is {value}; expected a number above 0")
@@ -202,9 +200,7 @@ def check_descriptors(features: Tensor, dimension: int | None = None) -> None:
     least, expected = (2, "K") if dimension is None else (1, dimension)
     fits = features.ndim == 2 and len(features) >= least and dimension in (None, features.shape[1])
     if not fits or not features.numel() or not features.is_floating_point():
-        raise InputError(
-            f"the descriptors are {tuple(features.shape)} {features.dtype}; expected floats (N, {expected}), "
-            f"N at least {least}"
-        )
+        seen = f"the descriptors are {tuple(features.shape)} {features.dtype}"
+        raise InputError(f"{seen}; expected floats (N, {expected}), N at least {least}")
     if not all(bool(part.isfinite().all()) for part in features.split(ROWS)):
         raise InputError("the descriptors hold NaN or infinity; expected finite numbers")

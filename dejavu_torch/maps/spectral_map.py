@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from fractions import Fraction
 from functools import cache
 from itertools import accumulate
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,7 +17,7 @@ from torch import Tensor
 from dejavu_torch.maps.codec import Stream, decode
 from dejavu_torch.maps.file import checked
 from dejavu_torch.maps.frame_table import Route
-from dejavu_torch.maps.place_map import PlaceMap
+from dejavu_torch.maps.place_map import PlaceMap, require
 from dejavu_torch.maps.spectrum import Transform, from_slots, half_cycles, slots
 from dejavu_torch.maps.summary import ChunkSummary, MapSummary
 from dejavu_torch.types import InputError
@@ -55,7 +55,7 @@ class Chunk(NamedTuple):
 
 
 class SpectralState(NamedTuple):
-    """The header of a map file for a spectral map; see its arguments."""
+    """What `SpectralMap.get_extra_state` gives; see its arguments."""
 
     kind: Literal["spectral"]
     places: int
@@ -135,19 +135,14 @@ class SpectralMap(PlaceMap):
         resolution: float = 0.0,
         step: float = 0.0,
     ) -> None:
-        if metric not in get_args(SpectralMetric):
-            raise InputError(f"metric {metric!r} is none of a spectral map; expected 'cosine' or 'l2'")
-        if transform not in get_args(Transform):
-            raise InputError(f"transform {transform!r} is unknown; expected 'dft' or 'dct'")
-        if not isinstance(chunk, int) or isinstance(chunk, bool) or chunk < 2:
-            raise InputError(
-                f"chunk is {chunk!r}; expected a number of places, at least 2, such as 10000; one larger "
-                "than the route makes one chunk"
-            )
+        if type(chunk) is not int or chunk < 2:
+            raise InputError(f"chunk is {chunk!r}; expected a number of places, at least 2, such as 10000")
         if not 0 <= resolution < math.inf:
             raise InputError(f"resolution is {resolution}; expected a number of places, 0 or more")
         super().__init__(0, 0 if means is None else means.shape[1])
-        self.metric, self.transform, self.chunk, self.resolution = metric, transform, chunk, resolution
+        self.metric: SpectralMetric = checked(metric, SpectralMetric, "metric")
+        self.transform: Transform = checked(transform, Transform, "transform")
+        self.chunk, self.resolution = chunk, resolution
         self._step = step
         for name in ("counts", "feature", "level", "norms"):
             self.register_buffer(name, None, persistent=False)
@@ -420,43 +415,42 @@ class SpectralMap(PlaceMap):
         super().set_extra_state(state)
         self.routes = checked(state.get("routes", ()), tuple[Route, ...], "the map's routes")
 
-    def disagreement(self) -> str:
-        return next((told for wrong, told in self._disagreements() if wrong), "")
-
-    def _disagreements(self) -> Iterator[tuple[bool, str]]:
-        """Whether a rule is broken, and what to say then; each relies on those before it."""
+    def check(self) -> None:
         for name, (dtype, ndim) in FILE.items():
             seen = getattr(self, name)
             fits = seen.dtype == dtype and seen.ndim == ndim
-            yield not fits, f"{name} {tuple(seen.shape)} {seen.dtype}; expected {dtype} of {ndim} dimensions"
-        lengths, steps, routes = self.lengths.tolist(), self.steps, self.routes
+            require(fits, f"{name} {tuple(seen.shape)} {seen.dtype}; expected {dtype} of {ndim} dimensions")
+        lengths, steps, means = self.lengths.tolist(), self.steps, self.means
         fits = min(lengths, default=1) >= 1 and sum(lengths) == self.places
-        yield not fits, f"chunks of {lengths!s:.100} places; expected {self.places} in all"
+        require(fits, f"chunks of {lengths!s:.100} places; expected {self.places} in all")
         fits = len(steps) == len(lengths) and bool(((steps > 0) & steps.isfinite()).all())
-        yield not fits, f"steps {steps.tolist()!s:.100}; expected {len(lengths)} finite numbers above 0"
+        require(fits, f"steps {steps.tolist()!s:.100}; expected {len(lengths)} finite numbers above 0")
         shape = tuple(self.stream_table.shape)
-        told = f"a stream table {shape} for {len(lengths)} chunks; expected a row each"
-        yield shape != (len(lengths), 2), told
-        sizes = self.stream_table[:, 0].tolist()
-        told = f"the coded lines are {len(self.streams)} bytes; the table claims {sizes!s:.100}"
-        yield min(sizes, default=0) < 0 or sum(sizes) != len(self.streams), told
-        shape = (max(1, len(routes)), self.dimension)
-        fits = not self.places or (self.means.shape == shape and bool(self.means.isfinite().all()))
-        yield not fits, f"means {tuple(self.means.shape)}; expected {shape} finite numbers"
-        if not routes:
-            return
-        names, places, frames = zip(*routes, strict=True)
-        told = f"names {', '.join(names)}; expected another one for each of {len(names)} routes"
-        yield len({*names}) != len(names) or not all(names), told
-        whole = {*accumulate(lengths)}.issuperset(accumulate(places)) and sum(places) == self.places
-        told = f"routes of {[*places]!s:.100} places; expected whole chunks, {self.places} places in all"
-        yield not whole or min(places) < 1, told
-        told = f"routes of {[*frames]!s:.100} frames; expected {self.table.frames} in all"
-        yield sum(frames) != self.table.frames, told
+        fits = shape == (len(lengths), 2)
+        require(fits, f"a stream table {shape} for {len(lengths)} chunks; expected a row each")
+        sizes, size = self.stream_table[:, 0].tolist(), len(self.streams)
+        fits = min(sizes, default=0) >= 0 and sum(sizes) == size
+        require(fits, f"the coded lines are {size} bytes; the table claims {sizes!s:.100}")
+        shape = max(1, len(self.routes)), self.dimension
+        fits = not self.places or (means.shape == shape and bool(means.isfinite().all()))
+        require(fits, f"means {tuple(means.shape)}; expected {shape} finite numbers")
+        if self.routes:
+            self._check_routes()
+        super().check()
+
+    def _check_routes(self) -> None:
+        names, places, frames = zip(*self.routes, strict=True)
+        fits = len({*names}) == len(names) and all(names)
+        require(fits, f"names {', '.join(names)}; expected another one for each of {len(names)} routes")
+        ends = {*accumulate(self.lengths.tolist())}
+        fits = min(places) > 0 and sum(places) == self.places and ends.issuperset(accumulate(places))
+        told = f"expected whole chunks, {self.places} places in all"
+        require(fits, f"routes of {[*places]!s:.100} places; {told}")
+        fits = sum(frames) == self.table.frames
+        require(fits, f"routes of {[*frames]!s:.100} frames; expected {self.table.frames} in all")
 
     def loaded(self) -> None:
         """Decode the chunks of a file."""
-        self.check()
         chunks, visits = self.coded(), self.visits
         self._clear()
         self.extend(chunks)

@@ -8,7 +8,6 @@ from fractions import Fraction
 from typing import NamedTuple
 
 from dejavu_torch.periods.support import common_period
-from dejavu_torch.types import Plan
 
 LAYERS_SHOWN = 6
 CHUNKS_SHOWN = 12  # of a summary in lines
@@ -31,6 +30,19 @@ class ChunkSummary(NamedTuple):
     def common_period(self) -> Fraction:
         """The least common multiple of the layers' periods, in places: the capacity; 0 without layers."""
         return common_period(self.periods) if self.features else Fraction(0)
+
+    def __str__(self) -> str:
+        where, count = f"places {self.start}-{self.stop - 1}", len(self.periods)
+        if not self.features:
+            return f"{where}: strongest periods {', '.join(map(_number, self.periods)) or 'none'}"
+        largest = sorted(range(count), key=lambda j: -self.features[j])[:LAYERS_SHOWN]
+        shown = (f"{_number(self.periods[j])} ({self.features[j]} features)" for j in sorted(largest))
+        line = f"{where}: {count} layer{'s' * (count > 1)}, periods {', '.join(shown)}"
+        if more := count - len(largest):
+            line += f" and {more} smaller layer{'s' * (more > 1)}"
+        if count > 1 and self.common_period < LARGE:
+            line += f"; together {_number(self.common_period)} places"
+        return line
 
 
 @dataclass(frozen=True, repr=False)
@@ -81,7 +93,7 @@ class MapSummary:
     def __repr__(self) -> str:
         if not self.places:
             return f"{self.fixed_bytes} bytes without a map ({_parts(self.fixed)})"
-        lines = [_chunk_line(chunk) for chunk in self.chunks[:CHUNKS_SHOWN]]
+        lines = [*map(str, self.chunks[:CHUNKS_SHOWN])]
         if len(self.chunks) > CHUNKS_SHOWN:
             lines.append(f"and {len(self.chunks) - CHUNKS_SHOWN} more chunks")
         content = f"{self.templates} templates, {self.template_numbers} numbers"
@@ -95,46 +107,8 @@ class MapSummary:
         return "\n".join([*lines, f"{self.covered} of {self.places} places covered; {content}", size])
 
 
-def summarise(plan: Plan, places: int, route: Mapping[str, int]) -> MapSummary:
-    """The summary of a plan over `places` places, whose parts take these bytes.
-
-    Example:
-        >>> from dejavu_torch.types import FrequencyLayer
-        >>> layers = [FrequencyLayer(Fraction(p), p, 0, 1024, (0, 1)) for p in (93, 171)]
-        >>> summarise(tuple(layers), places=1024, route={"templates": 2112, "layers": 1984})
-        places 0-1023: 2 layers, periods 93 (2 features), 171 (2 features); together 5301 places
-        1024 of 1024 places covered; 264 templates, 528 numbers
-        4096 bytes, 4.0 per place: 4096 of the route, 4.00 per place (templates 2112, layers 1984)
-    """
-    chunks = []
-    covered = end = 0
-    for start, stop in sorted({(layer.start, layer.stop) for layer in plan}):
-        members = [layer for layer in plan if (layer.start, layer.stop) == (start, stop)]
-        periods, features = zip(*((layer.period, len(layer.features)) for layer in members), strict=True)
-        chunks.append(ChunkSummary(start, stop, periods, features))
-        covered, end = covered + max(0, stop - max(start, end)), max(stop, end)
-    templates = sum(layer.phases for layer in plan)
-    numbers = sum(layer.phases * len(layer.features) for layer in plan)
-    return MapSummary("templates", places, covered, templates, numbers, tuple(chunks), route, {})
-
-
 def _parts(parts: Mapping[str, int]) -> str:
     return ", ".join(f"{name} {size}" for name, size in parts.items())
-
-
-def _chunk_line(chunk: ChunkSummary) -> str:
-    if not chunk.features:
-        periods = ", ".join(_number(period) for period in chunk.periods) or "none"
-        return f"places {chunk.start}-{chunk.stop - 1}: strongest periods {periods}"
-    count = len(chunk.periods)
-    largest = sorted(range(count), key=lambda j: -chunk.features[j])[:LAYERS_SHOWN]
-    shown = ", ".join(f"{_number(chunk.periods[j])} ({chunk.features[j]} features)" for j in sorted(largest))
-    line = f"places {chunk.start}-{chunk.stop - 1}: {count} layer{'s' * (count > 1)}, periods {shown}"
-    if more := count - len(largest):
-        line += f" and {more} smaller layer{'s' * (more > 1)}"
-    if count > 1 and chunk.common_period < LARGE:
-        line += f"; together {_number(chunk.common_period)} places"
-    return line
 
 
 def _number(value: Fraction) -> str:

@@ -6,16 +6,18 @@ import math
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from functools import reduce
-from itertools import accumulate, pairwise
+from itertools import accumulate, groupby, pairwise
+from operator import attrgetter
 from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 
-from dejavu_torch.maps.distance import Metric, check_metric, phase_distances
+from dejavu_torch.maps.distance import Metric, phase_distances
+from dejavu_torch.maps.file import checked
 from dejavu_torch.maps.layer_search import lowest
-from dejavu_torch.maps.place_map import Mapper, PlaceMap
-from dejavu_torch.maps.summary import MapSummary, summarise
+from dejavu_torch.maps.place_map import Mapper, PlaceMap, require
+from dejavu_torch.maps.summary import ChunkSummary, MapSummary
 from dejavu_torch.maps.templates import PhaseTemplates, check_plan
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
@@ -110,10 +112,9 @@ class TemplateMap(PlaceMap):
         weights: Tensor | None = None,
     ) -> None:
         super().__init__(places, dimension)
-        check_metric(metric)
-        if reduction not in ("mean", "sum"):
-            raise InputError(f"reduction {reduction!r} is unknown; expected 'mean' or 'sum'")
-        self.metric, self.reduction, self.temperature = metric, reduction, temperature
+        self.metric: Metric = checked(metric, Metric, "metric")
+        self.reduction: Reduction = checked(reduction, Reduction, "reduction")
+        self.temperature = temperature
         for layer, block in zip(plan, templates, strict=True):
             shape = layer.phases, len(layer.features)
             if block.shape != shape:
@@ -152,29 +153,28 @@ class TemplateMap(PlaceMap):
         self.lap_phases = torch.cat([torch.zeros(0, dtype=torch.int64), *phases]).to(self.layers.device)
         self.segments = tuple(segments(self.plan, self.places))
 
-    def disagreement(self) -> str:
+    def check(self) -> None:
         count, last = self.layers.numel() // 5, self.feature_index.numel()
         shapes = {"layers": (count, 5), "feature_ptr": (count + 1,), "feature_index": (last,)}
         for name, shape in shapes.items():
-            buffer = getattr(self, name)
-            if buffer.shape != shape or buffer.dtype not in (torch.int32, torch.int64):
-                return f"{name} {tuple(buffer.shape)} {buffer.dtype}; expected {shape} int32 or int64"
-        sizes = self.feature_ptr.diff()
-        if bool((sizes < 0).any()) or (int(self.feature_ptr[0]), int(self.feature_ptr[-1])) != (0, last):
-            return f"feature_ptr does not rise from 0 to {last}"
-        if bool((self.layers[:, 1] < 1).any()):
-            return "a period with a denominator below 1"
+            seen = getattr(self, name)
+            fits = seen.shape == shape and seen.dtype in (torch.int32, torch.int64)
+            require(fits, f"{name} {tuple(seen.shape)} {seen.dtype}; expected {shape} int32 or int64")
+        sizes, ends = self.feature_ptr.diff(), self.feature_ptr[[0, -1]].tolist()
+        rises = ends == [0, last] and not (sizes < 0).any()
+        require(rises, f"feature_ptr does not rise from 0 to {last}")
+        require(not (self.layers[:, 1] < 1).any(), "a period with a denominator below 1")
         numbers = int((self.layers[:, 2] * sizes).sum())
         for name, lengths in (("templates", [numbers]), ("weights", [self.dimension, 0])):
-            values = getattr(self, name)
-            if values.ndim != 1 or len(values) not in lengths:
-                return f"{name} {tuple(values.shape)}; expected {' or '.join(f'({n},)' for n in lengths)}"
-            if not values.is_floating_point() or not values.isfinite().all():
-                return f"{name} that are not finite floats"
+            seen, expected = getattr(self, name), " or ".join(f"({n},)" for n in lengths)
+            fits = seen.ndim == 1 and len(seen) in lengths
+            require(fits, f"{name} {tuple(seen.shape)}; expected {expected}")
+            fits = seen.is_floating_point() and bool(seen.isfinite().all())
+            require(fits, f"{name} that are not finite floats")
         T = self.temperature
-        if T is not None and not (isinstance(T, (int, float)) and 0 < T < math.inf):
-            return f"the temperature is {T!r}; expected a number above 0"
-        return ""
+        fits = T is None or (isinstance(T, (int, float)) and 0 < T < math.inf)
+        require(fits, f"the temperature is {T!r}; expected a number above 0")
+        super().check()
 
     def settings(self) -> dict[str, Any]:
         return {"metric": self.metric, "reduction": self.reduction}
@@ -188,9 +188,8 @@ class TemplateMap(PlaceMap):
 
     def blocks(self) -> list[Tensor]:
         """Templates of each layer, (P,F) views of the flat buffer."""
-        shapes = [(layer.phases, len(layer.features)) for layer in self.plan]
-        parts = self.templates.split([math.prod(shape) for shape in shapes])
-        return [part.view(shape) for part, shape in zip(parts, shapes, strict=True)]
+        parts = self.templates.split([layer.phases * len(layer.features) for layer in self.plan])
+        return [part.view(layer.phases, -1) for part, layer in zip(parts, self.plan, strict=True)]
 
     def layer_features(self) -> list[Tensor]:
         """Feature indices of each layer, (F,) int32."""
@@ -211,8 +210,9 @@ class TemplateMap(PlaceMap):
 
     def divisor(self, layers: Sequence[int]) -> float:
         """What the sum of the distances of these layers is divided by in S."""
-        per_layer = (weight_per_feature(self.metric, len(self.plan[j].features)) for j in layers)
-        return sum(per_layer) if self.reduction == "mean" else 1.0
+        if self.reduction == "sum":
+            return 1.0
+        return sum(weight_per_feature(self.metric, len(self.plan[j].features)) for j in layers)
 
     def combine(self, distances: Sequence[Tensor], start: int = 0, stop: int | None = None) -> Tensor:
         """S of the places [start, stop) from the phase distances of each layer (eq. 4): L tensors (Q,P) ->
@@ -223,8 +223,7 @@ class TemplateMap(PlaceMap):
             first, count = max(start, begin), min(stop, end) - max(start, begin)
             if count > 0 and layers:
                 rows = [_along(distances[j], laps[j], first - self.plan[j].start, count) for j in layers]
-                total: Tensor = reduce(torch.add, rows)
-                parts.append(total / self.divisor(layers) if self.reduction == "mean" else total)
+                parts.append(reduce(torch.add, rows) / self.divisor(layers))
             elif count > 0:
                 parts.append(torch.full_like(distances[0][:, :1], math.inf).expand(-1, count))
         return torch.cat(parts, 1) if parts else distances[0][:, :0]
@@ -238,9 +237,10 @@ class TemplateMap(PlaceMap):
         self, queries: Tensor, start: int = 0, stop: int | None = None
     ) -> Iterator[tuple[int, Tensor]]:
         """See `PlaceMap`: one block, from the layers that cover these places."""
-        stop = self.places if stop is None else stop
-        whole = self.temperature is not None  # a softmax is over all places
-        yield start, self.scores(queries)[:, start:stop] if whole else self._sums(queries, start, stop)
+        if self.temperature is not None:  # a softmax is over all places
+            yield start, self.scores(queries)[:, start:stop]
+        else:
+            yield start, self._sums(queries, start, self.places if stop is None else stop)
 
     def _sums(self, queries: Tensor, start: int, stop: int) -> Tensor:
         members = [j for j, layer in enumerate(self.plan) if layer.start < stop and layer.stop > start]
@@ -304,11 +304,17 @@ class TemplateMap(PlaceMap):
         return torch.cat([self.templates[:0], *((block * factors[f]).flatten() for block, f in pairs)])
 
     def summary(self) -> MapSummary:
-        """See `MapSummary`; the parts are those of the route."""
+        span = attrgetter("start", "stop")
+        chunks = tuple(
+            ChunkSummary(*where, *zip(*((one.period, len(one.features)) for one in own), strict=True))
+            for where, own in groupby(sorted(self.plan, key=span), span)
+        )
+        covered = sum(stop - start for start, stop, layers in self.segments if layers)
         parts = {"templates": self.templates, "weights": self.weights, "positions": self.positions}
         route = {name: tensor.nbytes for name, tensor in parts.items() if len(tensor)}
         route["layers"] = self.layers.nbytes + self.feature_ptr.nbytes + self.feature_index.nbytes
-        return summarise(self.plan, self.places, route)
+        phases = sum(layer.phases for layer in self.plan)
+        return MapSummary(self.kind, self.places, covered, phases, len(self.templates), chunks, route, {})
 
     def extra_repr(self) -> str:
         sizes = f"places={self.places}, dimension={self.dimension}, layers={len(self.plan)}"

@@ -57,14 +57,10 @@ def fits(weight: Tensor) -> bool:
     return bool(weight.detach().abs().max() < HUGE)
 
 
-def _fitting(module: nn.Module) -> list[nn.Parameter]:
-    return [weight for weight in module.parameters() if fits(weight)]
-
-
 @torch.no_grad()
 def round_weights(module: nn.Module) -> bool:
     """Round in place all parameters that fit into 8 bits, but no buffers; whether there are any."""
-    weights = _fitting(module)
+    weights = [*filter(fits, module.parameters())]
     for weight in weights:
         weight.copy_(rounded(weight))
     return bool(weights)
@@ -72,21 +68,21 @@ def round_weights(module: nn.Module) -> bool:
 
 def is_rounded(module: nn.Module) -> bool:
     """Whether `round_weights` would change nothing."""
-    return all(torch.equal(weight, rounded(weight)) for weight in _fitting(module))
+    return all(torch.equal(weight, rounded(weight)) for weight in filter(fits, module.parameters()))
 
 
 @contextmanager
 def in_bits(module: nn.Module, bits: int) -> Iterator[None]:
     """Within the block the module has weights of so many bits."""
-    kept = [(weight, weight.detach().clone()) for weight in _fitting(module)] if bits == 8 else []
-    if kept:
+    weights = [*filter(fits, module.parameters())] if bits == 8 else []
+    kept = [weight.detach().clone() for weight in weights]
+    if weights:
         round_weights(module)
     try:
         yield
     finally:
-        with torch.no_grad():
-            for weight, before in kept:
-                weight.copy_(before)
+        for weight, before in zip(weights, kept, strict=True):
+            weight.detach().copy_(before)
 
 
 def packed(module: nn.Module) -> dict[str, Tensor]:
@@ -102,19 +98,18 @@ def unpacked(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
     """The tensors of a file; below a prefix, products in place of whole numbers and scales that `quantised`
     returned; others are an InputError."""
     found = dict(tensors)
-    for name in tensors:
-        if name.startswith(prefix) and name + SCALE in tensors:
-            found[name] = _product(name, tensors[name], found.pop(name + SCALE))
+    for name, whole in tensors.items():
+        if not name.startswith(prefix) or name + SCALE not in tensors:
+            continue
+        scale = found.pop(name + SCALE)
+        types = whole.dtype, scale.dtype
+        fitting = types == (torch.int8, torch.bfloat16) and scale.shape == whole.shape[:1]
+        weight = whole * _over(scale, whole) if fitting else None
+        if weight is None or not fits(weight) or not all(map(torch.equal, quantised(weight), (whole, scale))):
+            raise InputError(
+                f"{name} and its scale are {types[0]} {tuple(whole.shape)} and {types[1]} "
+                f"{tuple(scale.shape)}; expected int8 (O,...) and bfloat16 (O,), finite, the largest of each "
+                f"channel {LARGEST}, or all of it 0"
+            )
+        found[name] = weight
     return found
-
-
-def _product(name: str, whole: Tensor, scale: Tensor) -> Tensor:
-    if (whole.dtype, scale.dtype) == (torch.int8, torch.bfloat16) and scale.shape == whole.shape[:1]:
-        weight = whole * _over(scale, whole)
-        if fits(weight) and all(map(torch.equal, quantised(weight), (whole, scale))):
-            return weight
-    seen = " and ".join(f"{one.dtype} {tuple(one.shape)}".removeprefix("torch.") for one in (whole, scale))
-    raise InputError(
-        f"{name} and its scale are {seen}; expected int8 (O,...) and bfloat16 (O,), finite, the largest of "
-        f"each channel {LARGEST}, or all of it 0"
-    )

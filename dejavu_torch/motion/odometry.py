@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-from inspect import signature
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +15,7 @@ from dejavu_torch.data.frame_range import runs
 from dejavu_torch.motion.flow import flow_shift, tracker
 from dejavu_torch.motion.ground_plane import TRAPEZIUM, Corners, check_corners, ground_patch
 from dejavu_torch.motion.phase_correlation import MIN_CONFIDENCE, phase_shifts, viterbi_path
+from dejavu_torch.text import settings_of
 from dejavu_torch.types import InputError, Traverse
 
 log = logging.getLogger("dejavu_torch")
@@ -152,8 +152,7 @@ class GroundOdometry(nn.Module):
                 *(name, rows, shown, height, width, fits),
             )
 
-    def extra_repr(self) -> str:
-        return ", ".join(f"{name}={getattr(self, name)}" for name in signature(type(self)).parameters)
+    extra_repr = settings_of
 
 
 def interpolated(shift: Tensor, valid: Tensor, name: str) -> Tensor:

@@ -11,6 +11,7 @@ from torch import Tensor
 from dejavu_torch.memory import check_room
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.support import supportive_periods
+from dejavu_torch.text import settings_of
 from dejavu_torch.types import FrequencyLayer, InputError, Plan
 
 LONGEST = 2**24  # bins of a period, and places of a bin: their products fit whole numbers of 64 bits
@@ -74,5 +75,4 @@ class ImposedPeriods(PeriodFinder):
             for j, period in enumerate(periods)
         )
 
-    def extra_repr(self) -> str:
-        return f"periods={self.periods}, bin={self.bin}, stagger={self.stagger}"
+    extra_repr = settings_of

@@ -5,13 +5,13 @@ from __future__ import annotations
 import logging
 import math
 from fractions import Fraction
-from inspect import signature
 from typing import Any, Literal, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from dejavu_torch.periods.finder import PeriodFinder
+from dejavu_torch.text import settings_of
 from dejavu_torch.types import FrequencyLayer, InputError, Plan
 
 torchaudio: Any
@@ -196,7 +196,8 @@ class SpectrogramAnalysis(PeriodFinder):
         if len(features) < self.window:
             self._warn_once(f"window shrunk from {self.window} to {len(features)} places, the whole route")
         for start, stop in chunks:
-            bins, share = self._strongest(features[start:stop])
+            parts = features[start:stop].split(max(1, NUMBERS_AT_ONCE // (stop - start)), 1)
+            bins, share = (torch.cat(found, -1) for found in zip(*map(self._strongest, parts), strict=True))
             alarm = self.false_alarm
             least = 0.0 if alarm is None else noise_share((stop - start) // 2, len(share), alarm)
             if least > HANN_PEAK:
@@ -215,20 +216,16 @@ class SpectrogramAnalysis(PeriodFinder):
 
     def _strongest(self, chunk: Tensor) -> tuple[Tensor, Tensor]:
         """The strongest bins of each feature (count,D), and the largest share of its power in one (D,)."""
-        found, shares = [], []
-        count, last = min(self.strongest, len(chunk) // 2 + 1), len(chunk) // self.min_period
-        for columns in chunk.split(max(1, NUMBERS_AT_ONCE // len(chunk)), 1):
-            power = chunk_power(columns)
-            bins = strongest_bins(power, count, last, self.peaks)
-            share = power.gather(0, bins.clamp(min=0)) / power[1:].sum(0)
-            found.append(bins)
-            shares.append(share.where(bins > 0, 0.0).amax(0))
-        return torch.cat(found, 1), torch.cat(shares)
+        power = chunk_power(chunk)
+        bins = strongest_bins(
+            power, min(self.strongest, len(power)), len(chunk) // self.min_period, self.peaks
+        )
+        share = power.gather(0, bins.clamp(min=0)) / power[1:].sum(0)
+        return bins, share.where(bins > 0, 0.0).amax(0)
 
     def _warn_once(self, message: str) -> None:
         if message not in self._logged:
             log.warning(message)
             self._logged.add(message)
 
-    def extra_repr(self) -> str:
-        return ", ".join(f"{name}={getattr(self, name)!r}" for name in signature(type(self)).parameters)
+    extra_repr = settings_of

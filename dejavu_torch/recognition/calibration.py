@@ -153,7 +153,7 @@ def calibrated(
         another_visit: the queries are of another visit, whose own wrong answers show how often to expect one.
             Those off the map then count, together, for as many as lack to `MISSED`.
     """
-    answers: tuple[list[Tensor], list[Tensor]] = [], []  # of single queries, and of a filter
+    answers: tuple[list[tuple[Tensor, ...]], ...] = [], []  # of single queries, and of a filter
     for descriptors, places in segments:
         scores = torch.cat([route.scores(part) for part in descriptors.split(64)])
         places = places.to(scores.device)
@@ -164,14 +164,13 @@ def calibrated(
             for rows, (found, own) in zip(answers, pairs, strict=True):
                 index = best_match(found).index
                 right = ((index - places).abs() <= TOLERANCE) & (index >= 0) & on_map
-                columns = own.cpu(), right.cpu(), torch.full(right.shape, on_map)
-                rows.append(torch.stack([*map(Tensor.double, columns)], 1)[places.cpu() >= 0])
+                columns = own, right, torch.full_like(right, on_map)
+                rows.append(tuple(column[places >= 0].cpu() for column in columns))
     if not answers[0]:
         raise InputError("there are no queries to calibrate by; expected some")
     platts: list[Platt | None] = []
     for rows in answers:
-        own, right, on_the_map = torch.cat(rows).unbind(1)
-        right, on_the_map = right > 0, on_the_map > 0
+        own, right, on_the_map = map(torch.cat, zip(*rows, strict=True))
         wrong = int((on_the_map & ~right).sum())
         away_weight = max(0, MISSED - wrong) / max(1, int((~on_the_map).sum())) if another_visit else 1.0
         weight = torch.where(on_the_map, 1.0, away_weight)

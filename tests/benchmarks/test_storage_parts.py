@@ -52,12 +52,17 @@ def test_all_components_give_back_all() -> None:
     assert (few.route, few.fixed) == (600, 2 * 12 + 2 * 4 + 12 * 4)
 
 
-def test_longer_codes_give_back_more() -> None:
+def test_longer_codes_give_back_more_also_of_padded_descriptors_and_with_codebooks_in_int8() -> None:
     pytest.importorskip("faiss")
-    places, other = route(), normalize(torch.randn(2000, 12), dim=1)
+    places, other = route(numbers=13), normalize(torch.randn(2000, 13), dim=1)
     errors = [error(ProductQuantiser(other, m)(places), places) for m in (1, 4, 12)]
     assert errors == sorted(errors, reverse=True)
     assert errors[-1] < error(torch.zeros_like(places), places) / 10
+    quantisers = [ProductQuantiser(other, 4, rotated=True, int8=int8) for int8 in (False, True)]
+    assert [quantiser.width for quantiser in quantisers] == [16, 16]
+    backs = [quantiser(places) for quantiser in quantisers]
+    assert backs[0].shape == places.shape
+    assert error(backs[1], places) < 1.1 * error(backs[0], places)
 
 
 def test_a_rotation_helps_where_numbers_go_together() -> None:
@@ -67,16 +72,6 @@ def test_a_rotation_helps_where_numbers_go_together() -> None:
     plain, turned = (ProductQuantiser(mixed, 3, rotated=rotated) for rotated in (False, True))
     assert error(turned(mixed), mixed) < 0.9 * error(plain(mixed), mixed)
     assert (plain.bytes, turned.bytes) == (256 * 12, 256 * 12 + 144)
-
-
-def test_codebooks_in_int8_and_descriptors_that_are_padded() -> None:
-    pytest.importorskip("faiss")
-    places, other = route(numbers=13), normalize(torch.randn(2000, 13), dim=1)
-    quantisers = [ProductQuantiser(other, 4, rotated=True, int8=int8) for int8 in (False, True)]
-    assert [quantiser.width for quantiser in quantisers] == [16, 16]
-    backs = [quantiser(places) for quantiser in quantisers]
-    assert backs[0].shape == places.shape
-    assert error(backs[1], places) < 1.1 * error(backs[0], places)
 
 
 @pytest.mark.parametrize("codec", ["libx264", "libx265"])

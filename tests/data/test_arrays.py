@@ -27,17 +27,17 @@ FEATURES = RANDOM.random((7, 6))
         (COLOUR, torch.tensor(COLOUR).permute(0, 3, 1, 2) / 255),
         (COLOUR[..., :1], torch.tensor(COLOUR)[:, None, :, :, 0] / 255),
         (FRAMES, torch.tensor(FRAMES)),
-        (FEATURES, torch.tensor(FEATURES)),
         (FEATURES.astype(np.float16), torch.tensor(FEATURES.astype(np.float16)).float()),
         (GREY[::-1], torch.tensor(GREY[::-1].copy())[:, None] / 255),
         (np.asfortranarray(FEATURES), torch.tensor(FEATURES)),
     ],
-    ids=["grey", "colour", "one-channel", "float", "features", "half", "reversed", "fortran"],
+    ids=["grey", "colour", "one-channel", "float", "half", "reversed", "fortran"],
 )
 def test_values(values: np.ndarray, expected: Tensor, kind: str, tmp_path: Path) -> None:
     if kind == "file":
         np.save(tmp_path / "a.npy", values)
         traverse = read_array(tmp_path / "a.npy")
+        next(traverse.batches(3)).zero_()  # a batch is a copy
     else:
         traverse = ArrayTraverse(torch.tensor(values.copy()) if kind == "tensor" else values)
     found = all_of(traverse)
@@ -46,30 +46,23 @@ def test_values(values: np.ndarray, expected: Tensor, kind: str, tmp_path: Path)
     assert traverse.length == 7
 
 
-def test_a_batch_is_a_copy_of_a_file(tmp_path: Path) -> None:
-    np.save(tmp_path / "a.npy", FEATURES)
-    traverse = read_array(tmp_path / "a.npy")
-    next(traverse.batches(3)).zero_()
-    assert torch.equal(all_of(traverse), torch.tensor(FEATURES))
+def test_another_byte_order_is_read(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", FEATURES.astype(">f8"))
+    assert torch.equal(all_of(read_array(tmp_path / "a.npy")), torch.tensor(FEATURES))
 
 
 @pytest.mark.parametrize(
     "values",
     [
         np.zeros((3, 4), np.uint8),
-        np.zeros((3, 4), np.int64),
-        np.zeros((3, 4), bool),
         np.zeros((3, 4), np.complex64),
-        np.zeros(3),
+        np.zeros((3, 4), np.longdouble),
         np.zeros(()),
         np.zeros((3, 4, 5)),
         np.zeros((3, 4, 5, 2), np.uint8),
-        np.zeros((3, 4, 5), np.uint16),
-        np.zeros((2, 3, 4, 5, 6)),
         np.zeros((3, 4, 5, 3)),
         np.zeros((0, 4)),
         np.zeros((3, 0)),
-        np.zeros((0, 4, 5), np.uint8),
         np.array(["a", "b"]),
     ],
     ids=lambda values: f"{values.shape}{values.dtype}",
@@ -83,26 +76,14 @@ def test_another_shape_or_type_is_refused(values: np.ndarray, tmp_path: Path) ->
         read_array(path)
 
 
-def test_a_number_type_torch_does_not_know_is_refused() -> None:
-    with refused("float128", "expected frames"):
-        all_of(ArrayTraverse(np.zeros((3, 4), np.longdouble)))
-
-
-@pytest.mark.parametrize("content", [b"", b"\x93NUMPY", b"not an array\n" * 9, b"\x80\x04\x95 a pickle"])
-def test_a_file_that_is_no_array_is_refused(tmp_path: Path, content: bytes) -> None:
-    path = tmp_path / "a.npy"
-    path.write_bytes(content)
-    with refused(str(path), "no whole .npy array", "expected frames (N,H,W)"):
-        read_array(path)
-
-
-def test_a_truncated_array_is_refused_at_any_length(tmp_path: Path) -> None:
+def test_a_file_that_is_no_whole_array_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.npy"
     np.save(path, FEATURES)
     whole = path.read_bytes()
-    for length in range(0, len(whole), 7):
-        path.write_bytes(whole[:length])
-        with refused(str(path), "no whole .npy array"):
+    cut = [whole[:length] for length in range(0, len(whole), 7)]
+    for content in (*cut, b"not an array\n" * 9, b"\x80\x04\x95 a pickle"):
+        path.write_bytes(content)
+        with refused(str(path), "no whole .npy array", "expected frames (N,H,W)"):
             read_array(path)
 
 
@@ -118,56 +99,34 @@ def test_pickled_objects_are_refused_and_not_run(tmp_path: Path) -> None:
     assert not (tmp_path / "ran").exists()
 
 
-def written(path: Path, header: str, body: bytes = bytes(256), version: int = 1) -> Path:
+def written(path: Path, header: str, version: int = 1) -> Path:
     """A file with any header."""
     text = header.encode().ljust(118) + b"\n"
     length = len(text).to_bytes(2 if version == 1 else 4, "little")
-    path.write_bytes(b"\x93NUMPY" + bytes([version, 0]) + length + text + body)
+    path.write_bytes(b"\x93NUMPY" + bytes([version, 0]) + length + text + bytes(256))
     return path
 
 
-@pytest.mark.parametrize("version", [1, 2, 3])
+@pytest.mark.parametrize("version", [1, 2])
 @pytest.mark.parametrize(
-    "header",
+    ("kind", "shape"),
     [
-        "(",
-        "'''",
-        "{'descr'",
-        "[" * 9000,
-        "1" * 5000,
-        *(
-            f"{{'descr': {kind}, 'fortran_order': False, 'shape': {shape}}}"
-            for kind, shape in [
-                ("'<f4'", "(-1, 4)"),
-                ("'<f4'", "(-4, -4)"),
-                ("'<f4'", "(2**62, 4)"),
-                ("'<f4'", f"({2**62}, 4)"),
-                ("'<f4'", f"({10**40}, 1)"),
-                ("'<f4'", "(9, 9)"),
-                ("'<f4'", "(True, 4)"),
-                ("'<f4'", "(" + "1," * 70 + ")"),
-                ("'V0'", "(4, 4)"),
-                ("'|O'", "(4, 4)"),
-                ("[('a', '<f4')]", "(4, 4)"),
-                ("('<f4', (1000000000000,))", "(4, 4)"),
-                ("{}", "(4, 4)"),
-                ("None", "(4, 4)"),
-            ]
-        ),
+        ("'<f4'", "(-4, -4)"),
+        ("'<f4'", f"({2**62}, 4)"),
+        ("'<f4'", f"({10**40}, 1)"),
+        ("'<f4'", "(9, 9)"),
+        ("'<f4'", "(" + "1," * 70 + ")"),
+        ("'<f4'", "(" * 5000),
+        ("'V0'", "(4, 4)"),
+        ("[('a', '<f4')]", "(4, 4)"),
+        ("('<f4', (1000000000000,))", "(4, 4)"),
+        ("None", "(4, 4)"),
     ],
 )
-def test_a_header_that_no_array_has_is_refused(tmp_path: Path, header: str, version: int) -> None:
+def test_a_header_that_no_array_has_is_refused(tmp_path: Path, kind: str, shape: str, version: int) -> None:
+    header = f"{{'descr': {kind}, 'fortran_order': False, 'shape': {shape}}}"
     with refused("a.npy", "expected frames (N,H,W)"):
-        read_array(written(tmp_path / "a.npy", header, version=version))
-
-
-def test_a_header_of_gigabytes_is_not_read(tmp_path: Path) -> None:
-    path = tmp_path / "a.npy"
-    with path.open("wb") as file:
-        file.write(b"\x93NUMPY\x02\x00\xff\xff\xff\xff")
-        file.truncate(2**33)
-    with refused("a.npy", "no whole .npy array"):
-        read_array(path)
+        read_array(written(tmp_path / "a.npy", header, version))
 
 
 def test_a_frame_larger_than_the_memory_is_refused(tmp_path: Path) -> None:
@@ -179,13 +138,7 @@ def test_a_frame_larger_than_the_memory_is_refused(tmp_path: Path) -> None:
         read_array(path)
 
 
-@pytest.mark.parametrize("kind", [">f2", ">f4", ">f8"])
-def test_another_byte_order_is_read(tmp_path: Path, kind: str) -> None:
-    np.save(tmp_path / "a.npy", FEATURES.astype(kind))
-    assert torch.allclose(all_of(read_array(tmp_path / "a.npy")).double(), torch.tensor(FEATURES), atol=1e-3)
-
-
-@pytest.mark.parametrize("bad", [-0.01, 1.01, np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("bad", [-0.01, 1.01, np.nan, np.inf])
 def test_float_frames_of_a_file_lie_from_0_to_1(tmp_path: Path, bad: float) -> None:
     frames = FRAMES.copy()
     frames[5, 0, 1, 1] = bad

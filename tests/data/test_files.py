@@ -14,12 +14,6 @@ from dejavu_torch.data.files import check_regular, read_text, reading
 from dejavu_torch.types import InputError
 
 
-def test_a_regular_file_tells_its_size(tmp_path: Path) -> None:
-    (tmp_path / "a.txt").write_bytes(b"12345")
-    (tmp_path / "link").symlink_to(tmp_path / "a.txt")
-    assert check_regular(tmp_path / "a.txt", "a text") == check_regular(tmp_path / "link", "a text") == 5
-
-
 @pytest.mark.parametrize(
     ("name", "words"),
     [
@@ -37,26 +31,20 @@ def test_what_is_no_regular_file_is_refused_and_not_waited_for(tmp_path: Path, n
         check_regular(tmp_path / name, "a text")
 
 
-@pytest.mark.parametrize(
-    "problem", [KeyError("size"), MemoryError(), ZeroDivisionError("a\nb"), OSError(5, "I/O")]
-)
-def test_whatever_a_decoder_raises_is_one_line(tmp_path: Path, problem: Exception) -> None:
-    (tmp_path / "a.bin").touch()
-    with (
-        refused(str(tmp_path / "a.bin"), "is no array", "expected one"),
-        reading(tmp_path / "a.bin", "is no array", "one"),
-    ):
-        raise problem
-
-
-def test_what_we_refuse_ourselves_stays_and_warnings_are_no_line(tmp_path: Path) -> None:
-    (tmp_path / "a.bin").touch()
+def test_whatever_a_decoder_raises_is_one_line_and_what_it_warns_of_is_none(tmp_path: Path) -> None:
+    path = tmp_path / "a.bin"
+    path.write_bytes(b"12345")
+    (tmp_path / "link").symlink_to(path)
+    assert check_regular(tmp_path / "link", "a text") == 5
+    for problem in (KeyError("size"), MemoryError(), ZeroDivisionError("a\nb"), OSError(5, "I/O")):
+        with refused(str(path), "is no array", "expected one"), reading(path, "is no array", "one"):
+            raise problem
+    with pytest.raises(InputError, match=r"^ours$"), reading(path, "is no array", "one"):
+        raise InputError("ours")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        with reading(tmp_path / "a.bin", "is no array", "one"):
+        with reading(path, "is no array", "one"):
             warnings.warn("odd", stacklevel=1)
-    with pytest.raises(InputError, match=r"^ours$"), reading(tmp_path / "a.bin", "is no array", "one"):
-        raise InputError("ours")
 
 
 def test_a_text_without_its_mark_and_one_that_is_none(
@@ -65,7 +53,7 @@ def test_a_text_without_its_mark_and_one_that_is_none(
     path = tmp_path / "a.csv"
     path.write_bytes(b"\xef\xbb\xbfa\r\nb")
     assert read_text(path, "lines") == "a\nb"
-    for content, words in ((b"\xff\xfe1", "no UTF-8 text"), (b"a\0b", "no text")):
+    for content, words in ((b"\xff\xfe1", "UTF-8 text"), (b"a\0b", "null character")):
         path.write_bytes(content)
         with refused(str(path), words, "expected lines"):
             read_text(path, "lines")

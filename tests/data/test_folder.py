@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import os
-import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from helpers import refused
+from helpers import all_of, refused
 from PIL import EpsImagePlugin, Image
-from torch import Tensor
 
 from dejavu_torch import memory
 from dejavu_torch.data.folder import ImageFolder, read_image
@@ -27,10 +25,6 @@ def write(path: Path, *names: str) -> None:
         Image.new("L", (5, 4), j).save(path / name)
 
 
-def all_of(folder: ImageFolder, batch: int = 64) -> Tensor:
-    return torch.cat(list(folder.batches(batch)))
-
-
 def with_alpha(pixels: np.ndarray) -> np.ndarray:
     return np.concatenate([pixels.reshape(4, 5, -1), np.full((4, 5, 1), 90, np.uint8)], 2)
 
@@ -42,7 +36,6 @@ def with_alpha(pixels: np.ndarray) -> np.ndarray:
         (Image.fromarray(COLOUR), "a.png", COLOUR / 255),
         (Image.fromarray(with_alpha(COLOUR)), "a.png", COLOUR / 255),
         (Image.fromarray(with_alpha(GREY), "LA"), "a.png", GREY[..., None] / 255),
-        (Image.fromarray(GREY.astype(np.uint16) * 257), "a.png", GREY[..., None] / 255),
         (Image.fromarray(GREY.astype(np.uint16) * 257), "a.tif", GREY[..., None] / 255),
         (Image.fromarray(GREY > 90), "a.png", (GREY > 90)[..., None]),
         (Image.fromarray(COLOUR).quantize(256), "a.png", COLOUR / 255),
@@ -67,28 +60,14 @@ def test_lossy_formats(name: str, tmp_path: Path) -> None:
 
 
 def test_numbers_in_names_count_as_numbers(tmp_path: Path) -> None:
-    names = [
-        "f1.png",
-        "f2.png",
-        "f9.png",
-        "f10.png",
-        "f010b.png",
-        "f100.png",
-        "g1_2.png",
-        "g1_10.png",
-        "x.png",
-    ]
+    names = ["f1.png", "f9.png", "f10.png", "f010b.png", "f100.png", "g1_2.png", "g1_10.png", "x.png"]
     write(tmp_path, *names)
-    assert [file.name for file in ImageFolder(tmp_path).files] == names
-    assert torch.equal(all_of(ImageFolder(tmp_path))[:, 0, 0, 0] * 255, torch.arange(9.0))
-
-
-def test_other_files_and_folders_are_passed_over(tmp_path: Path) -> None:
-    write(tmp_path, "1.png", "2.png")
     (tmp_path / "truth.csv").write_text("query,place")
     (tmp_path / "3.png").mkdir()
-    assert ImageFolder(tmp_path).length == 2
-    assert [ImageFolder(tmp_path).frame_name(i) for i in range(2)] == ["1.png", "2.png"]
+    folder = ImageFolder(tmp_path)
+    assert folder.length == 8
+    assert [folder.frame_name(i) for i in range(8)] == names
+    assert torch.equal(all_of(folder)[:, 0, 0, 0] * 255, torch.arange(8.0))
 
 
 @pytest.mark.parametrize(
@@ -98,7 +77,6 @@ def test_other_files_and_folders_are_passed_over(tmp_path: Path) -> None:
         ("empty", (), ("empty", "holds no images", "expected files such as .png")),
         (".", (), ("holds no images", "it has folders such as empty")),
         ("full", (-1, 0), ("width=-1", "expected width and height of at least 0")),
-        ("full", (10**12, 0), ("expected", "at most")),
         ("full", (10**5, 10**5), ("expected", "at most")),
     ],
 )
@@ -113,30 +91,24 @@ def test_what_is_no_folder_of_images_and_sizes_that_no_frame_has(
         all_of(ImageFolder(tmp_path / name, *given))
 
 
-@pytest.mark.parametrize("batch", [1, 64])
-@pytest.mark.parametrize(
-    ("odd", "seen"),
-    [
-        (Image.new("L", (5, 6)), "6 x 5 pixels of 1 channel"),
-        (Image.new("RGB", (5, 4)), "4 x 5 pixels of 3 channels"),
-    ],
-    ids=["size", "channels"],
-)
-def test_mixed_images_are_refused_by_name(tmp_path: Path, odd: Image.Image, seen: str, batch: int) -> None:
-    write(tmp_path, *(f"{j}.png" for j in range(5)))
-    odd.save(tmp_path / "3.png")
-    with refused("3.png", seen, "expected 4 x 5 pixels of 1 channel", "0.png"):
-        all_of(ImageFolder(tmp_path), batch)
+def test_mixed_images_are_refused_by_name(tmp_path: Path) -> None:
+    write(tmp_path, "0.png", "1.png", "2.png")
+    for odd, seen in (("L", (5, 6)), "6 x 5 pixels of 1 channel"), (("RGB", (5, 4)), "of 3 channels"):
+        Image.new(*odd).save(tmp_path / "1.png")
+        with refused("1.png", seen, "expected 4 x 5 pixels of 1 channel", "0.png"):
+            all_of(ImageFolder(tmp_path))
 
 
-@pytest.mark.parametrize("content", [b"", b"no image at all\nbut text\n"])
-def test_an_unreadable_image_in_the_middle_is_refused_by_name(tmp_path: Path, content: bytes) -> None:
-    write(tmp_path, *(f"{j}.png" for j in range(5)))
-    (tmp_path / "2.png").write_bytes(content)
-    frames = ImageFolder(tmp_path).batches(1)
-    assert next(frames).shape == next(frames).shape
-    with refused("2.png", "cannot be read as an image"):
-        next(frames)
+def test_only_the_images_asked_for_are_read(tmp_path: Path) -> None:
+    write(tmp_path, *(f"{j}.png" for j in range(10)))
+    for broken, content in ((4, b""), (9, b"no image at all\nbut text\n")):
+        (tmp_path / f"{broken}.png").write_bytes(content)
+    folder = ImageFolder(tmp_path)
+    assert torch.cat(list(folder.select(range(1, 9, 2), 3)))[:, 0, 0, 0].mul(255).tolist() == [1, 3, 5, 7]
+    assert torch.cat(list(folder.between(5, 8)))[:, 0, 0, 0].mul(255).tolist() == [5, 6, 7]
+    for broken in (4, 9):
+        with refused(f"{broken}.png", "cannot be read as an image"):
+            list(folder.between(broken, broken + 1))
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.bmp", "a.tif", "a.webp", "a.ppm"])
@@ -149,21 +121,6 @@ def test_a_truncated_image_is_refused_by_name(tmp_path: Path, name: str) -> None
         path.write_bytes(whole[: int(part * len(whole))])
         with refused(str(path), "cannot be read as an image"):
             read_image(path)
-
-
-def test_a_damaged_image_is_read_or_refused_in_one_line(tmp_path: Path) -> None:
-    random, path = np.random.default_rng(0), tmp_path / "a.png"
-    Image.fromarray(COLOUR).save(path)
-    whole = path.read_bytes()
-    for _ in range(200):
-        damaged = bytearray(whole)
-        damaged[random.integers(len(whole))] = random.integers(256)
-        path.write_bytes(damaged)
-        try:
-            read_image(path)
-        except InputError as error:
-            assert str(path) in str(error)  # noqa: PT017
-            assert "\n" not in str(error)  # noqa: PT017
 
 
 def test_images_are_resized_as_they_are_read(tmp_path: Path) -> None:
@@ -184,58 +141,26 @@ def test_a_camera_held_upright_is_turned(tmp_path: Path) -> None:
     assert np.allclose(all_of(ImageFolder(tmp_path))[0, 0].numpy(), expected)
 
 
-def test_only_the_images_asked_for_are_read(tmp_path: Path) -> None:
-    write(tmp_path, *(f"{j}.png" for j in range(10)))
-    for broken in (4, 9):  # the first one tells how large frames are
-        (tmp_path / f"{broken}.png").write_bytes(b"")
-    folder = ImageFolder(tmp_path)
-    assert torch.cat(list(folder.select(range(1, 9, 2), 3)))[:, 0, 0, 0].mul(255).tolist() == [1, 3, 5, 7]
-    assert torch.cat(list(folder.between(5, 8)))[:, 0, 0, 0].mul(255).tolist() == [5, 6, 7]
-
-
-def png(rows: int, columns: int) -> bytes:
-    """A black image in colour, whatever its size in a few bytes: what it says is not what it holds."""
-
-    def chunk(kind: bytes, content: bytes) -> bytes:
-        check = zlib.crc32(kind + content).to_bytes(4, "big")
-        return len(content).to_bytes(4, "big") + kind + content + check
-
-    header = columns.to_bytes(4, "big") + rows.to_bytes(4, "big") + bytes([8, 2, 0, 0, 0])
-    parts = (
-        chunk(b"IHDR", header)
-        + chunk(b"IDAT", zlib.compress(bytes(1 + min(3 * columns, 9999))))
-        + chunk(b"IEND", b"")
-    )
-    return b"\x89PNG\r\n\x1a\n" + parts
-
-
-@pytest.mark.parametrize("size", [(14_000, 14_000), (60_000, 60_000), (2, 2**27)])
+@pytest.mark.parametrize(
+    ("size", "words"),
+    [((60_000, 60_000), "pixels"), ((10_000, 10_000), "10 MB free")],
+)
 def test_an_image_that_claims_too_many_pixels_is_refused_by_its_header(
-    tmp_path: Path, size: tuple[int, int], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(Image.Image, "load", lambda _: pytest.fail("it was decoded"))
-    (tmp_path / "a.png").write_bytes(png(*size))
-    with refused("a.png", "expected"):
-        read_image(tmp_path / "a.png")
-
-
-def test_an_image_that_the_memory_does_not_hold_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, size: tuple[int, int], words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(memory, "free_memory", lambda: 10e6)
-    (tmp_path / "a.png").write_bytes(png(1000, 1000))
-    with refused("1000 x 1000 pixels", "10 MB free"):
-        read_image(tmp_path / "a.png")
+    monkeypatch.setattr(Image.Image, "load", lambda _: pytest.fail("it was decoded"))
+    (tmp_path / "a.ppm").write_bytes(f"P6 {size[1]} {size[0]} 255\n".encode() + bytes(99))
+    with refused("a.ppm", words):
+        read_image(tmp_path / "a.ppm")
 
 
-@pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.tif"])
-def test_only_the_formats_of_the_suffixes_are_read(
-    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_the_formats_of_the_suffixes_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(EpsImagePlugin, "Ghostscript", lambda *_, **__: pytest.fail("a program was started"))
-    (tmp_path / name).write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 10 10\n%%EndComments\n")
-    with refused(name, "cannot be read as an image"):
-        read_image(tmp_path / name)
+    path = tmp_path / "a.png"
+    path.write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 10 10\n%%EndComments\n")
+    with refused("a.png", "cannot be read as an image"):
+        read_image(path)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -0.1, 1.5])

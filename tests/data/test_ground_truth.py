@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import math
-import time
 import zipfile
+from contextlib import chdir
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,16 +16,13 @@ import torch
 from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
-from PIL import Image
 from torch import Tensor
 
 from dejavu_torch import memory
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.folder import ImageFolder
 from dejavu_torch.data.frame_range import FrameRange
 from dejavu_torch.data.ground_truth import (
     GroundTruth,
-    as_ground_truth,
     check_ground_truth,
     counted,
     describe_ground_truth,
@@ -47,16 +46,13 @@ def column(truth: Tensor) -> list[int]:
     return truth[:, 0].tolist()
 
 
-@given(st.integers(1, 9), st.integers(1, 9), st.integers(-12, 12))
-def test_offset(queries: int, places: int, offset: int) -> None:
-    expected = [i + offset if 0 <= i + offset < places else -1 for i in range(queries)]
-    assert column(offset_truth(queries, places, offset)) == expected
-
-
-@given(st.lists(st.integers(0, 30), min_size=1, max_size=9), st.integers(-40, 40))
-def test_offset_of_numbered_queries_on_a_map_of_unknown_length(numbers: list[int], offset: int) -> None:
-    expected = [i + offset if i + offset >= 0 else -1 for i in numbers]
-    assert column(offset_truth(torch.tensor(numbers), None, offset)) == expected
+@given(
+    st.lists(st.integers(0, 30), min_size=1, max_size=9), st.none() | st.integers(1, 30), st.integers(-40, 40)
+)
+def test_offset(numbers: list[int], frames: int | None, offset: int) -> None:
+    end = 100 if frames is None else frames  # of a map of unknown length
+    expected = [i + offset if 0 <= i + offset < end else -1 for i in numbers]
+    assert column(offset_truth(torch.tensor(numbers), frames, offset)) == expected
 
 
 @given(POSITIONS, POSITIONS)
@@ -72,15 +68,12 @@ def test_position_is_the_nearest_reference_frame(reference: list[int], query: li
             assert abs(reference[place] - position) == nearest
 
 
-def test_position_beyond_the_route_has_no_right_place() -> None:
-    reference, query = torch.arange(5.0), torch.tensor([-3.0, -0.4, 2.4, 4.9, 9.0])
-    assert column(position_truth(reference, query)) == [-1, 0, 2, 4, -1]
-
-
 def test_convention_5_tolerance_is_inclusive() -> None:
     index = torch.tensor([4, 5, 10, 15, 16])
     assert is_right(index, torch.full((5, 1), 10), 5).tolist() == [False, True, True, True, False]
     assert is_right(index, torch.full((5, 1), 10), 0).tolist() == [False, False, True, False, False]
+    for largest in (2**53, 2**63, 10**30):
+        assert is_right(index[:2], torch.tensor([[10**6], [-1]]), largest).tolist() == [True, False]
 
 
 ANSWERS = st.lists(
@@ -132,15 +125,6 @@ def test_near_needs_no_table_of_all_pairs(largest_tensor: type) -> None:
     assert seen.numel < 2500 * 2500 / 3
 
 
-def test_a_tensor_of_places_is_a_truth_in_which_all_is_known() -> None:
-    right = torch.tensor([[0, 1], [-1, -1]])
-    truth = as_ground_truth(right)
-    assert torch.equal(truth.positives, right)
-    assert truth.judged.tolist() == [True, True]
-    assert truth.ignored.shape == (2, 0)
-    assert as_ground_truth(truth) is truth
-
-
 def test_a_soft_place_counts_neither_way_and_an_unknown_query_never() -> None:
     """Right, wrong, soft, silent, soft but right by the tolerance, not known, not known though right."""
     index = torch.tensor([10, 30, 20, -1, 11, 30, 10])
@@ -156,10 +140,14 @@ def route(length: int, place: list[float] | None = None) -> Traverse:
     return traverse
 
 
-def read(truth: str, frames: int | None, queries: int | Tensor, **options: bool) -> GroundTruth:
-    found = find_ground_truth(truth, None, None, frames, queries, **options)
+def known(*arguments: Any, **options: bool) -> GroundTruth:
+    found = find_ground_truth(*arguments, **options)
     assert found is not None
     return found
+
+
+def read(truth: str, frames: int | None, queries: int | Tensor, **options: bool) -> GroundTruth:
+    return known(truth, None, None, frames, queries, **options)
 
 
 def sets(table: Tensor) -> list[set[int]]:
@@ -179,35 +167,31 @@ def written(folder: Path, text: str | bytes) -> str:
 @pytest.mark.parametrize(
     ("truth", "reference", "query", "expected"),
     [
-        ("-1", route(3), route(3), [-1, 0, 1]),
         ("+1", route(3), route(2), [1, 2]),
         (None, route(3, [0, 1, 2]), route(2, [2, 1]), [2, 1]),
         ("1", route(3, [0, 1, 2]), route(3, [2, 1, 0]), [1, 2, -1]),
-        ("9", route(5), route(4), ("truth 9", "from -3 to 4")),
-        ("-9", None, route(9), ("truth -9", "from -8")),
         ("-8", None, route(9), [-1] * 8 + [0]),
+        (None, route(3), route(4), None),
+        (None, None, route(3), None),
+        (None, route(3), None, None),
     ],
 )
 def test_what_a_command_was_given_or_can_know(
-    truth: str | None, reference: Traverse | None, query: Traverse, expected: list[int] | tuple[str, ...]
+    truth: str | None, reference: Traverse | None, query: Traverse | None, expected: list[int] | None
 ) -> None:
-    def find() -> GroundTruth | None:
-        return find_ground_truth(truth, reference, query, reference and reference.length, query.length or 0)
-
-    if isinstance(expected, tuple):
-        with refused(*expected):
-            find()
-        return
-    found = find()
-    assert found is not None
-    assert found.positives[:, 0].tolist() == expected
-    assert found.judged.all()
+    queries = query.length if query is not None else None
+    found = find_ground_truth(truth, reference, query, reference and reference.length, queries or 3)
+    assert (found is None) == (expected is None)
+    if found is not None:
+        assert found.positives[:, 0].tolist() == expected
+        assert found.judged.all()
 
 
-def test_without_a_truth_other_lengths_or_missing_traverses_give_none() -> None:
-    assert find_ground_truth(None, route(3), route(4), 3, 4) is None
-    assert find_ground_truth(None, None, route(3), 3, 3) is None
-    assert find_ground_truth(None, route(3), None, None, torch.tensor([0])) is None
+def test_an_offset_beyond_every_frame_is_refused() -> None:
+    with refused("truth 9", "from -3 to 4"):
+        find_ground_truth("9", route(5), route(4), 5, 4)
+    with refused("truth -9", "from -8"):
+        find_ground_truth("-9", None, route(9), None, 9)
 
 
 class Named(ArrayTraverse):
@@ -238,10 +222,7 @@ ABC, TIMES = list("abc"), ["0:00.0", "0:00.5", "0:01.0"]
         (Named(ABC), Named(ABC), True),
         (FrameRange(Named([*"xabc"]), 1), Named(ABC), True),
         (route(3), route(3), False),
-        (route(3, [0, 1, 2]), route(3), False),
-        (Named(ABC), Named(["a", "b", "d"]), False),
         (Named(ABC), Named(["b", "a", "c"]), False),
-        (Named([""] * 3), Named([""] * 3), False),
         (Named(["a", "b", ""]), Named(["a", "b", ""]), False),
         (Named(["a"] * 3), Named(["a"] * 3), False),
         (Named(TIMES, timed=True), Named(TIMES, timed=True), False),
@@ -261,22 +242,17 @@ def test_as_many_frames_are_the_same_places_where_they_say_so(
     assert frames is not None
     assert queries == frames
     found = find_ground_truth(None, reference, query, frames, queries)
-    assert (found is not None) == says
-    expected = list(range(frames))
-    if found is not None:
-        assert found.positives[:, 0].tolist() == expected
-    named = find_ground_truth(None, reference, query, frames, queries, aligned=True)  # by a user
-    assert named is not None
-    assert named.positives[:, 0].tolist() == expected
+    named = known(None, reference, query, frames, queries, aligned=True)  # by a user
+    assert named.positives[:, 0].tolist() == list(range(frames))
+    assert found is None if not says else torch.equal(found.positives, named.positives)
 
 
 def test_numbered_queries_get_their_own_rows() -> None:
     numbers = torch.tensor([3, 0])
-    by_offset = find_ground_truth("2", None, None, None, numbers)
-    by_position = find_ground_truth(None, route(3, [0, 1, 2]), route(4, [2, 9, 9, 1]), 3, numbers)
-    by_name = find_ground_truth(None, Named([*"abcd"]), Named([*"abcd"]), 4, numbers)
+    by_offset = known("2", None, None, None, numbers)
+    by_position = known(None, route(3, [0, 1, 2]), route(4, [2, 9, 9, 1]), 3, numbers)
+    by_name = known(None, Named([*"abcd"]), Named([*"abcd"]), 4, numbers)
     for found, expected in ((by_offset, [5, 2]), (by_position, [1, 2]), (by_name, [3, 0])):
-        assert found is not None
         assert found.positives[:, 0].tolist() == expected
     with refused("query 3", "below 3"):
         find_ground_truth(None, route(3, [0, 1, 2]), route(3, [0, 1, 2]), 3, numbers)
@@ -284,29 +260,24 @@ def test_numbered_queries_get_their_own_rows() -> None:
 
 # any text
 
+NO_TRUTH = ["x", "", "1.5", "utm:", "utm:far", "utm:-1", "utm:nan", "utm2", "9" * 30, "truth.txt", "nan"]
+
 
 @pytest.mark.parametrize(
-    "truth", ["x", "", "1.5", "utm:", "utm:far", "utm:-1", "utm:nan", "utm2", "9" * 30, "truth.txt"]
+    ("truth", "options", "words"),
+    [
+        *((text, {}, (f"truth {text!r}", "an integer offset", "utm:25")) for text in NO_TRUTH),
+        *((name, {}, (name, "is not there")) for name in ("none.csv", "none.npz", "none.CSV")),
+        *((text, {"interpolate": True}, (text, "interpolated", ".csv")) for text in ("3", "utm:7.5")),
+        ("folder.csv", {}, ("folder.csv", "is a folder")),
+    ],
 )
-def test_text_that_is_no_truth_is_refused(truth: str) -> None:
-    with refused(f"truth {truth!r}", "expected an integer offset", ".csv", ".npz", "utm:25"):
-        read(truth, 3, 3)
-
-
-@pytest.mark.parametrize("name", ["none.csv", "none.npz", "none.CSV"])
-def test_a_file_that_is_not_there_is_refused_early(tmp_path: Path, name: str) -> None:
-    with refused(name, "is not there", "expected"):
-        check_ground_truth(str(tmp_path / name))
-    (tmp_path / name).mkdir()
-    with refused(name, "is a folder"):
-        check_ground_truth(str(tmp_path / name))
-
-
-@pytest.mark.parametrize("truth", ["3", "utm", "utm:7.5"])
-def test_only_a_csv_can_be_interpolated(truth: str) -> None:
-    check_ground_truth(truth)
-    with refused(truth, "interpolated", ".csv"):
-        check_ground_truth(truth, interpolate=True)
+def test_what_is_no_truth_is_refused_early(
+    truth: str, options: dict[str, bool], words: tuple[str, ...], scratch: Path
+) -> None:
+    (scratch / "folder.csv").mkdir(exist_ok=True)
+    with chdir(scratch), refused(*words):
+        check_ground_truth(truth, **options)
 
 
 # csv
@@ -318,13 +289,6 @@ TABLE = "query,place...\n0,4\n2,1,7\n3\n5,-1\n"
 @pytest.fixture(scope="module")
 def scratch(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("truth")
-
-
-def test_csv_by_hand(tmp_path: Path) -> None:
-    truth = read(written(tmp_path, TABLE), 8, 7)
-    assert sets(truth.positives) == [{4}, set(), {1, 7}, set(), set(), set(), set()]
-    assert truth.judged.tolist() == [True, False, True, True, False, True, False]
-    assert truth.ignored.shape == (7, 0)
 
 
 @given(LISTED, st.booleans(), st.lists(st.integers(0, 20), min_size=1, max_size=9, unique=True))
@@ -347,10 +311,10 @@ def test_csv_holds_what_was_written(
 @pytest.mark.parametrize(
     "text",
     [
+        TABLE,
         TABLE.replace("\n", "\r\n"),
         "\ufeff" + TABLE,
         TABLE.replace("\n", "\n\n") + "\n , ,\n",
-        TABLE.replace(",", " , "),
         TABLE.replace(",", ";"),
         TABLE.replace(",", "\t"),
         TABLE.replace(",", " "),
@@ -359,14 +323,13 @@ def test_csv_holds_what_was_written(
         TABLE.split("\n", 1)[1],
         '"query","place"\n"0","4"\n"2","1","7"\n"3"\n"5","-1"\n',
         "3\n5\n2,1,7\n0,4",
-        TABLE.encode("utf-8").rstrip(b"\n"),
     ],
 )
-def test_csv_is_read_leniently(tmp_path: Path, text: str | bytes) -> None:
-    expected = read(written(tmp_path, TABLE), 8, 7)
+def test_csv_is_read_leniently(tmp_path: Path, text: str) -> None:
     truth = read(written(tmp_path, text), 8, 7)
-    assert sets(truth.positives) == sets(expected.positives)
-    assert truth.judged.tolist() == expected.judged.tolist()
+    assert sets(truth.positives) == [{4}, set(), {1, 7}, set(), set(), set(), set()]
+    assert truth.judged.tolist() == [True, False, True, True, False, True, False]
+    assert truth.ignored.shape == (7, 0)
 
 
 @pytest.mark.parametrize(
@@ -374,11 +337,9 @@ def test_csv_is_read_leniently(tmp_path: Path, text: str | bytes) -> None:
     [
         ("query,place\n0,1\n1,x\n", ("line 3", "'x'", "expected")),
         ("0,1\n\n1,nan\n", ("line 3", "'nan'")),
-        ("0,1\n1,1e300\n", ("line 2", "'1e300'")),
         ("query;place\n0;1,5\n", ("line 2", "'1,5'")),
         ("0,1\n2,1\n0,3\n", ("line 3", "query 0", "twice")),
         ("0,1\n-1,1\n", ("line 2", "query -1")),
-        ("0,1\n1.5,1\n", ("line 2", "query 1.5")),
         ("0,1\n1,8\n", ("line 2", "place 8", "0 to 7")),
         ("0,1\n1,-2\n", ("line 2", "place -2", "-1 for none")),
         ("0,1\n1,2.5\n", ("line 2", "place 2.5", "whole", "interpolation")),
@@ -426,17 +387,8 @@ def test_interpolation_is_a_straight_line_between_neighbours_and_nothing_beyond(
 
 def test_interpolation_by_hand(tmp_path: Path) -> None:
     path = written(tmp_path, "1,10\n5,12.4\n6,0\n")
-    truth = read(path, 20, 8, interpolate=True)
-    assert truth.positives[:, 0].tolist() == [-1, 10, 11, 11, 12, 12, 0, -1]
-    some = read(path, 20, torch.tensor([5, 2]), interpolate=True)
-    assert some.positives[:, 0].tolist() == [12, 11]
-
-
-def test_convention_5_the_tolerance_applies_on_top_of_listed_places(tmp_path: Path) -> None:
-    right = read(written(tmp_path, "0,3,4\n1,3,4\n2,3,4\n3,3,4"), None, 4).positives
-    index = torch.tensor([1, 2, 4, 5])
-    assert is_right(index, right, 0).tolist() == [False, False, True, False]
-    assert is_right(index, right, 1).tolist() == [False, True, True, True]
+    some = read(path, 20, torch.tensor([5, 2, 0]), interpolate=True)
+    assert some.positives[:, 0].tolist() == [12, 11, -1]
 
 
 # npz
@@ -488,94 +440,75 @@ def test_npz_with_one_matrix_only(tmp_path: Path) -> None:
         assert truth.ignored.shape == (2, 0)
 
 
+SQUARE, SOME = np.eye(3, dtype=bool), torch.tensor([0, 2])
+
+
 @pytest.mark.parametrize(
-    ("shape", "places", "queries", "words"),
+    ("hard", "places", "queries", "words"),
     [
-        ((3, 2), 2, 3, ("(3, 2)", "(2, 3)", "transposed it fits")),
-        ((3, 2), None, 3, ("(3, 2)", "(reference frames, 3)", "transposed it fits")),
-        ((3, 5), None, torch.tensor([0, 2]), ("(3, 5)", "(reference frames, 3)")),
-        ((3, 2), None, torch.tensor([0, 2]), ("transposed it fits",)),
-        ((4, 4), 3, 4, ("(4, 4)", "(3, 4)")),
-        ((3, 4), 3, 5, ("(3, 4)", "(3, 5)")),
-        ((3, 6), 3, 5, ("(3, 6)", "(3, 5)")),
-        ((3,), 3, 1, ("(3,)", "a column a query")),
+        (np.ones((3, 2)), 2, 3, ("(3, 2)", "(2, 3)", "transposed it fits")),
+        (np.ones((3, 5)), None, SOME, ("(3, 5)", "(reference frames, 3)")),
+        (np.ones((3, 2)), None, SOME, ("transposed it fits",)),
+        (np.ones((4, 4)), 3, 4, ("(4, 4)", "(3, 4)")),
+        (np.ones((3, 6)), 3, 5, ("(3, 6)", "(3, 5)")),
+        (np.ones(3), 3, 1, ("(3,)", "a column a query")),
+        (np.array([["1"]]), 1, 1, ("<U1",)),
+        (np.array([[{}]], dtype=object), 1, 1, ("no whole .npz",)),
+        (np.full((3, 3), np.nan), 3, 3, ("not finite",)),
     ],
 )
 def test_a_matrix_that_does_not_fit_is_refused(
-    tmp_path: Path, shape: tuple[int, ...], places: int | None, queries: int | Tensor, words: tuple[str, ...]
+    tmp_path: Path, hard: np.ndarray, places: int | None, queries: int | Tensor, words: tuple[str, ...]
 ) -> None:
-    with refused("truth.npz: GThard", *words):
-        read(saved(tmp_path, GThard=np.ones(shape, dtype=bool)), places, queries)
-
-
-def test_some_queries_of_a_larger_matrix(tmp_path: Path) -> None:
-    path = saved(tmp_path, GThard=np.eye(4, 9, dtype=bool))
-    assert sets(read(path, None, torch.tensor([6, 1, 2])).positives) == [set(), {1}, {2}]
+    with refused("truth.npz", "GThard", *words):
+        read(saved(tmp_path, GThard=hard), places, queries)
 
 
 def test_other_npz_files_are_refused(tmp_path: Path) -> None:
-    square = np.eye(3, dtype=bool)
     with refused("truth.npz", "holds gt, S", "GThard"):
-        read(saved(tmp_path, gt=square, S=square), 3, 3)
+        read(saved(tmp_path, gt=SQUARE, S=SQUARE), 3, 3)
     with refused("differ in shape"):
-        read(saved(tmp_path, GThard=square, GTsoft=np.ones((2, 3))), None, 3)
-    with refused("differ in shape"):
-        read(saved(tmp_path, GThard=square, GTsoft=np.ones((3, 4))), None, torch.tensor([0, 1]))
-    with refused("no whole .npz"):
-        read(saved(tmp_path, GThard=np.array([[{}]], dtype=object)), 1, 1)
-    with refused("GThard", "<U1"):
-        read(saved(tmp_path, GThard=np.array([["1"]])), 1, 1)
-    path = Path(saved(tmp_path, GThard=square))
-    whole = path.read_bytes()
-    for data in (whole[: len(whole) // 2], b"", b"query,place\n"):
+        read(saved(tmp_path, GThard=SQUARE, GTsoft=np.ones((2, 3))), None, 3)
+    path = Path(saved(tmp_path, GThard=SQUARE))
+    whole, single = path.read_bytes(), io.BytesIO()
+    np.save(single, SQUARE)
+    for data in (whole[: len(whole) // 2], b"", b"query,place\n", single.getvalue()):
         path.write_bytes(data)
         with refused("truth.npz", "no whole .npz", "GThard"):
             read(str(path), 3, 3)
-    with path.open("wb") as file:
-        np.save(file, square)
-    with refused("no whole .npz"):
-        read(str(path), 3, 3)
 
 
 # coordinates in image names
 
 
-def images(folder: Path, points: list[tuple[float, float]]) -> ImageFolder:
-    folder.mkdir()
-    for i, (east, north) in enumerate(points):
-        Image.new("L", (2, 2)).save(folder / f"{i:03}@{east:.2f}@{north:.2f}@33@T@@@.png")
-    return ImageFolder(folder)
+def images(*points: tuple[float, float]) -> Traverse:
+    return Named([f"{i:03}@{east:.2f}@{north:.2f}@33@T@@@.png" for i, (east, north) in enumerate(points)])
 
 
-def test_utm_makes_every_reference_frame_near_by_right(tmp_path: Path) -> None:
-    reference = images(tmp_path / "a", [(500_000 + 10 * i, 4_000_000) for i in range(8)])
-    query = images(tmp_path / "b", [(500_030, 4_000_000), (500_000, 4_000_025), (500_000, 4_000_026)])
+def test_utm_makes_every_reference_frame_near_by_right() -> None:
+    reference = images(*((500_000 + 10 * i, 4_000_000) for i in range(8)))
+    query = images((500_030, 4_000_000), (500_000, 4_000_025), (500_000, 4_000_026))
     expected = [{1, 2, 3, 4, 5}, {0}, set()]
     for text in ("utm", "utm:25"):
-        truth = find_ground_truth(text, reference, query, 8, 3)
-        assert truth is not None
+        truth = known(text, reference, query, 8, 3)
         assert sets(truth.positives) == expected
         assert truth.judged.all()
-    near = find_ground_truth("utm:10", reference, query, 8, torch.tensor([2, 0]))
-    assert near is not None
+    near = known("utm:10", reference, query, 8, torch.tensor([2, 0]))
     assert sets(near.positives) == [set(), {2, 3, 4}]
     with refused("no query has a right answer", "within 1 m"):
         find_ground_truth("utm:1", reference, query, 8, torch.tensor([2, 1]))
 
 
-def test_utm_needs_two_folders_of_images_with_coordinates(tmp_path: Path) -> None:
-    good = images(tmp_path / "a", [(1, 2)])
-    (tmp_path / "b").mkdir()
+def test_utm_needs_two_folders_of_images_with_coordinates() -> None:
+    good = images((1, 2))
     for name in ("1.png", "@1@.png", "@x@3@.png"):
-        Image.new("L", (2, 2)).save(tmp_path / "b" / name)
         with refused(name, "@easting@northing@"):
-            find_ground_truth("utm", good, ImageFolder(tmp_path / "b"), 1, 1)
-        (tmp_path / "b" / name).unlink()
+            find_ground_truth("utm", good, Named([name]), 1, 1)
     with refused("no image names", "folders of images"):
         find_ground_truth("utm", route(1), good, 1, 1)
-    for lacking in (lambda: find_ground_truth("utm", good, None, 1, 1), lambda: read("utm", 1, 1)):
+    for query in (good, None):
         with refused("truth utm", "both traverses"):
-            lacking()
+            find_ground_truth("utm", None, query, 1, 1)
     with refused("query 1", "below 1"):
         find_ground_truth("utm", good, good, 1, torch.tensor([1]))
 
@@ -585,15 +518,11 @@ def test_utm_needs_two_folders_of_images_with_coordinates(tmp_path: Path) -> Non
 
 def test_the_corridor_truth(data_dir: Path) -> None:
     truth = read(str(data_dir / "corridor" / "truth.csv"), 111, 111)
-    assert isinstance(truth, GroundTruth)
     assert truth.judged.all()
     found = sets(truth.positives)
-    assert found[0] == {0, 1, 2}
-    assert found[110] == {108, 109, 110}
-    assert all(found)
-    # a slow camera: right places follow each other without gaps, and never go far back
+    assert (found[0], found[110]) == ({0, 1, 2}, {108, 109, 110})
+    # a slow camera: right places follow each other without gaps
     assert all(max(places) - min(places) == len(places) - 1 for places in found)
-    assert math.isclose(sum(min(places) for places in found) / 111, 53, abs_tol=3)
 
 
 # resampled by distance: two queries show frames 3 and 9 of 11; three places show frames 0, 4 and 9 of 12
@@ -603,10 +532,7 @@ PLACE_OF = torch.tensor([0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, -1])
 
 
 def resampled(truth: str, **options: bool) -> GroundTruth:
-    reference, query = route(12), route(11)
-    found = find_ground_truth(truth, reference, query, 12, SHOWN, resampled=True, **options)
-    assert found is not None
-    return found
+    return known(truth, route(12), route(11), 12, SHOWN, resampled=True, **options)
 
 
 def test_convention_11_a_ground_truth_counts_frames(tmp_path: Path) -> None:
@@ -636,34 +562,28 @@ def test_a_frame_that_no_query_shows_speaks_for_the_nearest_one_that_is_shown(tm
 
 def test_a_frame_may_be_shown_by_several_queries(tmp_path: Path) -> None:
     path = written(tmp_path, "0,2\n1,5\n")
-    found = find_ground_truth(path, None, None, 12, torch.tensor([0, 0, 1, 1, 1]), resampled=True)
-    assert found is not None
+    found = known(path, None, None, 12, torch.tensor([0, 0, 1, 1, 1]), resampled=True)
     assert sets(found.positives) == [{2}, {2}, {5}, {5}, {5}]
 
 
 def test_matrices_are_of_frames(tmp_path: Path) -> None:
     hard, soft = np.zeros((12, 11), bool), np.zeros((12, 11), bool)
     hard[11, 3] = hard[0, 9] = hard[5, 0] = soft[4, 3] = True
-    found = resampled(saved(tmp_path, GThard=hard, GTsoft=soft))
-    assert (sets(found.positives), sets(found.ignored)) == ([{11}, {0}], [{4}, set()])
-    places = ground_truth_in_places(found, lambda frames: look_up(PLACE_OF, frames))
+    places = ground_truth_in_places(
+        resampled(saved(tmp_path, GThard=hard, GTsoft=soft)), lambda frames: look_up(PLACE_OF, frames)
+    )
     assert (sets(places.positives), sets(places.ignored)) == ([set(), {0}], [{1}, set()])
-    with refused("(3, 2)", "(12, 10)"):
-        resampled(saved(tmp_path, GThard=np.eye(3, 2, dtype=bool)))
 
 
-def test_positions_and_coordinates_are_of_frames(tmp_path: Path) -> None:
-    reference = images(tmp_path / "reference", [(10 * i, 0) for i in range(12)])
-    query = images(tmp_path / "query", [(10 * (i + 1), 0) for i in range(11)])
-    found = find_ground_truth("utm:1", reference, query, 12, SHOWN, resampled=True)
-    assert found is not None
+def test_positions_and_coordinates_are_of_frames() -> None:
+    reference = images(*((10 * i, 0) for i in range(12)))
+    query = images(*((10 * i, 0) for i in range(1, 12)))
+    found = known("utm:1", reference, query, 12, SHOWN, resampled=True)
     assert sets(found.positives) == [{4}, {10}]
-    part = find_ground_truth("utm:1", FrameRange(reference, start=2), query, 10, SHOWN)
-    assert part is not None
+    part = known("utm:1", FrameRange(reference, start=2), query, 10, SHOWN)
     assert sets(part.positives) == [{2}, {8}]
     carried = route(12, list(range(12))), route(10, list(range(1, 11)))
-    found = find_ground_truth(None, *carried, 12, SHOWN, resampled=True)
-    assert found is not None
+    found = known(None, *carried, 12, SHOWN, resampled=True)
     assert sets(found.positives) == [{4}, {10}]
 
 
@@ -708,15 +628,10 @@ def packed(folder: Path, kind: str, shape: str, body: bytes, method: int = zipfi
     ("kind", "shape"),
     [
         ("'|b1'", f"({10**6}, {10**6})"),
-        ("'|b1'", f"({2**62}, {2**62})"),
         ("'|b1'", f"({10**40}, 3)"),
         ("'|b1'", "(-3, -3)"),
         ("'|b1'", "(2, 3)"),
-        ("'|O'", "(3, 3)"),
-        ("[('a', '|b1')]", "(3, 3)"),
         ("('|b1', (1000000000000,))", "(3, 3)"),
-        ("{}", "(3, 3)"),
-        ("'|b1'", "(" * 5000),
     ],
 )
 def test_what_a_matrix_claims_is_not_believed(tmp_path: Path, kind: str, shape: str) -> None:
@@ -732,7 +647,7 @@ def test_a_matrix_larger_than_the_memory_is_not_unpacked(
     path = packed(tmp_path, "'|b1'", "(3000, 3000)", b"\1" * 3000**2)
     assert Path(path).stat().st_size < 10**5
     monkeypatch.setattr(memory, "free_memory", lambda: 10e6)
-    with refused("GThard (3000, 3000) bool", "10 MB free"):
+    with refused("GThard takes 18 MB", "10 MB free"):
         read(path, 3000, 3000)
 
 
@@ -747,9 +662,6 @@ def test_entries_of_other_kinds_are_refused(tmp_path: Path) -> None:
     path.write_bytes(locked)
     with refused("no whole .npz", "encrypted"):
         read(str(path), 3, 3)
-    nan = np.full((3, 3), np.nan)
-    with refused("not finite"):
-        read(saved(tmp_path, GThard=nan), 3, 3)
 
 
 def test_a_table_wider_than_the_memory_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -760,18 +672,3 @@ def test_a_table_wider_than_the_memory_is_refused(tmp_path: Path, monkeypatch: p
         read(path, None, 2000)
     with refused("1500 places for each of 30000 queries", "GB free"):
         near_truth(torch.zeros(1500, 2), torch.zeros(30_000, 2), radius=1.0)
-
-
-def test_many_frames_that_one_query_speaks_for_take_no_longer(tmp_path: Path) -> None:
-    path = written(tmp_path, "\n".join(f"{i},{i}" for i in range(60_000)))
-    began = time.process_time()
-    found = find_ground_truth(path, None, None, 60_000, torch.tensor([70_000]), resampled=True)
-    assert found is not None
-    assert found.positives.shape == (1, 60_000)
-    assert time.process_time() - began < 10  # copied each time, half a minute
-
-
-def test_no_tolerance_is_too_large() -> None:
-    far = torch.tensor([[10**6], [-1]])
-    for tolerance in (10**6, 2**53, 2**63, 10**30):
-        assert is_right(torch.tensor([0, 0]), far, tolerance).tolist() == [True, False]

@@ -27,6 +27,7 @@ def packed(names: list[str]) -> str:
     return code
 
 
+NEARLY = st.text("019-.:_a", max_size=5)  # as counters have them
 PLAIN = st.text(st.characters(blacklist_categories=[]), max_size=8)
 COUNTER = st.builds(
     lambda prefix, suffix, width, first, stride, frames: [
@@ -40,32 +41,20 @@ TIMES = st.builds(
 )
 
 
-@given(st.lists(PLAIN, max_size=12))
-def test_any_names_are_given_back(names: list[str]) -> None:
-    packed(names)
-
-
-@given(st.lists(COUNTER | TIMES | st.lists(PLAIN, max_size=3), max_size=4))
-def test_series_of_names_are_given_back(series: list[list[str]]) -> None:
+@given(st.lists(COUNTER | TIMES | st.lists(PLAIN, max_size=12) | st.lists(NEARLY, max_size=15), max_size=4))
+def test_any_names_are_given_back(series: list[list[str]]) -> None:
     packed([name for names in series for name in names])
 
 
-@given(st.lists(st.text("019-.:_a", max_size=5), max_size=15))
-def test_names_that_nearly_count_are_given_back(names: list[str]) -> None:
-    packed(names)
-
-
-@pytest.mark.parametrize("frames", [2, 1000, 30_000])
-@pytest.mark.parametrize(
-    "form", ["{:06}.png", "left_{}.jpg", "image-1-{:03}_cam0.png", "frame{:04}.2.tif", "{}"]
-)
+@pytest.mark.parametrize("frames", [2, 30_000])
+@pytest.mark.parametrize("form", ["{:06}.png", "image-1-{:03}_cam0.png", "frame{:04}.2.tif", "{}"])
 def test_a_counter_takes_hardly_a_byte_for_a_hundred_frames(form: str, frames: int) -> None:
     assert len(packed([form.format(5 + 3 * i) for i in range(frames)])) < 150 + frames / 100
 
 
-@pytest.mark.parametrize("rate", [25.0, 30000 / 1001, 24000 / 1001, 10.0])
-def test_times_of_a_video_take_less_than_a_tenth_of_a_byte_a_frame(rate: float) -> None:
-    assert len(packed([clock_time(i / rate) for i in range(30_000)])) < 3000
+def test_times_of_a_video_take_less_than_a_tenth_of_a_byte_a_frame() -> None:
+    for rate in (25.0, 24000 / 1001):
+        assert len(packed([clock_time(i / rate) for i in range(30_000)])) < 3000
 
 
 def test_other_names_are_compressed() -> None:
@@ -96,10 +85,8 @@ def coded(value: object) -> str:
     "code",
     [
         None,
-        7,
         "%%%",
         base64.b64encode(b"no zlib").decode(),
-        base64.b64encode(zlib.compress(b"no json")).decode(),
         base64.b64encode(zlib.compress(b"[" * 10**6)).decode(),
         coded(["one", 2]),
         coded("ab"),

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 from helpers import refused
@@ -22,6 +23,8 @@ from dejavu_torch.data.output import (
     check_output_file,
     check_output_folder,
     make_output_folder,
+    remove_empty_folders,
+    temporary_folder,
     whole_file,
     whole_folder,
 )
@@ -32,78 +35,103 @@ def full_disk(*_: object, **__: object) -> None:
     raise OSError(errno.ENOSPC, "No space left on device")
 
 
-def test_a_new_file_appears_whole(tmp_path: Path) -> None:
-    target = tmp_path / "a.txt"
-    with whole_file(target) as temporary:
-        temporary.write_text("first half, ")
-        assert not target.exists()
-        temporary.write_text("all of it")
-    assert target.read_text() == "all of it"
-    assert list(tmp_path.iterdir()) == [target]
-
-
-def test_the_temporary_file_has_the_name_of_its_target_in_a_folder_beside_it(tmp_path: Path) -> None:
-    target = tmp_path / ("a" * 251 + ".png")  # no name could be longer
-    with whole_file(target) as temporary:
-        assert (temporary.parent.parent, temporary.name) == (tmp_path, target.name)
-        temporary.touch()
-    assert list(tmp_path.iterdir()) == [target]
-
-
-@pytest.mark.parametrize("before", ["", "old"])
-@pytest.mark.parametrize("problem", [RuntimeError("bug"), KeyboardInterrupt(), InputError("bad")])
-def test_an_exception_leaves_what_was_there(tmp_path: Path, before: str, problem: BaseException) -> None:
-    target = tmp_path / "a.txt"
-    if before:
-        target.write_text(before)
-
-    def write_half() -> None:
-        with whole_file(target) as temporary:
-            temporary.write_text("half")
-            raise problem
-
-    with pytest.raises(type(problem)):
-        write_half()
-    assert [file.read_text() for file in tmp_path.iterdir()] == [before] * bool(before)
-
-
-def test_a_full_disk_while_renaming_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    target = tmp_path / "a.txt"
-    target.write_text("old")
-    monkeypatch.setattr(Path, "replace", full_disk)
-    with refused(str(target), "No space left on device"), whole_file(target) as temporary:
-        temporary.write_text("new")
-    assert {file.name: file.read_text() for file in tmp_path.iterdir()} == {"a.txt": "old"}
-
-
-@pytest.mark.parametrize("check", [check_output_file, lambda path: whole_file(path).__enter__()])
-def test_a_file_that_cannot_be_written_is_refused_at_once(tmp_path: Path, check: object) -> None:
-    assert callable(check)
-    with refused(str(tmp_path), "folder"):
-        check(tmp_path)
-    with refused("missing", "does not exist"):
-        check(tmp_path / "missing" / "a.txt")
-    (tmp_path / "file").touch()
-    with refused("file"):
-        check(tmp_path / "file" / "a.txt")
-    for path in ("file", "file/below"):
-        with refused("file"):
-            make_output_folder(tmp_path / path)
-    for _ in range(2):
-        make_output_folder(tmp_path / "a" / "b")
-    assert (tmp_path / "a" / "b").is_dir()
-
-
-# what is there already
-
-
 def write(target: Path, text: str = "new") -> None:
     with whole_file(target) as temporary:
         temporary.write_text(text)
 
 
+def held(folder: Path) -> dict[str, str]:
+    """The files in a folder, and what they hold."""
+    return {file.name: file.read_text() for file in folder.iterdir() if file.is_file()}
+
+
 def mode_of(path: Path) -> int:
     return stat.S_IMODE(path.stat().st_mode)
+
+
+@pytest.mark.parametrize("name", [".mode", ".dejavu-notes", "a" * 255])
+def test_a_file_or_folder_of_any_name_appears_whole(tmp_path: Path, name: str) -> None:
+    with whole_file(tmp_path / name) as temporary:
+        assert (temporary.parent.parent, temporary.name) == (tmp_path, name)
+        temporary.write_text("first half, ")
+        assert not (tmp_path / name).exists()
+        temporary.write_text("new")
+    with whole_folder(tmp_path / "a" / "new") as temporary:
+        (temporary / name).write_text("new")
+        assert not (tmp_path / "a").exists()
+    assert held(tmp_path) == held(tmp_path / "a" / "new") == {name: "new"}
+    assert sorted(file.name for file in tmp_path.iterdir()) == sorted([name, "a"])
+
+
+def file_in(folder: Path) -> AbstractContextManager[Path]:
+    return whole_file(folder / "a")
+
+
+def whole(folder: Path) -> AbstractContextManager[Path]:
+    return whole_folder(folder, ["earlier"])
+
+
+@pytest.mark.parametrize("problem", [RuntimeError("bug"), KeyboardInterrupt(), InputError("bad")])
+@pytest.mark.parametrize(
+    ("kind", "before"),
+    [(file_in, {}), (file_in, {"a": "old"}), (whole, None), (whole, {"a": "old", "earlier": "old"})],
+)
+def test_an_exception_leaves_what_was_there(
+    tmp_path: Path, kind: Callable[[Path], Any], before: dict[str, str] | None, problem: BaseException
+) -> None:
+    folder = tmp_path / "new" / "folder"
+    if before is not None:
+        folder.mkdir(parents=True)
+        for name, text in before.items():
+            (folder / name).write_text(text)
+
+    def write_half() -> None:
+        with kind(folder) as temporary:
+            (temporary / "a" if temporary.is_dir() else temporary).write_text("half")
+            raise problem
+
+    with pytest.raises(type(problem)):
+        write_half()
+    left = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")}
+    assert left == set() if before is None else held(folder) == before
+    assert len(left) == (0 if before is None else 2 + len(before))
+
+
+@pytest.mark.parametrize(
+    ("check", "name", "words"),
+    [
+        (check_output_file, "", "folder"),
+        (write, "", "folder"),
+        (check_output_file, "missing/a.txt", "does not exist"),
+        (check_output_file, "file/a.txt", "file"),
+        (make_output_folder, "file", "is a file"),
+        (make_output_folder, "file/below", "is a file"),
+        *((check, f"new/{'a' * 256}", "bytes") for check in (check_output_file, check_output_folder)),
+        *((check, "\xe4" * 128, "bytes") for check in (check_output_file, check_output_folder)),
+        *((check, "/".join(["a" * 200] * 21), "bytes") for check in (check_output_file, check_output_folder)),
+        *((check, "a\0b", "null") for check in (check_output_file, check_output_folder)),
+    ],
+)
+def test_what_cannot_be_written_is_refused_at_once(
+    tmp_path: Path, check: Callable[[Path], None], name: str, words: str
+) -> None:
+    (tmp_path / "file").touch()
+    with refused(str(tmp_path), words):
+        check(tmp_path / name)
+    assert list(tmp_path.iterdir()) == [tmp_path / "file"]
+
+
+def test_a_folder_is_made_with_its_parents() -> None:
+    with temporary_folder(Path(tempfile.gettempdir())) as folder:
+        for _ in range(2):
+            make_output_folder(folder / "a" / "b")
+        (folder / "a" / "file").touch()
+        remove_empty_folders(folder / "a")
+        assert [path.name for path in sorted(folder.rglob("*"))] == ["a", "file"]
+    assert not folder.exists()
+
+
+# what is there already
 
 
 def test_through_a_link_its_target_is_written(tmp_path: Path) -> None:
@@ -114,10 +142,7 @@ def test_through_a_link_its_target_is_written(tmp_path: Path) -> None:
     (tmp_path / "there" / "a.txt").write_text("old")
     write(tmp_path / "second_link.txt")
     write(tmp_path / "second_dangling.txt")
-    assert {file.name: file.read_text() for file in (tmp_path / "there").iterdir()} == {
-        "a.txt": "new",
-        "new.txt": "new",
-    }
+    assert held(tmp_path / "there") == {"a.txt": "new", "new.txt": "new"}
     assert len([file for file in tmp_path.iterdir() if file.is_symlink()]) == 4
 
 
@@ -152,18 +177,6 @@ def test_what_is_no_regular_file_is_refused_and_stays(tmp_path: Path) -> None:
         with refused("loop"):
             check_output_file(tmp_path / "loop")
         assert {file.name: file.lstat().st_mode for file in tmp_path.iterdir()} == before
-
-
-def test_names_that_are_too_long_are_refused_at_once(tmp_path: Path) -> None:
-    for path in (tmp_path / ("a" * 256), tmp_path / ("\xe4" * 128), tmp_path.joinpath(*["a" * 200] * 21)):
-        for check in (check_output_file, check_output_folder):
-            with refused("bytes"):
-                check(path)
-    with refused("bytes"):
-        check_output_folder(tmp_path / "new" / ("a" * 256))
-    for check in (check_output_file, check_output_folder):
-        with refused("null"):
-            check(tmp_path / "a\0b")
 
 
 def test_no_permission_is_told_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -235,26 +248,6 @@ def test_the_folder_vanishes_meanwhile(tmp_path: Path) -> None:
 # folders
 
 
-@pytest.mark.parametrize("name", [".mode", ".dejavu-notes", "a" * 255])
-def test_any_name_can_be_written(tmp_path: Path, name: str) -> None:
-    write(tmp_path / name)
-    with whole_folder(tmp_path / "new") as temporary:
-        (temporary / name).write_text("new")
-    assert [file.read_text() for file in (tmp_path / name, tmp_path / "new" / name)] == ["new", "new"]
-    assert sorted(file.name for file in tmp_path.iterdir()) == sorted([name, "new"])
-
-
-def test_a_new_folder_appears_whole(tmp_path: Path) -> None:
-    with whole_folder(tmp_path / "a" / "b") as temporary:
-        (temporary / "one").write_text("1")
-        assert not (tmp_path / "a").exists()
-    assert [str(path.relative_to(tmp_path)) for path in sorted(tmp_path.rglob("*"))] == [
-        "a",
-        "a/b",
-        "a/b/one",
-    ]
-
-
 def test_a_folder_keeps_its_other_files(tmp_path: Path) -> None:
     for name in ("own", "kept", "earlier"):
         (tmp_path / name).write_text("old")
@@ -262,39 +255,20 @@ def test_a_folder_keeps_its_other_files(tmp_path: Path) -> None:
     with whole_folder(tmp_path, ["kept", "earlier", "never"]) as temporary:
         (temporary / "kept").write_text("new")
         (temporary / "one").write_text("new")
-    found = {file.name: file.read_text() for file in tmp_path.iterdir()}
-    assert found == {"own": "old", "kept": "new", "one": "new"}
+    assert held(tmp_path) == {"own": "old", "kept": "new", "one": "new"}
     assert mode_of(tmp_path / "kept") == 0o600
 
 
-@pytest.mark.parametrize("problem", [RuntimeError("bug"), KeyboardInterrupt(), InputError("bad")])
-@pytest.mark.parametrize("before", [{}, {"a": "old", "earlier": "old"}])
-def test_an_exception_leaves_a_folder_as_it_was(
-    tmp_path: Path, before: dict[str, str], problem: BaseException
+def test_a_full_disk_or_a_folder_in_the_way_leaves_what_was_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    target = tmp_path / "new" / "target"
-    if before:
-        target.mkdir(parents=True)
-    for name, text in before.items():
-        (target / name).write_text(text)
-
-    def write_half() -> None:
-        with whole_folder(target, ["earlier"]) as temporary:
-            (temporary / "a").write_text("new")
-            raise problem
-
-    with pytest.raises(type(problem)):
-        write_half()
-    assert {file.name: file.read_text() for file in target.glob("*")} == before
-    assert list(tmp_path.iterdir()) == ([tmp_path / "new"] if before else [])
-
-
-def test_a_full_disk_or_a_folder_in_the_way_leaves_a_folder_as_it_was(tmp_path: Path) -> None:
     (tmp_path / "a").write_text("old")
     (tmp_path / "b").mkdir()
-    with refused(str(tmp_path), "No space left"), whole_folder(tmp_path) as temporary:
-        (temporary / "a").write_text("new")
-        full_disk()
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", full_disk)
+        for kind in (whole_file(tmp_path / "a"), whole_folder(tmp_path)):
+            with refused(str(tmp_path), "No space left"), kind as temporary:
+                (temporary / "a" if temporary.is_dir() else temporary).write_text("new")
     with refused(str(tmp_path / "b"), "folder"), whole_folder(tmp_path) as temporary:
         (temporary / "a").write_text("new")
         (temporary / "b").write_text("new")
@@ -308,7 +282,7 @@ def test_of_two_writers_of_a_new_folder_the_last_wins(tmp_path: Path) -> None:
         (one / "a").write_text("one")
         (one / "b").write_text("one")
         (other / "a").write_text("other")
-    assert {file.name: file.read_text() for file in target.iterdir()} == {"a": "one", "b": "one"}
+    assert held(target) == {"a": "one", "b": "one"}
     assert list(tmp_path.iterdir()) == [target]
 
 

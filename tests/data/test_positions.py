@@ -6,14 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dejavu_torch.data.positions import (
-    NEAR,
-    borders,
-    look_up,
-    nearest_places,
-    place_of,
-    shown_frames,
-)
+from dejavu_torch.data.positions import NEAR, borders, look_up, place_of, shown_frames
 
 WAYS = st.lists(st.floats(-1.5, 2.5, width=32), min_size=1, max_size=25).map(
     lambda steps: torch.tensor([0.0, *steps]).cumsum(0)
@@ -36,7 +29,7 @@ def test_each_place_is_taken_where_it_is_first_reached(positions: torch.Tensor) 
 @given(WAYS)
 def test_a_frame_belongs_to_the_place_nearest_to_it(positions: torch.Tensor) -> None:
     places = len(shown_frames(positions))
-    nearest = nearest_places(positions)
+    nearest = place_of(positions, torch.arange(len(positions)))
     for place, position in zip(nearest.tolist(), positions.tolist(), strict=True):
         if place < 0:
             assert position < 0
@@ -47,7 +40,7 @@ def test_a_frame_belongs_to_the_place_nearest_to_it(positions: torch.Tensor) -> 
 def test_convention_11_standing_and_going_back_add_no_places() -> None:
     positions = torch.tensor([0.0, 1, 2, 2, 2, 1, 0, 1, 2, 3])
     assert shown_frames(positions).tolist() == [0, 1, 2, 9]
-    assert nearest_places(positions).tolist() == [0, 1, 2, 2, 2, 1, 0, 1, 2, 3]
+    assert place_of(positions, torch.arange(10)).tolist() == [0, 1, 2, 2, 2, 1, 0, 1, 2, 3]
     assert borders(positions).tolist() == [0, 1, 2, 9, 10]
     assert place_of(positions, torch.tensor([[8, -1]])).tolist() == [[2, -1]]
 

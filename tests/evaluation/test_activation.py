@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 from fractions import Fraction
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -16,28 +18,28 @@ def layer(period: Fraction | int, phases: int, start: int = 0, stop: int = 40) -
     return FrequencyLayer(Fraction(period), phases, start, stop, (0,))
 
 
+def rates(best: list[int], index: list[int], truth: GroundTruth, tolerance: int, places: int) -> list[Rate]:
+    """Of a layer of period 10 in the chunk [0, 40), to which these phases are nearest, and of the fusion."""
+    route: Any = SimpleNamespace(plan=(layer(10, 10),), places=places, templates=torch.zeros(0))
+    route.distances = lambda queries, _: [(queries - torch.arange(10)).abs()]
+    return activation_rates(route, [0], torch.tensor(best)[:, None], torch.tensor(index), truth, tolerance)
+
+
 def test_rates_in_closed_form() -> None:
-    # chunk [0, 40), period 10: of the places 3, 13, 27 inside and 41, 52 outside
+    # of the places 3, 13, 27 inside and 41, 52 outside
     truth = as_ground_truth(torch.tensor([[3], [13], [27], [41], [52]]))
-    best = torch.tensor([3, 4, 0, 0, 7])  # 0, 1 and 3 phases off inside; 1 and 5 off outside
-    index = torch.tensor([3, 20, 26, 42, -1])  # right, wrong, right; right, nothing reported
-    rates = activation_rates([layer(10, 10)], [best], index, truth, tolerance=1, places=60)
-    assert rates.layers == (Rate(pytest.approx(2 / 3), pytest.approx(1 / 2), pytest.approx(3 / 10)),)
-    assert rates.fused == Rate(pytest.approx(2 / 3), pytest.approx(1 / 2), pytest.approx(3 / 60))
-    assert rates.as_json() == {
-        "start": 0,
-        "stop": 40,
-        "layers": [{"inside": 2 / 3, "outside": 1 / 2, "chance": 3 / 10}],
-        "fused": {"inside": 2 / 3, "outside": 1 / 2, "chance": 3 / 60},
-    }
+    best = [3, 4, 0, 0, 7]  # 0, 1 and 3 phases off inside; 1 and 5 off outside
+    index = [3, 20, 26, 42, -1]  # right, wrong, right; right, nothing reported
+    alone, fused = rates(best, index, truth, tolerance=1, places=60)
+    assert alone == pytest.approx((2 / 3, 1 / 2, 3 / 10))
+    assert fused == pytest.approx((2 / 3, 1 / 2, 3 / 60))
 
 
 def test_unknown_queries_and_those_without_an_answer_do_not_count() -> None:
     right = torch.tensor([[3], [13], [-1]])
     truth = GroundTruth(right, torch.tensor([True, False, True]), right.new_zeros(3, 0))
-    wrong = torch.tensor([8, 3, 3])
-    rates = activation_rates([layer(10, 10)], [wrong], wrong, truth, 0, 40)
-    assert rates.layers[0][:2] == rates.fused[:2] == (0.0, None)
+    alone, fused = rates([8, 3, 3], [8, 3, 3], truth, 0, 40)
+    assert alone[:2] == fused[:2] == (0.0, None)
 
 
 @given(st.fractions(2, 60, max_denominator=7), st.integers(0, 500), st.integers(0, 9), st.data())

@@ -109,10 +109,9 @@ def test_what_is_asked_of_a_line(scored: bool, offset: int | None, asks: bool) -
     assert ("contradict the truth (place = query + 0)" in told) == (asks and scored)
 
 
-def test_an_offset_may_be_negative_or_none() -> None:
+@pytest.mark.parametrize(
+    ("offset", "line"), [(-7, "query - 7: is it --truth -7?"), (0, "query: is it --truth 0?")]
+)
+def test_an_offset_may_be_negative_or_none(offset: int, line: str) -> None:
     queries = torch.arange(60)
-    for offset, told in (
-        (-7, "place = query - 7: is it --truth -7?"),
-        (0, "place = query: is it --truth 0?"),
-    ):
-        assert told in told_line(own_facts(answers(queries + offset), queries, 5, scored=False), False)
+    assert f"place = {line}" in told_line(own_facts(answers(queries + offset), queries, 5, False), False)

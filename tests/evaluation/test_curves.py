@@ -88,22 +88,6 @@ def test_every_distinct_score_is_a_threshold(queries: list[tuple[float, bool, bo
     assert recall_at_full_precision(curve) == max((r for p, r, _ in expected if p == 1), default=0.0)
 
 
-def test_by_hand() -> None:
-    """Five queries: right, right, wrong, right, and one that reports nothing; all had an answer."""
-    score = torch.tensor([1.0, 2.0, 3.0, 4.0, INF])
-    right = torch.tensor([True, True, False, True, False])
-    answerable = torch.ones(5, dtype=torch.bool)
-    every, reported = pr_curve(score, right, answerable), pr_curve(score, right, answerable, "reported")
-    assert every.precision.tolist() == [1, 1, 2 / 3, 3 / 4]
-    assert every.recall.tolist() == pytest.approx([1 / 5, 2 / 5, 2 / 5, 3 / 5])
-    assert every.threshold.tolist() == [1, 2, 3, 4]
-    assert reported.recall.tolist() == pytest.approx([1 / 5, 2 / 5, 2 / 4, 3 / 4])
-    # the steps of recall times the mean precision, no point added at recall 0
-    assert area(every) == pytest.approx(1 / 5 * 1 + 0 + 1 / 5 * (2 / 3 + 3 / 4) / 2)
-    assert area(reported) == pytest.approx(1 / 5 + 1 / 10 * (1 + 2 / 3) / 2 + 1 / 4 * (2 / 3 + 3 / 4) / 2)
-    assert recall_at_full_precision(every) == pytest.approx(2 / 5)
-
-
 @BOTH
 @given(queries=QUERIES, order=st.randoms())
 def test_the_order_of_queries_changes_nothing(
@@ -252,28 +236,6 @@ def test_queries_that_are_not_counted_are_as_if_never_asked(
     assert rest_counts["unknown"] == rest_counts["ignored"] == 0
     for name in ("judged", "with_answer", "accepted", "accepted_right"):
         assert counts[name] == rest_counts[name]
-
-
-def test_soft_places_and_unknown_queries_by_hand() -> None:
-    """Right, wrong, soft, unknown, silent with an answer, wrong without an answer and not accepted."""
-    match = match_of([10, 40, 20, 10, 0, 40], [1.0, 2.0, 0.5, 0.1, INF, 3.0])
-    match = match._replace(accepted=match.accepted & (match.score < 3))
-    right = torch.tensor([[10]] * 5 + [[-1]])
-    truth = GroundTruth(right, torch.tensor([True] * 3 + [False] + [True] * 2), torch.tensor([[20]] * 6))
-    assert count_queries(match, truth, 5) == {
-        "queries": 6,
-        "judged": 4,
-        "unknown": 1,
-        "ignored": 1,
-        "with_answer": 3,
-        "accepted": 2,
-        "accepted_right": 1,
-    }
-    scores = evaluate(match, truth, 5)
-    assert scores.recall_at_1 == scores.recall_at_100_precision == pytest.approx(1 / 3)
-    assert scores.precision_at_100_recall == pytest.approx(1 / 3)
-    # the soft and the unknown query would else lead the curve
-    assert points_of(curve_of(match, truth, 5))[0] == (1.0, pytest.approx(1 / 3), 1.0)
 
 
 def test_a_soft_place_within_the_tolerance_of_a_right_one_is_right() -> None:

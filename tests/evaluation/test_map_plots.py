@@ -1,4 +1,4 @@
-"""Pictures of a map, read back from the figures."""
+"""Pictures of a spectral map, read back from the figures, and a query's scores as a sum of periods."""
 
 from __future__ import annotations
 
@@ -6,53 +6,111 @@ from fractions import Fraction
 
 import pytest
 import torch
-from drawn import layer, render, texts
+from drawn import texts
+from torch import Tensor
 
-from dejavu_torch.evaluation.map_plots import plot_activations, plot_chunks, plot_layers
-from dejavu_torch.types import FrequencyLayer
+from dejavu_torch import DejaVu
+from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.data.ground_truth import as_ground_truth, offset_truth
+from dejavu_torch.evaluation.contenders import COLOURS
+from dejavu_torch.evaluation.localization import Localization
+from dejavu_torch.evaluation.map_plots import components, draw_components, draw_spectrum
+from dejavu_torch.maps.spectral import SpectralMapper
+from dejavu_torch.maps.spectral_map import SpectralMap
+from dejavu_torch.maps.spectrum import period_of
+
+PLACES = 240
 
 
-def test_activations_show_the_scores_and_mark_the_best() -> None:
-    layers, scores = (layer(4, 8, 16), layer(2, 8, 16)), torch.rand(2, 8)
-    figure, rows = plot_activations(
-        layers, scores, scores.sum(0), 5, torch.arange(21), [11], torch.rand(3, 6, 8)
+def route(seed: int) -> Tensor:
+    noise = torch.randn(PLACES, 6, generator=torch.Generator().manual_seed(seed))
+    angle = 2 * torch.pi * torch.arange(PLACES)[:, None] / torch.tensor([60.0, 24, 16, 12, 8, 5])
+    return (angle + 0.7).sin() * torch.tensor([3.5, 2, 3, 4, 5, 0.1]) + 0.1 * noise
+
+
+def localized(chunk: int = 10_000, scored: bool = True) -> tuple[Localization, SpectralMap]:
+    model = DejaVu(whitening="none", mapper=SpectralMapper(None, 1.0, chunk)).learn(route(0))  # type: ignore[arg-type]
+    truth = as_ground_truth(offset_truth(PLACES, PLACES)) if scored else None
+    match = model.localize(route(1))
+    traverses = ArrayTraverse(route(0)), ArrayTraverse(route(1))
+    assert isinstance(model.map, SpectralMap)
+    return Localization(model, *traverses, route(0), route(1), match, truth, 2), model.map
+
+
+@pytest.mark.parametrize("chunk", [10_000, 150])
+def test_the_lines_that_are_marked_are_those_of_the_map(chunk: int) -> None:
+    run, held = localized(chunk)
+    picture = draw_spectrum(run, held)["spectrum"]
+    figure, axes = picture.plot
+    start, stop = held.chunks[0]
+    every = held.lines(0)
+    assert [axis.get_title(loc="left").split(":")[0] for axis in axes] == [f"feature {j}" for j in (4, 3, 0)]
+    for axis, feature in zip(axes, (4, 3, 0), strict=True):
+        lines = every.line[every.feature == feature]
+        expected = sorted(float(period_of(line, stop - start)) for line in lines.tolist() if line)
+        zero, kept = (sorted(one.get_xdata().tolist()) for one in axis.lines[:2])
+        assert kept == pytest.approx(expected)
+        assert len(kept) + len(zero) == stop - start - 1
+        assert f"{len(kept)} of {stop - start - 1} lines" in axis.get_title(loc="left")
+        assert min(axis.lines[1].get_ydata()) >= 0.65  # a dead zone of 1.3 steps around 0
+        assert axis.lines[2].get_ydata() == [1, 1]
+        assert axis.lines[1].get_color() == COLOURS["map"]
+    assert {"period (frames)", "size of a line (steps)", "kept", "coded as 0", "step"} <= set(texts(figure))
+    assert ("of the chunk of frames 0 to 150" in picture.caption) == (chunk == 150)
+
+
+def test_a_map_without_lines_has_no_such_pictures() -> None:
+    run, held = localized()[0], SpectralMapper(None, 1e6)(route(0))
+    assert draw_spectrum(run, held) == draw_components(run, held) == {}
+
+
+def test_the_components_end_with_the_map_s_own_scores() -> None:
+    run, held = localized()
+    picture = draw_components(run, held)["components"]
+    figure, axes = picture.plot
+    assert axes[-1].lines[0].get_ydata().tolist() == pytest.approx(
+        held.scores(route(1)[120:121])[0].tolist(), abs=1e-5
     )
-    for axis, values in zip(rows[1:], (*scores, scores.sum(0)), strict=True):
-        curve, best = axis.lines[:2]
-        assert curve.get_xdata().tolist() == list(range(8, 16))
-        assert curve.get_ydata().tolist() == values.tolist()
-        assert float(best.get_xdata()[0]) == 8 + int(values.argmin())
-    assert {"period 4, 2 features", "all layers fused", "true place"} <= set(texts(figure))
+    assert axes[-1].lines[0].get_color() == COLOURS["map"]
+    assert {"true place", "difference of query 120 (lower is better)"} <= set(texts(figure))
+    titles = [axis.get_title(loc="left") for axis in axes]
+    assert titles[0].startswith("strongest period, 8 frames: ")
+    assert titles[1].startswith("4 strongest periods: ")
+    better = picture.numbers["places_that_fit_better"]
+    assert [int(title.split(": ")[1].split()[0]) for title in titles] == better
+    assert better[-1] == 0 < better[0]
+    assert len({axis.get_ylim() for axis in axes}) == 1
+    unscored = draw_components(*localized(scored=False))["components"]
+    assert unscored.numbers == {}
+    assert "fit better" not in " ".join(texts(unscored.plot[0]))
 
 
-def test_layers_show_their_phases() -> None:
-    layers = [FrequencyLayer(Fraction(tau), tau, 20, 80, tuple(range(tau))) for tau in range(5, 20)]
-    plot = plot_layers(layers, torch.arange(81), "frames")
-    render(plot[0])
-    shown = plot[1].images[0].get_array()
-    assert shown.shape == (12, 60)  # the twelve of most features
-    assert shown[0].tolist() == pytest.approx([(i % 8) / 8 for i in range(20, 80)])
+def waves() -> Tensor:
+    """Two numbers that repeat after 24 places and after 15, the first twice as large."""
+    angle = 2 * torch.pi * torch.arange(PLACES)[:, None] / torch.tensor([24.0, 15.0])
+    return torch.cat([angle.sin(), angle.cos()], 1) * torch.tensor([2.0, 1.0, 2.0, 1.0])
 
 
-STANDS = torch.tensor([0, 2, 4, 30, 31, 32, 33, 34, 35])  # the camera stands from frame 4 to 29
+@pytest.mark.parametrize(
+    ("transform", "metric", "chunk"), [("dft", "l2", 10_000), ("dct", "cosine", 70), ("dct", "l2", 70)]
+)
+def test_the_sum_of_all_periods_is_the_map_s_score(transform: str, metric: str, chunk: object) -> None:
+    torch.manual_seed(0)
+    route = SpectralMapper(None, 0.5, chunk, transform, metric)(waves() + 0.3 * torch.randn(240, 4) + 1)  # type: ignore[arg-type]
+    query = torch.randn(4)
+    expected = route.scores(query[None])[0]
+    for number, (start, stop) in enumerate(route.chunks):
+        *some, (every, scores) = components(route, query, number)
+        assert torch.allclose(scores, expected[start:stop], atol=1e-4)
+        assert [len(periods) for periods, _ in some] == [n for n in (1, 4, 16) if n < len(every)]
+        assert all(periods == every[: len(periods)] for periods, _ in some)
 
 
-def test_convention_11_axes_along_the_route_count_frames_and_periods_count_places() -> None:
-    layers = (layer(4, 0, 4), layer(2, 4, 8))
-    figure, axis = plot_chunks(layers, STANDS, "places")
-    drawn = {tuple(map(tuple, part.get_segments()[0].tolist())) for part in axis.collections}
-    assert drawn == {((0, 4), (31, 4)), ((31, 2), (35, 2))}
-    assert axis.get_xlim() == (0, 35)
-    told = {"place (frame)", "period (places)", "4", "2", "widest bar: 2 features"}
-    assert told <= set(texts(figure))
-    figure, axis = plot_layers(layers[:1], STANDS, "places")
-    assert axis.get_xlim() == (-0.5, 30.5)
-    assert {"place (frame)", "period (places)"} <= set(texts(figure))
-    assert axis.images[0].get_array().shape[:2] == (1, 4)
-    scores = torch.rand(1, 4)
-    figure, rows = plot_activations(layers[1:], scores, scores[0], 77, STANDS, [6], torch.rand(1, 6, 4))
-    assert rows[-1].lines[0].get_xdata().tolist() == [31, 32, 33, 34]
-    assert rows[-1].get_xlim() == (31, 35)
-    assert [line.get_xdata()[0] for line in rows[0].lines] == [33]
-    assert rows[0].images[0].get_extent()[:2] == [31, 35]
-    assert "difference of query 77 (lower is better)" in texts(figure)
+def test_the_strongest_period_alone_is_a_wave() -> None:
+    route = SpectralMapper(None, 0.01, metric="l2")(waves())
+    (strongest, first), (both, every) = components(route, waves()[100])
+    assert (strongest, both) == ((Fraction(24),), (Fraction(24), Fraction(15)))
+    # |query|^2 + |place|^2 - 2 query . place
+    wave = 10 - 8 * (2 * torch.pi * (torch.arange(PLACES) - 100) / 24).cos()
+    assert torch.allclose(first, wave, atol=0.05)
+    assert int(every.argmin()) % 120 == 100  # both waves begin anew after 120 places

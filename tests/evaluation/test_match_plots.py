@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
-from drawn import matched, render, texts
+from drawn import matched, run_of, texts
+from torch import Tensor
 
 from dejavu_torch import PlaceFilter, SequenceMatcher
 from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth
 from dejavu_torch.evaluation.match_plots import (
-    PosteriorImage,
-    Row,
-    diagonal,
     draw_coverage,
-    example_matches,
-    plot_posterior,
+    draw_posterior,
+    draw_scores,
+    example_queries,
     plot_rows,
-    plot_score_matrix,
-    posterior_image,
-    score_matrix,
 )
 from dejavu_torch.types import Match
 
@@ -31,6 +28,17 @@ def dots(axis: object) -> dict[str, list[tuple[float, float]]]:
     }
 
 
+def scaled(scores: Tensor) -> Tensor:
+    """0 at a query's best score, 1 at its median and above."""
+    least, median = scores.amin(1, keepdim=True), scores.median(1, keepdim=True).values
+    return ((scores - least) / (median - least)).clamp(max=1)
+
+
+def image(axis: object) -> Tensor:
+    """What an axis shows, a row a query."""
+    return torch.as_tensor(axis.images[0].get_array().filled(torch.nan)).T  # type: ignore[attr-defined]
+
+
 def test_without_a_truth_coverage_shows_the_probabilities() -> None:
     sure = torch.tensor([0.9, 0.2, 0.0, 0.6], dtype=torch.float64)
     match = matched(4, 9, -1, 2)._replace(probability=sure)
@@ -41,90 +49,64 @@ def test_without_a_truth_coverage_shows_the_probabilities() -> None:
     assert points.get_clim() == (0, 1)
     assert dots(axis) == {"1 not reported": [(2, 0)]}
     assert "probability of being right" in texts(figure)
-    render(figure)
 
 
 def test_coverage_leaves_grey_what_is_not_scored() -> None:
     right, known = torch.arange(5)[:, None], torch.tensor([True, False, True, False, True])
     truth = GroundTruth(right, known, torch.tensor([[-1], [-1], [7], [-1], [-1]]))
-    figure, axis = draw_coverage(
-        matched(0, 1, 7, -1, 9), truth, 0, torch.arange(11), torch.tensor([10, 20, 30, 40, 50]), "frames"
-    )["coverage"].plot
-    assert dots(axis) == {
-        "3 not scored": [(20, 1), (30, 7)],
-        "1 wrong": [(50, 9)],
-        "1 right": [(10, 0)],
-    }
+    queries = torch.tensor([10, 20, 30, 40, 50])
+    picture = draw_coverage(matched(0, 1, 7, -1, 9), truth, 0, torch.arange(11), queries, "frames")
+    figure, axis = picture["coverage"].plot
+    assert dots(axis) == {"3 not scored": [(20, 1), (30, 7)], "1 wrong": [(50, 9)], "1 right": [(10, 0)]}
     assert axis.get_xlim() == (10, 50)
     assert {"3 not scored", "right within 0 frames"} <= set(texts(figure))
 
 
-def found(index: list[int], score: list[float], below: float = 10.0) -> Match:
-    scores = torch.tensor(score)
-    return Match(torch.tensor(index), scores, scores < below)
-
-
-def test_examples_are_the_surest_right_the_surest_wrong_and_the_least_sure() -> None:
-    match = found([0, 9, 7, 3, 4, -1], [0.3, 0.2, 0.1, 0.25, 0.9, torch.inf])
+def test_examples_are_the_surest_right_the_surest_wrong_and_one_at_the_border() -> None:
+    score = torch.tensor([0.3, 0.2, 0.1, 0.25, 0.9, torch.inf])
+    match = Match(torch.tensor([0, 9, 7, 3, 4, -1]), score, score < 10)
     truth = torch.arange(6)[:, None]
     known = torch.tensor([True, True, False, True, True, True])  # query 2, the surest, is not judged
-    examples = example_matches(match, GroundTruth(truth, known, truth[:, :0]), tolerance=0)
-    assert [(one.query, one.place, one.right) for one in examples] == [(3, 3, 3), (1, 9, 1), (4, 4, 4)]
-    assert [one.why.split(",")[0] for one in examples] == [
-        "surest right answer",
-        "surest wrong answer",
-        "least sure answer",
-    ]
-    assert "score 0.25" in examples[0].why
-
-
-def test_where_a_threshold_rejects_some_the_best_of_them_is_shown() -> None:
-    match = found([0, 1, 2, 3], [0.1, 0.4, 0.3, 0.2], below=0.25)
-    last = example_matches(match, None, 0)[-1]
-    assert (last.query, last.right) == (2, -1)
-    assert "surest not accepted" in last.why
+    judged = GroundTruth(truth, known, truth[:, :0])
+    answers = {3: "surest right answer", 1: "surest wrong answer", 4: "least sure answer"}
+    assert example_queries(match, judged, 0) == answers
+    strict = match._replace(accepted=score < 0.25)
+    assert example_queries(strict, judged, 0) == {
+        3: "surest right answer, surest not accepted",
+        1: answers[1],
+    }
+    assert example_queries(match, None, 0) == {2: "surest answer", 4: answers[4]}
 
 
 def test_rows_show_frames_side_by_side_under_their_titles() -> None:
-    frames = [torch.rand(3, 8, 12), torch.rand(1, 16, 16), torch.rand(1, 16, 16)]
-    titles = ["query:\nframe 0", "reported:\nframe 9 of_a_long_name_0009.png", "right:\nframe 1"]
-    missing = [*titles[:2], "right:\nnone is known"]
-    figure, axes = plot_rows([Row("surest answer", titles, frames), Row("other", missing, frames[:2])])
-    assert {"surest answer", "other", "query:\nframe 0", "right:\nnone is known"} <= {
-        text.strip() for text in texts(figure)
-    }
+    long, frames = "reported:\nframe 9 of_a_long_name_0009.png", torch.rand(3, 1, 16, 16)
+    first = dict(zip(["query:\nframe 0", long, "right:\nframe 1"], frames, strict=True))
+    second = {"query:\nframe 3": torch.rand(3, 8, 12), "reported": frames[0], "right:\nnone is known": None}
+    figure, axes = plot_rows([("surest answer", first), ("other", second)])
+    assert {"surest answer", "other", "query:\nframe 0", "right:\nnone is known"} <= set(texts(figure))
     for axis, frame in zip(axes[0], frames, strict=True):
-        assert torch.equal(
-            torch.as_tensor(axis.images[0].get_array()), frame.expand(3, -1, -1).permute(1, 2, 0)
-        )
+        shown = torch.as_tensor(axis.images[0].get_array())
+        assert torch.equal(shown, frame.expand(3, -1, -1).permute(1, 2, 0))
     assert not axes[1, 2].images
-    assert len({axis.get_title(loc="left").count("\n") for axis in axes[0]}) == 1
-    assert "".join(axes[0, 1].get_title(loc="left").split()) == "".join(titles[1].split())  # wrapped
+    assert "".join(axes[0, 1].get_title(loc="left").split()) == "".join(long.split())  # wrapped
 
 
-def test_the_score_matrix_holds_block_minima_of_scaled_scores() -> None:
-    scores = torch.rand(30, 50)
-    matrix = score_matrix(lambda rows: scores[rows[:, 0].long()], torch.arange(30.0)[:, None], cells=20)
-    assert matrix is not None
-    assert matrix.query.tolist() == list(range(0, 30, 2))
-    assert (matrix.block, matrix.values.shape) == (3, (15, 17))
-    least, median = scores.amin(1, keepdim=True), scores.median(1, keepdim=True).values
-    scaled = ((scores - least) / (median - least)).clamp(max=1)[::2]
-    for column, block in enumerate(scaled.split(3, 1)):
-        assert torch.allclose(matrix.values[:, column], block.amin(1))
+def test_scores_are_scaled_and_the_best_of_each_block_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dejavu_torch.evaluation.match_plots.SCORES_AT_ONCE", 200)
+    scores, asked = torch.rand(30, 50), []
 
+    def of(numbers: Tensor) -> Tensor:
+        asked.append(len(numbers))
+        return scores[numbers]
 
-def test_few_queries_are_scored_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = []
-
-    def scores(rows: torch.Tensor) -> torch.Tensor:
-        asked.append(len(rows))
-        return torch.rand(len(rows), 100)
-
-    monkeypatch.setattr("dejavu_torch.evaluation.match_plots.SCORES_AT_ONCE", 1000)
-    score_matrix(scores, torch.rand(35, 4))
-    assert sum(asked) == 35
-    assert max(asked) == 10
+    run = run_of(scores)
+    run.scores = of
+    picture = draw_scores(run, cells=20)["scores"]
+    for column, block in enumerate(scaled(scores)[::2].split(3, 1)):
+        assert torch.allclose(image(picture.plot[1].flat[0])[:, column], block.amin(1))
+    assert (sum(asked), max(asked)) == (15, 4)
+    told = "Drawn: 15 of the queries; of 3 neighbouring places the one that fits best."
+    assert picture.caption.endswith(told)
 
 
 def test_convention_11_places_and_queries_are_drawn_at_their_frames() -> None:
@@ -137,11 +119,9 @@ def test_convention_11_places_and_queries_are_drawn_at_their_frames() -> None:
     assert (axis.get_xlim(), axis.get_ylim()[1]) == ((0, 12), 40)
     labels = {"query (frame)", "reported place (frame)", "right within 1 places"}
     assert labels <= set(texts(figure))
-    scores = torch.rand(4, 10)
+    run = run_of(torch.rand(4, 10), borders=borders, query_frames=queries, match=match, truth=truth)
     for cells, shape in ((20, (10, 4)), (4, (4, 4))):
-        matrix = score_matrix(lambda rows: scores[: len(rows)], torch.rand(4, 2), cells)
-        assert matrix is not None
-        figure, axis = plot_score_matrix(matrix, match, truth, borders, queries)
+        figure, ((axis,),) = draw_scores(run, cells)["scores"].plot
         assert axis.images[0].get_array().shape[:2] == shape
         assert (axis.get_xlim(), axis.get_ylim()) == ((-0.5, 12.5), (-0.5, 39.5))
         reported, first, second, _ = axis.lines
@@ -150,36 +130,22 @@ def test_convention_11_places_and_queries_are_drawn_at_their_frames() -> None:
         assert first.get_ydata().tolist() == [0, 30, 4, 35]
         assert second.get_ydata()[3] == 31
         assert {"query (frame)", "place (frame)", "reported place", "right place"} <= set(texts(figure))
-        assert "right place" not in texts(plot_score_matrix(matrix, match, None, borders, queries)[0])
+    run.truth = None
+    assert "right place" not in texts(draw_scores(run)["scores"].plot[0])
 
 
 def test_the_cells_that_a_sequence_adds_up_are_drawn_on_the_scores_around_them() -> None:
-    scores, place = torch.rand(60, 50), 30
+    scores, place = torch.rand(81, 50), 30
     for k in range(5):  # the query is 2 places further on with each
         scores[40 - k, place - 2 * k] = -1.0
-    matcher = SequenceMatcher(5, speeds=(1, 2))
-    example = diagonal(
-        lambda rows: scores[rows[:, 0].long()], torch.arange(60.0)[:, None], matcher, 40, place
-    )
-    assert example.query.tolist() == [40, 39, 38, 37, 36]
-    assert example.place.tolist() == [30, 28, 26, 24, 22]
-    (top, left), (height, width) = example.first, example.values.shape
-    assert (top, left, height, width) == (31, 17, 15, 19)
-    least, median = scores.amin(1, keepdim=True), scores.median(1, keepdim=True).values
-    scaled = ((scores - least) / (median - least)).clamp(max=1)
-    assert torch.allclose(example.values, scaled[31:46, 17:36])
-
-    matrix = score_matrix(lambda rows: scores[: len(rows)], torch.rand(60, 2))
-    assert matrix is not None
-    borders, queries = torch.arange(0, 102, 2), torch.arange(0, 180, 3)  # convention 11
-    figure, (above, below) = plot_score_matrix(
-        matrix, matched(*[place] * 60), None, borders, queries, example
-    )
+    borders, queries = torch.arange(0, 102, 2), torch.arange(0, 243, 3)  # convention 11
+    parts = {"match": matched(*[place] * 81), "sequence": SequenceMatcher(5, speeds=(1, 2))}
+    run = run_of(scores, borders=borders, query_frames=queries, **parts)
+    figure, (above, below) = draw_scores(run)["scores"].plot
     (line,) = [line for line in below.lines if line.get_label() == "added up"]
-    assert list(zip(*line.get_data(), strict=True)) == [
-        (3 * query, 2 * place) for query, place in zip(example.query, example.place, strict=True)
-    ]
-    assert below.images[0].get_array().shape == (19, 15)
+    added = [(40, 30), (39, 28), (38, 26), (37, 24), (36, 22)]
+    assert list(zip(*line.get_data(), strict=True)) == [(3 * query, 2 * place) for query, place in added]
+    assert torch.allclose(image(below), scaled(scores)[31:46, 17:36])
     assert (below.get_xlim(), below.get_ylim()) == ((92.5, 137.5), (33.5, 71.5))
     (frame,) = above.patches
     assert (frame.get_xy(), frame.get_width(), frame.get_height()) == ((93, 34), 45, 38)
@@ -190,49 +156,43 @@ def test_what_a_sequence_adds_up_may_reach_off_the_map_and_before_the_first_quer
     scores = torch.rand(4, 12)
     scores[:, 9:] = torch.inf  # nothing covers the last places
     matcher = SequenceMatcher(6, speeds=(1, -1))
-    example = diagonal(lambda rows: scores[rows[:, 0].long()], torch.arange(4.0)[:, None], matcher, 2, 1)
-    assert example.first == (0, 0)
-    assert example.values.shape == (4, 12)
-    assert example.values[:, 9:].isnan().all()
-    mean = scores[example.query, example.place].mean()
-    assert torch.isclose(mean, matcher(scores[:3])[-1, 1])
+    run = run_of(scores, match=matched(1, 1, 1, 1), sequence=matcher)
+    below = draw_scores(run)["scores"].plot[1][1]
+    assert image(below).shape == (4, 12)
+    assert image(below)[:, 9:].isnan().all()
+    query, place = (torch.as_tensor(part).long() for part in below.lines[-1].get_data())
+    assert torch.isclose(scores[query, place].mean(), matcher(scores[:3])[-1, 1])
 
 
-def test_a_posterior_is_pooled_as_it_comes(monkeypatch: pytest.MonkeyPatch, largest_tensor: type) -> None:
+def test_a_posterior_is_pooled_as_it_comes_and_shows_some_right_places(
+    monkeypatch: pytest.MonkeyPatch, largest_tensor: type
+) -> None:
+    monkeypatch.setattr("dejavu_torch.evaluation.match_plots.SCORES_AT_ONCE", 450)
     scores, model = torch.rand(130, 75), PlaceFilter()
     with torch.no_grad():
         posterior = model.posterior(scores)
-    monkeypatch.setattr("dejavu_torch.evaluation.match_plots.SCORES_AT_ONCE", 450)
-    features = torch.arange(130.0)[:, None]
+    right = torch.arange(130).masked_fill(torch.arange(130) >= 70, -1)
+    borders, queries = torch.arange(0, 152, 2), torch.arange(0, 390, 3)  # convention 11
+    parts = {"borders": borders, "query_frames": queries, "truth": as_ground_truth(right[:, None])}
+    run = run_of(scores, sequence=model, **parts)
     with largest_tensor() as seen:
-        image = posterior_image(lambda rows: scores[rows[:, 0].long()], features, model, cells=40)
+        picture = draw_posterior(run, cells=40)["posterior"]
     assert seen.numel <= 38 * 33  # queries by places of the image
-    assert image.blocks == (4, 2)
-    for row, queries in zip(image.values, posterior[:, :-1].split(4), strict=True):
-        for value, places in zip(row, queries.split(2, 1), strict=True):
-            assert value == places.max()
-    assert torch.equal(image.off, posterior[:, -1])
-
-
-def test_a_posterior_is_drawn_with_some_right_places_and_where_there_is_none() -> None:
-    values = torch.tensor([[1.0, 0.0], [0.5, 0.25], [1e-9, 1e-3]])
-    off = torch.tensor([0.0, 0.1, 0.25, 0.9, 0.9, 1.0])
-    image = PosteriorImage(values, off, (2, 3))
-    truth = as_ground_truth(torch.tensor([[0, -1], [2, 4], [3, -1], [4, -1], [-1, -1], [-1, -1]]))
-    borders, queries = torch.arange(0, 12, 2), torch.arange(0, 18, 3)  # convention 11
-    figure, (axis, below) = plot_posterior(image, truth, borders, queries)
-    assert torch.equal(torch.as_tensor(axis.images[0].get_array()), values.T.clamp(min=1e-6))
-    assert (axis.get_xlim(), axis.get_ylim()) == ((-0.5, 15.5), (-0.5, 9.5))
-    marked = [(x, y) for line in axis.lines for x, y in zip(*line.get_data(), strict=True) if float(y) == y]
-    assert marked == [(0, 0), (3, 4), (6, 6), (9, 8), (3, 8)]
-    assert all(line.get_markerfacecolor() == "none" for line in axis.lines)  # what is below is seen
-    (curve,) = below.lines
-    assert curve.get_xdata().tolist() == queries.tolist()
-    assert curve.get_ydata().tolist() == off.tolist()
+    assert "the most probable of 4 queries and 2 places" in picture.caption
+    figure, (axis, below) = picture.plot
+    for row, some in zip(image(axis), posterior[:, :-1].split(4), strict=True):
+        for value, places in zip(row, some.split(2, 1), strict=True):
+            assert value == places.max().clamp(min=1e-6)
+    assert (axis.get_xlim(), axis.get_ylim()) == ((-0.5, 387.5), (-0.5, 149.5))
+    (marks,) = axis.lines
+    assert marks.get_xdata().tolist() == [3 * query for query in range(0, 130, 6)]
+    assert marks.get_ydata()[:12].tolist() == [2 * query for query in range(0, 70, 6)]
+    assert marks.get_markerfacecolor() == "none"  # what is below is seen
+    assert np.array_equal(below.lines[0].get_data(), [queries, posterior[:, -1]])
     (nowhere,) = below.collections
-    assert nowhere.get_datalim(below.transData).intervalx.tolist() == [12, 15]
+    assert nowhere.get_datalim(below.transData).intervalx.tolist() == [210, 387]
     assert {"query (frame)", "place (frame)", "off the map", "right place"} <= set(texts(figure))
-    plain, (axis, below) = plot_posterior(image, None, borders, queries)
+    run.truth = None
+    axis, below = draw_posterior(run)["posterior"].plot[1]
     assert not axis.lines
     assert not below.collections
-    render(plain)

@@ -1,7 +1,8 @@
+"""Every picture of a run, from frames to figures."""
+
 from __future__ import annotations
 
-import io
-from fractions import Fraction
+from typing import Any
 
 import pytest
 import torch
@@ -10,53 +11,37 @@ from footage import QUERY, REFERENCE, STEP, camera, footage
 from helpers import Fixed, template_model
 from torch import Tensor, nn
 
-from dejavu_torch import (
-    HOG,
-    DejaVu,
-    Match,
-    PlaceFilter,
-    Preprocess,
-    SequenceMatcher,
-    SpectrogramAnalysis,
-)
+from dejavu_torch import HOG, DejaVu, Match, PlaceFilter, Preprocess, SequenceMatcher, SpectrogramAnalysis
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth, offset_truth
 from dejavu_torch.data.positions import place_of
 from dejavu_torch.data.strip import SlidingWindow
 from dejavu_torch.evaluation.contenders import contend
-from dejavu_torch.evaluation.pictures import (
-    Localization,
-    as_hog_sees,
-    best_explained,
-    draw_pictures,
-    leading_layers,
-    paper_pictures,
-    slit_scan,
-)
+from dejavu_torch.evaluation.localization import Localization
+from dejavu_torch.evaluation.pictures import draw_pictures, paper_pictures
 from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.report import PICTURES
+from dejavu_torch.evaluation.template_plots import as_hog_sees, best_explained, shown_chunk, slit_scan
 from dejavu_torch.recognition.localizer import Matching
 from dejavu_torch.recognition.sequence import SequenceModel
 from dejavu_torch.types import FrequencyLayer
 
-ALL = [
+ALL = (
     *("pairs", "coverage", "scores", "pr", "auc", "chunks"),
     *("spectrogram", "templates", "features", "activations"),
-]
-ALONE = [name for name in ALL if name != "auc"]  # one area has nothing to be compared with
+)
 
 
 def layer(period: int, start: int, stop: int, *features: int) -> FrequencyLayer:
-    return FrequencyLayer(Fraction(period), period, start, stop, features)
+    return FrequencyLayer(period, period, start, stop, features)  # type: ignore[arg-type]
 
 
-def frames(seed: int, length: int = 120, channels: int = 1) -> Tensor:
+def frames(seed: int, length: int = 120) -> Tensor:
     """Stripes that pass with periods 12 and 20 in the upper and the lower half, and noise."""
     i = torch.arange(length, dtype=torch.float32)[:, None, None]
     rows, columns = torch.meshgrid(torch.arange(24), torch.arange(24), indexing="ij")
-    period = torch.where(rows < 12, 12, 20)
-    stripes = 0.5 + 0.4 * torch.sin(2 * torch.pi * (i + columns) / period)
-    noise = torch.rand(length, channels, 24, 24, generator=torch.Generator().manual_seed(seed))
+    stripes = 0.5 + 0.4 * torch.sin(2 * torch.pi * (i + columns) / torch.where(rows < 12, 12, 20))
+    noise = torch.rand(length, 1, 24, 24, generator=torch.Generator().manual_seed(seed))
     return 0.9 * stripes[:, None] + 0.1 * noise
 
 
@@ -67,12 +52,9 @@ def localized(model: DejaVu, reference: Tensor, query: Tensor, truth: GroundTrut
     return Localization(model, *traverses, stored, seen, model.localize(seen), truth, 2)
 
 
-def drawn(
-    model: DejaVu, reference: Tensor, query: Tensor, truth: GroundTruth | None, **found: Match
-) -> dict[str, Picture]:
-    run = localized(model, reference, query, truth)
-    contenders = {"map": contend("this map", run.match, truth, 2)}
-    contenders |= {key: contend(f"the {key}", match, truth, 2) for key, match in found.items()}
+def drawn(run: Localization, **found: Match) -> dict[str, Picture]:
+    contenders = {"map": contend("this map", run.match, run.truth, 2)}
+    contenders |= {key: contend(f"the {key}", match, run.truth, 2) for key, match in found.items()}
     pictures = draw_pictures(run, contenders)
     assert pictures.keys() <= set(PICTURES)
     for picture in pictures.values():
@@ -82,94 +64,68 @@ def drawn(
     return pictures
 
 
-def short(**options: object) -> DejaVu:
-    return template_model(HOG(), SpectrogramAnalysis(window=60, min_period=4), **options)  # type: ignore[arg-type]
+def model_of(window: int = 60, features: nn.Module | None = None) -> DejaVu:
+    return template_model(features or HOG(), SpectrogramAnalysis(window=window, min_period=4))
 
 
 def same_places(length: int = 120) -> GroundTruth:
     return as_ground_truth(offset_truth(length, length))
 
 
-def test_every_picture_of_frames_that_repeat() -> None:
+@pytest.fixture(scope="module")
+def run() -> Localization:
+    return localized(model_of(), frames(0), frames(1), same_places())
+
+
+def test_every_picture_of_frames_that_repeat(run: Localization) -> None:
     other = Match(torch.arange(120), torch.zeros(120), torch.ones(120, dtype=torch.bool))
-    pictures = drawn(short(), frames(0), frames(1), same_places(), stride=other, leave_out=other)
-    assert list(pictures) == ALL
-    for picture in pictures.values():
-        buffer = io.BytesIO()
-        picture.plot[0].savefig(buffer, format="png", dpi=50)
-        assert buffer.tell() > 2000
-    labels = [text.get_text() for text in pictures["auc"].plot[1].texts]
-    assert {"this map", "the stride"} < set(labels)
-    assert "the leave_out" not in labels
+    pictures = drawn(run, stride=other, leave_out=other)
+    assert tuple(pictures) == ALL
+    assert {"this map", "the stride"} < set(texts(pictures["auc"].plot[0]))
+    best = torch.tensor(pictures["scores"].plot[1].flat[0].images[0].get_array()).argmin(0)
+    assert torch.equal(best, run.match.index)
     assert [name for name, picture in pictures.items() if picture.numbers] == ["activations"]
-    numbers = pictures["activations"].numbers
-    assert (numbers["start"], numbers["stop"]) == (0, 60)
-    assert all(0 <= rate["inside"] <= 1 and 0 <= rate["outside"] <= 1 for rate in numbers["layers"])
-    assert 0 <= numbers["fused"]["inside"] <= 1
     assert "Elsewhere" in pictures["activations"].caption
 
 
-def test_the_rates_are_those_of_the_layers_they_stand_beside() -> None:
-    """Two layers that each answer for their own period only: swapped, neither would be in phase."""
-    values = (torch.arange(90)[:, None] % torch.tensor([9.0, 9.0, 10.0])) + torch.tensor([0.0, 1.0, 2.0])
-    model = template_model(periods=Fixed(layer(9, 0, 90, 0, 1), layer(10, 0, 90, 2)))
-    rates = drawn(model, values, values, as_ground_truth(offset_truth(90, 90)))["activations"].numbers[
-        "layers"
-    ]
-    assert [rate["inside"] for rate in rates] == [1.0, 1.0]
-    assert [rate["chance"] for rate in rates] == [pytest.approx(5 / 9), 0.5]
+RIGHT, NUMBERS = offset_truth(120, 120), torch.arange(120)
+NOTHING = GroundTruth(RIGHT.clamp(max=-1), NUMBERS >= 0, NUMBERS.expand(120, -1))
+OTHER = nn.Sequential(nn.AvgPool2d(2), nn.Flatten())
 
 
 @pytest.mark.parametrize(
-    ("case", "left_out"),
+    ("left_out", "given"),
     [
-        ("without truth", ["pr"]),
-        ("some unknown", []),
-        ("nothing judged", ["pr"]),
-        ("one chunk", []),
-        ("ready features", ["pairs", "features"]),
-        ("one layer", ["activations", "spectrogram"]),
-        ("no layers", ["pairs", "scores", "spectrogram", "templates", "features", "activations"]),
+        ("pr", {"truth": None}),
+        ("", {"truth": GroundTruth(RIGHT, NUMBERS % 3 > 0, RIGHT - 5)}),  # some are unknown
+        ("pr", {"truth": NOTHING}),
+        ("", {"model": model_of(window=120)}),  # one chunk
+        ("pairs features", {"of": HOG()}),  # ready features
+        ("features", {"model": model_of(features=OTHER)}),
+        ("features", {"model": model_of(features=type("OtherHOG", (HOG,), {})())}),
+        ("activations spectrogram", {"model": template_model(periods=Fixed(layer(12, 0, 120, 0, 1, 2)))}),
+        (
+            "pairs scores spectrogram templates features activations",
+            {"model": template_model(periods=Fixed())},  # no layers
+        ),
     ],
 )
-def test_pictures_that_there_is_nothing_for_are_left_out(case: str, left_out: list[str]) -> None:
-    right = offset_truth(120, 120)
-    truths = {
-        "without truth": None,
-        "some unknown": GroundTruth(right, torch.arange(120) % 3 > 0, right - 5),
-        "nothing judged": GroundTruth(
-            right.clamp(max=-1), right[:, 0] >= 0, torch.arange(120).expand(120, -1)
-        ),
-    }
-    models = {
-        "one chunk": template_model(periods=SpectrogramAnalysis(window=120, min_period=4)),
-        "one layer": template_model(periods=Fixed(layer(12, 0, 120, 0, 1, 2))),
-        "no layers": template_model(periods=Fixed()),
-    }
-    made = [HOG()(frames(seed)) if case == "ready features" else frames(seed) for seed in (0, 1)]
-    pictures = drawn(models.get(case, short()), *made, truths.get(case, same_places()))
-    assert list(pictures) == [name for name in ALONE if name not in left_out]
-    if case == "one chunk":
+def test_pictures_that_there_is_nothing_for_are_left_out(left_out: str, given: dict[str, Any]) -> None:
+    model, of, truth = ({"model": model_of(), "of": nn.Identity(), "truth": same_places()} | given).values()
+    run = localized(model, of(frames(0)), of(frames(1)), truth)
+    pictures = drawn(run)
+    # one area has nothing to be compared with
+    assert list(pictures) == [name for name in ALL if name not in ("auc", *left_out.split())]
+    if truth is not None and "activations" in pictures and len(run.model.map.summary().chunks) == 1:
         numbers = pictures["activations"].numbers
         assert [rate["outside"] for rate in (*numbers["layers"], numbers["fused"])] == [None] * 3
         assert "lsewhere" not in pictures["activations"].caption
 
 
-def test_features_are_drawn_for_our_hog_only() -> None:
-    class Other(HOG):
-        """Looks at the frame otherwise."""
-
-    for module in (Other(), nn.Sequential(nn.AvgPool2d(2), nn.Flatten())):
-        model = template_model(module, SpectrogramAnalysis(window=60, min_period=4))
-        assert "features" not in draw_pictures(localized(model, frames(0), frames(1), None), {})
-
-
-def test_the_pairs_are_the_frames_that_were_matched() -> None:
-    reference, query = frames(0), frames(1)
-    run = localized(short(), reference, query, same_places())
+def test_the_pairs_are_the_frames_that_were_matched(run: Localization) -> None:
     pairs = draw_pictures(run, {})["pairs"]
     numbers = [int(axis.get_title(loc="left").split()[-1]) for axis in pairs.plot[1].flat]
-    sources = [query, reference, reference] * len(pairs.plot[1])
+    sources = [frames(1), frames(0), frames(0)] * len(pairs.plot[1])
     for axis, number, source in zip(pairs.plot[1].flat, numbers, sources, strict=True):
         assert torch.allclose(torch.tensor(axis.images[0].get_array())[..., 0], source[number, 0])
     for asked, reported in zip(numbers[::3], numbers[1::3], strict=True):
@@ -179,56 +135,30 @@ def test_the_pairs_are_the_frames_that_were_matched() -> None:
     assert "best match of those that are rejected" in draw_pictures(strict, {})["pairs"].caption
 
 
-def test_the_score_matrix_is_the_map_s() -> None:
-    run = localized(short(), frames(0), frames(1), same_places())
-    values = draw_pictures(run, {})["scores"].plot[1].images[0].get_array()
-    best = torch.tensor(values).argmin(0)
-    assert torch.equal(best, run.match.index)
-
-
 def sequenced(run: Localization, model: SequenceModel) -> Localization:
     """The same, with the queries matched together."""
     match = run.model.localize(run.query_features, sequence=model)
     return run._replace(matching=Matching(model), match=match)
 
 
-def test_a_sequence_shows_what_it_adds_up() -> None:
-    run = sequenced(localized(short(), frames(0), frames(1), same_places()), SequenceMatcher(5))
+def test_a_sequence_shows_what_it_adds_up_and_a_filter_its_posterior(run: Localization) -> None:
+    pictures = draw_pictures(sequenced(run, PlaceFilter()), {})
+    assert list(pictures)[2:4] == ["scores", "posterior"]
+    assert "cells" not in pictures["scores"].caption
+    assert "Circles" in pictures["posterior"].caption
+    run = sequenced(run, SequenceMatcher(5))
     run.match.index[58:63] = -1  # the example is the nearest to the middle that is reported
-    pictures = draw_pictures(run, {})
-    assert "posterior" not in pictures
-    assert "frame 57" in pictures["scores"].caption
-    assert "5 cells" in pictures["scores"].caption
-    line, place = pictures["scores"].plot[1][1].lines[-1], int(run.match.index[57])
-    assert line.get_xdata().tolist() == list(range(57, 52, -1))
-    assert line.get_ydata().tolist() == list(range(place, place - 5, -1))
+    assert "frame 57 and the place reported for it, the 5 cells" in draw_pictures(run, {})["scores"].caption
     run.match.index.fill_(-1)
     assert "cells" not in draw_pictures(run, {})["scores"].caption
 
 
-def test_a_filter_shows_its_posterior() -> None:
-    model = PlaceFilter()
-    run = sequenced(localized(short(), frames(0), frames(1), same_places()), model)
-    pictures = draw_pictures(run, {})
-    assert list(pictures)[2:4] == ["scores", "posterior"]
-    assert "cells" not in pictures["scores"].caption
-    with torch.no_grad():
-        posterior = model.posterior(run.model.map.scores(run.query_features))
-    axis, below = pictures["posterior"].plot[1]
-    drawn = torch.as_tensor(axis.images[0].get_array())
-    assert torch.allclose(drawn, posterior[:, :-1].T.clamp(min=1e-6))
-    assert torch.allclose(torch.as_tensor(below.lines[0].get_ydata()), posterior[:, -1])
-    assert "Circles" in pictures["posterior"].caption
-    assert "Circles" not in draw_pictures(run._replace(truth=None), {})["posterior"].caption
-
-
-def test_the_paper_s_own_pictures() -> None:
-    run = localized(short(), frames(0), frames(1), same_places())
+def test_the_paper_s_own_pictures(run: Localization) -> None:
     assert list(paper_pictures(run)) == ["frames", "autocorrelogram", "layers"]
     assert list(paper_pictures(run._replace(truth=None))) == ["autocorrelogram", "layers"]
     nothing = localized(template_model(periods=Fixed()), frames(0), frames(1), same_places())
     assert list(paper_pictures(nothing)) == ["frames"]
-    features = localized(short(), *(HOG()(frames(seed)) for seed in (0, 1)), same_places())
+    features = localized(model_of(), HOG()(frames(0)), HOG()(frames(1)), same_places())
     assert list(paper_pictures(features)) == ["autocorrelogram", "layers"]
 
 
@@ -253,14 +183,10 @@ def test_slit_scan_holds_no_more_than_it_shows() -> None:
     scan = slit_scan(ArrayTraverse(torch.rand(300, 1, 16, 16)), 10, 290)
     assert scan is not None
     assert scan.untyped_storage().nbytes() <= 2 * 280 * 16 * 4
-
-
-def test_slit_scan_of_a_sliding_window_is_the_strip() -> None:
     strip = torch.rand(3, 8, 200)
     scan = slit_scan(SlidingWindow(strip, width=10), 20, 120)
     assert scan is not None
     assert torch.equal(scan, strip[:, :, 25:125])
-    assert slit_scan(ArrayTraverse(torch.rand(20, 4)), 0, 10) is None
 
 
 # a resampled map: places are even steps, the camera stands at one of them
@@ -295,10 +221,11 @@ def test_convention_11_every_axis_along_a_resampled_route_counts_frames(
     asked = [frame for line in axes["coverage"].lines for frame in line.get_xdata().tolist()]
     assert sorted(asked) == run.query.frame.tolist()
     assert axes["coverage"].get_ylim()[1] == axes["chunks"].get_xlim()[1] == frames
-    assert axes["scores"].get_ylim() == (-0.5, frames - 0.5)
+    scores = axes["scores"].flat[0]
+    assert scores.get_ylim() == (-0.5, frames - 0.5)
     filtered = draw_pictures(sequenced(run, PlaceFilter()), {})["posterior"].plot[1][0]
     assert filtered.get_ylim() == (-0.5, frames - 0.5)
-    assert filtered.get_xlim() == axes["scores"].get_xlim()
+    assert filtered.get_xlim() == scores.get_xlim()
     assert axes["spectrogram"][1].get_xlim() == (0, frames)
     middle, end = run.model.map.frame_of(torch.tensor([50, 100])).tolist()  # of chunks of 50 places
     borders = [line.get_xdata()[0] for line in axes["chunks"].lines]
@@ -320,7 +247,7 @@ def test_convention_11_what_counts_places_says_so(pictures: dict[str, Picture]) 
         assert "right within 3 places at even steps" in texts(pictures[name].plot[0]), name
     assert "within 3 places at even steps" in pictures["activations"].caption
     assert pictures["activations"].numbers["start"] in (0, 50)  # as the chunks of report.json
-    plain = draw_pictures(localized(short(), frames(0), frames(1), None), {})
+    plain = draw_pictures(localized(model_of(), frames(0), frames(1), None), {})
     assert "period (frames)" in texts(plain["chunks"].plot[0])
 
 
@@ -333,7 +260,7 @@ def test_convention_11_frames_of_a_resampled_route_are_called_as_in_the_matches(
     shown = run.model.map.frame_of(run.match.index)
     pairs = set(zip(run.query.frame.tolist(), shown.tolist(), strict=True))
     assert set(zip(asked, reported, strict=True)) <= pairs
-    layer = run.model.map.plan[leading_layers(run.model.map.plan)[0]]
+    layer = run.model.map.plan[shown_chunk(run.model.map.plan)[0]]
     middle = int(run.model.map.frame_of(torch.tensor((layer.start + layer.stop) // 2)))
     assert f"drawn on frame {middle} as" in pictures["features"].caption
     numbers = [axis.get_title(loc="left").split()[-1] for axis in pictures["frames"].plot[1].flat]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from itertools import combinations
 
+import numpy as np
 import pytest
 import torch
 from drawn import render, texts
@@ -13,8 +14,10 @@ from dejavu_torch.evaluation.curves import PRCurve, Scores
 from dejavu_torch.evaluation.plots import DARK, GREY, LAYERS, RIGHT, WRONG
 from dejavu_torch.evaluation.score_plots import (
     Length,
-    plot_auc,
-    plot_curves,
+    Stored,
+    draw_curves,
+    draw_sequences,
+    draw_storage,
     plot_lengths,
 )
 
@@ -29,29 +32,79 @@ def rgb(colour: str) -> tuple[float, ...]:
 
 
 def test_bars_and_curves_have_the_colour_of_the_key_whatever_else_is_drawn() -> None:
-    everything = {key: contender(f"the {key}", 0.1 * i) for i, key in enumerate(COLOURS)}
-    for keys in (list(COLOURS), ["map", "hog", "null"], ["null_same_plan", "stride"]):
-        shown = {key: everything[key] for key in keys}
-        figure, axis = plot_auc(shown)
+    everything = {
+        key: contender(f"the {key}", 0.1 * i) for i, key in enumerate(COLOURS) if key != "leave_out"
+    }
+    for keys in (list(everything), ["map", "hog", "null"], ["null_same_plan", "stride"]):
+        pictures = draw_curves({key: everything[key] for key in keys}, "2 frames")
+        figure, axis = pictures["auc"].plot
         for key, bar in zip(keys, axis.patches, strict=True):
             assert bar.get_width() == everything[key].scores.auc
             assert bar.get_facecolor()[:3] == pytest.approx(rgb(COLOURS[key]))
-        assert {f"the {key}" for key in keys} | {"0.000"} <= set(texts(figure)) | {"0.000"}
-        figure, axis = plot_curves(shown)
-        by_name = {line.get_label(): line for line in axis.lines}
+        assert {f"the {key}" for key in keys} <= set(texts(figure))
+        by_name = {line.get_label(): line for line in pictures["pr"].plot[1].lines}
         for key in keys:
             line = by_name[f"the {key}"]
             assert line.get_color() == COLOURS[key]
             assert line.get_xdata().tolist() == everything[key].curve.recall.tolist()
-        render(figure)
+        assert "right within 2 frames" in texts(pictures["pr"].plot[0])
 
 
 def test_a_curve_that_reports_nothing_says_so_and_one_without_scores_is_left_out() -> None:
     silent, unscored = contender("null: x", 0.0, points=0), Contender("unscored", None)
-    figure, axis = plot_curves({"null": silent, "hog": unscored})
-    assert "null: x (reports nothing)" in texts(figure)
-    assert len(axis.lines) == 1
-    assert len(plot_auc({"null": silent, "hog": unscored})[1].patches) == 1
+    pictures = draw_curves({"null": silent, "hog": unscored, "leave_out": contender("other", 1)}, "2 frames")
+    assert list(pictures) == ["pr"]
+    assert "null: x (reports nothing)" in texts(pictures["pr"].plot[0])
+    assert len(pictures["pr"].plot[1].lines) == 1
+    assert draw_curves({"hog": unscored}, "2 frames") == {}
+
+
+def points(*pairs: tuple[float, float]) -> list[Stored]:
+    return [Stored(size, area, area) for size, area in pairs]
+
+
+def test_the_storage_picture_shows_the_points_and_what_the_null_takes() -> None:
+    storage = {"map": points((1, 0.5), (2, 0.8)), "null": points((4, 0.5), (16, 0.6)), "interpolated": []}
+    whole = Contender("all of them", Scores(0.9, 0.9, 0.1, 0.1, 0.9, 0.9), 100, 1)
+    picture = draw_storage({"uncompressed": whole}, storage, "2 frames")["storage"]
+    figure, axis = picture.plot
+    lines = {line.get_label(): line for line in axis.lines}
+    assert np.stack(lines["this map"].get_data(), 1).tolist() == [[1, 0.5], [2, 0.8]]
+    assert lines["this map"].get_color() == COLOURS["map"]
+    assert lines["all of them"].get_ydata() == [0.9, 0.9]
+    assert axis.get_xscale() == "log"
+    assert {"route bytes per place", "right within 2 frames"} <= set(texts(figure))
+    assert "null takes 4 times the bytes" in picture.caption
+    assert picture.numbers["null_over_map"] == [4.0]
+    assert picture.numbers["map"][0] == {"route_bytes_per_place": 1, "auc": 0.5, "recall_at_1": 0.5}
+    assert draw_storage({}, {}, "2 frames") == draw_storage({}, {"map": []}, "2 frames") == {}
+
+
+def at(*areas: float) -> dict[int, Scores]:
+    return {T: Scores(area, area, 0, 0, area, area) for T, area in zip((1, 5, 11), areas, strict=True)}
+
+
+def test_the_areas_of_sequences_of_all_contenders_and_of_the_map_at_other_sizes() -> None:
+    """Sizes that the map has, and those that no budget has, are not drawn twice."""
+    contenders = {
+        "map": Contender("this map", None, 1000, fixed=500, sequences=at(0.5, 0.7, 0.9)),
+        "hog": Contender("HOG, every frame", None, sequences=at(0.4, 0.6, 0.8)),
+        "leave_out": Contender("without", None),
+    }
+    coded = [
+        Stored(size, 0, 0, at(0.3, 0.4, area)) for size, area in ((0.97, 0.6), (4.9, 0.9), (5.1, 0.9), (9, 1))
+    ]
+    figure, axis = draw_sequences(contenders, coded, 100, "2 frames")["sequences"].plot
+    lines = {line.get_label(): line for line in axis.lines}
+    # 5 route bytes per place are its own; 2.5 are nearest to 0.97, which are there already
+    names = ["this map, 5 route bytes per place", "the same in 0.97 bytes", "HOG, every frame"]
+    assert list(lines) == names[::-1]  # the first on top
+    assert [list(line.get_xdata()) for line in axis.lines] == [[1, 5, 11]] * 3
+    assert list(lines[names[0]].get_ydata()) == [0.5, 0.7, 0.9]
+    assert list(lines[names[1]].get_ydata()) == [0.3, 0.4, 0.6]
+    assert [line.get_color() for line in axis.lines] == [COLOURS[key] for key in ("hog", "map", "map")]
+    assert {"1", "5", "11", "right within 2 frames"} <= set(texts(figure))
+    assert draw_sequences({"map": Contender("this map", None)}, [], 100, "2 frames") == {}
 
 
 # Machado, Oliveira and Fernandes 2009: how linear RGB looks without one kind of cone

@@ -12,7 +12,7 @@ import torch
 from helpers import refused
 from torch import Tensor, nn
 
-from dejavu_torch import HOG, InputError, Traverse, types
+from dejavu_torch import HOG, Traverse, types
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.features import extract
 from dejavu_torch.features.extract import feature_batches, features_of
@@ -53,14 +53,14 @@ def test_frames_go_through_the_module_in_order() -> None:
         torch.testing.assert_close(torch.cat(batches), whole, rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("training", [True, False])
-def test_runs_in_eval_mode_and_restores_the_mode(training: bool) -> None:
-    module = Pooled().train(training)
-    list(feature_batches(ArrayTraverse(torch.rand(5, 1, 4, 4)), module, 2))
-    assert module.modes == [False] * 3
-    assert module.training is training
-    assert module.norm.training is training
-    assert int(module.norm.num_batches_tracked) == 0
+def test_runs_in_eval_mode_and_restores_the_mode_of_every_part() -> None:
+    for whole, part in ((True, True), (True, False), (False, False)):
+        module = Pooled().train(whole)
+        module.norm.train(part)
+        list(feature_batches(ArrayTraverse(torch.rand(5, 1, 4, 4)), module, 2))
+        assert module.modes == [False] * 3
+        assert (module.training, module.norm.training) == (whole, part)
+        assert int(module.norm.num_batches_tracked) == 0
 
 
 def test_restores_the_mode_after_an_error_and_when_abandoned() -> None:
@@ -71,23 +71,17 @@ def test_restores_the_mode_after_an_error_and_when_abandoned() -> None:
     batches.close()
     assert module.training
     frames[3] = torch.nan
-    with pytest.raises(InputError):
+    with refused("frame 3"):
         list(feature_batches(ArrayTraverse(frames), module, 2))
     assert module.training
 
 
-def test_restores_the_mode_of_frozen_parts() -> None:
-    module = Pooled().train()
-    module.norm.eval()
-    list(feature_batches(ArrayTraverse(torch.rand(2, 1, 4, 4)), module))
-    assert module.training
-    assert not module.norm.training
-
-
-def test_keeps_no_gradients() -> None:
-    frames = torch.rand(4, 1, 4, 4, requires_grad=True)
-    for features in feature_batches(ArrayTraverse(frames), Pooled(), 2):
+def test_batches_keep_no_gradients_and_features_of_one_do() -> None:
+    frames = torch.rand(4, 1, 16, 16, requires_grad=True)
+    for features in feature_batches(ArrayTraverse(frames), HOG(), 2):
         assert not features.requires_grad
+    features_of(frames, HOG()).sum().backward()
+    assert frames.grad is not None
 
 
 def test_ready_features_pass_as_they_are() -> None:
@@ -100,45 +94,27 @@ def test_ready_features_pass_as_they_are() -> None:
 @pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf])
 @pytest.mark.parametrize("size", [1, 2, 64])
 def test_a_bad_frame_is_named_by_its_number(bad: float, size: int) -> None:
-    frames = torch.rand(8, 1, 16, 16)
-    frames[5, 0, 8, 8] = bad
-    with refused("frame 5", "NaN or infinite"):
-        list(feature_batches(ArrayTraverse(frames), HOG(), size))
-    features = torch.rand(8, 3)
-    features[5, 1] = bad
-    with refused("frame 5 "):
-        list(feature_batches(ArrayTraverse(features), HOG(), size))
+    frames, features = torch.rand(8, 1, 16, 16), torch.rand(8, 3)
+    frames[5, 0, 8, 8] = features[5, 1] = bad
+    for values in (frames, features):
+        with refused("frame 5 ", "NaN or infinite"):
+            list(feature_batches(ArrayTraverse(values), HOG(), size))
 
 
 @pytest.mark.parametrize(
-    "module",
-    [nn.Identity(), nn.Flatten(0), nn.Sequential(nn.Flatten(), nn.Unflatten(0, (1, 4)), nn.Flatten())],
-    ids=["images", "one vector", "one row"],
+    ("module", "batches", "facts"),
+    [
+        (nn.Identity(), [torch.rand(4, 1, 2, 2)], ("(4, 1, 2, 2)", "(4, D)")),
+        (nn.Flatten(0), [torch.rand(4, 1, 2, 2)], ("(4, 1, 2, 2)", "(4, D)")),
+        (HOG(), [torch.rand(2, 3, 4)], ("the list", "(2, 3, 4)", "float frames")),
+        (HOG(), [torch.zeros(2, 1, 4, 4, dtype=torch.uint8)], ("the list", "uint8", "float frames")),
+        (HOG(), [torch.zeros(2, 3).long()], ("the list", "int64", "float frames")),
+        (HOG(), [], ("the list", "no frames")),
+    ],
 )
-def test_a_module_that_makes_no_feature_rows_is_refused(module: nn.Module) -> None:
-    with refused("(4, 1, 2, 2)", "(4, D)"):
-        list(feature_batches(ArrayTraverse(torch.rand(4, 1, 2, 2)), module))
-
-
-@pytest.mark.parametrize(
-    "batch", [torch.rand(2, 3, 4), torch.zeros(2, 1, 4, 4, dtype=torch.uint8), torch.zeros(2, 3).long()]
-)
-def test_a_batch_that_is_neither_frames_nor_features_is_refused(batch: Tensor) -> None:
-    with refused("the list", str(tuple(batch.shape)), str(batch.dtype), "float frames"):
-        list(feature_batches(Listed(batch), HOG()))
-
-
-def test_a_traverse_without_frames_is_refused() -> None:
-    module = Pooled().train()
-    with refused("the list", "no frames"):
-        list(feature_batches(Listed(), module))
-    assert module.training
-
-
-def test_features_of_keeps_gradients() -> None:
-    frames = torch.rand(2, 1, 16, 16, requires_grad=True)
-    features_of(frames, HOG()).sum().backward()
-    assert frames.grad is not None
+def test_what_is_refused(module: nn.Module, batches: list[Tensor], facts: tuple[str, ...]) -> None:
+    with refused(*facts):
+        list(feature_batches(Listed(*batches), module))
 
 
 def test_coarse_floats_become_float32() -> None:

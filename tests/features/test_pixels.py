@@ -2,36 +2,25 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 import torch
 from helpers import refused
 
-from dejavu_torch import DejaVu, Preprocess, Whitening
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.resize import resize_frames
 
 
 def test_equals_a_literal_loop() -> None:
     frames = torch.rand(2, 1, 9, 12, dtype=torch.float64)
+    frames[0, :, :, :6] = 0.7  # flat
     found = PatchPixels(size=(8, 12), patch=4)(frames).view(2, 8, 12)
     small = resize_frames(frames, (8, 12))[:, 0]
     for image, pixels in zip(small, found, strict=True):
         for top in range(0, 8, 4):
             for left in range(0, 12, 4):
                 patch = image[top : top + 4, left : left + 4]
-                expected = (patch - patch.mean()) / patch.std(correction=0)
+                expected = (patch - patch.mean()) / patch.std(correction=0).clamp(min=1 / 255)
                 assert torch.allclose(pixels[top : top + 4, left : left + 4], expected)
-
-
-def test_light_and_contrast_of_a_patch_change_nothing() -> None:
-    frames = torch.rand(1, 1, 32, 64)
-    other = frames.clone()
-    other[..., 8:16, 24:32] = 0.3 + 0.5 * other[..., 8:16, 24:32]
-    assert torch.allclose(PatchPixels()(frames), PatchPixels()(other), atol=1e-4)
-    flat = PatchPixels()(torch.full((1, 1, 32, 64), 0.7))
-    assert flat.abs().max() < 1e-3
 
 
 @pytest.mark.parametrize(
@@ -46,12 +35,3 @@ def test_what_holds_no_patch_is_refused() -> None:
         PatchPixels()(torch.rand(1, 1, 7, 40))
     with refused("size=(8, 64)", "at least 9"):
         PatchPixels((8, 64), 9)
-
-
-def test_a_map_file_names_them(tmp_path: Path) -> None:
-    frames = torch.rand(40, 3, 16, 24, generator=torch.Generator().manual_seed(0))
-    model = DejaVu(PatchPixels(), Whitening(views=2), preprocess=Preprocess("grey")).learn(frames)
-    model.save(tmp_path / "map.safetensors")
-    loaded = DejaVu.load(tmp_path / "map.safetensors")
-    assert torch.equal(loaded(frames), model.eval()(frames))
-    assert torch.equal(loaded.localize(frames).index, torch.arange(40))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
@@ -52,52 +54,21 @@ def test_in_closed_form_where_the_numbers_are_independent() -> None:
     torch.testing.assert_close(projection.abs(), torch.tensor([[0.0], [expected]]), rtol=0, atol=1e-6)
 
 
-def test_a_season_is_whitened_away() -> None:
-    """What a season changes alike everywhere tells nothing any more, though it is the largest change."""
-    _, places = pairs(k=20)
-    season = torch.cat([torch.tensor([90.0, -50.0, 40.0]), torch.zeros(17)])
-    winter = places + season + 0.1 * torch.randn(places.shape, generator=torch.Generator().manual_seed(1))
-    raw = torch.cdist(winter, places).argmin(1) == torch.arange(len(places))
-    mean, projection = learned_whitening(winter[:100], places[:100], 16)
-    projected = [(x[100:] - mean) @ projection for x in (winter, places)]
-    unit = [torch.nn.functional.normalize(x, dim=1) for x in projected]
-    found = torch.cdist(*unit).argmin(1) == torch.arange(100)
-    assert raw.float().mean() < 0.3
-    assert found.float().mean() > 0.9
-
-
-def test_what_cannot_be_whitened() -> None:
-    for views, places, words in (
+@pytest.mark.parametrize(
+    ("views", "places", "facts"),
+    [
         (torch.ones(3, 2), torch.ones(3, 2), ("the descriptors of 3 views", "by 0 in", "an augmentation")),
         (torch.zeros(0, 2), torch.zeros(0, 2), ("of 0 views", "more than rounding")),
         (torch.full((3, 2), math.nan), torch.ones(3, 2), ("by nan", "expected a finite number")),
         (torch.ones(3, 2) + 1e-6, torch.ones(3, 2), ("by 2", "more than rounding")),
-    ):
-        with refused(*words):
-            learned_whitening(views, places, 1)
-        coder = Coder(2, 3, hidden=4)
-        with refused(*words):
-            coder.whiten(views, places)
-        assert not coder.whitened
-        assert torch.equal(coder.projection, torch.eye(2))
-
-
-@pytest.mark.parametrize(("places", "views"), [(12, 12), (40, 30), (40, 400)])
-def test_shrinkage_comes_near_the_best_there_is(places: int, views: int) -> None:
-    """Of Gaussian samples, whose covariance is known: near the best, and far better than 0.03."""
-    true = torch.diag(torch.linspace(4, 0.2, places).double().square())
-    errors = torch.zeros(102)
-    for seed in range(30):
-        random = torch.Generator().manual_seed(seed)
-        samples = torch.randn(views, places, generator=random, dtype=torch.float64) @ true.sqrt()
-        sample = samples.T @ samples / views
-        shrinkages = [oracle_shrinkage(sample, views), *torch.linspace(0, 1, 101).tolist()]
-        target = sample.diagonal().mean() * torch.eye(places).double()
-        for i, a in enumerate(shrinkages):
-            errors[i] += float(((1 - a) * sample + a * target - true).square().sum())
-    own, fixed = errors[0], errors[1:]
-    assert own < 1.1 * fixed.min()
-    assert views == 400 or own < 0.8 * fixed[3]
+    ],
+)
+def test_what_cannot_be_whitened(views: Tensor, places: Tensor, facts: tuple[str, ...]) -> None:
+    coder = Coder(2, 3, hidden=4)
+    with refused(*facts):
+        coder.whiten(views, places)
+    assert not coder.whitened
+    assert torch.equal(coder.projection, torch.eye(2))
 
 
 def test_shrinkage_in_closed_form() -> None:
@@ -127,6 +98,15 @@ def route(places: int = 600, features: int = 40, rank: int = 12) -> tuple[Tensor
     return own @ basis + 3, own @ basis + 3 + light
 
 
+PLACES, VIEWS = route()
+
+
+def learned(places: Tensor = PLACES, views: Tensor | None = VIEWS, **settings: Any) -> Whitening:
+    whitening = Whitening(**settings)
+    whitening.learn(places, None if views is None else [(views, torch.arange(len(views)))])
+    return whitening
+
+
 def found(whitening: Whitening, views: Tensor, places: Tensor) -> float:
     similar = whitening(views) @ whitening(places).T
     return float((similar.argmax(1) == torch.arange(len(places))).float().mean())
@@ -134,38 +114,26 @@ def found(whitening: Whitening, views: Tensor, places: Tensor) -> float:
 
 @pytest.mark.parametrize("bits", [4, 8, 16])
 def test_what_changes_between_visits_is_whitened_away(bits: int) -> None:
-    places, views = route()
-    plain, whitening = Whitening(bits=bits), Whitening(numbers=10, bits=bits)
-    plain.learn(places)
-    whitening.learn(
-        places[:300], [(views[:100], torch.arange(100)), (views[100:300], torch.arange(100, 300))]
-    )
-    assert found(whitening, views[300:], places[300:]) > 0.95 > 0.5 > found(plain, views[300:], places[300:])
-    torch.testing.assert_close(whitening(views).norm(dim=1), torch.ones(600))
+    plain, whitening = learned(views=None, bits=bits), Whitening(numbers=10, bits=bits)
+    batches = [(VIEWS[:100], torch.arange(100)), (VIEWS[100:300], torch.arange(100, 300))]
+    whitening.learn(PLACES[:300], batches)
+    assert found(whitening, VIEWS[300:], PLACES[300:]) > 0.95 > 0.5 > found(plain, VIEWS[300:], PLACES[300:])
+    torch.testing.assert_close(whitening(VIEWS).norm(dim=1), torch.ones(600))
     assert whitening.projection.nbytes == 40 * 10 * bits // 8
 
 
 def test_a_power_of_whitened_numbers() -> None:
-    places, views = route()
-    plain, roots = (Whitening(numbers=10, power=power) for power in (1.0, 0.5))
-    for whitening in (plain, roots):
-        whitening.learn(places, [(views, torch.arange(600))])
-    whitened = plain(views)
+    plain, roots = (learned(numbers=10, power=power) for power in (1.0, 0.5))
+    whitened = plain(VIEWS)
     expected = torch.nn.functional.normalize(whitened.sign() * whitened.abs().sqrt(), dim=1)
-    torch.testing.assert_close(roots(views), expected)
-    assert found(roots, views, places) > 0.95
-    query = views[:2].double().requires_grad_()
-    assert torch.autograd.gradcheck(roots, query)
+    torch.testing.assert_close(roots(VIEWS), expected)
     middle = (roots.offset / roots.scale).double() @ torch.linalg.pinv(roots.whole.double())
     middle = middle[None].requires_grad_()  # whitened to zeros
     roots(middle).sum().backward()
     assert middle.grad is not None
     assert middle.grad.isfinite().all()
-    without = Whitening(numbers=3, power=0.5)
-    without.learn(places)  # components as they are
-    other = Whitening(numbers=3)
-    other.learn(places)
-    assert torch.equal(without(views), other(views))
+    one, other = (learned(views=None, power=power) for power in (1.0, 0.5))
+    assert torch.equal(one(VIEWS), other(VIEWS))  # components stay as they are
 
 
 def test_numbers_of_four_bits_come_back_from_their_bytes() -> None:
@@ -182,42 +150,23 @@ def test_numbers_of_four_bits_come_back_from_their_bytes() -> None:
 
 
 def test_without_views_components_keep_their_variances() -> None:
-    places, _ = route()
-    whitening = Whitening(bits=16)
-    whitening.learn(places)
-    described = whitening(places)
+    described = learned(views=None, bits=16)(PLACES)
     assert described.shape == (600, 13)  # the rank, and one constant number
     torch.testing.assert_close(described.norm(dim=1), torch.ones(600))
-    number = ((places - places.mean(0)).square().sum(1).mean() / 12).sqrt()  # the constant, before that
+    number = ((PLACES - PLACES.mean(0)).square().sum(1).mean() / 12).sqrt()  # the constant, before that
     components = described[:, :-1] / described[:, -1:] * number
     distances = torch.cdist(components, components)
-    torch.testing.assert_close(distances, torch.cdist(places, places), rtol=1e-2, atol=5e-2)
-
-
-def test_without_views_there_are_at_most_256_numbers() -> None:
-    random = torch.Generator().manual_seed(0)
-    places, numbers = torch.randn(400, 300, generator=random), []
-    for whitening in (Whitening(), Whitening(numbers=20)):
-        whitening.learn(places)
-        numbers.append(len(whitening.scale))
-    assert numbers == [256, 20]
+    torch.testing.assert_close(distances, torch.cdist(PLACES, PLACES), rtol=1e-2, atol=5e-2)
 
 
 def test_numbers_follow_the_rank_and_the_length_of_the_route(caplog: pytest.LogCaptureFixture) -> None:
-    places, views = route()
-    whitening = Whitening()
-    whitening.learn(places[:40], [(views[:40], torch.arange(40))])
-    assert len(whitening.scale) == 10  # a quarter of the places
+    assert len(learned(PLACES[:40], VIEWS[:40]).scale) == 10  # a quarter of the places
+    assert len(learned(PLACES[:, :8], VIEWS[:, :8]).scale) == 8  # all there are
+    many = torch.randn(400, 300, generator=torch.Generator().manual_seed(0))
+    assert [len(learned(many, None, numbers=count).scale) for count in (None, 20)] == [256, 20]
     assert not caplog.text
-    whitening.learn(places, [(views, torch.arange(600))])
-    assert len(whitening.scale) == 12
+    assert len(learned().scale) == 12
     assert "rank 12" in caplog.text
-    caplog.clear()
-    whitening.learn(places[:, :8], [(views[:, :8], torch.arange(600))])
-    assert len(whitening.scale) == 8  # all there are
-    assert not caplog.text
-    with refused("numbers is 20", "rank 12"):
-        Whitening(numbers=20).learn(places, [(views, torch.arange(600))])
 
 
 def test_short_routes_are_looked_at_more_often() -> None:
@@ -228,26 +177,22 @@ def test_short_routes_are_looked_at_more_often() -> None:
     assert Whitening(views=2).copies(60, 1764) == 2
 
 
-def test_a_state_of_any_size_is_loaded() -> None:
-    for bits in (4, 8, 16):
-        for numbers in (5, 8):
-            places, views = route()
-            one, other = Whitening(numbers, bits=bits), Whitening()
-            one.learn(places, [(views, torch.arange(600))])
-            other.learn(places[:, :9])
-            other.load_state_dict(one.state_dict())
-            assert torch.equal(other(views), one(views))
-            assert not Whitening().learned
-            assert torch.equal(Whitening()(views), views)
+@pytest.mark.parametrize("bits", [4, 8, 16])
+@pytest.mark.parametrize("numbers", [5, 8])
+def test_a_state_of_any_size_is_loaded(bits: int, numbers: int) -> None:
+    one, other = learned(numbers=numbers, bits=bits), learned(PLACES[:, :9], None)
+    other.load_state_dict(one.state_dict())
+    assert torch.equal(other(VIEWS), one(VIEWS))
+    assert not Whitening().learned
+    assert torch.equal(Whitening()(VIEWS), VIEWS)
 
 
-def test_gradients_reach_the_features() -> None:
+@pytest.mark.parametrize("power", [1.0, 0.5])
+def test_gradients_reach_the_features(power: float) -> None:
     places, views = route(200, 6, 4)
-    for own in ([(views, torch.arange(200))], None):
-        whitening = Whitening(numbers=3)
-        whitening.learn(places, own)
+    for seen in (views, None):
         some = views[:3].double().requires_grad_()
-        assert torch.autograd.gradcheck(whitening, (some,))
+        assert torch.autograd.gradcheck(learned(places, seen, numbers=3, power=power), (some,))
 
 
 @pytest.mark.parametrize("features", [30, 300])
@@ -263,48 +208,35 @@ def test_principal_components_are_those_of_the_covariance(features: int) -> None
     assert agreement.min() > 0.99
 
 
-def test_whitening_settings_out_of_range() -> None:
-    for settings, words in (
-        ({"numbers": 0}, ("numbers=0", "at least 1")),
-        ({"numbers": 500}, ("numbers=500", "components=400")),
-        ({"views": -1}, ("views=-1", "0 views")),
-        ({"shrinkage": 0.0}, ("shrinkage=0.0", "above 0")),
-        ({"bits": 6}, ("bits=6", "4, 8, 16")),
-        ({"power": 0.0}, ("power=0.0", "above 0")),
-        ({"power": 1.5}, ("power=1.5", "at most 1")),
-    ):
-        with refused("Whitening got", *words):
-            Whitening(**settings)  # type: ignore[arg-type]
-
-
-def test_a_route_that_cannot_be_whitened() -> None:
-    places, views = route()
-    with refused("600 descriptors", "all alike"):
-        Whitening().learn(torch.ones(600, 4))
-    with refused("(1, 40)", "N at least 2"):
-        Whitening().learn(places[:1])
-    with refused("no views", "None for none"):
-        Whitening().learn(places, [])
-    with refused("views", "augmentation"):
-        Whitening().learn(places, [(places, torch.arange(600))])
-    whitening = Whitening()
-    whitening.learn(places)
-    with refused("(600, 7)", "(B, 40)"):
-        whitening(views[:, :7])
-    with refused("7 features", "expected 40"):
-        whitening.learn(places, [(views[:, :7], torch.arange(600))])
-    with refused("strengths", "'all'"):
-        Whitening(strengths="all")  # type: ignore[arg-type]
+@pytest.mark.parametrize(
+    ("call", "facts"),
+    [
+        (lambda: Whitening(numbers=0), ("numbers=0", "at least 1")),
+        (lambda: Whitening(numbers=500), ("numbers=500", "components=400")),
+        (lambda: Whitening(views=-1), ("views=-1", "0 views")),
+        (lambda: Whitening(shrinkage=0.0), ("shrinkage=0.0", "above 0")),
+        (lambda: Whitening(bits=6), ("bits=6", "4, 8, 16")),
+        (lambda: Whitening(power=0.0), ("power=0.0", "above 0")),
+        (lambda: Whitening(power=1.5), ("power=1.5", "at most 1")),
+        (lambda: Whitening(strengths="all"), ("strengths", "'all'")),
+        (lambda: learned(torch.ones(600, 4), None), ("600 descriptors", "all alike")),
+        (lambda: learned(PLACES[:1], None), ("(1, 40)", "N at least 2")),
+        (lambda: Whitening().learn(PLACES, []), ("no views", "None for none")),
+        (lambda: learned(views=PLACES), ("views", "augmentation")),
+        (lambda: learned(numbers=20), ("numbers is 20", "rank 12")),
+        (lambda: learned(views=VIEWS[:, :7]), ("7 features", "expected 40")),
+        (lambda: learned()(VIEWS[:, :7]), ("(600, 7)", "(B, 40)")),
+    ],
+)
+def test_what_is_refused(call: Callable[[], Any], facts: tuple[str, ...]) -> None:
+    with refused(*facts):
+        call()
 
 
 @pytest.mark.parametrize("bits", [4, 8])
 @pytest.mark.parametrize("name", ["projection", "scale", "offset", "length"])
 def test_a_state_that_does_not_fit_is_refused(name: str, bits: int) -> None:
-    places, views = route()
-    whitening, other = Whitening(numbers=4, bits=bits), Whitening()
-    whitening.learn(places, [(views, torch.arange(600))])
-    state = whitening.state_dict()
-    columns = bits // 2
+    state, other, columns = learned(numbers=4, bits=bits).state_dict(), Whitening(), bits // 2
     state[name] = torch.ones(3) if name == "length" else state[name][..., : columns - 1]
     with refused("(K,)", f"(40, {columns - 1})" if name == "projection" else f"(40, {columns})"):
         other.load_state_dict(state)

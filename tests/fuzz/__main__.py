@@ -1,10 +1,7 @@
 """`python -m tests.fuzz`, see runner.py."""
 
-from __future__ import annotations
-
 import sys
 
 from .runner import main
 
-if __name__ == "__main__":
-    sys.exit(main())
+sys.exit(main())

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import shutil
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-import av
 import numpy as np
 import torch
 from PIL import Image
@@ -26,6 +24,8 @@ from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.training.datamodule import RouteData
 from dejavu_torch.training.task import PlaceRecognitionTask
 from dejavu_torch.types import Training
+
+from ..videos import clip
 
 
 def pictures(count: int, side: int = 16, noise: float = 0.0) -> np.ndarray:
@@ -48,7 +48,7 @@ def maps(folder: Path) -> None:
     features = torch.from_numpy(np.random.default_rng(1).normal(size=(40, 12))).float()
     periods = ImposedPeriods([3, 4, 5], bin=2)
     write_images(folder / "photos", pictures(40))
-    ground = footage(40)
+    ground = pictures(40, 48)[::-1].swapaxes(1, 2).copy()  # comes nearer, down the frame
     small = {"channels": 1, "resize": (16, 16), "widths": (4, 8), "squeeze": 4}
     odometry = GroundOdometry(((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)), (48, 48), step=6.0)
     templates = TemplateMapper(periods)
@@ -74,17 +74,10 @@ def maps(folder: Path) -> None:
     shutil.rmtree(folder / "photos")
 
 
-def footage(count: int, side: int = 48) -> np.ndarray:
-    """(count,side,side) uint8, a camera that looks straight down and comes 4 pixels forward a frame."""
-    drawn = torch.rand(1, 1, count + side // 4, side // 4, generator=torch.Generator().manual_seed(0))
-    ground = torch.nn.functional.interpolate(drawn, scale_factor=4, mode="bicubic")[0, 0].clamp(0, 1).mul(255)
-    return torch.stack([ground[4 * i : 4 * i + side] for i in reversed(range(count))]).byte().numpy()
-
-
-def write_images(folder: Path, images: np.ndarray, suffix: str = ".png") -> None:
+def write_images(folder: Path, images: np.ndarray) -> None:
     folder.mkdir()
     for i, image in enumerate(images):
-        Image.fromarray(image).save(folder / f"{i}{suffix}")
+        Image.fromarray(image).save(folder / f"{i}.png")
 
 
 def images(folder: Path) -> None:
@@ -113,15 +106,9 @@ def videos(folder: Path) -> None:
     """Clips of a dozen frames in several containers."""
     kinds = {"a.mp4": ("libx264", "yuv420p"), "b.avi": ("mjpeg", "yuvj420p"), "c.mkv": ("ffv1", "bgr0")}
     kinds |= {"d.ts": ("libx264", "yuv420p"), "e.mov": ("mpeg4", "yuv420p"), "f.mjpeg": ("mjpeg", "yuvj420p")}
+    frames = np.stack([pictures(12, 48)[:, :32]] * 3, 3)
     for name, (codec, pixels) in kinds.items():
-        with av.open(str(folder / name), "w") as container:
-            stream = container.add_stream(codec, rate=25)
-            stream.width, stream.height, stream.pix_fmt = 48, 32, pixels
-            for i, image in enumerate(pictures(12, 48)):
-                frame = av.VideoFrame.from_ndarray(np.stack([image[:32]] * 3, 2), format="rgb24")
-                frame.pts, frame.time_base = i, Fraction(1, 25)
-                container.mux(stream.encode(frame))
-            container.mux(stream.encode())
+        clip(folder / name, frames, codec, pixels)
 
 
 TRAIN = """
@@ -164,10 +151,7 @@ def inputs(folder: Path) -> None:
     np.save(folder / "query.npy", pictures(12, noise=5.0))
     np.save(folder / "features.npy", np.random.default_rng(1).normal(size=(40, 12)).astype(np.float32))
     write_images(folder / "photos", pictures(30))
-    (folder / "clip").mkdir()
-    videos(folder / "clip")
-    (folder / "clip" / "a.mp4").rename(folder / "clip.mp4")
-    shutil.rmtree(folder / "clip")
+    clip(folder / "clip.mp4", np.stack([pictures(12, 48)[:, :32]] * 3, 3), "libx264", "yuv420p")
     Image.fromarray(pictures(1, 40)[0]).save(folder / "strip.png")
     (folder / "matches.csv").write_text(matches_text())
     (folder / "truth.csv").write_text("query,place\n" + "".join(f"{i},{i}\n" for i in range(12)))

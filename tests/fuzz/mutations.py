@@ -20,6 +20,7 @@ from torch import Tensor
 
 CANARY = "fuzz_canary"  # a module in the working folder, which no file may have imported
 DEEP = 20_000  # levels of nesting: beyond any recursion limit
+NESTED = "@[@", "@{@"  # stand in a tree for brackets nested so deeply, which no list could be written as
 LONG = 100_000  # characters
 
 NUMBERS = (
@@ -139,34 +140,14 @@ def odd_value(random: Random, value: Any) -> Any:
         return random.choice(near)
     built = {"class_path": random.choice(CLASSES), "init_args": random.choice(({}, {"a": 1}, None, []))}
     plain = (None, True, False, [], {}, [None], [[1, 2]], [-1, 2**62], [1e300] * 3, [0] * 10_000)
-    others = (random.choice(TEXTS), random.choice(plain), built, random.choice((Nested("["), Nested("{"))))
+    others = (random.choice(TEXTS), random.choice(plain), built, random.choice(NESTED))
     return random.choice((*[random.choice(NUMBERS)] * 4, *others))
-
-
-class Nested(str):
-    """Stands in a tree for brackets that nest deeply, which no list could be written as."""
-
-    __slots__ = ()
-
-    def __deepcopy__(self, memo: Any) -> Nested:
-        return self
 
 
 def json_text(value: Any) -> str:
     """A tree as JSON, NaN and infinities as Python writes them."""
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, Nested):
-            return f"@{value}@"
-        if isinstance(value, dict):
-            return {key: plain(inner) for key, inner in value.items()}
-        return [plain(inner) for inner in value] if isinstance(value, list) else value
-
-    return (
-        json.dumps(plain(value))
-        .replace('"@[@"', "[" * DEEP + "]" * DEEP)
-        .replace('"@{@"', '{"a":' * DEEP + "0" + "}" * DEEP)
-    )
+    lists, objects = "[" * DEEP + "]" * DEEP, '{"a":' * DEEP + "0" + "}" * DEEP
+    return json.dumps(value).replace(f'"{NESTED[0]}"', lists).replace(f'"{NESTED[1]}"', objects)
 
 
 def mutate_text(random: Random, text: str, tokens: Sequence[str] = TOKENS) -> bytes:
@@ -233,19 +214,16 @@ def mutate_words(random: Random, words: Sequence[str], others: Sequence[Sequence
 def mutate_tensors(random: Random, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     """Tensors of other values, shapes, types or names, some left out."""
     found = dict(tensors)
-    for _ in range(times(random)):
-        if not found:
-            break
-        name = random.choice(sorted(found))
+    for _ in range(times(random) if found else 0):
+        name, other = random.choice(sorted(found)), random.choice(sorted(found))
         act = random.randrange(12)
-        if act == 0:
+        if act == 0 and len(found) > 1:
             del found[name]
         elif act == 1:
-            found[name + random.choice(("", "_", ".weight"))] = found.pop(name)
+            found[f"{name}{random.choice(('', '_', '.weight'))}"] = found.pop(name)
         elif act == 2:
             found[random.choice(("map.extra", "features.x", "whitening.y", "z", ""))] = found[name]
         elif act == 3:
-            other = random.choice(sorted(found))
             found[name], found[other] = found[other], found[name]
         else:
             found[name] = odd_tensor(random, found[name])
@@ -254,35 +232,33 @@ def mutate_tensors(random: Random, tensors: dict[str, Tensor]) -> dict[str, Tens
 
 def odd_tensor(random: Random, tensor: Tensor) -> Tensor:
     """Another shape, size or type, a value that is odd, or other bytes."""
-    act = random.randrange(6)
+    flat, act = tensor.flatten(), random.randrange(6)
     if act == 0:
-        flat = tensor.flatten()
-        return random.choice((tensor[None], flat, tensor[..., None], flat[:0], tensor.new_zeros(())))
-    if act == 1:
-        if not tensor.ndim:
-            return tensor[None].expand(3)
-        doubled = torch.cat([tensor, tensor])
-        return random.choice((tensor[:-1], doubled, tensor[:1], tensor[..., :1], tensor.flip(0)))
+        shapes = (
+            tensor[None],
+            tensor[..., None],
+            flat,
+            flat[:0],
+            flat[:-1],
+            flat.repeat(2),
+            tensor.new_zeros(()),
+        )
+        return random.choice(shapes)
+    if act == 1 and tensor.ndim:
+        return random.choice(
+            (tensor[:-1], tensor[:1], tensor[..., :1], tensor.flip(0), torch.cat([tensor] * 2))
+        )
     if act == 2:
         return tensor.to(random.choice(KINDS))
     if act == 3 and tensor.numel():
-        data = bytearray(tensor.contiguous().view(-1).view(torch.uint8).numpy().tobytes())
+        data = bytearray(flat.view(torch.uint8).numpy().tobytes())
         for _ in range(random.choice((1, 10, 100))):
             data[random.randrange(len(data))] = random.randrange(256)
         return torch.frombuffer(data, dtype=torch.uint8).view(tensor.dtype).view(tensor.shape).clone()
-    return _filled(random, tensor)
-
-
-def _filled(random: Random, tensor: Tensor) -> Tensor:
-    """One or all of the values are odd ones."""
     odd = (0, 1, -1, 127, 255, 2**31 - 1, 2**62, -(2**62), math.nan, math.inf, -math.inf, 1e30)
-    value, tensor = random.choice(odd), tensor.clone()
-    if not tensor.is_floating_point():
-        about = None if tensor.dtype == torch.bool else torch.iinfo(tensor.dtype)
-        least, most = (about.min, about.max) if about else (0, 1)
-        value = min(max(int(value) if math.isfinite(value) else -1, least), most)
-    filling = torch.tensor(value).to(tensor.dtype)  # inf where halves hold no such number
-    if tensor.numel() and random.random() < 0.6:
-        tensor.view(-1)[random.randrange(tensor.numel())] = filling
-        return tensor
-    return tensor.copy_(filling)
+    value = torch.tensor(random.choice(odd), dtype=torch.float64).to(tensor.dtype)  # of integers any number
+    if act == 4 and tensor.numel():
+        flat = flat.clone()
+        flat[random.randrange(len(flat))] = value
+        return flat.view(tensor.shape)
+    return torch.full_like(tensor, value.item())

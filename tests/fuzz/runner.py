@@ -19,22 +19,24 @@ from __future__ import annotations
 
 import argparse
 import gc
-import json
 import logging
+import multiprocessing
 import os
 import resource
-import select
 import shlex
 import shutil
 import signal
+import stat
 import sys
 import tempfile
 import time
 import traceback
 import warnings
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, suppress
 from itertools import pairwise
+from multiprocessing.connection import Connection
 from pathlib import Path
 from random import Random
 from typing import Any, NamedTuple
@@ -74,7 +76,6 @@ class Result(NamedTuple):
     case: int
     outcome: str
     findings: list[Finding]
-    seconds: float
 
 
 class Hang(BaseException):
@@ -99,11 +100,10 @@ def _run_case(reader: Reader, seed: int, number: int, root: Path) -> Result:
     random = Random(f"{seed}/{reader.name}/{number}")
     torch.manual_seed(number)
     case = Case(random, folder, root / "made")
-    began, outcome, findings = time.process_time(), "accepted", []
+    outcome, findings = "accepted", []
     for output in (1, 2):
         os.ftruncate(output, 0)
     before: dict[str, Any] = {}
-
     case.begin = lambda: before.update(_files(root / "work"))
     signal.setitimer(signal.ITIMER_PROF, CPU)
     signal.setitimer(signal.ITIMER_REAL, WALL)
@@ -134,18 +134,15 @@ def _run_case(reader: Reader, seed: int, number: int, root: Path) -> Result:
         findings.append(Finding("code executed", "", "the canary was imported"))
     if case.words:
         line = shlex.join(case.words)
-        findings = [
-            one._replace(message=f"{one.message[:MOST]} of dejavu {line:.{MOST}}") for one in findings
-        ]
-    return Result(number, "broken" if findings else outcome, findings, time.process_time() - began)
+        findings = [one._replace(message=f"{one.message} of dejavu {line:.{MOST}}") for one in findings]
+    return Result(number, "broken" if findings else outcome, findings)
 
 
 def _finding(error: BaseException, kind: str) -> Finding:
-    frames = [
-        f for f in traceback.extract_tb(error.__traceback__) if Path(f.filename).is_relative_to(PACKAGE)
-    ]
-    last = frames[-1] if frames else None
-    where = f"{Path(last.filename).relative_to(PACKAGE)}:{last.lineno} {last.name}" if last else ""
+    where = ""
+    for frame in traceback.extract_tb(error.__traceback__):
+        if Path(frame.filename).is_relative_to(PACKAGE):
+            where = f"{Path(frame.filename).relative_to(PACKAGE)}:{frame.lineno} {frame.name}"
     return Finding(kind, where, str(error)[:MOST])
 
 
@@ -185,36 +182,25 @@ def _left(root: Path, case: Case, outcome: str, before: dict[str, Any], temporar
 
 
 def _named(words: Sequence[str], folder: Path) -> Callable[[str], bool]:
-    """Whether a command line names a file as output, or a folder that it lies in, and not also as input.
-
-    Args:
-        folder: that its words are relative to.
-    """
+    """Whether a command line, run in `folder`, names a file, or its folder, as output and not as input."""
     outputs, inputs = set(), set()
     for before, word in pairwise(["", *words]):
         option, equals, value = word.partition("=") if word.startswith("--") else (before, "=", word)
-        if not equals:
-            continue  # its value is the next word
         written = option in OUTPUTS or (option == "--map" and words[0] == "learn")
         address = value.removeprefix("strip:").partition("?")[0]
-        (outputs if written else inputs).add(os.path.normpath(folder / address))
-
-    def named(name: str) -> bool:
-        return name not in inputs and any(Path(name).is_relative_to(place) for place in outputs)
-
-    return named
+        if equals:  # else its value is the next word
+            (outputs if written else inputs).add(os.path.normpath(folder / address))
+    return lambda name: name not in inputs and any(Path(name).is_relative_to(place) for place in outputs)
 
 
 def _files(folder: Path) -> dict[str, Any]:
-    """Every file and folder, and the size and time of files."""
+    """Every file and folder by its path, and the size and time of files."""
     found: dict[str, Any] = {}
-    for inside, folders, files in os.walk(folder):
-        found |= {os.path.join(inside, name).removeprefix(str(folder)): None for name in folders}
-        for name in files:
-            path = os.path.join(inside, name)
-            status = os.lstat(path)
-            found[path.removeprefix(str(folder)).lstrip("/")] = (status.st_size, status.st_mtime_ns)
-    return {name.lstrip("/"): value for name, value in found.items()}
+    for path in folder.rglob("*"):
+        status = path.lstat()
+        told = None if stat.S_ISDIR(status.st_mode) else (status.st_size, status.st_mtime_ns)
+        found[str(path.relative_to(folder))] = told
+    return found
 
 
 def _address_space() -> int:
@@ -244,14 +230,8 @@ def _prepare(root: Path) -> None:
     torch.set_num_threads(1)
 
 
-def _work(reader: Reader, seed: int, numbers: Iterable[int], root: Path, pipe: int) -> None:
+def _work(reader: Reader, seed: int, numbers: Sequence[int], root: Path, told: Connection) -> None:
     """Run cases, telling of each when it begins and when it has ended."""
-
-    def tell(message: Any) -> None:
-        data = json.dumps(message).encode() + b"\n"
-        while data:
-            data = data[os.write(pipe, data) :]
-
     _prepare(root)
     for maker in reader.makers:
         folder = root / "made" / maker.__name__
@@ -263,13 +243,12 @@ def _work(reader: Reader, seed: int, numbers: Iterable[int], root: Path, pipe: i
             torch.manual_seed(0)
             maker(root / "making")
             (root / "making").rename(folder)
-    sys.stderr.flush()
     base = _address_space()
     resource.setrlimit(resource.RLIMIT_AS, (base + MEMORY, resource.RLIM_INFINITY))
     for number in numbers:
-        tell(number)
+        told.send(number)
         result = _run_case(reader, seed, number, root)
-        tell(result)
+        told.send(result)
         if any(f.kind in ("Hang", "MemoryError") for f in result.findings) or _address_space() > base + GROWN:
             return  # the next case in a process that has nothing of this one
 
@@ -279,66 +258,30 @@ def _work(reader: Reader, seed: int, numbers: Iterable[int], root: Path, pipe: i
 
 def run(reader: Reader, seed: int, numbers: Iterable[int], root: Path) -> Iterator[Result]:
     """The results of the cases of a reader, in order."""
-    waiting = list(numbers)
+    waiting, forked = list(numbers), multiprocessing.get_context("fork")
     while waiting:
-        reading, writing = os.pipe()
-        child = os.fork()
-        if not child:
-            status = 1
-            try:
-                os.close(reading)
-                _work(reader, seed, waiting, root, writing)
-                status = 0
-            except BaseException:
-                traceback.print_exc()
-                sys.stderr.flush()
-            finally:
-                os._exit(status)
-        os.close(writing)
-        begun, hung = None, False
-        with open(reading, "rb", buffering=0) as pipe:
-            for line in _lines(pipe):
-                if line is None:
-                    hung = True
-                    os.kill(child, signal.SIGKILL)
-                    break
-                message = json.loads(line)
-                if isinstance(message, int):
-                    begun = message
-                    continue
-                case, outcome, findings, seconds = message
-                waiting.remove(case)
-                begun = None
-                yield Result(case, outcome, [Finding(*one) for one in findings], seconds)
-        status = os.waitpid(child, 0)[1]
+        reading, writing = forked.Pipe(duplex=False)
+        child = forked.Process(target=_work, args=(reader, seed, waiting, root, writing))
+        child.start()
+        writing.close()
+        begun = None
+        with suppress(EOFError):
+            while reading.poll(SILENT):
+                message = reading.recv()
+                begun = message if isinstance(message, int) else None
+                if begun is None:
+                    waiting.remove(message.case)
+                    yield message
+            child.kill()  # it says nothing any more
+        child.join()
+        text = (root / "stderr").read_text(errors="replace")
         if begun is not None:
             waiting.remove(begun)
-            how = "hang" if hung else "killed" if os.WIFSIGNALED(status) else "ended"
-            number = os.WTERMSIG(status) if os.WIFSIGNALED(status) else os.WEXITSTATUS(status)
-            told = (root / "stderr").read_text(errors="replace")[-2 * MOST :]
-            yield Result(begun, "broken", [Finding(f"process {how}", f"{number}", told)], 0.0)
-        elif status:
-            raise RuntimeError(f"{reader.name} made no input: {(root / 'stderr').read_text()[-3000:]}")
-
-
-def _lines(pipe: Any) -> Iterator[bytes | None]:
-    """Lines as they come; None where none comes for too long."""
-    rest = b""
-    while True:
-        if not select.select([pipe], [], [], SILENT)[0]:
-            yield None
-            return
-        data = pipe.read(65536)
-        if not data:
-            return
-        *whole, rest = (rest + data).split(b"\n")
-        yield from whole
-
-
-def shares(cases: int, names: Iterable[str]) -> dict[str, int]:
-    """How many of the cases each reader gets, at least one."""
-    chosen = {name: READERS[name].share for name in names}
-    return {name: max(1, round(cases * share / sum(chosen.values()))) for name, share in chosen.items()}
+            how = "killed" if (child.exitcode or 0) < 0 else "ended"
+            finding = Finding(f"process {how} {abs(child.exitcode or 0)}", "", text[-2 * MOST :])
+            yield Result(begun, "broken", [finding])
+        elif child.exitcode:
+            raise RuntimeError(f"{reader.name} made no input: {text[-3000:]}")
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -348,27 +291,25 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--reader", action="append", choices=[*READERS], help="only this; may be given again")
     parser.add_argument("--case", type=int, help="only the case of this number, and all that it says")
-    parser.add_argument("--keep", help="a folder to leave the case's files in")
+    parser.add_argument("--keep", type=Path, help="a folder to leave the case's files in")
     chosen = parser.parse_args(arguments)
     print("reader               cases  accepted  refused  findings  seconds", flush=True)
     distinct: dict[tuple[str, str], list[tuple[str, int, Finding]]] = defaultdict(list)
-    total = [0] * 4
-    root = Path(tempfile.mkdtemp(prefix="fuzz-")) if chosen.keep is None else Path(chosen.keep).resolve()
-    root.mkdir(exist_ok=True)
-    try:
-        for name, count in shares(chosen.cases, chosen.reader or READERS).items():
-            numbers = range(count) if chosen.case is None else [chosen.case]
-            outcomes, began = defaultdict(int), time.perf_counter()
-            for result in run(READERS[name], chosen.seed, numbers, root):
+    total: Counter[str] = Counter()
+    with ExitStack() as stack:
+        root = chosen.keep or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="fuzz-")))
+        root.mkdir(exist_ok=True)
+        readers = [READERS[name] for name in chosen.reader or READERS]
+        for reader in readers:
+            count = chosen.cases * reader.share / sum(one.share for one in readers)
+            numbers = range(max(1, round(count))) if chosen.case is None else [chosen.case]
+            outcomes, began = Counter(cases=len(numbers)), time.perf_counter()
+            for result in run(reader, chosen.seed, numbers, root.resolve()):
                 outcomes[result.outcome] += 1
                 for finding in result.findings:
-                    distinct[finding.kind, finding.where].append((name, result.case, finding))
-            counts = [len(numbers), *(outcomes[one] for one in ("accepted", "refused", "broken"))]
-            total = [a + b for a, b in zip(total, counts, strict=True)]
-            print(_row(name, counts), f"{time.perf_counter() - began:8.1f}", flush=True)
-    finally:
-        if chosen.keep is None:
-            shutil.rmtree(root, ignore_errors=True)
+                    distinct[finding.kind, finding.where].append((reader.name, result.case, finding))
+            total += outcomes
+            print(_row(reader.name, outcomes), f"{time.perf_counter() - began:8.1f}", flush=True)
     print(_row("all", total))
     for (kind, where), found in sorted(distinct.items(), key=lambda item: -len(item[1])):
         name, case, finding = found[0]
@@ -380,6 +321,6 @@ def main(arguments: list[str] | None = None) -> int:
     return 1 if distinct else 0
 
 
-def _row(name: str, counts: list[int]) -> str:
-    cases, accepted, refused, broken = counts
+def _row(name: str, counts: Counter[str]) -> str:
+    cases, accepted, refused, broken = (counts[one] for one in ("cases", "accepted", "refused", "broken"))
     return f"{name:<20} {cases:5}  {accepted:8}  {refused:7}  {broken:8}"

@@ -1,13 +1,13 @@
-"""Levels as a stream, and a stream that was damaged."""
+"""Levels as a stream, by Python and compiled, and a stream that was damaged."""
 
 from __future__ import annotations
 
 import math
+import sys
 import zlib
-from collections.abc import Iterator
-from typing import Any
 from unittest import mock
 
+import numpy as np
 import pytest
 import torch
 from helpers import refused
@@ -16,25 +16,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from dejavu_torch.maps import codec
-from dejavu_torch.maps.codec import (
-    Stream,
-    coded_bytes,
-    decode,
-    encode,
-)
-
-
-@pytest.fixture(scope="module", params=["python", "numba"], autouse=True)
-def coder(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Whatever is tested here, with either."""
-    if request.param == "python":
-        kernel: Any = codec._code
-    else:
-        pytest.importorskip("numba")
-        kernel = codec._compiled()
-    assert kernel is not None
-    with mock.patch.object(codec, "_kernel", return_value=kernel):
-        yield
+from dejavu_torch.maps.codec import Stream, coded_bytes, decode, encode
+from dejavu_torch.types import InputError
 
 
 def levels(rows: int = 200, columns: int = 7, spread: float = 3.0) -> Tensor:
@@ -42,29 +25,16 @@ def levels(rows: int = 200, columns: int = 7, spread: float = 3.0) -> Tensor:
     return (random * spread * torch.linspace(2, 0.1, rows)[:, None]).round().to(torch.int32)
 
 
-@given(st.integers(1, 40), st.integers(1, 20), st.floats(0.1, 500))
-def test_a_stream_gives_the_levels_back(rows: int, columns: int, spread: float) -> None:
-    own = levels(rows, columns, spread)
-    again = decode(encode(own), rows, columns)
+@given(
+    st.integers(1, 40), st.integers(1, 20), st.sampled_from([0.1, 3.0, 60.0, 500.0, 2e9]), st.integers(0, 99)
+)
+def test_a_stream_gives_the_levels_back(rows: int, columns: int, spread: float, seed: int) -> None:
+    random = torch.randn(rows, columns, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    own = (random * spread).round().clamp(1 - 2**31, 2**31 - 1).to(torch.int32)
+    stream = encode(own)
+    again = decode(stream, rows, columns)
     assert torch.equal(again.int(), own)
     assert again.dtype == (torch.int8 if int(own.max()) < 128 and int(own.min()) >= -128 else torch.int32)
-
-
-def test_levels_that_a_byte_does_not_hold() -> None:
-    for value in (128, -129, 2**31 - 1, 1 - 2**31):
-        own = levels()
-        own[150, 3] = value
-        stream = encode(own)
-        assert torch.equal(decode(stream, 200, 7), own)
-        assert 0 <= coded_bytes(own) - len(stream.bytes) <= 1
-
-
-@given(st.integers(1, 12), st.integers(1, 12), st.data())
-def test_any_levels_come_back(rows: int, columns: int, data: st.DataObject) -> None:
-    values = st.lists(st.integers(-128, 127), min_size=rows * columns, max_size=rows * columns)
-    own = torch.tensor(data.draw(values), dtype=torch.int8).view(rows, columns)
-    stream = encode(own)
-    assert torch.equal(decode(stream, rows, columns), own)
     assert 0 <= coded_bytes(own) - len(stream.bytes) <= 1
 
 
@@ -130,25 +100,21 @@ def test_damage_is_told() -> None:
     stream = encode(own)
     altered = stream.bytes.clone()
     altered[len(altered) // 2] ^= 8
-    damaged = (
-        Stream(stream.bytes[:-5], stream.checksum),
-        Stream(altered, stream.checksum),
-        Stream(stream.bytes, stream.checksum + 1),
-        Stream(torch.zeros(0, dtype=torch.uint8), stream.checksum),
-    )
-    for one in damaged:
+    for packed, checksum in ((altered, stream.checksum), (stream.bytes, stream.checksum + 1)):
         with refused("truncated or altered", "1400"):
-            decode(one, 200, 7)
+            decode(Stream(packed, checksum), 200, 7)
     for rows in (199, 201):
         with refused("truncated or altered", str(rows * 7)):
             decode(stream, rows, 7)
+    with refused("altered"):  # after its last bit that counts a stream goes on in zeros
+        decode(encode(torch.zeros(10, 4, dtype=torch.int8)), 11, 4)
 
 
 def test_a_stream_of_too_many_or_too_few_bytes_is_told() -> None:
     """Even where the levels are those of the checksum."""
     own = levels()
     stream = encode(own)
-    for part in (stream.bytes[:-1], torch.cat([stream.bytes, stream.bytes.new_zeros(1)])):
+    for part in (stream.bytes[:-5], stream.bytes[:-1], torch.cat([stream.bytes, torch.zeros(1).byte()])):
         with refused("truncated or altered", "1400 levels", f"{len(part)} bytes"):
             decode(Stream(part, stream.checksum), 200, 7)
 
@@ -160,18 +126,11 @@ def test_a_stream_of_anything_is_refused(packed: bytes, rows: int, columns: int)
         decode(stream, rows, columns)
 
 
-def test_a_claim_of_nothing_is_refused() -> None:
-    for rows, columns in ((0, 5), (5, -1)):
-        with refused(f"claims {rows} x {columns}", "at least one"):
-            decode(encode(levels()), rows, columns)
-
-
-def test_a_claim_beyond_the_memory_is_refused_before_anything_is_made(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_claim_of_nothing_or_beyond_the_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     stream = encode(levels())
-    with refused("claims 10000000000 x 10000", "memory"):
-        decode(stream, 10**10, 10**4)
+    for rows, columns in ((0, 5), (5, -1), (10**10, 10**4)):
+        with refused(f"claims {rows} x {columns}", "at least one", "memory"):
+            decode(stream, rows, columns)
     monkeypatch.setattr(codec, "free_memory", lambda: math.inf)
     assert decode(stream, 200, 7).shape == (200, 7)
 
@@ -188,8 +147,36 @@ def test_a_claim_of_endless_zeros_is_refused_before_they_are_decoded(monkeypatch
         encode(sparse)
 
 
-def test_the_shape_is_part_of_what_a_stream_says() -> None:
-    """Behind its last bit that counts a stream goes on in zeros."""
-    stream = encode(torch.zeros(10, 4, dtype=torch.int8))
-    with refused("altered"):
-        decode(stream, 11, 4)
+@given(st.integers(1, 700), st.integers(1, 12), st.integers(0, 400), st.integers(0, 2**32 - 1))
+def test_compiled_and_plain_are_one(rows: int, columns: int, spread: int, seed: int) -> None:
+    """Streams, and how an altered stream is refused."""
+    random = np.random.default_rng(seed)
+    own = (random.integers(-spread, spread + 1, (rows, columns)) * random.random((rows, 1)) ** 4).astype(int)
+    levels, told = torch.from_numpy(own).int(), []
+    for kernel in (codec._code, codec._compiled()):
+        with mock.patch.object(codec, "_kernel", return_value=kernel):
+            stream = encode(levels)
+            altered = stream.bytes.numpy().copy()
+            altered[seed // 8 % len(altered)] ^= 1 << seed % 8
+            told.append([stream.bytes.tolist(), stream.checksum])
+            for packed in (altered, altered[: len(altered) // 2]):
+                try:
+                    found = decode(Stream(torch.from_numpy(packed.copy()), stream.checksum), rows, columns)
+                    told[-1].append(found.tolist())
+                except InputError as error:
+                    told[-1].append(str(error))
+    assert told[0] == told[1]
+
+
+def test_it_is_compiled_once_it_pays_if_it_can_be(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(codec, "_coded", 0)
+    assert codec._kernel(codec.WORTH_COMPILING - 1) is codec._code
+    assert codec._kernel(1) is codec._compiled() is not codec._code
+    monkeypatch.setitem(sys.modules, "numba.extending", None)
+    codec._compiled.cache_clear()
+    with caplog.at_level("INFO", "dejavu_torch"):
+        assert codec._kernel(1) is codec._kernel(1) is codec._code
+    codec._compiled.cache_clear()
+    assert ["not by numba" in line for line in caplog.messages] == [True]

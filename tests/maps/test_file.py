@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import pickle
 import sys
@@ -44,27 +43,6 @@ class Small(nn.Module):
 
     def forward(self, frames: Tensor) -> Tensor:
         return self.layers(frames)
-
-
-class Tied(nn.Module):
-    """Two layers that share one weight."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.encode = nn.Linear(8, 8)
-        self.again = nn.Linear(8, 8)
-        self.again.weight = self.encode.weight
-
-    def forward(self, frames: Tensor) -> Tensor:
-        return self.again(self.encode(frames.mean((1, 2))))
-
-
-class Stateful(Fixed):
-    """A period finder with a buffer of its own."""
-
-    def __init__(self, *layers: FrequencyLayer) -> None:
-        super().__init__(*layers)
-        self.register_buffer("prior", torch.ones(3))
 
 
 def waves(frames: int = 64) -> Tensor:
@@ -142,26 +120,13 @@ def test_scores_are_equal_bit_for_bit(path: Path, metric: str, reduction: Any) -
     assert (DejaVu.load(path).map.places, DejaVu.load(path).frame_shape) == (80, (2,))
 
 
-@pytest.mark.parametrize("layers", [(), (FrequencyLayer(Fraction(195, 2), 98, 10, 300, (0, 3)),)])
-def test_any_plan_comes_back(path: Path, layers: tuple[FrequencyLayer, ...]) -> None:
-    """97.5 frames in 98 phases, and none."""
-    model, query = template_model(periods=Fixed(*layers)).learn(torch.rand(310, 5)), torch.rand(20, 5)
-    model.save(path)
-    again = DejaVu.load(path)
-    assert (again.map.plan, again.map.places, again.map.dimension) == (layers, 310, 5)
-    assert torch.equal(again(query), model(query))
-
-
 def test_a_map_of_frames_comes_back_with_its_features_and_periods(path: Path) -> None:
-    model = template_model(
-        HOG(cell=4, resize=(16, 16)), SpectrogramAnalysis(window=64, peaks="bins", false_alarm=None)
-    )
-    model.learn(pictures()).save(path)
-    again = DejaVu.load(path)
-    query = pictures(20) + 0.1 * torch.rand(20, 1, 24, 24)
+    finder = SpectrogramAnalysis(window=64, peaks="bins", false_alarm=None)
+    model = template_model(HOG(cell=4, resize=(16, 16)), finder).learn(pictures())
+    model.save(path)
+    again, query = DejaVu.load(path), pictures(20) + 0.1 * torch.rand(20, 1, 24, 24)
     assert torch.equal(again(query), model(query))
     assert torch.equal(again.learn(pictures()).map.templates, model.map.templates)
-    assert again.map.plan == model.map.plan
 
 
 # the file
@@ -176,46 +141,25 @@ def test_one_file_of_the_size_the_map_claims(saved: Path) -> None:
 
 def test_no_pickle_is_written_or_read(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model = template_model(Small(), WINDOW).learn(pictures())
-
-    def forbidden(*_: object, **__: object) -> None:
-        raise AssertionError("pickle was used")
-
-    for module, names in (
-        (pickle, ("dump", "dumps", "load", "loads", "Pickler", "Unpickler")),
-        (torch, ("load", "save")),
-    ):
-        for name in names:
-            monkeypatch.setattr(module, name, forbidden)
+    for name in ("dump", "dumps", "load", "loads", "Pickler", "Unpickler"):
+        monkeypatch.delattr(pickle, name)
+    for name in ("load", "save"):
+        monkeypatch.delattr(torch, name)
     model.save(path)
     DejaVu.load(path, Small())
 
 
-def test_a_full_disk_keeps_the_old_map(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    model, before = DejaVu.load(saved), saved.read_bytes()
-
-    def half(_: object, path: Path, *__: object) -> None:
-        path.write_bytes(before[:100])
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(safetensors.torch, "save_file", half)
-    with refused(str(saved), "No space left on device"):
-        model.save(saved)
-    assert list(saved.parent.iterdir()) == [saved]
-    assert saved.read_bytes() == before
-
-
 def test_where_a_map_cannot_be_written(tmp_path: Path) -> None:
-    model, path = template_model(periods=WINDOW).learn(waves()), tmp_path / "a.safetensors"
-    endless = template_model(periods=WINDOW).learn(waves())
+    model, endless = (template_model(periods=WINDOW).learn(waves()) for _ in range(2))
     endless.batch_size = 2**60
     for one, where, words in (
-        (model, tmp_path / "missing" / "a.safetensors", ["missing", "does not exist"]),
-        (model, tmp_path, [str(tmp_path), "is a folder"]),
-        (DejaVu(), path, ["no map yet", "learn"]),
-        (endless, path, ["batch_size", "2^53"]),
+        (model, "missing/a.safetensors", ["missing", "does not exist"]),
+        (model, "", [str(tmp_path), "is a folder"]),
+        (DejaVu(), "a.safetensors", ["no map yet", "learn"]),
+        (endless, "a.safetensors", ["batch_size", "2^53"]),
     ):
         with refused(*words):
-            one.save(where)
+            one.save(tmp_path / where)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -224,14 +168,20 @@ def test_where_a_map_cannot_be_written(tmp_path: Path) -> None:
 
 def test_a_truncated_map_is_refused_at_any_length(saved: Path) -> None:
     whole = saved.read_bytes()
-    for length in [0, 1, 7, 8, 9, *range(20, len(whole), 61), len(whole) - 1]:
+    for length in [0, 1, 7, 8, 9, *range(20, len(whole), 211), len(whole) - 1]:
         saved.write_bytes(whole[:length])
         with refused(str(saved), "truncated", "expected a whole one"):
             DejaVu.load(saved)
 
 
-def with_version(path: Path, version: int) -> None:
-    with_metadata(path, {NAME: json.dumps(contents(path)[1] | {"version": version})})
+SEALED = f'{{"version": {FORMAT}, "checksums": '
+TEXTS = ["", "[]", "[" * 100_000, '{"version": true, "header": {}}', SEALED + '{}, "header": []}']
+TEXTS += [f'{SEALED}3, "header": {{"threshold": {odd}}}}}' for odd in ("NaN", "1e999", "1" * 5000)]
+
+
+def with_sealed(path: Path, **changes: Any) -> None:
+    """Give a map file another version, other checksums or another header."""
+    with_metadata(path, {NAME: json.dumps(contents(path)[1] | changes)})
 
 
 @pytest.mark.parametrize(
@@ -239,15 +189,17 @@ def with_version(path: Path, version: int) -> None:
     [
         (lambda path: path.unlink(), ["not there"]),
         (lambda path: [path.unlink(), path.mkdir()], ["is a folder", "map file"]),
-        *(
-            (lambda path, text=text: path.write_bytes(text), ["no map file"])
-            for text in (b"text", bytes(500))
-        ),
+        (lambda path: path.write_bytes(bytes(500)), ["no map file"]),
         (lambda path: torch.save({"state_dict": {}}, path), ["is a checkpoint", "dejavu train export"]),
         (lambda path: with_metadata(path, None), ["no map of dejavu_torch"]),
         (lambda path: with_metadata(path, {"format": NAME}), ["an old one", "learn the route anew"]),
-        (lambda path: with_version(path, 5), ["format 5", f"reads {FORMAT}", "learn the route anew"]),
-        (lambda path: with_version(path, FORMAT + 1), [f"format {FORMAT + 1}", f"reads {FORMAT}", "newer"]),
+        (lambda path: with_sealed(path, version=5), ["format 5", f"reads {FORMAT}", "learn the route anew"]),
+        (lambda path: with_sealed(path, version=FORMAT + 1), [f"format {FORMAT + 1}", "newer"]),
+        *(
+            (lambda path, sums=sums: with_sealed(path, checksums=sums), ["is damaged"])
+            for sums in ({}, None, {"map": "0"})
+        ),
+        *((lambda path, text=text: with_metadata(path, {NAME: text}), []) for text in TEXTS),
     ],
 )
 def test_what_is_no_map_is_refused(saved: Path, change: Any, words: list[str]) -> None:
@@ -256,51 +208,18 @@ def test_what_is_no_map_is_refused(saved: Path, change: Any, words: list[str]) -
         DejaVu.load(saved)
 
 
-def test_damaged_metadata_is_refused(saved: Path) -> None:
-    whole = saved.read_bytes()
-    start = f'{{"version": {FORMAT}, "checksums": '
-    odd = (f'3, "header": {{"threshold": {value}}}}}' for value in ("NaN", "1e999", "1" * 5000))
-    texts = [
-        "",
-        "{",
-        "[]",
-        "{}",
-        "[" * 100_000,
-        f'{{"version": {FORMAT}}}',
-        '{"version": true, "header": {}}',
-    ]
-    for text in (*texts, *(start + end for end in ('{}, "header": []}', '{}, "header": {}}', *odd))):
-        saved.write_bytes(whole)
-        with_metadata(saved, {NAME: text})
-        with refused(str(saved)):
-            DejaVu.load(saved)
-
-
 MAPPER, FEATURES, WHITENING = "mapper.init_args.", "features.init_args.", "whitening.init_args."
 GROUND = recipe_of(GroundOdometry())._asdict()
 CRAFTED_TEMPLATES: list[tuple[dict[str, Any], dict[str, Any], list[str]]] = [
-    *(
-        ({}, header, [])
-        for header in (
-            {MAPPER + "metric": "l7"},
-            {MAPPER + "metric": "l2"},
-            {MAPPER + "temperature": "warm"},
-            {"mapper": {"class_path": "HOG", "init_args": {}}},
-            {"mapper": 3},
-            {MAPPER + "periods": {"class_path": "HOG", "init_args": {}}},
-            {"map": {"kind": "templates"}},
-            {"batch_size": 0},
-            {"threshold": "low"},
-            {"features": None},
-            {"features": {"class_path": 5, "init_args": {}}},
-            {FEATURES + "cells": 8},
-            {FEATURES + "cell": 0},
-            {"features": {"class_path": "dejavu_torch.features.hog.HOG", "init_args": {}}},
-            {"velocity": {"class_path": "HOG", "init_args": {}}},
-            {"step": "far"},
-            {"trained": {"steps": 3}},
-        )
-    ),
+    ({}, {MAPPER + "metric": "l7"}, ["'l7'"]),
+    ({}, {MAPPER + "temperature": "warm"}, ["'warm'"]),
+    ({}, {"mapper": {"class_path": "HOG", "init_args": {}}}, ["HOG"]),
+    ({}, {"map": {"kind": "templates"}}, []),
+    ({}, {"batch_size": 0}, []),
+    ({}, {"features": None}, []),
+    ({}, {"features": {"class_path": 5, "init_args": {}}}, []),
+    ({}, {FEATURES + "cells": 8}, ["cells"]),
+    ({}, {"trained": {"steps": 3}}, ["steps"]),
     ({}, {"map.kind": "holographic"}, ["holographic", "templates"]),
     ({}, {"step": 2.0, "velocity": GROUND}, ["step", "frame positions"]),
     ({"map.positions": torch.arange(64.0)}, {}, ["step", "frame positions"]),
@@ -317,17 +236,64 @@ CRAFTED_TEMPLATES: list[tuple[dict[str, Any], dict[str, Any], list[str]]] = [
     ),
     ({"features.weight": torch.zeros(3)}, {}, ["features.weight"]),
     ({"map.layers": [[2**60, 1, 8, 0, 64], [9, 1, 9, 0, 64]]}, {}, ["below 2^63"]),
-    ({"map.templates": None}, {}, ["does not hold", "templates"]),
+    ({"map.templates": None}, {}, ["it holds", "expected", "templates"]),
+]
+CRAFTED_LINES: list[tuple[dict[str, Any], dict[str, Any], list[str]]] = [
+    ({}, {"batch_size": 2**62}, ["below 2^53"]),
+    ({}, {"batch_size": True}, ["True", "int"]),
+    ({}, {"frame_shape": [1, 10**9, 10**9]}, []),
+    ({}, {"names": "x" * 100}, []),
+    ({}, {"surprise": 1}, []),
+    ({}, {FEATURES + "widths": [10**6]}, []),
+    ({}, {FEATURES + "resize": [10**9, 10**9]}, []),
+    ({}, {FEATURES + "resize": [16]}, ["[16]"]),
+    ({}, {WHITENING + "power": "nan"}, ["'nan'"]),
+    ({}, {MAPPER + "resolution": -1.0}, ["-1.0"]),
+    ({}, {"map.dimension": 10**12}, []),
+    ({}, {"map.metric": "l2"}, ["'l2'"]),
+    ({}, {"map.temperature": 1.0}, []),
+    ({}, {"names": encode_names([f"{i:05}.png" for i in range(10_000)])}, ["10000 frames; expected 64"]),
+    ({"map.lengths": [10**12]}, {}, ["[1000000000000] places"]),
+    ({"map.lengths": [-64]}, {}, ["[-64] places"]),
+    ({"map.lengths": torch.tensor([64.0])}, {}, ["lengths (1,) torch.float32"]),
+    ({"map.stream_table": [[-1, 0]]}, {}, ["the table claims [-1]"]),
+    ({"map.stream_table": torch.zeros(0, 2, dtype=torch.int64)}, {}, ["(0, 2) for 1 chunks"]),
+    ({"map.steps": torch.tensor([3e38])}, {}, ["not finite"]),
+    ({"map.steps": torch.tensor([float("nan")])}, {}, ["finite numbers above 0"]),
 ]
 
 
-def test_crafted_template_maps_are_refused(saved: Path) -> None:
-    whole = saved.read_bytes()
-    for tensors, header, words in CRAFTED_TEMPLATES:
-        saved.write_bytes(whole)
-        craft(saved, tensors, **header)
-        with refused(str(saved), *words):
-            DejaVu.load(saved)
+@pytest.mark.parametrize(("kind", "crafted"), [(0, CRAFTED_LINES), (1, CRAFTED_TEMPLATES)])
+def test_crafted_maps_are_refused(path: Path, whole_maps: list[Path], kind: int, crafted: Any) -> None:
+    for tensors, header, words in crafted:
+        path.write_bytes(whole_maps[kind].read_bytes())
+        craft(path, tensors, **header)
+        with refused(str(path), *words):
+            DejaVu.load(path)
+
+
+def test_crafted_parts_are_refused(path: Path, whole_maps: list[Path]) -> None:
+    """Features within features, and whitening that makes more numbers than the map holds."""
+    own, sealed = contents(whole_maps[0])
+    scale, offset = own["whitening.scale"], own["whitening.offset"]
+    wider = {
+        "whitening.projection": torch.zeros(12, (len(scale) + 2) // 2, dtype=torch.uint8),
+        "whitening.scale": torch.cat([scale, scale[:1]]),
+        "whitening.offset": torch.cat([offset, offset[:1]]),
+    }
+    nested = sealed["header"]["features"]
+    init_args = {"dimension": 4, "channels": 1, "resize": [8, 8], "grid": 1, "cell": 0, "hidden": 0}
+    for _ in range(150):
+        arguments = {"network": nested, **init_args, "noise": 1.0, "kept": 128}
+        nested = {"class_path": "Embedding", "init_args": arguments}
+    for tensors, header, words in (
+        ({}, {"features": nested}, ["151 parts; expected at most 16"]),
+        (wider, {}, ["whitening makes", f"the map's {len(scale)}"]),
+    ):
+        path.write_bytes(whole_maps[0].read_bytes())
+        craft(path, tensors, **header)
+        with refused(str(path), *words):
+            DejaVu.load(path)
 
 
 def test_what_a_file_lacks_or_cannot_be_imported_has_its_default(saved: Path, trap: Path) -> None:
@@ -383,14 +349,6 @@ def test_damage_is_told_by_its_part(whole_maps: list[Path], path: Path, part: st
         DejaVu.load(path)
 
 
-def test_a_checksum_that_is_missing_is_damage(saved: Path) -> None:
-    sealed = contents(saved)[1]
-    for sums in ({}, None, {**sealed["checksums"], "other": "0"}, {"map": sealed["checksums"]["map"]}):
-        with_metadata(saved, {NAME: json.dumps(sealed | {"checksums": sums})})
-        with refused("is damaged"):
-            DejaVu.load(saved)
-
-
 def test_the_same_model_gives_the_same_bytes(whole_maps: list[Path], path: Path) -> None:
     for whole in whole_maps:
         for _ in range(4):
@@ -398,106 +356,13 @@ def test_the_same_model_gives_the_same_bytes(whole_maps: list[Path], path: Path)
             assert path.read_bytes() == whole.read_bytes()
 
 
-CRAFTED_LINES: list[tuple[dict[str, Any], dict[str, Any], list[str]]] = [
-    *(
-        ({}, header, [])
-        for header in (
-            {"batch_size": 2**62},
-            {"batch_size": True},
-            {"frame_shape": [1, 10**9, 10**9]},
-            {"frame_shape": [1, -4, 4]},
-            {"trained": {"steps": "many", "seed": 0}},
-            {"names": "x" * 100},
-            {"surprise": 1},
-            {FEATURES + "widths": [10**6]},
-            {FEATURES + "widths": "wide"},
-            {FEATURES + "dimension": 10**9},
-            {FEATURES + "squeeze": 10**9},
-            {FEATURES + "resize": [10**9, 10**9]},
-            {FEATURES + "resize": [16]},
-            {WHITENING + "power": "nan"},
-            {WHITENING + "bits": 4.0},
-            {WHITENING + "strengths": {"gain": 2**62}},
-            {MAPPER + "resolution": -1.0},
-            {MAPPER + "route_bytes_per_place": [5]},
-            {"map": [1]},
-            {"map.places": 10**12},
-            {"map.dimension": 10**12},
-            {"map.metric": "l2"},
-            {"map.temperature": 1.0},
-        )
-    ),
-    ({}, {"names": encode_names([f"{i:05}.png" for i in range(10_000)])}, ["10000 frames; expected 64"]),
-    ({"map.lengths": [10**12]}, {}, ["[1000000000000] places"]),
-    ({"map.lengths": [-64]}, {}, ["[-64] places"]),
-    ({"map.lengths": torch.tensor([64.0])}, {}, ["lengths (1,) torch.float32"]),
-    ({"map.lengths": None}, {}, ["does not hold", "lengths"]),
-    ({"map.stream_table": [[-1, 0]]}, {}, ["the table claims [-1]"]),
-    ({"map.stream_table": torch.zeros(0, 2, dtype=torch.int64)}, {}, ["(0, 2) for 1 chunks"]),
-    ({"map.steps": torch.tensor([3e38])}, {}, ["not finite"]),
-    ({"map.steps": torch.tensor([float("nan")])}, {}, ["finite numbers above 0"]),
-]
-
-
-def test_crafted_spectral_maps_are_refused(path: Path, whole_maps: list[Path]) -> None:
-    own, sealed = contents(whole_maps[0])
-    scale, offset = own["whitening.scale"], own["whitening.offset"]
-    wider = {
-        "whitening.projection": torch.zeros(12, (len(scale) + 2) // 2, dtype=torch.uint8),
-        "whitening.scale": torch.cat([scale, scale[:1]]),
-        "whitening.offset": torch.cat([offset, offset[:1]]),
-    }
-    nested = sealed["header"]["features"]
-    init_args = {"dimension": 4, "channels": 1, "resize": [8, 8], "grid": 1, "cell": 0, "hidden": 0}
-    for _ in range(150):
-        arguments = {"network": nested, **init_args, "noise": 1.0, "kept": 128}
-        nested = {"class_path": "Embedding", "init_args": arguments}
-    for tensors, header, words in (
-        *CRAFTED_LINES,
-        ({}, {"features": nested}, ["151 parts; expected at most 16"]),
-        (wider, {}, ["whitening makes", f"the map's {len(scale)}"]),
-    ):
-        path.write_bytes(whole_maps[0].read_bytes())
-        craft(path, tensors, **header)
-        for read in (DejaVu.load, read_place_map) if tensors and tensors is not wider else (DejaVu.load,):
-            with refused(str(path), *words):
-                read(path)
-
-
-class Masked(nn.Module):
-    """Features with a buffer that is expanded, and infinite in part."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.register_buffer("mask", torch.tensor([0.0, -torch.inf]).expand(4, 2))
-
-    def forward(self, frames: Tensor) -> Tensor:
-        return frames.flatten(1)[:, :32] + self.mask[:, 0].sum()
-
-
-@pytest.mark.parametrize("make", [Masked, Tied])
-def test_modules_from_elsewhere_may_have_any_state(path: Path, make: Any) -> None:
-    finder = Stateful(FrequencyLayer(Fraction(8), 8, 0, 64, (0,)))
-    model, query = template_model(make(), finder).learn(pictures(size=8)), pictures(5, 8)
-    model.save(path)
-    loaded, own = DejaVu.load(path, make()), model.features.state_dict()
-    assert all(torch.equal(tensor, own[name]) for name, tensor in loaded.features.state_dict().items())
-    assert torch.equal(loaded.localize(query).score, model.localize(query).score)
-
-
 # features from elsewhere
 
 
-@pytest.fixture
-def small_map(path: Path) -> tuple[Path, DejaVu]:
+def test_features_from_elsewhere_get_their_weights_from_the_file(path: Path) -> None:
     torch.manual_seed(0)
     model = template_model(Small(), SpectrogramAnalysis(window=64, false_alarm=None)).learn(pictures())
     model.save(path)
-    return path, model
-
-
-def test_features_from_elsewhere_get_their_weights_from_the_file(small_map: tuple[Path, DejaVu]) -> None:
-    path, model = small_map
     torch.manual_seed(1)
     features = Small()
     again = DejaVu.load(path, features)
@@ -509,22 +374,6 @@ def test_features_from_elsewhere_get_their_weights_from_the_file(small_map: tupl
     # convolution 3 x 9 + 3, batch norm 4 x 3 floats, and its int64 counter
     assert model.summary().fixed["backbone"] == 4 * (30 + 12) + 8
     assert path.stat().st_size == model.summary().map_bytes
-
-
-def test_other_features_are_refused(small_map: tuple[Path, DejaVu], tmp_path: Path) -> None:
-    path, wider, hog = small_map[0], Small(), tmp_path / "hog.safetensors"
-    wider.layers[0] = nn.Conv2d(1, 4, 3)
-    template_model(HOG(cell=4), periods=WINDOW).learn(pictures()).save(hog)
-    assert DejaVu.load(hog, HOG(cell=4)).map.places == 64
-    for file, given, words in (
-        (path, None, ["Small", "`features`"]),
-        (path, HOG(), ["Small", "HOG"]),
-        (path, wider, ["does not fit"]),
-        (hog, Small(), ["HOG", "Small"]),
-        (hog, HOG(cell=8), ["cell", "learned with"]),
-    ):
-        with refused(*words):
-            DejaVu.load(file, given)
 
 
 # an Embedding: features of this package around a network that may be from elsewhere
@@ -541,28 +390,13 @@ class Patch(nn.Module):
         return self.convolution(frames)
 
 
-class Moving(Patch):
-    """A network that makes tensors as it runs."""
-
-    def forward(self, frames: Tensor) -> Tensor:
-        maps = super().forward(frames)
-        return maps + torch.linspace(0, 1, maps.shape[-1])
-
-
-class Sized(Small):
-    """Features from elsewhere, with a `resize` of their own."""
-
-    resize = 224
-
-
 def embedding(network: nn.Module, **settings: Any) -> Embedding:
     return Embedding(network, **{"dimension": 5, "channels": 1, "resize": (8, 8)} | settings)
 
 
 def learnt_with(features: nn.Module, path: Path) -> DejaVu:
-    model = template_model(features, Fixed(FrequencyLayer(Fraction(8), 8, 0, 64, (0, 1, 2)))).learn(
-        pictures()
-    )
+    finder = Fixed(FrequencyLayer(Fraction(8), 8, 0, 64, (0, 1, 2)))
+    model = template_model(features, finder).learn(pictures())
     model.save(path)
     return model
 
@@ -598,54 +432,48 @@ def test_an_embedding_of_a_network_from_elsewhere_must_be_given(path: Path) -> N
         assert not again.training
 
 
-def test_a_network_that_is_given_may_do_as_it_likes(path: Path) -> None:
-    learnt_with(embedding(Moving()), path)
-    assert isinstance(DejaVu.load(path, Moving()).features.network, Moving)
-    assert learnt_with(Sized(), path).map.places == 64
-
-
 @pytest.mark.parametrize(
-    ("make", "words"),
+    ("own", "given", "words"),
     [
-        (lambda: embedding(Patch(), grid=2), ("Embedding of grid=1; got grid=2",)),
-        (lambda: embedding(Small()), ("Patch", "Small")),
-        (Small, ("Embedding; got", "Small")),
-        (lambda: embedding(Patch(3)), ("does not fit",)),
+        (Small, HOG, ("Small", "HOG")),
+        (HOG, Small, ("HOG", "Small")),
+        (HOG, lambda: HOG(cell=4), ("cell", "learned with")),
+        (
+            lambda: embedding(Patch()),
+            lambda: embedding(Patch(), grid=2),
+            ("Embedding of grid=1; got grid=2",),
+        ),
+        (lambda: embedding(Patch()), lambda: embedding(Small()), ("Patch", "Small")),
+        (lambda: embedding(Patch()), Small, ("Embedding; got", "Small")),
+        (lambda: embedding(Patch()), lambda: embedding(Patch(3)), ("does not fit",)),
     ],
 )
-def test_another_embedding_is_refused(path: Path, make: Any, words: tuple[str, ...]) -> None:
-    learnt_with(embedding(Patch()), path)
+def test_other_features_are_refused(path: Path, own: Any, given: Any, words: tuple[str, ...]) -> None:
+    learnt_with(own(), path)
     with refused(str(path), *words):
-        DejaVu.load(path, make())
+        DejaVu.load(path, given())
 
 
 # what training leaves in the file
 
 
-@pytest.fixture
-def trained(path: Path) -> DejaVu:
-    """As training leaves a model: templates, weights and temperature that no eq. 1 gives."""
+def test_a_trained_map_comes_back(path: Path) -> None:
+    """Templates, weights and temperature that no eq. 1 gives."""
     model = template_model(periods=WINDOW, temperature=0.07).learn(waves())
     model.map.trainable(weights=True, start=torch.tensor([0.5, -2.0]))
     with torch.no_grad():
         model.map.templates.add_(0.1)
     model.map.freeze()
-    model.trained = Training(steps=12, seed=4)
-    model.save(path)
-    return model
-
-
-def test_a_trained_map_comes_back(path: Path, trained: DejaVu) -> None:
-    again, query = DejaVu.load(path), waves() + 0.3 * torch.rand(64, 2)
-    assert torch.equal(again(query), trained(query))
-    assert (again.map.weights.tolist(), again.map.temperature) == ([0.5, 2.0], 0.07)
-    assert path.stat().st_size == trained.summary().map_bytes == again.summary().map_bytes
-    assert torch.equal(read_place_map(path).weights, again.map.weights)
-    for made in (Training(12, 4), Training(0, None)):
-        trained.trained = made
-        trained.save(path)
+    for made in (Training(0, None), Training(12, 4)):
+        model.trained = made
+        model.save(path)
         assert DejaVu.load(path).trained == made
-    trained.learn(waves()).save(path)  # by eq. 1 again
+    again, query = DejaVu.load(path), waves() + 0.3 * torch.rand(64, 2)
+    assert torch.equal(again(query), model(query))
+    assert (again.map.weights.tolist(), again.map.temperature) == ([0.5, 2.0], 0.07)
+    assert path.stat().st_size == model.summary().map_bytes == again.summary().map_bytes
+    assert torch.equal(read_place_map(path).weights, again.map.weights)
+    model.learn(waves()).save(path)  # by eq. 1 again
     again = DejaVu.load(path)
     assert (again.trained, len(again.map.weights)) == (None, 0)
 

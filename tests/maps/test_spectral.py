@@ -16,7 +16,6 @@ from helpers import refused
 from torch import Tensor
 
 from dejavu_torch import DejaVu, PhaseTemplates
-from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.maps import spectral_map
 from dejavu_torch.maps.quantisation import dead_zone, quantise
 from dejavu_torch.maps.spectral import SpectralMapper, code_chunk
@@ -108,41 +107,6 @@ def test_the_written_route_is_within_the_budget(budget: float, chunk: Any, tmp_p
     assert torch.equal(again(descriptors[:5]), model(descriptors[:5]))
 
 
-class Named(ArrayTraverse):
-    """Ready features with a counter that jitters, or a random name, for each frame."""
-
-    def __init__(self, values: Tensor, random: bool) -> None:
-        super().__init__(values)
-        draw = torch.randint(10**9, (len(values), 3), generator=torch.Generator().manual_seed(0)).tolist()
-        self.names = [
-            f"{a}-{b}-{c}.png" if random else f"{40 * i + (a % 8 == 0)}.png"
-            for i, (a, b, c) in enumerate(draw)
-        ]
-
-    def frame_name(self, i: int) -> str:
-        return self.names[i]
-
-
-@pytest.mark.parametrize(("random", "places"), [(False, 1000), (True, 111)])
-def test_names_are_beside_the_budget(
-    places: int, random: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    """Of names next to nothing long, and of over the budget: the coded lines are those of no names."""
-    mapper = SpectralMapper(4.0)
-    model = DejaVu(mapper=mapper, whitening="none").learn(Named(route(places, 24), random=random))
-    summary = model.summary()
-    assert "names" not in summary.route
-    assert summary.fixed["names"] > (4.0 if random else 0.2) * places
-    assert f"names {summary.fixed['names']}" in str(summary)
-    model.save(tmp_path / "m.safetensors")
-    again = DejaVu.load(tmp_path / "m.safetensors").summary()
-    assert again.map_bytes == summary.map_bytes == (tmp_path / "m.safetensors").stat().st_size
-    plain = model.learn(route(places, 24)).summary()
-    assert plain.route == summary.route
-    assert 0.98 * 4 <= plain.route_bytes / places <= 4
-    assert not caplog.text
-
-
 def test_positions_leave_the_lines_half_of_what_mean_and_chunks_leave(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -154,31 +118,9 @@ def test_positions_leave_the_lines_half_of_what_mean_and_chunks_leave(
     assert beside.lines == alone.lines > 0
 
 
-@pytest.mark.parametrize(("numbers", "share"), [(1, 0.9), (3, 0.5), (9, 1.2)])
-def test_the_budget_is_met_where_levels_are_nearly_all_different(numbers: int, share: float) -> None:
-    """Of few large levels the counts say little of what they take."""
-    budget = numbers * share + 0.4
-    for noise in (torch.randn(200, numbers), torch.randn(200, numbers) / torch.rand(200, numbers)):
-        learned = SpectralMapper(budget)(noise)
-        finest = float(learned.steps) < 0.02 * float(learned.decode(0).std())  # no finer step is tried
-        assert learned.summary().route_bytes <= budget * 200
-        assert learned.summary().route_bytes >= 0.97 * budget * 200 or finest
-
-
-def test_a_budget_that_no_line_fits_in_is_refused() -> None:
-    descriptors = route(60, 15)
-    nothing = SpectralMapper(None, step=1e9)(descriptors).summary()
-    assert nothing.lines == 0
-    with refused(f"expected more than {nothing.route_bytes / 60:.3g}"):
-        SpectralMapper(nothing.route_bytes / 60)(descriptors)
-    learned = SpectralMapper(nothing.route_bytes / 60 + 0.2)(descriptors).summary()
-    assert learned.lines > 0
-    assert learned.route_bytes <= nothing.route_bytes + 0.2 * 60
-
-
 @pytest.mark.parametrize(
     ("places", "numbers", "chunk"),
-    [(2, 1, 10_000), (2, 300, 4), (3, 6, 10_000), (5, 2, 4), (8, 300, 4), (12, 6, 4), (12, 2, 10_000)],
+    [(2, 1, 10_000), (3, 6, 10_000), (8, 300, 4), (12, 2, 10_000)],
 )
 def test_on_a_short_route_the_default_budget_gives_way(
     places: int, numbers: int, chunk: Any, caplog: pytest.LogCaptureFixture
@@ -191,8 +133,7 @@ def test_on_a_short_route_the_default_budget_gives_way(
     assert all(f"{places} places" in line for line in caplog.messages)
     if not caplog.messages:
         return
-    rebuilt = torch.cat([learned.decode(g) for g in range(len(learned.chunks))])
-    apart = (rebuilt - descriptors).square().sum() / (descriptors - descriptors.mean(0)).square().sum()
+    apart = (held(learned) - descriptors).square().sum() / (descriptors - descriptors.mean(0)).square().sum()
     assert apart < 0.2  # at least .85 of the variance, but for the last step of the search
     # where the budget is given it is refused, and what the line names works
     with pytest.raises(InputError) as refusal:
@@ -305,17 +246,6 @@ def test_noise_tells_what_half_of_its_variance_needs() -> None:
     assert SpectralMapper(None, step=100.0)(noise).needed == pytest.approx(needed, rel=0.01)
 
 
-@pytest.mark.slow
-def test_the_map_is_exported() -> None:
-    for transform in ("dft", "dct"):
-        learned = SpectralMapper(transform=transform, chunk=150)(route())
-        program = torch.export.export(
-            learned, (route()[:4],), dynamic_shapes={"queries": {0: torch.export.Dim("batch")}}
-        ).module()
-        for batch in (1, 8, 100):
-            assert torch.allclose(program(route()[:batch]), learned(route()[:batch]), atol=1e-5)
-
-
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
@@ -325,7 +255,7 @@ def test_the_map_is_exported() -> None:
         ({"chunk": 1}, ("chunk is 1", "at least 2")),
         ({"chunk": "route"}, ("'route'", "10000")),
         ({"transform": "fft"}, ("'fft'", "'dct'")),
-        ({"metric": "l1"}, ("'l1'", "'cosine' or 'l2'")),
+        ({"metric": "l1"}, ("'l1'", "'cosine', 'l2'")),
         ({"resolution": math.nan}, ("resolution is nan", "0 or more")),
         ({"route_bytes_per_place": 0.01}, ("0.01", "mean", "at most 48")),
         ({"route_bytes_per_place": 200.0}, ("200", "mean", "at most 48")),
@@ -336,18 +266,24 @@ def test_settings_out_of_range_are_refused(settings: dict[str, Any], words: tupl
         SpectralMapper(**settings)(route())
 
 
-def test_what_is_no_route_is_refused() -> None:
-    for descriptors, words in (
+@pytest.mark.parametrize(
+    ("descriptors", "words"),
+    [
         (torch.rand(1, 4), ("(1, 4)", "at least 2")),
         (torch.rand(4), ("(4,)", "(N, K)")),
         (torch.rand(4, 0), ("(4, 0)", "(N, K)")),
         (torch.ones(9, 4, dtype=torch.int64), ("int64", "floats")),
         (torch.ones(9, 4), ("9 descriptors", "all alike")),
         (torch.full((9, 4), math.nan), ("NaN",)),
-    ):
-        with refused(*words):
-            SpectralMapper()(descriptors)
-    learned = SpectralMapper(chunk=50)(route(60, 5))
+    ],
+)
+def test_what_is_no_route_is_refused(descriptors: Tensor, words: tuple[str, ...]) -> None:
+    with refused(*words):
+        SpectralMapper()(descriptors)
+
+
+def test_what_does_not_fit_a_map_is_refused() -> None:
+    learned, other = SpectralMapper(chunk=50)(route(60, 5)), SpectralMapper(chunk=50).empty()
     with refused("(3, 4)", "(Q, 5)"):
         learned.scores(torch.rand(3, 4))
     with refused("(50, 12)", "(N, 5)"):
@@ -357,22 +293,16 @@ def test_what_is_no_route_is_refused() -> None:
     with refused("truncated or altered"):
         learned.extend([altered])
     assert (learned.places, len(learned.chunks)) == (60, 2)
-
-
-@pytest.mark.parametrize(
-    ("name", "change", "words"),
-    [
-        ("streams", lambda t: t[:-9], ("bytes", "claims")),
-        ("streams", lambda t: t ^ (torch.arange(len(t)) == 40), ("altered", "expected")),
-        ("stream_table", lambda t: t[:, :1], ("expected",)),
-        ("means", lambda t: t[:, :-1], ("expected",)),
-    ],
-)
-def test_a_damaged_map_is_refused(name: str, change: Any, words: tuple[str, ...]) -> None:
-    learned, other = SpectralMapper(chunk=100)(route()), SpectralMapper(chunk=100).empty()
     tensors = learned.packed()
-    with refused(*words):
-        other.load_packed(tensors | {name: change(tensors[name])}, learned.get_extra_state())
+    for name, damaged, words in (
+        ("streams", tensors["streams"][:-9], ("bytes", "claims")),
+        ("streams", altered.stream.bytes, ("bytes", "claims")),
+        ("stream_table", tensors["stream_table"] + torch.tensor([0, 1]), ("altered", "expected")),
+        ("stream_table", tensors["stream_table"][:, :1], ("expected",)),
+        ("means", tensors["means"][:, :-1], ("expected",)),
+    ):
+        with refused(*words):
+            other.load_packed(tensors | {name: damaged}, learned.get_extra_state())
     assert other.places == 0
 
 
@@ -408,16 +338,3 @@ def test_nothing_is_written_to_stderr_when_a_map_scores() -> None:
     program += "SpectralMapper()(w).scores(w[:3])"
     found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert found.stderr == ""
-
-
-def test_chunks_are_added_without_touching_others() -> None:
-    descriptors = route(500)
-    learned = SpectralMapper(chunk=100)(descriptors[:250])
-    before, table = held(learned), learned.packed()["stream_table"]
-    grow(learned, descriptors[250:])
-    assert learned.places == 500
-    assert learned.lengths.tolist() == [100, 100, 50, 100, 100, 50]
-    assert torch.equal(held(learned)[:250], before)
-    assert torch.equal(learned.packed()["stream_table"][:3], table)
-    found = learned.scores(descriptors).argmin(1)
-    assert (found == torch.arange(500)).float().mean() > 0.95

@@ -1,24 +1,27 @@
-"""What a spectral map takes in memory and in a file, and which sizes it refuses."""
+"""What a spectral map takes in memory and in a file, which sizes it refuses, and routes that are long."""
 
 from __future__ import annotations
 
+import errno
+import os
+import tempfile
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
-from test_spectral import grow, levels_of
+from test_spectral import held, levels_of, route
 from torch import Tensor
 
-from dejavu_torch import DejaVu
-from dejavu_torch.maps import spectral, spectral_map
+from dejavu_torch import DejaVu, memory
+from dejavu_torch.maps import quantisation, spectral, spectral_map
 from dejavu_torch.maps.codec import encode
 from dejavu_torch.maps.spectral import SpectralMapper, code_chunk
 from dejavu_torch.maps.spectral_map import Chunk, SpectralMap, sparse_products
-from dejavu_torch.types import InputError
 
 
 def coded(levels: Tensor) -> Chunk:
@@ -63,10 +66,10 @@ def test_sparse_products_are_those_of_the_whole_rows(csr: bool, monkeypatch: pyt
 
 
 def test_a_long_chunk_is_decoded_by_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    route = SpectralMapper(None, 0.5, 32)(torch.randn(64, 256))
-    whole = [route.decode(g) for g in range(2)]
+    learned = SpectralMapper(None, 0.5, 32)(torch.randn(64, 256))
+    whole = held(learned)
     monkeypatch.setattr(spectral_map, "LONG", 32 * 100)
-    assert all(torch.allclose(route.decode(g), whole[g], atol=1e-6) for g in range(2))
+    assert torch.allclose(held(learned), whole, atol=1e-6)
 
 
 def test_more_places_than_the_index_type_holds_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -87,20 +90,71 @@ def test_a_map_takes_few_bytes_for_each_place(budget: float) -> None:
 def test_a_map_that_was_loaded_is_saved_without_coding_anew(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    features = torch.randn(300, 5, generator=torch.Generator().manual_seed(0)) * torch.tensor(
-        [900.0, 1, 1, 1, 1]
-    )
+    features = torch.randn(300, 5) * torch.tensor([900.0, 1, 1, 1, 1])
     model = DejaVu(mapper=SpectralMapper(None, step=0.5, chunk=90), whitening="none").learn(features)
     model.save(tmp_path / "a.safetensors")
-
-    def refuse(levels: Tensor) -> Any:
-        raise InputError("coded")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(spectral, "encode", refuse)
-        again = DejaVu.load(tmp_path / "a.safetensors")
-        again.save(tmp_path / "b.safetensors")
+    monkeypatch.delattr(spectral, "encode")
+    DejaVu.load(tmp_path / "a.safetensors").save(tmp_path / "b.safetensors")
     assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
-    assert isinstance(again.map, SpectralMap)
-    grow(again.map, again.whitened(features[:50]))  # only these are coded
-    assert [part.places for part in again.map.coded()] == [90, 90, 90, 30, 50]
+
+
+# routes so long that their lines are made and gone through in blocks
+
+IN_BLOCKS: list[dict[str, Any]] = [
+    {},
+    {"chunk": 700, "resolution": 4.0},
+    {"transform": "dct", "resolution": 4.0},
+]
+
+
+@pytest.fixture
+def in_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every route is a long one; its lines are in a file."""
+    monkeypatch.setattr(quantisation, "BLOCK", 1000)
+    monkeypatch.setattr(quantisation, "empty", lambda *size: memory.empty(*size, in_memory=0))
+
+
+@pytest.mark.parametrize("settings", IN_BLOCKS)
+def test_in_blocks_a_map_of_a_step_holds_the_same(
+    settings: dict[str, Any], request: pytest.FixtureRequest
+) -> None:
+    descriptors = route(2000, 24)
+    whole = SpectralMapper(None, step=0.1, **settings)(descriptors)
+    request.getfixturevalue("in_blocks")
+    parts = SpectralMapper(None, step=0.1, **settings)(descriptors)
+    assert torch.equal(parts.means, whole.means)
+    differ = (levels_of(parts) != levels_of(whole)).sum()  # sums of floats in another order
+    assert differ <= 1e-3 * (levels_of(whole) != 0).sum()
+    assert torch.allclose(held(parts), held(whole), atol=0.02)
+
+
+@pytest.mark.usefixtures("in_blocks")
+@pytest.mark.parametrize(("budget", "settings"), [*zip((0.7, 4.0, 4.0), IN_BLOCKS, strict=True)])
+def test_in_blocks_the_route_is_within_the_budget(settings: dict[str, Any], budget: float) -> None:
+    descriptors = route(2000, 24)
+    learned = SpectralMapper(budget, **settings)(descriptors)
+    assert 0.98 * budget <= learned.summary().route_bytes / 2000 <= budget
+    error = (held(learned) - descriptors).square().mean()
+    assert error < (0.7 if budget < 1 else 0.1) * descriptors.var()
+
+
+@pytest.mark.usefixtures("in_blocks")
+def test_descriptors_may_be_halves_in_a_file(tmp_path: Path) -> None:
+    descriptors = route(900, 24).half()
+    descriptors.numpy().tofile(tmp_path / "d")
+    mapped = torch.from_numpy(np.memmap(tmp_path / "d", np.float16, "c", shape=(900, 24)))
+    learned, own = SpectralMapper(3.0)(mapped), SpectralMapper(3.0)(descriptors.float())
+    assert torch.equal(levels_of(learned), levels_of(own))
+    assert torch.equal(learned.steps, own.steps)
+
+
+def test_there_may_be_no_room_for_the_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch, refused("1000 x 3", "No space left", "TMPDIR"):
+        patch.setattr(os, "posix_fallocate", full)
+        memory.empty(1000, 3, torch.device("cpu"), in_memory=0)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "none"))
+    with refused("temporary file", "TMPDIR"):
+        memory.empty(1000, 3, torch.device("cpu"), in_memory=0)

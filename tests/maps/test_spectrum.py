@@ -7,7 +7,6 @@ from fractions import Fraction
 
 import pytest
 import torch
-from helpers import refused
 from torch import Tensor
 
 from dejavu_torch.maps.spectrum import Transform, from_spectrum, period_of, spectrum
@@ -59,12 +58,3 @@ def test_a_whole_number_of_cycles_is_one_line_of_the_dft_and_many_of_the_dct() -
     lines = {name: int((spectrum(wave, name).abs() > 1e-9).sum()) for name in TRANSFORMS}
     assert lines["dft"] == 2
     assert lines["dct"] > 50
-
-
-@pytest.mark.parametrize("function", [spectrum, from_spectrum])
-def test_what_is_no_series_is_refused(function: object) -> None:
-    for bad in (torch.zeros(2, 0), torch.arange(3), torch.tensor(1.0)):
-        with refused("transform got", "(...,W)"):
-            function(bad)  # type: ignore[operator]
-    with refused("'fft'", "'dft' or 'dct'"):
-        function(torch.rand(3), "fft")  # type: ignore[operator]

@@ -11,9 +11,10 @@ import torch
 from helpers import refused, scored
 from hypothesis import given
 from hypothesis import strategies as st
+from test_scores import make
 from torch import Tensor
 
-from dejavu_torch import FrequencyLayer, InputError, PhaseTemplates, TemplateMap
+from dejavu_torch import FrequencyLayer, InputError, TemplateMap
 from dejavu_torch.types import Plan
 
 PLAN: Plan = (
@@ -22,10 +23,6 @@ PLAN: Plan = (
     FrequencyLayer(Fraction(115), 23, 100, 250, (0, 1, 3)),
 )
 PLACES, DIMENSION = 300, 4
-
-
-def make(values: Tensor, plan: Plan) -> TemplateMap:
-    return TemplateMap(plan, PhaseTemplates()(values, plan), *values.shape)
 
 
 @pytest.fixture
@@ -53,45 +50,31 @@ def test_convention_1_places_count_from_0_and_chunks_are_half_open() -> None:
         TemplateMap((last,), [torch.zeros(2, 1)], 4, 1)
 
 
-def changed(tensor: Tensor, row: int, column: int, value: int) -> Tensor:
-    tensor = tensor.clone()
-    tensor[row, column] = value
-    return tensor
-
-
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [
-        ("_extra_state", lambda s: {**s, "places": -1}, r"-1 places of 4 features; expected whole numbers"),
-        ("_extra_state", lambda s: {**s, "places": 3e9}, r"3000000000.0 places"),
-        ("_extra_state", lambda s: {**s, "places": 200}, r"expected it inside 200 places"),
-        ("_extra_state", lambda s: {**s, "dimension": 3}, r"expected it inside 300 places of 3 features"),
-        ("_extra_state", lambda s: {**s, "kind": "spectral"}, r"kind is 'spectral'; expected 'templates'"),
-        ("_extra_state", lambda s: {**s, "metric": "l2"}, r"metric is 'l2'; expected 'l1'"),
-        ("_extra_state", lambda s: {**s, "temperature": "warm"}, r"temperature is 'warm'"),
-        ("_extra_state", lambda s: [], r"state is a list"),
-        ("layers", lambda t: t.flatten(), r"layers .*\(15,\)"),
-        ("layers", lambda t: t[:2], r"feature_ptr \(4,\) .*expected \(3,\)"),
-        ("layers", lambda t: t.float(), r"layers .*float32; expected"),
-        ("layers", lambda t: changed(t, 0, 0, -195), r"period -195/2"),
-        ("layers", lambda t: changed(t, 0, 1, 0), r"denominator"),
-        ("layers", lambda t: changed(t, 0, 2, 97), r"272.*expected \D*270"),
-        ("layers", lambda t: changed(t, 0, 4, 301), r"covers \[0, 301\)"),
-        ("layers", lambda t: changed(t, 0, 4, 0), r"covers \[0, 0\)"),
-        ("positions", lambda t: torch.arange(299.0), r"positions of 299 places; expected 300"),
-        ("positions", lambda t: torch.full((300,), torch.nan), r"positions .*float32; expected finite"),
-        ("positions", lambda t: torch.arange(300), r"positions \(300,\) torch.int64; expected finite"),
-        ("feature_ptr", lambda t: t[[0, 2, 1, 3]], r"feature_ptr does not rise"),
-        ("feature_ptr", lambda t: t + 1, r"feature_ptr does not rise"),
-        ("feature_index", lambda t: t[:-1], r"does not rise from 0 to 5"),
-        ("feature_index", lambda t: t.flip(0), r"feature indices must be"),
-        ("feature_index", lambda t: t + 1, r"feature 4; expected it inside"),
-        ("templates", lambda t: t[:-1], r"271.*expected \D*272"),
-        ("templates", lambda t: t[None], r"templates .*\(1, 272\)"),
-        ("templates", lambda t: t * torch.nan, r"templates that are not finite"),
-        ("weights", lambda t: torch.ones(3), r"weights \(3,\); expected \(4,\) or \(0,\)"),
-        ("weights", lambda t: torch.tensor([1, 1, 1, torch.inf]), r"weights that are not finite"),
-        ("weights", lambda t: torch.ones(4, dtype=torch.int64), r"weights that are not finite floats"),
+        ("_extra_state", lambda s: {**s, "places": -1}, "-1 places of 4 features; expected whole numbers"),
+        ("_extra_state", lambda s: {**s, "places": 200}, "expected it inside 200 places"),
+        ("_extra_state", lambda s: {**s, "dimension": 3}, "expected it inside 300 places of 3 features"),
+        ("_extra_state", lambda s: {**s, "kind": "spectral"}, "kind is 'spectral'; expected 'templates'"),
+        ("_extra_state", lambda s: {**s, "metric": "l2"}, "metric is 'l2'; expected 'l1'"),
+        ("_extra_state", lambda s: {**s, "temperature": "warm"}, "temperature is 'warm'"),
+        ("_extra_state", lambda s: [], "state is a list"),
+        ("layers", lambda t: t.flatten(), "layers (15,)"),
+        ("layers", lambda t: t[:2], "feature_ptr (4,) torch.int64; expected (3,)"),
+        ("layers", lambda t: t.float(), "layers (3, 5) torch.float32; expected"),
+        ("layers", lambda t: t * torch.tensor([-1, 1, 1, 1, 1]), "period -195/2"),
+        ("layers", lambda t: t * torch.tensor([1, 0, 1, 1, 1]), "denominator"),
+        ("layers", lambda t: t + torch.tensor([0, 0, 1, 0, 0]), "templates (272,); expected (278,)"),
+        ("layers", lambda t: t + torch.tensor([0, 0, 0, 0, 101]), "covers [0, 301)"),
+        ("layers", lambda t: t * torch.tensor([1, 1, 1, 1, 0]), "covers [0, 0)"),
+        ("positions", lambda t: torch.arange(299.0), "positions of 299 places; expected 300"),
+        ("positions", lambda t: torch.arange(300), "positions (300,) torch.int64; expected finite"),
+        ("feature_ptr", lambda t: t[[0, 2, 1, 3]], "feature_ptr does not rise"),
+        ("feature_index", lambda t: t.flip(0), "feature indices must be"),
+        ("feature_index", lambda t: t + 1, "feature 4; expected it inside"),
+        ("templates", lambda t: t * torch.nan, "templates that are not finite"),
+        ("weights", lambda t: torch.ones(3), "weights (3,); expected (4,) or (0,)"),
     ],
 )
 def test_buffers_that_do_not_fit_together_are_refused(
@@ -99,9 +82,8 @@ def test_buffers_that_do_not_fit_together_are_refused(
 ) -> None:
     state = route.state_dict()
     state[name] = change(state[name])
-    with pytest.raises(InputError, match=message) as error:
+    with refused(message):
         TemplateMap().load_state_dict(state)
-    assert "\n" not in str(error.value)
 
 
 def test_templates_of_another_shape_are_refused() -> None:
@@ -117,10 +99,6 @@ WEIGHTS = torch.tensor([0.5, -1.5, 0.0, 2.0])
 def scores(route: TemplateMap, metric: str = "l1") -> Tensor:
     queries = torch.rand(5, DIMENSION, generator=torch.Generator().manual_seed(1))
     return scored(queries, route, metric)
-
-
-def same(one: Tensor, other: Tensor) -> None:
-    torch.testing.assert_close(one, other, rtol=0, atol=1e-6)
 
 
 def parameters(route: TemplateMap) -> set[str]:
@@ -139,8 +117,7 @@ def test_weights_and_templates_scale_alike(drawn: reference.Route, seed: int) ->
     torch.testing.assert_close(scored(queries, route), expected, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("weights", [False, True])
-@pytest.mark.parametrize("templates", [False, True])
+@pytest.mark.parametrize(("templates", "weights"), [(True, False), (False, True), (True, True)])
 def test_training_is_asked_for_and_frozen_without_a_change_of_scores(
     route: TemplateMap, templates: bool, weights: bool
 ) -> None:
@@ -163,7 +140,7 @@ def test_trained_weights_freeze_to_none_below_0(route: TemplateMap, metric: str)
     before = scores(route, metric)
     route.freeze()
     assert torch.equal(route.weights, WEIGHTS.abs())
-    same(scores(route, metric), before)
+    torch.testing.assert_close(scores(route, metric), before, rtol=0, atol=1e-6)
 
 
 def test_training_goes_on_from_weights(route: TemplateMap) -> None:
@@ -176,15 +153,12 @@ def test_training_goes_on_from_weights(route: TemplateMap) -> None:
     before = scores(route)
     route.trainable(weights=True, start=torch.ones(DIMENSION))
     assert torch.equal(route.weights, WEIGHTS.abs())
-    same(scores(route), before)
+    torch.testing.assert_close(scores(route), before, rtol=0, atol=1e-6)
 
 
-def test_a_start_of_another_shape_is_refused(route: TemplateMap) -> None:
+def test_weights_that_are_none_are_refused(route: TemplateMap) -> None:
     with refused("weights start as (4, 1)", "expected (4,)"):
         route.trainable(weights=True, start=torch.ones(4, 1))
-
-
-def test_training_that_ended_in_nan_is_not_frozen(route: TemplateMap) -> None:
     route.trainable(weights=True)
     with torch.no_grad():
         route.weights[1] = torch.nan
@@ -192,31 +166,16 @@ def test_training_that_ended_in_nan_is_not_frozen(route: TemplateMap) -> None:
         route.freeze()
 
 
-@pytest.mark.parametrize("frozen", [True, False])
-def test_trained_weights_go_into_an_empty_map(route: TemplateMap, frozen: bool) -> None:
-    route.trainable(weights=True, start=WEIGHTS)
-    if frozen:
-        route.freeze()
-    other = TemplateMap()
-    other.load_state_dict(route.state_dict())
-    assert torch.equal(other.weights, route.weights)
-    assert torch.equal(scores(other), scores(route))
-
-
-def test_a_state_goes_into_a_map_that_trains(route: TemplateMap) -> None:
+def test_a_state_goes_into_an_empty_map_and_into_one_that_trains(route: TemplateMap) -> None:
     """As a checkpoint does; weights may be below 0 on the way."""
     route.trainable(weights=True, start=WEIGHTS)
-    other = make(torch.rand(PLACES, DIMENSION), PLAN)
+    empty, other = TemplateMap(), make(torch.rand(PLACES, DIMENSION), PLAN)
     other.trainable(weights=True)
     parameter = other.weights
-    other.load_state_dict(route.state_dict())
+    for one in (empty, other):
+        one.load_state_dict(route.state_dict())
+        assert torch.equal(scores(one), scores(route))
     assert other.weights is parameter
     assert parameters(other) == {"templates", "weights"}
-    assert torch.equal(scores(other), scores(route))
-
-
-def test_a_state_of_other_layers_does_not_go_into_a_map_that_trains(route: TemplateMap) -> None:
-    route.trainable()
-    other = make(torch.rand(20, 1), (FrequencyLayer(Fraction(5), 5, 0, 20, (0,)),))
-    with pytest.raises((RuntimeError, InputError), match="templates"):
-        route.load_state_dict(other.state_dict())
+    with pytest.raises((RuntimeError, InputError), match="templates"):  # of other layers
+        other.load_state_dict(make(torch.rand(20, 1), (FrequencyLayer(5, 5, 0, 20, (0,)),)).state_dict())

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -20,7 +22,8 @@ from dejavu_torch.motion.resampling import ResampledTraverse
 
 @pytest.fixture(scope="module")
 def model() -> DejaVu:
-    return template_model(periods=everything(101), velocity=camera()).learn(footage(REFERENCE))
+    velocity = camera(step=STEP)  # a whole number
+    return template_model(periods=everything(101), velocity=velocity).learn(footage(REFERENCE))
 
 
 def resampled(*speeds: tuple[int, int], begin: int = 0, **settings: object) -> ResampledTraverse:
@@ -82,12 +85,6 @@ def test_the_file_keeps_the_step_and_the_table(model: DejaVu, tmp_path: Path) ->
         assert torch.equal(one, other)
 
 
-def test_a_step_may_be_a_whole_number(tmp_path: Path) -> None:
-    model = template_model(periods=everything(101), velocity=camera(step=6)).learn(footage(REFERENCE))
-    model.save(tmp_path / "m.safetensors")
-    assert DejaVu.load(tmp_path / "m.safetensors").step == 6
-
-
 def test_a_map_learned_from_features_takes_queries_as_they_are() -> None:
     model = template_model(periods=everything(40), velocity=camera()).learn_features(torch.rand(40, 900))
     assert model.step is None
@@ -105,11 +102,6 @@ def test_positions_count_in_the_budget_of_a_map() -> None:
     # a null has no positions, nor their bytes
     null = SpectralMapper.of_equal_size(model.map)(torch.randn(101, model.map.dimension)).summary()
     assert null.route_bytes == pytest.approx(summary.route_bytes - taken, rel=0.03)
-
-
-def test_ready_features_cannot_be_resampled() -> None:
-    with refused("(64, 8)", "ready features show no ground"):
-        template_model(velocity=camera()).learn(torch.rand(90, 8))
 
 
 # frames and places
@@ -160,21 +152,21 @@ def test_names_and_shape_are_those_of_the_frames_that_are_shown() -> None:
 
 
 @pytest.mark.parametrize(
-    ("step", "words"),
+    ("call", "facts"),
     [
-        (4000.0, ("at least one step, 4000",)),
-        (1e-9, ("at most 20 a frame",)),
-        (1e-300, ("at most 20 a frame",)),
+        (lambda: resampled((4, 60), step=4000.0), ("at least one step, 4000",)),
+        (lambda: resampled((4, 60), step=1e-9), ("at most 20 a frame",)),
+        (lambda: resampled((4, 60), step=1e-300), ("at most 20 a frame",)),
+        (lambda: resampled((0, 29)), ("stands still", "30 frames", "expected motion")),
+        (
+            lambda: template_model(velocity=camera()).learn(torch.rand(90, 8)),
+            ("(64, 8)", "ready features show no ground"),
+        ),
     ],
 )
-def test_steps_that_cannot_be_are_refused(step: float, words: tuple[str, ...]) -> None:
-    with refused(*words):
-        ResampledTraverse(ArrayTraverse(footage(REFERENCE)), camera(step=step))
-
-
-def test_footage_that_stands_still_is_refused() -> None:
-    with refused("stands still", "30 frames", "expected motion"):
-        resampled((0, 29))
+def test_what_is_refused(call: Callable[[], Any], facts: tuple[str, ...]) -> None:
+    with refused(*facts):
+        call()
 
 
 def test_ground_that_moves_to_and_fro_is_told(caplog: pytest.LogCaptureFixture) -> None:

@@ -130,7 +130,7 @@ MUTANTS = [
         "dejavu_torch/recognition/select.py",
         "window = torch.arange(-min(radius, columns), min(radius, columns) + 1, device=scores.device)",
         "window = torch.arange(-min(radius, columns), min(radius, columns), device=scores.device)",
-        ("tests/recognition/test_candidates.py::test_equals_reference",),
+        ("tests/recognition/test_select.py::test_candidates_equal_reference",),
     ),
     Mutant(
         "A search keeps enough of the best places that candidates and probabilities are those of all scores.",

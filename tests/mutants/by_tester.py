@@ -132,7 +132,7 @@ MUTANTS = [
         "dejavu_torch/recognition/select.py",
         "torch.where(finite, index, -1)",
         "torch.where(finite | (torch.arange(k) > 0), index, -1)",
-        ("tests/recognition/test_candidates.py::test_equals_reference",),
+        ("tests/recognition/test_select.py::test_candidates_equal_reference",),
     ),
     Mutant(
         "Of a sequence, a place that nothing covers for the latest query is not reported.",
@@ -256,8 +256,8 @@ MUTANTS = [
     Mutant(
         "A frame behind the first place shows none.",
         "dejavu_torch/data/positions.py",
-        ".clamp(-1, last)",
-        ".clamp(0, last)",
+        ".clamp(-1, count_places(positions) - 1)",
+        ".clamp(0, count_places(positions) - 1)",
         ("tests/motion/test_resampling.py::test_the_way_back_belongs_to_the_places_it_passes",),
     ),
     Mutant(
@@ -409,8 +409,8 @@ MUTANTS = [
     Mutant(
         "A run that goes on makes no chunk again that FILE.part holds.",
         "dejavu_torch/learning.py",
-        "code(coder, traverse, len(route.chunks), progress)",
-        "code(coder, traverse, 0, progress)",
+        "missing = range(-(-(route.places - start) // route.chunk), coder.total)",
+        "missing = range(coder.total)",
         ("tests/test_learning.py::test_finished_chunks_are_not_made_again",),
     ),
     Mutant(

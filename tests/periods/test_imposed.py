@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
+from typing import Any
 
 import pytest
 import torch
@@ -13,17 +15,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dejavu_torch.maps.template_map import Reduction, TemplateMap, TemplateMapper
-from dejavu_torch.model_file import build, recipe_of
-from dejavu_torch.periods.finder import PeriodFinder
+from dejavu_torch.maps.template_map import TemplateMap, TemplateMapper
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.periods.support import support_of, supportive_periods
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.types import Plan
 
 
-def learned(features: Tensor, plan: Plan, reduction: Reduction = "mean") -> TemplateMap:
-    return TemplateMapper(Fixed(*plan), reduction=reduction)(features)
+def learned(features: Tensor, plan: Plan) -> TemplateMap:
+    return TemplateMapper(Fixed(*plan))(features)
 
 
 @given(
@@ -54,20 +54,6 @@ def test_routes_of_a_few_bins(frames: int) -> None:
     plan = ImposedPeriods().plan(torch.rand(frames, 2))
     assert {layer.stop for layer in plan} == {frames}
     assert len(plan) >= 3
-
-
-def test_one_long_period_classifies_places() -> None:
-    """As many phases as bins, or more: each place is its own bin's, and unused phases do no harm."""
-    features = torch.rand(23, 4, dtype=torch.float64)
-    means = torch.stack([part.mean(0) for part in features.split(5)])
-    for phases in (5, 9):
-        plan = ImposedPeriods([phases]).plan(features)
-        route = learned(features, plan, "sum")
-        (block,) = route.blocks()
-        torch.testing.assert_close(block[:5], means)
-        assert block[5:].count_nonzero() == 0
-        expected = torch.cdist(features, means, p=1.0)[:, torch.arange(23) // 5]
-        torch.testing.assert_close(route.scores(features), expected)
 
 
 def separate(plan: Plan) -> Plan:
@@ -129,25 +115,23 @@ def test_staggered_layers_place_a_frame_finer_than_their_bins() -> None:
     assert errors[True][near].float().mean() < 1
 
 
-@pytest.mark.parametrize("finder", [ImposedPeriods(), ImposedPeriods([4, 9], 3, True)])
-def test_it_is_rebuilt_from_its_recipe(finder: ImposedPeriods) -> None:
-    recipe = recipe_of(finder)
-    again = build(recipe, PeriodFinder)
-    assert repr(again) == repr(finder)
-    assert recipe_of(again) == recipe
+WHOLE = "distinct whole numbers >= 2"
 
 
-@pytest.mark.parametrize("periods", [[], [1, 4], [4, 4], [4.0, 5], ["4"]])
-def test_periods_that_cannot_be_imposed(periods: list[int]) -> None:
-    with refused(str(periods), "distinct whole numbers >= 2"):
-        ImposedPeriods(periods)
-
-
-def test_bad_input_is_refused() -> None:
-    with refused("bin=0", "at least 1 place"):
-        ImposedPeriods(bin=0)
-    with refused("bin=1", "at least 2 places to stagger"):
-        ImposedPeriods(bin=1, stagger=True)
-    for shape in [(1, 4), (8,), (8, 0), (2, 3, 4)]:
-        with refused(str(shape), "(N,D) with N >= 2, D >= 1"):
-            ImposedPeriods().plan(torch.zeros(shape))
+@pytest.mark.parametrize(
+    ("call", "facts"),
+    [
+        (lambda: ImposedPeriods([]), ("[]", WHOLE)),
+        (lambda: ImposedPeriods([1, 4]), ("[1, 4]", WHOLE)),
+        (lambda: ImposedPeriods([4, 4]), ("[4, 4]", WHOLE)),
+        (lambda: ImposedPeriods([4.0, 5]), ("[4.0, 5]", WHOLE)),
+        (lambda: ImposedPeriods(bin=0), ("bin=0", "at least 1 place")),
+        (lambda: ImposedPeriods(bin=1, stagger=True), ("bin=1", "at least 2 places to stagger")),
+        (lambda: ImposedPeriods().plan(torch.zeros(1, 4)), ("(1, 4)", "(N,D) with N >= 2, D >= 1")),
+        (lambda: ImposedPeriods().plan(torch.zeros(8, 0)), ("(8, 0)", "(N,D) with N >= 2, D >= 1")),
+        (lambda: ImposedPeriods().plan(torch.zeros(8)), ("(8,)", "(N,D) with N >= 2, D >= 1")),
+    ],
+)
+def test_what_is_refused(call: Callable[[], Any], facts: tuple[str, ...]) -> None:
+    with refused(*facts):
+        call()

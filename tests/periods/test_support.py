@@ -53,11 +53,6 @@ def test_common_period_is_the_first_time_all_are_back(periods: list[Fraction]) -
     assert common == first
 
 
-@given(PERIODS)
-def test_a_period_with_itself(period: Fraction) -> None:
-    assert common_period([period]) == common_period([period, period]) == period
-
-
 @given(WHOLE, st.integers(3, 30))
 def test_code_distance_and_torus_distance_are_those_of_all_pairs(periods: list[int], places: int) -> None:
     pairs = list(combinations(range(places), 2))
@@ -73,32 +68,6 @@ def test_one_more_layer_never_brings_places_closer(periods: list[int], more: int
     before, after = support_of(periods, places), support_of([*periods, more], places)
     assert 0 <= after[0] - before[0] <= 1
     assert after[1] >= before[1]
-
-
-@pytest.mark.parametrize(("periods", "places"), [([3, 4, 5], 3), ([3, 4, 5, 7, 11], 12), ([2, 3, 5], 6)])
-def test_the_nearest_code_survives_as_many_wrong_layers_as_promised(periods: list[int], places: int) -> None:
-    survives = (support_of(periods, places)[0] - 1) // 2
-    codes = [[place % period for period in periods] for place in range(places)]
-
-    def decided(seen: list[int]) -> set[int]:
-        wrong = [sum(a != b for a, b in zip(code, seen, strict=True)) for code in codes]
-        return {place for place in range(places) if wrong[place] == min(wrong)}
-
-    def misled(count_wrong: int) -> bool:
-        """Whether copying that many residues of another place makes a place look like it, or as much so."""
-        return any(
-            decided([codes[b][j] if j in bad else code for j, code in enumerate(codes[a])]) != {a}
-            for a in range(places)
-            for b in range(places)
-            for bad in combinations(range(len(periods)), count_wrong)
-        )
-
-    assert not misled(survives)
-    assert misled(survives + 1)
-
-
-def test_support_of_a_set() -> None:
-    assert support_of([4, 6, 9], 30) == (1, 2)  # 18 places apart: 2 + 0 + 0
 
 
 @pytest.mark.parametrize("places", [3, 6, 12, 25, 40])

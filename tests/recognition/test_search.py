@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dejavu_torch import DejaVu, ImposedPeriods, PlaceFilter, SequenceMatcher, SpectralMapper, TemplateMapper
+from dejavu_torch import DejaVu, PlaceFilter, SequenceMatcher, SpectralMapper
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.recognition import localizer
 from dejavu_torch.recognition import search as searching
@@ -35,7 +35,7 @@ class Scored(PlaceMap):
     """Query i scores row i of a table; blocks of `size` places."""
 
     kind = "scored"
-    settings = summary = disagreement = lambda self: {}  # type: ignore[assignment]
+    settings = summary = lambda self: {}  # type: ignore[assignment]
 
     def __init__(self, table: Tensor, size: int) -> None:
         super().__init__(table.shape[1], 1)
@@ -158,18 +158,11 @@ def test_convention_10_scores_are_float32_whatever_the_autocast(metric: Any) -> 
         assert_equal(found, search(route, queries, 3))
 
 
-def test_auto_takes_the_maps_own_way_and_finds_what_a_scan_finds() -> None:
-    wave = walk(400)
-    model = DejaVu(mapper=TemplateMapper(ImposedPeriods((8, 9)))).learn(wave)
-    assert torch.equal(model.localize(wave).index, model.localize(wave, search="scan").index)
-
-
 def test_what_cannot_be_searched_so_is_refused() -> None:
     wave = walk(128)
     model = DejaVu(whitening="none").learn(wave)
     with refused("search 'all'", "expected auto, coarse, exact or scan"):
         model.localize(wave, search="all")  # type: ignore[arg-type]
-    for method in ("bound", "ivf"):
-        for sequence in (None, SequenceMatcher(3), PlaceFilter()):
-            with refused(f"search '{method}' was removed", "expected auto, coarse, exact or scan"):
-                model.localize(wave, sequence=sequence, search=method)  # type: ignore[arg-type]
+    for method, sequence in (("bound", None), ("ivf", SequenceMatcher(3)), ("ivf", PlaceFilter())):
+        with refused(f"search '{method}' was removed", "expected auto, coarse, exact or scan"):
+            model.localize(wave, sequence=sequence, search=method)  # type: ignore[arg-type]

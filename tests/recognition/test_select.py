@@ -1,4 +1,4 @@
-"""The best place (eq. 5) and whether to believe it (eq. 6)."""
+"""The best place (eq. 5), whether to believe it (eq. 6), and the best ones away from each other."""
 
 from __future__ import annotations
 
@@ -7,24 +7,36 @@ import math
 import pytest
 import reference
 import torch
+from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dejavu_torch import InputError, best_match
+from dejavu_torch import best_match
+from dejavu_torch.recognition.select import best_candidates, check_candidates
 
 INF = math.inf
-SCORE = st.one_of(st.integers(0, 3).map(float), st.just(INF))  # few values: many ties
+SCORE = st.one_of(st.integers(-3, 3).map(float), st.just(INF))  # few values: many ties
+ROWS = st.integers(1, 12).flatmap(lambda n: st.lists(st.lists(SCORE, min_size=n, max_size=n), min_size=1))
 
 
-@given(
-    st.integers(1, 8).flatmap(lambda n: st.lists(st.lists(SCORE, min_size=n, max_size=n), min_size=1)),
-    st.sampled_from([0.0, 1.0, 1.5, INF]),
-)
+@given(ROWS, st.sampled_from([0.0, 1.0, 1.5, INF]))
 def test_equals_reference(rows: list[list[float]], threshold: float) -> None:
     index, score, accepted = best_match(torch.tensor(rows), threshold)
     assert index.tolist() == [reference.best(row) for row in rows]
     assert score.tolist() == [min(row) for row in rows]
     assert accepted.tolist() == [reference.accepted(row, threshold) for row in rows]
+
+
+@given(ROWS, st.integers(1, 12), st.integers(0, 13))
+def test_candidates_equal_reference(rows: list[list[float]], k: int, apart: int) -> None:
+    k = min(k, len(rows[0]))
+    index, score, accepted = best_candidates(torch.tensor(rows), k, apart)
+    assert torch.equal(accepted, score.isfinite())
+    assert index.tolist() == [reference.candidates(row, k, apart) for row in rows]
+    at = [
+        [row[i] if i >= 0 else INF for i in places] for row, places in zip(rows, index.tolist(), strict=True)
+    ]
+    assert score.tolist() == at
 
 
 @pytest.mark.parametrize("places", [1, 2, 15, 16, 17, 1000, 4099])
@@ -40,10 +52,11 @@ def test_convention_2_ties_go_to_the_lowest_place(places: int, dtype: torch.dtyp
 
 @pytest.mark.parametrize("threshold", [None, 1.0, INF])
 def test_convention_2_a_query_that_nothing_covers_reports_nothing(threshold: float | None) -> None:
-    match = best_match(torch.tensor([[INF, INF, INF], [INF, 0.5, INF]]), threshold)
-    assert match.index.tolist() == [-1, 1]
-    assert match.score.tolist() == [INF, 0.5]
-    assert match.accepted.tolist() == [False, True]
+    match = best_match(torch.tensor([[INF, INF, INF], [INF, 0.5, INF], [1.0, torch.nan, 0.1]]), threshold)
+    assert match.index.tolist() == [-1, 1, -1]
+    assert match.score[:2].tolist() == [INF, 0.5]
+    assert match.accepted.tolist() == [False, True, False]
+    assert best_candidates(torch.tensor([[1.0, torch.nan, 2.0, 3.0]]), 2, 0).index.tolist() == [[-1, -1]]
 
 
 def test_convention_4_accept_when_the_score_is_below_the_threshold() -> None:
@@ -57,21 +70,24 @@ def test_convention_4_without_a_threshold_every_finite_score_is_accepted() -> No
     assert match.accepted.tolist() == [True, True, False]
 
 
-@pytest.mark.parametrize("threshold", [None, 5.0])
-def test_nan_reports_nothing(threshold: float | None) -> None:
-    match = best_match(torch.tensor([[1.0, torch.nan]]), threshold)
-    assert match.index.tolist() == [-1]
-    assert match.accepted.tolist() == [False]
-
-
-def test_the_score_carries_gradients() -> None:
-    scores = torch.tensor([[3.0, 1.0, 2.0]], requires_grad=True)
-    best_match(scores).score.sum().backward()
+def test_the_scores_carry_gradients_and_are_left_as_they_are() -> None:
+    scores = torch.tensor([[3.0, 1.0, 2.0, 4.0]], dtype=torch.float64, requires_grad=True)
+    (best_match(scores).score.sum() + best_candidates(scores, 2, 1).score.sum()).backward()
+    assert scores.tolist() == [[3, 1, 2, 4]]
     assert scores.grad is not None
-    assert scores.grad.tolist() == [[0, 1, 0]]
+    assert scores.grad.tolist() == [[0, 2, 0, 1]]
 
 
-@pytest.mark.parametrize("shape", [(3,), (3, 0), (1, 2, 3)])
-def test_scores_of_another_shape_are_refused(shape: tuple[int, ...]) -> None:
-    with pytest.raises(InputError, match=r"scores are .*; expected \(Q,N\) with N >= 1"):
-        best_match(torch.rand(shape))
+def test_what_cannot_be_is_refused() -> None:
+    scores = torch.rand(2, 4)
+    for arguments, words in (
+        ((scores, 0, 5), ["0 candidates", "at least 1"]),
+        ((scores, 5, 5), ["5 candidates", "on 4 places", "at most 4"]),
+        ((scores, 2, -1), ["more than -1 places apart", "at least 0"]),
+        ((scores[0], 2, 5), ["(4,)", "(Q,N)"]),
+        ((scores[:, :0], 1, 5), ["(2, 0)", "(Q,N) with N >= 1"]),
+        ((scores[None], 1, 5), ["(1, 2, 4)", "(Q,N)"]),
+    ):
+        with refused(*words):
+            best_candidates(*arguments)
+    check_candidates(10**6, 0)  # of an unknown number of places

@@ -99,14 +99,6 @@ def test_gradients_reach_every_score_of_a_trajectory() -> None:
     assert gradient.nonzero().tolist() == [[1, 2], [2, 3], [3, 4]]
 
 
-def test_no_more_rows_than_a_sequence_are_kept(largest_tensor: type) -> None:
-    matcher, batches = SequenceMatcher(5), (torch.rand(2, 50) for _ in range(100))
-    with largest_tensor() as seen:
-        for _ in streamed(matcher, batches):
-            pass
-    assert seen.numel <= (5 - 1 + 2) * (50 + 2 * 4)  # a trajectory's places to each side
-
-
 def route(noise: int) -> Tensor:
     fresh = torch.Generator().manual_seed(noise)
     places = torch.rand(200, 4, generator=torch.Generator().manual_seed(9))

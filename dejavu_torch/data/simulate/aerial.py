@@ -1,9 +1,7 @@
 """A road seen from a drone, painted procedurally: `sim:aerial`.
 
-One image column is one frame step, about 0.25 m of road. The lane dashes repeat exactly every
-`DASH_PERIOD` frames and the chevrons every `CHEVRON_PERIOD`; everything else occurs once. With
-`ground=repeat` nothing occurs once: one side of the road repeats every `TILES[0]` frames, the other every
-`TILES[1]`, and the road itself is the same everywhere.
+One image column is one frame step, about 0.25 m of road. The lane dashes repeat exactly every `DASH_PERIOD`
+frames and the chevrons every `CHEVRON_PERIOD`.
 """
 
 from __future__ import annotations
@@ -163,13 +161,7 @@ def _paint_plot(canvas: Canvas, random: Random, kind: str, x: float, side: int) 
 
 
 def road_markings(columns: int, scale: int = 1) -> tuple[Tensor, Tensor]:
-    """Coverage of the markings that repeat: lane dashes and chevrons.
-
-    Column x of either equals column x + its period, exactly.
-
-    Args:
-        columns: width of the image, in columns of one frame step each.
-        scale: samples per image pixel.
+    """Coverage of the markings that repeat exactly, lane dashes and chevrons, at `scale` samples a pixel.
 
     Shape: two (HEIGHT * scale, columns * scale) float32 in [0,1].
     """
@@ -210,11 +202,7 @@ def _paint_road(canvas: Canvas, random: Random, tone: Tensor, lanes: list[tuple[
 
 
 def paint_route(frames: int, seed: int = 0) -> Tensor:
-    """Paint the route from above, without the traffic of any one flight.
-
-    Args:
-        frames: number of camera positions, one image column apart.
-        seed: chooses everything except the markings, which are the same for every seed.
+    """Paint the route from above, without the traffic of any one flight; the seed chooses all but markings.
 
     Shape: (3, HEIGHT, frames + VIEW + 2 * MARGIN) float32 in [0,1].
     """
@@ -249,11 +237,8 @@ def paint_route(frames: int, seed: int = 0) -> Tensor:
 def paint_tiles(seed: int = 0) -> tuple[Tensor, Tensor]:
     """Paint the two tiles of ground that repeats: one lies above the middle of the road, one below.
 
-    Columns [0, P) of either go on as its columns [P, 2P), and so on. Both show their half of a road that is
-    the same in every column, and beyond it the roadside of a route of their own.
-
-    Args:
-        seed: chooses the roadsides.
+    Both show their half of a road that is the same in every column, and beyond it the roadside of a route of
+    their own.
 
     Shape: two (3, HEIGHT / 2, TILES[k]) float32 in [0,1], row 0 the one that is nearest to the middle.
     """
@@ -283,12 +268,9 @@ class AerialRoad(SimulatedRoute):
         noise: standard deviation of the sensor noise, 0 to 1, on the scale where white is 1.
         drift: largest sideways drift, 0 to 8 image pixels.
         yaw: largest turn of the camera, 0 to 5 degrees.
-        ground: "once": the lane dashes and chevrons repeat, everything else occurs once. "repeat": the upper
-            half of the view repeats every `TILES[0]` frames and the lower half every `TILES[1]`, without
-            traffic: a place is the pair of its phases.
-
-    Raises:
-        InputError: an argument that is no number or out of its range.
+        ground: "once": only the lane dashes and chevrons repeat. "repeat": the upper half of the view repeats
+            every `TILES[0]` frames and the lower half every `TILES[1]`, without traffic: a place is the pair
+            of its phases.
 
     Example:
         >>> next(AerialRoad(traverse=1, frames=3).batches(8)).shape
@@ -309,10 +291,8 @@ class AerialRoad(SimulatedRoute):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.frames > LONGEST[self.ground]:
-            raise InputError(
-                f"{self.name} has frames={self.frames}; expected 1 <= frames <= {LONGEST[self.ground]}, with "
-                f"ground=repeat {LONGEST['repeat']}"
-            )
+            expected = f"1 <= frames <= {LONGEST[self.ground]}, with ground=repeat {LONGEST['repeat']}"
+            raise InputError(f"{self.name} has frames={self.frames}; expected {expected}")
         self.length, self.place = self.frames, torch.arange(self.frames, dtype=torch.float64)
         random, swing = Random("flight", self.seed, self.traverse), 1.0 if self.traverse else 0.4
         looks = [random.pick(values) for values in ((0.78, 0.84, 1.16), (0.86, 1.16), (-0.06, 0.06))]
@@ -338,15 +318,12 @@ class AerialRoad(SimulatedRoute):
         return image.clamp_(0, 1)
 
     @cached_property
-    def _tiles(self) -> tuple[Tensor, Tensor]:
-        """The two halves of the ground that repeats as (3, HEIGHT, P + margins), each mirrored at the middle.
-
-        So a sample near the middle, which mixes two rows, finds its own tile on both sides.
+    def _tiles(self) -> list[Tensor]:
+        """The two halves of the ground that repeats as (3, HEIGHT, P + margins), each mirrored at the middle:
+        a sample near the middle, which mixes two rows, finds its own tile on both sides.
         """
-        ahead = VIEW + 2 * MARGIN
-        tiles = (torch.cat([tile.flip(1), tile], 1) for tile in paint_tiles(self.seed))
-        first, second = (torch.cat([tile, tile[..., :ahead]], 2) for tile in tiles)
-        return first, second
+        tiles = [torch.cat([tile.flip(1), tile], 1) for tile in paint_tiles(self.seed)]
+        return [torch.cat([tile, tile[..., : VIEW + 2 * MARGIN]], 2) for tile in tiles]
 
     def _frames(self, at: Tensor) -> Tensor:
         fine = math.ceil(VIEW / self.size)  # a small frame averages samples that lie an image pixel apart

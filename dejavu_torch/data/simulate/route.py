@@ -1,7 +1,4 @@
-"""What every simulated route shares: checked options, an address, frames on demand, repeatable draws.
-
-A new route is one subclass of `SimulatedRoute`, named in `SIMULATORS` (`simulate/__init__.py`).
-"""
+"""What every simulated route shares: checked options, an address, frames on demand, repeatable draws."""
 
 from __future__ import annotations
 
@@ -40,12 +37,9 @@ class SimulatedRoute(IndexedTraverse):
     A subclass is a dataclass whose fields are each an `option` or a `choice`, `seed` and `traverse` among
     them. It sets `length` and `place` and draws frames in `_frames`, each from its number and the options
     alone.
-
-    Attributes:
-        kind: its name, as in `sim:KIND?seed=0`.
     """
 
-    kind: ClassVar[str]
+    kind: ClassVar[str]  # its name, as in `sim:KIND?seed=0`
     length: int
     place: Tensor
 
@@ -73,9 +67,8 @@ class SimulatedRoute(IndexedTraverse):
         # without what was drawn already
         return type(self), tuple(getattr(self, entry.name) for entry in fields(self))  # type: ignore[arg-type]
 
-    @cached_property
+    @cached_property  # a frame takes long to draw
     def frame_shape(self) -> tuple[int, ...]:
-        """See `Traverse`; a frame takes long to draw."""
         return super().frame_shape
 
     def read(self, frames: range) -> Tensor:

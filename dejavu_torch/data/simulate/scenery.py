@@ -25,11 +25,7 @@ Range = tuple[float, float]
 
 
 class Structure(NamedTuple):
-    """Something that repeats along a stretch of the track.
-
-    name: what it is. period: metres. start, stop: metres; the first one stands at start, none at stop
-    or beyond.
-    """
+    """Something that repeats along the track from start, and short of stop, with a period; all in metres."""
 
     name: str
     period: float
@@ -75,11 +71,7 @@ def rails(sheet: str, middle: float, route: float) -> Iterator[Thing]:
 
 
 def people(world: World, random: Random, groups: int, foot: float, neck: float) -> Iterator[Thing]:
-    """Groups of people, each in coats of one colour, waiting along every platform.
-
-    Args:
-        foot, neck: where a coat begins and ends, metres from the lower edge of the sheet of people.
-    """
+    """Groups of people waiting along every platform, in coats from foot to neck, metres on their sheet."""
     for start in world.stations:
         for _ in range(groups):
             at = random.scattered(start + 3, start + STATION - 10, (4, 40))

@@ -33,9 +33,6 @@ class View:
 
     Attributes:
         up, right: (P,) metres by which each pixel's ray rises and moves aside per metre ahead.
-
-    Convention: square pixels; a point (x, y, ahead) is seen `FOCAL * width * x / ahead` pixels right of the
-        frame's middle and `FOCAL * width * y / ahead` above the horizon, `HORIZON * height` below its top.
     """
 
     def __init__(self, height: int, width: int, margin: int = 0) -> None:
@@ -107,11 +104,7 @@ class Thing:
         return count, s - self._at[count]
 
     def cover(self, s: Tensor, half: Tensor, slope: Tensor) -> Tensor:
-        """The part of [s - half, s + half] on the sheet that the boxes hide.
-
-        Args:
-            slope: metres along the sheet that one metre of depth hides.
-        """
+        """The part of [s - half, s + half] that the boxes hide, a metre of depth `slope` metres of it."""
         extent = (self.length + self.depth * slope).clamp(max=self._gap)
         (first, before), (second, after) = self._last(s - half), self._last(s + half)
         before, after = torch.minimum(before, extent), torch.minimum(after, extent)
@@ -250,13 +243,11 @@ class Painter:
         self._rays = [sheet.rays(view) for sheet in sheets]
 
     def draw(self, s: Tensor, step: Tensor, sway: Tensor) -> Tensor:
-        """Frames at these places.
+        """Frames (B,3,H,W), of the view's shape.
 
         Args:
             s: (B,) float64 metres. step: (B,) metres that the camera moves during the exposure.
             sway: (B,2) metres of the camera right and up of its mean.
-
-        Shape: -> (B,3,H,W), the view's shape.
         """
         colour = torch.zeros(len(s), *self.sky.shape)
         clear = torch.ones(len(s), 1, self.sky.shape[1])

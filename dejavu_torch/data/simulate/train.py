@@ -33,14 +33,13 @@ class Railway(SimulatedRoute):
 
     The camera takes 25 frames a second, 2.6 m above the track bed and 2.4 m above the level of the rails,
     with square pixels, a focal length of 0.55 frame widths and its horizon at 0.38 of the frame's height;
-    the shutter is open for 0.4 of a frame's time. The rails lie 1.5 m apart. The train speeds up and brakes
-    by 0.9 m/s^2, crawls twice and stops once, on odd traverses twice. All traverses of a seed meet the
-    same railway.
+    the shutter is open for 0.4 of a frame's time. The train speeds up and brakes by 0.9 m/s^2, crawls twice
+    and stops once, on odd traverses twice.
 
     Args:
         seed: chooses the railway, at least 0.
-        traverse: chooses the ride, 0 to 9; 0 is the reference. Each has its own speeds and stops,
-            light, sway, people and trains.
+        traverse: chooses the ride, 0 to 9, with its own speeds and stops, light, sway, people and trains; 0
+            is the reference.
         frames: number of frames from the start; 0 for the whole route.
         height, width: of a frame in pixels, 16 to 512 and 16 to 1024; half to 4 times as wide as high.
         speed: metres per second at which the reference cruises, 5 to 40; other rides, at 0.85 to 1.2 of it.
@@ -53,20 +52,14 @@ class Railway(SimulatedRoute):
         place: (N,) float64, the same in units of reference frames; where the reference stands still,
             the first frame of the stop, and past its last frame, that one.
         structures: what repeats, each with its name, period, start and stop in metres.
-        size: height and width of a frame in pixels.
         corners: (x, y) of the corners of a strip of ground: far left, far right, near right, near left, in
             fractions of the frame, (0, 0) the centre of its top left pixel and (1, 1) of its bottom right
-            one. 1.4 to 2.4 m to the right, beside the sleepers, of which the train may pass about one a
-            frame; from just above the bottom row (where that does not show all of it, from where it is seen)
-            to 12 m ahead; sway and roll are left out.
+            one. It lies 1.4 to 2.4 m to the right, beside the sleepers, and reaches from where all of it is
+            in sight to 12 m ahead; sway and roll are left out.
         ground_span: metres along the track from that strip's near edge to its far one.
 
     Convention: all of these figures, and those of the scenery, are frozen: results are measured on these
         routes.
-
-    Raises:
-        InputError: an argument that is no number or out of its range, a frame less than half or over 4 times
-            as wide as high, or more frames than the route has.
     """
 
     seed: int = option(0, 0)
@@ -83,16 +76,13 @@ class Railway(SimulatedRoute):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not 0.5 <= self.width / self.height <= 4:
-            raise InputError(
-                f"sim:{self.kind} has height={self.height} and width={self.width}; "
-                "expected a width of 0.5 to 4 times the height"
-            )
+            seen = f"sim:{self.kind} has height={self.height} and width={self.width}"
+            raise InputError(f"{seen}; expected a width of 0.5 to 4 times the height")
         reference = self._ride(0)
         distance = self._ride(self.traverse) if self.traverse else reference
         if self.frames > len(distance):
-            raise InputError(
-                f"sim:{self.kind} has frames={self.frames}; expected at most the {len(distance)} of its route"
-            )
+            expected = f"at most the {len(distance)} of its route"
+            raise InputError(f"sim:{self.kind} has frames={self.frames}; expected {expected}")
         self.size = self.height, self.width
         self.length = self.frames or len(distance)
         self.distance = distance[: self.length]
@@ -170,7 +160,7 @@ class Railway(SimulatedRoute):
 
     @cached_property
     def _painter(self) -> Painter:
-        """Draws the frames with a margin around them, from which pitch, yaw and roll cut them out."""
+        """Draws frames with a margin, from which pitch, yaw and roll cut them out."""
         view = View(*self.size, margin=math.ceil(0.05 * max(self.size)))
         sky = self._sky(view, Random(self.kind, "light", self.seed, self.traverse))
         return Painter(view, list(self._world.sheets.values()), self._light(self._world), sky)
@@ -210,14 +200,12 @@ class Railway(SimulatedRoute):
 def ride(
     route: float, cruise: float, slow: Sequence[tuple[float, ...]], stops: Sequence[tuple[float, ...]]
 ) -> Tensor:
-    """Where a train is at each frame, from one end of the route to the other.
+    """Where a train is at each frame, (N,) float64 metres, from one end of a route to the other.
 
     Args:
         route: metres. cruise: metres per second.
         slow: (start, stop, metres per second) of each slow section.
         stops: (place in metres, seconds) of each full stop, in order.
-
-    Shape: -> (N,) float64 metres, never decreasing, FPS frames per second.
     """
     s = np.arange(round(route / GRAIN) + 1) * GRAIN
     square = np.full(len(s), cruise**2)  # square of the speed: it changes evenly along the track
@@ -239,17 +227,9 @@ def ride(
 
 
 def reference_place(reference: Tensor, distance: Tensor) -> Tensor:
-    """The reference frame number at each distance, interpolated.
+    """The reference frame number at each distance, interpolated; of a stop the first frame.
 
-    Args:
-        reference: (N,) metres of the reference frames, never decreasing. distance: (Q,) metres.
-
-    Shape: -> (Q,) float64; where the reference stands still, the first frame of the stop.
-
-    Example:
-        >>> stands = torch.tensor([0.0, 1.0, 1.0, 1.0, 2.0])
-        >>> reference_place(stands, torch.tensor([0.5, 1.0, 1.5])).tolist()
-        [0.5, 1.0, 3.5]
+    Shape: metres of the reference frames (N,), never decreasing, and distance (Q,) -> (Q,) float64.
     """
     after = torch.searchsorted(reference, distance.contiguous()).clamp(1, len(reference) - 1)
     low, high = reference[after - 1], reference[after]

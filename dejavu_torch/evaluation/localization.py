@@ -1,0 +1,96 @@
+"""A localization run: what pictures are drawn from, and what is coded at several sizes."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dejavu_torch.data.ground_truth import GroundTruth
+from dejavu_torch.data.positions import unit_of
+from dejavu_torch.model import DejaVu
+from dejavu_torch.motion.resampling import ResampledTraverse
+from dejavu_torch.recognition.localizer import SINGLE, Matching
+from dejavu_torch.types import Match, SequenceModel, Traverse
+
+
+class Localization(NamedTuple):
+    """A map, the traverses it was made of and queried with, and what was found.
+
+    reference_features (N,D) and query_features (Q,D) may lie in a file. truth: None where there is none.
+    tolerance: distance from a right place, in places, up to which a reported one is right.
+    matching: how the map and all that it is set beside are matched.
+
+    Convention 11: match and truth count places and queries, pictures show frames of the sources.
+    """
+
+    model: DejaVu
+    reference: Traverse
+    query: Traverse
+    reference_features: Tensor
+    query_features: Tensor
+    match: Match
+    truth: GroundTruth | None
+    tolerance: int
+    matching: Matching = SINGLE
+
+    def __repr__(self) -> str:
+        return f"{self.query.name} on {self.reference.name}"
+
+    @property
+    def sequence(self) -> SequenceModel | None:
+        """What scores consecutive queries together."""
+        return self.matching.sequence
+
+    @property
+    def scored(self) -> Match:
+        """The matches as the scores count them."""
+        return self.match._replace(index=self.model.map.table.scored(self.match.index))
+
+    @property
+    def borders(self) -> Tensor:
+        """(N+1,) the reference frame with which each place begins, and the number of frames."""
+        return self.model.map.table.borders.cpu()
+
+    @property
+    def query_frames(self) -> Tensor:
+        """(Q,) the frame of its source that each query shows."""
+        if isinstance(self.query, ResampledTraverse):
+            return self.query.frame
+        return torch.arange(len(self.query_features))
+
+    @property
+    def unit(self) -> str:
+        """What periods and the tolerance count."""
+        return unit_of(self.model.map.positions)
+
+    @property
+    def has_frames(self) -> bool:
+        """Whether both traverses hold frames, not ready features."""
+        return len(self.reference.frame_shape) == len(self.query.frame_shape) == 3
+
+    @torch.no_grad()
+    def scores(self, numbers: Tensor) -> Tensor:
+        """Scores of single queries by the map, on the CPU: their numbers (B,) -> (B,N)."""
+        route = self.model.map
+        return route.scores(self.query_features[numbers].to(route.positions.device)).float().cpu()
+
+    def example_query(self, start: int, stop: int) -> tuple[int, list[int]]:
+        """A query near to the middle of a chunk, and its right places there; without truth the middle one."""
+        if self.truth is None:
+            return len(self.query_features) // 2, []
+        query = nearest_query(self.truth, (start + stop) / 2)
+        right = self.truth.positives[query].tolist() if self.truth.judged[query] else []
+        return query, [place for place in right if start <= place < stop]
+
+
+def nearest_query(truth: GroundTruth, place: float) -> int:
+    """The query one of whose right places is nearest to a place; the first where none has any."""
+    right = torch.where(truth.judged[:, None] & (truth.positives >= 0), truth.positives, torch.inf)
+    return int((right - place).abs().amin(1).argmin())
+
+
+def frame_at(traverse: Traverse, number: int) -> Tensor:
+    """One frame of a traverse, (C,H,W)."""
+    return next(traverse.between(number, number + 1))[0].float().cpu()
