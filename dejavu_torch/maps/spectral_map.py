@@ -6,6 +6,7 @@ import bisect
 import math
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 from functools import cache
 from itertools import accumulate
@@ -178,8 +179,12 @@ class SpectralMap(PlaceMap):
             return
         places, device = [one.places for one in chunks], self.means.device
         if levels is None:
-            levels = (decode(one.stream, one.places, self.dimension) for one in chunks)
-        parts = [_nonzero(one) for one in levels]
+            with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+                parts = [
+                    *pool.map(lambda one: _nonzero(decode(one.stream, one.places, self.dimension)), chunks)
+                ]
+        else:
+            parts = [_nonzero(one) for one in levels]
         sizes = self.places + sum(places), self._bounds[-1] + sum(len(level) for *_, level in parts)
         if max(sizes) > LARGEST:
             raise InputError(

@@ -32,7 +32,7 @@ REFINED = 32  # best groups of a query that are refined; 4 times as many if the 
 SPARE = 3  # further windows of a query that are scored if they are as good
 CLOSE = 0.02  # cosines that differ by less are as good
 UNLIKE = 0.02  # a query whose best cosine is less is scanned: places without a direction have cosine 0
-BLOCK = 8192  # samples that are compared at a time
+BLOCK, PRODUCTS = 8192, 2**20  # samples, and products with them, at a time: these stay in the cache
 TOGETHER = 256  # queries that are compared at a time
 LARGE = 6  # standard deviations of a component of a unit vector; larger ones are cut to it in 8 bits
 ROUNDING = 1e-5  # of products of unit vectors in float32
@@ -138,20 +138,22 @@ class Samples:
         self.norm = torch.cat(norms).clamp(min=1)
 
     def products(self, queries: Tensor) -> Iterator[Tensor]:
-        """Of blocks of rows with queries, (Q,K) int8 -> (n,Q) int32."""
-        for rows in self.rows.split(BLOCK):
-            if rows.device.type == "cpu" and has_int8_products():
-                yield torch._int_mm(rows, queries.T)
-            else:
-                yield (rows.float() @ queries.T.float()).int()
+        """Of blocks of whole groups with queries, (Q,K) int8 -> (n,Q) int32."""
+        whole = self.rows.device.type == "cpu" and has_int8_products()
+        for rows in self.rows.split(GROUP * max(1, PRODUCTS // (GROUP * len(queries))) if whole else BLOCK):
+            yield torch._int_mm(rows, queries.T) if whole else (rows.float() @ queries.T.float()).int()
 
     def best_of_groups(self, queries: Tensor) -> Tensor:
         """`GROUP` times the largest product in each group of rows, plus its row in the group: (Q,K) int8 ->
         (Q,G) int32. A maximum of one number is several times faster than one with its index."""
         number = torch.arange(GROUP, dtype=torch.int32, device=queries.device)[:, None]
         best = number.new_empty(len(queries), len(self.rows) // GROUP)
-        for block, products in zip(best.split(BLOCK // GROUP, 1), self.products(queries), strict=True):
-            block.copy_(products.view(-1, GROUP, len(queries)).mul_(GROUP).add_(number).amax(1).T)
+        first = 0
+        for products in self.products(queries):
+            groups = products.view(-1, GROUP, len(queries))
+            found = torch.add(number, groups, alpha=GROUP, out=groups).amax(1)
+            best[:, first : first + len(found)] = found.T
+            first += len(found)
         return best
 
 
@@ -227,10 +229,11 @@ class CoarseSearch:
         count = max(k for k, _ in wanted)
         best, group = best.topk(min(max(plan.refined, 2 * count), best.shape[1]), 1, sorted=False)
         middle = torch.searchsorted(fine.place, coarse.place[GROUP * group + best % GROUP])
-        reach = plan.coarse // plan.fine // 2 + 1
+        reach = max(1, plan.coarse // plan.fine // 2)
         offsets = torch.arange(-reach, reach + 1, device=middle.device)
         at = (middle[:, :, None] + offsets).clamp(0, len(fine.place) - 1).flatten(1)
-        cosines = torch.bmm(fine.rows[at].to(units), units[:, :, None])[..., 0] / fine.norm[at]
+        rows = fine.rows.index_select(0, at.flatten()).view(*at.shape, -1)
+        cosines = (rows * units[:, None]).sum(2) / fine.norm[at]
         width = plan.fine + 1 + max((k - 1) * (radius + 1) for k, radius in wanted)
         windows = best_candidates(-cosines, min(count + SPARE, at.shape[1]), width, fine.place[at])
         close = windows.score <= windows.score[:, :count].amax(1, keepdim=True) + CLOSE
@@ -293,7 +296,8 @@ class CoarseSearch:
         least -= ROUNDING
         least = least.where(least > 0, -1)  # from a right angle on nothing is ruled out
         sine, norm = (1 - least.square()).sqrt(), self.fine.norm.view(-1, GROUP).amin(1)
-        return norm * torch.stack([least, sine, torch.full_like(least, ROUNDING)])
+        bounds: Tensor = norm * torch.stack([least, sine, torch.full_like(least, ROUNDING)])
+        return bounds
 
     def _nearest(self, chunk: int) -> Tensor:
         """The fine sample that each place of a chunk is nearest to, (W,)."""
