@@ -33,6 +33,7 @@ from benchmarks.scale_contenders import (
     REPEATED,
     ROTATED,
     ROWS,
+    SEARCHED,
     TRAINED,
     Mapped,
 )
@@ -85,7 +86,10 @@ class Task(NamedTuple):
     step: float = 0.0
 
     def file(self, folder: Path) -> Path:
-        return folder / f"kept-{list(CONTENDERS).index(self.contender)}"
+        learned = self.contender
+        for search in SEARCHED:  # of one map
+            learned = learned.removesuffix(f", {search}")
+        return folder / f"kept-{self.case}-{list(CONTENDERS).index(learned)}"
 
 
 class Kept(IndexedTraverse):
@@ -141,22 +145,30 @@ def localize(task: Task, folder: Path) -> dict[str, Any]:
             seconds.append(time.perf_counter() - began)
             began = time.perf_counter()
 
-    peak, device, share = peak_memory(run), "cpu", None
-    whole = [taken for taken, part in zip(seconds, parts, strict=True) if len(part) == len(parts[alone])]
-    batch = float(np.median(whole))
+    def of_batch() -> float:
+        pairs = zip(seconds, parts, strict=True)
+        return float(np.median([taken for taken, part in pairs if len(part) == len(parts[alone])]))
+
+    peak, device, share, batch = peak_memory(run), "cpu", None, of_batch()
+    one, load, answers = float(np.median(seconds[1:alone])), seconds[0], found[alone:]
+    torch.set_num_threads(task.threads)
+    seconds.clear()
+    run()
     if isinstance(contender, Mapped):
         device = task.device
         scanned = sum(buffer.nbytes for buffer in contender.model.map.buffers())
         share = scanned / batch / bandwidth(device)
     if device.startswith("cuda"):
         peak = torch.cuda.max_memory_allocated(device)
-    score, index = (torch.cat(columns) for columns in zip(*found[alone:], strict=True))
+    score, index = (torch.cat(columns) for columns in zip(*answers, strict=True))
     match = Match(index, score, torch.ones(len(index), dtype=torch.bool))
     scores = evaluate(match, truth[:, None], TOLERANCE)
     return {
         "seconds": batch / len(parts[alone]),
-        "seconds_one": float(np.median(seconds[1:alone])),
-        "seconds_load": seconds[0],
+        "seconds_one": one,
+        "seconds_threads": of_batch() / len(parts[alone]),
+        "seconds_one_threads": float(np.median(seconds[1:alone])),
+        "seconds_load": load,
         "peak_bytes": peak,
         "recall_at_1": scores.recall_at_1,
         "auc": scores.auc,
@@ -180,14 +192,16 @@ def bandwidth(device: str) -> float:
 
 
 def measured(task: Task, folder: Path) -> Row:
-    """A contender's row: it learns in one process and localizes in another."""
-    facts: dict[str, Any] = {}
-    for what in (learn, localize):
-        facts |= in_process(__name__, [what.__name__, task, str(folder)])
-        if "skipped" in facts:
-            break
-    for file in folder.glob(task.file(folder).name + "*"):
-        file.unlink()
+    """A contender's row: it learns in one process and localizes in another. What was learned is kept until
+    another one learns, for other ways to search it."""
+    known = task.file(folder).with_suffix(".json")
+    if not known.exists():
+        for file in folder.glob("kept-*"):
+            file.unlink()
+        known.write_text(json.dumps(in_process(__name__, [learn.__name__, task, str(folder)])))
+    facts: dict[str, Any] = json.loads(known.read_text())
+    if "skipped" not in facts:
+        facts |= in_process(__name__, [localize.__name__, task, str(folder)])
     return scale_row(task.case, task.contender, task.places, **{"threads": task.threads} | facts)
 
 

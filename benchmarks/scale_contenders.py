@@ -18,6 +18,7 @@ from dejavu_torch.data.frame_range import IndexedTraverse
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import DejaVu
+from dejavu_torch.recognition.search import Search
 
 ROWS = 8192  # descriptors read at a time
 CHUNK = 8192
@@ -31,7 +32,7 @@ class Mapped(Store):
     """Ours: a map, of frames with the default whitening (None), or of descriptors as they are.
 
     Args:
-        shuffled: in random order, the null.
+        shuffled: in random order, the null. search: see `DejaVu.localize`.
     """
 
     model: DejaVu  # once it is loaded
@@ -41,8 +42,9 @@ class Mapped(Store):
         mapper: SpectralMapper | TemplateMapper,
         whitening: Literal["none"] | None = "none",
         shuffled: bool = False,
+        search: Search = "auto",
     ) -> None:
-        self.mapper, self.whitening, self.shuffled = mapper, whitening, shuffled
+        self.mapper, self.whitening, self.shuffled, self.search = mapper, whitening, shuffled, search
 
     def prepare(self, route: IndexedTraverse) -> float | None:
         return getattr(self.mapper, "step", None)
@@ -61,6 +63,7 @@ class Mapped(Store):
 
     def load(self, path: Path, device: str = "cpu") -> Find:
         self.model = DejaVu.load(path).to(device)
+        self.model.search = self.search
         locate = self.model.localize_descriptors if self.whitening else self.model.localize
         order = torch.from_numpy(np.load(path.with_suffix(".npy"))) if self.shuffled else None
 
@@ -87,10 +90,11 @@ class Faiss(Store):
 
     Args:
         factory: what `faiss.index_factory` takes; {cells} stands for the cells of an inverted file.
+        probes: of these that are searched; None for as many as `CELLS_PER_PROBE` says.
     """
 
-    def __init__(self, factory: str) -> None:
-        self.factory = factory
+    def __init__(self, factory: str, probes: int | None = None) -> None:
+        self.factory, self.probes = factory, probes
 
     def parts(self, route: IndexedTraverse) -> Iterable[Tensor]:
         """What is kept of a route, batch by batch."""
@@ -128,7 +132,7 @@ class Faiss(Store):
         index: Any = faiss.read_index(str(path))
         if "IVF" in self.factory:
             cells = faiss.extract_index_ivf(index)
-            cells.nprobe = max(PROBED_AT_LEAST, cells.nlist // CELLS_PER_PROBE)
+            cells.nprobe = self.probes or max(PROBED_AT_LEAST, cells.nlist // CELLS_PER_PROBE)
         elif "HNSW" in self.factory:
             index.hnsw.efSearch = EF_SEARCH
 
@@ -189,7 +193,11 @@ FLOWN = f"{OURS}, one chunk, of noisy frames"
 # long and is not used here
 PLACED: dict[str, Callable[[float, float], Store]] = {
     f"{OURS} 1 B": lambda *_: Mapped(SpectralMapper(1.0, chunk=CHUNK)),
+    f"{OURS} 1 B, exact": lambda *_: Mapped(SpectralMapper(1.0, chunk=CHUNK), search="exact"),
+    f"{OURS} 1 B, scan": lambda *_: Mapped(SpectralMapper(1.0, chunk=CHUNK), search="scan"),
     f"{OURS} 4 B": lambda *_: Mapped(SpectralMapper(4.0, chunk=CHUNK)),
+    f"{OURS} 4 B, exact": lambda *_: Mapped(SpectralMapper(4.0, chunk=CHUNK), search="exact"),
+    f"{OURS} 4 B, scan": lambda *_: Mapped(SpectralMapper(4.0, chunk=CHUNK), search="scan"),
     f"{OURS} 1 B, one chunk": lambda *_: Mapped(SpectralMapper(1.0, chunk=WHOLE)),
     f"{OURS} 4 B, one chunk": lambda *_: Mapped(SpectralMapper(4.0, chunk=WHOLE)),
     "null 1 B": lambda *_: Mapped(SpectralMapper(1.0, chunk=CHUNK), shuffled=True),
@@ -199,6 +207,8 @@ PLACED: dict[str, Callable[[float, float], Store]] = {
     "faiss IVF-PQ, 8 B": lambda *_: Faiss("IVF{cells},PQ8np"),
     "faiss IVF-PQ, 16 B": lambda *_: Faiss("IVF{cells},PQ16np"),
     "faiss IVF-PQ, 32 B": lambda *_: Faiss("IVF{cells},PQ32np"),
+    "faiss IVF-PQ, 32 B, 64 probes": lambda *_: Faiss("IVF{cells},PQ32np", 64),
+    "faiss IVF-PQ FastScan, 32 B, refined": lambda *_: Faiss("IVF{cells},PQ64x4fs,RFlat"),
     "faiss OPQ, IVF-PQ, 16 B": lambda *_: Faiss("OPQ16,IVF{cells},PQ16np"),
     "faiss HNSW": lambda *_: Faiss("HNSW16,Flat"),
 }
@@ -210,4 +220,5 @@ REPEATED: dict[str, Callable[[float, float], Store]] = {
     "interpolated frames": lambda room, _: Interpolated(room),
 }
 CONTENDERS = PLACED | REPEATED
+SEARCHED = ("exact", "scan", "64 probes")  # ways to search what a contender without them in its name keeps
 GIVEN = CONTENDERS.keys() - {ONE_CHUNK, FIXED, FLOWN}  # those whose bytes per place are given, and no result

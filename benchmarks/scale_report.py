@@ -16,7 +16,16 @@ RECALL = "recall@1"  # the panel of it
 KEYS = (
     *("places", "seconds", "seconds_one", "peak_bytes", "learn_peak_bytes", "bytes", "route_bytes"),
     *("bytes_per_place", "learn_rate", "recall_at_1", "auc", "queries", "threads", "ratio_to_ours"),
-    *("skipped", "seconds_load", "step", "difference", "device", "bandwidth_share"),
+    *(
+        "seconds_threads",
+        "seconds_one_threads",
+        "skipped",
+        "seconds_load",
+        "step",
+        "difference",
+        "device",
+        "bandwidth_share",
+    ),
 )
 COLUMNS: dict[str, Column] = {
     "B/place": ("bytes_per_place", ".3g"),
@@ -24,6 +33,8 @@ COLUMNS: dict[str, Column] = {
     "AUC": ("auc", ".3f"),
     "ms one": ("seconds_one", ".3g", 1e-3),
     "ms of 256": ("seconds", ".3g", 1e-3),
+    "one, threads": ("seconds_one_threads", ".3g", 1e-3),
+    "256, threads": ("seconds_threads", ".3g", 1e-3),
     "bandwidth": ("bandwidth_share", ".1%"),
     "s load": ("seconds_load", ".3g"),
     "peak MB": ("peak_bytes", ".0f", 1e6),
@@ -43,7 +54,8 @@ def scale_row(case: str, contender: str, places: int, **facts: Any) -> Row:
     """What one contender takes at one size; None where it is not known.
 
     places: N. seconds: of a query of a batch of `BATCH`; seconds_one: of a query by itself, the median; both
-    on one thread, from the descriptor to the place. seconds_load: from the file to the first answer.
+    on one thread, from the descriptor to the place; seconds_threads and seconds_one_threads: on all threads.
+    seconds_load: from the file to the first answer.
     peak_bytes: most memory while localizing beyond that of the programs, learn_peak_bytes while learning,
     each in a process of its own. bytes: of the file. route_bytes: of ours all that grows with the route, mean
     and tables with it; of an index its codes and links alone, without identifiers and codebooks. step: of the

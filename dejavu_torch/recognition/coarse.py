@@ -229,7 +229,7 @@ class CoarseSearch:
         count = max(k for k, _ in wanted)
         best, group = best.topk(min(max(plan.refined, 2 * count), best.shape[1]), 1, sorted=False)
         middle = torch.searchsorted(fine.place, coarse.place[GROUP * group + best % GROUP])
-        reach = max(1, plan.coarse // plan.fine // 2)
+        reach = -(-plan.coarse // (2 * plan.fine))
         offsets = torch.arange(-reach, reach + 1, device=middle.device)
         at = (middle[:, :, None] + offsets).clamp(0, len(fine.place) - 1).flatten(1)
         rows = fine.rows.index_select(0, at.flatten()).view(*at.shape, -1)

@@ -222,7 +222,10 @@ def test_a_process_learns_and_another_localizes(tmp_path: Path) -> None:
     save_file(asked, tmp_path / "places=600.safetensors")
     row = scale.measured(Task("places=600", "dejavu 4 B", "drawn", 600, 1, "cpu"), tmp_path)
     assert (row["skipped"], row["recall_at_1"]) == (None, 1)
-    assert not list(tmp_path.glob("kept*"))
+    scanned = scale.measured(Task("places=600", "dejavu 4 B, scan", "drawn", 600, 1, "cpu"), tmp_path)
+    assert scanned["learn_rate"] == row["learn_rate"]  # of the same map
+    scale.measured(Task("places=600", "dejavu 1 B", "drawn", 600, 1, "cpu"), tmp_path)
+    assert len(list(tmp_path.glob("kept*"))) == 2  # the other map is gone
 
 
 def test_queries_lie_evenly_along_the_route() -> None:
