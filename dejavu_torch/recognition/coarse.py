@@ -305,7 +305,8 @@ class CoarseSearch:
         at = torch.arange(start, stop, device=self.starts.device)
         first, last = torch.searchsorted(self.fine.place, torch.stack([at[0], at[-1] + 1])).tolist()
         place = self.fine.place[first:last]
-        return first + torch.bucketize(at, (place[1:] + place[:-1]) / 2)
+        nearest: Tensor = first + torch.bucketize(at, (place[1:] + place[:-1]) / 2)
+        return nearest
 
     def _by_query(self, query: Tensor, place: Tensor, score: Tensor, shape: tuple[int, int]) -> Best:
         """Pairs in order as a row for each query, of so many columns at least; +inf at no place."""
