@@ -78,7 +78,7 @@ def test_chance_is_told_by_the_losses_of_the_last_steps(
 ) -> None:
     last = LastLosses()
     for i in range(steps):
-        last.add({"place": torch.tensor(place[2 * i // LAST]), "phase": torch.tensor(phase)})
+        last.append({"place": torch.tensor(place[2 * i // LAST]), "phase": torch.tensor(phase)})
     if refused_:
         with refused("nothing is learned", "chance 3", f"phase loss is {phase:g}", "chance 2"):
             last.check({"place": 3.0, "phase": 2.0})

@@ -19,13 +19,11 @@ from dejavu_torch.cli.train import MapTrainer
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.features.views import STRETCH, Views
-from dejavu_torch.growth import calibrate_if_possible
-from dejavu_torch.training import export
 from dejavu_torch.training.export import UNTRAINED, LastCheckpoint, beside_untrained
 
 FRAMES = 320
 MADE = {"mapper": SpectralMapper(6.0), "whitening": "none"}  # a descriptor and its map
-CALIBRATE = calibrate_if_possible  # which conftest.py patches away
+CALIBRATE = DejaVu.calibrate  # which conftest.py patches away
 
 
 def long(**settings: Any) -> RouteData:
@@ -92,7 +90,7 @@ def test_what_training_has_not_seen_calibrates(
     def taken(model: DejaVu, reference: object, views: Views) -> None:
         seen.append(views)
 
-    monkeypatch.setattr(export, "calibrate_if_possible", taken)
+    monkeypatch.setattr(DejaVu, "calibrate", taken)
     monkeypatch.setattr("dejavu_torch.training.export.beside_untrained", lambda *_: {})
     data = long(validation=ArrayTraverse(footage(0.1, FRAMES)), validation_truth="0") if validated else long()
     trainer(tmp_path, max_steps=2, limit_val_batches=0).fit(new_task(**MADE), data)
@@ -106,7 +104,7 @@ def test_what_the_checkpoint_s_training_saw_does_not_calibrate(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, first: dict[str, Any]
 ) -> None:
     seen: list[Views] = []
-    monkeypatch.setattr(export, "calibrate_if_possible", lambda _, reference, views: seen.append(views))
+    monkeypatch.setattr(DejaVu, "calibrate", lambda _, reference, views: seen.append(views))
     monkeypatch.setattr("dejavu_torch.training.export.beside_untrained", lambda *_: {})
     quiet = {"max_steps": 2, "limit_val_batches": 0}
     trainer(tmp_path / "one", LastCheckpoint(), **quiet).fit(new_task(**MADE), long(**first))
@@ -123,7 +121,7 @@ def test_at_the_end_the_map_is_calibrated_and_set_beside_the_untrained_one(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At another size than the reference's, with a backbone that takes no other."""
-    monkeypatch.setattr(export, "calibrate_if_possible", CALIBRATE)
+    monkeypatch.setattr(DejaVu, "calibrate", CALIBRATE)
     monkeypatch.setattr("dejavu_torch.features.views.FEWEST", 40)
     np.save(tmp_path / "long.npy", footage(frames=FRAMES, side=32).numpy())
     words = ["--data.source", tmp_path / "long.npy", "--trainer.max_steps=2", "--trainer.limit_val_batches=0"]
@@ -143,7 +141,7 @@ def test_a_calibration_that_fails_loses_no_training(tmp_path: Path, monkeypatch:
     def failing(*_: object) -> None:
         raise RuntimeError("shapes cannot be multiplied")
 
-    monkeypatch.setattr(export, "calibrate_if_possible", failing)
+    monkeypatch.setattr(DejaVu, "calibrate", failing)
     with pytest.raises(RuntimeError, match="shapes"):
         trainer(tmp_path, max_steps=2, limit_val_batches=0).fit(new_task(**MADE), long())
     assert DejaVu.load(tmp_path / "map.safetensors").map.places == FRAMES

@@ -127,7 +127,7 @@ def test_a_second_traverse_tells_what_a_season_changes(tmp_path: Path) -> None:
     given = {"second": ArrayTraverse(winter), "second_truth": "0", "augmentation": still}
     trainer(tmp_path / "both").fit(task, data_of(summer, **given))
     assert task.views is not None
-    assert len({tuple(view) for view in task.views.descriptors.tolist()}) == 2 * FRAMES
+    assert len({tuple(view) for view in task.views[0].tolist()}) == 2 * FRAMES
     with refused("data.augmentation changes nothing", "data.second"):
         trainer(tmp_path / "one").fit(new_task(backbone=coded(network=HOG())), data_of(augmentation=still))
 
@@ -139,11 +139,11 @@ def test_frames_of_no_known_place_are_not_learned_from(tmp_path: Path) -> None:
     given = {"second": ArrayTraverse(footage(0.1)), "second_truth": str(truth), "batch_size": 2}
     trainer(tmp_path).fit(task, data_of(**given))
     assert task.views is not None
-    assert task.views.positives.min() == 0
-    assert len(task.views.descriptors) == len(task.views.positives) == 10 * (FRAMES + 10)
-    before = len(task.views.descriptors)
+    assert task.views[1].min() == 0
+    assert len(task.views[0]) == len(task.views[1]) == 10 * (FRAMES + 10)
+    before = len(task.views[0])
     trainer(tmp_path).fit(task, data_of())  # a further training describes its own frames
-    assert len(task.views.descriptors) == 10 * (FRAMES - FRAMES % 16) < before
+    assert len(task.views[0]) == 10 * (FRAMES - FRAMES % 16) < before
 
 
 def test_another_route_keeps_the_descriptor(tmp_path: Path) -> None:
