@@ -18,7 +18,7 @@ from typing import Any
 
 import pytorch_lightning as pl
 import torch
-from small_training import backbone, data_of, footage, mapper
+from small_training import backbone, data_of, footage, mapper, still
 from torch import nn
 
 from dejavu_torch import Embedding, SpectralMapper
@@ -28,7 +28,6 @@ from dejavu_torch.training.export import LastCheckpoint
 from dejavu_torch.training.task import PlaceRecognitionTask
 
 BATCH = 16  # of all processes
-STILL = Augmentation((0, 0), 0, (0, 0), 0, (0, 0), 0, 0, 0, 0, 0)
 
 
 def residues() -> Embedding:
@@ -71,7 +70,7 @@ def run(case: str, processes: int, folder: Path) -> None:
         batch_size=BATCH // processes,
         second=footage(0.1)[:35],
         second_truth=4,  # some of its frames show no place
-        augmentation=Augmentation() if case == "augmented" else STILL,
+        augmentation=Augmentation() if case == "augmented" else still(),
         validation=footage(0.05)[:37],
         validation_truth=0,
     )

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 import torch
 from pytorch_lightning import Trainer
-from several_processes import CASES, STILL, Steps, residues
-from small_training import backbone, data_of, footage
+from several_processes import CASES, Steps, residues
+from small_training import backbone, data_of, footage, still
 
 from dejavu_torch import DejaVu
 from dejavu_torch.data.arrays import ArrayTraverse
@@ -38,7 +38,7 @@ def trained(case: str, device: str, folder: Path, **settings: Any) -> tuple[list
         enable_model_summary=False,
     )
     torch.manual_seed(1)
-    trainer.fit(task, data_of(**{"second": footage(0.1), "augmentation": STILL} | settings))
+    trainer.fit(task, data_of(**{"second": footage(0.1), "augmentation": still()} | settings))
     return steps.figures, DejaVu.load(folder / "map.safetensors", task.dejavu.features)
 
 
