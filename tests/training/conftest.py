@@ -37,7 +37,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def _without_calibration(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of many small trainings, of which it takes a third; those of the command are calibrated."""
     if request.path.stem not in CALIBRATED:
-        monkeypatch.setattr(DejaVu, "calibrate", lambda self, *_: self)
+        monkeypatch.setattr(DejaVu, "calibrate", lambda self, *_, **__: self)
 
 
 @pytest.fixture(autouse=True)

@@ -12,11 +12,10 @@ import torch
 from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
-from small_training import FRAMES, Stop, coded, data_of, fit, footage, new_task, recall, trainer
+from small_training import Stop, coded, data_of, fit, footage, new_task, recall, trainer
 from torch import Tensor
 
-from dejavu_torch import RouteData, SpectralMapper
-from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch import SpectralMapper
 from dejavu_torch.maps.quantisation import quantise
 from dejavu_torch.maps.spectrum import Transform, from_spectrum, spectrum
 from dejavu_torch.training.losses import bands_of, coded_proxies, laplace_bits
@@ -175,9 +174,3 @@ def test_bits_are_saved_where_they_count(tmp_path: Path) -> None:
         bits.append(float(task.trainer.callback_metrics["train/bits"]))
         assert recall(model, footage()) > 0.9
     assert bits[1] < 0.7 * bits[0]
-
-
-def test_a_rate_is_of_one_route(tmp_path: Path) -> None:
-    several = [ArrayTraverse(footage(0.1 * k, FRAMES), f"route {k}") for k in range(2)]
-    with refused("model.rate is 1.0 and there are 2 routes", "model.rate 0"):
-        trainer(tmp_path).fit(rated(), RouteData(several, tolerance=2))
