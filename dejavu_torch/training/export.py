@@ -7,7 +7,6 @@ import logging
 import math
 import sys
 import time
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -209,18 +208,6 @@ def beside_untrained(
         log.warning("no untrained map to compare with: %s", error)
     scores = {name: contend(name, match, truth, tolerance).scores for name, match in found.items()}
     return {name: one for name, one in scores.items() if one is not None}
-
-
-def better(scores: Mapping[str, Scores]) -> list[str]:
-    """Names of what has a larger AUC than the first of them.
-
-    Example:
-        >>> from types import SimpleNamespace as S
-        >>> better({"the trained map": S(auc=0.5), "HOG": S(auc=0.7), "the untrained map": S(auc=0.4)})
-        ['HOG']
-    """
-    (_, first), *others = scores.items()
-    return [name for name, one in others if one.auc > first.auc]
 
 
 def _of_shape(query: Traverse, shape: tuple[int, ...] | None) -> Traverse:
