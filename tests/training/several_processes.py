@@ -18,7 +18,7 @@ from typing import Any
 
 import pytorch_lightning as pl
 import torch
-from small_training import backbone, data_of, footage, mapper, still
+from small_training import backbone, data_of, footage, mapper, still, trainer
 from torch import nn
 
 from dejavu_torch import Embedding, SpectralMapper
@@ -75,26 +75,16 @@ def run(case: str, processes: int, folder: Path) -> None:
         validation_truth=0,
     )
     steps, beginning = Steps(), copy.deepcopy(network.state_dict())
-    trainer = pl.Trainer(
-        max_steps=2 if case == "augmented" else 7,
-        accelerator="cpu",
-        devices=processes,
-        strategy="ddp" if processes > 1 else "auto",
-        default_root_dir=folder / f"{case}{processes}",
-        callbacks=[steps, LastCheckpoint(4)],
-        logger=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        gradient_clip_val=1.0,
-        num_sanity_val_steps=0,
-    )
+    shared = {"devices": processes, "strategy": "ddp" if processes > 1 else "auto", "num_sanity_val_steps": 0}
+    limits = {"max_steps": 2 if case == "augmented" else 7, "gradient_clip_val": 1.0}
+    running = trainer(folder / f"{case}{processes}", steps, LastCheckpoint(4), **shared, **limits)
     # a training makes its processes begin alike
-    torch.manual_seed(1 + trainer.global_rank)
+    torch.manual_seed(1 + running.global_rank)
     for parameter in network.parameters():
-        parameter.data += trainer.global_rank
-    trainer.fit(task, data)
+        parameter.data += running.global_rank
+    running.fit(task, data)
     kept = (steps.figures, beginning, task.dejavu.features.state_dict())
-    torch.save(kept, folder / f"{case}{processes}-{trainer.global_rank}.pt")
+    torch.save(kept, folder / f"{case}{processes}-{running.global_rank}.pt")
 
 
 if __name__ == "__main__":

@@ -70,11 +70,9 @@ def data_of(source: Tensor | None = None, **settings: Any) -> RouteData:
 
 
 def trainer(folder: Path, *callbacks: Callback, **settings: Any) -> Trainer:
-    given = {"max_steps": 4, "enable_checkpointing": bool(callbacks)} | settings
+    given = {"max_steps": 4, "accelerator": "cpu", "enable_checkpointing": bool(callbacks)} | settings
     quiet = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False}
-    return Trainer(
-        accelerator="cpu", default_root_dir=folder, callbacks=[*callbacks, MapExport()], **quiet, **given
-    )
+    return Trainer(default_root_dir=folder, callbacks=[*callbacks, MapExport()], **quiet, **given)
 
 
 def heights(steps: int) -> list[float]:
