@@ -248,18 +248,17 @@ class StepBar(ProgressBar):
     def on_train_batch_end(self, trainer: pl.Trainer, *_: Any) -> None:
         """Tell when it is time to."""
         step, now = trainer.global_step, time.monotonic()
-        loss = f"loss {float(trainer.callback_metrics.get('train/loss', math.nan)):.3g}"
         if self.bar is not None:
             self.bar.update(step - self.bar.n)
             if now - self.told_at > 1:
                 self.told_at = now
-                self.bar.set_postfix_str(loss, refresh=False)
+                self.bar.set_postfix_str(_loss(trainer), refresh=False)
             return
         due = (step - self.told) * LINES >= self.total or now - self.told_at >= APART
         if self.shown and (due or step == self.total) and step > self.told:
             self.told, self.told_at = step, now
             left = tqdm.format_interval((now - self.since) * (self.total - step) / (step - self.began))
-            line = f"dejavu: training: step {step} of {self.total}, {loss}, {left} left"
+            line = f"dejavu: training: step {step} of {self.total}, {_loss(trainer)}, {left} left"
             tqdm.write(line, file=sys.stderr)
 
     def teardown(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
@@ -267,6 +266,10 @@ class StepBar(ProgressBar):
         if self.bar is not None:
             self.bar.close()
             self.bar = None
+
+
+def _loss(trainer: pl.Trainer) -> str:
+    return f"loss {float(trainer.callback_metrics.get('train/loss', math.nan)):.3g}"
 
 
 def has_bf16() -> bool:
