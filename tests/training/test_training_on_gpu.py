@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 import torch
-from several_processes import CASES, Steps, residues
 from small_training import backbone, data_of, footage, still, trainer
+from test_several_processes import CASES, Steps, residues
 
 from dejavu_torch import DejaVu
 from dejavu_torch.data.arrays import ArrayTraverse
