@@ -437,7 +437,7 @@ def as_frames(values: Tensor) -> Tensor:
 
 
 def _joined(positives: list[Tensor]) -> GroundTruth:
-    """The truth of several traverses, one behind the other."""
+    """The truth of several traverses, one after the other."""
     width = max(part.shape[1] for part in positives)
     pad = torch.nn.functional.pad
     return as_ground_truth(torch.cat([pad(part, (0, width - part.shape[1]), value=-1) for part in positives]))

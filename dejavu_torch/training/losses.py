@@ -65,7 +65,7 @@ def place_cross_entropy(
     if tolerance < 0 or outside:
         seen = f"the tolerance is {tolerance} and places outside the route are {outside[:3]}"
         raise InputError(f"{seen}; expected at least 0, and places in 0..{n - 1} or -1")
-    # +1 where a right stretch begins, -1 behind its end: no Q x N x R
+    # +1 where a right stretch begins, -1 after its end: no Q x N x R
     known = (places >= 0).int()
     steps = known.new_zeros(queries, n + 1)
     steps.scatter_add_(1, (places - tolerance).clamp(min=0), known)

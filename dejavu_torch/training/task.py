@@ -215,7 +215,7 @@ class PlaceRecognitionTask(Trainee):
             model.features, self.frozen = HOG(), set()  # has nothing to store
             self.stages, self.index = nn.ModuleList([CodeStage()]), 0
         # a further training describes its own frames
-        self.began, self.views, self.places, self.last = 0, None, None, LastLosses()
+        self.began, self.views, self._descriptors, self.last = 0, None, None, LastLosses()
 
     def _say_few(self) -> None:
         data = self.data

@@ -19,7 +19,7 @@ from dejavu_torch.maps.template_map import TemplateMap, log_posterior
 from dejavu_torch.maps.weights import in_bits
 from dejavu_torch.model import DejaVu
 from dejavu_torch.text import one_line
-from dejavu_torch.training.datamodule import RouteData
+from dejavu_torch.training.datamodule import RouteData, StoredFrames
 from dejavu_torch.training.losses import Objective
 from dejavu_torch.types import InputError
 
@@ -41,7 +41,7 @@ class Trainee(pl.LightningModule):
         super().__init__()
         self.dejavu, self.made = dejavu, made
         self.feature_weights, self.weight_bits = feature_weights, weight_bits
-        self.places: Tensor | None = None  # see `descriptors`
+        self._descriptors: Tensor | None = None  # of the reference, once they stay as they are
         # what a code is learned from: descriptors of augmented frames, (n,K), and their places, (n,R)
         self.views: tuple[Tensor, Tensor] | None = None
 
@@ -89,10 +89,10 @@ class Trainee(pl.LightningModule):
 
     def descriptors(self) -> Tensor:
         """Descriptors of the reference, (N,K), of a network that is trained no more: made once."""
-        if self.places is None:
+        if self._descriptors is None:
             with in_mode(self.features, False):
-                self.places = self.of_reference(self.described)
-        return self.places
+                self._descriptors = self.of_reference(self.described)
+        return self._descriptors
 
     @torch.no_grad()
     def of_reference(
@@ -128,15 +128,16 @@ class Trainee(pl.LightningModule):
         """Batches of descriptors of augmented training frames, (B,K), and their known places, (B,R); at most
         `most` in all after the first round."""
         loader = self.data.training_batches()
-        rounds = min(rounds, most // len(loader.dataset)) if self.data.augmentation.acts else 1  # type: ignore[arg-type]
+        frames = len(cast(StoredFrames, loader.dataset))
+        rounds = min(rounds, most // frames) if self.data.augmentation.acts else 1
         with in_mode(self.features, False):
             for _ in range(max(1, rounds)):
-                for frames, truth in loader:
-                    known = truth.positives[:, 0] >= 0
+                for batch in loader:
+                    known = batch.truth.positives[:, 0] >= 0
                     if known.any():
-                        augmented = self.data.augmented(frames.to(self.device), self.data.clip)[known]
-                        views = features_of(augmented, self.describe, "the batch").float()
-                        yield views, truth.positives[known].to(self.device)
+                        augmented = self.data.augmented(batch.frames.to(self.device), self.data.clip)
+                        views = features_of(augmented[known], self.describe, "the batch").float()
+                        yield views, batch.truth.positives[known].to(self.device)
 
     # the map
 
