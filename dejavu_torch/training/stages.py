@@ -33,49 +33,23 @@ TEMPERATURE = 0.1  # of cosine distances, at the start
 NOISE = 0.5  # on descriptors in training, beside components of about 1
 
 
-class Stage(nn.Module):
-    """One part of a training, with an optimizer of its own.
-
-    Args:
-        share: of the steps of the whole training; the last stage takes the steps that are left.
-    """
-
-    def __init__(self, share: float = 0.0) -> None:
-        super().__init__()
-        self.share = share
-
-    def begin(self, task: Trainee) -> None:
-        """Make what the stage works with; called again if a training is resumed in it."""
-
-    def end(self) -> None:
-        """Drop what no later stage needs."""
-
-    def trained(self, task: Trainee) -> list[nn.Parameter]:
-        """The parameters that the stage trains."""
-        raise NotImplementedError
-
-    def losses(self, task: Trainee, batch: Batch) -> Losses:
-        """The losses of a batch."""
-        raise NotImplementedError
-
-    def chance(self, task: Trainee) -> dict[str, float]:
-        """The least that each loss can be without a look at the frames, of those that tell places apart."""
-        raise NotImplementedError
-
-
-class DescriptorStage(Stage):
+class DescriptorStage(nn.Module):
     """The descriptor learns to tell stretches of the route apart.
 
     Place cross-entropy over the cosine distances of the descriptor to one proxy for each stretch, as long as
     the tolerance, and shorter at the end of a route. If it is the last stage, the map is made of the
     descriptor in closed form.
+
+    Args:
+        share: of the steps of the whole training; the last stage takes the steps that are left.
     """
 
     every: Tensor
     stretch: Tensor
 
     def __init__(self, share: float = 0.0) -> None:
-        super().__init__(share)
+        super().__init__()
+        self.share = share
         self.proxies = nn.Parameter(torch.zeros(0, 0))
         self.log_temperature = nn.Parameter(torch.tensor(math.log(TEMPERATURE)))
         self.register_buffer("every", torch.tensor(1))  # places of a stretch
@@ -83,6 +57,7 @@ class DescriptorStage(Stage):
         self.register_buffer("stretch", torch.zeros(0, dtype=torch.int64), persistent=False)
 
     def begin(self, task: Trainee) -> None:
+        """Make what the stage works with; called again if a training is resumed in it."""
         if not _trainable(task.network):
             seen = f"nothing of {type(task.features).__name__} can be trained"
             raise InputError(f"{seen}; expected parameters that are not frozen, or `dejavu learn`")
@@ -109,15 +84,19 @@ class DescriptorStage(Stage):
         self.proxies = nn.Parameter(torch.randn(stretches, dimension).to(task.device))
 
     def end(self) -> None:
+        """Drop what no later stage needs."""
         self.proxies = nn.Parameter(self.proxies.detach()[:0])
 
     def trained(self, task: Trainee) -> list[nn.Parameter]:
+        """The parameters that the stage trains, with an optimizer of its own."""
         return [*_trainable(task.network), *self.parameters()]
 
     def losses(self, task: Trainee, batch: Batch) -> Losses:
+        """The losses of a batch."""
         return self.losses_to(self.proxies, task, batch)
 
     def chance(self, task: Trainee) -> dict[str, float]:
+        """The least that each loss can be without a look at the frames."""
         return {"descriptor": place_chance(sum(task.data.lengths), task.data.tolerance)}
 
     def losses_to(self, proxies: Tensor, task: Trainee, batch: Batch) -> Losses:
@@ -176,8 +155,8 @@ class RateStage(DescriptorStage):
         return Losses(total, place.parts | {"bits": per_place}, place.left_out)
 
 
-class CodeStage(Stage):
-    """Features learn to repeat with the periods of the map's layers, together with its templates.
+class CodeStage(nn.Module):
+    """The last: features learn to repeat with the periods of the map's layers, together with its templates.
 
     A descriptor is first whitened by what the augmentation and a second traverse change in it, and then kept:
     views of all training frames are described once, and the code is learned from them. Any other backbone is
@@ -221,6 +200,9 @@ class CodeStage(Stage):
     def chance(self, task: Trainee) -> dict[str, float]:
         place = {"place": place_chance(task.route.places, task.data.tolerance)}
         return place | ({"phase": phase_chance(task.route.plan)} if task.losses.phase else {})
+
+
+Stage = DescriptorStage | CodeStage
 
 
 def stages_of(backbone: nn.Module, descriptor: float, made: bool, rate: float) -> list[Stage]:

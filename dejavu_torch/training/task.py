@@ -35,7 +35,7 @@ from dejavu_torch.training.datamodule import FEW, Batch
 from dejavu_torch.training.losses import LastLosses, Objective
 from dejavu_torch.training.metrics import PlaceRecognition
 from dejavu_torch.training.processes import average_gradients, averaged, share
-from dejavu_torch.training.stages import CodeStage, RateStage, Stage, stages_of, whitens
+from dejavu_torch.training.stages import CodeStage, DescriptorStage, RateStage, Stage, stages_of, whitens
 from dejavu_torch.training.trainee import Trainee, coded
 from dejavu_torch.types import InputError, Training
 
@@ -294,7 +294,9 @@ class PlaceRecognitionTask(Trainee):
     def stop(self) -> int:
         """The step that ends the stage."""
         steps = int(self.trainer.estimated_stepping_batches)
-        return steps if self.in_last_stage else min(self.began + round(self.stage.share * steps), steps - 1)
+        if self.in_last_stage:
+            return steps
+        return min(self.began + round(cast(DescriptorStage, self.stage).share * steps), steps - 1)
 
     def _rise(self) -> int:
         """Steps of the stage in which the learning rate rises."""
@@ -302,7 +304,7 @@ class PlaceRecognitionTask(Trainee):
 
     def _advance(self, step: int) -> None:
         self._check_learned()
-        self.stage.end()
+        cast(DescriptorStage, self.stage).end()
         self.zero_grad()
         self.index, self.began, self.last = self.index + 1, step, LastLosses()
 
