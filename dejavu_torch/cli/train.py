@@ -433,7 +433,9 @@ def print_next(path: Path, data: RouteData, model: DejaVu, words: Sequence[str])
     option = "--model.backbone"
     if type(model.features) is Embedding:  # the map has its settings, all but those of the network
         option += ".network"
-    features = shlex.join(["", *features_words(model, words, option)])[2:]
+    features = "".join(
+        f" {word}" for word in map(shlex.quote, features_words(model, shlex.join(["", *words]), option))
+    )
     if len(data.listed["source"]) > 1:
         made = f"--descriptor {shlex.quote(str(path))}{features} --map route.safetensors"
         print(f"next: dejavu learn ROUTE {made}")
