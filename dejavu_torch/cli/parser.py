@@ -114,15 +114,15 @@ def with_made(words: Sequence[str]) -> list[str]:
         part, _, name = option.rpartition(".")
         if not configured and option in ("--features", "--model.backbone"):
             spelt.append(f"{option}=null")  # or arguments of the default would be those of another class
-        if option.startswith("--") and name.lstrip("-") in NETWORKS:
+        if part in made_by:
+            spelt.append(f"{part}.dict_kwargs.{word.removeprefix(part + '.')}")
+        elif option.startswith("--") and name.lstrip("-") in NETWORKS:
             value = [path] if equals else [*islice(rest, 1)]
             if value and _function_at(value[0]) is not None:
                 made_by.add(option)
                 spelt += [f"{option}={__name__}.made", f"{option}.function={value[0]}"]
             else:
                 spelt += [word] if equals else [word, *value]
-        elif part in made_by:
-            spelt.append(f"{part}.dict_kwargs.{word.removeprefix(part + '.')}")
         else:
             spelt.append(word)
     return spelt

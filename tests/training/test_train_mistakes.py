@@ -16,7 +16,7 @@ SPECTRAL = ["--model.mapper", "SpectralMapper"]
 @pytest.mark.parametrize(
     ("command", "options", "words"),
     [
-        ("fit", [*SPECTRAL, "--model.mapper.periods", "ImposedPeriods"], ["'periods' is not accepted"]),
+        ("fit", [*SPECTRAL, "--model.mapper.periods", "ImposedPeriods"], ["--model.mapper.periods is not accepted"]),
         ("fit", ["--model.mapper", "Nix"], ["model.mapper", "Nix"]),
         ("export", ["--trainer.default_root_dir", "never"], ["no checkpoint in never/checkpoints"]),
         ("fit", ["--model.backbone", "mine.Broken"], ["cannot be built", "no weights to be had"]),
@@ -63,7 +63,7 @@ def test_a_mistake_is_one_line(
 @pytest.mark.parametrize(
     ("before", "after", "words"),
     [
-        ("tolerance: 2", "tolerance: 2, augmentation: {clop: 3}", ["data.augmentation", "'clop'"]),
+        ("tolerance: 2", "tolerance: 2, augmentation: {clop: 3}", ["--data.augmentation.clop"]),
         ("source: one.npy, ", "", ["required: --data.source"]),
         ("max_steps: 4, ", "max_steps: null, ", ["trainer.max_steps is None"]),
         ("max_steps: 4, ", "max_steps: -1, ", ["no end", "trainer.max_epochs"]),
