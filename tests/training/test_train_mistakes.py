@@ -16,7 +16,11 @@ SPECTRAL = ["--model.mapper", "SpectralMapper"]
 @pytest.mark.parametrize(
     ("command", "options", "words"),
     [
-        ("fit", [*SPECTRAL, "--model.mapper.periods", "ImposedPeriods"], ["--model.mapper.periods is not accepted"]),
+        (
+            "fit",
+            [*SPECTRAL, "--model.mapper.periods", "ImposedPeriods"],
+            ["--model.mapper.periods is not accepted"],
+        ),
         ("fit", ["--model.mapper", "Nix"], ["model.mapper", "Nix"]),
         ("export", ["--trainer.default_root_dir", "never"], ["no checkpoint in never/checkpoints"]),
         ("fit", ["--model.backbone", "mine.Broken"], ["cannot be built", "no weights to be had"]),
