@@ -91,7 +91,7 @@ def run_demo(
     _publish(result, out, "dejavu demo: the built-in route", command)
     _print_localize(out / "map.safetensors", model, command, localized, "or try")
     for pair in ((learned, localized, "--config", "local_maxima"), ("MORNING", "EVENING")):
-        _print_next("compare", *pair, "--out", "report", lead="or try")
+        print_next("compare", *pair, "--out", "report", lead="or try")
 
 
 def run_learn(
@@ -242,7 +242,7 @@ def run_localize(
         _say(told_probable(counts, total) + (f"; next: {'; '.join(steps)}" if steps else ""))
     table: tuple[str | Path, ...] = () if model.step is None else ("--map", map)
     table += ("--route", "ROUTE") if model.map.routes else ()
-    _print_next("evaluate", out, "--truth", "TRUTH", *table, "--out", "scores")
+    print_next("evaluate", out, "--truth", "TRUTH", *table, "--out", "scores")
 
 
 def run_live(
@@ -533,7 +533,7 @@ def run_info(map: Path, *, features: nn.Module | None = None, command: str) -> N
         _print_localize(map, model, command)
     else:
         words = features_words(model, command)
-        _print_next("learn", "ROUTE", "--descriptor", map, *words, "--map", "route.safetensors")
+        print_next("learn", "ROUTE", "--descriptor", map, *words, "--map", "route.safetensors")
 
 
 def _check_cluster(cluster: str, device: str) -> None:
@@ -677,10 +677,11 @@ def route_lines(route: PlaceMap) -> list[str]:
 
 def _print_localize(map: Path, model: DejaVu, command: str, query: str = "QUERY", lead: str = "next") -> None:
     words = features_words(model, command)
-    _print_next("localize", map, query, *words, "--out", "matches.csv", lead=lead)
+    print_next("localize", map, query, *words, "--out", "matches.csv", lead=lead)
 
 
-def _print_next(*words: str | Path, lead: str = "next") -> None:
+def print_next(*words: object, lead: str = "next") -> None:
+    """What to run after this."""
     _say(f"{lead}: {shlex.join(['dejavu', *(str(word) for word in words)])}")
 
 

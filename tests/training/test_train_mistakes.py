@@ -26,11 +26,11 @@ SPECTRAL = ["--model.mapper", "SpectralMapper"]
         ("fit", ["--model.backbone", "mine.Broken"], ["cannot be built", "no weights to be had"]),
         ("fit", ["--trainer.max_steps", "0"], ["no steps", "above 0"]),
         ("fit", ["--trainer.val_check_interval", "0"], ["trainer.val_check_interval is 0"]),
-        ("fit", ["--trainer.max_steps", "-2"], ["trainer.max_steps is -2", "-1 for no end"]),
+        ("fit", ["--trainer.max_steps", "-2"], ["max_steps", "-2"]),
         (
             "fit",
             ["--trainer.devices", "[0, 1]", "--trainer.strategy", "fsdp"],
-            ["devices is [0, 1]", "strategy is fsdp", "or ddp"],
+            ["strategy is fsdp", "or ddp"],
         ),
         ("fit", ["--trainer.devices", "[1]"], ["CPUAccelerator"]),  # one, which this machine does not have
         ("fit", ["--trainer.num_nodes", "2"], ["num_nodes is 2", "MASTER_ADDR"]),
@@ -69,7 +69,7 @@ def test_a_mistake_is_one_line(
     [
         ("tolerance: 2", "tolerance: 2, augmentation: {clop: 3}", ["--data.augmentation.clop"]),
         ("source: one.npy, ", "", ["required: --data.source"]),
-        ("max_steps: 4, ", "max_steps: null, ", ["trainer.max_steps is None"]),
+        ("max_steps: 4, ", "max_steps: null, ", ["trainer.max_steps is null"]),
         ("max_steps: 4, ", "max_steps: -1, ", ["no end", "trainer.max_epochs"]),
         ("data: {", "data: [", ["is no YAML"]),
     ],
