@@ -35,16 +35,6 @@ def small_map(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # what works
 
 
-def test_learn_prints_plan_summary_and_bytes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run("learn", SMALL, "--map", tmp_path / "a.safetensors")
-    out = capsys.readouterr().out
-    assert "strongest periods" in out
-    assert "places covered" in out
-    assert "lines of their spectra" in out
-    assert f"{(tmp_path / 'a.safetensors').stat().st_size} bytes" in out
-    assert [file.name for file in tmp_path.iterdir()] == ["a.safetensors"]
-
-
 def test_localize_writes_one_row_a_query_as_python_finds_them(small_map: Path, tmp_path: Path) -> None:
     run("localize", small_map, QUERY, "--out", tmp_path / "m.csv")
     rows = list(csv.DictReader((tmp_path / "m.csv").open()))
@@ -101,22 +91,6 @@ def test_config_and_options(tmp_path: Path) -> None:
     assert model.map.reduction == "sum"
     assert model.batch_size == 16
     assert {(layer.start, layer.stop) for layer in model.map.plan} == {(0, 128), (128, 256)}
-
-
-def test_features_of_another_package_are_named_again_to_localize(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    np.save(tmp_path / "frames.npy", frames(64))
-    route = tmp_path / "a.safetensors"
-    monkeypatch.chdir(tmp_path)
-    flat = "--features", "torch.nn.Flatten", "--features.start_dim=1", "--features.end_dim", "-1"
-    run("learn", tmp_path / "frames.npy", "--map", route, *flat)
-    learned = capsys.readouterr().out.splitlines()[-1]
-    assert "torch.nn" in fails(capsys, "info", route)
-    run("info", route, *flat)
-    assert capsys.readouterr().out.splitlines()[-1] == learned
-    run(*("frames.npy" if word == "QUERY" else word for word in shlex.split(learned)[2:]))
-    assert len((tmp_path / "matches.csv").read_text().splitlines()) == 65
 
 
 def test_classes_of_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

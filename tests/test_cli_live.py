@@ -81,14 +81,6 @@ def test_a_line_a_frame_as_localize_finds_them(
     assert sum(abs(line["place"] - line["frame"]) <= 5 for line in found) > 50
 
 
-def test_without_a_filter_there_is_no_posterior(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for length in ("1", "5"):
-        run("live", folder / "map.safetensors", folder / "second.mkv", "--sequence", length)
-        found = lines_of(capsys.readouterr().out)
-        assert {line["posterior"] for line in found} == {None}
-        assert sum(abs(line["place"] - line["frame"]) <= 5 for line in found) > 50
-
-
 def test_a_pipe_is_brought_to_the_size_of_the_map(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -143,36 +135,6 @@ def test_frames_are_dropped_in_real_time_only(
     assert sum(left_out) + len(found) == 64
     run("live", folder / "map.safetensors", f"{folder / 'second.mkv'}?stop=8")
     assert "8 frames, 0 dropped" in capsys.readouterr().err
-
-
-def test_a_part_of_a_video_is_brought_to_the_size_of_the_map_and_keeps_its_times(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    frames = next(open_source(folder / "first.mkv").batches(24))
-    path = clip(tmp_path / "large.mkv", _pixels(torch.nn.functional.interpolate(frames, scale_factor=2)))
-    run("live", folder / "map.safetensors", f"{path}?start=4&stop=20", "--realtime", "--sequence", "1")
-    found = lines_of(capsys.readouterr().out)
-    assert all(line["place"] == 4 + line["frame"] for line in found)
-    expected = [(4 + line["frame"]) / 25 for line in found]
-    assert [line["time"] for line in found] == pytest.approx(expected, abs=2e-3)
-
-
-def test_an_interrupt_ends_with_the_summary(
-    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    call = LiveLocalizer.__call__
-
-    def interrupted(self: LiveLocalizer, frame: Any, dropped: int = 0) -> LiveMatch:
-        match = call(self, frame, dropped)
-        if match.place >= 20:
-            raise KeyboardInterrupt
-        return match
-
-    monkeypatch.setattr(LiveLocalizer, "__call__", interrupted)
-    run("live", folder / "map.safetensors", folder / "second.mkv")
-    out, err = capsys.readouterr()
-    assert err.startswith(f"dejavu: {len(lines_of(out))} frames, 0 dropped")
-    assert 10 < len(lines_of(out)) < 40
 
 
 @pytest.mark.parametrize("options", [(), ("--search_every", "5"), ("--sequence", "1")], ids=" ".join)
