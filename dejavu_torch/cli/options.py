@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -198,8 +197,7 @@ class Learning:
             return reference, None
         traverse = open_another("second", self.second, [query])
         reference = model.resample(reference, progress=True, shape=model.frame_shape)
-        with truth_by("--second_truth"):
-            return reference, growth.second_traverse(model, reference, traverse, self.second_truth)
+        return reference, growth.second_traverse(model, reference, traverse, self.second_truth)
 
     def with_calibration(
         self, model: DejaVu, reference: Reference, query: Traverse | None = None
@@ -217,8 +215,7 @@ class Learning:
             reference = model.resample(reference, model.step, True, model.frame_shape)
             traverse = model.fit(traverse, reference.frame_shape)
             model.describer.check_sizes(reference, traverse)
-        with truth_by("--calibration_truth"):
-            return reference, growth.associate(model, reference, traverse, truth)
+        return reference, growth.associate(model, reference, traverse, truth)
 
     def check_precision(self, model: DejaVu, traverse: Traverse) -> None:
         """Refuse a precision, given or the map's, that nothing is there to calibrate for."""
@@ -259,8 +256,7 @@ class Growth:
 
     def visits(self, model: DejaVu, reference: Traverse | None) -> Views:
         """The further traverse, and which places it shows, of the reference or of the map."""
-        with truth_by("--average_truth"):
-            return growth.associate(model, reference, open_source(str(self.average)), self.average_truth)
+        return growth.associate(model, reference, open_source(str(self.average)), self.average_truth)
 
 
 @dataclass
@@ -296,15 +292,6 @@ def check_no_truth(option: str, truth: str | None) -> None:
     """Refuse a truth of a traverse that is not given."""
     if truth is not None:
         raise InputError(f"--{option}_truth {truth} is of no traverse; expected --{option} SOURCE with it")
-
-
-@contextmanager
-def truth_by(option: str) -> Iterator[None]:
-    """What is refused within names the option that a truth would be given by."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(str(error).replace("or a truth that", f"or {option}, which")) from error
 
 
 def open_another(option: str, source: str, others: Iterable[Traverse | None]) -> Traverse:
