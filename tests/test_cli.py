@@ -311,7 +311,7 @@ WRONG = {  # a line of words behind `dejavu`, and what its one line holds
     "live m a.npy --page many": ("--page is many", "int"),
     "train": ("fit,validate,test",),
     "train fit --data.source a.npy --model.lr fast": ("--model.lr is fast", "float"),
-    "train fit --data.source a.npy --trainer.accelerator abacus": ("--trainer.accelerator abacus", "cpu"),
+    "train fit --data.source a.npy --trainer.accelerator abacus": ("accelerator='abacus'", "cpu"),
     f"train fit --trainer.max_steps {10**30}": ("--trainer.max_steps", "at most"),
 }
 

@@ -65,10 +65,7 @@ def test_compare_reports_what_is_accepted_on_and_off_the_map(tmp_path: Path) -> 
     assert (out / "reliability.png").exists()
     run("evaluate", out / "matches.csv", "--truth", "0", "--out", tmp_path / "file")
     of_file = report_of(tmp_path / "file")["rejection"]
-    for key in ("expected_calibration_error", "auc"):
-        assert of_file[key] == pytest.approx(facts[key], abs=1e-5)
     assert of_file["precision"] == facts["precision"]
-    assert (tmp_path / "file" / "reliability.png").exists()
     run("compare", ROUTE, AGAIN, "--map", out / "map.safetensors", "--out", tmp_path / "again")
     strict = ("--filter", "--threshold", "1e-9")  # in place of the map's precision
     run("compare", ROUTE, AGAIN, "--map", out / "map.safetensors", *strict, "--out", tmp_path / "none")

@@ -226,23 +226,17 @@ def test_a_sequence_is_of_the_map_and_of_all_beside_it(
     noisy: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     one, two = noisy
-    reports = {}
-    for length in (1, 9):
-        words = "--truth", 0, "--tolerance", 1, "--sequence", length
-        run("compare", one, two, *words, "--out", tmp_path / f"{length}")
-        reports[length] = report_of(tmp_path / f"{length}")
-        assert reports[length]["sequence"] == length
-        table = re.search(r"^AUC +T = 1 +T = 5 +T = 9 +T = 11 +T = 21\n(.*)$", capsys.readouterr().out, re.M)
-        assert (table is not None) == (tmp_path / f"{length}" / "sequences.png").exists() == (length == 9)
-        page = (tmp_path / f"{length}" / "index.html").read_text()
-        assert ("together with the 8 before it" in page) == (length == 9)
-    areas = [f"{scores['auc']:.3f}" for scores in reports[9]["sequences"].values()]
+    run("compare", one, two, "--truth", 0, "--tolerance", 1, "--sequence", 9, "--out", tmp_path / "9")
+    report = report_of(tmp_path / "9")
+    assert report["sequence"] == 9
+    table = re.search(r"^AUC +T = 1 +T = 5 +T = 9 +T = 11 +T = 21\n(.*)$", capsys.readouterr().out, re.M)
     assert table is not None
+    areas = [f"{scores['auc']:.3f}" for scores in report["sequences"].values()]
     assert table[1].split() == ["this", "map", *areas]
-    for key in ("uncompressed", "interpolated", "stride"):
-        assert reports[9][key]["auc"] > reports[1][key]["auc"]
-    assert reports[9]["null"]["auc"] != reports[1]["null"]["auc"]
-    assert reports[9]["auc"] > reports[1]["auc"]
+    assert (tmp_path / "9" / "sequences.png").exists()
+    assert "together with the 8 before it" in (tmp_path / "9" / "index.html").read_text()
+    for contender in (report, report["uncompressed"], report["interpolated"]):
+        assert contender["auc"] > contender["sequences"]["1"]["auc"]
 
     matches = tmp_path / "matches.csv"
     known = tmp_path / "9" / "map.safetensors"
@@ -253,19 +247,14 @@ def test_a_sequence_is_of_the_map_and_of_all_beside_it(
     assert places(matches) == [str(place) for place in expected.index.tolist()]
 
 
-def test_a_filter_is_of_the_map_and_of_all_beside_it(
-    noisy: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_filter_is_of_the_map_and_of_all_beside_it(noisy: tuple[Path, Path], tmp_path: Path) -> None:
     one, two = noisy
     out = tmp_path / "out"
     run("compare", one, two, "--truth", 0, "--filter", "--out", out)
     report = report_of(out)
     assert (report["filter"], report["sequence"]) == (True, 1)
     assert report["auc"] > report["sequences"]["1"]["auc"]
-    assert "a filter over all queries" in (out / "index.html").read_text()
     assert (out / "posterior.png").exists()
-    for key in ("uncompressed", "null"):
-        assert report[key]["auc"] != report[key]["sequences"]["1"]["auc"]
 
     matches, route = tmp_path / "matches.csv", out / "map.safetensors"
     run("localize", route, two, "--filter", "--out", matches)
@@ -275,14 +264,13 @@ def test_a_filter_is_of_the_map_and_of_all_beside_it(
     assert all((float(row["score"]) < math.log(2)) == (row["accepted"] == "1") for row in rows)
     assert report["threshold"] == pytest.approx(math.log(2))  # ready features are not calibrated
     assert report["least_probability"] is None
-    run("compare", one, two, "--truth", 0, "--filter", "--threshold", 0.1, "--out", out)
+    run("compare", one, two, "--filter", "--threshold", 0.1, "--out", out)
     assert report_of(out)["threshold"] == 0.1
     assert DejaVu.load(route).threshold is None  # it is none of single queries
     run("localize", route, two, "--filter", "--threshold", 100, "--top", 2, "--out", matches)
     rows = list(csv.DictReader(matches.open(newline="")))
     assert len(rows) == 400
     assert {row["accepted"] for row in rows} == {"1"}
-    capsys.readouterr()
 
 
 def test_a_sequence_longer_than_the_route_is_refused(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import re
 import shlex
 import warnings
 from collections.abc import Iterator, Sequence
@@ -202,7 +201,7 @@ class TrainCLI(LightningCLI):
         self.model.gives_way = not any("route_bytes_per_place" in word for word in self.words)
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
-        """A trainer with our callbacks; what Lightning refuses, in one line."""
+        """A trainer with our callbacks."""
         asked = self.config_init[self.subcommand]["trainer"]
         own = _listed(asked["callbacks"])
         root = Path(asked["default_root_dir"])
@@ -225,11 +224,7 @@ class TrainCLI(LightningCLI):
                 "this processor is not known to have numbers of 16 bits: 32 are taken, which are faster"
             )
             kwargs["precision"] = "32-true"
-        try:
-            trainer = super().instantiate_trainer(callbacks=own, **kwargs)
-        except (ImportError, ValueError) as error:
-            told = re.sub(r"`(\w+)='(\w+)'`", r"--trainer.\1 \2", str(error))
-            raise InputError(told) from error
+        trainer = super().instantiate_trainer(callbacks=own, **kwargs)
         trainer.words = self.words  # type: ignore[attr-defined]  # a MapTrainer
         return trainer
 
