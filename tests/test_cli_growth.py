@@ -178,14 +178,14 @@ def test_a_visit_is_averaged_into_a_map_that_is_there(
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("learn d.npy --append templates.safetensors", ["templates.safetensors", "'templates'"]),
+        ("learn d.npy --append templates.safetensors", ["kind 'templates'", "append to"]),
         ("learn wide.npy --append f.safetensors", ["wide.npy", "5 features", "expected 8"]),
         ("learn d.npy --append f.safetensors --seed 4", ["--seed", "--append"]),
         ("learn d.npy --append f.safetensors --config=paper", ["--config", "--append"]),
         ("learn d.npy --append f.safetensors --features.cell 4", ["f.safetensors", "cell"]),
         ("learn d.npy --append f.safetensors --precision .9", ["a precision, 0.9", "--calibration SOURCE"]),
         ("learn d.npy --append sure.safetensors", ["a precision, 0.9", "d.npy", "--threshold"]),
-        ("learn a.npy --append both.safetensors", ["both.safetensors", "routes first, other"]),
+        ("learn a.npy --append both.safetensors", ["routes first, other"]),
         ("learn --append f.safetensors", ["no source"]),
         ("learn --map m.safetensors --average d.npy", ["no source"]),
         ("learn --append f.safetensors --average wide.npy", ["wide.npy has 9 frames", "96"]),

@@ -118,7 +118,12 @@ def run_learn(
         raise InputError("there is no source; expected one, or --append MAP with --average SOURCE")
     assert map is not None  # the parser has seen to it
     where = device_of(learning.device, learns=True)
-    model = (model if append is None else _map_to_append_to(append, model, len(sources) > 0)).to(where)
+    if append is not None:
+        default = recipe_of(model.features) == recipe_of(HOG())
+        accepted = Acceptance(model.threshold, model.precision)
+        model = load_map(append, None if default else model.features)
+        accepted.of(model)
+    model = model.to(where)
     if cluster is not None:
         _check_cluster(cluster, learning.device)
         if not isinstance(model.mapper, SpectralMapper):
@@ -486,10 +491,7 @@ def run_merge(maps: Sequence[Path], *, map: Path, features: nn.Module | None = N
     if len(maps) < 2:
         raise InputError(f"{maps[0]} alone; expected at least two maps to merge")
     models = [load_map(path, copy.deepcopy(features)) for path in maps]
-    try:
-        model = growth.merge(models, [path.stem for path in maps])
-    except InputError as error:
-        raise InputError(f"merging {', '.join(str(path) for path in maps)}: {error}") from error
+    model = growth.merge(models, [path.stem for path in maps])
     model.save(map)
     print_map(model)
     _print_localize(map, model, command)
@@ -581,23 +583,6 @@ def _check_map_file(path: Path, *read: str | Path | None) -> None:
         raise InputError(f"--map {path} is no name of a map; expected {expected}")
     check_output_file(path)
     check_not_read(path, *read)
-
-
-def _map_to_append_to(path: Path, given: DejaVu, places: bool) -> DejaVu:
-    """The map of a file, which can grow, and accepts what the options say.
-
-    Args:
-        given: what the options say.
-        places: whether places are to be appended, not only visits averaged in.
-    """
-    default = recipe_of(given.features) == recipe_of(HOG())
-    model = load_map(path, None if default else given.features)
-    try:
-        growth.one_route(model, "append to" if places else "average visits into")
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-    Acceptance(given.threshold, given.precision).of(model)
-    return model
 
 
 def features_words(model: DejaVu, command: str, option: str = "--features") -> list[str]:
