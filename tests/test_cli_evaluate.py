@@ -8,10 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import TEMPLATES, fails, frames, report_of, run
+from command_line import fails, frames, report_of, run
 from PIL import Image
-
-from dejavu_torch import DejaVu
 
 
 @pytest.fixture(scope="module")
@@ -52,25 +50,14 @@ def test_evaluate_agrees_with_compare_whatever_the_form_of_the_truth(
     known = "--map", compared / "map.safetensors"
     run("compare", *pair, *known, "--truth", tmp_path / "truth.npz", "--out", tmp_path / "c3")
     expected = report_of(compared)
-    forms = (
-        ["4"],
-        [tmp_path / "all.csv"],
-        [tmp_path / "some.csv", "--interpolate"],
-        [tmp_path / "truth.npz"],
-    )
+    some = [tmp_path / "some.csv", "--interpolate"]
+    forms = (["4"], [tmp_path / "all.csv"], some, [tmp_path / "truth.npz"])
     for number, form in enumerate(forms):
         run("evaluate", matches, "--truth", *form, "--out", tmp_path / f"e{number}")
-        for folder in (f"e{number}", "c3"):
-            report = report_of(tmp_path / folder)
-            for key in (
-                "auc",
-                "auc_reported",
-                "recall_at_1",
-                "recall_at_100_precision",
-                "queries",
-                "accepted",
-            ):
-                assert report[key] == pytest.approx(expected[key], abs=1e-6), (folder, key)
+    keys = "auc", "auc_reported", "recall_at_1", "recall_at_100_precision", "queries", "accepted"
+    for folder in ("e0", "e1", "e2", "e3", "c3"):
+        report = report_of(tmp_path / folder)
+        assert [report[key] for key in keys] == pytest.approx([expected[key] for key in keys], abs=1e-6)
 
 
 def test_evaluate_writes_a_report_and_says_what_was_judged(
@@ -107,73 +94,11 @@ def test_coordinates_in_image_names_are_a_truth(tmp_path: Path) -> None:
     run("compare", *both, "--truth", "utm:4", "--tolerance", "0", "--out", tmp_path / "compare")
     matches = tmp_path / "compare" / "matches.csv"
     run("evaluate", matches, "--truth", "0", "--tolerance", "0", "--out", tmp_path / "zero")
+    assert report_of(tmp_path / "zero")["truth"] == "place = query"
     assert report_of(tmp_path / "compare")["auc"] == report_of(tmp_path / "zero")["auc"]
     options = ("--truth", "utm:4", "--tolerance", "0", "--out", tmp_path / "evaluate")
     run("evaluate", matches, *options, "--reference", both[0], "--query", both[1])
     assert report_of(tmp_path / "evaluate")["auc"] == report_of(tmp_path / "zero")["auc"]
-
-
-def test_what_evaluate_refuses(matches: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = ("--out", tmp_path / "out")
-    assert "nowhere.csv" in fails(capsys, "evaluate", tmp_path / "nowhere.csv", "--truth", "0", *out)
-    assert "cannot be interpolated" in fails(
-        capsys, "evaluate", matches, "--truth", "0", "--interpolate", *out
-    )
-    assert "both traverses" in fails(capsys, "evaluate", matches, "--truth", "utm", *out)
-    (tmp_path / "truth.csv").write_text("query,place\n0,four\n")
-    error = fails(capsys, "evaluate", matches, "--truth", tmp_path / "truth.csv", *out)
-    assert "truth.csv" in error
-    assert "line 2" in error
-    assert not (tmp_path / "out" / "report.json").exists()
-
-
-def test_channel_and_contrast_are_options_and_stay_with_the_map(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    route = tmp_path / "map.safetensors"
-    options = ("--preprocess.channel", "R-B", "--preprocess.contrast", "patch", "--preprocess.patch", "5")
-    run("learn", "sim:aerial?frames=128", "--map", route, *options)
-    preprocess = DejaVu.load(route).preprocess
-    assert (preprocess.channel, preprocess.contrast, preprocess.patch) == ("R-B", "patch", 5)
-    run("localize", route, "sim:aerial?frames=16", "--out", tmp_path / "m.csv")
-    run("info", route)
-    assert "channel='R-B', contrast='patch'" in capsys.readouterr().out
-    np.save(tmp_path / "grey.npy", frames(16, size=64))
-    error = fails(capsys, "localize", route, tmp_path / "grey.npy", "--out", tmp_path / "m.csv")
-    assert "R-B" in error
-    assert "frames with 1 channel" in error
-    error = fails(capsys, "learn", "sim:aerial?frames=128", "--map", route, "--preprocess.channel", "X")
-    assert "'X'" in error
-
-
-def test_what_is_taken_for_the_truth_is_told(
-    pair: tuple[Path, Path], matches: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = tmp_path / "photos"
-    folder.mkdir()
-    for i, image in enumerate(frames(32)):
-        Image.fromarray(image).save(folder / f"{i}.png")
-    run("compare", folder, folder, "--out", tmp_path / "same")
-    told = "right within 5 frames of the truth (place = query, as the sources say themselves)"
-    assert told in capsys.readouterr().out
-    assert told in (tmp_path / "same" / "index.html").read_text()
-    run("evaluate", matches, "--truth", "4", "--reference", pair[0], "--out", tmp_path / "offset")
-    assert "of the truth (place = query + 4)" in capsys.readouterr().out
-    assert report_of(tmp_path / "offset")["truth"] == "place = query + 4"
-
-
-def test_a_reference_tells_evaluate_where_the_map_ends(
-    pair: tuple[Path, Path], matches: Path, tmp_path: Path
-) -> None:
-    known = "--map", matches.parent / "map.safetensors"
-    run("compare", *pair, *known, "--truth", "20", "--out", tmp_path / "compare")
-    options = ("--truth", "20", "--out", tmp_path / "evaluate")
-    run("evaluate", tmp_path / "compare" / "matches.csv", "--reference", pair[0], *options)
-    both = [report_of(tmp_path / name) for name in ("compare", "evaluate")]
-    assert [report["with_answer"] for report in both] == [76, 76]
-    assert both[0]["recall_at_1"] == both[1]["recall_at_1"]
-    run("evaluate", matches, *options)
-    assert report_of(tmp_path / "evaluate")["places"] is None
 
 
 @pytest.mark.slow
@@ -192,31 +117,6 @@ def test_the_threshold_that_is_named_accepts_right_places_only(
     assert second["accepted"] == round(first["recall_at_100_precision"] * first["with_answer"])
 
 
-def test_a_curve_that_starts_late_is_marked(
-    pair: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Stored frames find themselves at distance 0, all of them: one threshold, and no area."""
-    run(
-        "compare",
-        pair[0],
-        pair[0],
-        "--truth",
-        "0",
-        *TEMPLATES,
-        "--tolerance",
-        "0",
-        "--out",
-        tmp_path / "itself",
-    )
-    out = capsys.readouterr().out
-    report = report_of(tmp_path / "itself")
-    assert report["uncompressed"]["recall_at_1"] == report["uncompressed"]["curve_starts_at_recall"] == 1
-    assert report["uncompressed"]["auc"] == 0
-    assert "0.000*" in out
-    assert "*: this curve starts at a recall above 0.1" in out
-    assert "every frame" not in out  # what stores the same frames stands there once
-
-
 def test_a_report_leaves_the_images_alone_and_no_picture_of_an_earlier_one(
     pair: tuple[Path, Path], compared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -233,29 +133,6 @@ def test_a_report_leaves_the_images_alone_and_no_picture_of_an_earlier_one(
     assert (tmp_path / "out" / "coverage.png").exists()
 
 
-def test_frames_of_other_sizes_are_told_before_learning_and_in_one_line(
-    pair: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    np.save(tmp_path / "large.npy", frames(96, size=48)[:, :40])
-    error = fails(capsys, "compare", pair[0], tmp_path / "large.npy", "--out", tmp_path / "out")
-    assert "324 features a frame of 1 x 32 x 32" in error
-    assert "720 features a frame of 1 x 40 x 48" in error
-    run("learn", pair[0], "--map", tmp_path / "map.safetensors")
-    capsys.readouterr()
-    options = ("--out", tmp_path / "m.csv")
-    error = fails(capsys, "localize", tmp_path / "map.safetensors", tmp_path / "large.npy", *options)
-    assert "frames of 1 x 40 x 48 give 720 features; the map expects 324" in error
-    run("info", tmp_path / "map.safetensors")
-    assert "frames of 1 x 32 x 32" in capsys.readouterr().out
-
-
-def test_a_map_without_layers_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    np.save(tmp_path / "flat.npy", np.full((40, 16, 16), 99, np.uint8))
-    run("learn", tmp_path / "flat.npy", "--map", tmp_path / "map.safetensors", *TEMPLATES)
-    run("localize", tmp_path / "map.safetensors", tmp_path / "flat.npy", "--out", tmp_path / "m.csv")
-    assert "the map holds no layers: no place can be reported" in capsys.readouterr().out
-
-
 def test_options_that_do_nothing_for_ready_features_are_told(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -265,50 +142,6 @@ def test_options_that_do_nothing_for_ready_features_are_told(
     assert "ready features" not in caplog.text
     run("learn", *arguments, "--preprocess.channel", "R-B")
     assert "these are ready features: channel and contrast are left as they are" in caplog.text
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        f"compare a b --out x --tolerance {2**63}",
-        f"learn a --map b.safetensors --seed -{2**64}",
-        f"learn a --map b.safetensors --preprocess.grid [{10**30},2]",
-        f"localize a b --out c.csv --seed {'9' * 4200}",
-        f"train fit --trainer.max_steps {10**30}",
-    ],
-)
-def test_whole_numbers_that_no_tensor_holds_are_refused(
-    arguments: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert "expected" in fails(capsys, *arguments.split())
-
-
-def test_options_are_not_guessed_from_their_beginnings(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    os.mkfifo(tmp_path / "fifo")  # which a --config would be looked at for
-    assert "--conf" in fails(capsys, "learn", "a", "--map", "b.safetensors", "--conf", tmp_path / "fifo")
-
-
-def test_a_tolerance_beyond_the_route_is_a_tolerance(
-    matches: Path, pair: tuple[Path, Path], tmp_path: Path
-) -> None:
-    run("evaluate", matches, "--truth", "4", "--tolerance", str(2**53), "--out", tmp_path / "evaluate")
-    assert report_of(tmp_path / "evaluate")["recall_at_1"] == 1
-    wide = ("--tolerance", str(2**53), "--truth", "4")
-    run("compare", *pair, *wide, "--out", tmp_path / "compare", *TEMPLATES, "--leave_out", str(2**53))
-    assert report_of(tmp_path / "compare")["recall_at_1"] == 1
-    known = "--map", matches.parent / "map.safetensors"
-    run("compare", *pair, *known, *wide, "--out", tmp_path / "filter", "--filter")
-    assert report_of(tmp_path / "filter")["recall_at_1"] == 1
-
-
-def test_frame_numbers_of_any_size_are_evaluated(tmp_path: Path) -> None:
-    far = 2**53 - 1
-    (tmp_path / "m.csv").write_text(f"query,place,score\n0,{far},0.5\n{far},3,0.7\n")
-    (tmp_path / "t.csv").write_text(f"0,{far}\n{far},3\n")
-    run("evaluate", tmp_path / "m.csv", "--truth", tmp_path / "t.csv", "--out", tmp_path / "out")
-    assert report_of(tmp_path / "out")["recall_at_1"] == 1
 
 
 @pytest.mark.parametrize("name", [b"a\nb", b"a\x1b[2Jb", b"\xff\xfe"])
@@ -335,3 +168,13 @@ def test_what_pillow_logs_is_no_line(
     path.write_bytes(whole)
     assert "a.tif" in fails(capsys, "learn", tmp_path / "images", "--map", tmp_path / "map.safetensors")
     assert caplog.text == ""
+
+
+def test_numbers_of_any_size_are_evaluated(tmp_path: Path) -> None:
+    far = 2**53 - 1
+    (tmp_path / "m.csv").write_text(f"query,place,score\n0,{far},0.5\n{far},3,0.7\n")
+    (tmp_path / "t.csv").write_text(f"0,{far}\n{far},5\n")
+    for tolerance, right in ((1, 0.5), (2**53, 1)):
+        words = "--truth", tmp_path / "t.csv", "--tolerance", tolerance
+        run("evaluate", tmp_path / "m.csv", *words, "--out", tmp_path / "out")
+        assert report_of(tmp_path / "out")["recall_at_1"] == right

@@ -10,6 +10,8 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from urllib.request import urlopen
@@ -22,6 +24,8 @@ from footage import REFERENCE, camera, footage
 from videos import H264, clip, piped
 
 from dejavu_torch import DejaVu, LiveLocalizer, SpectralMapper, Whitening, open_source
+from dejavu_torch.cli.commands import run_live
+from dejavu_torch.cli.parser import parse
 from dejavu_torch.live.localizer import LiveMatch
 from dejavu_torch.live.page import Page
 
@@ -75,14 +79,6 @@ def test_a_line_a_frame_as_localize_finds_them(
     assert [line["reference_frame"] for line in found] == [int(row["place"]) for row in rows]
     assert [line["accepted"] for line in found] == [row["accepted"] in ("1", "True") for row in rows]
     assert sum(abs(line["place"] - line["frame"]) <= 5 for line in found) > 50
-
-
-def test_without_a_filter_there_is_no_posterior(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for length in ("1", "5"):
-        run("live", folder / "map.safetensors", folder / "second.mkv", "--sequence", length)
-        found = lines_of(capsys.readouterr().out)
-        assert {line["posterior"] for line in found} == {None}
-        assert sum(abs(line["place"] - line["frame"]) <= 5 for line in found) > 50
 
 
 def test_a_pipe_is_brought_to_the_size_of_the_map(
@@ -141,56 +137,6 @@ def test_frames_are_dropped_in_real_time_only(
     assert "8 frames, 0 dropped" in capsys.readouterr().err
 
 
-def test_a_part_of_a_video_is_brought_to_the_size_of_the_map_and_keeps_its_times(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    frames = next(open_source(folder / "first.mkv").batches(24))
-    path = clip(tmp_path / "large.mkv", _pixels(torch.nn.functional.interpolate(frames, scale_factor=2)))
-    run("live", folder / "map.safetensors", f"{path}?start=4&stop=20", "--realtime", "--sequence", "1")
-    found = lines_of(capsys.readouterr().out)
-    assert all(line["place"] == 4 + line["frame"] for line in found)
-    expected = [(4 + line["frame"]) / 25 for line in found]
-    assert [line["time"] for line in found] == pytest.approx(expected, abs=2e-3)
-
-
-def test_an_interrupt_ends_with_the_summary(
-    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    call = LiveLocalizer.__call__
-
-    def interrupted(self: LiveLocalizer, frame: Any, dropped: int = 0) -> LiveMatch:
-        match = call(self, frame, dropped)
-        if match.place >= 20:
-            raise KeyboardInterrupt
-        return match
-
-    monkeypatch.setattr(LiveLocalizer, "__call__", interrupted)
-    run("live", folder / "map.safetensors", folder / "second.mkv")
-    out, err = capsys.readouterr()
-    assert err.startswith(f"dejavu: {len(lines_of(out))} frames, 0 dropped")
-    assert 10 < len(lines_of(out)) < 40
-
-
-@pytest.mark.parametrize("how", ["interrupt", "head"])
-def test_a_process_that_nobody_needs_any_more_ends(how: str, folder: Path, tmp_path: Path) -> None:
-    """Ctrl-C is how a camera is ended; and who reads the lines may leave."""
-    with piped(tmp_path, (folder / "second.ts").read_bytes() * 2, open_for=60) as pipe:
-        command = [sys.executable, "-m", "dejavu_torch.cli", "live", str(folder / "map.safetensors"), pipe]
-        environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
-        process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
-        )
-        assert process.stdout is not None
-        assert process.stderr is not None
-        json.loads(process.stdout.readline())
-        if how == "interrupt":
-            process.send_signal(signal.SIGINT)
-        else:
-            process.stdout.close()
-        assert process.wait(20) == 0
-        assert re.fullmatch(r"dejavu: \d+ frames, \d+ dropped; .*\n", process.stderr.read())
-
-
 @pytest.mark.parametrize("options", [(), ("--search_every", "5"), ("--sequence", "1")], ids=" ".join)
 def test_the_page_shows_frame_reference_and_answer(
     options: tuple[str, ...],
@@ -230,66 +176,6 @@ def test_the_page_shows_frame_reference_and_answer(
             assert sum(state["curve"]) + state["off"] == pytest.approx(1, abs=1e-3)
 
 
-@pytest.mark.slow
-def test_a_page_of_a_file_plays_in_real_time_and_stays_until_ctrl_c(folder: Path, tmp_path: Path) -> None:
-    """A folder has no times: 10 frames a second. Nobody looks at the page, and none of its frames is lost."""
-    frames = next(open_source(folder / "second.mkv").batches(8))
-    np.save(tmp_path / "frames.npy", _pixels(frames))
-    words = ["live", str(folder / "map.safetensors"), str(tmp_path / "frames.npy"), "--page", "0"]
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
-    process = subprocess.Popen(
-        [sys.executable, "-m", "dejavu_torch.cli", *words],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=environment,
-    )
-    assert process.stdout is not None
-    assert process.stderr is not None
-    url = process.stderr.readline().split()[-1]
-    began, lines = time.monotonic(), [json.loads(process.stdout.readline()) for _ in range(8)]
-    assert time.monotonic() - began > 0.5
-    assert [line["frame"] for line in lines] == [*range(8)]
-    assert url in process.stderr.readline()
-    with urlopen(f"{url}state") as answer:
-        assert json.load(answer)["number"] == 7
-    assert process.poll() is None
-    process.send_signal(signal.SIGINT)
-    assert process.wait(20) == 0
-    assert process.stderr.read().startswith("dejavu: 8 frames, 0 dropped")
-
-
-def test_a_port_in_use_is_one_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with Page(0) as page:
-        port = page.url.rpartition(":")[2].strip("/")
-        words = ("live", folder / "map.safetensors", folder / "second.mkv", "--page", port)
-        assert port in fails(capsys, *words)
-
-
-MISTAKES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    "camera": (("/dev/video99",), ("/dev/video99 is not there", "camera")),
-    "address": (("rtsp://127.0.0.1:1/x",), ("rtsp://127.0.0.1:1/x", "refused")),
-    "file": (("missing.mp4",), ("missing.mp4 is not there",)),
-    "no times": (("sim:aerial?frames=20", "--realtime"), ("no times", "video")),
-    "camera's time": (("/dev/video99", "--realtime"), ("its own time",)),
-    "reference alone": (("sim:aerial?frames=20", "--reference", "sim:aerial"), ("--page",)),
-    "reference": (
-        ("sim:aerial?frames=20", "--page", "0", "--reference", "sim:aerial?frames=20"),
-        ("20 frames", "64"),
-    ),
-    "port": (("sim:aerial?frames=20", "--page", "99999"), ("99999", "65535")),
-    "timeout": (("/dev/video99", "--timeout", "0"), ("--timeout 0", "above 0")),
-}
-
-
-@pytest.mark.parametrize("mistake", MISTAKES)
-def test_mistakes_are_one_line(mistake: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words, told = MISTAKES[mistake]
-    error = fails(capsys, "live", folder / "map.safetensors", *words)
-    assert [word for word in told if word not in error] == []
-
-
 def test_a_map_of_even_steps_is_refused_but_as_it_is(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -304,11 +190,64 @@ def test_a_map_of_even_steps_is_refused_but_as_it_is(
     assert any(line["place"] != line["reference_frame"] for line in found)
 
 
-def test_a_bare_page_has_a_port(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    ports = []
-    monkeypatch.setattr(
-        "dejavu_torch.cli.live.Page.__init__", lambda self, port, *_: ports.append(port) or 1 / 0
-    )
-    with pytest.raises(ZeroDivisionError):
-        run("live", folder / "map.safetensors", "sim:aerial?frames=20", "--page")
-    assert ports == [8765]
+@contextmanager
+def process(*words: str | Path) -> Iterator[subprocess.Popen[str]]:
+    """`dejavu live` of its own; its lines can be read as they come."""
+    command = [sys.executable, "-m", "dejavu_torch.cli", "live", *map(str, words)]
+    pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+    with subprocess.Popen(command, text=True, env=environment, **pipes) as started:  # type: ignore[call-overload]
+        yield started
+
+
+@pytest.mark.parametrize("how", ["interrupt", "head"])
+def test_a_process_that_nobody_needs_any_more_ends(how: str, folder: Path, tmp_path: Path) -> None:
+    """Ctrl-C is how a camera is ended; and who reads the lines may leave."""
+    stream = piped(tmp_path, (folder / "second.ts").read_bytes() * 2, open_for=60)
+    with stream as pipe, process(folder / "map.safetensors", pipe) as live:
+        json.loads(live.stdout.readline())
+        if how == "interrupt":
+            live.send_signal(signal.SIGINT)
+        else:
+            live.stdout.close()
+        assert live.wait(20) == 0
+        assert re.fullmatch(r"dejavu: \d+ frames, \d+ dropped; .*\n", live.stderr.read())
+
+
+def test_a_page_of_a_file_plays_in_real_time_and_stays_until_ctrl_c(folder: Path, tmp_path: Path) -> None:
+    """A folder has no times: 10 frames a second. Nobody looks at the page, and none of its frames is lost."""
+    np.save(tmp_path / "frames.npy", _pixels(next(open_source(folder / "second.mkv").batches(8))))
+    with process(folder / "map.safetensors", tmp_path / "frames.npy", "--page", "0") as live:
+        url = live.stderr.readline().split()[-1]
+        began, lines = time.monotonic(), [json.loads(live.stdout.readline()) for _ in range(8)]
+        assert time.monotonic() - began > 0.5
+        assert [line["frame"] for line in lines] == [*range(8)]
+        assert url in live.stderr.readline()
+        with urlopen(f"{url}state") as answer:
+            assert json.load(answer)["number"] == 7
+        assert live.poll() is None
+        live.send_signal(signal.SIGINT)
+        assert live.wait(20) == 0
+        assert live.stderr.read().startswith("dejavu: 8 frames, 0 dropped")
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("sim:aerial?frames=20 --realtime", "no times"),
+        ("/dev/video99 --realtime", "its own time"),
+        ("missing.mp4", "missing.mp4 is not there"),
+        ("sim:aerial?frames=20 --reference sim:aerial", "--page"),
+        ("sim:aerial?frames=20 --page 0 --reference sim:aerial?frames=20", "20 frames"),
+        ("sim:aerial?frames=20 --page 99999", "65535"),
+        ("/dev/video99 --timeout 0", "--timeout 0; expected seconds, above 0"),
+    ],
+)
+def test_mistakes_are_one_line(
+    words: str, told: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert told in fails(capsys, "live", folder / "map.safetensors", *words.split())
+
+
+def test_a_bare_page_has_a_port() -> None:
+    assert parse("live", run_live, ["map", "source", "--page"])["page"] == 8765

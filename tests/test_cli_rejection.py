@@ -51,16 +51,6 @@ def test_a_learned_map_tells_probabilities_and_accepts_by_them(learned: Path, tm
         assert any(row["accepted"] == "1" for row in found)
 
 
-def test_a_precision_is_kept_in_the_map_until_another_or_a_threshold_is_given(tmp_path: Path) -> None:
-    path, out = tmp_path / "map.safetensors", tmp_path / "m.csv"
-    run("learn", ROUTE, "--map", path, "--precision", ".95")
-    accepted = []
-    for words in ((), ("--precision", ".95"), ("--precision", ".5"), ("--threshold", "9")):
-        run("localize", path, AGAIN, "--out", out, *words)
-        accepted.append(sum(row["accepted"] == "1" for row in rows(out)))
-    assert accepted[0] == accepted[1] <= accepted[2] <= accepted[3] == 64
-
-
 def test_compare_reports_what_is_accepted_on_and_off_the_map(tmp_path: Path) -> None:
     out = tmp_path / "out"
     others = f"[{SEA},{SEA}&seed=3]"
@@ -75,10 +65,7 @@ def test_compare_reports_what_is_accepted_on_and_off_the_map(tmp_path: Path) -> 
     assert (out / "reliability.png").exists()
     run("evaluate", out / "matches.csv", "--truth", "0", "--out", tmp_path / "file")
     of_file = report_of(tmp_path / "file")["rejection"]
-    for key in ("expected_calibration_error", "auc"):
-        assert of_file[key] == pytest.approx(facts[key], abs=1e-5)
     assert of_file["precision"] == facts["precision"]
-    assert (tmp_path / "file" / "reliability.png").exists()
     run("compare", ROUTE, AGAIN, "--map", out / "map.safetensors", "--out", tmp_path / "again")
     strict = ("--filter", "--threshold", "1e-9")  # in place of the map's precision
     run("compare", ROUTE, AGAIN, "--map", out / "map.safetensors", *strict, "--out", tmp_path / "none")
@@ -106,64 +93,39 @@ def test_no_calibration_where_none_is_wanted_or_can_be(
 
 
 @pytest.mark.parametrize(
-    ("words", "told", "commands"),
+    ("line", "told"),
     [
-        ("--sequence 5 --precision .9", ("--sequence 5", "--precision 0.9"), "localize live compare"),
-        ("--sequence 5 --filter", ("--sequence 5", "--filter"), "localize live compare"),
-        ("--threshold 1 --precision .9", ("--threshold 1", "--precision 0.9"), "localize live compare"),
-        ("--sequence 5 --distractors sim:outdoor", ("--sequence 5", "--distractors sim:outdoor"), "compare"),
-        (
-            "--filter --search_every 9 --precision .9",
-            ("--search_every 9", "--precision 0.9"),
-            "localize live",
-        ),
-        ("--search_every 9", ("--search_every 9", "--filter"), "localize"),
-        ("--precision 1", ("precision is 1", "below 1"), "localize"),
-        ("--moves [1]", ("--moves [1.0]", "--filter"), "localize"),
-        ("--speeds [2]", ("--speeds [2.0]", "--sequence"), "localize"),
+        ("localize m a --out c --sequence 5 --precision .9", ("--sequence 5", "--precision 0.9")),
+        ("localize m a --out c --threshold 1 --precision .9", ("--threshold 1", "--precision 0.9")),
+        ("localize m a --out c --search_every 9", ("--search_every 9", "--filter")),
+        ("localize m a --out c --speeds [2]", ("--speeds [2.0]", "--sequence")),
+        ("localize m a --out c --precision 1", ("precision is 1", "below 1")),
+        ("live m a --sequence 5 --filter", ("--sequence 5", "--filter")),
+        ("live m a --filter --search_every 9 --precision .9", ("--search_every 9", "--precision 0.9")),
+        ("compare a b --out c --sequence 5 --distractors sim:outdoor", ("--sequence 5", "--distractors")),
     ],
 )
 def test_options_that_exclude_each_other_are_told_before_anything_is_read(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: str, told: tuple[str, ...], commands: str
+    capsys: pytest.CaptureFixture[str], line: str, told: tuple[str, ...]
 ) -> None:
-    out = ("--out", tmp_path / "out")
-    read = {
-        "localize": ("nowhere.safetensors", "nowhere", *out),
-        "live": ("nowhere.safetensors", "nowhere"),
-        "compare": ("nowhere", "nowhere", *out),
-    }
-    for command in commands.split():
-        error = fails(capsys, command, *read[command], *words.split())
-        assert [one for one in told if one not in error] == [], error
-        assert "nowhere" not in error
+    error = fails(capsys, *line.split())
+    assert [one for one in told if one not in error] == [], error
+    assert "not there" not in error
 
 
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (("--calibration", AGAIN), ("itself", "another traverse")),
-        (("--calibration", ROUTE), ("itself", "another traverse")),
-        (("--calibration", THIRD, "--calibration_truth", "60"), ("none of",)),
-        (("--calibration_truth", "0"), ("--calibration SOURCE",)),
-        (("--calibration", "nowhere"), ("nowhere is not there",)),
-        (("--distractors", AGAIN), ("one of the traverses", "another route")),
-        (("--precision", ".9", "--calibration", "none"), ("--precision 0.9", "calibrated map")),
+        (("--calibration", AGAIN), "itself; expected another traverse"),
+        (("--calibration", ROUTE), "itself; expected another traverse"),
+        (("--second", AGAIN), "itself; expected another traverse"),
+        (("--distractors", AGAIN), "itself; expected another traverse"),
+        (("--calibration_truth", "0"), "--calibration SOURCE"),
+        (("--precision", ".9", "--calibration", "none"), "a precision, 0.9, and --calibration none"),
     ],
 )
 def test_traverses_that_do_not_serve(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], told: tuple[str, ...]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], told: str
 ) -> None:
-    error = fails(capsys, "compare", ROUTE, AGAIN, "--out", tmp_path / "out", *words)
-    assert [word for word in told if word not in error] == [], error
+    assert told in fails(capsys, "compare", ROUTE, AGAIN, "--out", tmp_path / "out", *words)
     assert not (tmp_path / "out").exists()
-
-
-def test_frames_of_another_size_are_told_ahead_of_the_work(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    np.save(tmp_path / "small.npy", np.zeros((64, 32, 24), np.uint8))
-    monkeypatch.setattr(DejaVu, "learn", None)
-    words = ("--map", tmp_path / "map.safetensors", "--calibration", tmp_path / "small.npy")
-    error = fails(capsys, "learn", ROUTE, *words)
-    assert "small.npy gives" in error
-    assert "one size" in error

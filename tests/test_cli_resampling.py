@@ -9,13 +9,10 @@ import numpy as np
 import pytest
 import torch
 from command_line import TEMPLATES, fails, report_of
-from footage import QUERY, REFERENCE, SIDE, STEP, camera, everything, footage
-from helpers import template_model
+from footage import QUERY, REFERENCE, SIDE, STEP, footage
 
 from dejavu_torch import DejaVu
 from dejavu_torch.cli import main
-from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.evaluation.compare import compare
 
 CORNERS = ["--velocity.corners", "[[0,0],[1,0],[1,1],[0,1]]", "--velocity.size", f"[{SIDE},{SIDE}]"]
 STEPS = [*CORNERS, "--velocity.step", str(STEP)]
@@ -47,8 +44,15 @@ def evaluate_file(folder: Path, truth: str, out: Path, *options: str) -> dict:
     return report_of(out)
 
 
-def test_convention_11_matches_count_frames_of_the_sources(folder: Path) -> None:
+def test_convention_11_matches_count_frames_of_the_sources(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     rows = localize(folder, "again.csv")
+    assert f"{len(QUERY)} frames make 101 even steps of 6 pixels of ground" in capsys.readouterr().out
+    main(["info", f"{folder}/m.safetensors"])
+    told = capsys.readouterr().out
+    assert "places are 6 pixels of ground apart" in told
+    assert "GroundOdometry: corners=((0.0, 0.0)" in told
     assert list(rows[0])[:4] == ["query", "place", "score", "accepted"]
     assert len(rows) == 101
     queries, places = (torch.tensor([int(row[name]) for row in rows]) for name in ("query", "place"))
@@ -71,29 +75,6 @@ def test_compare_is_learn_localize_and_evaluate(folder: Path, tmp_path: Path) ->
     assert "right within 5 places at even steps" in (tmp_path / "c" / "index.html").read_text()
 
 
-def test_compare_of_a_single_query_frame() -> None:
-    model = template_model(periods=everything(101), velocity=camera())
-    one = ArrayTraverse(footage(torch.tensor([300])))
-    there = int((REFERENCE - 300).abs().argmin())
-    result = compare(ArrayTraverse(footage(REFERENCE)), one, str(there), model)
-    assert result.run.match.index.tolist() == [50]
-    assert result.report.as_json()["recall_at_1"] == 1.0
-
-
-def test_learn_and_localize_tell_the_steps(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    localize(folder, "told.csv")
-    assert f"{len(QUERY)} frames make 101 even steps of 6 pixels of ground" in capsys.readouterr().out
-    main(["learn", f"{folder}/reference.npy", "--map", f"{folder}/told.safetensors", *OPTIONS])
-    assert f"{len(REFERENCE)} frames make 101 even steps of 6 pixels" in capsys.readouterr().out
-
-
-def test_info_tells_how_the_ground_was_measured(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    main(["info", f"{folder}/m.safetensors"])
-    told = capsys.readouterr().out
-    assert "places are 6 pixels of ground apart" in told
-    assert "GroundOdometry: corners=((0.0, 0.0)" in told
-
-
 def test_another_camera_and_frames_as_they_come(folder: Path) -> None:
     # half of the ground fills the patch: it seems to move twice as fast
     rows = localize(folder, "half.csv", "--corners", "[[0,0.5],[1,0.5],[1,1],[0,1]]")
@@ -102,57 +83,20 @@ def test_another_camera_and_frames_as_they_come(folder: Path) -> None:
     assert [int(row["query"]) for row in rows] == list(range(len(QUERY)))
 
 
-# bad input -----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (["--velocity.corners", "[[0,0],[1,0],[1,1.5],[0,1]]"], "lie outside the frame"),
-        (["--velocity.corners", "[[1,1],[0,1],[0,0]]"], "3 corners"),
-        (["--velocity.step", "4000", *CORNERS], "expected at least one step, 4000"),
-        (["--velocity", "true"], "velocity"),
-    ],
-)
 def test_ground_that_cannot_be_is_refused(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], words: str
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert words in fails(
-        capsys, "learn", folder / "reference.npy", "--map", tmp_path / "m.safetensors", *options
-    )
+    outside = "[[0,0],[1,0],[1,1.5],[0,1]]"
+    learn = "learn", folder / "reference.npy", "--map", tmp_path / "m.safetensors"
+    assert "lie outside the frame" in fails(capsys, *learn, "--velocity.corners", outside)
+    query = folder / "query.npy", "--out", tmp_path / "m.csv", "--corners"
+    localized = "localize", folder / "m.safetensors", *query
+    assert "lie outside the frame" in fails(capsys, *localized, outside)
+    assert "--as_is measures no ground" in fails(capsys, *localized, outside, "--as_is")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_corners_of_another_camera_need_ground(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    main(["learn", f"{folder}/reference.npy", "--map", f"{tmp_path}/plain.safetensors"])
-    rest = [folder / "query.npy", "--out", tmp_path / "m.csv", "--corners", "[[0,0],[1,0],[1,1],[0,1]]"]
-    assert "without --velocity" in fails(capsys, "localize", tmp_path / "plain.safetensors", *rest)
-    error = fails(capsys, "localize", folder / "m.safetensors", *rest, "--as_is")
-    assert "--as_is measures no ground" in error
-    error = fails(capsys, "localize", folder / "m.safetensors", *rest[:-1], "[[0,0],[1,0],[1,2],[0,1]]")
-    assert "lie outside the frame" in error
-    assert not (tmp_path / "m.csv").exists()
-
-
-def test_queries_that_stand_are_refused(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    np.save(tmp_path / "still.npy", np.load(folder / "query.npy")[[7] * 9])
-    still = tmp_path / "still.npy", "--out", tmp_path / "m.csv"
-    assert "stands still in all of its 9 frames" in fails(
-        capsys, "localize", folder / "m.safetensors", *still
-    )
 
 
 def test_a_bare_velocity_is_understood(folder: Path, tmp_path: Path) -> None:
     command = ["learn", f"{folder}/reference.npy", "--map", f"{tmp_path}/m.safetensors", "--velocity"]
     main([*command, *OPTIONS])
     assert DejaVu.load(tmp_path / "m.safetensors").step == STEP
-
-
-def test_a_part_of_a_part_can_be_null(folder: Path, tmp_path: Path) -> None:
-    command = ["learn", f"{folder}/reference.npy", "--map", f"{tmp_path}/m.safetensors", *TEMPLATES]
-    main([*command, "--mapper.periods.hop", "50", "--mapper.periods.hop", "null"])
-    assert DejaVu.load(tmp_path / "m.safetensors").mapper.periods.hop is None

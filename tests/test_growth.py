@@ -463,7 +463,7 @@ def test_a_map_of_means_is_that_of_the_means_by_hand(tmp_path: Path) -> None:
     loaded = DejaVu.load(tmp_path / "m")
     assert torch.equal(loaded.map.visits, model.map.visits)
     learned(route).save(tmp_path / "once")
-    assert "map.visits" not in read_map(tmp_path / "once").tensors
+    assert "map.visits" not in read_map(tmp_path / "once")[0]
     assert loaded.summary().route["visits"] == 4 * 8
     assert loaded.summary().map_bytes == (tmp_path / "m").stat().st_size
     fresh = DejaVu(whitening="none", mapper=SpectralMapper(6.0, chunk=50))

@@ -34,7 +34,7 @@ ARROWS = {
     "model growth",
     "export": "text version types data features maps recognition model",
     "training": "text types memory resize data features periods maps recognition "
-    "motion model_file model growth evaluation",
+    "motion model_file model evaluation",
     "cli": "text types data features periods maps recognition motion learning model_file model "
     "growth cluster live export evaluation training",
 }

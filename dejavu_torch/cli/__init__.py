@@ -29,9 +29,6 @@ COMMANDS = {  # what `dejavu --help` says of them; each is `run_NAME` of command
 LONGEST = 300  # characters of a message of torch's
 
 
-BENCHES = "in a clone of the repository, with pip install '.[bench]'"  # where the benchmarks are
-
-
 def main(
     arguments: Sequence[str] | None = None, program: Callable[[Sequence[str]], None] | None = None
 ) -> None:
@@ -48,7 +45,9 @@ def main(
         process.take_over()
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read when torch is loaded, which is below
     try:
-        run(sys.argv[1:] if arguments is None else arguments, program)
+        with _shortages_of_one_line():
+            (program or run_command)(sys.argv[1:] if arguments is None else arguments)
+        _check_output()
     except SystemExit as error:
         if not error.code:
             _check_output()
@@ -60,16 +59,19 @@ def main(
         process.let_go()
 
 
-def run(given: Sequence[str], program: Callable[[Sequence[str]], None] | None = None) -> None:
-    """Run a command line; what it gets wrong is one line on stderr and exit status 2."""
+@contextmanager
+def _shortages_of_one_line() -> Iterator[None]:
+    """In the block a lack of memory, or of levels to nest, ends the command."""
     try:
-        (program or run_command)(given)
+        yield
     except (MemoryError, RuntimeError, ImportError, OSError) as error:
-        shortage = _shortage(error)
-        if shortage is None:
+        text = one_line(str(error))
+        if isinstance(error, RecursionError):
+            fail(f"nested too deeply: {text}")
+        told = ("an't allocate memory", "annot allocate memory", "out of memory")
+        if not isinstance(error, MemoryError) and not any(words in text for words in told):
             raise
-        fail(shortage)
-    _check_output()
+        fail(f"not enough memory: {text.rpartition('DefaultCPUAllocator: ')[2][:LONGEST] or 'it ran out'}")
 
 
 @contextmanager
@@ -136,17 +138,6 @@ def _log_to_stderr() -> None:
     warnings.showwarning = lambda message, *_, **__: log.warning("%s", message)
 
 
-def _shortage(error: Exception) -> str | None:
-    """What a failure says where it is one of memory, or of what was nested too deeply; else None."""
-    text = one_line(str(error))
-    if isinstance(error, RecursionError):
-        return f"nested too deeply: {text}"
-    told = ("can't allocate memory", "annot allocate memory", "out of memory")
-    if not isinstance(error, MemoryError) and not any(words in text for words in told):
-        return None
-    return f"not enough memory: {text.rpartition('DefaultCPUAllocator: ')[2][:LONGEST] or 'it ran out'}"
-
-
 def _check_output() -> None:
     problem = process.output_problem()
     if problem is not None:
@@ -163,7 +154,8 @@ def overview(word: str) -> NoReturn:
             print(f"  {name:<10}  {text}")
         print("\n`dejavu COMMAND --help` shows its options, `dejavu --version` the version.")
     elif word == "bench":
-        fail(f"the benchmarks are not part of the package; expected `python -m benchmarks` {BENCHES}")
+        where = "in a clone of the repository, with pip install '.[bench]'"
+        fail(f"the benchmarks are not part of the package; expected `python -m benchmarks` {where}")
     else:
         fail(f"{word!r} is no command; expected one of {', '.join(COMMANDS)} (see --help)")
     raise SystemExit(0)

@@ -6,12 +6,13 @@ Only what every command needs is imported above: the rest, such as matplotlib, w
 from __future__ import annotations
 
 import copy
+import re
 import shlex
 import threading
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from itertools import pairwise
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,7 +34,6 @@ from dejavu_torch.cli.options import (
     Searching,
     Sequences,
     load_map,
-    truth_by,
 )
 from dejavu_torch.data.frame_range import chained
 from dejavu_torch.data.output import check_output_file, check_output_folder, whole_folder
@@ -85,18 +85,14 @@ def run_demo(
     print(f"learning {reference.name}, then finding {query.name} on it")
     reference, views = given.with_second(model, reference, query)
     paper = paper_model()
-    named = [recipe_of(one.mapper) for one in (model, paper)]
-    others = {"paper": ("the paper to the letter", paper)} if named[0] != named[1] else {}
+    same = recipe_of(model.mapper) == recipe_of(paper.mapper)
+    others = {} if same else {"paper": ("the paper to the letter", paper)}
     settings: dict[str, Any] = {"seed": seed, "second": views, "others": others, "progress": True}
     result = compare(reference, query, model=model, storage_curve=True, **settings)
     _publish(result, out, "dejavu demo: the built-in route", command)
-    kept, features = str(out / "map.safetensors"), features_words(model, shlex.split(command), "--features")
-    for words in (
-        ["localize", kept, localized, *features, "--out", "matches.csv"],
-        ["compare", learned, localized, "--config", "local_maxima", "--out", "templates"],
-        ["compare", "MORNING", "EVENING", "--out", "report"],
-    ):
-        _say(f"or try: {shlex.join(['dejavu', *words])}")
+    _print_localize(out / "map.safetensors", model, command, localized, "or try")
+    for pair in ((learned, localized, "--config", "local_maxima"), ("MORNING", "EVENING")):
+        print_next("compare", *pair, "--out", "report", lead="or try")
 
 
 def run_learn(
@@ -118,47 +114,49 @@ def run_learn(
         cluster: Ray workers that make the chunks of a long route: auto, one for each processor of this
             machine, or the address of a cluster. Sources are read there, by the same paths
     """
-    append, average = growing.append, growing.average
-    where, map = device_of(learning.device, learns=True), append if map is None else map
+    append = growing.append
+    if not sources and not (append and growing.average):
+        raise InputError("there is no source; expected one, or --append MAP with --average SOURCE")
     assert map is not None  # the parser has seen to it
-    given = model.precision
-    model = (model if append is None else _map_to_append_to(append, model, len(sources) > 0)).to(where)
+    where = device_of(learning.device, learns=True)
+    if append is not None:
+        default = recipe_of(model.features) == recipe_of(HOG())
+        accepted = Acceptance(model.threshold, model.precision)
+        model = load_map(append, None if default else model.features)
+        accepted.of(model)
+    model = model.to(where)
     if cluster is not None:
         _check_cluster(cluster, learning.device)
         if not isinstance(model.mapper, SpectralMapper):
             seen = f"--cluster {cluster} makes chunks, and {type(model.mapper).__name__} makes none"
             raise InputError(f"{seen}; expected a spectral map")
-    _check_map_file(map, *sources, learning.second, *learning.files, average, growing.average_truth)
-    precision = f"--precision {given}" if given is not None else f"the map's precision, {model.precision},"
-    if learning.calibration == NO_CALIBRATION and model.precision is not None:
-        seen = f"{precision} with --calibration none"
-        raise InputError(f"{seen}; expected one of them, as --threshold replaces the precision")
+    _check_map_file(map, *sources, *learning.files, growing.average, growing.average_truth)
     learning.seed_whitening(model)
     growing.check(sources, learning.calibration)
-    traverse, views, visits = _to_learn(sources, model, growing, learning)
-    shown = visits.traverse if traverse is None else traverse
-    learning.check_precision(model, shown, precision)
-    known: Views | None = None
-    if traverse is not None:
-        traverse, known = learning.with_calibration(model, traverse)
-        shown = traverse
-    elif learning.calibration not in UNREAD:
-        with truth_by("--calibration_truth"):
-            further = open_source(str(learning.calibration))
-            known = growth.associate(model, None, further, learning.calibration_truth)
+    traverse: Traverse | None = None
+    views: Views | None = None
+    if sources:
+        chain = chained([open_source(one) for one in sources])
+        traverse = model.resample(chain, model.step, True, model.frame_shape)
+        _print_steps(traverse)
+        traverse, views = learning.with_second(model, traverse)
+    visits = None if growing.average is None else growing.visits(model, traverse)
+    learning.check_precision(model, visits.traverse if traverse is None else traverse)  # type: ignore[union-attr]
+    traverse, known = learning.with_calibration(model, traverse)
     places: Tensor | None = None  # that the traverse shows, where it is not from the first on
     done, start, checkpoint = "", model.map.places, Checkpoint(map)
     with _coding(cluster) as code:
-        if append is not None and traverse is not None:
+        if traverse is None:
+            assert visits is not None
+            checkpoint.check_unused()
+            count, traverse, places = growth.average(model, visits, progress=True), *visits
+            done = f"{count} of the {start} places of {append}"
+            done += ": decoded, averaged and coded again at the same step"
+        elif append is not None:
             growth.append(model, traverse, progress=True, checkpoint=checkpoint, code=code, visits=visits)
             places = torch.arange(start, model.map.places)
             known = known and known._replace(places=known.places + torch.where(known.places >= 0, start, 0))
             done = f"{len(places)} places behind the {start} of {append}; written to {map}"
-        elif traverse is None:
-            checkpoint.check_unused()
-            count, places = growth.average(model, visits, progress=True), visits.places
-            done = f"{count} of the {start} places of {append}"
-            done += ": decoded, averaged and coded again at the same step"
         elif visits is not None:
             growth.learn_mean(model, traverse, visits, True, views, checkpoint, code)
         else:
@@ -167,31 +165,14 @@ def run_learn(
         seen = f"{model.map.places} frames are learned here"
         print(f"{seen}: --cluster {cluster} is for the chunks of over {SHORT}")
     if learning.calibration != NO_CALIBRATION:
-        growth.calibrate_if_possible(model, shown, known, places)
+        growth.calibrate_if_possible(model, traverse, known, places)
     model.matching()
     model.save(map)
     checkpoint.remove()
     print_map(model)
     if done:
         _say(done)
-    if model.map.summary().covered:
-        _print_localize(map, model, command)
-    else:
-        print("next: try more frames, another --preprocess.contrast, or `dejavu train fit`")
-
-
-def _to_learn(
-    sources: Sequence[str], model: DejaVu, growing: Growth, learning: Learning
-) -> tuple[Traverse | None, Views | None, Any]:
-    """The traverse to learn, what whitening learns from, and visits to average in; the first and either of
-    the others are None where they are not asked for."""
-    if not sources:
-        return None, None, growing.visits(model, None)
-    chain = chained([open_source(one) for one in sources])
-    traverse = model.resample(chain, model.step, True, model.frame_shape)
-    _print_steps(traverse)
-    traverse, views = learning.with_second(model, traverse)
-    return traverse, views, growing.visits(model, traverse) if growing.average is not None else None
+    _print_localize(map, model, command)
 
 
 def run_localize(
@@ -223,8 +204,6 @@ def run_localize(
     check_not_read(out, map, source)
     matcher = sequences.matcher(APART, acceptance.threshold)
     acceptance.check(matcher)
-    if top is not None:
-        check_candidates(top, APART)
     if cluster is not None:
         _check_cluster(cluster, loading.device)
         if sequences.filter or sequences.sequence != 1:
@@ -245,10 +224,7 @@ def run_localize(
     if model.step is not None:
         query = model.resample(query, model.step, True, model.frame_shape)
         _print_steps(query)
-    if matcher is not None:
-        matcher.check(None, model.map.places)
-    model.matching(matcher)
-    rule = model.acceptance(matcher)
+    rule = model.matching(matcher).rule
     matches = model.matches(query, "localizing", matcher, None, top, APART)
     if top is not None:
         matches = (part.map(Tensor.flatten) for part in matches)
@@ -271,7 +247,7 @@ def run_localize(
         _say(told_probable(counts, total) + (f"; next: {'; '.join(steps)}" if steps else ""))
     table: tuple[str | Path, ...] = () if model.step is None else ("--map", map)
     table += ("--route", "ROUTE") if model.map.routes else ()
-    _print_next("evaluate", out, "--truth", "TRUTH", *table, "--out", "scores")
+    print_next("evaluate", out, "--truth", "TRUTH", *table, "--out", "scores")
 
 
 def run_live(
@@ -344,35 +320,24 @@ def run_compare(
     from dejavu_torch.evaluation.compare import compare
 
     where = device_of(learning.device, learns=map is None)
-    top, calibration = judging.top, learning.calibration
-    filter, within = sequences.filter, max(0, judging.tolerance)
-    matcher = sequences.matcher(within, model.threshold)
-    Acceptance(model.threshold, model.precision).check(matcher, judging.distractors)
-    if top is not None:
-        check_candidates(top, within)
-    asked = model.threshold
-    if filter:
-        model.threshold = None  # of distances: that of the filter is none for the map to keep
+    acceptance = Acceptance(model.threshold, model.precision)
+    matcher = sequences.matcher(max(0, judging.tolerance), acceptance.threshold)
+    acceptance.check(matcher, judging.distractors)
     if map is not None:
-        given = model
-        model = load_map(map, None if isinstance(given.features, HOG) else given.features)
+        model = load_map(map, None if isinstance(model.features, HOG) else model.features)
         if model.map.routes:
             names = ", ".join(route.name for route in model.map.routes)
             raise InputError(f"--map {map} has the routes {names}; expected a map of {reference} alone")
-        Acceptance(asked, given.precision).of(model)
-        model.threshold = None if filter and asked is not None else model.threshold
+        acceptance.of(model)
+    if sequences.filter and acceptance.threshold is not None:
+        model.threshold = None  # it is of the filter's probabilities, and none for the map to keep
     searching.of(model.to(where))
     first, queries = open_source(reference), open_source(query)
     _check_report_folder(out, COMPARED, [reference, query, learning.second], [judging.truth, *learning.files])
-    beside = [open_source(one) for one in (learning.second, calibration) if one not in UNREAD]
+    beside = [open_source(one) for one in (learning.second, learning.calibration) if one not in UNREAD]
     strange = judging.off_map([first, queries, *beside])
-    known_frames = calibration is None and len(first.frame_shape) == 3
-    certain = calibration not in UNREAD or (known_frames if map is None else model.calibration is not None)
-    if not certain or (matcher is not None and not filter):
-        for name, value in (("--precision", model.precision), ("--distractors", judging.distractors or None)):
-            if value is not None:
-                why = "probabilities are of single queries and of a filter, on a calibrated map"
-                raise InputError(f"{name} {value}: {why}; expected --threshold, or none of both")
+    if map is None:
+        learning.check_precision(model, first)
     learning.seed_whitening(model)
     first, views = learning.with_second(model, first, queries)
     first, known = learning.with_calibration(model, first, queries)
@@ -387,13 +352,13 @@ def run_compare(
         interpolate=judging.interpolate,
         second=views,
         sequence=matcher,
-        top=1 if top is None else top,
-        calibration="none" if calibration == NO_CALIBRATION else known,
+        top=1 if judging.top is None else judging.top,
+        calibration="none" if learning.calibration == NO_CALIBRATION else known,
         distractors=strange,
         storage_curve=judging.storage_curve,
         progress=True,
     )
-    _publish(result, out, f"{query} found on {reference}", command, map, top)
+    _publish(result, out, f"{query} found on {reference}", command, map, judging.top)
 
 
 def run_evaluate(
@@ -523,17 +488,13 @@ def run_merge(maps: Sequence[Path], *, map: Path, features: nn.Module | None = N
         features: class of the maps' features, if not ours
     """
     _check_map_file(map, *maps)
-    for i, path in enumerate(maps):
-        twice = next((one for one in maps[:i] if one.exists() and path.exists() and one.samefile(path)), None)
-        if twice is not None:
-            raise InputError(f"{path} and {twice} are one file; expected each map once")
+    for one, other in combinations(maps, 2):
+        if one.exists() and other.exists() and one.samefile(other):
+            raise InputError(f"{other} and {one} are one file; expected each map once")
     if len(maps) < 2:
         raise InputError(f"{maps[0]} alone; expected at least two maps to merge")
     models = [load_map(path, copy.deepcopy(features)) for path in maps]
-    try:
-        model = growth.merge(models, [path.stem for path in maps])
-    except InputError as error:
-        raise InputError(f"merging {', '.join(str(path) for path in maps)}: {error}") from error
+    model = growth.merge(models, [path.stem for path in maps])
     model.save(map)
     print_map(model)
     _print_localize(map, model, command)
@@ -576,8 +537,8 @@ def run_info(map: Path, *, features: nn.Module | None = None, command: str) -> N
     if model.map.places:
         _print_localize(map, model, command)
     else:
-        words = features_words(model, shlex.split(command), "--features")
-        _print_next("learn", "ROUTE", "--descriptor", map, *words, "--map", "route.safetensors")
+        words = features_words(model, command)
+        print_next("learn", "ROUTE", "--descriptor", map, *words, "--map", "route.safetensors")
 
 
 def _check_cluster(cluster: str, device: str) -> None:
@@ -627,46 +588,20 @@ def _check_map_file(path: Path, *read: str | Path | None) -> None:
     check_not_read(path, *read)
 
 
-def _map_to_append_to(path: Path, given: DejaVu, places: bool) -> DejaVu:
-    """The map of a file, which can grow, and accepts what the options say.
-
-    Args:
-        given: what the options say; of its features only what a file cannot bring counts.
-        places: whether places are to be appended, not only visits averaged in.
-    """
-    default = recipe_of(given.features) == recipe_of(HOG())
-    model = load_map(path, None if default else given.features)
-    try:
-        growth.one_route(model, "append to" if places else "average visits into")
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-    Acceptance(given.threshold, given.precision).of(model)
-    return model
-
-
-def features_words(model: DejaVu, words: Sequence[str], option: str) -> list[str]:
+def features_words(model: DejaVu, command: str, option: str = "--features") -> list[str]:
     """The options `--features ..` of a later command, where a map cannot bring its features back itself.
 
     Args:
-        words: of this command, in which `option` says what the features are.
+        command: as it was typed; its words with `option` say what the features are.
     """
-    foreign = [one.class_path for one in with_parts(recipe_of(model.features))]
-    foreign = [name for name in foreign if name not in REGISTRY]
+    parts = with_parts(recipe_of(model.features))
+    foreign = [one.class_path for one in parts if one.class_path not in REGISTRY]
     if not foreign:
         return []
-    told = [
-        word
-        for before, word in pairwise(["", *words])
-        if _of(word, option) or (_of(before, option) and "=" not in before)
-    ]
-    named = any(word.partition("=")[0] == option for word in told)
-    told = [f"--features{word.removeprefix(option)}" if _of(word, option) else word for word in told]
-    return told if named else ["--features", foreign[0], *told]  # a config file has named it
-
-
-def _of(word: str, option: str) -> bool:
-    """Whether a word is this option, or of its part."""
-    return f"{word}.".startswith((f"{option}.", f"{option}="))
+    typed = re.findall(rf" {option}((?:\.[\w.]+)?[= ](?:'[^']*'|[^\s'])+)", command)
+    if not any(one[0] in "= " for one in typed):  # a config file has named it
+        typed.insert(0, f" {foreign[0]}")
+    return shlex.split(" ".join(f"--features{one}" for one in typed))
 
 
 def _check_report_folder(
@@ -730,19 +665,14 @@ def route_lines(route: PlaceMap) -> list[str]:
     return lines
 
 
-def _print_localize(map: Path, model: DejaVu, command: str) -> None:
-    _print_next(
-        "localize",
-        map,
-        "QUERY",
-        *features_words(model, shlex.split(command), "--features"),
-        "--out",
-        "matches.csv",
-    )
+def _print_localize(map: Path, model: DejaVu, command: str, query: str = "QUERY", lead: str = "next") -> None:
+    words = features_words(model, command)
+    print_next("localize", map, query, *words, "--out", "matches.csv", lead=lead)
 
 
-def _print_next(*words: str | Path) -> None:
-    _say(f"next: {shlex.join(['dejavu', *(str(word) for word in words)])}")
+def print_next(*words: object, lead: str = "next") -> None:
+    """What to run after this."""
+    _say(f"{lead}: {shlex.join(['dejavu', *(str(word) for word in words)])}")
 
 
 def _say(text: str) -> None:

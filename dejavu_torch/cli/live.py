@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 import sys
 import time
 from collections import deque
@@ -18,7 +17,7 @@ from dejavu_torch.data.camera import Camera, Frame, is_stream, shots_of, stretch
 from dejavu_torch.data.source import open_source
 from dejavu_torch.live.feed import FrameReader, in_real_time
 from dejavu_torch.live.localizer import LiveLocalizer, LiveMatch
-from dejavu_torch.live.page import Page, ReferencePictures, Snapshot
+from dejavu_torch.live.page import Page, ReferencePictures, Snapshot, without_nan
 from dejavu_torch.model import DejaVu
 from dejavu_torch.text import printable
 from dejavu_torch.types import InputError, SequenceModel
@@ -128,21 +127,10 @@ def _noted(camera: Camera) -> Iterable[Frame]:
 
 def line_of(shot: Frame, match: LiveMatch) -> str:
     """An answer as a line of JSON."""
-    facts = {
-        "frame": shot.number,
-        "time": shot.seconds,
-        "place": match.place,
-        "reference_frame": match.frame,
-        "name": match.name,
-        "score": match.score,
-        "posterior": match.posterior,
-        "probability": match.probability,
-        "accepted": match.accepted,
-        "milliseconds": round(match.milliseconds, 3),
-    }
-    facts |= {"route": match.route} if match.route else {}
-    lost = [key for key, value in facts.items() if isinstance(value, float) and not math.isfinite(value)]
-    return json.dumps(facts | dict.fromkeys(lost))
+    answer = match._asdict() | {"milliseconds": round(match.milliseconds, 3)}
+    place, frame, route = (answer.pop(name) for name in ("place", "frame", "route"))
+    facts = {"frame": shot.number, "time": shot.seconds, "place": place, "reference_frame": frame, **answer}
+    return json.dumps(without_nan(facts | ({"route": route} if route else {})))
 
 
 def percentiles(milliseconds: Iterable[float]) -> tuple[float, float]:

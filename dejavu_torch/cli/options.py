@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from torch import nn
 
@@ -26,6 +25,7 @@ from dejavu_torch.types import InputError, SequenceModel, Traverse
 
 NO_CALIBRATION = "none"
 UNREAD = (None, NO_CALIBRATION)  # of --calibration: no source
+Reference = TypeVar("Reference", Traverse, Traverse | None)
 
 
 @dataclass
@@ -51,21 +51,20 @@ class Sequences:
         Args:
             within, threshold: of the filter, which keeps its own threshold if that is None.
         """
-        search_every: int | None = getattr(self, "search_every", None)
-        matcher = SequenceMatcher(self.sequence, (1.0,) if self.speeds is None else self.speeds)
-        if self.filter and self.sequence > 1:
-            raise InputError(f"--sequence {self.sequence} and --filter; expected one or the other")
+        settings = {"moves": self.moves, "search_every": getattr(self, "search_every", None)}
+        given: dict[str, Any] = {name: value for name, value in settings.items() if value is not None}
+        if self.filter:
+            if self.sequence > 1:
+                raise InputError(f"--sequence {self.sequence} and --filter; expected one or the other")
+            chosen = PlaceFilter(within=within, **given)
+            chosen.threshold = chosen.threshold if threshold is None else threshold
+            return chosen
+        for name, value in given.items():
+            raise InputError(f"--{name} {value} without --filter; expected both")
         if self.speeds is not None and self.sequence == 1:
             raise InputError(f"--speeds {self.speeds} without --sequence; expected --sequence T with them")
-        settings: dict[str, Any] = {"moves": self.moves, "search_every": search_every}
-        given = {name: value for name, value in settings.items() if value is not None}
-        if not self.filter:
-            for name, value in given.items():
-                raise InputError(f"--{name} {value} without --filter; expected both")
-            return None if self.sequence == 1 else matcher
-        chosen = PlaceFilter(within=within, **given)
-        chosen.threshold = chosen.threshold if threshold is None else threshold
-        return chosen
+        matcher = SequenceMatcher(self.sequence, (1.0,) if self.speeds is None else self.speeds)
+        return None if self.sequence == 1 else matcher
 
 
 @dataclass
@@ -204,8 +203,8 @@ class Learning:
 
     @property
     def files(self) -> list[Any]:
-        """What is read, but for the second traverse."""
-        return [self.second_truth, self.descriptor, self.calibration, self.calibration_truth]
+        """What is read."""
+        return [self.second, self.second_truth, self.descriptor, self.calibration, self.calibration_truth]
 
     def seed_whitening(self, model: DejaVu) -> None:
         """The command's seed for a whitening that is to be learned and has none of its own."""
@@ -219,41 +218,38 @@ class Learning:
         if self.second is None:
             check_no_truth("second", self.second_truth)
             return reference, None
-        traverse = open_source(self.second)
-        if query is not None and same_as(traverse, [query]):
-            seen = f"--second {self.second} is the query itself"
-            raise InputError(f"{seen}; expected a third traverse, or none")
+        traverse = open_another("second", self.second, [query])
         reference = model.resample(reference, progress=True, shape=model.frame_shape)
-        with truth_by("--second_truth"):
-            return reference, growth.second_traverse(model, reference, traverse, self.second_truth)
+        return reference, growth.second_traverse(model, reference, traverse, self.second_truth)
 
     def with_calibration(
-        self, model: DejaVu, reference: Traverse, query: Traverse | None = None
-    ) -> tuple[Traverse, Views | None]:
-        """The reference, and the traverse that its map is calibrated by."""
+        self, model: DejaVu, reference: Reference, query: Traverse | None = None
+    ) -> tuple[Reference, Views | None]:
+        """The reference, if there is one, and the traverse that its map, or the model's, is calibrated by."""
         source, truth = self.calibration, self.calibration_truth
-        if source in UNREAD:
+        if source is None or source == NO_CALIBRATION:
             check_no_truth("calibration", truth)
             return reference, None
-        traverse = open_source(str(source))
-        if self.second is not None and same_as(traverse, [open_source(self.second)]):
-            raise InputError(f"--calibration {source} is that of --second; expected a further traverse")
-        same = same_as(traverse, [*parts_of(source_of(reference)), *([] if query is None else [query])])
-        if same is not None:
-            raise InputError(f"--calibration {source} is {same.name} itself; expected another traverse")
-        reference = model.resample(reference, model.step, True, model.frame_shape)
-        traverse = model.fit(traverse, reference.frame_shape)
-        model.describer.check_sizes(reference, traverse)
-        with truth_by("--calibration_truth"):
-            return reference, growth.associate(model, reference, traverse, truth)
+        others: list[Traverse | None] = [query]
+        others += [] if reference is None else parts_of(source_of(reference))
+        others += [] if self.second is None else [open_source(self.second)]
+        traverse = open_another("calibration", source, others)
+        if reference is not None:
+            reference = model.resample(reference, model.step, True, model.frame_shape)
+            traverse = model.fit(traverse, reference.frame_shape)
+            model.describer.check_sizes(reference, traverse)
+        return reference, growth.associate(model, reference, traverse, truth)
 
-    def check_precision(self, model: DejaVu, traverse: Traverse, told: str) -> None:
-        """Refuse a precision that nothing can be calibrated for; `told` is how a message names it."""
-        if model.precision is not None and len(traverse.frame_shape) != 3 and self.calibration is None:
-            seen = f"{told} and {traverse.name}, which has no frames to calibrate by"
-            raise InputError(
-                f"{seen}; expected --calibration SOURCE, or --threshold in place of the precision"
-            )
+    def check_precision(self, model: DejaVu, traverse: Traverse) -> None:
+        """Refuse a precision, given or the map's, that nothing is there to calibrate for."""
+        why = ""
+        if self.calibration == NO_CALIBRATION:
+            why = "--calibration none"
+        elif self.calibration is None and len(traverse.frame_shape) != 3:
+            why = f"{traverse.name}, which has no frames to calibrate by"
+        if model.precision is not None and why:
+            expected = "expected --calibration SOURCE, or --threshold in place of the precision"
+            raise InputError(f"a precision, {model.precision}, and {why}; {expected}")
 
 
 @dataclass
@@ -277,17 +273,13 @@ class Growth:
         if self.average is None:
             check_no_truth("average", self.average_truth)
             return
-        traverse = open_source(self.average)
-        if same_as(traverse, [open_source(one) for one in sources]):
-            seen = f"--average {self.average} is what is learned"
-            raise InputError(f"{seen}; expected another traverse of its places")
-        if calibration not in UNREAD and same_as(traverse, [open_source(str(calibration))]):
-            raise InputError(f"--calibration {calibration} is that of --average; expected a further traverse")
+        traverse = open_another("average", self.average, [open_source(one) for one in sources])
+        if calibration not in UNREAD:
+            open_another("calibration", str(calibration), [traverse])
 
     def visits(self, model: DejaVu, reference: Traverse | None) -> Views:
         """The further traverse, and which places it shows, of the reference or of the map."""
-        with truth_by("--average_truth"):
-            return growth.associate(model, reference, open_source(str(self.average)), self.average_truth)
+        return growth.associate(model, reference, open_source(str(self.average)), self.average_truth)
 
 
 @dataclass
@@ -313,16 +305,10 @@ class Judging:
     distractors: list[str] | str | None = None
     storage_curve: bool = False
 
-    def off_map(self, traverses: Iterable[Traverse]) -> list[Traverse]:
+    def off_map(self, traverses: Collection[Traverse]) -> list[Traverse]:
         """The distractors, none of which may be one of the traverses."""
         given = [self.distractors] if isinstance(self.distractors, str) else self.distractors or []
-        others = [open_source(one) for one in given]
-        for other in others:
-            if same_as(other, traverses):
-                raise InputError(
-                    f"--distractors {other.name} is one of the traverses; expected another route"
-                )
-        return others
+        return [open_another("distractors", one, traverses) for one in given]
 
 
 def check_no_truth(option: str, truth: str | None) -> None:
@@ -331,16 +317,10 @@ def check_no_truth(option: str, truth: str | None) -> None:
         raise InputError(f"--{option}_truth {truth} is of no traverse; expected --{option} SOURCE with it")
 
 
-@contextmanager
-def truth_by(option: str) -> Iterator[None]:
-    """What is refused within names the option that a truth would be given by."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(str(error).replace("or a truth that", f"or {option}, which")) from error
-
-
-def same_as(traverse: Traverse, others: Iterable[Traverse]) -> Traverse | None:
-    """The first of others that has the name of a traverse, however its path is written."""
-    name = Path(traverse.name).resolve()
-    return next((other for other in others if Path(other.name).resolve() == name), None)
+def open_another(option: str, source: str, others: Iterable[Traverse | None]) -> Traverse:
+    """The traverse of an option, none of those that are read already, however its path is written."""
+    traverse = open_source(source)
+    for other in others:
+        if other is not None and Path(other.name).resolve() == Path(traverse.name).resolve():
+            raise InputError(f"--{option} {source} is {other.name} itself; expected another traverse")
+    return traverse

@@ -8,9 +8,9 @@ import pydoc
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import is_dataclass
-from itertools import pairwise
+from itertools import islice
 from pathlib import Path
-from typing import Any, Literal, NoReturn, cast, get_args, get_origin
+from typing import Any, NoReturn, cast, get_args, get_origin
 
 import docstring_parser
 import jsonargparse
@@ -21,8 +21,6 @@ from dejavu_torch.cli.presets import check_config, check_word, find_config
 from dejavu_torch.data.files import LARGEST
 from dejavu_torch.data.source import check_not_read
 from dejavu_torch.features.hog import HOG
-from dejavu_torch.maps.spectral import SpectralMapper
-from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.text import one_line
 from dejavu_torch.types import InputError
@@ -44,19 +42,7 @@ HINT = (
 )
 BARE = {"velocity": "GroundOdometry", "page": 8765}  # what an option without a value means
 MapFile = restricted_string_type("MapFile", r".*\.safetensors")
-MAPPERS = {SpectralMapper: "default", TemplateMapper: "local_maxima"}  # and the preset that has each
 NETWORKS = ("features", "backbone", "network")  # options that name a class, or a function that makes one
-WORDS = {  # what values of Python's types are on a command line
-    "int": "an integer",
-    "float": "a number",
-    "bool": "true or false",
-    "str": "a word",
-    "Path": "a path",
-    "MapFile": "a map file",
-    "Module": "a class or function by its import path, such as dejavu_torch.HOG",
-    **dict.fromkeys(("list", "tuple", "Sequence"), "a list, such as [1, 2]"),
-    **dict.fromkeys(("dict", "Mapping"), "settings, as KEY: VALUE"),
-}
 LONGEST = 300  # characters of a message that is told whole
 
 
@@ -98,10 +84,7 @@ def made(function: str, **arguments: Any) -> nn.Module:
     maker = _function_at(function)
     if maker is None:
         raise InputError(f"{function} is no function that can be imported; expected one, or a class")
-    try:
-        network = maker(**arguments)
-    except SystemExit as stop:  # it would end the command without a word
-        raise InputError(f"{function} ends the program ({stop}); expected what makes a network") from stop
+    network = maker(**arguments)
     if not isinstance(network, nn.Module):
         raise InputError(f"{function} made a {type(network).__name__}; expected an nn.Module")
     return network
@@ -122,27 +105,24 @@ def with_made(words: Sequence[str]) -> list[str]:
     `--features timm.create_model --features.model_name NAME` is the name's call; jsonargparse itself takes
     functions only whose return value and arguments are annotated.
     """
-    makers = {}
-    for word, after in pairwise([*words, ""]):
-        option, equals, value = word.partition("=")
-        if option.startswith("--") and option.lstrip("-").rpartition(".")[2] in NETWORKS:
-            path = value if equals else after
-            makers[option] = path if _function_at(path) is not None else ""
-    default = not any(word.partition("=")[0] in ("--config", "-c") for word in words)
+    configured = any(word.partition("=")[0] in ("--config", "-c") for word in words)
+    made_by: set[str] = set()  # options that name a function
     spelt: list[str] = []
-    skip = False
-    for word in words:
-        option, equals, _ = word.partition("=")
-        part = option.rpartition(".")[0]
-        if default and option in ("--features", "--model.backbone"):
+    rest = iter(words)
+    for word in rest:
+        option, equals, path = word.partition("=")
+        part, _, name = option.rpartition(".")
+        if not configured and option in ("--features", "--model.backbone"):
             spelt.append(f"{option}=null")  # or arguments of the default would be those of another class
-        if makers.get(option):
-            spelt += [f"{option}={__name__}.made", f"{option}.function={makers[option]}"]
-            skip = not equals
-        elif skip:
-            skip = False
-        elif makers.get(part):
+        if part in made_by:
             spelt.append(f"{part}.dict_kwargs.{word.removeprefix(part + '.')}")
+        elif option.startswith("--") and name.lstrip("-") in NETWORKS:
+            value = [path] if equals else [*islice(rest, 1)]
+            if value and _function_at(value[0]) is not None:
+                made_by.add(option)
+                spelt += [f"{option}={__name__}.made", f"{option}.function={value[0]}"]
+            else:
+                spelt += [word] if equals else [word, *value]
         else:
             spelt.append(word)
     return spelt
@@ -199,64 +179,34 @@ class Parser(jsonargparse.ArgumentParser):
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         head, required, names = message.partition("required: ")
         if required:
-            positional = [action.dest for action in self._actions if not action.option_strings]
-            needed = [
+            positional = {action.dest for action in self._actions if not action.option_strings}
+            words = [
                 name if name in positional else f"--{name.partition('.')[2] or name}"  # behind fit.
                 for name in names.split(", ")
             ]
-            message = f"{head}{required}{', '.join(needed)}"
+            message = f"{head}{required}{', '.join(words)}"
         told = one_line(_by_options(message, ex))
         raise UsageError(told if len(told) < LONGEST else f"{told[:LONGEST]} ...") from ex
 
 
 def _by_options(message: str, error: Exception | None) -> str:
-    """What jsonargparse says, by the names of options and without those of Python's types."""
-    found = re.match(r'Parser key "([^"]+)"[^:]*:\s*(.*)', message, re.DOTALL)
-    key, text = found.groups() if found else ("", message)
-    option = "--" + key.replace(".init_args", "")
-    part = next((one for one in causes(error) if isinstance(one, UsageError)), None) if key else None
-    if part is not None and part is not error and str(part) not in text.splitlines()[:1]:
+    """What jsonargparse says: of an option's value what the innermost parser or type says of it."""
+    key = re.match(r'Parser key "([^"]+)"', message)
+    if key is None:
+        return re.sub(r"^Option '([\w.]+)'", r"--\1", message)
+    option = "--" + key[1].replace(".init_args", "")
+    chain = list(causes(error))
+    part = next((one for one in chain if isinstance(one, UsageError)), None)
+    if part is not None:
         inner = re.sub(r"(?<![\w-])--(?=\w)", f"{option}.", str(part))  # of the part's own parser
         return inner if inner.startswith(option) else f"{option}: {inner}"
-    unknown = re.match(r"Option '([\w.]+)' is not accepted", text)
-    if unknown:
-        name = unknown[1].replace(".init_args", "")
-        return f"{option}{'.' * bool(key)}{name}: '{name}' is not accepted"
-    subcommands = re.match(r'expected "subcommand" to be one of {(.*)}', text)
-    if subcommands:
-        return f"no stage given; expected one of {subcommands[1].replace(',', ', ')}"
-    value = re.search(r"import path string: ([^\n]*)|(?:Given|Got) value: ([^\n]*)\Z", text)
-    if not key or value is None:
-        return f"{option}: {text}" if key else text
-    if "is abstract" in text:
-        return f"{option} has no class; expected {option} CLASS with it"
-    if "Problem with given class_path" in text:
-        *_, first = causes(error)
-        return f"{option} cannot be had: {first}"
-    setting = re.search(r"NestedArg\(key='([\w.]+)'", text)
-    if setting and value[1]:
-        return f"{option}.{setting[1]}: {option} {value[1]} has no settings; expected one or the other"
-    types = re.search(r"Subtypes: \[(.*)\]\n|Expected an? (.*?)\. Got", text)
-    wanted = "" if types is None else _wanted(types[1] or types[2])
-    return f"{option} is {value[1] or value[2]}; expected {wanted or 'a class by its import path'}"
-
-
-def _wanted(types: str) -> str:
-    """Python's types in words.
-
-    Example:
-        >>> _wanted("<class 'int'>, typing.Literal['route', 'x'], <class 'NoneType'>")
-        'an integer, route or x'
-    """
-    words = []
-    for name, choices, many in re.findall(r"<class '([\w.]+)'>|Literal\[(.*?)\]|\b(\w+)\[", types):
-        last = name.rpartition(".")[2]
-        if choices:
-            words += re.findall(r"\w+", choices)
-        elif last != "NoneType":
-            words.append(WORDS.get(last or many, f"a {last} by its import path"))
-    words = list(dict.fromkeys(words)) or ["null"]
-    return " or ".join(filter(None, [", ".join(words[:-1]), words[-1]]))
+    setting = re.search(r"NestedArg\(key='([\w.]+)'", message)
+    if setting:
+        return f"{option}.{setting[1]}: what {option} names has no settings; expected one or the other"
+    told = re.sub(r"<class '(?:\w+\.)*(\w+)'>", r"\1", str(chain[-1])).replace("typing.Literal", "one of ")
+    told = told.replace("Expected a dot import path string:", "expected the import path of a class, not")
+    value = re.match(r"Expected an? (.*)\. Got value: (.*)", told, re.DOTALL)
+    return f"{option} is {value[2]}; expected {value[1]}" if value else f"{option}: {told}"
 
 
 def command_parser(name: str, function: Callable[..., None], program: str = "dejavu") -> Parser:
@@ -346,108 +296,66 @@ def parse(name: str, function: Callable[..., None], words: Sequence[str]) -> dic
         InputError: what the constructor of a part refuses.
     """
     parser = command_parser(name, function)
-    told = [word.lstrip("-").partition("=")[0] for word in words if word.startswith("--")]
-    try:
-        parsed = parser.parse_args(list(words))
-    except UsageError as error:
-        if MODEL in function.__annotations__:
-            _explain(str(error), words, told)
-        raise
+    parsed = parser.parse_args(list(words))
     try:
         arguments: dict[str, Any] = parser.instantiate(parsed).as_dict()
     except Exception as error:
         raise refusal(error) from error
     if MODEL in function.__annotations__:
-        defaults = parser.get_defaults()
-        changed = {one for one in inspect.signature(DejaVu).parameters if parsed[one] != defaults[one]}
-        _check_settings(name, arguments, changed, told)
-        arguments[MODEL] = _model_of(name, arguments, told)
+        arguments[MODEL] = _model_of(name, arguments, [word.partition("=")[0] for word in words])
     return grouped(function, arguments)
 
 
-def _explain(message: str, words: Sequence[str], told: Sequence[str]) -> None:
-    """Say more than the parser where an option is of another mapper, or of what a file brings.
+def _model_of(name: str, arguments: dict[str, Any], words: Sequence[str]) -> DejaVu:
+    """The model that the arguments, which lose what it takes, describe.
 
     Args:
-        told: options of the command line.
+        words: of the command line, without values behind a `=`.
     """
-    pattern = r"--mapper\b.*?(?:unrecognized arguments: --mapper\.(\w+)|'(\w+)' is not accepted)"
-    unknown = re.match(pattern, message)
-    name = unknown and (unknown[1] or unknown[2])
-    for mapper, preset in MAPPERS.items():
-        if name in inspect.signature(mapper).parameters:
-            has = f"{mapper.__name__} has it, as with --config {preset}"
-            raise UsageError(f"--mapper.{name}: the chosen mapper has no such setting; {has}")
-    if message.startswith(("--whitening cannot be had", "--whitening is NestedArg")):
-        for option, value in pairwise(" ".join(words).replace("--whitening=", "--whitening ").split(" ")):
-            if option == "--whitening" and value.endswith(".safetensors"):
-                _check_own(Path(value), told, "whitening")
-
-
-def _check_settings(name: str, arguments: dict[str, Any], changed: set[str], told: Sequence[str]) -> None:
-    """Refuse settings beside a map that has its own, and a command to learn without source or file.
-
-    Args:
-        changed: arguments of DejaVu that are not the default. told: options of the command line.
-    """
-    both = [arguments[one] for one in ("threshold", "precision")]
-    if None not in both:
-        raise UsageError("--threshold {:g} and --precision {:g}; expected one of them".format(*both))
-    given = {"compare": "map", "learn": "append"}.get(name)  # a map that is taken as it is
-    if given and arguments[given]:
-        lost = changed - {"features", "threshold", "precision"}
-        taken = ("second", "second_truth", "descriptor", *["seed"] * (given == "append"))
-        lost |= {one for one in taken if arguments[one]}
-        if lost:
-            named = (one.partition(".")[0] for one in told)
-            one = next((one for one in named if one in lost), "config")
-            there = "a --map" if given == "map" else f"the map of --{given}"
-            raise UsageError(f"--{one}: {there} has its own settings; expected one or the other")
-    if name == "learn":
-        needed = {
-            "source": arguments["sources"] or (arguments["append"] and arguments["average"]) or None,
-            "--map": arguments["map"] or arguments["append"],
-        }
-        missing = ", ".join(one for one, value in needed.items() if value is None)
-        if missing:
-            raise UsageError(f"the following arguments are required: {missing}")
-
-
-def _model_of(name: str, arguments: dict[str, Any], told: Sequence[str]) -> DejaVu:
-    """The model that the arguments, which lose what it takes, describe."""
+    _check_settings(name, arguments, words)
     del arguments["config"]
     settings = {one: arguments.pop(one) for one in inspect.signature(DejaVu).parameters}
-    files: dict[Literal["whitening", "descriptor"], Path] = {}
+    files: dict[str, Path] = {}
     if isinstance(settings["whitening"], MapFile):
         files["whitening"] = Path(settings["whitening"])
         settings["whitening"] = None
     if arguments.get("descriptor"):
         files["descriptor"] = arguments["descriptor"]
     for what, path in files.items():
-        _check_own(path, told, what)
+        _check_own(words, {"preprocess", "weight_bits"}, f"the {what} of {path}")
     model = DejaVu(**settings)
     if len(files) == 2:
         seen = f"--whitening {files['whitening']} has its own features"
         raise UsageError(f"{seen}; expected it or --descriptor {files['descriptor']}")
-    named = any(one.startswith("features") for one in told)
+    named = any(word.startswith("--features") for word in words) or not isinstance(model.features, HOG)
     for what, path in files.items():  # features of our own come from there as well
-        if what == "whitening":
-            written = arguments["map"] if name == "learn" else arguments["out"] / "map.safetensors"
-            check_not_read(written, path)
-        known = DejaVu.load(path, model.features if named or not isinstance(model.features, HOG) else None)
+        file = DejaVu.load(path, model.features if named else None)
         if what == "descriptor":
-            model.take_descriptor(known)
+            model.take_descriptor(file)
             continue
+        check_not_read(arguments["map"] if name == "learn" else arguments["out"] / "map.safetensors", path)
         try:
-            model.take_whitening(known)
+            model.take_whitening(file)
         except InputError as error:
             raise InputError(f"--whitening {path}: {error}") from error
     return model
 
 
-def _check_own(path: Path, told: Sequence[str], what: Literal["whitening", "descriptor"]) -> None:
+def _check_settings(name: str, arguments: dict[str, Any], words: Sequence[str]) -> None:
+    """Refuse settings beside a map that has its own, and a command to learn without a file to write."""
+    if name == "learn":
+        arguments["map"] = arguments["map"] or arguments["append"]
+        if arguments["map"] is None:
+            raise UsageError("the following arguments are required: --map")
+    given = {"compare": "map", "learn": "append"}.get(name)  # a map that is taken as it is
+    if given and arguments[given]:
+        own = {*inspect.signature(DejaVu).parameters} - {"features", "threshold", "precision"}
+        own |= {"config", "second", "second_truth", "descriptor"}
+        _check_own(words, own if given == "map" else {*own, "seed"}, f"the map of --{given}")
+
+
+def _check_own(words: Sequence[str], own: set[str], whose: str) -> None:
     """Refuse options of what a file brings."""
-    of_file = ("preprocess", "weight_bits", *["whitening."] * (what == "whitening"))
-    other = [one for one in told if one.startswith(of_file)]
-    if other:
-        raise UsageError(f"--{other[0]}: the {what} of {path} has its own; expected one or the other")
+    for word in words:
+        if word.startswith("-") and {"-c": "config"}.get(word, word[2:]).partition(".")[0] in own:
+            raise UsageError(f"{word}: {whose} has its own settings; expected one or the other")

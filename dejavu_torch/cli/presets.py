@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
 
 import yaml
 
@@ -48,55 +47,45 @@ def check_config(path: Path) -> None:
     """Refuse what is no YAML file of options, ahead of what makes objects of it.
 
     Raises:
-        InputError: no regular file, no text, no YAML, not a mapping or an empty one; see `ConfigLoader`.
+        InputError: no regular file, no text, no YAML, not a mapping or an empty one; see `count_values`.
     """
     if check_regular(path, EXPECTED) > LARGEST:
         raise InputError(f"{path} is larger than {LARGEST} bytes; expected {EXPECTED}")
     text = read_text(path, EXPECTED)
     with reading(path, "is no YAML", EXPECTED):
-        if not isinstance(ConfigLoader(text).get_single_data(), dict):
+        node = yaml.compose(text, yaml.SafeLoader)
+        if not isinstance(node, yaml.MappingNode):
             raise InputError(f"{path} holds no options; expected {EXPECTED}, as KEY: VALUE")
+        count_values(node)
+        yaml.safe_load(text)
 
 
-class ConfigLoader(yaml.SafeLoader):  # type: ignore[misc]
-    """Refuses more, deeper or longer values than any config has, or a key twice in one mapping,
-    as a ValueError that names the line, before any value is made.
+def count_values(node: yaml.Node, level: int = 1, count: int = 0) -> int:
+    """How many values a node of YAML and those before it stand for, with aliases written out.
 
-    Other loaders do not: aliases that name each other keep them busy for hours, and many levels end the
-    process.
+    Raises:
+        ValueError: more, deeper or longer values than any config has, or a key twice in one mapping. Loaders
+            take them: aliases that name each other keep them busy for hours, many levels end the process.
     """
-
-    level = 0
-
-    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        """A node, which keeps how many values it has."""
-        event = self.peek_event()
-        line = f"line {event.start_mark.line + 1}"
-        if len(getattr(event, "value", "")) > LONGEST:
-            raise ValueError(f"{line}: a value of {len(event.value)} characters")
-        self.level += 1
-        if self.level > DEEPEST:
-            raise ValueError(f"{line}: over {DEEPEST} levels")
-        node = super().compose_node(parent, index)
-        self.level -= 1
-        if isinstance(event, yaml.AliasEvent):
-            return node
-        parts, keys = [], []
-        if isinstance(node, yaml.SequenceNode):
-            parts = node.value
-        elif isinstance(node, yaml.MappingNode):
-            parts = [part for pair in node.value for part in pair]
-            keys = [key for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
-        seen: set[str] = set()
-        for key in keys:
-            if key.value in seen:
+    line = f"line {node.start_mark.line + 1}"
+    if level > DEEPEST:
+        raise ValueError(f"{line}: over {DEEPEST} levels")
+    if count >= MOST:
+        raise ValueError(f"{line}: over {MOST} values")
+    if isinstance(node, yaml.ScalarNode):
+        if len(node.value) > LONGEST:
+            raise ValueError(f"{line}: a value of {len(node.value)} characters")
+        return count + 1
+    parts = node.value
+    if isinstance(node, yaml.MappingNode):
+        keys = [key for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+        for i, key in enumerate(keys):
+            if any(key.value == other.value for other in keys[:i]):
                 raise ValueError(f"line {key.start_mark.line + 1}: {key.value} appears twice")
-            seen.add(key.value)
-        # an alias of what it lies in has no size yet
-        node.size = 1 + sum(getattr(part, "size", MOST) for part in parts)
-        if node.size >= MOST:
-            raise ValueError(f"{line}: over {MOST} values")
-        return node
+        parts = [part for pair in node.value for part in pair]
+    for part in parts:
+        count = count_values(part, level + 1, count)
+    return count + 1
 
 
 def check_word(word: str) -> None:
@@ -107,7 +96,8 @@ def check_word(word: str) -> None:
         raise InputError(f"{word[:40]} ...: a word of {len(word)} characters; expected at most {LONGEST}")
     if "&" in word and "*" in word:  # aliases
         try:
-            ConfigLoader(word.partition("=")[2] if word.startswith("--") else word).get_single_node()
+            node = yaml.compose(word.partition("=")[2] if word.startswith("--") else word, yaml.SafeLoader)
+            count_values(node)
         except yaml.YAMLError:  # an address, or a name
             pass
         except ValueError as error:

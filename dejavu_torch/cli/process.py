@@ -59,16 +59,19 @@ def take_over() -> None:
 
 def reader_left() -> bool:
     """Whether nobody reads what is printed any more, as behind `| head`; what is printed is sent first."""
-    sys.stdout.flush()
-    raw = getattr(getattr(sys.stdout, "buffer", None), "raw", None)
-    return isinstance(getattr(raw, "problem", None), BrokenPipeError)
+    return isinstance(_problem(), BrokenPipeError)
 
 
 def output_problem() -> str | None:
     """Why what was printed did not arrive, where it is not that nobody reads on."""
-    sys.stdout.flush()
-    problem = getattr(getattr(getattr(sys.stdout, "buffer", None), "raw", None), "problem", None)
+    problem = _problem()
     return None if problem is None or isinstance(problem, BrokenPipeError) else problem.strerror
+
+
+def _problem() -> OSError | None:
+    sys.stdout.flush()
+    raw = getattr(getattr(sys.stdout, "buffer", None), "raw", None)
+    return raw.problem if isinstance(raw, Stream) else None
 
 
 def let_go() -> None:
@@ -104,8 +107,7 @@ def stop(number: int, frame: FrameType | None = None) -> NoReturn:
 @contextmanager
 def interrupts_raise() -> Iterator[None]:
     """In the block Ctrl-C is a KeyboardInterrupt, for work that keeps what it has when interrupted."""
-    kept = signal.getsignal(signal.SIGINT)
-    if kept != stop:
+    if signal.getsignal(signal.SIGINT) != stop:
         yield
         return
     signal.signal(signal.SIGINT, _raise)

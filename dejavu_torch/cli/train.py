@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import logging
-import math
 import os
-import re
 import shlex
 import warnings
 from collections.abc import Iterator, Sequence
@@ -22,7 +20,7 @@ from pytorch_lightning import LightningModule, Trainer
 from pytorch_lightning.callbacks import Checkpoint, ModelCheckpoint, ProgressBar
 from pytorch_lightning.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 
-from dejavu_torch.cli.commands import features_words, print_map
+from dejavu_torch.cli.commands import features_words, print_map, print_next
 from dejavu_torch.cli.parser import Parser, Preset, refusal
 from dejavu_torch.cli.process import interrupts_raise
 from dejavu_torch.data.output import check_output_folder, make_output_folder, remove_empty_folders, whole_file
@@ -31,19 +29,16 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.text import one_line
 from dejavu_torch.training.checkpoint import EXPECTED, CheckpointFiles, taking_over
 from dejavu_torch.training.datamodule import RouteData
-from dejavu_torch.training.export import DESCRIPTOR, LastCheckpoint, MapExport, StepBar, better, has_bf16
+from dejavu_torch.training.export import DESCRIPTOR, TRAINED, LastCheckpoint, MapExport, StepBar, has_bf16
 from dejavu_torch.training.losses import NothingLearned
 from dejavu_torch.training.task import TEMPERATURE, PlaceRecognitionTask, load_weights
 from dejavu_torch.types import InputError
 
-RANGES = {  # of numbers that Lightning takes as they are, and fails on later
-    "seed_everything": (0, 2**32 - 1, "from 0 to 2^32 - 1"),
-    "trainer.max_steps": (-1, math.inf, "of at least 1, or -1 for no end"),
-    "trainer.val_check_interval": (1e-9, math.inf, "above 0"),
-    "trainer.check_val_every_n_epoch": (1, math.inf, "of at least 1"),
-    "trainer.accumulate_grad_batches": (1, math.inf, "of at least 1"),
+LEAST = {  # of numbers that Lightning takes as they are, and fails on later; or null
+    "trainer.val_check_interval": 1e-9,
+    "trainer.check_val_every_n_epoch": 1,
+    "trainer.accumulate_grad_batches": 1,
 }
-MAY_BE_NULL = ("trainer.val_check_interval", "trainer.check_val_every_n_epoch")
 BF16 = ("bf16-mixed", "bf16")
 EVERY = 500  # steps between two validations, and between two checkpoints
 TOLERANCE = 5  # of `dejavu compare`, unless it is given
@@ -165,20 +160,20 @@ class TrainCLI(LightningCLI):
         for part in ("trainer", "model", "data"):
             if not isinstance(chosen[part], Namespace):
                 raise InputError(f"{part} is {chosen[part]!r:.40}; expected options, as KEY: VALUE")
-        for name, (least, most, expected) in RANGES.items():
+        for name, least in LEAST.items():
             value = chosen[name]
-            number = isinstance(value, (int, float))
-            if (number and not least <= value <= most) or (value is None and name not in MAY_BE_NULL):
-                raise InputError(f"{name} is {value}; expected a number {expected}")
-        counts = {name: chosen["trainer"][name] for name in ("devices", "num_nodes")}
-        strategy = chosen["trainer"]["strategy"]
-        told = ", ".join(f"trainer.{name} is {count}" for name, count in counts.items())
-        if (_several(counts["devices"]) or counts["num_nodes"] != 1) and strategy not in ("auto", "ddp"):
-            raise InputError(f"{told:.99}, trainer.strategy is {strategy!s:.40}; expected 1 of each, or ddp")
-        if counts["num_nodes"] != 1 and not {"MASTER_ADDR", "SLURM_JOB_ID"} & os.environ.keys():
+            if isinstance(value, (int, float)) and value < least:
+                raise InputError(f"{name} is {value}; expected a number of at least {least:g}")
+        trainer = chosen["trainer"]
+        if trainer["max_steps"] is None:
+            raise InputError("trainer.max_steps is null; expected a number of at least 1, or -1 for no end")
+        nodes, strategy = trainer["num_nodes"], trainer["strategy"]
+        if strategy not in ("auto", "ddp"):
+            raise InputError(f"trainer.strategy is {strategy!s:.40}; expected auto or ddp")
+        if nodes != 1 and not {"MASTER_ADDR", "SLURM_JOB_ID"} & os.environ.keys():
             raise InputError(  # they would wait for each other forever
-                f"{told:.99}, and nothing tells where the other machines are; expected MASTER_ADDR, "
-                "MASTER_PORT and NODE_RANK in the environment, as torchrun and SLURM set them"
+                f"trainer.num_nodes is {nodes}, and nothing tells where the other machines are; expected "
+                "MASTER_ADDR, MASTER_PORT and NODE_RANK in the environment, as torchrun and SLURM set them"
             )
 
     def _parse_ckpt_path(self) -> None:
@@ -206,7 +201,7 @@ class TrainCLI(LightningCLI):
         self.model.gives_way = not any("route_bytes_per_place" in word for word in self.words)
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
-        """A trainer with our callbacks; what Lightning refuses, in one line."""
+        """A trainer with our callbacks."""
         asked = self.config_init[self.subcommand]["trainer"]
         own = _listed(asked["callbacks"])
         root = Path(asked["default_root_dir"])
@@ -229,11 +224,7 @@ class TrainCLI(LightningCLI):
                 "this processor is not known to have numbers of 16 bits: 32 are taken, which are faster"
             )
             kwargs["precision"] = "32-true"
-        try:
-            trainer = super().instantiate_trainer(callbacks=own, **kwargs)
-        except (ImportError, ValueError) as error:
-            told = re.sub(r"`(\w+)='(\w+)'`", r"--trainer.\1 \2", str(error))
-            raise InputError(told) from error
+        trainer = super().instantiate_trainer(callbacks=own, **kwargs)
         trainer.words = self.words  # type: ignore[attr-defined]  # a MapTrainer
         return trainer
 
@@ -295,7 +286,7 @@ class TrainCLI(LightningCLI):
                     print_written(callback, self.datamodule, self.words)
             last = self._last_checkpoint() if self.trainer.is_global_zero else None
             if self.trainer.interrupted and last is not None and not refused:
-                print(f"to go on: {shlex.join(['dejavu', 'train', *self.words, '--ckpt_path', str(last)])}")
+                print_next("train", *self.words, "--ckpt_path", last, lead="to go on")
 
     def validate(self, **arguments: Any) -> None:
         """Figures of a checkpoint."""
@@ -347,10 +338,9 @@ class TrainCLI(LightningCLI):
         written = Path(self.trainer.default_root_dir) / self._written
         print(f"figures of {checkpoint}")
         if written.is_file():
-            print_next(written, self.datamodule, self.model.dejavu, self.words)
+            print_what_next(written, self.datamodule, self.model.dejavu, self.words)
         else:
-            words = ["export", *self.words[1:], "--ckpt_path", checkpoint]
-            print(f"next: {shlex.join(['dejavu', 'train', *words])}")
+            print_next("train", "export", *self.words[1:], "--ckpt_path", checkpoint)
 
     after_test = after_validate
 
@@ -383,12 +373,6 @@ class ConfigFile(SaveConfigCallback):
             self.parser.save(self.config, temporary, "yaml", False, overwrite=True, multifile=False)
 
 
-def _several(devices: int | str | list[int]) -> bool:
-    """Whether trainer.devices is no single one: a count of 1, or the number of one, as `[2]` or `2,`."""
-    named = devices.strip(", ").split(",") if isinstance(devices, str) and "," in devices else devices
-    return len(named) != 1 if isinstance(named, list) else named not in (1, "1", "auto")
-
-
 def _listed(given: Any) -> list[Any]:
     """One, several or none, as Lightning takes callbacks and plugins."""
     return [*given] if isinstance(given, list) else [] if given is None else [given]
@@ -405,7 +389,8 @@ def print_written(export: MapExport, data: RouteData, words: Sequence[str]) -> N
         print(f"written to {path}; on {on}, within {data.tolerance}:")
         for name, one in export.scores.items():
             print(f"  {name:20} AUC {one.auc:.3f}, recall@1 {one.recall_at_1:.3f}")
-        if beaten := better(export.scores):
+        first = export.scores[TRAINED].auc
+        if beaten := [name for name, one in export.scores.items() if one.auc > first]:
             source = shlex.quote(str(data.sources["source"]))
             told = "the trained map is worse than %s; `dejavu learn %s --map FILE` makes a map untrained"
             log.warning(told, " and ".join(beaten), source)
@@ -416,7 +401,7 @@ def print_written(export: MapExport, data: RouteData, words: Sequence[str]) -> N
         print(f"written to {path}; it has seen {seen} alone: only {another} traverse shows what it is worth:")
     else:
         print(f"written to {path}")
-    print_next(path, data, model, words)
+    print_what_next(path, data, model, words)
 
 
 def unseen_of(data: RouteData) -> Any:
@@ -424,7 +409,7 @@ def unseen_of(data: RouteData) -> Any:
     return data.sources["validation"] or data.sources["query"]
 
 
-def print_next(path: Path, data: RouteData, model: DejaVu, words: Sequence[str]) -> None:
+def print_what_next(path: Path, data: RouteData, model: DejaVu, words: Sequence[str]) -> None:
     """How to see what a map is worth, or to make one with a descriptor.
 
     Args:
@@ -433,17 +418,15 @@ def print_next(path: Path, data: RouteData, model: DejaVu, words: Sequence[str])
     option = "--model.backbone"
     if type(model.features) is Embedding:  # the map has its settings, all but those of the network
         option += ".network"
-    features = shlex.join(["", *features_words(model, words, option)])[2:]
+    features = features_words(model, shlex.join(["train", *words]), option)
     if len(data.listed["source"]) > 1:
-        made = f"--descriptor {shlex.quote(str(path))}{features} --map route.safetensors"
-        print(f"next: dejavu learn ROUTE {made}")
+        print_next("learn", "ROUTE", "--descriptor", path, *features, "--map", "route.safetensors")
         return
-    reference, query = (shlex.quote(str(s)) for s in (data.sources["source"], unseen_of(data) or "SECOND"))
     truth = data.truths["validation" if data.sources["validation"] is not None else "query"][0]
-    options = f" --truth {shlex.quote(str(truth))}" if truth is not None else ""
-    options += f" --tolerance {data.tolerance}" if data.tolerance != TOLERANCE else ""
-    scored = f"--map {shlex.quote(str(path))}{features}{options}"
-    print(f"next: dejavu compare {reference} {query} {scored} --out report")
+    judged: list[object] = [] if truth is None else ["--truth", truth]
+    judged += ["--tolerance", data.tolerance] if data.tolerance != TOLERANCE else []
+    pair = data.sources["source"], unseen_of(data) or "SECOND"
+    print_next("compare", *pair, "--map", path, *features, *judged, "--out", "report")
 
 
 def run_train(arguments: Sequence[str]) -> None:

@@ -368,7 +368,7 @@ def _listed(path: Path, frames: int | None, interpolate: bool) -> dict[int, list
 
 
 def _rounded(place: float) -> int:
-    return math.floor(place + 0.5)
+    return math.floor(place) + (place % 1 >= 0.5)  # a half added to a large number is lost
 
 
 def _read_matrices(path: Path, numbers: Tensor, frames: int | None, every: bool) -> GroundTruth:

@@ -125,8 +125,7 @@ class Page:
             return facts
         facts |= match._asdict() | {"time": frame.seconds}
         facts |= zip(("frames", "dropped", "p50", "p99"), counts, strict=True)
-        facts = {name: _number(value) for name, value in facts.items()}
-        return facts | {
+        return without_nan(facts) | {
             "places": len(scores) - posterior,
             "off": round(float(scores[-1]), 6) if posterior else None,
             "kind": "Posterior over the route" if posterior else "Match over the route, the best place 1",
@@ -136,9 +135,10 @@ class Page:
         }
 
 
-def _number(value: Any) -> Any:
-    """JSON has no NaN and no infinity."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def without_nan(facts: dict[str, Any]) -> dict[str, Any]:
+    """The facts for JSON, which has no NaN and no infinity."""
+    lost = [key for key, value in facts.items() if isinstance(value, float) and not math.isfinite(value)]
+    return facts | dict.fromkeys(lost)
 
 
 def curve(scores: Tensor, posterior: bool) -> list[float]:

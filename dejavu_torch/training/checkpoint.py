@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from math import isfinite
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
@@ -15,11 +14,9 @@ import torch
 from lightning_fabric.plugins.io.torch_io import TorchCheckpointIO
 from torch import Tensor
 
-from dejavu_torch.data.files import check_regular
+from dejavu_torch.data.files import LARGEST, check_regular
 from dejavu_torch.data.output import make_output_folder, whole_file
-from dejavu_torch.maps.file import checked_fields
 from dejavu_torch.maps.place_map import EXTRA
-from dejavu_torch.model_file import STATE
 from dejavu_torch.text import one_line
 from dejavu_torch.types import InputError
 
@@ -33,9 +30,11 @@ KEYS: dict[str, type] = {  # what every reader needs; the rest is Lightning's
     "stage": int,
     "began": int,
     "trained": list,
+    "routes": list,
+    "held": list,
 }
+OPTIONAL: dict[str, Any] = {"routes": [], "held": []}  # which older ones do not have
 MOST_PARTS = 10**6  # of nested containers
-MOST = 2**53  # steps, epochs and the like
 
 
 class CheckpointFiles(TorchCheckpointIO):
@@ -74,65 +73,58 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     path = Path(path)
     size = check_regular(path, EXPECTED.removeprefix("expected "))
     try:
-        with ZipFile(path) as archive:
-            records = archive.infolist()
-            packed = any(record.compress_type != ZIP_STORED for record in records)
-            if packed or sum(record.file_size for record in records) > size:
-                raise InputError(f"{path} claims more bytes than it holds; {EXPECTED}")
-            damaged = archive.testzip()  # torch does not look at checksums
-            if damaged is not None:
-                raise InputError(f"{path} is damaged: {damaged} does not have its checksum; {EXPECTED}")
-            pickled = [archive.read(one) for one in records if one.filename.endswith("data.pkl")]
-        if any(b"cbuiltins\nbytearray\n" in one for one in pickled):  # of any size, which torch would make
-            raise InputError(f"{path} claims more bytes than it holds; {EXPECTED}")
+        _check_archive(path, size)
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-    except InputError:
-        raise
+        _check_content(checkpoint, size)
+    except InputError as error:
+        raise InputError(f"{path} {error}; {EXPECTED}") from error
     except Exception as error:  # whatever a file can make of zipfile and torch
         told = "it is of more than tensors and plain data"
         told = told if isinstance(error, UnpicklingError) else cause_of(error)
-        raise InputError(f"the checkpoint cannot be read: {path}: {told}; {EXPECTED}") from error
-    try:
-        check_content(checkpoint, size)
-    except InputError as error:
-        raise InputError(f"{path} is no checkpoint of a training: {error}; {EXPECTED}") from error
-    return dict(checkpoint)
+        raise InputError(f"{path} cannot be read: {told}; {EXPECTED}") from error
+    return {**checkpoint, **{key: checkpoint.get(key, value) for key, value in OPTIONAL.items()}}
 
 
-def check_content(checkpoint: Any, size: int) -> None:
+def _check_archive(path: Path, size: int) -> None:
+    """Refuse damage, at whose checksums torch does not look, and what would take more bytes than the file."""
+    with ZipFile(path) as archive:
+        records = archive.infolist()
+        packed = any(record.compress_type != ZIP_STORED for record in records)
+        if packed or sum(record.file_size for record in records) > size:
+            raise InputError("claims more bytes than it holds")
+        if damaged := archive.testzip():
+            raise InputError(f"is damaged: {damaged} does not have its checksum")
+        pickles = [archive.read(one) for one in records if one.filename.endswith("data.pkl")]
+    if any(b"cbuiltins\nbytearray\n" in one for one in pickles):  # of any size, which torch would make
+        raise InputError("claims more bytes than it holds")
+
+
+def _check_content(checkpoint: Any, size: int) -> None:
     """Refuse what is no checkpoint of a training, whose file has so many bytes."""
     if not isinstance(checkpoint, dict):
-        raise InputError(f"it is of type {type(checkpoint).__name__}")
+        raise InputError(f"is of type {type(checkpoint).__name__}")
     for key, kind in KEYS.items():
-        value = checkpoint.get(key)
+        value = checkpoint.get(key, OPTIONAL.get(key))
         whole = isinstance(value, kind) and not isinstance(value, bool)
-        if not whole or (isinstance(value, int) and not 0 <= value < MOST):
-            raise InputError(f"{key} is {str(value)[:40]}, not of type {kind.__name__} and in range")
+        if not whole or (isinstance(value, int) and not 0 <= value < LARGEST):
+            raise InputError(f"has {key} {str(value)[:40]}, not of type {kind.__name__} and in range")
     for name, value in checkpoint["state_dict"].items():
         if not isinstance(name, str) or not (isinstance(value, Tensor) or name.endswith(EXTRA)):
-            raise InputError(f"{str(name)[:80]!r} in its state_dict is no tensor")
-        ours = name.startswith("dejavu.") and not name.startswith("dejavu.features.")
-        for leaf in leaves(value) if ours and name.endswith(EXTRA) else ():
-            if not isinstance(leaf, str | int | float | None) or (
-                isinstance(leaf, float) and not isfinite(leaf)
-            ):
-                raise InputError(f"{name[:80]} is not of plain numbers and text")
-        if name == f"dejavu.{EXTRA}":
-            checked_fields(value, STATE, name)
-    for tensor in (leaf for leaf in leaves(checkpoint) if isinstance(leaf, Tensor)):
+            raise InputError(f"has {str(name)[:80]!r} in its state_dict, which is no tensor")
+    for tensor in (leaf for leaf in _leaves(checkpoint) if isinstance(leaf, Tensor)):
         dense = tensor.layout == torch.strided and tensor.device.type == "cpu" and not tensor.is_quantized
         held = min(size, tensor.untyped_storage().nbytes()) if dense else 0
         if not dense or tensor.numel() * tensor.element_size() > held:
-            raise InputError(f"a tensor {tuple(tensor.shape)} has more numbers than the file")
+            raise InputError(f"has a tensor {tuple(tensor.shape)} of more numbers than the file")
 
 
-def leaves(value: Any) -> Iterator[Any]:
+def _leaves(value: Any) -> Iterator[Any]:
     """What nested containers hold, which is refused where it never ends."""
     left, count = [value], 0
     while left:
         one, count = left.pop(), count + 1
         if count > MOST_PARTS:
-            raise InputError(f"it has more than {MOST_PARTS} parts")
+            raise InputError(f"has more than {MOST_PARTS} parts")
         if isinstance(one, dict | list | tuple | set):
             left.extend(one.values() if isinstance(one, dict) else one)
         else:

@@ -65,7 +65,7 @@ class StoredFrames(Dataset[Batch]):
         return Batch(as_frames(chosen), GroundTruth(*(part[index] for part in self.truth)))
 
 
-class InOrder(DistributedSampler[list[int]]):
+class InOrder(DistributedSampler[list[int]]):  # as Lightning leaves it alone
     """All frames once, in batches; of several processes each takes a stretch, and none is repeated."""
 
     def __init__(self, count: int, batch_size: int, process: int = 0, processes: int = 1) -> None:
@@ -87,26 +87,23 @@ class Clips(DistributedSampler[list[int]]):
     def __init__(
         self, runs: list[range], batch_size: int, clip: int, process: int = 0, processes: int = 1
     ) -> None:
-        self.runs, self.lengths, self.clip = runs, [len(run) for run in runs], clip
-        # which Lightning leaves alone
-        super().__init__(cast(Any, range(sum(self.lengths))), processes, process)
-        every = sum(length // clip for length in self.lengths)
-        self.clips = min(batch_size // clip, every) // processes  # of a process's part of a batch
+        super().__init__(cast(Any, range(sum(map(len, runs)))), processes, process)
+        self.runs, self.clip = runs, clip
+        self.every = sum(len(run) // clip for run in runs)
+        self.clips = min(batch_size // clip, self.every) // processes  # of a process's part of a batch
         if not self.clips:
-            raise InputError(
-                f"there are {every} clips of {clip} frames and {processes} processes; expected one for each"
-            )
+            seen = f"there are {self.every} clips of {clip} frames and {processes} processes"
+            raise InputError(f"{seen}; expected one for each")
 
     def __len__(self) -> int:
-        return sum(length // self.clip for length in self.lengths) // (self.clips * self.num_replicas)
+        return self.every // (self.clips * self.num_replicas)
 
     def __iter__(self) -> Iterator[list[int]]:
         starts = []
         for run in self.runs:
             left_over = int(torch.randint(len(run) % self.clip + 1, ()))
             starts.append(run.start + left_over + torch.arange(len(run) // self.clip) * self.clip)
-        order = torch.cat(starts)
-        order = order[torch.randperm(len(order))]
+        order = torch.cat(starts)[torch.randperm(self.every)]
         frames = order[:, None] + torch.arange(self.clip)
         batches = frames.split(self.clips * self.num_replicas)[: len(self)]  # an incomplete one is left out
         return iter([batch.split(self.clips)[self.rank].flatten().tolist() for batch in batches])
@@ -119,23 +116,20 @@ class RouteData(LightningDataModule):
         source: the reference, whose frames are the places of the map: what `open_source` reads, a Traverse,
             or a tensor of frames or features (see `ArrayTraverse`). A list of several routes, or a folder of
             nothing but folders, trains one descriptor for all of them: their places are numbered one route
-            behind the other, and nothing crosses from one to the next.
+            after the other, and nothing crosses from one to the next.
         second: another traverse of the same route to train on as well: its frames are positives of the
             places they show. Of several routes it is a list as long, None for those without.
-        second_truth: which places those are, as --truth of `dejavu compare`; a list likewise. None also means
-            frame i is place i where the traverse is as long as the reference.
         validation: a traverse to validate on during training. None: the reference itself under augmentation,
             the same each time; its figures say what is learned, not how another traverse fares.
-        validation_truth: its places, as --truth of `dejavu compare`.
-        query: the traverse that `test` localizes, and that judges the map at the end of `fit` where there is
-            no validation.
-        truth: the places of the query, as --truth of `dejavu compare`.
+        query: the traverse that `test` localizes, and that judges the map at the end of `fit` without a
+            validation.
+        second_truth, validation_truth, truth: the places of these three, as --truth of `dejavu compare`; None
+            of a second traverse as long as the reference also means frame i is place i.
         tolerance: places within which one is right, inclusive.
         batch_size: frames of a batch.
         clip: consecutive frames in a batch, which get the same augmentation; 1 draws each frame by itself.
-        resize: (height, width) in pixels that frames are stored in; None is what the backbone of the task
-            resizes them to (its `frame_size`) where that is smaller, or several routes are of several sizes,
-            and their own size otherwise.
+        resize: (height, width) in pixels that frames are stored in; None is what the backbone resizes them to
+            if that is smaller, or several routes are of several sizes, and their own size otherwise.
         augmentation: of the training frames; None is `Augmentation` with its defaults.
         velocity: makes places and queries even steps along the ground, as in `DejaVu`.
         held_out: share of the reference's frames that training never sees, in evenly spaced stretches of 20,
@@ -177,29 +171,27 @@ class RouteData(LightningDataModule):
         if not 0 <= held_out <= 0.5:
             raise InputError(f"held_out is {held_out}; expected a share of the frames, from 0 to 0.5")
         if tolerance < 0 or clip < 1 or not 2 <= batch_size < LARGEST or batch_size % clip:
-            raise InputError(
-                f"tolerance is {tolerance}, batch_size {batch_size}, clip {clip}; expected a tolerance of 0 "
-                "or more, and batches of at least 2 frames, below 2^53, made of whole clips"
-            )
+            seen = f"tolerance is {tolerance}, batch_size {batch_size}, clip {clip}"
+            raise InputError(f"{seen}; expected 0 or more, and batches of at least 2 frames in whole clips")
         if resize is not None and (len(resize) != 2 or min(resize) < 1):
             raise InputError(f"resize is {resize}; expected (height, width), at least 1 pixel each")
         routes = routes_of(source) if isinstance(source, (str, Path)) else source
-        self.listed = {"source": list(routes) if isinstance(routes, (list, tuple)) else [routes]}
-        self.truths: dict[str, list[str | None]] = {}
-        others = {"second": (second, second_truth)}
-        others |= {"validation": (validation, validation_truth), "query": (query, truth)}
-        for name, (given, known) in others.items():
-            self.listed[name] = self._one_each(name, given)
-            self.truths[name] = self._one_each(f"{name}_truth" if name != "query" else "truth", known)
+        self.listed = {"source": [*routes] if isinstance(routes, (list, tuple)) else [routes]}
         if not self.listed["source"]:
             raise InputError("source is an empty list; expected at least one traverse")
+        self.listed["second"] = self._one_each("second", second)
+        self.listed["validation"] = self._one_each("validation", validation)
+        self.listed["query"] = self._one_each("query", query)
+        self.truths = {
+            "second": self._one_each("second_truth", second_truth),
+            "validation": self._one_each("validation_truth", validation_truth),
+            "query": self._one_each("truth", truth),
+        }
         for name, one in ((name, one) for name, every in self.listed.items() for one in every):
             missing = one is None and name != "source"
             if not missing and not isinstance(one, (str, Path, Traverse, Tensor)):
-                raise InputError(
-                    f"{name} is of type {type(one).__name__}; expected a path or `sim:` address, a Traverse, "
-                    "or a tensor of frames or features"
-                )
+                seen = f"{name} is of type {type(one).__name__}"
+                raise InputError(f"{seen}; expected a path, a Traverse, or a tensor of frames or features")
         paths = [str(one) for one in self.listed["source"] if isinstance(one, (str, Path))]
         for one in (one for one in paths if paths.count(one) > 1):
             raise InputError(f"{one} is given twice; expected each route once, other traverses as second")
@@ -221,15 +213,11 @@ class RouteData(LightningDataModule):
         count = len(self.listed["source"])
         each = list(given) if isinstance(given, (list, tuple)) else [given] * (count if given is None else 1)
         if count > 1 and name in ("validation", "query") and any(one is not None for one in each):
-            raise InputError(
-                f"{name} is given, and there are {count} routes, which make no map; expected none, and "
-                "`dejavu compare A B --descriptor FILE` for a route"
-            )
+            seen = f"{name} is given, and there are {count} routes, which make no map"
+            raise InputError(f"{seen}; expected none, and `dejavu compare A B --descriptor FILE` for a route")
         if len(each) != count:
-            raise InputError(
-                f"{name} is of {len(each)}, the routes are {count}; expected one of each route, null for "
-                "those without"
-            )
+            seen = f"{name} is of {len(each)}, the routes are {count}"
+            raise InputError(f"{seen}; expected one of each route, null for those without")
         return each
 
     @property
@@ -256,42 +244,39 @@ class RouteData(LightningDataModule):
     def held(self) -> list[int]:
         """The first places of the stretches that training never sees."""
         frames = self.sets["reference"].values
-        task = None if self.trainer is None else self.trainer.lightning_module
         # the templates of a place that is never seen would not be found
-        one_map = len(self.routes) == 1 and frames.ndim == 4 and getattr(task, "made", True)
+        one_map = len(self.routes) == 1 and frames.ndim == 4 and self._of_task("made", True)
         if not one_map or not self.held_out or len(frames) < FEW or self.sources["validation"] is not None:
             return []
         count = max(FEWEST, round(self.held_out * len(frames) / STRETCH))
         return [(2 * i + 1) * len(frames) // (2 * count) - STRETCH // 2 for i in range(count)]
 
+    def _of_task(self, name: str, default: Any = None) -> Any:
+        """What the task in training says; the default without one."""
+        return default if self.trainer is None else getattr(self.trainer.lightning_module, name, default)
+
     def setup(self, stage: str) -> None:
         """Read the reference, and what the stage needs beside it."""
-        task = None if self.trainer is None else self.trainer.lightning_module
-        if len(self.listed["source"]) > 1 and task is not None and not getattr(task, "made", False):
-            raise InputError(
-                f"there are {len(self.listed['source'])} routes, and the map in training is of one; expected "
-                "one traverse, or model.mapper SpectralMapper, which trains a descriptor"
-            )
-        wanted = getattr(task, "frame_size", None) if self.resize is None else self.resize
+        if len(self.listed["source"]) > 1 and not self._of_task("made", True):
+            seen = f"there are {len(self.listed['source'])} routes, and templates are of one"
+            raise InputError(f"{seen}; expected one, or model.mapper SpectralMapper, to train a descriptor")
+        wanted = self._of_task("frame_size") if self.resize is None else self.resize
         if wanted != self._wanted:
             self.sets.clear()
             self._wanted = wanted
         if "reference" not in self.sets:
             opened = [self._open(source) for source in self.listed["source"]]
             self.routes = [resampled(route, self.velocity, self.batch_size) for route in opened]
-            size, parts = self._size, []
-            for route in self.routes:
-                parts.append(store(route, size))
-                self._check_length(route.name, len(parts[-1]))
+            parts = [self._stored(route) for route in self.routes]
             places = torch.arange(sum(map(len, parts)))
             self.sets["reference"] = StoredFrames(parts, as_ground_truth(places[:, None]))
+        if self._of_task("made"):
+            self._read("second")  # its map is made anew, whatever the stage
         needed = {"fit": ("second", "validation"), "validate": ("validation",), "test": ("query",)}
-        also = ("second",) if getattr(task, "made", False) else ()  # its map is made anew, whatever the stage
-        for name in (*also, *needed.get(stage, ())):
-            if self.sources[name] is not None and name not in self.sets:
-                self.sets[name] = self._read(name)
+        for name in needed.get(stage, ()):
+            self._read(name)
         if stage == "fit":
-            self.unseen()  # what it refuses at the end is refused ahead of the training
+            self.unseen()  # what it refuses at the end is refused before the training
         if stage == "test" and "query" not in self.sets:
             raise InputError("there is nothing to test on; expected data.query, a second traverse")
 
@@ -310,11 +295,17 @@ class RouteData(LightningDataModule):
 
     def unseen(self) -> tuple[Traverse, GroundTruth] | None:
         """The traverse to validate on, else the one to test on, and its places; None without either."""
-        for name in (name for name in ("validation", "query") if self.sources[name] is not None):
-            if name not in self.sets:
-                self.sets[name] = self._read(name)
-            return self._opened(name), self.sets[name].truth
+        for name in ("validation", "query"):
+            if self.sources[name] is not None:
+                self._read(name)
+                return self._opened(name), self.sets[name].truth
         return None
+
+    def _open(self, source: Any, shape: tuple[int, ...] | None = None) -> Traverse:
+        """At the size that `DejaVu.fit` of the task's model gives; as it is where `resize` gives one."""
+        traverse = as_traverse(source) if isinstance(source, (Traverse, Tensor)) else open_source(source)
+        model = self._of_task("dejavu")
+        return traverse if model is None or self.resize is not None else model.fit(traverse, shape)
 
     def _opened(self, name: str, i: int = 0) -> Traverse:
         """Another traverse of route i, at its steps."""
@@ -323,29 +314,32 @@ class RouteData(LightningDataModule):
         traverse = self._open(self.listed[name][i], route.frame_shape)
         return resampled(traverse, self.velocity, self.batch_size, step)
 
-    def _open(self, source: Any, shape: tuple[int, ...] | None = None) -> Traverse:
-        """At the size that `DejaVu.fit` of the task's model gives; as it is where `resize` gives one."""
-        traverse = as_traverse(source) if isinstance(source, (Traverse, Tensor)) else open_source(source)
-        model = None if self.trainer is None else getattr(self.trainer.lightning_module, "dejavu", None)
-        return traverse if model is None or self.resize is not None else model.fit(traverse, shape)
+    def _stored(self, traverse: Traverse) -> Tensor:
+        """See `store`; refused if every answer would be right."""
+        values = store(traverse, self._size)
+        if len(values) <= max(1, self.tolerance):
+            seen = f"{traverse.name} has {len(values)} frame{'s' * (len(values) != 1)}"
+            raise InputError(f"{seen} and the tolerance is {self.tolerance}; expected a longer route")
+        return values
 
-    def _read(self, name: str) -> StoredFrames:
-        """Another traverse of each route, as if of one behind the other."""
+    def _read(self, name: str) -> None:
+        """Another traverse of each route, as if of one after the other, if it is given and not read yet."""
         given = [i for i, source in enumerate(self.listed[name]) if source is not None]
+        if not given or name in self.sets:
+            return
         parts, truths = zip(*(self._read_one(name, i) for i in given), strict=True)
-        if len(self.routes) == 1:
-            return StoredFrames([*parts], truths[0])
-        known = [truth.positives.masked_fill(~truth.judged[:, None], -1) for truth in truths]
-        starts = [sum(self.lengths[:i]) for i in given]
-        moved = [torch.where(p >= 0, p + start, -1) for p, start in zip(known, starts, strict=True)]
-        return StoredFrames([*parts], _joined(moved))
+        truth = truths[0]
+        if len(self.routes) > 1:
+            known = [one.positives.masked_fill(~one.judged[:, None], -1) for one in truths]
+            starts = [sum(self.lengths[:i]) for i in given]
+            truth = _joined([p.where(p < 0, p + start) for p, start in zip(known, starts, strict=True)])
+        self.sets[name] = StoredFrames([*parts], truth)
 
     def _read_one(self, name: str, i: int) -> tuple[Tensor, GroundTruth]:
         """Another traverse of route i, and the places of that route that it shows."""
         route, reference = self.routes[i], self.sets["reference"].parts[i]
         traverse = self._opened(name, i)
-        values = store(traverse, self._size)
-        self._check_length(traverse.name, len(values))
+        values = self._stored(traverse)
         if values.shape[1:] != reference.shape[1:]:
             raise _other_frames(traverse.name, tuple(values.shape[1:]), tuple(reference.shape[1:]))
         named = name == "second"  # as another traverse of the same places
@@ -353,20 +347,11 @@ class RouteData(LightningDataModule):
         known = ground_truth_of(self.truths[name][i], route, traverse, *counts, aligned=named)
         if known is None:
             option = "data.truth" if name == "query" else f"data.{name}_truth"
-            raise InputError(
-                f"there is no ground truth for {traverse.name}: it has {len(values)} frames, the reference "
-                f"{len(reference)} places; expected {option}, such as 0 where frame i is place i"
-            )
+            seen = f"no truth for {traverse.name}: {len(values)} frames, {len(reference)} places"
+            raise InputError(f"{seen}; expected {option}, such as 0 if frame i is place i")
         if isinstance(route, ResampledTraverse):
             known = ground_truth_in_places(known, partial(place_of, route.positions))
         return values, known
-
-    def _check_length(self, name: str, frames: int) -> None:
-        if frames <= max(1, self.tolerance):
-            raise InputError(
-                f"{name} has {frames} frame{'s' * (frames != 1)} and the tolerance is {self.tolerance}: "
-                "every answer would be right; expected a longer route"
-            )
 
     def train_dataloader(self) -> DataLoader[Batch]:
         """Frames of the reference and of the second traverse, as they are stored; this process's part."""
@@ -388,9 +373,8 @@ class RouteData(LightningDataModule):
         runs = [run for part in each for run in runs_of(part[kept[part]])]
         longest = max(map(len, runs))
         if longest < self.clip:
-            seen = "the longest stretch that is trained on" if self.held else "the route"
-            share = f" (data.held_out is {self.held_out:g})" if self.held else ""
-            raise InputError(f"clip is {self.clip} and {seen} has {longest} frames{share}; expected fewer")
+            seen = f"clip is {self.clip} and the longest stretch that is trained on has {longest} frames"
+            raise InputError(f"{seen} (data.held_out is {self.held_out:g}); expected fewer")
         batch_size = self.batch_size * self._processes[1]
         return _loader(frames, Clips(runs, batch_size, self.clip, process, processes))
 
@@ -436,10 +420,8 @@ def store(traverse: Traverse, resize: tuple[int, int] | None = None) -> Tensor:
                 check_room(needed, f"{traverse.name} in frames of {resize[0]} x {resize[1]}")
                 batch = resize_frames(batch, resize)
             if shape and tuple(batch.shape[1:]) != shape:
-                raise InputError(
-                    f"{traverse.name} holds frames of {shape} and of {tuple(batch.shape[1:])}; "
-                    "expected one size, as data.resize makes"
-                )
+                seen = f"{traverse.name} holds frames of {shape} and of {tuple(batch.shape[1:])}"
+                raise InputError(f"{seen}; expected one size, as data.resize makes")
             shape = tuple(batch.shape[1:])
             if not batch.isfinite().all():
                 raise InputError(f"{traverse.name} holds NaN or infinite values; expected finite numbers")
@@ -455,17 +437,15 @@ def as_frames(values: Tensor) -> Tensor:
 
 
 def _joined(positives: list[Tensor]) -> GroundTruth:
-    """The truth of several traverses, one behind the other."""
+    """The truth of several traverses, one after the other."""
     width = max(part.shape[1] for part in positives)
     pad = torch.nn.functional.pad
     return as_ground_truth(torch.cat([pad(part, (0, width - part.shape[1]), value=-1) for part in positives]))
 
 
 def _other_frames(name: str, seen: tuple[int, ...], reference: tuple[int, ...]) -> InputError:
-    return InputError(
-        f"{name} has frames of {seen}, the reference of {reference}; expected the same channels, and one "
-        "size, as data.resize makes"
-    )
+    told = f"{name} has frames of {seen}, the reference of {reference}"
+    return InputError(f"{told}; expected the same channels, and one size, as data.resize makes")
 
 
 def _loader(frames: StoredFrames, batches: Iterable[list[int]]) -> DataLoader[Batch]:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import copy
 import logging
+import math
 import sys
 import time
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytorch_lightning as pl
 from pytorch_lightning.callbacks import Callback, Checkpoint, ModelCheckpoint, ProgressBar
@@ -22,7 +22,6 @@ from dejavu_torch.evaluation.curves import Scores
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import Views, augmented_segments
 from dejavu_torch.features.whitening import STRENGTHS
-from dejavu_torch.growth import calibrate_if_possible
 from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.localizer import SINGLE
@@ -40,12 +39,12 @@ log = logging.getLogger("dejavu_torch")
 
 
 class MapExport(Callback):
-    """Writes the map when training ends or is interrupted: of the best checkpoint where one is watched for,
-    else of the last step.
+    """Writes the map when training ends or is interrupted: of the best checkpoint if one is watched for, else
+    of the last step.
 
     Of several routes it is their descriptor, without a map, in `descriptor.safetensors`.
 
-    Where training has ended, `scores` are what the map is worth on the traverse to validate or to test on,
+    When training has ended, `scores` are what the map is worth on the traverse to validate or to test on,
     else on stretches that training never saw, see `beside_untrained`; they are logged too.
 
     Args:
@@ -72,41 +71,37 @@ class MapExport(Callback):
             return
         if self.began in (None, step):
             log.warning("nothing was trained: step %d is reached; max_steps counts from the start", step)
-        for callback in trainer.checkpoint_callbacks:
-            if not isinstance(callback, ModelCheckpoint) or not callback.monitor:
-                continue
-            best = callback.best_model_path
-            if best and Path(best).is_file():
-                load_weights(pl_module, best)
-            else:
-                told = f"{best} is gone" if best else f"{callback.monitor} was never measured"
-                log.warning("%s: the map is of the last step", told)
-            if best:
-                break
+        watch = [
+            one for one in trainer.checkpoint_callbacks if isinstance(one, ModelCheckpoint) and one.monitor
+        ]
+        best = next((one.best_model_path for one in watch if one.best_model_path), "")
+        if best and Path(best).is_file():
+            load_weights(pl_module, best)
+        elif watch:
+            seen = f"{best} is gone" if best else f"{watch[0].monitor} was never measured"
+            log.warning("%s: the map is of the last step", seen)
         data = pl_module.data
         self.write(pl_module, Path(trainer.default_root_dir), data)
         if self.written is None or not self.written[1].map.places:
             return
         unseen = data.unseen() or held_frames(self.written[1], data, pl_module.held)
-        if unseen is None:
-            return
-        self.scores = beside_untrained(self.written[1], data.reference, *unseen, data.tolerance)
-        figures = {f"unseen/auc of {name}": one.auc for name, one in self.scores.items()}
-        for logger in trainer.loggers:
-            logger.log_metrics({name.replace(" ", "_"): auc for name, auc in figures.items()}, step)
+        if unseen is not None:
+            self.scores = beside_untrained(self.written[1], data.reference, *unseen, data.tolerance)
+            figures = {f"unseen/auc_of_{n.replace(' ', '_')}": one.auc for n, one in self.scores.items()}
+            for logger in trainer.loggers:
+                logger.log_metrics(figures, step)
 
     def on_exception(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, exception: BaseException
     ) -> None:
-        """Write the map of the last step where the user interrupts."""
+        """Write the map of the last step if the user interrupts."""
         interrupted = isinstance(exception, KeyboardInterrupt) and trainer.state.fn == "fit"
         if interrupted and trainer.global_step and self.written is None:
-            assert isinstance(pl_module, PlaceRecognitionTask)
-            self.write(pl_module, Path(trainer.default_root_dir))
+            self.write(cast(PlaceRecognitionTask, pl_module), Path(trainer.default_root_dir))
 
     def write(self, task: PlaceRecognitionTask, folder: Path, data: RouteData | None = None) -> None:
-        """Write the task's map, calibrated by what training has not seen of the data where it is given; a
-        warning where it has none yet."""
+        """Write the task's map, calibrated by what training has not seen of the data if it is given; a
+        warning if there is none yet."""
         try:
             model = task.deployed()
         except InputError as error:
@@ -138,35 +133,32 @@ def calibrate(model: DejaVu, data: RouteData, starts: list[int]) -> None:
     """By the traverse to validate on, else by stretches that training never saw; else not at all."""
     validated = data.sources["validation"] is not None
     unseen = data.unseen() if validated else held_frames(model, data, starts, model.frame_shape)
-    if unseen is None:
-        if data.held:
-            told = "the map is not calibrated: the training has seen what data.held_out %g leaves out"
-            log.warning(told, data.held_out)
-        elif isinstance(model.mapper, TemplateMapper) and model.map.places >= FEW:
-            log.warning("the map is not calibrated: of templates nothing is held out; data.validation would")
-        return
-    frames, truth = unseen
-    if validated:
-        frames = _of_shape(frames, model.frame_shape)
-    try:
-        calibrate_if_possible(model, data.reference, Views(frames, truth.positives[:, 0]))
-    except InputError as error:
-        log.warning("the map is not calibrated: %s", error)
+    if unseen is not None:
+        frames, truth = unseen
+        frames = _of_shape(frames, model.frame_shape) if validated else frames
+        try:
+            model.calibrate(data.reference, Views(frames, truth.positives[:, 0]))
+        except InputError as error:
+            log.warning("the map is not calibrated: %s", error)
+    elif data.held:
+        seen = "the map is not calibrated: the training has seen what data.held_out %g leaves out"
+        log.warning(seen, data.held_out)
+    elif isinstance(model.mapper, TemplateMapper) and model.map.places >= FEW:
+        log.warning("the map is not calibrated: of templates nothing is held out; data.validation would")
 
 
 class LastCheckpoint(Checkpoint):
-    """Keeps `checkpoints/last.ckpt` in the trainer's default_root_dir, also where a training is interrupted.
+    """Keeps `checkpoints/last.ckpt` in the trainer's default_root_dir, also if a training is interrupted.
 
     Args:
         every: steps between two.
     """
 
     def __init__(self, every: int = 500) -> None:
-        self.every = every
-        self.saved = 0
+        self.every, self.saved = every, 0
 
     def on_train_batch_end(self, trainer: pl.Trainer, *_: Any) -> None:
-        """Save where it is time to."""
+        """Save when it is time to."""
         if trainer.global_step % self.every == 0:
             self._save(trainer)
 
@@ -177,7 +169,7 @@ class LastCheckpoint(Checkpoint):
     def on_exception(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, exception: BaseException
     ) -> None:
-        """Save the last step where the user interrupts."""
+        """Save the last step if the user interrupts."""
         if isinstance(exception, KeyboardInterrupt):
             self._save(trainer)
 
@@ -190,10 +182,9 @@ class LastCheckpoint(Checkpoint):
 def beside_untrained(
     model: DejaVu, reference: Traverse, query: Traverse, truth: GroundTruth, tolerance: int
 ) -> dict[str, Scores]:
-    """Scores of a trained map, of HOG of all frames, and of the spectral map of whitened HOG.
-
-    The untrained map is that of `DejaVu()`, by the model's own mapper where this is not of templates: of as
-    many route bytes. What cannot be made of these frames is left out, with a warning.
+    """Scores of a trained map, of HOG of all frames, and of the untrained map: that of `DejaVu()`, by the
+    model's own mapper, unless it is of templates, in as many route bytes. What cannot be made of these frames
+    is left out, with a warning.
 
     Args:
         model: with its map, on any device. reference, query: resampled where the model is.
@@ -217,18 +208,6 @@ def beside_untrained(
         log.warning("no untrained map to compare with: %s", error)
     scores = {name: contend(name, match, truth, tolerance).scores for name, match in found.items()}
     return {name: one for name, one in scores.items() if one is not None}
-
-
-def better(scores: Mapping[str, Scores]) -> list[str]:
-    """Names of what has a larger AUC than the first of them.
-
-    Example:
-        >>> from types import SimpleNamespace as S
-        >>> better({"the trained map": S(auc=0.5), "HOG": S(auc=0.7), "the untrained map": S(auc=0.4)})
-        ['HOG']
-    """
-    (_, first), *others = scores.items()
-    return [name for name, one in others if one.auc > first.auc]
 
 
 def _of_shape(query: Traverse, shape: tuple[int, ...] | None) -> Traverse:
@@ -263,34 +242,34 @@ class StepBar(ProgressBar):
         self.told, self.since = self.began, time.monotonic()
         self.told_at = self.since
         if self.shown and sys.stderr.isatty():
-            self.bar = tqdm(
-                desc="training", total=self.total, initial=self.began, unit=" steps", file=sys.stderr
-            )
+            given = {"total": self.total, "initial": self.began, "unit": " steps", "file": sys.stderr}
+            self.bar = tqdm(desc="training", **given)
 
     def on_train_batch_end(self, trainer: pl.Trainer, *_: Any) -> None:
-        """Tell where it is time to."""
+        """Tell when it is time to."""
         step, now = trainer.global_step, time.monotonic()
         if self.bar is not None:
             self.bar.update(step - self.bar.n)
             if now - self.told_at > 1:
                 self.told_at = now
-                self.bar.set_postfix_str(f"loss {self._loss(trainer):.3g}", refresh=False)
+                self.bar.set_postfix_str(_loss(trainer), refresh=False)
             return
         due = (step - self.told) * LINES >= self.total or now - self.told_at >= APART
         if self.shown and (due or step == self.total) and step > self.told:
             self.told, self.told_at = step, now
-            left = (now - self.since) * (self.total - step) / (step - self.began)
-            told = f"step {step} of {self.total}, loss {self._loss(trainer):.3g}"
-            tqdm.write(f"dejavu: training: {told}, {tqdm.format_interval(left)} left", file=sys.stderr)
-
-    def _loss(self, trainer: pl.Trainer) -> float:
-        return float(trainer.callback_metrics.get("train/loss", float("nan")))
+            left = tqdm.format_interval((now - self.since) * (self.total - step) / (step - self.began))
+            line = f"dejavu: training: step {step} of {self.total}, {_loss(trainer)}, {left} left"
+            tqdm.write(line, file=sys.stderr)
 
     def teardown(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
         """Leave the bar as it stands."""
         if self.bar is not None:
             self.bar.close()
             self.bar = None
+
+
+def _loss(trainer: pl.Trainer) -> str:
+    return f"loss {float(trainer.callback_metrics.get('train/loss', math.nan)):.3g}"
 
 
 def has_bf16() -> bool:

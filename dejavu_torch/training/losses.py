@@ -24,7 +24,7 @@ LAST, BELOW = 100, 0.98  # steps, and the share of chance, or of what was before
 
 
 class PlaceLoss(NamedTuple):
-    """loss: scalar. left_out: queries without a right place that is covered; the mean leaves them out."""
+    """loss: scalar. left_out: queries without a right place that is covered, which the mean leaves out."""
 
     loss: Tensor
     left_out: int
@@ -51,8 +51,6 @@ def place_cross_entropy(
 
     Shape: (Q,N), (Q,R) int64 -> PlaceLoss.
 
-    Convention: a query of which no right place is covered is left out.
-
     Raises:
         InputError: shapes that do not fit, places outside the N, a tolerance < 0 or temperature <= 0.
 
@@ -67,13 +65,33 @@ def place_cross_entropy(
     if tolerance < 0 or outside:
         seen = f"the tolerance is {tolerance} and places outside the route are {outside[:3]}"
         raise InputError(f"{seen}; expected at least 0, and places in 0..{n - 1} or -1")
-    # +1 where a right stretch begins, -1 behind its end: no Q x N x R
+    # +1 where a right stretch begins, -1 after its end: no Q x N x R
     known = (places >= 0).int()
     steps = known.new_zeros(queries, n + 1)
     steps.scatter_add_(1, (places - tolerance).clamp(min=0), known)
     steps.scatter_add_(1, (places + tolerance + 1).clamp(max=n), -known)
     surprise = _surprise(scores, steps.cumsum(1)[:, :n] > 0, temperature)
     return PlaceLoss(mean_of_all(surprise), queries - len(surprise))
+
+
+def _check_places(places: Tensor, scores: Tensor) -> None:
+    if scores.ndim != 2 or places.ndim != 2 or len(places) != len(scores) or places.dtype != torch.int64:
+        seen = f"scores {tuple(scores.shape)} and places {tuple(places.shape)} {places.dtype}"
+        raise InputError(f"the loss got {seen}; expected (Q,N) and (Q,R) int64")
+
+
+def _surprise(scores: Tensor, right: Tensor, temperature: Tensor | float) -> Tensor:
+    """-log of the softmax's share of what is right, for the rows that have it. (Q,K), (Q,K) -> (counted,)."""
+    smallest = torch.as_tensor(temperature).min().item()
+    if not smallest > 0:
+        raise InputError(f"the temperature is {smallest}; expected a number above 0")
+    covered = ~scores.isposinf()
+    right = right & covered
+    kept = right.any(1)
+    # +inf is taken out before the division: inf times a gradient of 0 is NaN
+    scores = scores.to(torch.promote_types(scores.dtype, torch.float32)).masked_fill(~covered, 0)
+    logits = (-scores / temperature).masked_fill(~covered, -math.inf)[kept]
+    return logits.logsumexp(1) - logits.masked_fill(~right[kept], -math.inf).logsumexp(1)
 
 
 def phase_cross_entropy(
@@ -83,8 +101,7 @@ def phase_cross_entropy(
 
     Args:
         distances: d of each layer, as `phase_distances` gives them.
-        places: the right places of each query, -1 as padding; their phases in the layer are right.
-        temperature: T > 0, in units of the distances; may carry gradients.
+        places, temperature: see `place_cross_entropy`; T in units of the distances.
 
     Shape: L tensors (Q,P), (Q,R) int64 -> scalar.
 
@@ -101,9 +118,7 @@ def phase_cross_entropy(
     """
     shapes, expected = [tuple(d.shape) for d in distances], [(len(places), layer.phases) for layer in plan]
     if not shapes or shapes != expected:
-        raise InputError(
-            f"the distances are {shapes}; expected at least one layer, and the plan's {expected}"
-        )
+        raise InputError(f"the distances are {shapes}; expected at least one, the plan's {expected}")
     surprise = []
     for block, layer in zip(distances, plan, strict=True):
         _check_places(places, block)
@@ -154,9 +169,8 @@ class Objective:
 
     def __post_init__(self) -> None:
         if not (min(self.place, self.phase) >= 0 and 0 < self.place + self.phase < math.inf):
-            raise InputError(
-                f"the losses count place={self.place}, phase={self.phase}; expected 0 or more, one above 0"
-            )
+            seen = f"the losses count place={self.place}, phase={self.phase}"
+            raise InputError(f"{seen}; expected 0 or more, one above 0")
 
     def __call__(
         self,
@@ -167,8 +181,7 @@ class Objective:
         temperature: Tensor,
         tolerance: int,
     ) -> Losses:
-        """The losses of a batch: of eq. 3 of each layer (B,P), `log_posterior` of eq. 4 (B,N) and the right
-        places (B,R), -1 as padding."""
+        """The losses of distances by eq. 3, (B,P) of each layer, and scores by `log_posterior`, (B,N)."""
         found = place_cross_entropy(scores, places, tolerance, 1.0)  # the scores have their temperature
         parts, total = {"place": found.loss}, self.place * found.loss
         if self.phase:
@@ -180,26 +193,6 @@ class Objective:
             parts["phase"] = phase_cross_entropy(distances, route.plan, places, temperature)
             total = total + self.phase * parts["phase"]
         return Losses(total, parts, found.left_out)
-
-
-def _surprise(scores: Tensor, right: Tensor, temperature: Tensor | float) -> Tensor:
-    """-log of the softmax's share of what is right, for the rows that have it. (Q,K), (Q,K) -> (counted,)."""
-    smallest = torch.as_tensor(temperature).min().item()
-    if not smallest > 0:
-        raise InputError(f"the temperature is {smallest}; expected a number above 0")
-    covered = ~scores.isposinf()
-    right = right & covered
-    kept = right.any(1)
-    # +inf is taken out ahead of the division: inf times a gradient of 0 is NaN
-    scores = scores.to(torch.promote_types(scores.dtype, torch.float32)).masked_fill(~covered, 0)
-    logits = (-scores / temperature).masked_fill(~covered, -math.inf)[kept]
-    return logits.logsumexp(1) - logits.masked_fill(~right[kept], -math.inf).logsumexp(1)
-
-
-def _check_places(places: Tensor, scores: Tensor) -> None:
-    if scores.ndim != 2 or places.ndim != 2 or len(places) != len(scores) or places.dtype != torch.int64:
-        seen = f"scores {tuple(scores.shape)} and places {tuple(places.shape)} {places.dtype}"
-        raise InputError(f"the loss got {seen}; expected (Q,N) and (Q,R) int64")
 
 
 class Coded(NamedTuple):
@@ -229,13 +222,13 @@ def coded_proxies(
     """A proxy for each stretch of a route, rebuilt from the quantised lines of their spectra over the route.
 
     A network whose descriptors follow the proxies learns features of few frequencies, as a `SpectralMap` of
-    few bytes holds them. All arguments are learned: lines, the step that they are coded in, and an entropy
-    model, the widths of a Laplace distribution of the levels.
+    few bytes holds them.
 
     Args:
         lines: of any RMS, see `spectrum`; W stretches, at least 2.
-        log_step: of the step, beside an RMS of 1.
-        log_widths: in steps, for each band (`bands_of`) and feature, in this order.
+        log_step: of the step that they are coded in, beside an RMS of 1.
+        log_widths: of the Laplace distribution of the levels, in steps, for each band (`bands_of`) and
+            feature, in this order.
         transform: of the lines.
         noise: whether the bits are those of levels with uniform noise in place of the rounding error.
 
@@ -292,29 +285,22 @@ def phase_chance(plan: Plan) -> float:
     return sum(entropies) / len(entropies)
 
 
-class LastLosses:
-    """The losses of the last `LAST` steps of a stage, behind its warm-up."""
+class LastLosses(deque[Mapping[str, Tensor]]):
+    """The losses of the last `LAST` steps of a stage, after its warm-up; those of a step by name."""
 
     def __init__(self) -> None:
-        self.last: deque[dict[str, Tensor]] = deque(maxlen=LAST)
+        super().__init__(maxlen=LAST)
         self.learned = False
-
-    def add(self, parts: Mapping[str, Tensor]) -> None:
-        """Those of a step, by name."""
-        self.last.append(dict(parts))
 
     def check(self, chance: Mapping[str, float]) -> None:
         """Refuse losses that tell places apart if none is below chance or still falls; not before `LAST`."""
-        if len(self.last) < LAST or not chance:
+        if len(self) < LAST or not chance:
             return
-        losses = {name: torch.stack([parts[name] for parts in self.last]) for name in chance}
-        halves = {name: one.view(2, -1).mean(1).tolist() for name, one in losses.items()}
-        self.learned = any(sum(halves[name]) / 2 <= BELOW * guess for name, guess in chance.items())
-        falling = any(late < BELOW * early for early, late in halves.values())
-        if self.learned or falling or min(chance.values()) == 0:
-            return
-        means = {name: sum(one) / 2 for name, one in halves.items()}
-        seen = ", ".join(
-            f"the {name} loss is {mean:.3g} (chance {chance[name]:.3g})" for name, mean in means.items()
-        )
-        raise NothingLearned(f"nothing is learned: over the last {LAST} steps {seen}")
+        losses = {name: torch.stack([parts[name] for parts in self]) for name in chance}
+        means = {name: float(one.mean()) for name, one in losses.items()}
+        halves = [one.view(2, -1).mean(1).tolist() for one in losses.values()]
+        self.learned = any(means[name] <= BELOW * guess for name, guess in chance.items())
+        falling = any(late < BELOW * early for early, late in halves)
+        if not (self.learned or falling or min(chance.values()) == 0):
+            seen = (f"the {name} loss is {means[name]:.3g} (chance {chance[name]:.3g})" for name in chance)
+            raise NothingLearned(f"nothing is learned: over the last {LAST} steps {', '.join(seen)}")

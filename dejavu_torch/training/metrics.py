@@ -28,8 +28,7 @@ class PlaceRecognition(Metric):
         measured. Three numbers are kept of each query, on the device of the metric.
 
     Raises:
-        InputError: a negative tolerance, matches that are not an index and a score for each query, a NaN
-            score, or a truth that does not fit the matches.
+        InputError: in update, a negative tolerance, a NaN score, or a truth that does not fit the matches.
 
     Example:
         >>> metric = PlaceRecognition(tolerance=0)
@@ -45,52 +44,37 @@ class PlaceRecognition(Metric):
     plot_lower_bound = 0.0
     plot_upper_bound = 1.0
 
-    score: list[Tensor]
-    found: list[Tensor]
-    right: list[Tensor]
+    rows: list[Tensor]
 
     def __init__(self, tolerance: int, **kwargs: Any) -> None:
         super().__init__(**kwargs)
-        if tolerance < 0:
-            raise InputError(f"the tolerance is {tolerance}; expected at least 0")
         self.tolerance = tolerance
-        # one number a query in each, so that batches and processes join whatever their R; and all float64,
-        # which is then also what a process that saw no query gives
+        # of one dimension, so that batches and processes join whatever their R; and float64, which is then
+        # also what a process that saw no query gives
         self.set_dtype(torch.float64)
-        for state in ("score", "found", "right"):
-            self.add_state(state, [], dist_reduce_fx="cat")
+        self.add_state("rows", [], dist_reduce_fx="cat")
 
     def update(self, match: Match, truth: Tensor | GroundTruth) -> None:
         """Add the queries of a batch."""
-        if (
-            match.index.ndim != 1
-            or match.index.dtype != torch.int64
-            or match.score.shape != match.index.shape
-        ):
-            shapes = f"{tuple(match.index.shape)} {match.index.dtype} and {tuple(match.score.shape)}"
-            raise InputError(f"index and score are {shapes}; expected (Q,) int64 and (Q,)")
+        check_truth(match, truth, self.tolerance)
         if match.score.isnan().any():
             raise InputError("a score is NaN; expected numbers or +inf")
-        check_truth(match, truth, self.tolerance)
         index, score = match.index.cpu(), match.score.detach().cpu()
-        truth = as_ground_truth(
-            truth.cpu() if isinstance(truth, Tensor) else GroundTruth(*(part.cpu() for part in truth))
-        )
+        truth = GroundTruth(*(part.cpu() for part in as_ground_truth(truth)))
         good, answerable = is_right(index, truth.positives, self.tolerance), (truth.positives >= 0).any(1)
         kept = counted(index, truth, self.tolerance)
         # the same queries in a world of two places: what is reported is place 0, and it or place 1 is right
-        rows = torch.stack([score, (index >= 0).double() - 1, torch.where(answerable, (~good).double(), -1)])
-        for state, row in zip((self.score, self.found, self.right), rows[:, kept], strict=True):
-            state.append(row.to(self.device))
+        rows = torch.stack(
+            [score, (index >= 0).double() - 1, torch.where(answerable, (~good).double(), -1)], 1
+        )
+        self.rows.append(rows[kept].flatten().to(self.device))
 
     def compute(self) -> dict[str, Tensor]:
         """The figures by name."""
         figures = Scores(*[float("nan")] * len(Scores._fields))
-        score, found, right = (
-            dim_zero_cat(state).cpu() if len(state) else torch.zeros(0)
-            for state in (self.score, self.found, self.right)
-        )
-        if len(score):
+        rows = dim_zero_cat(self.rows).cpu() if len(self.rows) else torch.zeros(0)
+        if len(rows):
+            score, found, right = rows.view(-1, 3).T
             match = Match(found.long(), score, found >= 0)
             figures = evaluate(match, right.long()[:, None], tolerance=0)
         values = torch.tensor(figures, dtype=torch.float64, device=self.device)

@@ -1,9 +1,8 @@
 """What the processes of one training share: a batch, its gradients and running statistics.
 
-Each process uses its part of every batch; losses and gradients are those of one process with all of it.
-Batch normalisation is by each part, unless Lightning's `sync_batchnorm` is on, on GPUs. Random numbers are
-drawn alike in all processes, but for those of the augmentation and of the network itself, so that what is
-made of the whole route, such as a whitening or a map, is the same in each without being sent.
+Losses and gradients are those of one process with the whole batch; only batch normalisation is by each part.
+All processes draw the same random numbers, but for augmentation and network: so each makes what is of the
+whole route, such as a whitening or a map, alike, without being sent it.
 """
 
 from __future__ import annotations
@@ -32,12 +31,7 @@ def process() -> int:
 
 def mean_of_all(values: Tensor) -> Tensor:
     """The sum of a process's values over how many a process has on average: the mean over processes of such
-    figures, and of their gradients, is the mean over all values. (n,) -> scalar, 0 where there are none.
-
-    Example:
-        >>> mean_of_all(torch.tensor([1.0, 2.0]))
-        tensor(1.5000)
-    """
+    figures, and of their gradients, is the mean over all values. (n,) -> scalar, 0 if there are none."""
     count = averaged(torch.tensor(float(len(values)), device=values.device))
     return values.sum() / count.clamp(min=1 / processes())
 
@@ -52,10 +46,7 @@ def averaged(values: Tensor) -> Tensor:
 
 
 def average_gradients(optimizers: Iterable[Optimizer], module: nn.Module) -> None:
-    """Replace each gradient, and the running statistics of a module, by the mean over processes.
-
-    What no process has a gradient of stays without.
-    """
+    """Replace each gradient that any process has, and the running statistics of a module, by the mean."""
     if processes() == 1:
         return
     groups = [group for optimizer in optimizers for group in optimizer.param_groups]
@@ -94,13 +85,10 @@ def own_random(step: int) -> Iterator[None]:
 
 
 def share(task: pl.LightningModule, trainer: pl.Trainer) -> None:
-    """Make the processes of a trainer begin alike.
+    """Make the processes of a trainer begin alike; a strategy other than DDP is an InputError.
 
-    Convention: a training makes new parameters as it goes, which a model that DDP has wrapped would not know;
-        so the strategy starts the processes, and the task averages its gradients by `average_gradients`.
-
-    Raises:
-        InputError: a strategy that is not DDP.
+    A training makes new parameters as it goes, which a model that DDP has wrapped would not know: the
+    strategy only starts the processes, and the task averages its gradients by `average_gradients`.
     """
     if trainer.world_size == 1:
         return

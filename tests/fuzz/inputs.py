@@ -11,6 +11,7 @@ import torch
 from PIL import Image
 from pytorch_lightning import Trainer
 from torch import Tensor
+from videos import clip
 
 from dejavu_torch.cli.presets import FOLDER
 from dejavu_torch.data.arrays import ArrayTraverse
@@ -24,8 +25,6 @@ from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.training.datamodule import RouteData
 from dejavu_torch.training.task import PlaceRecognitionTask
 from dejavu_torch.types import Training
-
-from ..videos import clip
 
 
 def pictures(count: int, side: int = 16, noise: float = 0.0) -> np.ndarray:

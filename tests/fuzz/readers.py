@@ -105,7 +105,7 @@ class Case:
         """Run a command line, which may write where its words say."""
         self.words = list(words)
         self.begin()
-        cli.run(words)
+        cli.main(words)
 
 
 Maker, Run = Callable[[Path], None], Callable[[Case], None]

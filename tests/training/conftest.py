@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from small_training import CONFIG, MINE, footage, train
 
-from dejavu_torch.training import export
+from dejavu_torch import DejaVu
 from dejavu_torch.training.task import PlaceRecognitionTask
 
 CALIBRATED = ("test_export", "test_train_command")
@@ -37,7 +37,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def _without_calibration(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of many small trainings, of which it takes a third; those of the command are calibrated."""
     if request.path.stem not in CALIBRATED:
-        monkeypatch.setattr(export, "calibrate_if_possible", lambda *_: None)
+        monkeypatch.setattr(DejaVu, "calibrate", lambda self, *_, **__: self)
 
 
 @pytest.fixture(autouse=True)

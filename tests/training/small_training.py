@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,9 @@ from dejavu_torch import DejaVu, ImposedPeriods, TemplateMapper
 from dejavu_torch.cli import main
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.evaluation.curves import evaluate
+from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.cnn import SmallCNN
+from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.training.datamodule import RouteData
 from dejavu_torch.training.export import MapExport
@@ -40,6 +43,12 @@ def backbone(dimension: int = 8) -> SmallCNN:
     return SmallCNN(dimension, channels=1, resize=(16, 16), widths=(4, 8), squeeze=4)
 
 
+def coded(**settings: Any) -> Embedding:
+    """With a hidden layer: a descriptor, and a code of it."""
+    given = {"dimension": 12, "channels": 1, "resize": (16, 16), "hidden": 16} | settings
+    return Embedding(**{"network": backbone()} | given)
+
+
 def mapper(periods: PeriodFinder | None = None, **settings: Any) -> TemplateMapper:
     return TemplateMapper(ImposedPeriods([3, 4, 5], bin=2) if periods is None else periods, **settings)
 
@@ -48,17 +57,29 @@ def new_task(**settings: Any) -> PlaceRecognitionTask:
     return PlaceRecognitionTask(**{"backbone": backbone(), "mapper": mapper()} | settings)
 
 
+def still(**strengths: Any) -> Augmentation:
+    """Which changes nothing but what is given."""
+    none = dict.fromkeys(("rotation", "scale", "gamma", "illumination", "blur", "occlusion", "noise"), 0.0)
+    pairs = dict.fromkeys(("colour", "shift", "exposure"), (0.0, 0.0))
+    return Augmentation(**none | pairs | strengths)  # type: ignore[arg-type]
+
+
 def data_of(source: Tensor | None = None, **settings: Any) -> RouteData:
     given = {"tolerance": 2, "batch_size": 16} | settings
     return RouteData(ArrayTraverse(footage() if source is None else source), **given)
 
 
 def trainer(folder: Path, *callbacks: Callback, **settings: Any) -> Trainer:
-    given = {"max_steps": 4, "enable_checkpointing": bool(callbacks)} | settings
+    given = {"max_steps": 4, "accelerator": "cpu", "enable_checkpointing": bool(callbacks)} | settings
     quiet = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False}
-    return Trainer(
-        accelerator="cpu", default_root_dir=folder, callbacks=[*callbacks, MapExport()], **quiet, **given
-    )
+    return Trainer(default_root_dir=folder, callbacks=[*callbacks, MapExport()], **quiet, **given)
+
+
+def heights(steps: int) -> list[float]:
+    """The learning rates of a stage of so many steps, beside the highest."""
+    rise = max(1, steps // 10)
+    falls = [0.5 + 0.5 * math.cos(math.pi * k / (steps - rise)) for k in range(steps - rise)]
+    return [(k + 1) / rise for k in range(rise)] + falls
 
 
 def fit(folder: Path, task: PlaceRecognitionTask, data: RouteData, **settings: Any) -> DejaVu:

@@ -9,11 +9,21 @@ import pytest
 import torch
 from helpers import refused
 from kornia.feature import TFeat
-from small_training import FRAMES, backbone, data_of, fit, footage, new_task, recall, trainer, warned
+from small_training import (
+    FRAMES,
+    backbone,
+    data_of,
+    fit,
+    footage,
+    new_task,
+    recall,
+    still,
+    trainer,
+    warned,
+)
 from torch import Tensor, nn
 
 from dejavu_torch import HOG, DejaVu
-from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.training.task import PlaceRecognitionTask, freeze_parts, start_from
@@ -30,44 +40,43 @@ def changed(tmp_path: Path, module: nn.Module, **settings: Any) -> tuple[set[str
     return {name for name, value in before.items() if not torch.equal(value, after[name])}, task
 
 
+def trained(task: PlaceRecognitionTask) -> set[str]:
+    return {name for name, parameter in task.named_parameters() if parameter.requires_grad}
+
+
 def test_frozen_wholly_it_stays_as_it_was(tmp_path: Path) -> None:
     start = fit(tmp_path, new_task(backbone=(module := backbone()), freeze=[""], lr=1e-12), data_of())
     names, task = changed(tmp_path, module, freeze=[""])
     assert names == set()
     assert not torch.allclose(task.dejavu.map.templates, start.map.templates, atol=1e-3)
-    trained = {name for name, parameter in task.named_parameters() if parameter.requires_grad}
-    assert trained == {"log_temperature", "dejavu.map.templates"}
+    assert trained(task) == {"log_temperature", "dejavu.map.templates"}
 
 
-@pytest.mark.parametrize("prefix", ["convolutions.1", "convolutions.1."])
-def test_frozen_in_part_only_that_part_stays(tmp_path: Path, prefix: str) -> None:
-    module = backbone()
-    names, _ = changed(tmp_path, module, freeze=[prefix])
-    # the bias ahead of a standardisation is taken out again
+def normed() -> nn.Module:
+    norm = nn.InstanceNorm2d(2, affine=True, track_running_stats=True)
+    return nn.Sequential(nn.Conv2d(1, 2, 5, stride=4), norm, nn.Flatten(), nn.Linear(18, 4))
+
+
+def test_frozen_in_part_only_that_part_stays(tmp_path: Path) -> None:
+    """With its running statistics, also those of instances."""
+    names, _ = changed(tmp_path, module := backbone(), freeze=["convolutions.1"])
+    # the bias before a standardisation is taken out again
     kept = {name for name in module.state_dict() if name.startswith("convolutions.1.")} | {"linear.bias"}
     assert names | {"linear.bias"} == set(module.state_dict()) - kept | {"linear.bias"}
+    names, _ = changed(tmp_path, normed(), freeze=["1"])
+    assert names == {"0.weight", "0.bias", "3.weight", "3.bias"}
+    names, _ = changed(tmp_path, normed())
+    assert {"1.running_mean", "1.running_var"} < names
 
 
 def test_frozen_batch_norm_keeps_its_statistics_and_learns_its_weights(tmp_path: Path) -> None:
-    module = backbone()
-    names, task = changed(tmp_path, module, batch_norm="frozen")
+    names, task = changed(tmp_path, module := backbone(), batch_norm="frozen")
     statistics = {name for name in module.state_dict() if name.endswith(RUNNING)}
     assert statistics
     assert names == set(module.state_dict()) - statistics
     task.train()
     assert {type(part) for part in module.modules() if not part.training} == {nn.BatchNorm1d, nn.BatchNorm2d}
     assert module.training
-
-
-def test_statistics_of_instances_stay_in_a_frozen_part(tmp_path: Path) -> None:
-    def module() -> nn.Module:
-        norm = nn.InstanceNorm2d(2, affine=True, track_running_stats=True)
-        return nn.Sequential(nn.Conv2d(1, 2, 5, stride=4), norm, nn.Flatten(), nn.Linear(18, 4))
-
-    names, _ = changed(tmp_path, module(), freeze=["1"])
-    assert names == {"0.weight", "0.bias", "3.weight", "3.bias"}
-    names, _ = changed(tmp_path, module())
-    assert {"1.running_mean", "1.running_var"} < names
 
 
 def test_a_prefix_of_nothing_is_refused() -> None:
@@ -81,44 +90,23 @@ def test_a_map_gives_a_backbone_to_start_from(tmp_path: Path) -> None:
     first, path = new_task(weight_bits=32), tmp_path / "map.safetensors"
     fit(tmp_path, first, data_of())
     start_from(module := backbone(), path)
-    trained = first.dejavu.features.state_dict()
-    assert all(torch.equal(value, trained[name]) for name, value in module.state_dict().items())
+    own = first.dejavu.features.state_dict()
+    assert all(torch.equal(value, own[name]) for name, value in module.state_dict().items())
     with refused("map.safetensors holds weights of", "SmallCNN", "expected those of the same"):
         start_from(backbone(9), path)
     with refused("gone is not there"):
         start_from(module, tmp_path / "gone")
 
 
-class Foreign(nn.Module):
-    """What a user brings."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.linear = nn.Linear(256, 8)
-        self.norm = nn.BatchNorm1d(8, affine=False)
-
-    def forward(self, frames: Tensor) -> Tensor:
-        features: Tensor = self.norm(self.linear(frames.flatten(1)))
-        return features
-
-
-@pytest.mark.parametrize("kind", ["foreign", "kornia"])
-def test_a_foreign_network_learns(tmp_path: Path, kind: str) -> None:
-    def module() -> nn.Module:
-        torch.manual_seed(0)
-        return (
-            Foreign()
-            if kind == "foreign"
-            else Embedding(TFeat(pretrained=False), 8, channels=1, resize=(32, 32))
-        )
-
-    noisy = footage(0.1)
-    light = Augmentation(rotation=0, shift=(0, 0), scale=0, blur=0, occlusion=0, noise=0.2)
-    found = []
+def test_a_foreign_network_learns(tmp_path: Path) -> None:
+    """Two trainings of a step and of many, whose maps take its weights along."""
+    noisy, found = footage(0.1), []
     for lr, steps in ((1e-9, 1), (3e-3, 60)):
-        task = new_task(backbone=module(), lr=lr)
-        trainer(tmp_path, max_steps=steps).fit(task, data_of(augmentation=light))
-        model = DejaVu.load(tmp_path / "map.safetensors", module())  # its weights are the map's
+        torch.manual_seed(0)
+        module, own = (Embedding(TFeat(pretrained=False), 8, channels=1, resize=(32, 32)) for _ in range(2))
+        task = new_task(backbone=module, lr=lr)
+        trainer(tmp_path, max_steps=steps).fit(task, data_of(augmentation=still(noise=0.2)))
+        model = DejaVu.load(tmp_path / "map.safetensors", own)
         torch.testing.assert_close(model.eval()(noisy[:4, None] / 255), task.eval()(noisy[:4, None] / 255))
         found.append(recall(model, noisy))
     assert found[1] > max(0.4, found[0] + 0.15), found
@@ -129,8 +117,7 @@ def test_a_foreign_network_learns(tmp_path: Path, kind: str) -> None:
 def test_hog_has_nothing_to_train_but_the_map_is(tmp_path: Path) -> None:
     task = new_task(backbone=HOG(cell=4, block=1), feature_weights=True)
     model = fit(tmp_path, task, data_of())
-    trained = {name for name, parameter in task.named_parameters() if parameter.requires_grad}
-    assert trained == {"log_temperature", "dejavu.map.templates", "dejavu.map.weights"}
+    assert trained(task) == {"log_temperature", "dejavu.map.templates", "dejavu.map.weights"}
     assert len(model.map.weights) == model.map.dimension
     assert not (model.map.weights == 1).all()
     assert recall(model, footage(0.02)) > 0.5
@@ -141,26 +128,11 @@ def test_ready_features_leave_a_backbone_out(tmp_path: Path, caplog: pytest.LogC
     running = trainer(tmp_path)
     running.fit(task, data_of(features))
     model = DejaVu.load(tmp_path / "map.safetensors")  # by itself
+    running.validate(task, data_of(features), verbose=False)
     assert warned(caplog) == ["these are ready features: the backbone is left out"]
     assert "backbone" not in model.summary().fixed
     assert model.summary().map_bytes < sum(p.nbytes for p in backbone().parameters())
     torch.testing.assert_close(model(features[:3]), task(features[:3]))
-    running.validate(task, data_of(features), verbose=False)
-    assert len(warned(caplog)) == 1
-
-
-@pytest.mark.parametrize("channels", [1, 3])
-def test_a_backbone_for_other_channels_is_told_at_once(tmp_path: Path, channels: int) -> None:
-    frames = footage()[:, None].expand(-1, channels, -1, -1)
-    for module, words in (
-        (SmallCNN(8, 4 - channels, (16, 16), (4,)), (f"got frames (40, {channels}, 16, 16)",)),
-        (
-            nn.Sequential(nn.Conv2d(4 - channels, 2, 3), nn.Flatten()),
-            (f"Sequential does not take frames ({channels}, 16, 16)", f"{4 - channels} channels"),
-        ),
-    ):
-        with refused(*words):
-            fit(tmp_path, new_task(backbone=module), data_of(frames.float() / 255))
 
 
 class Wrong(nn.Module):
@@ -181,14 +153,22 @@ class Wrong(nn.Module):
 
 
 @pytest.mark.parametrize(
-    ("what", "words"),
+    ("module", "facts"),
     [
-        ("3d", ("Wrong made (40, 8, 1)", "expected features (40, D)")),
-        ("half", ("Wrong made (20, 8)", "expected features (40, D)")),
-        ("nan", ("Wrong makes NaN", "the array")),
-        ("late", ("the loss is nan at step 2", "place nan", "expected a finite number")),
+        (Wrong("3d"), ("Wrong made (40, 8, 1)", "expected features (40, D)")),
+        (Wrong("half"), ("Wrong made (20, 8)", "expected features (40, D)")),
+        (Wrong("nan"), ("Wrong makes NaN", "the array")),
+        (Wrong("late"), ("the loss is nan at step 2", "place nan", "expected a finite number")),
+        (SmallCNN(8, 3, (16, 16), (4,)), ("got frames (40, 1, 16, 16)",)),
+        (
+            nn.Sequential(nn.Conv2d(3, 2, 3), nn.Flatten()),
+            ("Sequential does not take frames (1, 16, 16)", "3 channels"),
+        ),
     ],
+    ids=["3d", "half", "nan", "late", "CNN's channels", "channels"],
 )
-def test_wrong_features_are_told_at_once(tmp_path: Path, what: str, words: tuple[str, ...]) -> None:
-    with refused(*words):
-        fit(tmp_path, new_task(backbone=Wrong(what)), data_of(), max_steps=9)
+def test_wrong_features_and_channels_are_told_at_once(
+    tmp_path: Path, module: nn.Module, facts: tuple[str, ...]
+) -> None:
+    with refused(*facts):
+        fit(tmp_path, new_task(backbone=module), data_of(), max_steps=9)

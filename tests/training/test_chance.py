@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from command_line import fails
 from helpers import refused
 from small_training import FRAMES, backbone, data_of, new_task, trainer, warned
 
 from dejavu_torch import SpectralMapper
-from dejavu_torch.cli import main
 from dejavu_torch.training.losses import (
     LAST,
     LastLosses,
@@ -78,7 +78,7 @@ def test_chance_is_told_by_the_losses_of_the_last_steps(
 ) -> None:
     last = LastLosses()
     for i in range(steps):
-        last.add({"place": torch.tensor(place[2 * i // LAST]), "phase": torch.tensor(phase)})
+        last.append({"place": torch.tensor(place[2 * i // LAST]), "phase": torch.tensor(phase)})
     if refused_:
         with refused("nothing is learned", "chance 3", f"phase loss is {phase:g}", "chance 2"):
             last.check({"place": 3.0, "phase": 2.0})
@@ -94,15 +94,6 @@ def test_frames_that_are_all_alike_end_a_training_ahead_of_its_last_step(tmp_pat
         running.fit(task_of(kind), data_of(ALIKE))
     assert FEW < running.global_step < 9 * FEW
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("kind", ["templates", "spectral"])
-@pytest.mark.usefixtures("few")
-def test_a_training_that_learns_is_left_alone(tmp_path: Path, kind: str) -> None:
-    running = trainer(tmp_path, max_steps=4 * FEW, limit_val_batches=0)
-    running.fit(task_of(kind), data_of())
-    assert running.global_step == 4 * FEW
-    assert (tmp_path / "map.safetensors").is_file()
 
 
 @pytest.mark.usefixtures("few")
@@ -122,33 +113,21 @@ def test_what_forgets_all_is_told_at_the_end(tmp_path: Path) -> None:
     assert not (tmp_path / "map.safetensors").exists()
 
 
-@pytest.mark.parametrize("routes", [1, 2])
 @pytest.mark.usefixtures("few")
 def test_the_command_begins_again_once_and_then_gives_up(
-    folder: Path,
-    tmp_path: Path,
-    capfd: pytest.CaptureFixture[str],
-    caplog: pytest.LogCaptureFixture,
-    routes: int,
+    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
-    paths = [tmp_path / "alike.npy", tmp_path / "again.npy"][:routes]
-    for path in paths:
-        np.save(path, ALIKE.numpy())
-    source = str(paths[0]) if routes == 1 else f"[{','.join(map(str, paths))}]"
-    words = ["fit", "--config", "train.yaml", "--data.source", source, "--model.mapper", "SpectralMapper"]
+    """And names a command that takes one route."""
+    path, root = tmp_path / "alike.npy", tmp_path / "run"
+    np.save(path, ALIKE.numpy())
+    words = ["--config", "train.yaml", "--data.source", path, "--model.mapper", "SpectralMapper"]
     words += ["--trainer.max_steps", STEPS, "--trainer.limit_val_batches", 0, "--model.lr", 0.003]
-    words += ["--seed_everything", 2]
-    words += ["--trainer.default_root_dir", tmp_path / "run"]
-    with pytest.raises(SystemExit) as stop:
-        main(["train", *map(str, words)])
-    assert stop.value.code == 2
-    (again,), (last,) = warned(caplog), capfd.readouterr().err.splitlines()
+    error = fails(capfd, "train", "fit", *words, "--seed_everything", 2, "--trainer.default_root_dir", root)
+    (again,) = warned(caplog)
     assert "nothing is learned" in again
     assert "--model.lr 0.001 instead of 0.003" in again
-    assert "nothing is learned" in last
-    # which takes one route
-    assert (f"`dejavu learn {tmp_path / 'alike.npy'} --map FILE`" in last) == (routes == 1)
-    assert ("dejavu learn" in last) == (routes == 1)
-    assert not list((tmp_path / "run").rglob("*.safetensors"))
-    logs = sorted((tmp_path / "run").rglob("config.yaml"))  # of both
+    assert "nothing is learned" in error
+    assert f"`dejavu learn {path} --map FILE`" in error
+    assert not list(root.rglob("*.safetensors"))
+    logs = sorted(root.rglob("config.yaml"))  # of both
     assert [yaml.safe_load(one.read_text())["model"]["lr"] for one in logs] == [0.003, 0.001]

@@ -45,24 +45,6 @@ def test_the_map_is_of_the_best_checkpoint_and_training_stops_early(tmp_path: Pa
     assert model.trained.steps == running.global_step
 
 
-def test_without_a_step_there_is_no_map(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    trainer(tmp_path, limit_train_batches=0).fit(new_task(), data_of())
-    assert warned(caplog) == ["no step was taken: no map is written"]
-    assert not (tmp_path / "map.safetensors").exists()
-
-
-def test_a_run_that_is_over_already_warns(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    trainer(tmp_path, ModelCheckpoint(tmp_path, save_last=True)).fit(new_task(), data_of())
-    assert warned(caplog) == []
-    (tmp_path / "map.safetensors").rename(tmp_path / "before.safetensors")
-    trainer(tmp_path).fit(new_task(), data_of(), ckpt_path=tmp_path / "last.ckpt")
-    (line,) = warned(caplog)
-    assert line.startswith("nothing was trained")
-    assert "step 4 is reached" in line
-    maps = [DejaVu.load(tmp_path / f"{name}.safetensors").map for name in ("before", "map")]
-    assert torch.equal(maps[0].templates, maps[1].templates)
-
-
 class Tidy(Callback):
     """Deletes the best checkpoint."""
 
@@ -70,10 +52,20 @@ class Tidy(Callback):
         Path(trainer.checkpoint_callbacks[0].best_model_path).unlink()  # type: ignore[attr-defined]
 
 
-def test_a_best_checkpoint_that_is_gone_warns(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_what_leaves_no_map_or_another_than_expected_warns(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    trainer(tmp_path, limit_train_batches=0).fit(new_task(), data_of())
+    assert warned(caplog) == ["no step was taken: no map is written"]
+    assert not (tmp_path / "map.safetensors").exists()
+    caplog.clear()
     best, task = ModelCheckpoint(tmp_path, monitor="val/auc_augmented", mode="max"), new_task()
-    trainer(tmp_path, best, Tidy()).fit(task, data_of())
+    trainer(tmp_path, best, Tidy(), LastCheckpoint()).fit(task, data_of())
     assert warned(caplog) == [f"{best.best_model_path} is gone: the map is of the last step"]
+    caplog.clear()
+    trainer(tmp_path).fit(new_task(), data_of(), ckpt_path=tmp_path / "checkpoints" / "last.ckpt")
+    (line,) = warned(caplog)
+    assert line.startswith("nothing was trained: step 4 is reached")
     assert torch.equal(DejaVu.load(tmp_path / "map.safetensors").map.templates, task.route.templates)
 
 
@@ -85,12 +77,9 @@ def test_an_interrupt_leaves_the_map_and_the_checkpoint_of_the_last_step(tmp_pat
     finally:
         signal.signal(signal.SIGINT, handler)
     model, task = DejaVu.load(tmp_path / "map.safetensors"), new_task()
-    assert model.trained is not None
-    assert model.trained.steps == 3
     load_weights(task, tmp_path / "checkpoints" / "last.ckpt")
     assert torch.equal(task.route.templates, model.map.templates)
-    assert task.deployed().trained is not None
-    assert task.deployed().trained.steps == 3  # type: ignore[union-attr]
+    assert [one.trained and one.trained.steps for one in (model, task.deployed())] == [3, 3]
 
 
 def test_the_last_checkpoint_is_by_steps_and_of_the_end(tmp_path: Path) -> None:

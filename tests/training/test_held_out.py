@@ -14,18 +14,16 @@ from helpers import refused
 from small_training import backbone, data_of, footage, new_task, train, trainer, warned
 
 from dejavu_torch import DejaVu, Preprocess, RouteData, SpectralMapper
-from dejavu_torch.cli import main
 from dejavu_torch.cli.train import MapTrainer
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.features.views import STRETCH, Views
-from dejavu_torch.growth import calibrate_if_possible
-from dejavu_torch.training import export
 from dejavu_torch.training.export import UNTRAINED, LastCheckpoint, beside_untrained
 
 FRAMES = 320
 MADE = {"mapper": SpectralMapper(6.0), "whitening": "none"}  # a descriptor and its map
-CALIBRATE = calibrate_if_possible  # which conftest.py patches away
+SHORT = {"max_steps": 2, "limit_val_batches": 0}
+CALIBRATE = DejaVu.calibrate  # which conftest.py patches away
 
 
 def long(**settings: Any) -> RouteData:
@@ -39,6 +37,23 @@ def places_of(data: RouteData) -> set[int]:
     return {place for batch in data.training_batches() for place in batch.truth.positives[:, 0].tolist()}
 
 
+def held(data: RouteData) -> set[int]:
+    return {start + i for start in data.held for i in range(STRETCH)}
+
+
+@pytest.fixture
+def calibrations(monkeypatch: pytest.MonkeyPatch) -> list[set[int]]:
+    """The places of the views that maps are calibrated by."""
+    seen: list[set[int]] = []
+
+    def taken(model: DejaVu, reference: object, views: Views) -> None:
+        seen.append(set(views.places.tolist()))
+
+    monkeypatch.setattr(DejaVu, "calibrate", taken)
+    monkeypatch.setattr("dejavu_torch.training.export.beside_untrained", lambda *_: {})
+    return seen
+
+
 @pytest.mark.parametrize(
     ("frames", "share", "expected"),
     [(320, 0.05, 2), (320, 0.25, 4), (2697, 0.05, 7), (299, 0.05, 0), (320, 0.0, 0)],
@@ -46,9 +61,9 @@ def places_of(data: RouteData) -> set[int]:
 def test_stretches_are_evenly_spaced(frames: int, share: float, expected: int) -> None:
     data = data_of(torch.zeros(frames, 4, 4, dtype=torch.uint8), held_out=share)
     data.setup("fit")
-    starts = torch.tensor([*data.held, frames + data.held[0]] if data.held else [])
     assert len(data.held) == expected
     if expected:
+        starts = torch.tensor([*data.held, frames + data.held[0]])
         assert (starts.diff() - frames / expected).abs().max() <= 1
         assert min(data.held) >= 0
         assert max(data.held) + STRETCH <= frames
@@ -57,73 +72,56 @@ def test_stretches_are_evenly_spaced(frames: int, share: float, expected: int) -
 @pytest.mark.parametrize("clip", [1, 4])
 def test_training_never_sees_them_in_any_traverse(clip: int) -> None:
     data = long(clip=clip, second=ArrayTraverse(footage(0.1, FRAMES)), batch_size=8)
-    held = {start + i for start in data.held for i in range(STRETCH)}
-    assert len(held) == 2 * STRETCH
-    seen = set().union(*(places_of(data) for _ in range(8)))
-    assert seen == set(range(FRAMES)) - held
+    assert len(held(data)) == 2 * STRETCH
+    assert set().union(*(places_of(data) for _ in range(8))) == set(range(FRAMES)) - held(data)
 
 
-@pytest.mark.parametrize(
-    "source",
-    [torch.rand(FRAMES, 6), [footage(frames=FRAMES), footage(frames=FRAMES)]],
-    ids=["features", "routes"],
-)
-def test_nothing_is_held_out_where_it_would_serve_for_nothing(source: Any) -> None:
-    data = RouteData(source, tolerance=2)
-    data.setup("fit")
-    assert data.held == []
+def test_nothing_is_held_out_if_it_would_serve_for_nothing(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Of features, of several routes, with a validation, or of templates."""
+    for source in (torch.rand(FRAMES, 6), [footage(frames=FRAMES), footage(frames=FRAMES)]):
+        data = RouteData(source, tolerance=2)
+        data.setup("fit")
+        assert data.held == []
     validated = long(validation=ArrayTraverse(footage(0.1, FRAMES)), validation_truth="0")
     assert places_of(validated) == set(range(FRAMES))
-
-
-def test_templates_are_trained_on_all_places(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     data = long()
-    trainer(tmp_path, max_steps=2, limit_val_batches=0).fit(new_task(), data)
+    trainer(tmp_path, **SHORT).fit(new_task(), data)
     assert data.held == []
     assert len([line for line in warned(caplog) if "not calibrated" in line]) == 1
 
 
 @pytest.mark.parametrize("validated", [False, True])
 def test_what_training_has_not_seen_calibrates(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, validated: bool
+    tmp_path: Path, calibrations: list[set[int]], validated: bool
 ) -> None:
-    seen: list[Views] = []
-
-    def taken(model: DejaVu, reference: object, views: Views) -> None:
-        seen.append(views)
-
-    monkeypatch.setattr(export, "calibrate_if_possible", taken)
-    monkeypatch.setattr("dejavu_torch.training.export.beside_untrained", lambda *_: {})
     data = long(validation=ArrayTraverse(footage(0.1, FRAMES)), validation_truth="0") if validated else long()
-    trainer(tmp_path, max_steps=2, limit_val_batches=0).fit(new_task(**MADE), data)
-    (views,) = seen
-    held = {start + i for start in data.held for i in range(STRETCH)}
-    assert set(views.places.tolist()) == (set(range(FRAMES)) if validated else held)
+    trainer(tmp_path, **SHORT).fit(new_task(**MADE), data)
+    assert calibrations == [set(range(FRAMES)) if validated else held(data)]
 
 
 @pytest.mark.parametrize("first", [{"held_out": 0}, {}], ids=["all seen", "held out"])
 def test_what_the_checkpoint_s_training_saw_does_not_calibrate(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, first: dict[str, Any]
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    calibrations: list[set[int]],
+    first: dict[str, Any],
 ) -> None:
-    seen: list[Views] = []
-    monkeypatch.setattr(export, "calibrate_if_possible", lambda _, reference, views: seen.append(views))
-    monkeypatch.setattr("dejavu_torch.training.export.beside_untrained", lambda *_: {})
-    quiet = {"max_steps": 2, "limit_val_batches": 0}
-    trainer(tmp_path / "one", LastCheckpoint(), **quiet).fit(new_task(**MADE), long(**first))
-    seen.clear()
+    trainer(tmp_path / "one", LastCheckpoint(), **SHORT).fit(new_task(**MADE), long(**first))
+    calibrations.clear()
     running = MapTrainer(accelerator="cpu", logger=False, default_root_dir=tmp_path / "two")
     running.export(new_task(**MADE), long(), str(tmp_path / "one" / "checkpoints" / "last.ckpt"))
     assert (tmp_path / "two" / "map.safetensors").is_file()
-    assert len(seen) == ("held_out" not in first)
+    assert len(calibrations) == ("held_out" not in first)
     assert len([line for line in warned(caplog) if "not calibrated" in line]) == len(first)
 
 
-@pytest.mark.slow
 def test_at_the_end_the_map_is_calibrated_and_set_beside_the_untrained_one(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At another size than the reference's, with a backbone that takes no other."""
-    monkeypatch.setattr(export, "calibrate_if_possible", CALIBRATE)
+    monkeypatch.setattr(DejaVu, "calibrate", CALIBRATE)
     monkeypatch.setattr("dejavu_torch.features.views.FEWEST", 40)
     np.save(tmp_path / "long.npy", footage(frames=FRAMES, side=32).numpy())
     words = ["--data.source", tmp_path / "long.npy", "--trainer.max_steps=2", "--trainer.limit_val_batches=0"]
@@ -143,9 +141,9 @@ def test_a_calibration_that_fails_loses_no_training(tmp_path: Path, monkeypatch:
     def failing(*_: object) -> None:
         raise RuntimeError("shapes cannot be multiplied")
 
-    monkeypatch.setattr(export, "calibrate_if_possible", failing)
+    monkeypatch.setattr(DejaVu, "calibrate", failing)
     with pytest.raises(RuntimeError, match="shapes"):
-        trainer(tmp_path, max_steps=2, limit_val_batches=0).fit(new_task(**MADE), long())
+        trainer(tmp_path, **SHORT).fit(new_task(**MADE), long())
     assert DejaVu.load(tmp_path / "map.safetensors").map.places == FRAMES
 
 
@@ -162,32 +160,26 @@ def test_the_untrained_map_is_of_frames_of_the_queries_size(
     assert len([line for line in warned(caplog) if "brought to" in line]) == (size is not None)
 
 
-# short routes --------------------------------------------------------------------------------------------
+# short routes, and channels ------------------------------------------------------------------------------
 
 
-def test_a_short_route_is_told_ahead_of_the_training(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    trainer(tmp_path, max_steps=1, limit_val_batches=0).fit(new_task(), data_of())
+def test_a_short_route_is_told_before_the_training(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    trainer(tmp_path, **SHORT).fit(new_task(), data_of())
     (line,) = warned(caplog)
-    assert "40 frames, below 300" in line
-    assert "dejavu learn" in line
-    assert "data.validation" in line
+    assert all(fact in line for fact in ("40 frames, below 300", "dejavu learn", "data.validation"))
     assert DejaVu.load(tmp_path / "map.safetensors").calibration is None
 
 
 def test_bytes_that_nobody_asked_for_give_way(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    given = {"mapper": SpectralMapper(0.3), "whitening": "none"}
-    with refused("route_bytes_per_place is 0.3"):
-        trainer(tmp_path, max_steps=1, limit_val_batches=0).fit(new_task(**given), data_of())
-    caplog.clear()
-    task = new_task(**given)
+    task = new_task(mapper=SpectralMapper(0.3), whitening="none")
     task.gives_way = True
-    trainer(tmp_path, max_steps=1, limit_val_batches=0).fit(task, data_of())
+    trainer(tmp_path, **SHORT).fit(task, data_of())
     assert [line for line in warned(caplog) if "route_bytes_per_place 0.3" in line and "1.43" in line]
     summary = DejaVu.load(tmp_path / "map.safetensors").summary()
     assert summary.lines > 0
     assert summary.route_bytes / 40 <= 1.43
+    with refused("route_bytes_per_place is 0.3"):
+        trainer(tmp_path, **SHORT).fit(new_task(mapper=SpectralMapper(0.3), whitening="none"), data_of())
 
 
 def test_the_command_tells_what_was_asked_for(
@@ -197,37 +189,25 @@ def test_the_command_tells_what_was_asked_for(
     head, tail = config.split("  mapper:")[0], config[config.index("data:") :]
     mapper = "  mapper: {class_path: SpectralMapper, init_args: {route_bytes_per_place: 0.3}}\n"
     (tmp_path / "tight.yaml").write_text(f"{head}{mapper}{tail}")
-    words = ["--config", str(tmp_path / "tight.yaml"), "--trainer.default_root_dir", str(tmp_path / "run")]
-    words += ["--trainer.max_steps=1", "--trainer.limit_val_batches=0"]
-    error = fails(capfd, "train", "fit", *words, "--model.mapper.route_bytes_per_place", "0.3")
-    assert "route_bytes_per_place is 0.3; expected more than" in error
+    words = ["--trainer.default_root_dir", tmp_path / "run", "--trainer.max_steps=1"]
+    asked = ["--config", tmp_path / "tight.yaml", *words, "--model.mapper.route_bytes_per_place", "0.3"]
+    assert "route_bytes_per_place is 0.3; expected more than" in fails(capfd, "train", "fit", *asked)
     for command in ("fit", "export"):
-        main(["train", command, *words])
+        train(command, *words, config=str(tmp_path / "tight.yaml"))
     assert (tmp_path / "run" / "map.safetensors").is_file()
-
-
-# channels ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("channels", [1, 3])
 def test_a_network_takes_as_many_channels_as_the_frames_have(tmp_path: Path, channels: int) -> None:
     frames = footage()[..., None].expand(-1, -1, -1, channels)
-    network = type(backbone())(8, resize=(16, 16), widths=(4, 8), squeeze=4)
-    task = new_task(backbone=network)
-    trainer(tmp_path, max_steps=1, limit_val_batches=0).fit(task, data_of(frames))
+    network, again = (type(backbone())(8, resize=(16, 16), widths=(4, 8), squeeze=4) for _ in range(2))
+    trainer(tmp_path, LastCheckpoint(), **SHORT).fit(new_task(backbone=network), data_of(frames))
     model = DejaVu.load(tmp_path / "map.safetensors")
     assert model.features.channels == channels
     assert model(torch.rand(2, channels, 16, 16)).shape == (2, 40)
-    start = str(tmp_path / "map.safetensors")
-    again = type(network)(8, resize=(16, 16), widths=(4, 8), squeeze=4)
-    new_task(backbone=again, start=start)  # takes its channels too
+    new_task(backbone=again, start=str(tmp_path / "map.safetensors"))  # takes its channels too
     assert again.channels == channels
-
-
-def test_a_checkpoint_brings_its_channels(folder: Path, tmp_path: Path) -> None:
-    config = (folder / "train.yaml").read_text().replace("channels: 1, ", "")
-    (tmp_path / "free.yaml").write_text(config)
-    words = ["--trainer.default_root_dir", tmp_path / "run"]
-    train("fit", *words, "--trainer.max_steps", 1, config=str(tmp_path / "free.yaml"))
-    train("export", *words, config=str(tmp_path / "free.yaml"))
-    assert DejaVu.load(tmp_path / "run" / "map.safetensors").features.channels == 1
+    free = type(network)(8, resize=(16, 16), widths=(4, 8), squeeze=4)
+    running = MapTrainer(accelerator="cpu", logger=False, default_root_dir=tmp_path / "again")
+    running.export(new_task(backbone=free), data_of(frames), str(tmp_path / "checkpoints" / "last.ckpt"))
+    assert DejaVu.load(tmp_path / "again" / "map.safetensors").features.channels == channels

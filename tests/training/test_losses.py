@@ -189,7 +189,7 @@ SCORES, PLACES = torch.rand(3, 9), torch.zeros(3, 2, dtype=torch.int64)
         (lambda: place_cross_entropy(SCORES, PLACES, -1, 1.0), ["tolerance is -1", "at least 0"]),
         (lambda: place_cross_entropy(SCORES, PLACES, 1, 0.0), ["temperature is 0.0", "above 0"]),
         (lambda: place_cross_entropy(SCORES, PLACES, 1, torch.tensor(math.nan)), ["temperature is nan"]),
-        (lambda: phase_cross_entropy([], (), PLACES, 1.0), ["distances are []", "at least one layer"]),
+        (lambda: phase_cross_entropy([], (), PLACES, 1.0), ["distances are []", "at least one"]),
         (lambda: phase_cross_entropy([SCORES], PLAN, PLACES, 1.0), ["[(3, 9)]", "[(3, 4), (3, 3)]"]),
         (lambda: phase_cross_entropy([SCORES[:, :4], SCORES[:, :3]], PLAN, PLACES, -1.0), ["is -1.0"]),
         (lambda: Objective(place=-1.0), ["place=-1.0", "0 or more"]),

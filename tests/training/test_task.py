@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from small_training import (
     data_of,
     fit,
     footage,
+    heights,
     mapper,
     new_task,
     recall,
@@ -35,15 +35,15 @@ from dejavu_torch.training.datamodule import RouteData
 from dejavu_torch.training.task import PlaceRecognitionTask
 from dejavu_torch.types import FrequencyLayer, Training
 
+EPOCHS = {"max_steps": -1, "enable_checkpointing": False}
+
 
 @pytest.mark.parametrize(
     "settings",
     [
-        {},
         {"feature_weights": True},
         {"mapper": mapper(metric="l2", reduction="sum", temperature=0.5)},
-        {"mapper": mapper(metric="cosine", trainable=True)},
-        {"batch_size": 1},
+        {"mapper": mapper(metric="cosine", trainable=True), "batch_size": 1},
     ],
     ids=str,
 )
@@ -68,9 +68,7 @@ def test_the_map_holds_how_it_was_trained_and_counts_the_backbone(
     assert model.summary().fixed["backbone"] == weights > 0
     assert model.summary().map_bytes == (tmp_path / "map.safetensors").stat().st_size
     monkeypatch.setenv("PL_GLOBAL_SEED", "7")
-    again = fit(tmp_path, new_task(), data_of())
-    assert again.trained is not None
-    assert again.trained.seed == 7
+    assert fit(tmp_path, new_task(), data_of()).trained == Training(4, 7)
 
 
 def test_training_finds_places_that_the_untrained_start_does_not(tmp_path: Path) -> None:
@@ -82,41 +80,15 @@ def test_training_finds_places_that_the_untrained_start_does_not(tmp_path: Path)
     assert trained > start + 0.2, (start, trained)
 
 
-def test_a_seed_repeats_a_training(tmp_path: Path) -> None:
+def test_a_seed_repeats_a_training_and_a_validation_changes_nothing_in_it(tmp_path: Path) -> None:
     states = []
-    for seed in (1, 1, 2):
+    for seed, batches in ((1, 1.0), (1, 0), (2, 0)):
         torch.manual_seed(seed)
-        states.append(fit(tmp_path, new_task(refresh=1), data_of(), max_epochs=2, max_steps=-1).state_dict())
+        given = EPOCHS | {"max_epochs": 2, "limit_val_batches": batches, "num_sanity_val_steps": 0}
+        states.append(fit(tmp_path, new_task(refresh=1), data_of(), **given).state_dict())
     one, same, other = ({n: t for n, t in s.items() if isinstance(t, Tensor)} for s in states)
     assert all(torch.equal(one[name], same[name]) for name in one)
     assert not torch.equal(one["map.templates"], other["map.templates"])
-
-
-def test_a_validation_changes_nothing_in_training(tmp_path: Path) -> None:
-    maps = []
-    for batches in (0, 1.0):
-        torch.manual_seed(0)
-        settings = {"limit_val_batches": batches, "num_sanity_val_steps": 0, "max_epochs": 3, "max_steps": -1}
-        maps.append(fit(tmp_path, new_task(), data_of(), **settings).map.templates)
-    assert torch.equal(*maps)
-
-
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        ({"lr": 0.0}, ("lr is 0.0", "above 0")),
-        ({"refresh": -1}, ("refresh is -1",)),
-        ({"descriptor": -0.1}, ("descriptor is -0.1", "from 0 to below 1")),
-        ({"rate": math.nan}, ("rate is nan", "0 or more")),
-        ({"rate": 1.0}, ("rate is given, which does nothing for the map of a TemplateMapper",)),
-        ({"weight_bits": 4}, ("weight_bits is 4", "8, 32")),
-        ({"mapper": nn.Identity()}, ("mapper is a Identity", "expected a Mapper")),
-    ],
-    ids=str,
-)
-def test_settings_out_of_range(settings: dict[str, Any], words: tuple[str, ...]) -> None:
-    with refused(*words):
-        new_task(**settings)
 
 
 # templates, weights, layers ------------------------------------------------------------------------------
@@ -132,10 +104,6 @@ def test_weights_are_learned_and_written_with_their_signs_turned(tmp_path: Path)
         torch.testing.assert_close(model(frames), task.eval()(frames), rtol=1e-5, atol=1e-5)
 
 
-def phases(task: PlaceRecognitionTask) -> list[int]:
-    return [layer.phases for layer in task.route.plan]
-
-
 class Watch(Callback):
     """At the first step of each epoch: how often the layers were asked for, and the templates."""
 
@@ -149,23 +117,21 @@ class Watch(Callback):
             self.templates = pl_module.route.templates.detach().clone()
 
 
+@pytest.mark.parametrize(("refresh", "times"), [(0, [1] * 4), (1, [1, 2, 3, 4]), (3, [1, 1, 1, 2])])
 @pytest.mark.parametrize("weights", [False, True])
-def test_layers_found_later_are_trained(tmp_path: Path, weights: bool) -> None:
-    task, seen = new_task(mapper=mapper(Later()), refresh=1, feature_weights=weights), Watch()
-    running = trainer(tmp_path, seen, max_epochs=2, max_steps=-1, enable_checkpointing=False)
+def test_layers_are_found_anew_every_few_epochs_and_trained(
+    tmp_path: Path, refresh: int, times: list[int], weights: bool
+) -> None:
+    watch = Watch()
+    task = new_task(mapper=mapper(Later()), refresh=refresh, feature_weights=weights)
+    running = trainer(tmp_path, watch, **EPOCHS, max_epochs=4)
     running.fit(task, data_of())
-    assert phases(task) == [5, 7, 9]
-    assert not torch.equal(seen.templates, task.route.templates)
+    assert watch.times == times
+    assert [layer.phases for layer in task.route.plan] == ([5, 7, 9] if refresh else [3, 4])
+    assert not torch.equal(watch.templates, task.route.templates)
     optimised = {id(p) for group in running.optimizers[0].param_groups for p in group["params"]}
     assert optimised == {id(p) for p in task.parameters()}
     assert {id(p) for p in running.optimizers[0].state} <= optimised
-
-
-@pytest.mark.parametrize(("refresh", "times"), [(0, [1] * 5), (1, [1, 2, 3, 4, 5]), (3, [1, 1, 1, 2, 2])])
-def test_layers_are_found_anew_every_few_epochs(tmp_path: Path, refresh: int, times: list[int]) -> None:
-    watch, task = Watch(), new_task(mapper=mapper(Later()), refresh=refresh)
-    trainer(tmp_path, watch, max_epochs=5, max_steps=-1, enable_checkpointing=False).fit(task, data_of())
-    assert watch.times == times
 
 
 def test_places_without_a_layer_are_left_out(tmp_path: Path) -> None:
@@ -177,9 +143,19 @@ def test_places_without_a_layer_are_left_out(tmp_path: Path) -> None:
     assert DejaVu.load(tmp_path / "map.safetensors").eval()(torch.rand(2, 1, 16, 16))[:, 16:24].isinf().all()
 
 
-def test_features_in_which_nothing_repeats_are_refused(tmp_path: Path) -> None:
-    with refused("nothing repeats in the features of the array", "imposed periods"):
-        fit(tmp_path, new_task(mapper=mapper(Fixed())), data_of())
+@pytest.mark.parametrize(
+    ("settings", "steps", "facts"),
+    [
+        ({"mapper": mapper(Fixed())}, {}, ["nothing repeats in the features of the array", "imposed"]),
+        ({}, {"max_steps": -1, "max_epochs": -1}, ["no end", "trainer.max_steps"]),
+    ],
+    ids=["no layer", "no end"],
+)
+def test_what_cannot_be_trained_is_refused(
+    tmp_path: Path, settings: dict[str, Any], steps: dict[str, Any], facts: list[str]
+) -> None:
+    with refused(*facts):
+        fit(tmp_path, new_task(**settings), data_of(), **steps)
 
 
 # frames --------------------------------------------------------------------------------------------------
@@ -209,7 +185,7 @@ def test_frames_are_resized_when_they_are_stored(
     tmp_path: Path, settings: dict[str, Any], resize: Any, stored: tuple[int, ...], shape: tuple[int, ...]
 ) -> None:
     data, task = data_of(footage(side=24), resize=resize), new_task(**settings)
-    trainer(tmp_path).fit(task, data)
+    trainer(tmp_path, max_steps=1).fit(task, data)
     assert data.sets["reference"].values.shape == (FRAMES, *stored)
     assert task.deployed().frame_shape == shape
 
@@ -228,44 +204,33 @@ def assert_figures(running: Trainer, task: PlaceRecognitionTask, noisy: Tensor, 
     assert figures == pytest.approx({f"test/{name}": value for name, value in expected.items()}, abs=1e-6)
 
 
-@pytest.mark.parametrize("truth", ["0", "5", "csv"])
-def test_the_figures_are_those_of_evaluate_on_the_map(tmp_path: Path, truth: str) -> None:
-    """5 leaves the last queries without a right place; the csv also leaves some unknown."""
-    if truth == "csv":
-        truth = str(tmp_path / "truth.csv")
-        rows = [f"{i},{i},{i // 2}" if i % 3 else f"{i}" for i in range(30)]
-        Path(truth).write_text("\n".join(rows) + "\n")
+def test_the_figures_are_those_of_evaluate_on_the_map(tmp_path: Path) -> None:
+    """Also of queries without a right place, or of which nothing is known."""
+    rows = [f"{i},{i},{i // 2}" if i % 3 else f"{i}" for i in range(30)]
+    (tmp_path / "truth.csv").write_text("\n".join(rows) + "\n")
     running, task = trainer(tmp_path), new_task()
     running.fit(task, data_of())
-    assert_figures(running, task, footage(0.2), truth)
+    assert_figures(running, task, footage(0.2), str(tmp_path / "truth.csv"))
 
 
-@pytest.mark.parametrize("precision", ["bf16-mixed", "32-true"])
-def test_figures_are_made_in_32_bits(tmp_path: Path, precision: Any) -> None:
-    running, task = trainer(tmp_path, precision=precision, max_steps=30), new_task(feature_weights=True)
+def test_figures_are_made_in_32_bits(tmp_path: Path) -> None:
+    running, task = trainer(tmp_path, precision="bf16-mixed", max_steps=30), new_task(feature_weights=True)
     running.fit(task, data_of())
     assert_figures(running, task, footage(0.2))
 
 
 def test_without_training_the_phase_means_are_evaluated(tmp_path: Path) -> None:
+    """Of the augmented reference the figures are called so."""
     running, task = trainer(tmp_path), new_task()
-    running.validate(
-        task, data_of(validation=ArrayTraverse(footage(0.2)), validation_truth="0"), verbose=False
-    )
+    given = {"validation": ArrayTraverse(footage(0.2)), "validation_truth": "0"}
+    (figures,) = running.validate(task, data_of(**given), verbose=False)
+    assert {"val/auc", "val/recall_at_1"} < set(figures)
+    (figures,) = running.validate(task, data_of(), verbose=False)
+    assert {"val/auc_augmented", "val/recall_at_1_augmented"} < set(figures)
+    assert all(name.endswith("_augmented") for name in figures)
     task.deployed().save(tmp_path / "map.safetensors")
     assert_figures(running, task, footage(0.2))
     trainer(tmp_path).fit(task, data_of())  # and it can be trained all the same
-
-
-def test_figures_of_the_augmented_reference_are_called_so(tmp_path: Path) -> None:
-    validated = {"validation": ArrayTraverse(footage(0.2)), "validation_truth": "0"}
-    for given, suffix in (({}, "_augmented"), (validated, "")):
-        (figures,) = trainer(tmp_path).validate(new_task(), data_of(**given), verbose=False)
-        assert {f"val/auc{suffix}", f"val/recall_at_1{suffix}"} < set(figures)
-        assert all(name.endswith(suffix) and name.count("augmented") == bool(suffix) for name in figures)
-
-
-# the optimizer -------------------------------------------------------------------------------------------
 
 
 class Rates(Callback):
@@ -280,19 +245,10 @@ class Rates(Callback):
         assert decays == {id(p): 0.3 if p.ndim > 1 else 0 for p in pl_module.parameters()}
 
 
-@pytest.mark.parametrize("steps", [20, 2, 1])
+@pytest.mark.parametrize("steps", [20, 1])
 def test_the_rate_rises_over_a_tenth_and_falls_to_0(tmp_path: Path, steps: int) -> None:
     """And only what is multiplied decays."""
     rates, task = Rates(), new_task(weight_decay=0.3)
     running = trainer(tmp_path, rates, max_steps=steps, enable_checkpointing=False, limit_val_batches=0)
     running.fit(task, data_of())
-    rise = max(1, steps // 10)
-    expected = [(k + 1) / rise for k in range(rise)]
-    left = steps - rise
-    expected += [0.5 + 0.5 * math.cos(math.pi * k / left) for k in range(left)]
-    assert rates.seen == pytest.approx(expected)
-
-
-def test_a_training_needs_an_end(tmp_path: Path) -> None:
-    with refused("no end", "trainer.max_steps"):
-        trainer(tmp_path, max_steps=-1, max_epochs=-1).fit(new_task(), data_of())
+    assert rates.seen == pytest.approx(heights(steps))

@@ -1,4 +1,4 @@
-"""`dejavu train` as a user meets it: files, figures, and what it says."""
+"""`dejavu train` as a user meets it: files, figures, what it says, and one line for each mistake."""
 
 from __future__ import annotations
 
@@ -14,43 +14,34 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from command_line import fails, run
 from pytorch_lightning import Trainer
 from small_training import CONFIG, FRAMES, MINE, footage, train, warned
 
 from dejavu_torch import DejaVu, RouteData, TemplateMap
-from dejavu_torch.cli import main
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.maps.file import read_map
 from dejavu_torch.maps.spectral_map import SpectralMap
 
+SPECTRAL = ["--model.mapper", "SpectralMapper"]
 
-def figures(path: Path) -> dict[str, list[float]]:
-    rows = list(csv.DictReader(path.open()))
+
+def figures(folder: Path) -> dict[str, list[float]]:
+    rows = list(csv.DictReader((folder / "lightning_logs" / "version_0" / "metrics.csv").open()))
     return {name: [float(row[name]) for row in rows if row[name]] for name in rows[0]}
-
-
-def printed(capsys: pytest.CaptureFixture[str]) -> dict[str, float]:
-    """The table of figures that a test or validation prints."""
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[-2].endswith(".ckpt")
-    command = "dejavu compare one.npy two.npy --map run/map.safetensors --truth 0 --tolerance 2 --out report"
-    assert lines[-1] == f"next: {command}"  # which scores
-    rows = [line.split() for line in lines]
-    return {row[0]: float(row[1]) for row in rows if row and row[0].startswith(("test/", "val/"))}
 
 
 # what it does --------------------------------------------------------------------------------------------
 
 
 def test_a_fit_leaves_a_map_a_checkpoint_figures_and_its_config(folder: Path) -> None:
-    log = folder / "run" / "lightning_logs" / "version_0"
     assert [path.name for path in (folder / "run" / "checkpoints").iterdir()] == ["last.ckpt"]
-    assert (log / "config.yaml").is_file()
-    seen = figures(log / "metrics.csv")
+    assert (folder / "run" / "lightning_logs" / "version_0" / "config.yaml").is_file()
+    seen = figures(folder / "run")
     assert {"val/auc_augmented", "val/recall_at_1_augmented", "train/left_out"} <= set(seen)
-    assert len(seen["val/auc_augmented"]) == 1  # at the last step, which is ahead of the first 500
+    assert len(seen["val/auc_augmented"]) == 1  # at the last step, which is before the first 500
     model = DejaVu.load(folder / "run" / "map.safetensors")
     assert model.trained is not None
     assert (model.trained.steps, model.trained.seed) == (4, 0)
@@ -58,15 +49,24 @@ def test_a_fit_leaves_a_map_a_checkpoint_figures_and_its_config(folder: Path) ->
 
 
 def test_test_and_validate_take_the_last_checkpoint(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    train("test", "--data.query", "two.npy", "--data.truth", "0")
+    """And say what the figures are of, and which command scores the map."""
     match = DejaVu.load("run/map.safetensors").localize(ArrayTraverse(footage(0.1)))
-    scores = evaluate(match, torch.arange(FRAMES)[:, None], tolerance=2)
-    assert printed(capsys) == pytest.approx({f"test/{n}": f for n, f in scores._asdict().items()}, abs=1e-6)
-    train("validate", "--data.validation", "two.npy", "--data.validation_truth", "0")
-    assert printed(capsys) == pytest.approx({f"val/{n}": f for n, f in scores._asdict().items()}, abs=1e-6)
+    scores = evaluate(match, torch.arange(FRAMES)[:, None], tolerance=2)._asdict()
+    compare = "dejavu compare one.npy two.npy --map run/map.safetensors --truth 0 --tolerance 2 --out report"
+    for command, name, truth, prefix in (
+        ("test", "query", "truth", "test/"),
+        ("validate", "validation", "validation_truth", "val/"),
+    ):
+        train(command, f"--data.{name}=two.npy", f"--data.{truth}=0")
+        lines = capsys.readouterr().out.splitlines()
+        assert lines[-2].endswith(".ckpt")
+        assert lines[-1] == f"next: {compare}"
+        rows = [line.split() for line in lines if line.strip().startswith(prefix)]
+        expected = {prefix + name: value for name, value in scores.items()}
+        assert {row[0]: float(row[1]) for row in rows} == pytest.approx(expected, abs=1e-6)
 
 
-def test_a_source_alone_is_enough(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_source_alone_is_enough(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Steps, validations and checkpoints have defaults; here but a few steps are taken."""
     monkeypatch.chdir(tmp_path)
     np.save("photos.npy", np.random.default_rng(0).integers(0, 255, (12, 120, 160, 3), dtype=np.uint8))
@@ -79,45 +79,39 @@ def test_a_source_alone_is_enough(folder: Path, tmp_path: Path, monkeypatch: pyt
         assert datamodule.sets["reference"].values.shape == (12, 3, 96, 96)
 
     monkeypatch.setattr("dejavu_torch.cli.train.MapTrainer.fit", taken)
-    main(["train", "fit", "--data.source", "photos.npy", "--trainer.accelerator", "cpu"])
+    run("train", "fit", "--data.source", "photos.npy", "--trainer.accelerator", "cpu")
     assert seen == {"steps": 3000, "every": 500, "epochs": None}
     assert DejaVu.load("dejavu_train/map.safetensors").frame_shape == (3, 120, 160)
-
-
-def test_auto_is_one_device_of_however_many(folder: Path, tmp_path: Path) -> None:
-    options = ["--trainer.default_root_dir", tmp_path, "--trainer.logger", "false"]
-    train("fit", "--trainer.devices", "auto", *options)
-    assert yaml.safe_load((tmp_path / "config.yaml").read_text())["trainer"]["devices"] == 1
-
-
-def test_losses_and_a_users_backbone_by_name(folder: Path, tmp_path: Path) -> None:
-    options = ["--model.losses.phase=0.5", "--model.backbone", "mine.Plain"]
-    train("fit", *options, "--trainer.default_root_dir", tmp_path, "--trainer.log_every_n_steps", 1)
-    seen = figures(tmp_path / "lightning_logs" / "version_0" / "metrics.csv")
-    expected = np.array(seen["train/place"]) + 0.5 * np.array(seen["train/phase"])
-    np.testing.assert_allclose(seen["train/loss"], expected, rtol=1e-4)
-    assert "mine.Plain" in str(read_map(tmp_path / "map.safetensors")[1]["features"])
 
 
 def test_options_of_our_own_parts_need_no_class_name(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "short.yaml").write_text(
         "model: {backbone: {init_args: {dimension: 8, channels: 1, resize: [16, 16], widths: [4]}}}\n"
         "data: {source: one.npy, batch_size: 20}\n"
-        "trainer: {max_steps: 2, accelerator: cpu, enable_progress_bar: false}\n"
+        "trainer: {max_steps: 2, accelerator: cpu, enable_progress_bar: false, devices: auto}\n"
     )
     options = ["--model.mapper.periods.periods", "[11,12,13,17]", "--data.augmentation.rotation", 0]
-    options += ["--model.mapper.reduction=sum", "--model.preprocess.contrast=patch"]
-    options += ["--trainer.default_root_dir", tmp_path / "run"]
+    options += [
+        "--model.mapper.reduction=sum",
+        "--model.preprocess.contrast=patch",
+        "--model.losses.phase=.5",
+    ]
+    options += ["--trainer.default_root_dir", tmp_path, "--trainer.log_every_n_steps", 1]
+    options += ["--model.losses.phase", 0.5]
     train("fit", *options, config=str(tmp_path / "short.yaml"))
-    model = DejaVu.load(tmp_path / "run" / "map.safetensors")
+    model = DejaVu.load(tmp_path / "map.safetensors")
     assert [layer.phases for layer in model.map.plan] == [11, 12, 13, 17]
     assert isinstance(model.map, TemplateMap)
     assert (model.map.reduction, model.preprocess.contrast) == ("sum", "patch")
     assert type(model.features) is SmallCNN
-    (config,) = (tmp_path / "run").rglob("config.yaml")
-    kept = yaml.safe_load(config.read_text())["data"]["augmentation"]
-    assert kept["class_path"] == "dejavu_torch.features.augmentation.Augmentation"
-    assert kept["init_args"]["rotation"] == 0
+    (path,) = tmp_path.rglob("config.yaml")
+    config = yaml.safe_load(path.read_text())
+    assert config["data"]["augmentation"]["class_path"] == "dejavu_torch.features.augmentation.Augmentation"
+    assert config["data"]["augmentation"]["init_args"]["rotation"] == 0
+    assert config["trainer"]["devices"] == 1  # auto is one of however many
+    seen = figures(tmp_path)
+    expected = np.array(seen["train/place"]) + 0.5 * np.array(seen["train/phase"])
+    np.testing.assert_allclose(seen["train/loss"], expected, rtol=1e-4)
 
 
 def test_a_class_in_the_current_folder_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -128,9 +122,9 @@ def test_a_class_in_the_current_folder_is_found(tmp_path: Path, monkeypatch: pyt
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [path for path in sys.path if path not in ("", str(tmp_path))])
     monkeypatch.setattr(sys, "modules", dict(sys.modules))
-    train("fit", "--model.backbone", "own_classes.Plain")
-    header = read_map(tmp_path / "run" / "map.safetensors")[1]
-    assert "own_classes.Plain" in str(header["features"])
+    train("fit", "--model.backbone", "own_classes.Plain", "--trainer.enable_checkpointing", "false")
+    assert "own_classes.Plain" in str(read_map(tmp_path / "run" / "map.safetensors")[1]["features"])
+    assert not list(tmp_path.rglob("*.ckpt"))  # which can be switched off
 
 
 def test_a_users_own_checkpoints_decide_which_is_the_map(folder: Path, tmp_path: Path) -> None:
@@ -156,68 +150,55 @@ trainer:
     assert checkpoint["epoch"] == 0  # stopped at the first
 
 
-def test_checkpoints_can_be_switched_off(folder: Path, tmp_path: Path) -> None:
-    train("fit", "--trainer.enable_checkpointing", "false", "--trainer.default_root_dir", tmp_path)
-    assert not list(tmp_path.rglob("*.ckpt"))
-    assert (tmp_path / "map.safetensors").is_file()
-
-
 def test_export_makes_a_map_of_a_checkpoint(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """With the config that the fit has left."""
     last = folder / "run" / "checkpoints" / "last.ckpt"
-    train("export", "--ckpt_path", last, "--trainer.default_root_dir", tmp_path / "new")
+    config = str(folder / "run" / "lightning_logs" / "version_0" / "config.yaml")
+    train("export", "--ckpt_path", last, "--trainer.default_root_dir", tmp_path / "new", config=config)
     written = DejaVu.load(tmp_path / "new" / "map.safetensors")
-    model = DejaVu.load(folder / "run" / "map.safetensors")
     frames = torch.rand(2, 1, 16, 16)
-    assert torch.equal(written(frames), model(frames))
+    assert torch.equal(written(frames), DejaVu.load(folder / "run" / "map.safetensors")(frames))
     assert written.trained is not None
     assert written.trained.steps == 4
     assert f"--map {tmp_path}/new/map.safetensors" in capsys.readouterr().out
-    config = str(folder / "run" / "lightning_logs" / "version_0" / "config.yaml")  # the one of the fit
-    train("export", "--ckpt_path", last, "--trainer.default_root_dir", tmp_path / "again", config=config)
-    assert (tmp_path / "again" / "map.safetensors").is_file()
 
 
 def test_a_spectral_map_whatever_mapper_a_preset_has(
     folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
-    (tmp_path / "plain.yaml").write_text(CONFIG.partition("  mapper:")[0] + CONFIG[CONFIG.index("data:") :])
-    chosen = ["--model.mapper", "SpectralMapper", "--model.mapper.route_bytes_per_place", 12]
-    for config in ("train.yaml", str(tmp_path / "plain.yaml")):
-        run = tmp_path / Path(config).stem
-        train("fit", *chosen, "--trainer.default_root_dir", run, config=config)
-        assert warned(caplog) == []
-        said = capfd.readouterr()
-        assert said.err == ""
-        assert "lines of their spectra" in said.out
-        assert isinstance(DejaVu.load(run / "map.safetensors").map, SpectralMap)
+    chosen = [*SPECTRAL, "--model.mapper.route_bytes_per_place", 12]
+    train("fit", *chosen, "--trainer.default_root_dir", tmp_path / "fit")
+    assert warned(caplog) == []
+    said = capfd.readouterr()
+    assert said.err == ""
+    assert "lines of their spectra" in said.out
     for size in (12, 1.2):  # the map is made anew of the checkpoint's features
         options = [*chosen[:-1], size, "--trainer.default_root_dir", tmp_path / str(size)]
         options += ["--data.validation=two.npy", "--data.validation_truth=0"]  # which calibrates the map
-        train("export", "--ckpt_path", run / "checkpoints" / "last.ckpt", *options)
+        train("export", "--ckpt_path", tmp_path / "fit" / "checkpoints" / "last.ckpt", *options)
         assert ("this route needs about" in capfd.readouterr().out) == (size == 1.2)
-    maps = [DejaVu.load(tmp_path / name / "map.safetensors") for name in ("plain", "12", "1.2")]
+    maps = [DejaVu.load(tmp_path / name / "map.safetensors") for name in ("fit", "12", "1.2")]
+    assert all(isinstance(model.map, SpectralMap) for model in maps)
     assert [model.calibration is not None for model in maps] == [False, True, True]
-    assert torch.equal(maps[0].map.streams, maps[1].map.streams)
-    assert len(maps[2].map.level) < len(maps[1].map.level)
-    assert maps[1].trained is not None
-    assert maps[1].trained.steps == 4
+    assert torch.equal(maps[0].map.streams, maps[1].map.streams)  # type: ignore[arg-type]
+    assert len(maps[2].map.level) < len(maps[1].map.level)  # type: ignore[arg-type]
 
 
-def test_a_preset_by_name_and_options_that_have_the_last_word(folder: Path, tmp_path: Path) -> None:
+def test_a_preset_by_name_and_options_that_have_the_last_word(tmp_path: Path) -> None:
     options = ["--trainer.max_steps=2", "--data.source=sim:aerial?frames=40", "--trainer.accelerator=cpu"]
-    options += ["--trainer.precision", "32-true", "--trainer.default_root_dir", tmp_path]
-    main(["train", "fit", *map(str, options), "--config", "train_small"])
+    options += ["--trainer.precision", "32-true", "--trainer.default_root_dir", str(tmp_path)]
+    run("train", "fit", *options, "--config", "train_small")
     model = DejaVu.load(tmp_path / "map.safetensors")
     assert model.trained is not None
     assert model.trained.steps == 2
     assert model.features.resize == (64, 64)
 
 
-def test_help_has_our_options_first(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_has_our_options_first(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
-        main(["train", "fit", "--help"])
+        run("train", "fit", "--help")
     assert stop.value.code == 0
     usage, _, options = capsys.readouterr().out.partition("options:")
     assert usage.startswith("usage: dejavu train ")
@@ -229,17 +210,16 @@ def test_help_has_our_options_first(folder: Path, capsys: pytest.CaptureFixture[
 # what it says --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("options", [[], ["--trainer.precision=bf16-mixed", "--model.freeze=['']"]])
 def test_a_normal_run_prints_its_map_and_what_to_do_next(
     folder: Path,
     tmp_path: Path,
     capfd: pytest.CaptureFixture[str],
     caplog: pytest.LogCaptureFixture,
     recwarn: pytest.WarningsRecorder,
-    options: list[str],
 ) -> None:
     for expected in ([], [f"{tmp_path} holds an earlier run, which this one replaces"]):
         caplog.clear()
+        options = ["--trainer.precision=bf16-mixed", "--model.freeze=['']"]
         train("fit", *options, "--trainer.default_root_dir", tmp_path)
         assert warned(caplog) == expected
         said = capfd.readouterr()
@@ -247,10 +227,8 @@ def test_a_normal_run_prints_its_map_and_what_to_do_next(
         plan, *rest = said.out.split("written to ")
         assert plan.endswith(f"{DejaVu.load(tmp_path / 'map.safetensors').summary()!s}\n")
         assert "only a second traverse" in rest[0]
-        command = (
-            f"next: dejavu compare one.npy SECOND --map {tmp_path}/map.safetensors --tolerance 2 --out report"
-        )
-        assert rest[0].splitlines()[-1] == command
+        scored = f"--map {tmp_path}/map.safetensors --tolerance 2 --out report"
+        assert rest[0].splitlines()[-1] == f"next: dejavu compare one.npy SECOND {scored}"
     # Python itself keeps deprecations to those who develop
     assert [str(w.message) for w in recwarn if not issubclass(w.category, DeprecationWarning)] == []
 
@@ -271,11 +249,9 @@ def test_a_second_traverse_shows_a_trained_map_beside_untrained_ones(
     options = ["--data.source", tmp_path / "first.npy", *option, tmp_path / "second.npy"]
     options += ["--model.lr", 1e-6, "--trainer.max_steps", 2, "--trainer.default_root_dir", tmp_path / "run"]
     train("fit", *options)
-    rows = {
-        line[:20].strip(): line[20:] for line in capsys.readouterr().out.splitlines() if "recall@1" in line
-    }
-    assert list(rows) == ["the trained map", "HOG of all frames", "the untrained map"]
-    auc = {name: float(row.split()[1].rstrip(",")) for name, row in rows.items()}
+    lines = [line for line in capsys.readouterr().out.splitlines() if "recall@1" in line]
+    auc = {line[:20].strip(): float(line[20:].split()[1].rstrip(",")) for line in lines}
+    assert list(auc) == ["the trained map", "HOG of all frames", "the untrained map"]
     query, truth = ArrayTraverse(footage(0.1, side=32)), torch.arange(FRAMES)[:, None]
     trained = DejaVu.load(tmp_path / "run" / "map.safetensors")
     untrained = DejaVu().learn(ArrayTraverse(footage(side=32)))
@@ -283,25 +259,21 @@ def test_a_second_traverse_shows_a_trained_map_beside_untrained_ones(
         assert auc[name] == pytest.approx(evaluate(model.localize(query), truth, tolerance=2).auc, abs=6e-4)
     assert auc["HOG of all frames"] > auc["the trained map"]
     assert [line for line in warned(caplog) if "worse than" in line and "HOG of all frames" in line]
-    seen = figures(tmp_path / "run" / "lightning_logs" / "version_0" / "metrics.csv")
-    assert seen["unseen/auc_of_HOG_of_all_frames"][-1] == pytest.approx(auc["HOG of all frames"], abs=6e-4)
+    logged = figures(tmp_path / "run")["unseen/auc_of_HOG_of_all_frames"]
+    assert logged[-1] == pytest.approx(auc["HOG of all frames"], abs=6e-4)
 
 
 def test_a_trial_run_leaves_an_earlier_run_as_it_is(
     folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
 ) -> None:
     shutil.copytree(folder / "run", tmp_path / "run")
-    before = contents(tmp_path / "run")
+    files = [tmp_path / "run" / "map.safetensors", *(tmp_path / "run" / "checkpoints").iterdir()]
+    before = [path.read_bytes() for path in files]
     options = ["--trainer.default_root_dir", tmp_path / "run", "--seed_everything", 5]
     train("fit", *options, "--trainer.fast_dev_run", "true")
-    assert contents(tmp_path / "run") == before
+    assert [path.read_bytes() for path in files] == before
     assert "written to" not in capsys.readouterr().out
     assert not [line for line in warned(caplog) if "earlier run" in line]
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    kept = [folder / "map.safetensors", *(folder / "checkpoints").iterdir()]
-    return {path.name: path.read_bytes() for path in kept}
 
 
 def test_an_interrupt_is_one_line_and_130_and_leaves_a_map(
@@ -324,3 +296,77 @@ def test_an_interrupt_is_one_line_and_130_and_leaves_a_map(
     model = DejaVu.load(tmp_path / "map.safetensors", import_module("mine").Interrupted())
     assert model.trained is not None
     assert model.trained.steps == last["global_step"] == 3
+
+
+# mistakes ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "facts"),
+    [
+        ([*SPECTRAL, "--model.mapper.periods", "ImposedPeriods"], ["--model.mapper.periods is not accepted"]),
+        (["--model.mapper", "Nix"], ["model.mapper", "Nix"]),
+        (["--model.backbone", "mine.Broken"], ["cannot be built", "no weights to be had"]),
+        (["--trainer.max_steps", "0"], ["no steps", "above 0"]),
+        (["--trainer.max_steps", "-1"], ["no end", "trainer.max_epochs"]),
+        (["--trainer.max_steps", "null"], ["trainer.max_steps is None"]),
+        (["--trainer.val_check_interval", "0"], ["trainer.val_check_interval is 0"]),
+        (["--trainer.devices", "[0, 1]", "--trainer.strategy", "fsdp"], ["strategy is fsdp", "or ddp"]),
+        (["--trainer.devices", "[1]"], ["CPUAccelerator"]),  # one, which this machine does not have
+        (["--trainer.num_nodes", "2"], ["num_nodes is 2", "MASTER_ADDR"]),
+        (["--model.backbone", "mine.Hungry"], ["not enough memory: it ran out"]),
+        (["--seed_everything", str(2**63)], ["seed_everything", "expected whole numbers of at most"]),
+        (["--data.resize", "[1000000,1000000]"], ["frames of 1000000 x 1000000", "GB free"]),
+        (["--model.backbone.widths", "[1000000,1000000]"], ["cannot be built", "memory"]),
+        (["--trainer.overfit_batches", "2"], ["overfit_batches", "trainer.limit_train_batches"]),
+        (["--data.source", "gone.npy"], ["gone.npy is not there", "expected a folder"]),
+        (["--data.augmentation.clop", "3"], ["clop"]),
+        (["--trainer.default_root_dir", "a_file"], ["a_file cannot be made a folder"]),
+        (
+            ["--trainer.callbacks+", "EarlyStopping", "--trainer.callbacks.monitor=nix"],
+            ["early stopping", "`nix`"],
+        ),
+        (["--trainer.accelerator", "mps"], ["mps", "not available"]),
+        (["--model.backbone", "mine.Nothing"], ["model.backbone", "no attribute 'Nothing'"]),
+        (["--config", "train_smal"], ["train_smal is not there", "train_small"]),
+        (["--data.source", "short.npy"], ["longer route"]),
+        (["--ckpt_path", "run/map.safetensors"], ["cannot be read"]),
+    ],
+    ids=str,
+)
+def test_a_mistake_is_one_line_and_leaves_no_empty_folder(
+    folder: Path,
+    capfd: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    options: list[str],
+    facts: list[str],
+) -> None:
+    root = tmp_path / "nest" / "run"
+    words = ["--config", "train.yaml", "--trainer.default_root_dir", root, *options]
+    error = fails(capfd, "train", "fit", *words)
+    assert [fact for fact in facts if fact.lower() not in error.lower()] == [], error
+    files = [path for path in tmp_path.rglob("*") if path.is_file()]
+    assert files or not any(tmp_path.iterdir())  # a training that fails on the way leaves what it wrote
+
+
+@pytest.mark.parametrize(
+    ("command", "before", "after", "facts"),
+    [
+        ("fit", "source: one.npy, ", "", ["required: --data.source"]),
+        ("fit", "data: {", "data: [", ["is no YAML"]),
+        ("export", "dir: run", "dir: never", ["no checkpoint in never/checkpoints"]),
+    ],
+    ids=str,
+)
+def test_a_mistake_in_the_config_is_one_line(
+    folder: Path,
+    capfd: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    command: str,
+    before: str,
+    after: str,
+    facts: list[str],
+) -> None:
+    (tmp_path / "bad.yaml").write_text(CONFIG.replace(before, after))
+    error = fails(capfd, "train", command, "--config", tmp_path / "bad.yaml")
+    assert [fact for fact in facts if fact not in error] == [], error

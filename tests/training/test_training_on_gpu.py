@@ -7,14 +7,12 @@ from typing import Any
 
 import pytest
 import torch
-from pytorch_lightning import Trainer
-from several_processes import CASES, STILL, Steps, residues
-from small_training import backbone, data_of, footage
+from small_training import backbone, data_of, footage, still, trainer
+from test_several_processes import CASES, Steps, residues
 
 from dejavu_torch import DejaVu
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.features.augmentation import Augmentation
-from dejavu_torch.training.export import MapExport
 from dejavu_torch.training.task import PlaceRecognitionTask
 
 CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
@@ -26,19 +24,9 @@ def trained(case: str, device: str, folder: Path, **settings: Any) -> tuple[list
     torch.manual_seed(0)
     task = PlaceRecognitionTask(residues() if case == "stages" else backbone(), **CASES[case], lr=1e-2)
     steps = Steps()
-    trainer = Trainer(
-        max_steps=6,
-        accelerator=device,
-        devices=1,
-        default_root_dir=folder,
-        callbacks=[steps, MapExport()],
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-    )
+    running = trainer(folder, steps, max_steps=6, accelerator=device, devices=1)
     torch.manual_seed(1)
-    trainer.fit(task, data_of(**{"second": footage(0.1), "augmentation": STILL} | settings))
+    running.fit(task, data_of(**{"second": footage(0.1), "augmentation": still()} | settings))
     return steps.figures, DejaVu.load(folder / "map.safetensors", task.dejavu.features)
 
 

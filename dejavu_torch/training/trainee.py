@@ -1,0 +1,213 @@
+"""A model in training: how it describes the frames of its route, and the map of them."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, cast
+
+import pytorch_lightning as pl
+import torch
+from torch import Tensor, nn
+
+from dejavu_torch.features.embedding import Embedding
+from dejavu_torch.features.extract import features_of, in_mode
+from dejavu_torch.maps.place_map import PlaceMap
+from dejavu_torch.maps.spectral import SpectralMapper
+from dejavu_torch.maps.template_map import TemplateMap, log_posterior
+from dejavu_torch.maps.weights import in_bits
+from dejavu_torch.model import DejaVu
+from dejavu_torch.text import one_line
+from dejavu_torch.training.datamodule import RouteData, StoredFrames
+from dejavu_torch.training.losses import Objective
+from dejavu_torch.types import InputError
+
+WIDE = 1e6  # step of a map without lines, beside descriptors of about 1
+
+log = logging.getLogger("dejavu_torch")
+
+
+class Trainee(pl.LightningModule):
+    """A `DejaVu` model and the route that it is trained on. Its map is of templates, which are trained, or of
+    another kind, which is made of the descriptors in closed form (`made`)."""
+
+    log_temperature: nn.Parameter
+    losses: Objective
+    frozen: set[str]  # modules of the features whose running statistics stay
+    gives_way = False  # whether bytes per place that a short route cannot meet are raised
+
+    def __init__(self, dejavu: DejaVu, made: bool, feature_weights: bool, weight_bits: int) -> None:
+        super().__init__()
+        self.dejavu, self.made = dejavu, made
+        self.feature_weights, self.weight_bits = feature_weights, weight_bits
+        self._descriptors: Tensor | None = None  # of the reference, once they stay as they are
+        # what a code is learned from: descriptors of augmented frames, (n,K), and their places, (n,R)
+        self.views: tuple[Tensor, Tensor] | None = None
+
+    @property
+    def data(self) -> RouteData:
+        """The data module that the trainer runs with."""
+        data = getattr(self._trainer, "datamodule", None)
+        if not isinstance(data, RouteData):
+            raise InputError(f"the trainer's data module is {type(data).__name__}; expected RouteData")
+        return data
+
+    @property
+    def map(self) -> PlaceMap:
+        """The map of the present features; empty until it is made."""
+        return self.dejavu.map
+
+    @property
+    def route(self) -> TemplateMap:
+        """The map in training."""
+        return cast(TemplateMap, self.dejavu.map)
+
+    @property
+    def features(self) -> nn.Module:
+        """What is trained to describe frames."""
+        return self.dejavu.features
+
+    @property
+    def network(self) -> nn.Module:
+        """What makes the descriptor: the features, or their network if a code follows."""
+        embedding = coded(self.features)
+        return self.features if embedding is None else embedding.network
+
+    def describe(self, frames: Tensor) -> Tensor:
+        """Descriptors of frames, without a code: (B,C,H,W) -> (B,K)."""
+        embedding = coded(self.features)
+        if embedding is None:
+            return self.dejavu.describe(frames)
+        return embedding.describe(self.dejavu.preprocess(frames))
+
+    def scores(self, distances: Sequence[Tensor]) -> Tensor:
+        """Eq. 4 of the map with the temperature that is trained: L tensors (B,P) -> (B,N)."""
+        return log_posterior(self.route.combine(distances), self.log_temperature.exp())
+
+    # the reference, described
+
+    def descriptors(self) -> Tensor:
+        """Descriptors of the reference, (N,K), of a network that is trained no more: made once."""
+        if self._descriptors is None:
+            with in_mode(self.features, False):
+                self._descriptors = self.of_reference(self.described)
+        return self._descriptors
+
+    @torch.no_grad()
+    def of_reference(
+        self, make: Callable[[Tensor], Tensor], given: Tensor | None = None, shuffled: bool = False
+    ) -> Tensor:
+        """What `make` gives for batches of the stored frames, or of what is given of each, (N,D); NaN is
+        refused. Shuffled batches are drawn from all over the route, for running statistics."""
+        frames = self.data.sets["reference"]
+        count = len(frames)
+        order = torch.randperm(count) if shuffled else torch.arange(count)
+        made = []
+        for batch in order.tensor_split(min(-(-count // self.dejavu.batch_size), count // 2)):
+            values = frames[batch.tolist()].frames if given is None else given[batch.to(given.device)]
+            with torch.autocast(self.device.type, enabled=False):
+                made.append(make(values))
+        features = torch.cat(made)
+        features = features[order.argsort().to(features.device)]
+        if not features.isfinite().all():
+            seen = f"{type(self.features).__name__} makes NaN or infinite features of {self.data.route_name}"
+            raise InputError(f"{seen}; expected finite numbers")
+        return features
+
+    def described(self, frames: Tensor, describe: Callable[[Tensor], Tensor] | None = None) -> Tensor:
+        """Descriptors of stored frames; a backbone that does not take them is refused."""
+        try:
+            return features_of(frames.to(self.device), describe or self.describe, "the batch")
+        except RuntimeError as error:
+            seen = f"{type(self.features).__name__} does not take frames {tuple(frames.shape[1:])}"
+            raise InputError(f"{seen}: {one_line(error)[:200]}") from error
+
+    @torch.no_grad()
+    def views_of(self, rounds: int, most: int) -> Iterator[tuple[Tensor, Tensor]]:
+        """Batches of descriptors of augmented training frames, (B,K), and their known places, (B,R); at most
+        `most` in all after the first round."""
+        loader = self.data.training_batches()
+        frames = len(cast(StoredFrames, loader.dataset))
+        rounds = min(rounds, most // frames) if self.data.augmentation.acts else 1
+        with in_mode(self.features, False):
+            for _ in range(max(1, rounds)):
+                for batch in loader:
+                    known = batch.truth.positives[:, 0] >= 0
+                    if known.any():
+                        augmented = self.data.augmented(batch.frames.to(self.device), self.data.clip)
+                        views = features_of(augmented[known], self.describe, "the batch").float()
+                        yield views, batch.truth.positives[known].to(self.device)
+
+    # the map
+
+    def relearn(self) -> None:
+        """The map anew from the present features of the reference (section III-A)."""
+        if self.made:
+            self._make_map()
+        else:
+            self._learn_templates()
+        self.map.train(self.training)
+        if self.data.resize is not None and len(self.data.routes) == 1:
+            self.dejavu.frame_shape = tuple(self.data.sets["reference"].values.shape[1:])
+
+    def _learn_templates(self) -> None:
+        first, weights = not self.route.places, self.route.weights
+        embedding = coded(self.features)
+        with in_mode(self, first):  # the first are made in training mode: running statistics are gathered
+            if embedding is None:
+                features = self.of_reference(self.described, shuffled=first)
+            else:
+                features = self.of_reference(embedding.code, self.descriptors(), shuffled=first)
+            self.dejavu.learn_features(features, self.data.reference)
+        if not self.route.plan:
+            name = self.data.reference.name
+            raise InputError(f"nothing repeats in the features of {name}; expected imposed periods")
+        self.route.trainable(True, self.feature_weights, weights)
+
+    def _make_map(self) -> None:
+        """In closed form, of the rounded network, and with no random number of the training."""
+        model, whitening = self.dejavu, self.dejavu.whitening
+        with (
+            in_bits(self.features, self.weight_bits),
+            torch.random.fork_rng(),
+            torch.no_grad(),
+            in_mode(model, False),
+        ):
+            features = self.of_reference(self.described)
+            if self.gives_way:
+                self.check_budget(*features.shape)
+            if whitening is not None:
+                torch.manual_seed(whitening.seed)
+                views = self.views_of(whitening.copies(*features.shape), whitening.most_views)
+                pairs = ((view, places[:, 0]) for view, places in views)
+                whitening.learn(features, None if whitening.views == 0 else pairs)
+            alone = self.data.reference if len(self.data.routes) == 1 else None
+            model.learn_features(model.whitened(features), alone)
+
+    def check_budget(self, places: int, dimension: int) -> None:
+        """Refuse a map of too few bytes; those that nobody asked for give way."""
+        mapper: Any = self.dejavu.mapper
+        whitening = self.dejavu.whitening
+        numbers = dimension if whitening is None else whitening.kept(places, dimension, True)
+        descriptors = torch.randn(places, numbers, generator=torch.Generator().manual_seed(0))
+        wanted = getattr(mapper, "route_bytes_per_place", None)
+        gives_way, self.gives_way = self.gives_way, False  # it is settled
+        try:
+            mapper(descriptors)
+        except InputError:
+            if not gives_way or wanted is None:
+                raise
+            empty = SpectralMapper(None, step=WIDE, chunk=mapper.chunk)(descriptors)
+            more = min(wanted + empty.summary().route_bytes / places, 4 * numbers)
+            mapper.route_bytes_per_place = math.ceil(100 * more) / 100
+            mapper(descriptors)
+            log.warning(
+                "%d places need more than --model.mapper.route_bytes_per_place %g: %g is used",
+                *(places, wanted, mapper.route_bytes_per_place),
+            )
+
+
+def coded(features: nn.Module) -> Embedding | None:
+    """The features if they are an `Embedding` whose code is learned from a whitened descriptor."""
+    return features if isinstance(features, Embedding) and features.coder is not None else None
