@@ -21,6 +21,7 @@ from dejavu_torch.cli.commands import run_learn
 from dejavu_torch.cli.parser import parse
 from dejavu_torch.features import views
 from dejavu_torch.maps.file import read_map
+from dejavu_torch.recognition import coarse
 
 ROUTE = "sim:aerial?frames=96"
 SECOND = "sim:aerial?frames=96&traverse=1"
@@ -54,19 +55,27 @@ def same_maps(first: Path, second: Path) -> bool:
 # what works
 
 
-def test_searches_of_localize(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_searches_of_localize(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(coarse, "FEWEST", 0)  # as a long map is searched
     path, out = tmp_path / "m.safetensors", tmp_path / "m.csv"
     run("learn", ROUTE, "--map", path, "--mapper.chunk", "32", "--whitening.views", "2")
     found = []
-    for search in ("auto", "scan"):
+    for search in ("scan", "exact", "auto"):
         run("localize", path, SECOND, "--search", search, "--out", out)
         found.append(places(out))
     assert found[0] == found[1]
+    assert sum(a == b for a, b in zip(found[0], found[2], strict=True)) > 90
     run("localize", path, SECOND, "--filter", "--out", out)
     always = places(out)
     run("localize", path, SECOND, "--filter", "--search_every", "8", "--out", out)
     assert sum(a == b for a, b in zip(places(out), always, strict=True)) > 90
     assert "scan" in fails(capsys, "localize", path, SECOND, "--search", "ivf", "--out", out)
+    for memory, words in (("0", "search_memory 0"), ("1e-4", "expected at least")):
+        assert words in fails(capsys, "localize", path, SECOND, "--search_memory", memory, "--out", out)
+    run("info", path)
+    assert "single queries: samples every" in capsys.readouterr().out
 
 
 def places(path: Path) -> list[str]:

@@ -11,7 +11,7 @@ import shlex
 import threading
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -513,6 +513,8 @@ def run_info(map: Path, *, features: nn.Module | None = None, command: str) -> N
 
     model = DejaVu.load(map, features)
     print_map(model)
+    with suppress(InputError):  # a chunk that is too long for the memory
+        print(f"single queries: {plan(model.map) or 'all places are scored'}")
     if model.frame_shape is not None:
         kind = "frames of " if len(model.frame_shape) == 3 else "ready features, "
         print(f"learned from {kind}{' x '.join(str(n) for n in model.frame_shape)}")
@@ -643,8 +645,6 @@ def print_map(model: DejaVu) -> None:
     if whitening is not None:
         numbers = " to ".join(str(count) for count in (len(whitening.projection), len(whitening.scale)))
         print(f"Whitening, {numbers} numbers: {whitening.extra_repr()}")
-    if chosen := plan(model.map, model.search_memory):
-        print(f"single queries: {chosen}")
     if isinstance(model.map, SpectralMap) and model.map.needed is not None:
         print(f"this route needs about {model.map.needed:.2g} bytes per place")
 

@@ -45,7 +45,7 @@ def follow(
     Raises:
         InputError: what is wrong with the source, behind the lines and the summary of what came before.
     """
-    localizer = LiveLocalizer(model, sequence)
+    localizer = LiveLocalizer(model, sequence, keep_scores=port is not None)
     shots, newest, name = shots_from(source, model, realtime, port is not None)
     recent: deque[float] = deque(maxlen=RECENT)  # milliseconds
     frames = 0

@@ -45,11 +45,12 @@ class LiveLocalizer:
     Args:
         model: has a map. It is used as it is and where it is: on a GPU, frames are moved there.
         sequence: "filter" is a `PlaceFilter`; None matches each frame by itself.
+        keep_scores: keeps those of all places; without, a single frame is searched for as by `localize`.
 
     Shape: a frame (H,W), (H,W,3) or (C,H,W), tensor or array, uint8 or float in [0, 1] -> `LiveMatch`.
 
     Attributes:
-        scores: (N,) of the latest frame, on the model's device; None before the first.
+        scores: (N,) of the latest frame, on the model's device; None before the first, or if not kept.
 
     Convention: the answers are those of `DejaVu.localize`, but for rounding. A frame that is refused changes
         nothing. `localizer(frame, left_out)` says how many frames were skipped since the one before: a
@@ -65,7 +66,12 @@ class LiveLocalizer:
         (20, 21)
     """
 
-    def __init__(self, model: DejaVu, sequence: SequenceModel | Literal["filter"] | None = "filter") -> None:
+    def __init__(
+        self,
+        model: DejaVu,
+        sequence: SequenceModel | Literal["filter"] | None = "filter",
+        keep_scores: bool = True,
+    ) -> None:
         if model.step is not None and model.velocity is not None:
             raise InputError(
                 "the map's places are even steps along the ground, which are measured on a whole traverse; "
@@ -75,6 +81,7 @@ class LiveLocalizer:
             raise InputError(
                 f"the sequence is {sequence!r}; expected a SequenceModel such as PlaceFilter, 'filter', None"
             )
+        self.keep_scores = keep_scores
         self.model, self.sequence = model, PlaceFilter() if isinstance(sequence, str) else sequence
         self._pipeline = model.describer.pipeline
         self._shape: tuple[int, ...] | None = None  # of the latest frame that fitted
@@ -85,8 +92,10 @@ class LiveLocalizer:
     def reset(self) -> None:
         """Forget the frames so far."""
         self.scores: Tensor | None = None
-        matching = self.model.matching(self.sequence)._replace(on_scores=self._keep)
-        self._localizer = self.model.localizer(matching)
+        matching = self.model.matching(self.sequence)
+        self._localizer = self.model.localizer(
+            matching._replace(on_scores=self._keep) if self.keep_scores else matching
+        )
 
     def _keep(self, scores: Tensor) -> None:
         self.scores = scores[0]

@@ -77,12 +77,12 @@ def plan(route: PlaceMap, limit: int = MEMORY, exact: bool = False) -> Plan | No
     def size(places: int, *spacings: int) -> int:
         return sum(-(-places // d) * (route.dimension + OTHERS) for d in spacings)
 
+    if route.places < max(FEWEST, 2 * longest):
+        return None
     least = size(longest, SPACINGS[0], SPACINGS[1])
     if limit < least:
         seen = f"the limit of the search's memory is {limit} bytes"
         raise InputError(f"{seen}; expected at least {least}, for a chunk")
-    if route.places < max(FEWEST, 2 * longest):
-        return None
     if exact:
         return Plan(1, 1, 1, 1.0, size(route.places, 1))
     held = energy_held(route)
