@@ -7,7 +7,7 @@ best places are near the best of these samples; only places near them are scored
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cache
 from typing import NamedTuple
 
@@ -33,7 +33,6 @@ SPARE = 3  # further windows of a query that are scored if they are as good
 CLOSE = 0.02  # cosines that differ by less are as good
 UNLIKE = 0.02  # a query whose best cosine is less is scanned: places without a direction have cosine 0
 BLOCK, PRODUCTS = 8192, 2**20  # samples, and products with them, at a time: these stay in the cache
-TOGETHER = 256  # queries that are compared at a time
 LARGE = 6  # standard deviations of a component of a unit vector; larger ones are cut to it in 8 bits
 ROUNDING = 1e-5  # of products of unit vectors in float32
 MEASURED = 16  # chunks, evenly along the map, whose energy is measured
@@ -182,10 +181,24 @@ class CoarseSearch:
 
     @torch.no_grad()
     def __call__(self, queries: Tensor, wanted: Wanted) -> Best:
-        found = [self._search(some, wanted) for some in queries.split(TOGETHER)]
-        width = max(score.shape[1] for score, _ in found)
-        score, place = zip(*(_widened(*one, width, self.route.places) for one in found), strict=True)
-        return torch.cat(score), torch.cat(place)
+        units = F.normalize(queries.to(torch.promote_types(queries.dtype, torch.float32))).float()
+        best = self.coarse.best_of_groups(to_int8(units))
+        query, place = self._windows(units, best, wanted)
+        shape = len(units), max(k for k, _ in wanted)
+        pairs = query, place, self._scores(units, query, place)
+        found, last = self._by_query(pairs, shape, wanted)
+        if self.exact:
+            pairs = self._below(units, best, last.masked_fill(last.isinf(), -1))  # those are scanned
+            found, last = self._by_query(pairs, shape, wanted)
+        left = last.isinf() | ~(found[0].amin(1) <= 1 - UNLIKE)
+        if left.any():
+            score, place = search(self.route, queries[left], lowest_needed(wanted, self.route.places))
+            row = left.nonzero()[:, 0].repeat_interleave(score.shape[1])
+            kept, there = ~left[pairs[0]], score.flatten().isfinite()
+            scanned = (one.flatten()[there] for one in (row, place, score))
+            both = zip(pairs, scanned, strict=True)
+            found, _ = self._by_query([torch.cat([a[kept], b]) for a, b in both], shape, wanted)
+        return found
 
     @torch.no_grad()
     def approximate(self, queries: Tensor) -> Tensor:
@@ -200,27 +213,6 @@ class CoarseSearch:
         query, place = self._windows(units, self.coarse.best_of_groups(small), [(1, 0)])
         scores[query, place] = self._scores(units, query, place)
         return scores
-
-    def _search(self, queries: Tensor, wanted: Wanted) -> Best:
-        units = F.normalize(queries.to(torch.promote_types(queries.dtype, torch.float32))).float()
-        best = self.coarse.best_of_groups(to_int8(units))
-        query, place = self._windows(units, best, wanted)
-        shape = len(units), max(k for k, _ in wanted)
-        found = self._by_query(query, place, self._scores(units, query, place), shape)
-        last = last_wanted(*found, wanted)
-        if self.exact:
-            last = last.masked_fill(last.isinf(), -1)  # too few were found: it is scanned
-            found = self._by_query(*self._below(units, best, last), shape)
-            last = last_wanted(*found, wanted)
-        left = last.isinf() | ~(found[0].amin(1) <= 1 - UNLIKE)
-        if left.any():
-            scanned = search(self.route, queries[left], lowest_needed(wanted, self.route.places))
-            width = max(found[0].shape[1], scanned[0].shape[1])
-            score, place = _widened(*found, width, self.route.places)
-            score[left], place[left] = _widened(*scanned, width, self.route.places)
-            place, order = place.sort(1)
-            found = score.gather(1, order), place
-        return found
 
     def _windows(self, units: Tensor, best: Tensor, wanted: Wanted) -> tuple[Tensor, Tensor]:
         """Pairs (P,) of a query and a place near its best fine samples, by query and place: around each as
@@ -281,8 +273,7 @@ class CoarseSearch:
                 row, at = (scores <= score[own, None] + ROUNDING).nonzero().T
                 found.append((own[row], at + first, scores[row, at]))
         query, place, score = (torch.cat(column) for column in zip(*found, strict=True))
-        order = (query * self.route.places + place).argsort()
-        return query[order], place[order], score[order]
+        return query, place, score
 
     def _bounds(self) -> Tensor:
         """Of each group of fine samples the least length, times the cosine and the sine of the largest angle
@@ -308,14 +299,20 @@ class CoarseSearch:
         nearest: Tensor = first + torch.bucketize(at, (place[1:] + place[:-1]) / 2)
         return nearest
 
-    def _by_query(self, query: Tensor, place: Tensor, score: Tensor, shape: tuple[int, int]) -> Best:
-        """Pairs in order as a row for each query, of so many columns at least; +inf at no place."""
-        counts = torch.bincount(query, minlength=shape[0])
+    def _by_query(
+        self, pairs: Sequence[Tensor], shape: tuple[int, int], wanted: Wanted
+    ) -> tuple[Best, Tensor]:
+        """Query, place and score of pairs as a row for each query, of so many columns at least, by place; and
+        the highest score of the candidates that are wanted, (Q,). +inf for none."""
+        query, place, score = pairs
+        order = (query * self.route.places + place).argsort()
+        query, counts = query[order], torch.bincount(query, minlength=shape[0])
         column = torch.arange(len(query), device=query.device) - (counts.cumsum(0) - counts)[query]
         table = score.new_full((shape[0], max(shape[1], int(counts.max()))), math.inf)
         where = torch.full_like(table, self.route.places, dtype=torch.int64)
-        table[query, column], where[query, column] = score, place
-        return table, where
+        table[query, column], where[query, column] = score[order], place[order]
+        last = [best_candidates(table, *one, where).score[:, -1] for one in wanted]
+        return (table, where), torch.stack(last).amax(0)
 
 
 def to_int8(units: Tensor) -> Tensor:
@@ -334,13 +331,3 @@ def has_int8_products() -> bool:
 def angle(cosine: Tensor) -> Tensor:
     """The largest angle that a rounded cosine may be of."""
     return (cosine - ROUNDING).clamp(-1, 1).acos()
-
-
-def last_wanted(score: Tensor, place: Tensor, wanted: Wanted) -> Tensor:
-    """The highest score of all candidates that are wanted, (Q,)."""
-    return torch.stack([best_candidates(score, *one, place).score[:, -1] for one in wanted]).amax(0)
-
-
-def _widened(score: Tensor, place: Tensor, width: int, places: int) -> Best:
-    more = width - score.shape[1]
-    return F.pad(score, (0, more), value=math.inf), F.pad(place, (0, more), value=places)

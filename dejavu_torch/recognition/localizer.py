@@ -23,6 +23,7 @@ from dejavu_torch.types import Match, SequenceModel
 ROWS = 4096  # descriptors on the device at a time
 CACHED = 2**20  # scores summed at a time: they stay in the processor's cache
 FEW = 1 / 16  # of the places of a block: to keep more of the best takes longer than all scores
+SAMPLED = 64  # places at least for a number that a search by samples holds of a query
 LISTED = 16  # numbers held for each of the best of a query, while two lists are merged
 
 
@@ -99,7 +100,7 @@ class Localizer:
         few = n <= max(1, FEW * min(places, route.block_places)) or places > SCORES_AT_ONCE
         way, size = self._by_scores, places
         if matching.sequence is None and matching.on_scores is None and (few or self.find is not None):
-            way, size = partial(self._by_search, wanted), LISTED * n
+            way, size = partial(self._by_search, wanted), max(LISTED * n, places // SAMPLED)
         parts = descriptors.split(max(1, min(ROWS, SCORES_AT_ONCE // size)))
         return Match.joined(way(part.to(route.positions.device)) for part in parts)
 
