@@ -157,7 +157,7 @@ def test_a_visit_is_averaged_into_a_map_that_is_there(
     before = first.read_bytes()
     run("learn", "--append", first, "--average", f"{FIRST}&traverse=1", "--map", out)
     told = capsys.readouterr().out
-    assert f"64 of the 64 places of {first}: decoded, averaged and coded again at the same step" in told
+    assert f"64 of the 64 places of {first}: averaged and coded again at the same step" in told
     assert "mean of 2 visits" in told
     model = DejaVu.load(out)
     assert (model.map.places, model.map.visits.tolist()) == (64, [[64, 2]])

@@ -43,7 +43,7 @@ from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.views import Views
 from dejavu_torch.learning import SAMPLE as SHORT
 from dejavu_torch.learning import Checkpoint, ChunkCoder, Code
-from dejavu_torch.maps.place_map import PlaceMap
+from dejavu_torch.maps.place_map import Mapper, PlaceMap
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.model import DejaVu
@@ -119,17 +119,9 @@ def run_learn(
         raise InputError("there is no source; expected one, or --append MAP with --average SOURCE")
     assert map is not None  # the parser has seen to it
     where = device_of(learning.device, learns=True)
-    if append is not None:
-        default = recipe_of(model.features) == recipe_of(HOG())
-        accepted = Acceptance(model.threshold, model.precision)
-        model = load_map(append, None if default else model.features)
-        accepted.of(model)
-    model = model.to(where)
+    model = growing.model(model).to(where)
     if cluster is not None:
-        _check_cluster(cluster, learning.device)
-        if not isinstance(model.mapper, SpectralMapper):
-            seen = f"--cluster {cluster} makes chunks, and {type(model.mapper).__name__} makes none"
-            raise InputError(f"{seen}; expected a spectral map")
+        _check_cluster(cluster, learning.device, model.mapper)
     _check_map_file(map, *sources, *learning.files, growing.average, growing.average_truth)
     learning.seed_whitening(model)
     growing.check(sources, learning.calibration)
@@ -150,8 +142,7 @@ def run_learn(
             assert visits is not None
             checkpoint.check_unused()
             count, traverse, places = growth.average(model, visits, progress=True), *visits
-            done = f"{count} of the {start} places of {append}"
-            done += ": decoded, averaged and coded again at the same step"
+            done = f"{count} of the {start} places of {append}: averaged and coded again at the same step"
         elif append is not None:
             growth.append(model, traverse, progress=True, checkpoint=checkpoint, code=code, visits=visits)
             places = torch.arange(start, model.map.places)
@@ -212,11 +203,8 @@ def run_localize(
     model = loading.model(map)
     searching.of(model)
     if corners is not None:
-        if model.velocity is None or model.step is None:
-            why = "--as_is measures no ground" if loading.as_is else f"{map} was learned without --velocity"
-            raise InputError(f"--corners {corners}: {why}; expected a map and frames at even steps")
-        check_corners(corners)
-        model.velocity.corners = tuple((float(x), float(y)) for x, y in corners)
+        why = "--as_is measures no ground" if loading.as_is else f"{map} was learned without --velocity"
+        _set_corners(model, corners, why)
     acceptance.of(model)
     if top is not None:
         check_candidates(top, APART, model.map.places)
@@ -543,13 +531,24 @@ def run_info(map: Path, *, features: nn.Module | None = None, command: str) -> N
         print_next("learn", "ROUTE", "--descriptor", map, *words, "--map", "route.safetensors")
 
 
-def _check_cluster(cluster: str, device: str) -> None:
-    """Refuse early what no cluster does."""
+def _set_corners(model: DejaVu, corners: list[list[float]], why: str) -> None:
+    """Where a camera sees the ground; `why` a model does not measure it."""
+    if model.velocity is None or model.step is None:
+        raise InputError(f"--corners {corners}: {why}; expected a map and frames at even steps")
+    check_corners(corners)
+    model.velocity.corners = tuple((float(x), float(y)) for x, y in corners)
+
+
+def _check_cluster(cluster: str, device: str, mapper: Mapper | None = None) -> None:
+    """Refuse early what no cluster does, or learns by this mapper."""
     from dejavu_torch.cluster import check_installed
 
     if device != "cpu":
         raise InputError(f"--cluster {cluster} and --device {device}; expected one of them")
     check_installed()
+    if not isinstance(mapper, SpectralMapper | None):
+        seen = f"--cluster {cluster} makes chunks, and {type(mapper).__name__} makes none"
+        raise InputError(f"{seen}; expected a spectral map")
 
 
 @contextmanager

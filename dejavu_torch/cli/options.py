@@ -13,9 +13,10 @@ from dejavu_torch import growth
 from dejavu_torch.cli.device import device_of
 from dejavu_torch.data.frame_range import parts_of
 from dejavu_torch.data.source import open_source
+from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.views import Views
 from dejavu_torch.model import DejaVu, check_precision
-from dejavu_torch.model_file import NO_MAP
+from dejavu_torch.model_file import NO_MAP, recipe_of
 from dejavu_torch.motion.resampling import source_of
 from dejavu_torch.recognition.coarse import MEMORY
 from dejavu_torch.recognition.filter import PlaceFilter
@@ -267,6 +268,15 @@ class Growth:
     append: Path | None = None
     average: str | None = None
     average_truth: str | None = None
+
+    def model(self, given: DejaVu) -> DejaVu:
+        """That of --append, with the features and the acceptance of the given one; or that one."""
+        if self.append is None:
+            return given
+        default = recipe_of(given.features) == recipe_of(HOG())
+        model = load_map(self.append, None if default else given.features)
+        Acceptance(given.threshold, given.precision).of(model)
+        return model
 
     def check(self, sources: Iterable[str], calibration: str | None) -> None:
         """Refuse to average a traverse with itself, or to calibrate by what a map has been averaged with."""

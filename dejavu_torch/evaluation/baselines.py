@@ -157,8 +157,28 @@ def baselines_of(
         }
         found = {key: nearest(name, reference, k, size(own, k), k) for key, (name, k) in names.items()}
 
+    found |= _null_controls(run, seed, one)
+    if leave_out is not None:
+        index, score, *_ = leave_out_match(model, reference, leave_out)
+        itself = Match(index, score, score.isfinite())
+        found["leave_out"] = Baseline(f"reference on itself, +-{leave_out} left out", itself)
+    pair, batch = (run.reference, run.query), model.batch_size
+    if not _is_plain_hog(model):
+        found |= hog_baselines(*pair, batch, run.tolerance, progress, matching)
+    if run.sequence is not None:  # SeqSLAM compares the grey pixels of small frames by L1
+        plain = DejaVu(PatchPixels(), "none", batch_size=batch, preprocess=Preprocess("grey"))
+        names = {"seqslam": ("SeqSLAM's pixels: grey, patches normalised", 1)}
+        found |= _described_baselines(plain, "pixels", names, pair, progress, matching)
+    return found
+
+
+def _null_controls(run: Localization, seed: int, one: str) -> dict[str, Baseline]:
+    """Maps of the same frames in random order; `one` is what a place is called."""
+    model, spectral = run.model, isinstance(run.model.map, SpectralMap)
+    found = {}
+
     def null(name: str, same_plan: bool = False) -> Baseline:
-        match = null_control(model, reference, run.query_features, seed, same_plan, matching)
+        match = null_control(model, run.reference_features, run.query_features, seed, same_plan, run.matching)
         return Baseline(f"null: {name}", match)
 
     foreign = isinstance(model.mapper, TemplateMapper) and model.mapper.periods is None
@@ -173,17 +193,6 @@ def baselines_of(
             found["null_same_plan"] = null(f"this map's layers, shuffled {one}s", same_plan=True)
         else:  # training anew is a run of its own
             found["null"] = null(f"templates of shuffled {one}s", same_plan=True)
-    if leave_out is not None:
-        index, score, *_ = leave_out_match(model, reference, leave_out)
-        itself = Match(index, score, score.isfinite())
-        found["leave_out"] = Baseline(f"reference on itself, +-{leave_out} left out", itself)
-    pair, batch = (run.reference, run.query), model.batch_size
-    if not _is_plain_hog(model):
-        found |= hog_baselines(*pair, batch, run.tolerance, progress, matching)
-    if run.sequence is not None:  # SeqSLAM compares the grey pixels of small frames by L1
-        plain = DejaVu(PatchPixels(), "none", batch_size=batch, preprocess=Preprocess("grey"))
-        names = {"seqslam": ("SeqSLAM's pixels: grey, patches normalised", 1)}
-        found |= _described_baselines(plain, "pixels", names, pair, progress, matching)
     return found
 
 
