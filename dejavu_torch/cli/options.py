@@ -101,8 +101,8 @@ class Searching:
 
     Args:
         search: coarse scores the places near the best samples of a long spectral map, exact rules out all
-            others, scan scores all places; auto is coarse, or a scan where that takes no longer
-        search_memory: MB that the samples may take
+            others, scan scores all; auto is the faster of coarse and scan
+        search_memory: MB for these samples
     """
 
     search: Search = "auto"
