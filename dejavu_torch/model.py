@@ -168,10 +168,8 @@ class DejaVu(nn.Module):
         self.search: Search = "auto"  # how single queries are searched for, see `localize`
         self.search_memory = MEMORY  # bytes that it may take at most beyond the map
         self.find: Find | None = None  # in its place, as a cluster does
-        self._coarse: tuple[tuple[Any, ...], CoarseSearch | None] = (
-            (),
-            None,
-        )  # its samples, and what they are of
+        # its samples, and what they are of
+        self._coarse: tuple[tuple[Any, ...], CoarseSearch | None] = (), None
         self._warned: set[tuple[str, str]] = set()  # traverse and line of warnings that are logged once
 
     def settings(self) -> dict[str, Any]:
