@@ -88,7 +88,7 @@ def append(
     grown = copy.deepcopy(route)
     grown.positions = route.positions[:0]  # those of all places follow when all are there
     if checkpoint is not None:
-        own = digests(map=checksums(route.packed(), route.get_extra_state()))
+        own = digests(base=checksums(route.packed(), route.get_extra_state()))
         checkpoint.open(run_key(model, added, visits=visits) | own, added, grown, model.whitening)
     text = "learning" if progress else None
     append_places(grown, model.describer, added, route.places, visits, text, checkpoint, code)

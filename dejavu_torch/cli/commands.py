@@ -326,6 +326,12 @@ def run_compare(
     strange = judging.off_map([first, queries, *beside])
     if map is None:
         learning.check_precision(model, first)
+    frames = learning.calibration is None and len(first.frame_shape) == 3  # by which it is calibrated
+    if learning.calibration in UNREAD and not (frames if map is None else model.calibration is not None):
+        for name, value in (("--precision", model.precision), ("--distractors", judging.distractors)):
+            if value:
+                seen = f"{name} {value}: what is accepted is told by the probabilities of a calibrated map"
+                raise InputError(f"{seen}; expected --calibration SOURCE, or none of both options")
     learning.seed_whitening(model)
     first, views = learning.with_second(model, first, queries)
     first, known = learning.with_calibration(model, first, queries)
@@ -665,6 +671,9 @@ def route_lines(route: PlaceMap) -> list[str]:
 
 
 def _print_localize(map: Path, model: DejaVu, command: str, query: str = "QUERY", lead: str = "next") -> None:
+    if not model.map.summary().covered:
+        print(f"{lead}: try more frames, another --preprocess.contrast, or `dejavu train fit`")
+        return
     words = features_words(model, command)
     print_next("localize", map, query, *words, "--out", "matches.csv", lead=lead)
 

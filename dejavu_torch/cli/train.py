@@ -164,6 +164,9 @@ class TrainCLI(LightningCLI):
             value = chosen[name]
             if isinstance(value, (int, float)) and value < least:
                 raise InputError(f"{name} is {value}; expected a number of at least {least:g}")
+        seed = chosen["seed_everything"]
+        if not isinstance(seed, bool | None) and not 0 <= seed < 2**32:
+            raise InputError(f"seed_everything is {seed}; expected a number from 0 to 2^32 - 1")
         trainer = chosen["trainer"]
         if trainer["max_steps"] is None:
             raise InputError("trainer.max_steps is null; expected a number of at least 1, or -1 for no end")

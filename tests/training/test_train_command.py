@@ -310,6 +310,7 @@ def test_an_interrupt_is_one_line_and_130_and_leaves_a_map(
         (["--trainer.max_steps", "0"], ["no steps", "above 0"]),
         (["--trainer.max_steps", "-1"], ["no end", "trainer.max_epochs"]),
         (["--trainer.max_steps", "null"], ["trainer.max_steps is None"]),
+        (["--seed_everything", "-1"], ["seed_everything is -1", "2^32 - 1"]),
         (["--trainer.val_check_interval", "0"], ["trainer.val_check_interval is 0"]),
         (["--trainer.devices", "[0, 1]", "--trainer.strategy", "fsdp"], ["strategy is fsdp", "or ddp"]),
         (["--trainer.devices", "[1]"], ["CPUAccelerator"]),  # one, which this machine does not have
