@@ -308,6 +308,7 @@ WRONG = {  # a line of words behind `dejavu`, and what its one line holds
     "compare a.npy b.npy --out r --config paper": ("18 places", "1024", "--mapper.periods.short shrink"),
     "evaluate nowhere.csv --truth 0 --out new/r": ("nowhere.csv",),
     "reproduce mars --out new/r": ("mars", "aerial"),
+    "compare a.npy b.npy --out new/r --map m -cpaper": ("-cpaper: the map of --map has its own settings",),
     "live m a.npy --page many": ("--page is many", "int"),
     "train": ("fit,validate,test",),
     "train fit --data.source a.npy --model.lr fast": ("--model.lr is fast", "float"),

@@ -105,7 +105,7 @@ def with_made(words: Sequence[str]) -> list[str]:
     `--features timm.create_model --features.model_name NAME` is the name's call; jsonargparse itself takes
     functions only whose return value and arguments are annotated.
     """
-    configured = any(word.partition("=")[0] in ("--config", "-c") for word in words)
+    configured = any(word.startswith(("--config=", "-c")) or word == "--config" for word in words)
     made_by: set[str] = set()  # options that name a function
     spelt: list[str] = []
     rest = iter(words)
@@ -357,5 +357,6 @@ def _check_settings(name: str, arguments: dict[str, Any], words: Sequence[str]) 
 def _check_own(words: Sequence[str], own: set[str], whose: str) -> None:
     """Refuse options of what a file brings."""
     for word in words:
-        if word.startswith("-") and {"-c": "config"}.get(word, word[2:]).partition(".")[0] in own:
+        option = "config" if word.startswith("-c") else word[2:].partition(".")[0]
+        if word.startswith("-") and option in own:
             raise UsageError(f"{word}: {whose} has its own settings; expected one or the other")
