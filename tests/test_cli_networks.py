@@ -37,6 +37,12 @@ def transform(name):
 """
 ROUTE = "sim:aerial?frames=40"
 OWN = ("--features", "dejavu_torch.Embedding", "--features.dimension=null", "--features.resize", "[16,16]")
+NOTES = (
+    "--features.network.note",
+    "it's",
+    "--features.network.notes=a b",
+    '--features.network.more={"a": 1}',
+)
 HUB = ("--features.network", "zoo.load", "--features.network.repo=a/b", "--features.network.model", "m")
 
 
@@ -83,8 +89,20 @@ def test_functions_methods_and_classes(words: str, channels: int) -> None:
 
 
 def test_the_next_line_brings_the_network_back(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run("learn", ROUTE, "--map", "map.safetensors", *OWN, *HUB, "--features.layer", "0", "--features.mean=.5")
+    run(
+        "learn",
+        ROUTE,
+        "--map",
+        "map.safetensors",
+        *OWN,
+        *HUB,
+        *NOTES,
+        "--features.layer",
+        "0",
+        "--features.mean=.5",
+    )
     before, _, told = capsys.readouterr().out.rpartition("next: dejavu ")
+    assert [word for word in NOTES if word not in shlex.split(told)] == []
     assert "backbone 448" in before  # of 112 numbers: what lies behind the layer is not kept
     sys.modules.pop("zoo")
     assert "Sequential" in fails(capsys, "localize", "map.safetensors", ROUTE, "--out", "matches.csv")
