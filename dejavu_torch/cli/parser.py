@@ -84,7 +84,10 @@ def made(function: str, **arguments: Any) -> nn.Module:
     maker = _function_at(function)
     if maker is None:
         raise InputError(f"{function} is no function that can be imported; expected one, or a class")
-    network = maker(**arguments)
+    try:
+        network = maker(**arguments)
+    except SystemExit as stop:  # it would end the command without a word
+        raise InputError(f"{function} ends the program ({stop}); expected what makes a network") from stop
     if not isinstance(network, nn.Module):
         raise InputError(f"{function} made a {type(network).__name__}; expected an nn.Module")
     return network
