@@ -77,15 +77,16 @@ def test_a_function_is_called_with_what_is_typed() -> None:
 @pytest.mark.parametrize(
     ("words", "channels"),
     [
-        ("zoo.typed --features.network.width 5", 5),
-        ("zoo.Net.pretrained --features.network.name x --features.network.depth=2", 6),
-        ("zoo.Net --features.network.in_channels=3 --features.network.out_channels 7 "
-         "--features.network.kernel_size=3", 7),
+        ("--features.network zoo.typed --features.network.width 5", 5),
+        ("--features.network.width 5 --features.network zoo.typed", 5),
+        ("--features.network zoo.Net.pretrained --features.network.name x --features.network.depth=2", 6),
+        ("--features.network zoo.Net --features.network.in_channels=3 "
+         "--features.network.out_channels 7 --features.network.kernel_size=3", 7),
     ],
-    ids=["typed", "method", "class"],
+    ids=["typed", "ahead", "method", "class"],
 )  # fmt: skip
 def test_functions_methods_and_classes(words: str, channels: int) -> None:
-    net = features_of(*OWN, "--features.network", *words.split())
+    net = features_of(*OWN, *words.split())
     assert isinstance(net, Embedding)
     assert net.cell == 0  # the argument of another class than the default
     assert net(torch.rand(2, 3, 20, 20)).shape == (2, channels)

@@ -8,7 +8,7 @@ import pydoc
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import is_dataclass
-from itertools import islice
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NoReturn, cast, get_args, get_origin
 
@@ -109,25 +109,33 @@ def with_made(words: Sequence[str]) -> list[str]:
     functions only whose return value and arguments are annotated.
     """
     configured = any(word.startswith(("--config=", "-c")) or word == "--config" for word in words)
-    made_by: set[str] = set()  # options that name a function
+    makers = {}
+    for word, after in pairwise([*words, ""]):
+        option, equals, value = word.partition("=")
+        if option.startswith("--") and option.lstrip("-").rpartition(".")[2] in NETWORKS:
+            path = value if equals else after
+            makers[option] = path if _function_at(path) is not None else ""
     spelt: list[str] = []
-    rest = iter(words)
-    for word in rest:
-        option, equals, path = word.partition("=")
-        part, _, name = option.rpartition(".")
-        if not configured and option in ("--features", "--model.backbone"):
-            spelt.append(f"{option}=null")  # or arguments of the default would be those of another class
-        if part in made_by:
-            spelt.append(f"{part}.dict_kwargs.{word.removeprefix(part + '.')}")
-        elif option.startswith("--") and name.lstrip("-") in NETWORKS:
-            value = [path] if equals else [*islice(rest, 1)]
-            if value and _function_at(value[0]) is not None:
-                made_by.add(option)
-                spelt += [f"{option}={__name__}.made", f"{option}.function={value[0]}"]
-            else:
-                spelt += [word] if equals else [word, *value]
-        else:
+    skip = False
+    for word in words:
+        option, equals, _ = word.partition("=")
+        part = option.rpartition(".")[0]
+        own = part if makers.get(part) and not makers.get(option) else option
+        path = makers.get(own)
+        made_by = [f"{own}={__name__}.made", f"{own}.function={path}"] if path else []
+        if made_by and made_by[1] in spelt:
+            made_by = []
+        elif not configured and own in ("--features", "--model.backbone"):
+            spelt.append(f"{own}=null")  # or arguments of the default would be those of another class
+        spelt += made_by  # ahead of its arguments, wherever they are typed
+        if skip:
+            skip = False
+        elif not path:
             spelt.append(word)
+        elif option == own:
+            skip = not equals
+        else:
+            spelt.append(f"{own}.dict_kwargs.{word.removeprefix(own + '.')}")
     return spelt
 
 
