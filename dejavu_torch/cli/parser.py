@@ -204,6 +204,9 @@ def _by_options(message: str, error: Exception | None) -> str:
     """What jsonargparse says: of an option's value what the innermost parser or type says of it."""
     key = re.match(r'Parser key "([^"]+)"', message)
     if key is None:
+        stages = re.match(r'expected "subcommand" to be one of {(.*)}', message)
+        if stages:
+            return f"no stage given; expected one of {stages[1].replace(',', ', ')}"
         return re.sub(r"^Option '([\w.]+)'", r"--\1", message)
     option = "--" + key[1].replace(".init_args", "")
     chain = list(causes(error))
@@ -215,7 +218,9 @@ def _by_options(message: str, error: Exception | None) -> str:
     if setting:
         return f"{option}.{setting[1]}: what {option} names has no settings; expected one or the other"
     told = re.sub(r"<class '(?:\w+\.)*(\w+)'>", r"\1", str(chain[-1])).replace("typing.Literal", "one of ")
-    told = told.replace("Expected a dot import path string:", "expected the import path of a class, not")
+    others = ", none or a map file" * ("MapFile" in message)
+    wanted = f"expected the import path of a class{others}, not"
+    told = told.replace("Expected a dot import path string:", wanted)
     value = re.match(r"Expected an? (.*)\. Got value: (.*)", told, re.DOTALL)
     return f"{option} is {value[2]}; expected {value[1]}" if value else f"{option}: {told}"
 
