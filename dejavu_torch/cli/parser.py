@@ -121,7 +121,7 @@ def with_made(words: Sequence[str]) -> list[str]:
         option, equals, _ = word.partition("=")
         part = option.rpartition(".")[0]
         own = part if makers.get(part) and not makers.get(option) else option
-        path = makers.get(own)
+        path = makers.get(own, "")
         made_by = [f"{own}={__name__}.made", f"{own}.function={path}"] if path else []
         if made_by and made_by[1] in spelt:
             made_by = []
