@@ -32,11 +32,20 @@ class Net(nn.Conv2d):
     def pretrained(cls, name, **settings):
         return cls(3, 6, 3)
 
+def leave():
+    raise SystemExit("bye")
+
 def transform(name):
     return name.upper
 """
 ROUTE = "sim:aerial?frames=40"
 OWN = ("--features", "dejavu_torch.Embedding", "--features.dimension=null", "--features.resize", "[16,16]")
+NOTES = (
+    "--features.network.note",
+    "it's",
+    "--features.network.notes=a b",
+    '--features.network.more={"a": 1}',
+)
 HUB = ("--features.network", "zoo.load", "--features.network.repo=a/b", "--features.network.model", "m")
 
 
@@ -68,23 +77,36 @@ def test_a_function_is_called_with_what_is_typed() -> None:
 @pytest.mark.parametrize(
     ("words", "channels"),
     [
-        ("zoo.typed --features.network.width 5", 5),
-        ("zoo.Net.pretrained --features.network.name x --features.network.depth=2", 6),
-        ("zoo.Net --features.network.in_channels=3 --features.network.out_channels 7 "
-         "--features.network.kernel_size=3", 7),
+        ("--features.network zoo.typed --features.network.width 5", 5),
+        ("--features.network.width 5 --features.network zoo.typed", 5),
+        ("--features.network zoo.Net.pretrained --features.network.name x --features.network.depth=2", 6),
+        ("--features.network zoo.Net --features.network.in_channels=3 "
+         "--features.network.out_channels 7 --features.network.kernel_size=3", 7),
     ],
-    ids=["typed", "method", "class"],
+    ids=["typed", "ahead", "method", "class"],
 )  # fmt: skip
 def test_functions_methods_and_classes(words: str, channels: int) -> None:
-    net = features_of(*OWN, "--features.network", *words.split())
+    net = features_of(*OWN, *words.split())
     assert isinstance(net, Embedding)
     assert net.cell == 0  # the argument of another class than the default
     assert net(torch.rand(2, 3, 20, 20)).shape == (2, channels)
 
 
 def test_the_next_line_brings_the_network_back(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run("learn", ROUTE, "--map", "map.safetensors", *OWN, *HUB, "--features.layer", "0", "--features.mean=.5")
+    run(
+        "learn",
+        ROUTE,
+        "--map",
+        "map.safetensors",
+        *OWN,
+        *HUB,
+        *NOTES,
+        "--features.layer",
+        "0",
+        "--features.mean=.5",
+    )
     before, _, told = capsys.readouterr().out.rpartition("next: dejavu ")
+    assert [word for word in NOTES if word not in shlex.split(told)] == []
     assert "backbone 448" in before  # of 112 numbers: what lies behind the layer is not kept
     sys.modules.pop("zoo")
     assert "Sequential" in fails(capsys, "localize", "map.safetensors", ROUTE, "--out", "matches.csv")
@@ -104,6 +126,7 @@ def test_the_next_line_brings_the_network_back(tmp_path: Path, capsys: pytest.Ca
     ("words", "seen"),
     [
         (("zoo.transform", "--features.network.name", "x"), ("zoo.transform made a", "nn.Module")),
+        (("zoo.leave",), ("zoo.leave ends the program (bye); expected what makes a network",)),
         (("zoo.nothing", "--features.network.name", "x"), ("'zoo' has no attribute 'nothing'",)),
         (("zoo.typed", "--features.network.widht", "x"), ("widht",)),
         (("zoo.load", "--features.network.repo", "x"), ("model",)),

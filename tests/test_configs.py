@@ -138,6 +138,8 @@ def aliases(levels: int) -> str:
         ("batch_size: " + "9" * 5000, "a value of 5000 characters"),
         ("batch_size: 3\nbatch_size: 4", "line 2: batch_size appears twice"),
         ("mapper: {class_path: a, class_path: b}", "class_path appears twice"),
+        (" 1\n".join(f"a{i}:" for i in range(26_000)), "over 10000 values"),
+        (" 1\n".join(f"a{i % 4_999}:" for i in range(5_000)), "a0 appears twice"),
         ("", "holds no options"),
         ("- 3", "holds no options"),
         ("a: *b", "no YAML"),
@@ -147,7 +149,7 @@ def aliases(levels: int) -> str:
         (b"\xff\xfea: 1", "UTF-8 text"),
         (b"a: \x07", "no YAML"),
     ],
-    ids=range(15),
+    ids=range(17),
 )
 def test_a_config_that_is_none_is_refused_ahead_of_the_loader(
     tmp_path: Path, text: str | bytes, words: str
@@ -177,6 +179,6 @@ def test_a_word_of_more_than_an_option_can_mean_is_refused() -> None:
     for word in (flow, f"--mapper={flow}", "[" * 100_000):
         with refused("expected"):
             check_word(word)
-    plain = ["sim:aerial?frames=64&seed=*", "--features.x=a&b*c: [", "a*&b"]
+    plain = ["sim:aerial?frames=64&seed=*", "--features.x=a&b*c: [", "a*&b", "#&*"]
     for word in plain:
         check_word(word)

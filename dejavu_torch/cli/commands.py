@@ -6,7 +6,6 @@ Only what every command needs is imported above: the rest, such as matplotlib, w
 from __future__ import annotations
 
 import copy
-import re
 import shlex
 import threading
 from collections import Counter
@@ -605,10 +604,14 @@ def features_words(model: DejaVu, command: str, option: str = "--features") -> l
     foreign = [one.class_path for one in parts if one.class_path not in REGISTRY]
     if not foreign:
         return []
-    typed = re.findall(rf" {option}((?:\.[\w.]+)?[= ](?:'[^']*'|[^\s'])+)", command)
-    if not any(one[0] in "= " for one in typed):  # a config file has named it
-        typed.insert(0, f" {foreign[0]}")
-    return shlex.split(" ".join(f"--features{one}" for one in typed))
+    told, values, named = [], False, False
+    for word in shlex.split(command):
+        own = f"{word.partition('=')[0]}.".startswith(f"{option}.")
+        if own or values:
+            told.append(f"--features{word.removeprefix(option)}" if own else word)
+        named |= word.partition("=")[0] == option
+        values = own and "=" not in word
+    return told if named else ["--features", foreign[0], *told]  # a config file has named it
 
 
 def _check_report_folder(

@@ -8,7 +8,7 @@ import pydoc
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import is_dataclass
-from itertools import islice
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NoReturn, cast, get_args, get_origin
 
@@ -84,7 +84,10 @@ def made(function: str, **arguments: Any) -> nn.Module:
     maker = _function_at(function)
     if maker is None:
         raise InputError(f"{function} is no function that can be imported; expected one, or a class")
-    network = maker(**arguments)
+    try:
+        network = maker(**arguments)
+    except SystemExit as stop:  # it would end the command without a word
+        raise InputError(f"{function} ends the program ({stop}); expected what makes a network") from stop
     if not isinstance(network, nn.Module):
         raise InputError(f"{function} made a {type(network).__name__}; expected an nn.Module")
     return network
@@ -105,26 +108,34 @@ def with_made(words: Sequence[str]) -> list[str]:
     `--features timm.create_model --features.model_name NAME` is the name's call; jsonargparse itself takes
     functions only whose return value and arguments are annotated.
     """
-    configured = any(word.partition("=")[0] in ("--config", "-c") for word in words)
-    made_by: set[str] = set()  # options that name a function
+    configured = any(word.startswith(("--config=", "-c")) or word == "--config" for word in words)
+    makers = {}
+    for word, after in pairwise([*words, ""]):
+        option, equals, value = word.partition("=")
+        if option.startswith("--") and option.lstrip("-").rpartition(".")[2] in NETWORKS:
+            path = value if equals else after
+            makers[option] = path if _function_at(path) is not None else ""
     spelt: list[str] = []
-    rest = iter(words)
-    for word in rest:
-        option, equals, path = word.partition("=")
-        part, _, name = option.rpartition(".")
-        if not configured and option in ("--features", "--model.backbone"):
-            spelt.append(f"{option}=null")  # or arguments of the default would be those of another class
-        if part in made_by:
-            spelt.append(f"{part}.dict_kwargs.{word.removeprefix(part + '.')}")
-        elif option.startswith("--") and name.lstrip("-") in NETWORKS:
-            value = [path] if equals else [*islice(rest, 1)]
-            if value and _function_at(value[0]) is not None:
-                made_by.add(option)
-                spelt += [f"{option}={__name__}.made", f"{option}.function={value[0]}"]
-            else:
-                spelt += [word] if equals else [word, *value]
-        else:
+    skip = False
+    for word in words:
+        option, equals, _ = word.partition("=")
+        part = option.rpartition(".")[0]
+        own = part if makers.get(part) and not makers.get(option) else option
+        path = makers.get(own, "")
+        made_by = [f"{own}={__name__}.made", f"{own}.function={path}"] if path else []
+        if made_by and made_by[1] in spelt:
+            made_by = []
+        elif not configured and own in ("--features", "--model.backbone"):
+            spelt.append(f"{own}=null")  # or arguments of the default would be those of another class
+        spelt += made_by  # ahead of its arguments, wherever they are typed
+        if skip:
+            skip = False
+        elif not path:
             spelt.append(word)
+        elif option == own:
+            skip = not equals
+        else:
+            spelt.append(f"{own}.dict_kwargs.{word.removeprefix(own + '.')}")
     return spelt
 
 
@@ -193,6 +204,9 @@ def _by_options(message: str, error: Exception | None) -> str:
     """What jsonargparse says: of an option's value what the innermost parser or type says of it."""
     key = re.match(r'Parser key "([^"]+)"', message)
     if key is None:
+        stages = re.match(r'expected "subcommand" to be one of {(.*)}', message)
+        if stages:
+            return f"no stage given; expected one of {stages[1].replace(',', ', ')}"
         return re.sub(r"^Option '([\w.]+)'", r"--\1", message)
     option = "--" + key[1].replace(".init_args", "")
     chain = list(causes(error))
@@ -204,7 +218,9 @@ def _by_options(message: str, error: Exception | None) -> str:
     if setting:
         return f"{option}.{setting[1]}: what {option} names has no settings; expected one or the other"
     told = re.sub(r"<class '(?:\w+\.)*(\w+)'>", r"\1", str(chain[-1])).replace("typing.Literal", "one of ")
-    told = told.replace("Expected a dot import path string:", "expected the import path of a class, not")
+    others = ", none or a map file" * ("MapFile" in message)
+    wanted = f"expected the import path of a class{others}, not"
+    told = told.replace("Expected a dot import path string:", wanted)
     value = re.match(r"Expected an? (.*)\. Got value: (.*)", told, re.DOTALL)
     return f"{option} is {value[2]}; expected {value[1]}" if value else f"{option}: {told}"
 
@@ -357,5 +373,6 @@ def _check_settings(name: str, arguments: dict[str, Any], words: Sequence[str]) 
 def _check_own(words: Sequence[str], own: set[str], whose: str) -> None:
     """Refuse options of what a file brings."""
     for word in words:
-        if word.startswith("-") and {"-c": "config"}.get(word, word[2:]).partition(".")[0] in own:
+        option = "config" if word.startswith("-c") else word[2:].partition(".")[0]
+        if word.startswith("-") and option in own:
             raise UsageError(f"{word}: {whose} has its own settings; expected one or the other")

@@ -70,18 +70,20 @@ def count_values(node: yaml.Node, level: int = 1, count: int = 0) -> int:
     line = f"line {node.start_mark.line + 1}"
     if level > DEEPEST:
         raise ValueError(f"{line}: over {DEEPEST} levels")
-    if count >= MOST:
+    scalar = isinstance(node, yaml.ScalarNode)
+    if count >= MOST or (not scalar and count + len(node.value) > MOST):
         raise ValueError(f"{line}: over {MOST} values")
-    if isinstance(node, yaml.ScalarNode):
+    if scalar:
         if len(node.value) > LONGEST:
             raise ValueError(f"{line}: a value of {len(node.value)} characters")
         return count + 1
     parts = node.value
     if isinstance(node, yaml.MappingNode):
-        keys = [key for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
-        for i, key in enumerate(keys):
-            if any(key.value == other.value for other in keys[:i]):
+        seen: set[str] = set()
+        for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
+            if key.value in seen:
                 raise ValueError(f"line {key.start_mark.line + 1}: {key.value} appears twice")
+            seen.add(key.value)
         parts = [part for pair in node.value for part in pair]
     for part in parts:
         count = count_values(part, level + 1, count)
@@ -97,7 +99,8 @@ def check_word(word: str) -> None:
     if "&" in word and "*" in word:  # aliases
         try:
             node = yaml.compose(word.partition("=")[2] if word.startswith("--") else word, yaml.SafeLoader)
-            count_values(node)
+            if node is not None:  # a comment
+                count_values(node)
         except yaml.YAMLError:  # an address, or a name
             pass
         except ValueError as error:
