@@ -97,8 +97,8 @@ def read_array(path: Path) -> ArrayTraverse:
     """
     with reading(path, "is no whole .npy array", EXPECTED):
         values = np.lib.format.open_memmap(path, mode="r")
+        traverse = ArrayTraverse(values, printable(path))
         check_room(24.0 * math.prod(values.shape[1:]), f"a frame of {path}")
-    traverse = ArrayTraverse(values, printable(path))
     traverse.path = path
     return traverse
 

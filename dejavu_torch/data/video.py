@@ -35,6 +35,7 @@ SUFFIXES = {
 # what these files are, and nothing else that FFmpeg knows, such as a list of other files or addresses
 FORMATS = "mov,mp4,matroska,webm,avi,mpeg,mpegts,mpegvideo,m4v,h264,hevc,asf,flv,live_flv,ogg,mjpeg"
 EBML, SEGMENT, CLUSTER = b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67", b"\x1f\x43\xb6\x75"  # of Matroska
+BOXES = {b"ftyp", b"free", b"skip", b"wide", b"moov", b"moof", b"mdat", b"mfra", b"sidx", b"styp", b"uuid"}
 UNEVEN = 1.5  # longest interval over the median one; rounded to ticks of half a frame or less it is less
 
 
@@ -54,8 +55,9 @@ class Video(Traverse):
 
     Raises:
         InputError: width or height out of range; no video, or one that is cut off; while reading, a damaged
-            frame, frames that are missing, or frames of different size. Of files that do not say how long
-            they are (.ts, .mpg, .flv, .mjpeg) a cut between two frames is not found.
+            frame, frames that are missing, or frames of different size. A cut may go unnoticed where the file
+            does not say how long it is (.ts, .mts, .mpg, .wmv, .flv, .ogv, .mjpeg, live recordings), and
+            between parts that each say it (of a fragmented .mp4, or an .avi of more than 1 GB).
     """
 
     def __init__(self, path: str | Path, width: int = 0, height: int = 0) -> None:
@@ -71,7 +73,7 @@ class Video(Traverse):
             if container.format.name.startswith("mov") and stream.frames:
                 entries = stream.index_entries
                 self.length = sum(not entry.is_discard for entry in entries)
-                whole = all(entry.pos + entry.size <= container.size for entry in entries)
+                whole = whole and all(entry.pos + entry.size <= container.size for entry in entries)
         if not whole:
             raise InputError(f"{path} is cut off or damaged; expected a whole video file")
 
@@ -239,10 +241,25 @@ def _as_tensor(frames: list[np.ndarray]) -> Tensor:
 
 
 def _is_whole(path: Path) -> bool:
-    """Whether a file, if it is a Matroska one, is neither cut nor has holes, of which FFmpeg says no word."""
+    """Whether the outer parts of an MP4, AVI or Matroska file end inside it; FFmpeg says no word if not."""
     with path.open("rb") as file:
-        is_matroska = file.read(len(EBML)) == EBML
-        return not is_matroska or _elements_fit(file, 0, file.seek(0, 2))
+        start, stop = 0, file.seek(0, 2)
+        while start < stop:
+            file.seek(start)
+            head = file.read(16)
+            if head[:4] == EBML:
+                return _elements_fit(file, start, stop)
+            if head[:4] == b"RIFF":
+                length = 8 + int.from_bytes(head[4:8], "little")
+            elif head[4:8] in BOXES:
+                length = int.from_bytes(head[:4])
+                length = int.from_bytes(head[8:]) if length == 1 else length
+            else:
+                return True  # what follows is not ours
+            if length in (0, 7 + 2**32):  # up to the end, or recorded live: nothing to check against
+                return True
+            start += max(8, length)
+        return start == stop
 
 
 def _elements_fit(file: BinaryIO, start: int, stop: int) -> bool:

@@ -129,6 +129,12 @@ def test_a_header_that_no_array_has_is_refused(tmp_path: Path, kind: str, shape:
         read_array(written(tmp_path / "a.npy", header, version))
 
 
+def test_a_file_of_no_frames_is_said_to_hold_nothing(tmp_path: Path) -> None:
+    header = "{'descr': '<f4', 'fortran_order': False, 'shape': (0, 9999999999)}"
+    with refused("a.npy", "(0, 9999999999), which holds nothing"):
+        read_array(written(tmp_path / "a.npy", header))
+
+
 def test_a_frame_larger_than_the_memory_is_refused(tmp_path: Path) -> None:
     header = f"{{'descr': '|u1', 'fortran_order': False, 'shape': (2, {10**6}, {10**6})}}"
     path = written(tmp_path / "a.npy", header)

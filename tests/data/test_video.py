@@ -35,6 +35,7 @@ KINDS = {
     "ffv1.avi": FFV1,
 }
 FRONT = {"movflags": "faststart"}  # the table of contents first, so that a cut leaves it whole
+FRAGMENTS = {"movflags": "empty_moov", "frag_duration": "400000"}  # of 10 frames each
 
 
 def times_of(video: Video) -> Tensor:
@@ -237,15 +238,32 @@ def test_frames_of_another_size_are_refused(tmp_path: Path, kind: str) -> None:
         all_of(Video(both))
 
 
-@pytest.mark.parametrize("name", [name for name in KINDS if name.endswith((".mp4", ".mkv", ".avi", ".mov"))])
-def test_a_truncated_video_is_refused(tmp_path: Path, name: str) -> None:
-    front = name.endswith((".mp4", ".mov"))
-    path = clip(tmp_path / name, pictures(30), options=FRONT if front else {}, **KINDS[name])
-    whole = path.read_bytes()
-    for part in (0.3, 0.5, 0.9, 0.97):
-        path.write_bytes(whole[: int(part * len(whole))])
-        with refused(str(path), "expected a whole video file"):
-            all_of(Video(path))
+@pytest.mark.parametrize("kept", [1, 15, 29])
+@pytest.mark.parametrize("more", [0, 1, 20], ids=lambda more: f"{more} more bytes")
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("h264.mp4", FRONT),
+        ("h264.mp4", FRAGMENTS),
+        ("mpeg4.mp4", FRONT),
+        ("h264.mov", FRONT),
+        ("h264.mkv", {}),
+        ("ffv1.mkv", {}),
+        ("h264.avi", {}),
+        ("mpeg4.avi", {}),
+        ("mjpeg.avi", {}),
+    ],
+)
+def test_a_cut_behind_a_frame_is_refused(
+    tmp_path: Path, name: str, options: dict[str, str], more: int, kept: int
+) -> None:
+    path = clip(tmp_path / name, pictures(30), options=options, **KINDS[name])
+    assert numbers(all_of(Video(path))) == list(range(30))
+    with av.open(str(path)) as container:
+        ends = [packet.pos + packet.size for packet in container.demux(video=0) if packet.size]
+    path.write_bytes(path.read_bytes()[: ends[kept - 1] + more])
+    with refused(str(path), "cut off", "expected a whole video file"):
+        Video(path)
 
 
 @pytest.mark.parametrize("name", ["h264.mp4", "h264.mkv", "mjpeg.avi", "mpeg4.mp4", "h264.ts"])
@@ -275,6 +293,18 @@ def test_any_cut_of_a_small_video_is_refused(tmp_path: Path) -> None:
 def test_a_video_recorded_live_is_read(tmp_path: Path) -> None:
     path = clip(tmp_path / "a.mkv", pictures(5), options={"live": "1"})
     assert numbers(all_of(Video(path))) == [0, 1, 2, 3, 4]
+    path = clip(tmp_path / "a.avi", pictures(5))
+    whole = path.read_bytes()
+    for length in (bytes(4), b"\xff" * 4):  # as where it could not be filled in
+        path.write_bytes(whole[:4] + length + whole[8:])
+        assert numbers(all_of(Video(path))) == [0, 1, 2, 3, 4]
+
+
+def test_what_follows_a_video_does_not_matter(tmp_path: Path) -> None:
+    for name in ("h264.mp4", "h264.mkv", "mjpeg.avi"):
+        path = clip(tmp_path / name, pictures(5), **KINDS[name])
+        path.write_bytes(path.read_bytes() + b"something else")
+        assert numbers(all_of(Video(path))) == [0, 1, 2, 3, 4]
 
 
 def test_a_drive(data_dir: Path) -> None:
