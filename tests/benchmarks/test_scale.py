@@ -222,10 +222,6 @@ def test_a_process_learns_and_another_localizes(tmp_path: Path) -> None:
     save_file(asked, tmp_path / "places=600.safetensors")
     row = scale.measured(Task("places=600", "dejavu 4 B", "drawn", 600, 1, "cpu"), tmp_path)
     assert (row["skipped"], row["recall_at_1"]) == (None, 1)
-    scanned = scale.measured(Task("places=600", "dejavu 4 B, scan", "drawn", 600, 1, "cpu"), tmp_path)
-    assert scanned["learn_rate"] == row["learn_rate"]  # of the same map
-    scale.measured(Task("places=600", "dejavu 1 B", "drawn", 600, 1, "cpu"), tmp_path)
-    assert len(list(tmp_path.glob("kept*"))) == 2  # the other map is gone
 
 
 def test_queries_lie_evenly_along_the_route() -> None:
@@ -251,3 +247,18 @@ def test_exponents_and_tables() -> None:
     assert first.splitlines()[0] == "places=100"
     assert first.splitlines()[-1].split() == ["faiss", "flat", "skipped:", "no", "faiss"]
     assert last.startswith("repeat=N: exponents of N\n")
+
+
+def test_a_map_is_kept_for_all_its_searches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ran: list[tuple[str, str]] = []
+
+    def in_no_process(_: str, words: list[Any]) -> dict[str, Any]:
+        ran.append((words[0], words[1].contender))
+        words[1].file(tmp_path).touch()
+        return {"bytes": 7}
+
+    monkeypatch.setattr(scale, "in_process", in_no_process)
+    for name in ("dejavu 4 B", "dejavu 4 B, scan", "dejavu 1 B"):
+        assert scale.measured(Task("places=600", name, "drawn", 600, 1, "cpu"), tmp_path)["bytes"] == 7
+    assert [name for what, name in ran if what == "learn"] == ["dejavu 4 B", "dejavu 1 B"]
+    assert len(list(tmp_path.glob("kept*"))) == 2  # of the last, and what learning told
