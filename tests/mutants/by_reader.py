@@ -134,7 +134,7 @@ MUTANTS = [
     ),
     Mutant(
         "A search keeps enough of the best places that candidates and probabilities are those of all scores.",
-        "dejavu_torch/recognition/localizer.py",
+        "dejavu_torch/recognition/search.py",
         "(k - 1) * (2 * radius + 1) + 1 for",
         "(k - 1) * (radius + 1) + 1 for",
         ("tests/recognition/test_search.py::-k candidates_are_those or calibrated_map",),
