@@ -143,6 +143,32 @@ class Faiss(Store):
         return find
 
 
+class Usearch(Store):
+    """A graph of usearch over descriptors of length 1, in 8 bits a number."""
+
+    def learn(self, route: IndexedTraverse, path: Path) -> int:
+        from usearch.index import Index
+
+        index: Any = Index(ndim=route.frame_shape[0], metric="cos", dtype="i8")
+        for first, part in zip(range(0, route.length, ROWS), route.batches(ROWS), strict=True):
+            index.add(np.arange(first, first + len(part)), part.numpy(), threads=torch.get_num_threads())
+        index.save(str(path))
+        return path.stat().st_size - 8 * route.length  # names
+
+    def load(self, path: Path, device: str = "cpu") -> Find:
+        from usearch.index import Index
+
+        index: Any = Index.restore(str(path))
+        index.expansion_search = EF_SEARCH
+
+        def find(queries: Tensor) -> tuple[Tensor, Tensor]:
+            found = index.search(queries.numpy(), 1, threads=torch.get_num_threads())
+            place = torch.from_numpy(found.keys.reshape(-1).astype(np.int64))
+            return torch.from_numpy(found.distances.reshape(-1)), place
+
+        return find
+
+
 class Interpolated(Store):
     """Every k-th descriptor in int8 and straight lines between them, in so many bytes per place."""
 
@@ -211,6 +237,7 @@ PLACED: dict[str, Callable[[float, float], Store]] = {
     "faiss IVF-PQ FastScan, 32 B, refined": lambda *_: Faiss("IVF{cells},PQ64x4fs,RFlat"),
     "faiss OPQ, IVF-PQ, 16 B": lambda *_: Faiss("OPQ16,IVF{cells},PQ16np"),
     "faiss HNSW": lambda *_: Faiss("HNSW16,Flat"),
+    "usearch int8": lambda *_: Usearch(),
 }
 REPEATED: dict[str, Callable[[float, float], Store]] = {
     ONE_CHUNK: lambda *_: Held(SpectralMapper(None, 1.0, WHOLE)),

@@ -336,8 +336,17 @@ class SpectralMap(PlaceMap):
         """Inner products with all descriptors of equally long chunks: (Q,K) -> (Q,W G).
 
         The inverse transform is linear, so they are the inverse transform of the products with the lines:
-        O(lines + W log W) for a query instead of O(W K).
+        O(lines + W log W) for a query instead of O(W K). No autocast.
         """
+        parts = [queries]
+        if not torch.compiler.is_compiling():  # what is held for the others stays in the cache
+            places = self.chunks[chunks.stop - 1][1] - self.chunks[chunks.start][0]
+            parts = [*queries.split(max(TOGETHER, BLOCK // places))]
+        with torch.autocast(queries.device.type, enabled=False):
+            products = [self._products(part, chunks) for part in parts]
+        return products[0] if len(products) == 1 else torch.cat(products)
+
+    def _products(self, queries: Tensor, chunks: range) -> Tensor:
         first, last = self.chunks[chunks.start][0], self.chunks[chunks.stop - 1][1]
         count, length = len(chunks), (last - first) // len(chunks)
         slot, factor = slots(length, self.transform, queries.dtype, queries.device)
@@ -390,17 +399,13 @@ class SpectralMap(PlaceMap):
             rows = max(1, queries.shape[0] + len(self.level) // max(1, self.places))
         for run in self._runs(*self._span(start, stop), rows):
             begin, end = self.chunks[run.start][0], self.chunks[run.stop - 1][1]
-            with torch.autocast(queries.device.type, enabled=False):
-                some = [queries]
-                if not torch.compiler.is_compiling():  # what is held for the others stays in the cache
-                    some = [*queries.split(max(TOGETHER, BLOCK // (end - begin)))]
-                products = torch.cat([self.products(part, run) for part in some])
-                if self.metric == "cosine":
-                    inverse = self.inverse_norms(begin, end).to(queries)
-                    scores = torch.addcmul(queries.new_ones(()), products, inverse, value=-1)
-                else:
-                    square = self.norms[begin:end].to(queries).square()
-                    scores = (square - 2 * products + length.square()).clamp(min=0)
+            products = self.products(queries, run)
+            if self.metric == "cosine":
+                inverse = self.inverse_norms(begin, end).to(queries)
+                scores = torch.addcmul(queries.new_ones(()), products, inverse, value=-1)
+            else:
+                square = self.norms[begin:end].to(queries).square()
+                scores = (square - 2 * products + length.square()).clamp(min=0)
             low, high = max(start, begin), min(stop, end)
             yield low, scores[:, low - begin : high - begin]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from fractions import Fraction
+from functools import lru_cache
 from typing import Literal, TypeVar
 
 import torch
@@ -53,12 +54,24 @@ def slots(
     count: int, transform: Transform, dtype: torch.dtype, device: torch.device
 ) -> tuple[Tensor, Tensor]:
     """The slot in which `from_slots` expects each of W lines, (W,) int64, and the factor that it expects on
-    each of the S slots, (S,); slots without a line are 0."""
+    each of the S slots, (S,); slots without a line are 0. Both may be shared: they are not to be changed."""
+    if torch.compiler.is_compiling():
+        return _slots(count, transform, dtype, device)
+    with torch.inference_mode(False):  # what is kept serves gradients too
+        return _kept_slots(count, transform, dtype, device)
+
+
+def _slots(
+    count: int, transform: Transform, dtype: torch.dtype, device: torch.device
+) -> tuple[Tensor, Tensor]:
     slot, size = torch.arange(count, device=device), count
     if transform == "dft":  # pairs of a cosine and a sine; the mean has no sine
         slot, size = slot + (slot > 0), 2 * (count // 2) + 2
     scale = 1 / _scale(torch.empty(count, dtype=dtype, device=device), transform)
     return slot, scale.new_zeros(size).index_copy(0, slot, scale)
+
+
+_kept_slots = lru_cache(32)(_slots)  # they take a third of the time of a chunk's products
 
 
 def from_slots(slotted: Tensor, count: int, transform: Transform) -> Tensor:

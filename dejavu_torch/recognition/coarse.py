@@ -7,7 +7,7 @@ best places are near the best of these samples; only places near them are scored
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import cache
 from typing import NamedTuple
 
@@ -23,11 +23,12 @@ from dejavu_torch.recognition.select import best_candidates
 from dejavu_torch.types import InputError
 
 FEWEST = 20_000  # places; a shorter map is scanned, which takes no longer
-OTHERS = 12  # bytes of a sample beside its numbers
+OTHERS = 16  # bytes of a sample beside its numbers
 MEMORY = 100_000_000  # bytes of the samples at most by default
 SPACINGS = (32, 16, 12, 8, 6, 4, 3, 2)  # places from one sample to the next
 COARSE, FINE = 0.93, 0.98  # shares of the lines' energy that coarse and fine samples hold
 GROUP = 8  # consecutive samples of which the best counts
+BESIDE = 16  # groups of a block; the best groups are in the best blocks
 REFINED = 32  # best groups of a query that are refined; 4 times as many if the samples hold less than COARSE
 SPARE = 3  # further windows of a query that are scored if they are as good
 CLOSE = 0.02  # cosines that differ by less are as good
@@ -118,7 +119,8 @@ def coarse_search(route: PlaceMap, limit: int = MEMORY, exact: bool = False) -> 
 
 
 class Samples:
-    """Low-passed descriptors of a map, about every `spacing` places, in whole groups for each chunk.
+    """Low-passed descriptors of a map, about every `spacing` places, in whole groups for each chunk, and
+    whole blocks of groups for the map.
 
     Attributes:
         rows: (S,K) int8, their directions, all on one scale. norm: (S,) of the rows.
@@ -132,7 +134,9 @@ class Samples:
             padding = -len(row) % GROUP  # rows of 0, which are never the best
             rows.append(F.pad(to_int8(F.normalize(row)), (0, 0, 0, padding)))
             places.append(F.pad(at, (0, padding), value=stop - start - 1) + start)
-        self.rows, self.place = torch.cat(rows), torch.cat(places)
+        padding = -sum(map(len, rows)) % (GROUP * BESIDE)
+        self.rows = torch.cat([*rows, rows[0].new_zeros(padding, route.dimension)])
+        self.place = F.pad(torch.cat(places), (0, padding), value=route.places - 1)
         norms = [torch.linalg.vector_norm(some.float(), dim=1) for some in self.rows.split(BLOCK)]
         self.norm = torch.cat(norms).clamp(min=1)
 
@@ -144,15 +148,15 @@ class Samples:
 
     def best_of_groups(self, queries: Tensor) -> Tensor:
         """`GROUP` times the largest product in each group of rows, plus its row in the group: (Q,K) int8 ->
-        (Q,G) int32. A maximum of one number is several times faster than one with its index."""
+        (G,Q) int32. A maximum of one number is several times faster than one with its index."""
         number = torch.arange(GROUP, dtype=torch.int32, device=queries.device)[:, None]
-        best = number.new_empty(len(queries), len(self.rows) // GROUP)
+        best = number.new_empty(len(self.rows) // GROUP, len(queries))
         first = 0
         for products in self.products(queries):
             groups = products.view(-1, GROUP, len(queries))
-            found = torch.add(number, groups, alpha=GROUP, out=groups).amax(1)
-            best[:, first : first + len(found)] = found.T
-            first += len(found)
+            last = first + len(groups)
+            torch.amax(torch.add(number, groups, alpha=GROUP, out=groups), 1, out=best[first:last])
+            first = last
         return best
 
 
@@ -166,7 +170,7 @@ class CoarseSearch:
         route: the map; it is not changed.
         chosen: see `plan`.
 
-    Shape: queries (Q,K), wanted -> scores and places (Q,m), by place, +inf for none, in which the wanted
+    Shape: queries (Q,K), wanted -> scores and places (Q,M), by place, +inf for none, in which the wanted
         candidates are; see `Wanted`.
 
     Convention: scores are those of a scan. A query of length 0, or one that is like no place, is scanned.
@@ -177,27 +181,28 @@ class CoarseSearch:
         self.starts = torch.tensor([start for start, _ in route.chunks], device=route.norms.device)
         self.fine = Samples(route, chosen.fine)
         self.coarse = self.fine if self.exact else Samples(route, chosen.coarse)
+        self.middle = torch.searchsorted(self.fine.place, self.coarse.place, out_int32=True)
         self.bounds = self._bounds() if self.exact else None
 
     @torch.no_grad()
     def __call__(self, queries: Tensor, wanted: Wanted) -> Best:
         units = F.normalize(queries.to(torch.promote_types(queries.dtype, torch.float32))).float()
         best = self.coarse.best_of_groups(to_int8(units))
-        query, place = self._windows(units, best, wanted)
-        shape = len(units), max(k for k, _ in wanted)
-        pairs = query, place, self._scores(units, query, place)
-        found, last = self._by_query(pairs, shape, wanted)
+        place = self._windows(units, best, wanted)
+        found = self._scores(units, place), place
+        last = self._last(found, wanted)
         if self.exact:
-            pairs = self._below(units, best, last.masked_fill(last.isinf(), -1))  # those are scanned
-            found, last = self._by_query(pairs, shape, wanted)
-        left = last.isinf() | ~(found[0].amin(1) <= 1 - UNLIKE)
-        if left.any():
-            score, place = search(self.route, queries[left], lowest_needed(wanted, self.route.places))
-            row = left.nonzero()[:, 0].repeat_interleave(score.shape[1])
-            kept, there = ~left[pairs[0]], score.flatten().isfinite()
-            scanned = (one.flatten()[there] for one in (row, place, score))
-            both = zip(pairs, scanned, strict=True)
-            found, _ = self._by_query([torch.cat([a[kept], b]) for a, b in both], shape, wanted)
+            found = self._below(units, best, last.masked_fill(last.isinf(), -1))  # those are scanned
+            last = self._last(found, wanted)
+        left = (last.isinf() | ~(found[0].amin(1) <= 1 - UNLIKE)).nonzero()[:, 0]
+        if len(left):
+            scanned = search(self.route, queries[left], lowest_needed(wanted, self.route.places))
+            place, order = scanned[1].sort(1)
+            more = max(0, place.shape[1] - found[0].shape[1])
+            found = F.pad(found[0], (0, more), value=math.inf), F.pad(found[1], (0, more))
+            found[0][left] = math.inf
+            found[0][left, : place.shape[1]] = scanned[0].gather(1, order)
+            found[1][left, : place.shape[1]] = place
         return found
 
     @torch.no_grad()
@@ -210,44 +215,57 @@ class CoarseSearch:
         cosines = torch.cat([*self.fine.products(small)]) / size / self.fine.norm[:, None]
         nearest = torch.cat([self._nearest(chunk) for chunk in range(len(self.starts))])
         scores: Tensor = (1 - cosines)[nearest].T.contiguous()
-        query, place = self._windows(units, self.coarse.best_of_groups(small), [(1, 0)])
-        scores[query, place] = self._scores(units, query, place)
+        place = self._windows(units, self.coarse.best_of_groups(small), [(1, 0)])
+        own = self._scores(units, place)
+        query, column = own.isfinite().nonzero().T
+        scores[query, place[query, column]] = own[query, column]
         return scores
 
-    def _windows(self, units: Tensor, best: Tensor, wanted: Wanted) -> tuple[Tensor, Tensor]:
-        """Pairs (P,) of a query and a place near its best fine samples, by query and place: around each as
-        many places as candidates of a single peak may lie apart."""
-        coarse, fine, plan = self.coarse, self.fine, self.plan
+    def _windows(self, units: Tensor, best: Tensor, wanted: Wanted) -> Tensor:
+        """Places near the best fine samples of each query, (Q,M), by place; -1 for none. Around each as many
+        as candidates of a single peak may lie apart."""
+        plan, places = self.plan, self.route.places
         count = max(k for k, _ in wanted)
-        best, group = best.topk(min(max(plan.refined, 2 * count), best.shape[1]), 1, sorted=False)
-        middle = torch.searchsorted(fine.place, coarse.place[GROUP * group + best % GROUP])
+        group, best = highest(best, max(plan.refined, 2 * count))
         reach = -(-plan.coarse // (2 * plan.fine))
-        offsets = torch.arange(-reach, reach + 1, device=middle.device)
-        at = (middle[:, :, None] + offsets).clamp(0, len(fine.place) - 1).flatten(1)
-        rows = fine.rows.index_select(0, at.flatten()).view(*at.shape, -1)
-        cosines = (rows * units[:, None]).sum(2) / fine.norm[at]
+        offsets = torch.arange(-reach, reach + 1, device=group.device)
+        middle = self.middle[GROUP * group + best % GROUP]
+        at = (middle[:, :, None] + offsets).clamp(0, len(self.fine.place) - 1).flatten(1)
+        rows = self.fine.rows.index_select(0, at.flatten()).view(*at.shape, -1)
+        cosines = (rows * units[:, None]).sum(2) / self.fine.norm[at]
         width = plan.fine + 1 + max((k - 1) * (radius + 1) for k, radius in wanted)
-        windows = best_candidates(-cosines, min(count + SPARE, at.shape[1]), width, fine.place[at])
+        windows = best_candidates(-cosines, min(count + SPARE, at.shape[1]), width, self.fine.place[at])
         close = windows.score <= windows.score[:, :count].amax(1, keepdim=True) + CLOSE
-        query, rank = (windows.accepted & close).nonzero().T
-        around = torch.arange(-width, width + 1, device=query.device)
-        place = (windows.index[query, rank, None] + around).clamp(0, self.route.places - 1)
-        pairs = (query[:, None] * self.route.places + place).flatten().unique()
-        return pairs // self.route.places, pairs % self.route.places
+        around = torch.arange(-width, width + 1, device=group.device)
+        place = (windows.index[:, :, None] + around).clamp(0, places - 1)
+        place = place.masked_fill(~(windows.accepted & close)[:, :, None], -1).flatten(1).sort(1).values
+        again = F.pad(place[:, 1:] == place[:, :-1], (0, 1))
+        return place.masked_fill(again, -1)
 
-    def _scores(self, units: Tensor, query: Tensor, place: Tensor) -> Tensor:
-        """Scores of pairs of a query and a place, (P,), by the map's own products."""
-        score = torch.empty(place.shape, device=place.device)
+    def _scores(self, units: Tensor, place: Tensor) -> Tensor:
+        """Scores of places for each query, (Q,M), by the map's own products; +inf for none."""
+        products = torch.full(place.shape, -math.inf, device=place.device)
         chunk = torch.bucketize(place, self.starts, right=True) - 1
         for g in chunk.unique().tolist():
-            some = (chunk == g).nonzero()[:, 0]
-            own, row = query[some].unique(return_inverse=True)
-            for first, scores in self.route.score_blocks(units[own], *self.route.chunks[g]):  # a single block
-                score[some] = scores[row, place[some] - first]
-        return score
+            if g >= 0:
+                query, column = (chunk == g).nonzero().T
+                own, row = query.unique_consecutive(return_inverse=True)
+                here = self.route.products(units[own], range(g, g + 1))
+                products[query, column] = here[row, place[query, column] - self.route.chunks[g][0]]
+        norms = self.route.norms[place]
+        inverse = torch.where(norms > 0, 1 / norms, 0).masked_fill(place < 0, 1)
+        return torch.addcmul(products.new_ones(()), products, inverse, value=-1)
 
-    def _below(self, units: Tensor, best: Tensor, score: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Query, place and score of all places that score at most so much, (Q,) -> (P,) each.
+    def _last(self, found: Best, wanted: Wanted) -> Tensor:
+        """The highest score of the candidates that are wanted, (Q,); +inf if not all were found."""
+        score, place = found
+        if score.shape[1] < max(k for k, _ in wanted):
+            return score.new_full((len(score),), math.inf)
+        last = [best_candidates(score, *one, place).score[:, -1] for one in wanted]
+        return torch.stack(last).amax(0)
+
+    def _below(self, units: Tensor, best: Tensor, score: Tensor) -> Best:
+        """Places of each query that score at most so much, (Q,), and perhaps others of their chunks.
 
         For unit vectors q, s and x, the angle of q and x is at least that of q and s less that of s and x.
         Here s are the fine samples of a group, and x the places near them.
@@ -257,14 +275,15 @@ class CoarseSearch:
         size = torch.linalg.vector_norm(small, dim=1)
         reach = angle(1 - score) + angle((units * small).sum(1) / size.clamp(min=1))
         reach = reach.clamp(max=math.pi / 2)
-        turned = GROUP * size[:, None] * torch.stack([reach.cos(), -reach.sin(), -torch.ones_like(reach)], 1)
+        turned = GROUP * size * torch.stack([reach.cos(), -reach.sin(), -torch.ones_like(reach)])
         parts = []
-        for start in range(0, best.shape[1], BLOCK // GROUP):  # they stay in the cache
+        for start in range(0, len(best), BLOCK // GROUP):  # they stay in the cache
+            some = slice(start, start + BLOCK // GROUP)
             # the cosine of a sum of two angles; a product below 0 is not told from 0
-            least = F.threshold(turned @ self.bounds[:, start : start + BLOCK // GROUP], 0, -math.inf)
-            pairs = (best[:, start : start + BLOCK // GROUP] >= least).nonzero()
-            parts.append(pairs + pairs.new_tensor([0, start]))
-        query, group = torch.cat(parts).T.contiguous()
+            least = F.threshold(self.bounds[some] @ turned, 0, -math.inf)
+            pairs = (best[some] >= least).nonzero()
+            parts.append(pairs + pairs.new_tensor([start, 0]))
+        group, query = torch.cat(parts).T.contiguous()
         chunk = torch.bucketize(self.fine.place[group * GROUP], self.starts, right=True) - 1
         found = [(query[:0], query[:0], score[:0])]
         for g in chunk.unique().tolist():
@@ -273,11 +292,17 @@ class CoarseSearch:
                 row, at = (scores <= score[own, None] + ROUNDING).nonzero().T
                 found.append((own[row], at + first, scores[row, at]))
         query, place, score = (torch.cat(column) for column in zip(*found, strict=True))
-        return query, place, score
+        query, order = query.sort(stable=True)  # they are by place
+        counts = torch.bincount(query, minlength=len(units))
+        column = torch.arange(len(query), device=query.device) - (counts.cumsum(0) - counts)[query]
+        table = score.new_full((len(units), max(1, int(counts.max()))), math.inf)
+        where = torch.full_like(table, -1, dtype=torch.int64)
+        table[query, column], where[query, column] = score[order], place[order]
+        return table, where
 
     def _bounds(self) -> Tensor:
         """Of each group of fine samples the least length, times the cosine and the sine of the largest angle
-        between a sample and a place near it, and of itself: (3, S / GROUP)."""
+        between a sample and a place near it, and of itself: (S / GROUP, 3)."""
         least = torch.ones(len(self.fine.norm) // GROUP, device=self.fine.norm.device)
         for chunk, (start, stop) in enumerate(self.route.chunks):
             nearest, units = self._nearest(chunk), F.normalize(self.route.decode(chunk))
@@ -287,7 +312,7 @@ class CoarseSearch:
         least -= ROUNDING
         least = least.where(least > 0, -1)  # from a right angle on nothing is ruled out
         sine, norm = (1 - least.square()).sqrt(), self.fine.norm.view(-1, GROUP).amin(1)
-        bounds: Tensor = norm * torch.stack([least, sine, torch.full_like(least, ROUNDING)])
+        bounds: Tensor = norm[:, None] * torch.stack([least, sine, torch.full_like(least, ROUNDING)], 1)
         return bounds
 
     def _nearest(self, chunk: int) -> Tensor:
@@ -299,20 +324,14 @@ class CoarseSearch:
         nearest: Tensor = first + torch.bucketize(at, (place[1:] + place[:-1]) / 2)
         return nearest
 
-    def _by_query(
-        self, pairs: Sequence[Tensor], shape: tuple[int, int], wanted: Wanted
-    ) -> tuple[Best, Tensor]:
-        """Query, place and score of pairs as a row for each query, of so many columns at least, by place; and
-        the highest score of the candidates that are wanted, (Q,). +inf for none."""
-        query, place, score = pairs
-        order = (query * self.route.places + place).argsort()
-        query, counts = query[order], torch.bincount(query, minlength=shape[0])
-        column = torch.arange(len(query), device=query.device) - (counts.cumsum(0) - counts)[query]
-        table = score.new_full((shape[0], max(shape[1], int(counts.max()))), math.inf)
-        where = torch.full_like(table, self.route.places, dtype=torch.int64)
-        table[query, column], where[query, column] = score[order], place[order]
-        last = [best_candidates(table, *one, where).score[:, -1] for one in wanted]
-        return (table, where), torch.stack(last).amax(0)
+
+def highest(best: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """So many rows of (G,Q) with the highest numbers, and these, (Q,n): they are in the best blocks."""
+    blocks = best.view(-1, BESIDE, best.shape[1])
+    block = blocks.amax(1).T.topk(min(count, len(blocks)), 1, sorted=False).indices
+    inside = blocks.permute(2, 0, 1).gather(1, block[:, :, None].expand(-1, -1, BESIDE)).flatten(1)
+    number, at = inside.topk(min(count, inside.shape[1]), 1, sorted=False)
+    return block.gather(1, at // BESIDE) * BESIDE + at % BESIDE, number
 
 
 def to_int8(units: Tensor) -> Tensor:

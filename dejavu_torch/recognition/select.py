@@ -70,7 +70,6 @@ def best_candidates(scores: Tensor, k: int, radius: int, places: Tensor | None =
         raise InputError(f"scores are {tuple(scores.shape)}; expected (Q,N) with N >= 1")
     columns = scores.shape[1]
     check_candidates(k, radius, columns)
-    window = torch.arange(-min(radius, columns), min(radius, columns) + 1, device=scores.device)
     found = []
     for rank in range(k):
         score, at = scores.min(1)
@@ -79,6 +78,7 @@ def best_candidates(scores: Tensor, k: int, radius: int, places: Tensor | None =
         if rank + 1 == k:
             break
         if places is None:  # a window cut off at an end of the map repeats that end, which is in it
+            window = torch.arange(-min(radius, columns), min(radius, columns) + 1, device=scores.device)
             scores = scores.scatter(1, (at[:, None] + window).clamp(0, columns - 1), torch.inf)
         else:
             scores = scores.masked_fill((places - index[:, None]).abs() <= radius, torch.inf)
