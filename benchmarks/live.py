@@ -23,6 +23,7 @@ from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.live.feed import FrameReader, in_real_time
 from dejavu_torch.live.localizer import LiveLocalizer
 from dejavu_torch.model import DejaVu
+from dejavu_torch.recognition.filter import PlaceFilter
 
 RATE = 30  # frames a second
 CAMERA = (480, 640)
@@ -40,6 +41,7 @@ COLUMNS: dict[str, Column] = {
     "found": ("recall_at_1", ".3f"),
 }
 WARM = 10  # frames ahead of those that are timed
+SEARCHED = (1, 50)  # the filter's search_every
 
 
 def bench_live(
@@ -60,18 +62,23 @@ def bench_live(
         seconds_p99: the longest but for 1 %. rate: frames a second from the file to the place, decoding
         beside it; cpu_seconds: that a frame takes of all cores together, which other programs change little.
         dropped: of the frames at `RATE` a second. recall_at_1: share that was found. parts: seconds of
-        decoding, features, whitening, scores and filter, each by itself, the median of some.
+        decoding, features, whitening, scores and filter, each by itself, the median of some; "search" is that
+        of a frame without a filter.
     """
     with tempfile.TemporaryDirectory() as folder, torch.no_grad():
         path = Path(folder) / "drive.mkv"
         write_drive(path, frames, camera)
         shown = tqdm(sizes, desc="live", disable=None, leave=False)
-        return [live_row(Video(path, width=w, height=h), camera, places, numbers) for h, w in shown]
+        rows = []
+        for height, width in shown:
+            video = Video(path, width=width, height=height)
+            model, first = long_model(video, places, numbers)
+            rows += [live_row(video, camera, model, first, every) for every in SEARCHED]
+        return rows
 
 
-def live_row(video: Video, camera: tuple[int, int], places: int, numbers: int) -> Row:
-    model, first = long_model(video, places, numbers)
-    localizer = LiveLocalizer(model)
+def live_row(video: Video, camera: tuple[int, int], model: DejaVu, first: int, every: int) -> Row:
+    localizer = LiveLocalizer(model, PlaceFilter(search_every=every), keep_scores=every == 1)
     found, milliseconds = 0, []
     with FrameReader(shots_of(video)) as feed:
         for shot in feed:
@@ -88,10 +95,10 @@ def live_row(video: Video, camera: tuple[int, int], places: int, numbers: int) -
     with FrameReader(in_real_time(shots_of(video), "drive"), newest=True) as feed:
         for shot in feed:
             localizer(shot.pixels)
-    height, width = video.frame_shape[1:]
+    (height, width), places = video.frame_shape[1:], model.map.places
     return {
         "case": f"{camera[0]} x {camera[1]} on a map of {height} x {width}",
-        "contender": "dejavu",
+        "contender": "dejavu" if every == 1 else f"dejavu, search_every {every}",
         "seconds": p50,
         "seconds_p99": p99,
         "rate": rate,
@@ -102,7 +109,7 @@ def live_row(video: Video, camera: tuple[int, int], places: int, numbers: int) -
         "places": places,
         "route_bytes_per_place": model.map.summary().route_bytes / places,
         "threads": torch.get_num_threads(),
-        "parts": parts_of(model, video),
+        "parts": parts_of(model, video, every),
     }
 
 
@@ -150,25 +157,29 @@ def long_model(video: Video, places: int, numbers: int) -> tuple[DejaVu, int]:
     return model, middle * len(own)
 
 
-def parts_of(model: DejaVu, video: Video) -> dict[str, float]:
+def parts_of(model: DejaVu, video: Video, every: int) -> dict[str, float]:
     """Seconds of each part of a frame's way by itself, the median of some runs."""
-    localizer, whitening = LiveLocalizer(model), model.whitening
+    whitening, filter = model.whitening, PlaceFilter(search_every=every)
     assert whitening is not None
-    assert localizer.sequence is not None
     began = time.perf_counter()
     decoded = sum(1 for _ in video.batches(1))
     seconds = {"decoding": (time.perf_counter() - began) / decoded}
     (frame,) = video.between(0, 1)
     features, unpacked = model.describe(frame), whitening.unpacked()
     descriptor = whitening(features, unpacked)
-    scores = model.map.scores(descriptor)
-    filter, state = localizer.sequence, localizer.sequence.start(model.map.places)
+    scores, state = model.map.scores(descriptor), filter.start(model.map.places)
     works: dict[str, Callable[[], object]] = {
         "features": lambda: model.describe(frame),
         "whitening": lambda: whitening(features, unpacked),
-        "scores": lambda: model.map.scores(descriptor),
-        "filter": lambda: filter.step(scores, state),
+        "search": lambda: model.localize_descriptors(descriptor),
     }
+    if every == 1:
+        works["scores"] = lambda: model.map.scores(descriptor)
+        works["filter"] = lambda: filter.step(scores, state)
+    else:  # together, of a frame that others led to
+        near = model.localizer(model.matching(filter))
+        near(descriptor.expand(WARM, -1))
+        works["scores and filter"] = lambda: near(descriptor)
     for name, work in works.items():
         timer = Timer("work()", globals={"work": work}, num_threads=torch.get_num_threads())
         seconds[name] = timer.blocked_autorange().median
@@ -182,11 +193,11 @@ def run_live(*, out: Path) -> list[str]:
         out: folder for bench.json and bench.png
     """
     rows = bench_live()
-    parts = {row["case"]: {"dejavu": row["seconds"]} | row["parts"] for row in rows}
+    parts = {f"{row['case']}: {row['contender']}": {"dejavu": row["seconds"]} | row["parts"] for row in rows}
     drawn = {case: {name: 1e3 * value for name, value in own.items()} for case, own in parts.items()}
     picture = plot_ratios(drawn, "milliseconds a frame (p50), and of each part by itself")
     write_bench(out, rows, picture, rate=RATE)
     columns: dict[str, Column] = {name: (name, ".1f", 1e-3) for row in rows for name in row["parts"]}
-    figures = table([row | row["parts"] for row in rows], COLUMNS | columns, "{case}")
+    figures = table([dict.fromkeys(columns) | row | row["parts"] for row in rows], COLUMNS | columns)
     note = "100000 places; found: within 5; from decoding on: milliseconds of each part by itself"
     return [figures, note]

@@ -7,7 +7,7 @@ import math
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,6 +31,7 @@ from benchmarks.scale_contenders import (
     PLACED,
     PROBED_AT_LEAST,
     REPEATED,
+    REQUESTED,
     ROTATED,
     ROWS,
     SEARCHED,
@@ -282,11 +283,14 @@ def spread(places: int) -> Tensor:
     return torch.arange(count) * (places // count)
 
 
-def bench_scale(places: Sequence[int] = (), device: str = "cpu") -> Iterator[Row]:
+def bench_scale(
+    places: Sequence[int] = (), device: str = "cpu", contenders: Sequence[str] = ()
+) -> Iterator[Row]:
     """All contenders at all sizes, a row at a time.
 
     Args:
         places: N of each size, `PLACES` where none is given. device: that our maps localize on.
+        contenders: in place of all those of the cases `places=N`, of which alone there are rows then.
 
     Yields:
         Rows of the cases `places=N`: up to `RENDERED` places `sim:aerial`, beyond it descriptors that are
@@ -294,14 +298,17 @@ def bench_scale(places: Sequence[int] = (), device: str = "cpu") -> Iterator[Row
         `repeat=N`: ground that repeats, see `TiledRoute`; `templates=N`: see `bench_templates`.
 
     Raises:
-        InputError: too few places or too many, or no room for their descriptors.
+        InputError: too few places or too many, an unknown contender, or no room for the descriptors.
     """
+    if unknown := set(contenders) - PLACED.keys():
+        raise InputError(f"contenders are {sorted(unknown)}; expected of {list(PLACED)}")
     sizes = sorted(set(places or PLACES))
     if sizes[0] < FEWEST or sizes[-1] > MOST:
         raise InputError(f"bench scale got places {sizes}; expected {FEWEST} to {MOST} each")
     made = [n for n in sizes if n > RENDERED]
-    whole = [] if places else [LONGEST["repeat"]]  # cycles of both tiles
-    repeating = [n for n in sizes if n <= LONGEST["repeat"]] + whole
+    placed = contenders or [name for name in PLACED if name not in REQUESTED]
+    whole = [] if places or contenders else [LONGEST["repeat"]]  # cycles of both tiles
+    repeating = [] if contenders else [n for n in sizes if n <= LONGEST["repeat"]] + whole
     with temporary_folder(Path(tempfile.gettempdir())) as path:
         folder = Folder(path, RENDERED if made else sizes[-1])
         if made:
@@ -309,13 +316,15 @@ def bench_scale(places: Sequence[int] = (), device: str = "cpu") -> Iterator[Row
         if repeating:
             folder.draw_again(repeating[-1], max([n for n in repeating if n <= RENDERED], default=0))
         for n in sizes:
-            if n in made[:1]:  # ahead of which made descriptors are checked
-                yield from rows_of(folder, "made", "made", CHECKED, device)
-            yield from rows_of(folder, "places", "made" if n in made else "drawn", n, device)
+            if n in made[:1] and not contenders:  # ahead of which made descriptors are checked
+                yield from rows_of(folder, "made", "made", CHECKED, device, placed)
+            yield from rows_of(folder, "places", "made" if n in made else "drawn", n, device, placed)
             if n in repeating:
-                yield from rows_of(folder, "repeat", "tiles", n, device)
+                yield from rows_of(folder, "repeat", "tiles", n, device, REPEATED)
         for n in whole:
-            yield from rows_of(folder, "repeat", "tiles", n, device)
+            yield from rows_of(folder, "repeat", "tiles", n, device, REPEATED)
+    if contenders:
+        return
     for row in bench_templates(sizes if places else TEMPLATES):  # a query by itself takes as long as of many
         count, size = int(row["case"].partition("=")[2]), row["file_bytes"]
         same = {key: row[key] for key in ("seconds", "peak_bytes", "threads", "skipped", "difference")}
@@ -323,12 +332,14 @@ def bench_scale(places: Sequence[int] = (), device: str = "cpu") -> Iterator[Row
         yield scale_row(row["case"], row["contender"], count, **same)
 
 
-def rows_of(folder: Folder, kind: str, source: str, places: int, device: str) -> Iterator[Row]:
-    """The contenders of a case, `kind=places`."""
+def rows_of(
+    folder: Folder, kind: str, source: str, places: int, device: str, names: Iterable[str]
+) -> Iterator[Row]:
+    """Contenders of a case, `kind=places`."""
     case, threads = f"{kind}={places}", torch.get_num_threads()
     folder.ask(case, source, places)
     room = step = 0.0
-    for name in REPEATED if kind == "repeat" else PLACED:
+    for name in names:
         if places > SHUFFLED and (name == FLOWN or name.startswith("null")):
             why = "noisy frames are drawn" if name == FLOWN else "shuffled orders are"
             yield scale_row(case, name, places, skipped=f"{why} of at most {SHUFFLED} places")
@@ -340,18 +351,21 @@ def rows_of(folder: Folder, kind: str, source: str, places: int, device: str) ->
         yield row
 
 
-def run_scale(*, out: Path, places: Sequence[int] = (), device: str = "cpu") -> list[str]:
+def run_scale(
+    *, out: Path, places: Sequence[int] = (), device: str = "cpu", contenders: Sequence[str] = ()
+) -> list[str]:
     """Time, memory, bytes and accuracy over the number of places, beside the indexes of faiss.
 
     Args:
         out: folder for bench.json and bench.png
         places: 10000, 100000 and 1000000 if not given
         device: what localizes: as of `dejavu localize`
+        contenders: by name, in this order; all but "usearch int8" if not given
     """
     device = str(device_of(device))
     rows: list[Row] = []
     facts: dict[str, Any] = {"tolerance": TOLERANCE, "device": device, "faiss": FAISS}
-    bar = tqdm(bench_scale(places, device), "rows", disable=None, leave=False)
+    bar = tqdm(bench_scale(places, device, contenders), "rows", disable=None, leave=False)
     try:
         for row in bar:
             rows = with_ratios([*rows, row])

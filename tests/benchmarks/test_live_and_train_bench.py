@@ -25,12 +25,16 @@ def test_every_frame_is_found_and_timed(
     benchmark("live", "--out", tmp_path)
     assert "filter" in capsys.readouterr().out
     rows = json.loads((tmp_path / "bench.json").read_text())["rows"]
-    assert [row["case"] for row in rows] == [f"96 x 128 on a map of {by}" for by in ("48 x 64", "32 x 48")]
+    cases = [f"96 x 128 on a map of {by}" for by in ("48 x 64", "32 x 48")]
+    assert [(row["case"], row["contender"]) for row in rows] == [
+        (case, ours) for case in cases for ours in ("dejavu", "dejavu, search_every 50")
+    ]
     for row in rows:
         assert 0 < row["seconds"] <= row["seconds_p99"]
         assert row["recall_at_1"] > 0.8
         assert 0 <= row["dropped"] < row["frames"] == 40
-        assert set(row["parts"]) == {"decoding", "features", "whitening", "scores", "filter"}
+        scored = {"scores", "filter"} if row["contender"] == "dejavu" else {"scores and filter"}
+        assert set(row["parts"]) == {"decoding", "features", "whitening", "search", *scored}
         assert sum(row["parts"].values()) > row["seconds"] / 10
     assert (tmp_path / "bench.png").is_file()
 

@@ -14,7 +14,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 from command_line import benchmark
-from helpers import all_of
+from helpers import all_of, refused
 from safetensors.torch import save_file
 from torch import Tensor
 
@@ -160,6 +160,15 @@ def _small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scale_contenders, "CHUNK", 128)
     for name in PLACED.keys() - {"dejavu 4 B", "dejavu 4 B, one chunk", "null 4 B", "faiss flat"}:
         monkeypatch.delitem(PLACED, name)
+
+
+@pytest.mark.usefixtures("_small")
+def test_contenders_are_chosen_by_name(tmp_path: Path) -> None:
+    benchmark("scale", "--places", "900", "--contenders", "faiss flat", "--out", tmp_path)
+    rows = json.loads((tmp_path / "bench.json").read_text())["rows"]
+    assert [(row["case"], row["contender"]) for row in rows] == [("places=900", "faiss flat")]
+    with refused("contenders are ['grep']", "faiss flat"):
+        list(scale.bench_scale([900], contenders=["grep"]))
 
 
 @pytest.mark.usefixtures("_small")
