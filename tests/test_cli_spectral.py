@@ -116,7 +116,7 @@ def test_learn_and_info_tell_what_the_map_holds(folder: Path, capsys: pytest.Cap
         assert f"whitening {summary.fixed['whitening']}" in told
         assert "1764 to 24 numbers" in told
         assert "views=2" in told
-        assert "needs about" not in told
+        assert "less than half" not in told
     assert "route_bytes_per_place=None" in info
 
 
