@@ -27,7 +27,7 @@ from dejavu_torch.learning import (
 )
 from dejavu_torch.maps.file import checksums, digests
 from dejavu_torch.maps.frame_table import FrameTable
-from dejavu_torch.maps.spectral import SpectralMapper, code_chunk
+from dejavu_torch.maps.spectral import HALF, SpectralMapper, code_chunk
 from dejavu_torch.maps.spectral_map import LARGEST, Chunk, SpectralMap
 from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import Recipe, difference, recipe_of, run_key, weights_of
@@ -37,6 +37,7 @@ from dejavu_torch.types import InputError, Traverse
 log = logging.getLogger("dejavu_torch")
 
 EXACT = 2**24  # places whose positions float32 tells apart
+FAR = 0.1  # from one share of a variance to another that is told
 
 
 @torch.no_grad()
@@ -98,10 +99,30 @@ def append(
     if len(positions):
         grown.positions = torch.cat([route.positions, positions_behind(positions, route.places)])
     grown.check()
+    _tell_held(route, grown, getattr(model.mapper, "hold", None))
     frames = len(positions) or places
     names = [model.frame_names, names_of(source_of(added), frames)]
     model.frame_names = _joined_names(names, [route.table.frames, frames])
     return model.replace_map(grown)
+
+
+def _tell_held(before: SpectralMap, grown: SpectralMap, hold: float | None) -> None:
+    """Say what share of their variance appended places hold in the map's step, if that is unlike before.
+
+    Args:
+        hold: of the mapper. A file does not tell what its places hold; without `hold` under half is told.
+    """
+    energy, error = grown.energy - before.energy, grown.error - before.error
+    if energy <= 0:  # they are like the mean
+        return
+    held = 1 - error / energy
+    usual = hold if before.held is None and not before.resolution else before.held
+    far = held < HALF if usual is None else abs(held - usual) > FAR
+    if far:
+        log.warning(
+            "the %d places behind hold %.2g of their variance in the map's step%s",
+            *(grown.places - before.places, held, "" if usual is None else f", those before {usual:.2g}"),
+        )
 
 
 def learn_mean(

@@ -41,7 +41,7 @@ SAMPLE = 10_000  # frames that a route is fitted on; a route that has no more is
 STRETCHES = 4  # of a sample, at least
 ROWS = 4096  # descriptors on the device at a time
 FEW = IN_MEMORY // 4  # bytes of descriptors kept in memory
-OFF = 0.02  # deviation from the bytes per place asked for that is logged
+OFF = 0.02  # deviation from the bytes per place, or the share, asked for that is logged
 LONGEST_SEGMENT = 512  # queries that a filter follows in a calibration
 SEGMENT_SCORES = 2**22  # of the queries of a segment at all places
 CALIBRATION_SCORES = 2**30  # of all frames of a calibration at all places
@@ -508,7 +508,11 @@ def learn_descriptors(mapper: Mapper, descriptors: Tensor) -> PlaceMap:
 
 
 def log_reached(route: SpectralMap, mapper: SpectralMapper) -> None:
-    """The bytes of a long route, and the variance that it holds, if the sample promised other bytes."""
+    """The bytes of a long route, and the variance that it holds, if the sample promised others."""
+    hold, held = mapper.hold, route.held or 0
+    if hold is not None and not mapper.resolution and abs(held - hold) > OFF:
+        seen = "hold is %g, and the lines hold %.3g of the variance: their step is of %d of %d places"
+        log.warning(seen, *(hold, held, SAMPLE, route.places))
     wanted, places, summary = mapper.budget, route.places, route.summary()
     if wanted is None or summary.route_bytes - summary.route["lines"] >= wanted * places:
         return
@@ -518,7 +522,7 @@ def log_reached(route: SpectralMap, mapper: SpectralMapper) -> None:
         log.warning(
             "route_bytes_per_place is %g, and the route takes %.3g, for %.0f %% of its variance: its step is "
             "of %d of its %d places",
-            *(wanted, reached, 100 * (route.held or 0), SAMPLE, places),
+            *(wanted, reached, 100 * held, SAMPLE, places),
         )
 
 

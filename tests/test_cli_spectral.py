@@ -116,7 +116,7 @@ def test_learn_and_info_tell_what_the_map_holds(folder: Path, capsys: pytest.Cap
         assert f"whitening {summary.fixed['whitening']}" in told
         assert "1764 to 24 numbers" in told
         assert "views=2" in told
-        assert "needs about" not in told
+        assert "less than half" not in told
     assert "route_bytes_per_place=None" in info
 
 
@@ -170,13 +170,47 @@ def test_a_route_of_noise_says_what_it_needs(folder: Path, capsys: pytest.Captur
     source, options = folder / "noise.npy", ("--whitening", "none")
     budget = "--mapper.route_bytes_per_place", "1"
     run("learn", source, "--map", folder / "noise.safetensors", *options, *budget)
-    (line,) = [told for told in capsys.readouterr().out.splitlines() if "needs about" in told]
-    needed = line.removeprefix("this route needs about ").removesuffix(" bytes per place")
-    assert 5 < float(needed) < 20
+    (line,) = [told for told in capsys.readouterr().out.splitlines() if "less than half" in told]
+    (needed,) = re.findall(r"about ([\d.]+) bytes per place would hold 0.85", line)
+    assert 15 < float(needed) < 30
     run("compare", source, source, *options, *budget, "--out", folder / "noise")
     assert line in capsys.readouterr().out.splitlines()
     run("learn", source, "--map", folder / "n.safetensors", *options, *budget[:1], needed)
-    assert "needs about" not in capsys.readouterr().out
+    assert "less than half" not in capsys.readouterr().out
+
+
+def test_a_map_that_holds_a_share(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """By a word or a file; the map knows it, and a budget beside it is refused."""
+    path, config = folder / "held.safetensors", folder / "hold.yaml"
+    config.write_text("mapper: {class_path: SpectralMapper, init_args: {hold: 0.9, chunk: 300}}\n")
+    options = "--whitening", "none", "--calibration", "none"
+    run("learn", folder / "noise.npy", "--map", path, "--config", config, *options)
+    by_file = DejaVu.load(path).mapper
+    assert isinstance(by_file, SpectralMapper)
+    assert (by_file.hold, by_file.route_bytes_per_place, by_file.chunk) == (0.9, None, 300)
+    first = DejaVu.load(path)
+    run(
+        "learn",
+        folder / "noise.npy",
+        "--map",
+        path,
+        "--mapper.chunk",
+        "300",
+        "--mapper.hold",
+        "0.9",
+        *options,
+    )
+    assert torch.equal(first.map.streams, DejaVu.load(path).map.streams)
+    capsys.readouterr()
+    run("info", path)
+    assert "hold=0.9" in capsys.readouterr().out
+    words = "learn", folder / "noise.npy", "--map", path, "--config", config, *options
+    for option in ("route_bytes_per_place", "step"):
+        error = fails(capsys, *words, f"--mapper.{option}", "0.5")
+        assert f"{option} is 0.5 and hold is 0.9; expected one of them" in error
+    assert "hold is 1.5; expected a number above 0 and below 1" in fails(
+        capsys, *words, "--mapper.hold", "1.5"
+    )
 
 
 # what is refused

@@ -219,6 +219,25 @@ def test_what_is_held_is_measured_over_the_whole_route() -> None:
     assert model.map.held == pytest.approx(1 - float((own - values).square().sum() / spread), abs=1e-4)
 
 
+def test_a_long_route_holds_the_share_that_its_sample_holds(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    model = DejaVu(whitening="none", mapper=SpectralMapper(hold=0.8, chunk=CHUNK))
+    noise = torch.randn(PLACES, 40, generator=torch.Generator().manual_seed(0))
+
+    def share() -> float | None:
+        route = model.learn(noise, checkpoint=Checkpoint(tmp_path / "m")).map
+        assert isinstance(route, SpectralMap)
+        return route.held
+
+    assert share() == share() == pytest.approx(0.8, abs=0.02)  # the second is of the partial map
+    assert caplog.text == ""
+    (tmp_path / "m.part").unlink()
+    noise[Sample.of(PLACES, CHUNK).frame] *= 0.1  # its fine step holds more of all else
+    assert share() == pytest.approx(1, abs=0.01)
+    assert "hold is 0.8, and the lines hold" in caplog.text
+
+
 def test_the_partial_map_of_another_run_is_refused(tmp_path: Path) -> None:
     part = tmp_path / "map.safetensors.part"
 

@@ -43,7 +43,7 @@ from dejavu_torch.features.views import Views
 from dejavu_torch.learning import SAMPLE as SHORT
 from dejavu_torch.learning import Checkpoint, ChunkCoder, Code
 from dejavu_torch.maps.place_map import Mapper, PlaceMap
-from dejavu_torch.maps.spectral import SpectralMapper
+from dejavu_torch.maps.spectral import HELD, SpectralMapper
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import REGISTRY, recipe_of, with_parts
@@ -639,7 +639,7 @@ def _print_steps(traverse: Traverse) -> None:
 
 
 def print_map(model: DejaVu) -> None:
-    """What a map holds, and what it would need where that is next to nothing."""
+    """What a map holds, and what would hold more where that is little."""
     summary = model.summary()
     if summary.places and not summary.covered:
         print("this route does not repeat")
@@ -654,7 +654,8 @@ def print_map(model: DejaVu) -> None:
         numbers = " to ".join(str(count) for count in (len(whitening.projection), len(whitening.scale)))
         print(f"Whitening, {numbers} numbers: {whitening.extra_repr()}")
     if isinstance(model.map, SpectralMap) and model.map.needed is not None:
-        print(f"this route needs about {model.map.needed:.2g} bytes per place")
+        more = f"about {model.map.needed:.3g} bytes per place would hold {HELD}, as --mapper.hold {HELD} does"
+        print(f"the lines hold less than half of the descriptors' variance: {more}")
 
 
 def route_lines(route: PlaceMap) -> list[str]:

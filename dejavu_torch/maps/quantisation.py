@@ -105,12 +105,15 @@ class RouteLines:
 
     def step_of(self, room: float) -> float:
         """The smallest step in which the lines take so many bytes, or fewer; of a long route, about it."""
-        return self._smallest_step(self.coded_bytes, room, CLOSE if self.lines.numel() > BLOCK else 1.0)
+        return self._steps_around(self.coded_bytes, room, CLOSE if self.lines.numel() > BLOCK else 1.0)[1]
 
     def step_that_holds(self, share: float) -> float:
-        """The smallest step in which the lines hold less than a share of the variance."""
-        most = math.nextafter(share, 0)
-        return self._smallest_step(lambda step: 1 - self.error(step) / self.energy, most)
+        """The largest step in which the lines hold a share of the variance, or the finest there is."""
+        return self._steps_around(self.held, math.nextafter(share, 0))[0]
+
+    def held(self, step: float) -> float:
+        """The share of the variance that lines in such steps hold."""
+        return 1 - self.error(step) / self.energy
 
     @cached_property
     def coarsest(self) -> float:
@@ -134,8 +137,11 @@ class RouteLines:
             width = None if self.width is None else self.width[rows]
             yield self.lines[rows], quantise(self.lines[rows], step, width)
 
-    def _smallest_step(self, value: Callable[[float], float], most: float, close: float = 1.0) -> float:
-        """The smallest step whose falling value is at most `most`, by bisection of its logarithm."""
+    def _steps_around(
+        self, value: Callable[[float], float], most: float, close: float = 1.0
+    ) -> tuple[float, float]:
+        """The largest step whose falling value is above `most`, and the smallest whose is not, by bisection
+        of their logarithm; the finest is both if no value is above."""
         finest = self.scale / FINEST
         low, high = math.log(finest), math.log(self.coarsest)
         for _ in range(HALVINGS):
@@ -144,4 +150,6 @@ class RouteLines:
             low, high = (low, middle) if found <= most else (middle, high)
             if close * most <= found < most:
                 break
-        return finest if low == math.log(finest) and value(finest) <= most else math.exp(high)
+        if low == math.log(finest):
+            return finest, finest if value(finest) <= most else math.exp(high)
+        return math.exp(low), math.exp(high)

@@ -19,9 +19,9 @@ from dejavu_torch.types import InputError
 log = logging.getLogger("dejavu_torch")
 
 ROWS = 2**14  # of descriptors, checked at a time
-LITTLE = 0.1  # of the variance: a map that holds less says what it needs
+HALF = 0.5  # of the variance: a map that holds less says which bytes would hold `HELD`
+HELD = 0.85  # of the variance: such maps find nearly what their descriptors find
 ROUTE_BYTES = 5.0  # per place by default
-HELD = 0.85  # of the variance, where that default does not apply
 
 
 class SpectralMapper(Mapper):
@@ -30,19 +30,23 @@ class SpectralMapper(Mapper):
     Args:
         route_bytes_per_place: bytes of the map for each place, without those that do not grow with the route;
             the step is the smallest whose coded lines fit. Positions of frames count, but come on top, with a
-            warning, if they would leave the lines less than half. None, without a step, is 5; more if that
-            holds less than .85 of the variance of ready features, or if mean and chunks alone take it.
-        step: the step itself, in units of the descriptor; route_bytes_per_place is then None.
+            warning, if they would leave the lines less than half. None, without step and hold, is 5; more if
+            that holds less than .85 of the variance of ready features, or if mean and chunks alone take it.
+        step: the step itself, in units of the descriptor, in place of the bytes.
         chunk: places of a chunk. Shorter chunks cost more bytes; a route no longer than one has one.
         transform, metric: of the maps, see `SpectralMap`.
         resolution: places; 0 codes all lines alike. The dead zone of a line of period P is
             1 + (resolution / P)^2 times as wide. For video with many frames for each place that a user tells
             apart 8 makes a better map; if every frame is another place it makes a worse one.
+        hold: in place of the bytes, the share of the descriptors' variance that the lines hold, such as .85:
+            1 - the sum of squares of what is missing / that of the differences from the mean. The step is
+            the largest that holds it; `resolution` then leaves out lines that count in it.
 
     Shape: descriptors (N,K) -> SpectralMap of N places.
 
     Convention: the written route is within 2 % of the budget and not above it, unless steps so fine that they
-        change no score take less.
+        change no score take less. Without `resolution` the share that a map holds is at least `hold`, unless
+            even such steps hold less; that of a long route is as its sample tells.
 
     Raises:
         InputError: settings out of range; forward: fewer than two places, descriptors that are not finite or
@@ -65,16 +69,20 @@ class SpectralMapper(Mapper):
         transform: Transform = "dft",
         metric: SpectralMetric = "cosine",
         resolution: float = 0.0,
+        hold: float | None = None,
     ) -> None:
         super().__init__()
-        if route_bytes_per_place is not None and step is not None:
-            seen = f"route_bytes_per_place is {route_bytes_per_place} and step is {step}"
-            raise InputError(f"{seen}; expected one of them, the other None")
-        for name, value in (("route_bytes_per_place", route_bytes_per_place), ("step", step)):
-            if value is not None and not 0 < value < math.inf:
-                raise InputError(f"{name} is {value}; expected a number above 0")
-        self.route_bytes_per_place, self.step, self.chunk = route_bytes_per_place, step, chunk
-        self.transform, self.metric, self.resolution = transform, metric, resolution
+        every = {"route_bytes_per_place": route_bytes_per_place, "step": step, "hold": hold}
+        given = {name: value for name, value in every.items() if value is not None}
+        if len(given) > 1:
+            seen = " and ".join(f"{name} is {value}" for name, value in given.items())
+            raise InputError(f"{seen}; expected one of them, None for the rest")
+        for name, value in given.items():
+            if not 0 < value < (1 if name == "hold" else math.inf):
+                share = " and below 1, such as 0.85" if name == "hold" else ""
+                raise InputError(f"{name} is {value}; expected a number above 0{share}")
+        self.route_bytes_per_place, self.step, self.hold = route_bytes_per_place, step, hold
+        self.chunk, self.transform, self.metric, self.resolution = chunk, transform, metric, resolution
         self.overhead, self.ready = 0, False  # see `with_overhead`
         self.empty()  # checks the settings
 
@@ -90,8 +98,8 @@ class SpectralMapper(Mapper):
     @property
     def budget(self) -> float | None:
         """Bytes per place; None where a step, or the variance that a map holds, decides."""
-        own = self.route_bytes_per_place is not None or self.step is not None or self.ready
-        return self.route_bytes_per_place if own else ROUTE_BYTES
+        default = self.step is None and self.hold is None and not self.ready
+        return ROUTE_BYTES if self.route_bytes_per_place is None and default else self.route_bytes_per_place
 
     @torch.no_grad()
     def forward(self, features: Tensor) -> SpectralMap:
@@ -118,7 +126,7 @@ class SpectralMapper(Mapper):
         return other
 
     def extra_repr(self) -> str:
-        names = ("route_bytes_per_place", "step", "chunk", "transform", "metric", "resolution")
+        names = ("route_bytes_per_place", "step", "chunk", "transform", "metric", "resolution", "hold")
         return ", ".join(f"{name}={getattr(self, name)!r}" for name in names)
 
     def _fitted(self, features: Tensor, chunk: int) -> tuple[SpectralMap, RouteLines]:
@@ -141,15 +149,17 @@ class SpectralMapper(Mapper):
                 )
         step = float(torch.tensor(self._fitting_step(lines, fixed)))  # as the file holds it
         route = self._map(lines.mean[None], step)
-        if 1 - lines.error(step) / lines.energy < LITTLE:
-            even = lines.even()
-            route.needed = (fixed + even.coded_bytes(even.step_that_holds(0.5))) / places
+        even = lines.even()  # what `resolution` leaves out is not missed
+        if self.hold is None and even.held(step) < HALF:
+            route.needed = (fixed + lines.coded_bytes(even.step_that_holds(HELD))) / places
         return route, lines
 
     def _fitting_step(self, lines: RouteLines, fixed: int) -> float:
         """The smallest step whose coded lines fit into the budget, to 2 %, or the mapper's own step."""
         if self.step is not None:
             return self.step
+        if self.hold is not None:
+            return lines.even().step_that_holds(self.hold)
         places, numbers = lines.lines.shape
         given = self.route_bytes_per_place
         nothing = lines.coded_bytes(lines.coarsest)

@@ -93,8 +93,8 @@ class SpectralMap(PlaceMap):
         norms: (N,) float32, of the descriptors that the map holds; 0 for next to none (`MIN_NORM`).
 
     Attributes:
-        chunks: the places [start, stop) of each. needed: bytes per place that would hold half the variance
-            of a learned route of which this map holds under a tenth, else None.
+        chunks: the places [start, stop) of each. needed: bytes per place that would hold .85 of the variance
+            of a learned route, if its bytes or its step hold less than half, else None.
         energy, error: sums over the chunks that were added, not loaded; see `Chunk`.
 
     Args:

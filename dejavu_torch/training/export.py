@@ -22,6 +22,7 @@ from dejavu_torch.evaluation.curves import Scores
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import Views, augmented_segments
 from dejavu_torch.features.whitening import STRENGTHS
+from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.localizer import SINGLE
@@ -198,6 +199,9 @@ def beside_untrained(
     hog = hog_baselines(reference, query, model.batch_size, tolerance)
     found |= {HOG: hog["hog"].found} if hog else {}
     mapper = None if isinstance(model.mapper, TemplateMapper) else copy.deepcopy(model.mapper)
+    if isinstance(mapper, SpectralMapper) and mapper.budget is None:  # another descriptor takes other bytes
+        mapper.route_bytes_per_place = model.map.summary().route_bytes / model.map.places
+        mapper.step = mapper.hold = None
     try:
         preprocess = Preprocess(size=model.preprocess.size)
         untrained = DejaVu(mapper=mapper, batch_size=model.batch_size, preprocess=preprocess)

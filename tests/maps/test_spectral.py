@@ -163,6 +163,36 @@ def test_a_step_of_ones_own() -> None:
     assert coarse.summary().route_bytes < fine.summary().route_bytes
 
 
+@pytest.mark.parametrize("settings", SETTINGS)
+def test_the_lines_hold_the_share_that_is_asked_for(settings: dict[str, Any]) -> None:
+    descriptors = route(403)
+    sizes = []
+    for hold in (0.3, 0.85, 0.99):
+        learned = SpectralMapper(hold=hold, **settings | {"resolution": 0.0})(descriptors)
+        missing = (held(learned) - descriptors).square().sum()
+        spread = (descriptors - learned.means[0].float()).square().sum()
+        assert learned.held is not None
+        assert learned.held == pytest.approx(1 - float(missing / spread), abs=1e-5)
+        assert hold - 1e-6 <= learned.held < hold + 0.01  # few lines: one of them is over a thousandth
+        assert learned.needed is None
+        sizes.append(learned.summary().route_bytes)
+    assert sizes[0] < sizes[1] < sizes[2]
+    coarse = SpectralMapper(hold=0.99, **settings)(descriptors)  # what `resolution` leaves out counts
+    assert coarse.step == learned.step
+    assert (coarse.held < learned.held) == (coarse.resolution > 0)
+
+
+def test_the_step_that_holds_most_of_white_noise_is_known() -> None:
+    """What is missing of a number lies between -.35 and .65 of a step."""
+    noise = torch.randn(4000, 16, generator=torch.Generator().manual_seed(0))
+    for hold, transform in ((0.99, "dft"), (0.999, "dct")):
+        step = SpectralMapper(hold=hold, transform=transform)(noise).step
+        assert step**2 * (0.65**3 + 0.35**3) / 3 == pytest.approx(1 - hold, rel=0.02)
+    finest = SpectralMapper(hold=1 - 1e-9)(noise)  # no finer step changes a score
+    assert finest.step == pytest.approx(1 / 64, rel=0.01)
+    assert finest.held > 0.9999
+
+
 def waves(cycles: int, period: int = 20) -> Tensor:
     """Four features of three harmonics each, a whole number of cycles."""
     time = torch.arange(cycles * period, dtype=torch.float64)[:, None] * (2 * math.pi / period)
@@ -234,15 +264,18 @@ def test_a_place_without_a_descriptor_scores_cosine_0() -> None:
     assert gradient.isfinite().all()
 
 
-def test_noise_tells_what_half_of_its_variance_needs() -> None:
+def test_noise_tells_what_would_hold_its_variance() -> None:
     noise = torch.randn(800, 60, generator=torch.Generator().manual_seed(0))
     needed = SpectralMapper(0.8)(noise).needed
     assert needed is not None
     learned = SpectralMapper(needed)(noise)
     assert learned.needed is None
     share = 1 - (held(learned) - noise).square().mean() / noise.var()
-    assert 0.45 < share < 0.55
+    assert 0.84 < share < 0.86
+    asked = SpectralMapper(hold=0.85)(noise).summary().route_bytes / 800
+    assert asked == pytest.approx(needed, rel=1e-6)
     assert SpectralMapper(0.8)(route(800, 60)).needed is None
+    assert SpectralMapper(hold=0.2)(noise).needed is None  # it is what was asked for
     assert SpectralMapper(None, step=100.0)(noise).needed == pytest.approx(needed, rel=0.01)
 
 
@@ -251,7 +284,12 @@ def test_noise_tells_what_half_of_its_variance_needs() -> None:
     [
         ({"route_bytes_per_place": 5.0, "step": 0.1}, ("5.0", "0.1", "None")),
         ({"route_bytes_per_place": math.nan}, ("nan", "above 0")),
+        ({"route_bytes_per_place": 5.0, "hold": 0.85}, ("5.0", "hold is 0.85", "None")),
+        ({"step": 0.1, "hold": 0.85}, ("step is 0.1", "hold is 0.85", "None")),
         ({"step": 0.0}, ("step is 0", "above 0")),
+        ({"hold": 0.0}, ("hold is 0", "below 1")),
+        ({"hold": 1.0}, ("hold is 1.0", "below 1", "0.85")),
+        ({"hold": math.nan}, ("hold is nan", "below 1")),
         ({"chunk": 1}, ("chunk is 1", "at least 2")),
         ({"chunk": "route"}, ("'route'", "10000")),
         ({"transform": "fft"}, ("'fft'", "'dct'")),

@@ -18,7 +18,9 @@ from dejavu_torch.cli.train import MapTrainer
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.features.views import STRETCH, Views
+from dejavu_torch.training import export
 from dejavu_torch.training.export import UNTRAINED, LastCheckpoint, beside_untrained
+from dejavu_torch.types import Match
 
 FRAMES = 320
 MADE = {"mapper": SpectralMapper(6.0), "whitening": "none"}  # a descriptor and its map
@@ -158,6 +160,24 @@ def test_the_untrained_map_is_of_frames_of_the_queries_size(
     scores = beside_untrained(model, reference, query, as_ground_truth(torch.arange(24)[:, None]), 2)
     assert UNTRAINED in scores
     assert len([line for line in warned(caplog) if "brought to" in line]) == (size is not None)
+
+
+@pytest.mark.parametrize("settings", [{"hold": 0.9}, {"step": 1.0}])
+def test_the_untrained_map_takes_as_many_bytes(
+    settings: dict[str, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its own descriptor would take others to hold as much, and a step is in units of the trained one."""
+    reference, query = (ArrayTraverse(footage(noise, 24, 64)) for noise in (0.0, 0.1))
+    model = DejaVu(backbone(), mapper=SpectralMapper(**settings)).learn(reference)  # type: ignore[arg-type]
+    sizes, match = [], export._match
+
+    def noted(model: DejaVu, query: ArrayTraverse) -> Match:
+        sizes.append(model.summary().route_bytes)
+        return match(model, query)
+
+    monkeypatch.setattr(export, "_match", noted)
+    beside_untrained(model, reference, query, as_ground_truth(torch.arange(24)[:, None]), 2)
+    assert sizes[1] == pytest.approx(sizes[0], rel=0.02)
 
 
 # short routes, and channels ------------------------------------------------------------------------------
