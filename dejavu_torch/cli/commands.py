@@ -651,8 +651,8 @@ def print_map(model: DejaVu) -> None:
         print(f"each place is the mean of {counts.mean():.3g} visits ({counts.min():g} to {counts.max():g})")
     whitening = model.whitening
     if whitening is not None:
-        numbers = " to ".join(str(count) for count in (len(whitening.projection), len(whitening.scale)))
-        print(f"Whitening, {numbers} numbers: {whitening.extra_repr()}")
+        sizes = " + ".join(map(str, whitening.sizes))
+        print(f"Whitening, {sizes} to {len(whitening.scale)} numbers: {whitening.extra_repr()}")
     if isinstance(model.map, SpectralMap) and model.map.needed is not None:
         print(f"this route needs about {model.map.needed:.2g} bytes per place")
 
