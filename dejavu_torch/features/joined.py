@@ -19,8 +19,7 @@ class Joined(nn.Module):
         members: modules (B,C,H,W) -> (B,D_i), any whatsoever; all see the same frames.
 
     Attributes:
-        groups: how many features each member made of the frames seen last, in order; None before. The
-            whitening that is learned from them whitens each by itself.
+        groups: features of each member, of the frames seen last; the whitening learned from them takes these.
 
     Shape: (B,C,H,W) -> (B, D_1 + D_2 + ..).
 

@@ -205,6 +205,10 @@ def test_a_list_in_a_config_file(folder: Path) -> None:
 def test_learn_and_localize(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run(*LEARN, LIST)
     assert "Whitening, 1764 + 2048 to 15 numbers" in capsys.readouterr().out
+    run("info", "map.safetensors")
+    told = capsys.readouterr().out
+    assert "HOG: orientations=9" in told
+    assert "PatchPixels: size=(32, 64), patch=8, channel='grey'" in told
     run("localize", "map.safetensors", f"{ROUTE}&traverse=1", "--out", "matches.csv")
     rows = [line.split(",") for line in (folder / "matches.csv").read_text().splitlines()[1:]]
     assert sum(abs(int(query) - int(place)) <= 5 for query, place, *_ in rows) > 50
