@@ -687,8 +687,9 @@ def own_size(features: nn.Module, block: bool = False) -> tuple[int, int] | None
     """The size (height, width) that features resize frames to, if a class of this package does; the largest
     of joined ones. With `block` a block of HOG is one, too."""
     if isinstance(features, Joined):
-        sizes = [size for member in features.members if (size := own_size(member, block))]
-        return (max(size[0] for size in sizes), max(size[1] for size in sizes)) if sizes else None
+        found = [own_size(member, block) for member in features.members]
+        sizes = [one for one in found if one is not None]
+        return (max(height for height, _ in sizes), max(width for _, width in sizes)) if sizes else None
     size: tuple[int, int] | None = getattr(features, "resize", None) if type(features) in CLASSES else None
     if size is None and block and type(features) is HOG:
         size = (features.cell * features.block,) * 2

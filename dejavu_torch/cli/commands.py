@@ -511,13 +511,13 @@ def run_info(map: Path, *, features: nn.Module | None = None, command: str) -> N
     if model.frame_shape is not None:
         kind = "frames of " if len(model.frame_shape) == 3 else "ready features, "
         print(f"learned from {kind}{' x '.join(str(n) for n in model.frame_shape)}")
-    features = [*getattr(model.features, "members", [model.features])]
-    parts = [model.preprocess, *features, model.mapper, *model.mapper.children()]
+    made_by = [*getattr(model.features, "members", [model.features])]
+    parts = [model.preprocess, *made_by, model.mapper, *model.mapper.children()]
     if model.step is not None and model.velocity is not None:
         print(f"places are {model.step:.4g} pixels of ground apart")
         parts.append(model.velocity)
     for part in parts:
-        if part in parts[: 2 + len(features)] or part.extra_repr():
+        if part in parts[: 2 + len(made_by)] or part.extra_repr():
             print(f"{type(part).__name__}: {part.extra_repr()}")
     if model.trained is not None:
         steps, seed = model.trained

@@ -210,12 +210,11 @@ class Whitening(nn.Module):
         # bf16 is too coarse for the small differences that whitening enlarges
         with torch.autocast(descriptors.device.type, enabled=False):
             exact = descriptors.to(torch.promote_types(descriptors.dtype, torch.float32))
-            _, *members = self.parts
-            whole, *inner = [part.whole for part in self.parts] if unpacked is None else unpacked
-            if members:
-                each = zip(members, exact.split(sizes, 1), inner, strict=True)
-                exact = torch.cat([member._projected(*own) for member, *own in each], 1)
-            return self._projected(exact, whole)
+            wholes = [part.whole for part in self.parts] if unpacked is None else unpacked
+            if len(self.members):
+                each = zip(self.parts[1:], exact.split(sizes, 1), wholes[1:], strict=True)
+                exact = torch.cat([member._projected(own, whole) for member, own, whole in each], 1)
+            return self._projected(exact, wholes[0])
 
     def _projected(self, exact: Tensor, whole: Tensor) -> Tensor:
         """Rows (B,D) by the own projection, to length 1; whole: (D,K)."""
