@@ -208,9 +208,9 @@ def model_by(whitening: DejaVu | None) -> DejaVu:
 def check(model: DejaVu, reference: Traverse, query: Traverse) -> None:
     """Refuse, before the long work, a pair that does not fit the model or each other."""
     features, whitening = model.describer.check_sizes(reference, query), model.whitening
-    if whitening is not None and whitening.learned and len(whitening.projection) != features:
+    if whitening is not None and whitening.learned and sum(whitening.sizes) != features:
         raise InputError(
-            f"the whitening is of {len(whitening.projection)} features and {reference.name} gives {features} "
+            f"the whitening is of {sum(whitening.sizes)} features and {reference.name} gives {features} "
             "a frame; expected as many, as frames of one size give"
         )
     if reference.length is not None and query.length is not None:

@@ -112,7 +112,8 @@ class Graph(nn.Module):
             parts |= {"preprocess": model.preprocess, "features": model.features}
         if model.whitening is not None and model.whitening.learned:
             whitening = copy.deepcopy(model.whitening)
-            whitening.projection = whitening.whole  # not two numbers to a byte
+            for part in whitening.parts:
+                part.projection = part.whole  # not two numbers to a byte
             parts["whitening"] = whitening
         parts["map"] = Rebuilt(model.map) if isinstance(model.map, SpectralMap) else model.map
         self.parts = nn.ModuleDict(parts)

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.frame_range import Selection
 from dejavu_torch.features.extract import check_alone, feature_batches, warn_of_bright
+from dejavu_torch.features.joined import groups_of
 from dejavu_torch.features.views import (
     LEAST,
     STRETCH,
@@ -140,11 +141,12 @@ class Describer(NamedTuple):
             copies = whitening.copies(*features.shape)
             settings = copies, whitening.most_views, whitening.strengths, whitening.seed
             second, looks = augmented_route(traverse, len(features), *settings)
+        groups = None if is_ready(traverse) else groups_of(self.pipeline)
         if second is None:
-            whitening.learn(features)
+            whitening.learn(features, None, groups)
         else:
             batches = self.features(second.traverse, progress and f"learning what changes: {looks}")
-            whitening.learn(features, _with_places(batches, second.places.to(self.device)))
+            whitening.learn(features, _with_places(batches, second.places.to(self.device)), groups)
         whitening.to(self.device)
 
     def visits(self, views: Views, progress: str | None = None) -> tuple[Tensor, Tensor]:

@@ -19,6 +19,7 @@ from dejavu_torch.data.fitted import at_size, resize_like, size_like
 from dejavu_torch.data.names import names_of
 from dejavu_torch.features.extract import features_of
 from dejavu_torch.features.hog import HOG
+from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import Views
 from dejavu_torch.features.whitening import WIDEST, Whitening
@@ -352,9 +353,7 @@ class DejaVu(nn.Module):
             return traverse
         if shape is None:
             longest = None if traverse.sized else self.preprocess.size
-            least = own_size(self.features)
-            if least is None and type(self.features) is HOG:
-                least = (self.features.cell * self.features.block,) * 2
+            least = own_size(self.features, block=True)
             size, why = reduced_size(own, longest, least), "see preprocess.size"
         else:
             size, why = size_like(own, shape), "the size of the map's frames"
@@ -608,7 +607,7 @@ class DejaVu(nn.Module):
     def features_per_frame(self) -> int:
         """D, that the map was learned from."""
         learned = self.whitening is not None and self.whitening.learned
-        return len(self.whitening.projection) if learned and self.whitening else self.map.dimension
+        return sum(self.whitening.sizes) if learned and self.whitening else self.map.dimension
 
     def check_queries(self, shape: tuple[int, ...], dimension: int, name: str) -> None:
         """Refuse queries that do not fit the map, and warn of frames of another size that do.
@@ -684,9 +683,17 @@ class DejaVu(nn.Module):
             raise InputError(f"{seen}; expected learn(...) of a route with it first")
 
 
-def own_size(features: nn.Module) -> tuple[int, int] | None:
-    """The size (height, width) that features resize frames to, if a class of this package does."""
-    return getattr(features, "resize", None) if type(features) in CLASSES else None
+def own_size(features: nn.Module, block: bool = False) -> tuple[int, int] | None:
+    """The size (height, width) that features resize frames to, if a class of this package does; the largest
+    of joined ones. With `block` a block of HOG is one, too."""
+    if isinstance(features, Joined):
+        found = [own_size(member, block) for member in features.members]
+        sizes = [one for one in found if one is not None]
+        return (max(height for height, _ in sizes), max(width for _, width in sizes)) if sizes else None
+    size: tuple[int, int] | None = getattr(features, "resize", None) if type(features) in CLASSES else None
+    if size is None and block and type(features) is HOG:
+        size = (features.cell * features.block,) * 2
+    return size
 
 
 def check_precision(precision: float | None) -> None:

@@ -21,6 +21,7 @@ from dejavu_torch.data.names import decode_names, encode_names
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.features.hog import HOG
+from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import Views
@@ -61,6 +62,7 @@ CLASSES: tuple[type[nn.Module], ...] = (
     PatchPixels,
     SmallCNN,
     Embedding,
+    Joined,
     Whitening,
     SpectrogramAnalysis,
     ImposedPeriods,
@@ -104,7 +106,9 @@ def recipe_of(module: nn.Module) -> Recipe:
         return Recipe(f"{cls.__module__}.{cls.__qualname__}", {})
     arguments = {name: getattr(module, name) for name in inspect.signature(cls).parameters}
     for name, value in arguments.items():
-        if isinstance(value, nn.Module):
+        if isinstance(value, nn.ModuleList):
+            arguments[name] = [recipe_of(one)._asdict() for one in value]
+        elif isinstance(value, nn.Module):
             arguments[name] = recipe_of(value)._asdict()
     return Recipe(cls.__name__, json.loads(json.dumps(arguments)))  # equal to that read from a file
 
@@ -117,14 +121,18 @@ def recipes_of(model: Any) -> dict[str, Any]:
 
 def with_parts(recipe: Recipe) -> list[Recipe]:
     """A recipe, and those of all its parts."""
-    return [recipe, *(inner for part in _parts(recipe).values() for inner in with_parts(part))]
+    parts = (part for parts in _parts(recipe).values() for part in parts)
+    return [recipe, *(inner for part in parts for inner in with_parts(part))]
 
 
-def _parts(recipe: Recipe) -> dict[str, Recipe]:
-    named = {
-        name: one for name, one in recipe.init_args.items() if isinstance(one, dict) and "class_path" in one
+def _parts(recipe: Recipe) -> dict[str, list[Recipe]]:
+    """The recipes among the arguments, by name; several of an argument that is a list of them."""
+    named = {name: one if isinstance(one, list) else [one] for name, one in recipe.init_args.items()}
+    return {
+        name: checked(ones, list[Recipe], name)
+        for name, ones in named.items()
+        if any(isinstance(one, dict) and "class_path" in one for one in ones)
     }
-    return {name: checked(one, Recipe, name) for name, one in named.items()}
 
 
 def difference(stored: Recipe, given: Recipe) -> str:
@@ -161,10 +169,11 @@ def build(recipe: Recipe, kind: type[M], given: nn.Module | None = None) -> M:
     count = len(with_parts(recipe))
     if count > MOST_PARTS:
         raise InputError(f"the map's {name} is made of {count} parts; expected at most {MOST_PARTS}")
-    for key, part in _parts(recipe).items():
+    for key, parts in _parts(recipe).items():
         # only learning needs what found the periods: without a finder of this package the mapper has none
-        foreign = key == "periods" and part.class_path not in REGISTRY
-        arguments[key] = None if foreign else build(part, nn.Module, given)
+        foreign = key == "periods" and parts[0].class_path not in REGISTRY
+        made = [None if foreign else build(part, nn.Module, given) for part in parts]
+        arguments[key] = made if isinstance(arguments[key], list) else made[0]
     module: Any = cls(**arguments)
     if "periods" in arguments:
         module.periods = arguments["periods"]

@@ -168,3 +168,24 @@ def routes(draw: Callable, most_layers: int = 4) -> Route:
     generator = torch.Generator().manual_seed(draw(st.integers(0, 2**16)))
     values = torch.randint(-16, 17, (frames, dimension), generator=generator).double() / 8
     return Route(values, tuple(plan))
+
+
+def joined_rows(places: Sequence[Table], queries: Sequence[Table], kept: int) -> Tensor:
+    """Cosines (Q,N) of queries and places from their whitened members: each to length 1, side by side, turned
+    to the `kept` directions with the largest mean square over the places."""
+
+    def side_by_side(members: Sequence[Table]) -> list[list[float]]:
+        rows = []
+        for parts in zip(*members, strict=True):
+            row: list[float] = []
+            for part in parts:
+                length = math.sqrt(sum(number**2 for number in part))
+                row += [number / length for number in part]
+            rows.append(row)
+        return rows
+
+    own, asked = (torch.tensor(side_by_side(one), dtype=torch.float64) for one in (places, queries))
+    directions = torch.linalg.eigh(own.T @ own / len(own)).eigenvectors.flip(1)[:, :kept]
+    ours, theirs = (rows @ directions for rows in (own, asked))
+    lengths = theirs.norm(dim=1)[:, None] * ours.norm(dim=1)
+    return (theirs @ ours.T / lengths).float()

@@ -28,6 +28,7 @@ from dejavu_torch import (
     Whitening,
 )
 from dejavu_torch.features.cnn import SmallCNN
+from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.preprocess import VALUES_AT_ONCE
 from dejavu_torch.types import FrequencyLayer, Plan
@@ -78,6 +79,7 @@ MODELS: dict[str, Callable[[], DejaVu]] = {
     "patches": partial(templates, HOG, preprocess=Preprocess("R-B", "patch")),
     "spectral": partial(spectral, HOG),
     "spectral Embedding": partial(spectral, embedding),
+    "joined": partial(spectral, lambda: Joined([HOG(), PatchPixels(channel="grey"), embedding()])),
     "in parts": partial(spectral, HOG, (64, 64)),  # eagerly HOG takes 42 frames of this size at a time
     "spectral chunks": partial(whitened, chunk=25),
     "spectral dct, l2": partial(whitened, transform="dct", metric="l2"),
@@ -122,7 +124,7 @@ def test_the_exported_model_scores_as_the_model_does(kind: str) -> None:
     assert_scores_alike(program.module() if kind == "no layers" else saved(program), model)
 
 
-@pytest.mark.parametrize("kind", ["HOG", "SmallCNN", "spectral", "no layers", "l1, temperature"])
+@pytest.mark.parametrize("kind", ["HOG", "SmallCNN", "spectral", "joined", "no layers", "l1, temperature"])
 def test_the_compiled_model_scores_as_the_model_does(kind: str) -> None:
     model = MODELS[kind]()
     torch.compiler.reset()

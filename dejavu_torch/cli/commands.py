@@ -511,12 +511,13 @@ def run_info(map: Path, *, features: nn.Module | None = None, command: str) -> N
     if model.frame_shape is not None:
         kind = "frames of " if len(model.frame_shape) == 3 else "ready features, "
         print(f"learned from {kind}{' x '.join(str(n) for n in model.frame_shape)}")
-    parts = [model.preprocess, model.features, model.mapper, *model.mapper.children()]
+    made_by = [*getattr(model.features, "members", [model.features])]
+    parts = [model.preprocess, *made_by, model.mapper, *model.mapper.children()]
     if model.step is not None and model.velocity is not None:
         print(f"places are {model.step:.4g} pixels of ground apart")
         parts.append(model.velocity)
     for part in parts:
-        if part in parts[:3] or part.extra_repr():
+        if part in parts[: 2 + len(made_by)] or part.extra_repr():
             print(f"{type(part).__name__}: {part.extra_repr()}")
     if model.trained is not None:
         steps, seed = model.trained
@@ -651,8 +652,8 @@ def print_map(model: DejaVu) -> None:
         print(f"each place is the mean of {counts.mean():.3g} visits ({counts.min():g} to {counts.max():g})")
     whitening = model.whitening
     if whitening is not None:
-        numbers = " to ".join(str(count) for count in (len(whitening.projection), len(whitening.scale)))
-        print(f"Whitening, {numbers} numbers: {whitening.extra_repr()}")
+        sizes = " + ".join(map(str, whitening.sizes))
+        print(f"Whitening, {sizes} to {len(whitening.scale)} numbers: {whitening.extra_repr()}")
     if isinstance(model.map, SpectralMap) and model.map.needed is not None:
         more = f"about {model.map.needed:.3g} bytes per place would hold {HELD}, as --mapper.hold {HELD} does"
         print(f"the lines hold less than half of the descriptors' variance: {more}")

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import argparse
 import inspect
+import json
 import pydoc
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import is_dataclass
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any, NoReturn, cast, get_args, get_origin
 
 import docstring_parser
 import jsonargparse
+import yaml
 from jsonargparse.typing import restricted_string_type
 from torch import nn
 
@@ -21,6 +24,7 @@ from dejavu_torch.cli.presets import check_config, check_word, find_config
 from dejavu_torch.data.files import LARGEST
 from dejavu_torch.data.source import check_not_read
 from dejavu_torch.features.hog import HOG
+from dejavu_torch.features.joined import Joined
 from dejavu_torch.model import DejaVu
 from dejavu_torch.text import one_line
 from dejavu_torch.types import InputError
@@ -36,7 +40,8 @@ HINT = (
     "Parts have options of their own, such as --features.cell 4, --whitening.numbers 64 or "
     "--mapper.route_bytes_per_place 2.5: see --features.help HOG, --whitening.help, --mapper.help "
     "SpectralMapper, --preprocess.help and --velocity.help. --config local_maxima makes a map of templates, "
-    "with options such as --mapper.periods.window 512. --whitening also takes none, or a map file, with "
+    "with options such as --mapper.periods.window 512. --features '[HOG, PatchPixels]' joins the features of "
+    "several. --whitening also takes none, or a map file, with "
     "the features that it was learned from; --descriptor takes those alone, from a map or from what "
     "`dejavu train` makes of several routes."
 )
@@ -108,6 +113,7 @@ def with_made(words: Sequence[str]) -> list[str]:
     `--features timm.create_model --features.model_name NAME` is the name's call; jsonargparse itself takes
     functions only whose return value and arguments are annotated.
     """
+    words = list(_with_members(words))
     configured = any(word.startswith(("--config=", "-c")) or word == "--config" for word in words)
     makers = {}
     for word, after in pairwise([*words, ""]):
@@ -137,6 +143,37 @@ def with_made(words: Sequence[str]) -> list[str]:
         else:
             spelt.append(f"{own}.dict_kwargs.{word.removeprefix(own + '.')}")
     return spelt
+
+
+def _with_members(words: Sequence[str]) -> Iterator[str]:
+    """The command line with `Joined` where an option that names features is a list of them."""
+    following = iter(words)
+    for word in following:
+        option, equals, value = word.partition("=")
+        named = option.startswith("--") and option.lstrip("-").rpartition(".")[2] in NETWORKS
+        behind = [] if equals or not named else [*islice(following, 1)]
+        value = behind[0] if behind else value
+        if not named or not value.startswith("["):
+            yield from (word, *behind)
+            continue
+        with suppress(yaml.YAMLError):  # the parser says so
+            members = yaml.safe_load(value)
+            made_in = _made_in(members)
+            value = value if made_in == members else json.dumps(made_in)
+        yield from (f"{option}={Joined.__module__}.{Joined.__name__}", f"{option}.members={value}")
+
+
+def _made_in(value: Any) -> Any:
+    """A value of YAML with what `made` makes where a `class_path` in it is a function."""
+    if isinstance(value, list):
+        return [_made_in(one) for one in value]
+    if not isinstance(value, dict):
+        return value
+    path, inner = value.get("class_path"), {key: _made_in(one) for key, one in value.items()}
+    if not isinstance(path, str) or _function_at(path) is None or path == f"{__name__}.made":
+        return inner
+    named = {"class_path": f"{__name__}.made", "init_args": {"function": path}}
+    return named | {"dict_kwargs": inner.get("init_args") or {}}
 
 
 class HelpFormatter(jsonargparse.DefaultHelpFormatter):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor, nn
 
-from dejavu_torch.features.preprocess import FLAT, check_frames
+from dejavu_torch.features.preprocess import FLAT, channel_name, check_frames, select_channel
 from dejavu_torch.resize import check_size, resize_frames
 from dejavu_torch.text import settings_of
 from dejavu_torch.types import InputError
@@ -17,6 +17,7 @@ class PatchPixels(nn.Module):
     Args:
         size: (height, width) in pixels; smaller frames keep theirs, cut to whole patches.
         patch: side in pixels of the square patches, which lie side by side.
+        channel: that alone, as of `Preprocess`, such as "grey"; None takes all that the frames have.
 
     Shape: (B,C,H,W) -> (B, C x height x width).
 
@@ -24,11 +25,12 @@ class PatchPixels(nn.Module):
         InputError: a size smaller than a patch; forward: frames that are not (B,C,H,W) float, or as small.
     """
 
-    def __init__(self, size: tuple[int, int] = (32, 64), patch: int = 8) -> None:
+    def __init__(self, size: tuple[int, int] = (32, 64), patch: int = 8, channel: str | None = None) -> None:
         super().__init__()
         if patch < 2:
             raise InputError(f"patches of {patch} pixels; expected at least 2")
         self.size, self.patch = check_size(size, patch, "PatchPixels got size"), patch
+        self.channel = None if channel is None else channel_name(channel)
 
     def forward(self, frames: Tensor) -> Tensor:
         check_frames(frames, "PatchPixels got")
@@ -37,6 +39,7 @@ class PatchPixels(nn.Module):
             raise InputError(
                 f"frames of {height} x {width} pixels; expected at least one patch, {side} x {side}"
             )
+        frames = frames if self.channel is None else select_channel(frames, self.channel)
         small = (min(height, self.size[0]) // side * side, min(width, self.size[1]) // side * side)
         patches = resize_frames(frames, small).unflatten(-1, (-1, side)).unflatten(-3, (-1, side))
         centred = patches - patches.mean((-3, -1), keepdim=True)  # (B,C,rows,side,columns,side)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterable, Mapping
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, TypeAlias
 
 import torch
 from torch import Tensor, nn
@@ -35,6 +35,7 @@ STRENGTHS: Mapping[str, Any] = {  # of augmented copies: those of `Augmentation`
 }
 LEAST = 1e-12  # absolute value that a power is applied to: keeps gradients finite
 ROUNDING = 1e-7  # of the largest variance: below it there is none
+_Components: TypeAlias = tuple[Tensor, Tensor, Tensor, int]  # mean, basis, variances, how many to keep
 
 
 def learned_whitening(
@@ -101,6 +102,10 @@ class Whitening(nn.Module):
         bits: of each number of the projection: 4, two to a byte, 8 or 16.
         power: of the absolute value of each whitened number, above 0 and at most 1. Below 1 large ones, such
             as those of something new in the frame, count for less.
+        groups: D_1, D_2, .. of a descriptor whose members lie side by side. Each is whitened by itself, to
+            length 1, and these are reduced to the K numbers that keep most of their products. None is what
+            the features tell (`Joined`); of those that tell nothing the descriptor is whitened as a whole.
+        group_numbers: that are kept of each member, its rank at most; None is as many as of a descriptor.
 
     Shape: (B,D) -> (B,K).
 
@@ -109,7 +114,8 @@ class Whitening(nn.Module):
 
     Raises:
         InputError: settings out of range; learn: descriptors that do not vary, views that equal their places,
-            more `numbers` than the rank; forward: descriptors of another dimension.
+            more `numbers` than the rank, groups of other than D numbers; forward: descriptors of another
+            dimension.
 
     Example:
         >>> route, whitening = torch.randn(400, 16), Whitening(numbers=4)
@@ -134,26 +140,33 @@ class Whitening(nn.Module):
         seed: int = 0,
         bits: int = 4,
         power: float = 1.0,
+        groups: list[int] | None = None,
+        group_numbers: int | None = None,
     ) -> None:
         super().__init__()
         if not isinstance(strengths, Mapping | None):
             raise InputError(f"the strengths are {strengths!r}; expected arguments of Augmentation by name")
         self.numbers, self.components, self.shrinkage, self.views = numbers, components, shrinkage, views
         self.most_views, self.seed, self.bits, self.power = most_views, seed, bits, power
-        least, shares = 1 if numbers is None else numbers, (power, 1 if shrinkage is None else shrinkage)
-        counts = 1 <= least <= components and (views or 0) >= 0 and most_views >= 1
+        self.groups, self.group_numbers = None if groups is None else [*groups], group_numbers
+        kept = [1, *(one for one in (numbers, group_numbers) if one is not None)]
+        shares = power, 1 if shrinkage is None else shrinkage
+        counts = 1 <= min(kept) <= max(kept) <= components and (views or 0) >= 0 and most_views >= 1
         if not counts or bits not in (4, 8, 16) or not all(0 < share <= 1 for share in shares):
             raise InputError(
                 f"Whitening got {settings_of(self, 'strengths', 'seed')}; expected numbers of at least 1 and "
                 "at most components, 0 views or more, at least 1 in all, a shrinkage and a power above 0 "
                 "and at most 1, bits of 4, 8, 16"
             )
+        if groups is not None and min(groups, default=0) < 1:
+            raise InputError(f"the groups are {self.groups}; expected numbers of each member, at least 1")
         self.strengths = {**STRENGTHS, **(strengths or {})}
         self.fixed = False  # learned elsewhere: it serves this route unchanged
         self.register_buffer("projection", torch.zeros(0, 0, dtype=torch.int8))  # (D,K), see `take`
         self.register_buffer("scale", torch.zeros(0))  # (K,)
         self.register_buffer("offset", torch.zeros(0))  # (K,), of the mean
         self.register_buffer("length", torch.zeros(0))  # (1,), the constant number, or (0,)
+        self.members = nn.ModuleList()  # a whitening of each group; the projection is then of theirs together
 
     @property
     def whole(self) -> Tensor:
@@ -163,9 +176,19 @@ class Whitening(nn.Module):
         halves = torch.cat([self.projection & 15, self.projection >> 4], 1)
         return halves[:, : self.scale.shape[0]].to(torch.int8) - 8
 
-    def unpacked(self) -> Tensor:
-        """`whole` as float32, by columns in memory, for a fast `forward` of single descriptors."""
-        return self.whole.T.float().contiguous().T
+    @property
+    def parts(self) -> list[Whitening]:
+        """All that project: this one, and those of its groups."""
+        return [self, *(member for member in self.members if isinstance(member, Whitening))]
+
+    def unpacked(self) -> list[Tensor]:
+        """`whole` of all `parts` as float32, by columns, for a fast `forward` of single descriptors."""
+        return [part.whole.T.float().contiguous().T for part in self.parts]
+
+    @property
+    def sizes(self) -> list[int]:
+        """Numbers of each member of the descriptors that are whitened, once there is a projection."""
+        return [len(member.projection) for member in self.parts[1:]] or [len(self.projection)]
 
     @property
     def learned(self) -> bool:
@@ -177,23 +200,30 @@ class Whitening(nn.Module):
         """Of a whitened descriptor, once there is a projection."""
         return len(self.scale) + len(self.length)
 
-    def forward(self, descriptors: Tensor, unpacked: Tensor | None = None) -> Tensor:
+    def forward(self, descriptors: Tensor, unpacked: Sequence[Tensor] | None = None) -> Tensor:
         """Descriptors (B,D) -> (B,K); `unpacked`: the result of that method, if it is kept."""
         if not self.learned:
             return descriptors
-        shape = tuple(descriptors.shape)
-        if shape[1:] != (len(self.projection),):
-            raise InputError(f"the whitening got descriptors {shape}; expected (B, {len(self.projection)})")
+        shape, sizes = tuple(descriptors.shape), self.sizes
+        if shape[1:] != (sum(sizes),):
+            raise InputError(f"the whitening got descriptors {shape}; expected (B, {sum(sizes)})")
         # bf16 is too coarse for the small differences that whitening enlarges
         with torch.autocast(descriptors.device.type, enabled=False):
             exact = descriptors.to(torch.promote_types(descriptors.dtype, torch.float32))
-            whole = self.whole if unpacked is None else unpacked
-            whitened = (exact @ whole.to(exact)) * self.scale.to(exact) - self.offset.to(exact)
-            if len(self.length):
-                whitened = torch.cat([whitened, self.length.to(whitened).expand(whitened.shape[0], 1)], 1)
-            elif self.power < 1:
-                whitened = whitened.sign() * whitened.abs().clamp(min=LEAST) ** self.power
-            return nn.functional.normalize(whitened, dim=1)
+            wholes = [part.whole for part in self.parts] if unpacked is None else unpacked
+            if len(self.members):
+                each = zip(self.parts[1:], exact.split(sizes, 1), wholes[1:], strict=True)
+                exact = torch.cat([member._projected(own, whole) for member, own, whole in each], 1)
+            return self._projected(exact, wholes[0])
+
+    def _projected(self, exact: Tensor, whole: Tensor) -> Tensor:
+        """Rows (B,D) by the own projection, to length 1; whole: (D,K)."""
+        whitened = (exact @ whole.to(exact)) * self.scale.to(exact) - self.offset.to(exact)
+        if len(self.length):
+            whitened = torch.cat([whitened, self.length.to(whitened).expand(whitened.shape[0], 1)], 1)
+        elif self.power < 1 and not self.members:
+            whitened = whitened.sign() * whitened.abs().clamp(min=LEAST) ** self.power
+        return nn.functional.normalize(whitened, dim=1)
 
     def copies(self, frames: int, features: int) -> int:
         """Augmented copies of each frame, by the numbers of frames and features."""
@@ -209,39 +239,62 @@ class Whitening(nn.Module):
         return min(DIMENSIONS, features, max(1, places // PLACES_PER_DIMENSION)) if views else WIDEST
 
     @torch.no_grad()
-    def learn(self, places: Tensor, views: Iterable[tuple[Tensor, Tensor]] | None = None) -> None:
+    def learn(
+        self,
+        places: Tensor,
+        views: Iterable[tuple[Tensor, Tensor]] | None = None,
+        groups: Sequence[int] | None = None,
+    ) -> None:
         """Find the projection for one route.
 
         Args:
             places: (N,D), the descriptors of the route; they may lie in a file.
             views: batches of descriptors (B,D) and the places (B,) that they show; None has no views.
+            groups: of the features, if the constructor's are None.
         """
-        kept = self.kept(len(places), places.shape[1], views is not None)
-        found = principal_components(places, kept if views is None else self.components, self.seed)
+        groups = groups if self.groups is None else self.groups
+        sizes = [places.shape[1]] if groups is None else [*groups]
+        if sum(sizes) != places.shape[1]:
+            seen = f"groups of {' + '.join(map(str, sizes))} numbers, and descriptors {tuple(places.shape)}"
+            raise InputError(f"{seen}; expected (N, {sum(sizes)})")
+        members = [self] if groups is None else [self._member() for _ in sizes]
+        begun = []
+        for member, own in zip(members, places.split(sizes, 1), strict=True):
+            kept = self.kept(len(places), own.shape[1], views is not None)
+            kept = kept if groups is None or self.group_numbers is None else self.group_numbers
+            begun.append(member._components(own, kept, kept if views is None else self.components))
+        if views is None:
+            for member, (mean, basis, variances, _) in zip(members, begun, strict=True):
+                member.take(mean, basis, variances.mean().sqrt())
+        else:
+            pairs = _of_views(places, views, begun)
+            for member, (mean, basis, _, kept), (shown, own) in zip(members, begun, pairs, strict=True):
+                centre, projection = learned_whitening(shown, own, kept, self.shrinkage)
+                member.take(mean + basis @ centre, basis @ projection, None)
+        if groups is not None:
+            some = places[:: max(1, len(places) // SAMPLED)].to(self.scale.device).split(sizes, 1)
+            joined = torch.cat([member(own) for member, own in zip(members, some, strict=True)], 1)
+            kept = self.kept(len(places), joined.shape[1], views is not None)
+            # about zero, not their mean: the products of all pairs are kept, which cosines are made of
+            mean, basis, *_ = self._components(joined, kept, kept, centre=False)
+            self.take(mean, basis, None)
+        self.members = nn.ModuleList([] if groups is None else members)
+
+    def _member(self) -> Whitening:
+        """The whitening of a group, not learned yet."""
+        return Whitening(bits=self.bits, power=self.power).to(self.scale.device)
+
+    def _components(self, places: Tensor, kept: int, count: int, centre: bool = True) -> _Components:
+        """`principal_components` up to the rank, and how many numbers are kept of those that are wanted."""
+        found = principal_components(places, count, self.seed, centre)
         # many descriptors lie in a file, wherever the model is
         mean, basis, variances = (one.to(self.scale.device) for one in found)
         rank = int((variances > ROUNDING * variances[0]).sum())
         if kept > rank and self.numbers is not None:
             raise InputError(f"numbers is {kept}, but the descriptors of this route have rank {rank}")
-        if kept > rank and views is not None:
+        if rank < kept < count:
             log.warning("the descriptors of this route have rank %d: as many numbers, not %d", rank, kept)
-        kept = min(kept, rank)
-        if views is None:
-            self.take(mean, basis[:, :kept], variances[:kept].mean().sqrt())
-            return
-        basis, pairs = basis[:, :rank], []
-        for view, place in views:
-            if view.shape[1] != len(mean):
-                raise InputError(
-                    f"the views have {view.shape[1]} features; expected {len(mean)} as in the route"
-                )
-            own = places[place.to(places.device)].to(mean)
-            pairs.append(torch.stack([(part - mean) @ basis for part in (view, own)]))
-        if not pairs:
-            raise InputError("there are no views to whiten with; expected some, or None for none")
-        shown, own = torch.cat(pairs, 1)
-        centre, projection = learned_whitening(shown, own, kept, self.shrinkage)
-        self.take(mean + basis @ centre, basis @ projection, None)
+        return mean, basis[:, :rank], variances[:rank], min(kept, rank)
 
     def take(self, mean: Tensor, projection: Tensor, length: Tensor | None) -> None:
         """Set mean (D,), projection (D,K), rounded to `bits`, and the constant number, if any.
@@ -258,15 +311,22 @@ class Whitening(nn.Module):
         self.length = self.scale.new_zeros(0) if length is None else length.to(self.scale).view(1)
 
     def _load_from_state_dict(self, state: dict[str, Any], prefix: str, *args: Any) -> None:
+        inner = f"{prefix}members."
+        made = {name.removeprefix(inner).partition(".")[0] for name in state if name.startswith(inner)}
+        self.members = nn.ModuleList(self._member() for _ in made)  # torch loads them next
         buffers = {name: state.get(prefix + name, own) for name, own in self.named_buffers(recurse=False)}
         kind, seen = buffers["projection"].dtype, [tuple(one.shape) for one in buffers.values()]
         width = tuple((count + 1) // 2 if kind == torch.uint8 else count for count in seen[1])
         fits = len(seen[0]) == 2 and seen[0][1:] == width and seen[2] == seen[1] and seen[3] in ((0,), (1,))
+        counted = [name for name in state if name.startswith(inner) and name.endswith((".scale", ".length"))]
+        numbers = sum(state[name].numel() for name in counted)
+        fits = fits and (not made or numbers == seen[0][0])
         finite = all(bool(stored.isfinite().all()) for stored in buffers.values())
+        told = f"; D is {numbers}, of its {len(made)} groups" if made else ""
         if not fits or not finite or kind not in (torch.uint8, torch.int8, torch.int16):
             raise InputError(
                 f"the whitening has a projection, scale, offset and length of {seen}; expected finite (D,K), "
-                "two numbers to a byte in uint8, (K,), (K,), and one number or none"
+                f"two numbers to a byte in uint8, (K,), (K,), and one number or none{told}"
             )
         for name, stored in buffers.items():
             setattr(self, name, torch.empty_like(stored, device=self.scale.device))
@@ -276,16 +336,38 @@ class Whitening(nn.Module):
         return settings_of(self, *(["strengths"] if self.strengths == STRENGTHS else []))
 
 
-def principal_components(rows: Tensor, count: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
+def _of_views(
+    places: Tensor, views: Iterable[tuple[Tensor, Tensor]], begun: Sequence[_Components]
+) -> list[Tensor]:
+    """Components (2,n,C) of views, which may be made as they come, and of their places, of each group."""
+    sizes, pairs = [len(mean) for mean, *_ in begun], [list[Tensor]() for _ in begun]
+    for view, place in views:
+        if view.shape[1] != places.shape[1]:
+            seen = f"the views have {view.shape[1]} features"
+            raise InputError(f"{seen}; expected {places.shape[1]} as in the route")
+        both = (rows.split(sizes, 1) for rows in (view, places[place.to(places.device)]))
+        for held, (mean, basis, *_), *parts in zip(pairs, begun, *both, strict=True):
+            held.append(torch.stack([(part.to(mean) - mean) @ basis for part in parts]))
+    if not pairs[0]:
+        raise InputError("there are no views to whiten with; expected some, or None for none")
+    return [torch.cat(held, 1) for held in pairs]
+
+
+def principal_components(
+    rows: Tensor, count: int, seed: int = 0, centre: bool = True
+) -> tuple[Tensor, Tensor, Tensor]:
     """The directions in which SAMPLED of the descriptors, drawn evenly, vary most, by subspace iteration
     (Halko, Martinsson and Tropp, SIAM Review 53, 2011, algorithm 4.4), faster than `torch.svd_lowrank`.
+
+    Args:
+        centre: vary about their mean; else about zero, and the mean is 0.
 
     Shape: (N,D) -> mean (D,), basis (D,C), variances (C,), the largest first; C is `count` at most.
     """
     if rows.ndim != 2 or len(rows) < 2:
         raise InputError(f"the descriptors are {tuple(rows.shape)}; expected (N,D), N at least 2")
     sample = rows[:: max(1, len(rows) // SAMPLED)].float()
-    mean = sample.mean(0)
+    mean = sample.mean(0) if centre else sample.new_zeros(sample.shape[1])
     centred = sample - mean
     width = min(count + SPARE, len(sample), rows.shape[1])
     generator = torch.Generator().manual_seed(seed)

@@ -10,13 +10,16 @@ from torch import nn
 from dejavu_torch import HOG, GroundOdometry, ImposedPeriods, Preprocess, SpectrogramAnalysis, Whitening
 from dejavu_torch.features import preprocess
 from dejavu_torch.features.cnn import SmallCNN
+from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.pixels import PatchPixels
-from dejavu_torch.model_file import recipe_of
+from dejavu_torch.model_file import build, recipe_of
 
 MODULES: dict[str, nn.Module] = {
     "hog": HOG(),
     "hog with linear bins": HOG(orientations=6, cell=4, block=3, resize=(24, 28), bins="linear"),
     "pixels": PatchPixels((16, 24), patch=4),
+    "grey pixels": PatchPixels((16, 24), 4, "grey"),
+    "joined": Joined([HOG(), PatchPixels((16, 24), channel="grey")]),
     "network": SmallCNN(dimension=6, resize=(16, 24), widths=[4, 6]).eval(),
     "grey": Preprocess("grey"),
     "patches": Preprocess(contrast="patch"),
@@ -24,6 +27,7 @@ MODULES: dict[str, nn.Module] = {
     "clahe": Preprocess("G", "clahe", clip_limit=3, grid=[2, 3]),
 }
 OTHERS = {
+    "grouped whitening": Whitening(groups=[30, 20], group_numbers=12),
     "whitening": Whitening(20, views=3, strengths={"noise": 0.2}, power=0.5),
     "spectrogram": SpectrogramAnalysis(256, hop=100, peaks="bins", false_alarm=None),
     "imposed": ImposedPeriods([4, 9], 3, True),
@@ -45,7 +49,7 @@ def test_a_batch_is_its_frames_one_by_one(name: str, monkeypatch: pytest.MonkeyP
 def test_a_recipe_builds_the_same_module(name: str) -> None:
     module = {**MODULES, **OTHERS}[name]
     recipe = recipe_of(module)
-    again = type(module)(**recipe.init_args)
+    again = build(recipe, nn.Module)
     assert repr(again) == repr(module)
     assert recipe_of(again) == recipe
 

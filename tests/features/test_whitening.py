@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable
 from typing import Any
@@ -11,6 +12,7 @@ import torch
 from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
+from reference import joined_rows
 from torch import Tensor
 
 from dejavu_torch.features.embedding import Coder
@@ -20,6 +22,7 @@ from dejavu_torch.features.whitening import (
     oracle_shrinkage,
     principal_components,
 )
+from dejavu_torch.types import InputError
 
 
 def pairs(n: int = 200, k: int = 6, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -241,3 +244,130 @@ def test_a_state_that_does_not_fit_is_refused(name: str, bits: int) -> None:
     with refused("(K,)", f"(40, {columns - 1})" if name == "projection" else f"(40, {columns})"):
         other.load_state_dict(state)
     assert not other.learned
+
+
+# members side by side ---------------------------------------------------------------------------------
+
+OTHER = route(600, 25, 9)  # another member's descriptors of the same places
+SIDE = torch.cat([PLACES, OTHER[0]], 1), torch.cat([VIEWS, OTHER[1]], 1)
+GROUPS = [40, 25]
+
+
+def joined(views: bool = True, groups: list[int] | None = GROUPS, **settings: Any) -> Whitening:
+    whitening = Whitening(groups=groups, **{"bits": 16} | settings)
+    whitening.learn(SIDE[0], [(SIDE[1], torch.arange(600))] if views else None)
+    return whitening
+
+
+@pytest.mark.parametrize("views", [True, False])
+@pytest.mark.parametrize("settings", [{}, {"power": 0.5}, {"numbers": 14, "group_numbers": 8}])
+def test_members_are_whitened_one_by_one_and_joined(views: bool, settings: dict[str, Any]) -> None:
+    alone = {"bits": 16, "power": settings.get("power", 1.0), "numbers": settings.get("group_numbers")}
+    members = []
+    for places, other in ((PLACES, VIEWS), OTHER):
+        member = learned(places, other if views else None, **alone)
+        members.append((member(places).tolist(), member(other).tolist()))
+    whitening = joined(views, **settings)
+    expected = joined_rows(*map(list, zip(*members, strict=True)), whitening.dimension)
+    found, places = whitening(SIDE[1]), whitening(SIDE[0])
+    torch.testing.assert_close(found.norm(dim=1), torch.ones(600))
+    torch.testing.assert_close(found @ places.T, expected, rtol=0, atol=2e-3)
+
+
+def test_one_group_keeps_the_cosines_of_a_whitening_without() -> None:
+    plain = learned(*SIDE, bits=16)
+    one = joined(groups=[65], numbers=plain.dimension)
+    assert len(one.members) == 1
+    torch.testing.assert_close(
+        one(SIDE[1]) @ one(SIDE[0]).T, plain(SIDE[1]) @ plain(SIDE[0]).T, rtol=0, atol=1e-3
+    )
+    again = Whitening(bits=16)
+    again.learn(SIDE[0], [(SIDE[1], torch.arange(600))], None)
+    assert torch.equal(again(SIDE[1]), plain(SIDE[1]))
+
+
+def test_the_order_of_members_changes_no_cosine() -> None:
+    whitening, swapped = joined(), Whitening(bits=16)
+    turned = [torch.cat([rows[:, 40:], rows[:, :40]], 1) for rows in SIDE]
+    swapped.learn(turned[0], [(turned[1], torch.arange(600))], (25, 40))  # as features tell it
+    assert (swapped.groups, swapped.sizes, whitening.sizes) == (None, [25, 40], GROUPS)
+    cosines = [one(views) @ one(places).T for one, (places, views) in ((whitening, SIDE), (swapped, turned))]
+    torch.testing.assert_close(*cosines, rtol=0, atol=1e-3)
+
+
+def test_own_groups_are_ahead_of_those_of_the_features() -> None:
+    whitening = Whitening(groups=[65])
+    whitening.learn(SIDE[0], [(SIDE[1], torch.arange(600))], GROUPS)
+    assert whitening.sizes == [65]
+
+
+def test_views_of_members_are_made_once_in_any_batches() -> None:
+    batches = ((SIDE[1][part], part) for part in torch.arange(600).split(250))
+    whitening = Whitening(groups=GROUPS, bits=16)
+    whitening.learn(SIDE[0], batches)
+    torch.testing.assert_close(whitening(SIDE[1]), joined()(SIDE[1]), rtol=0, atol=1e-4)
+
+
+def test_a_member_that_is_scaled_weighs_as_before() -> None:
+    whitening, scaled = joined(), Whitening(groups=GROUPS, bits=16)
+    larger = [torch.cat([rows[:, :40], 100 * rows[:, 40:]], 1) for rows in SIDE]
+    scaled.learn(larger[0], [(larger[1], torch.arange(600))])
+    cosines = [one(views) @ one(places).T for one, (places, views) in ((whitening, SIDE), (scaled, larger))]
+    torch.testing.assert_close(*cosines, rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("bits", [4, 8, 16])
+@pytest.mark.parametrize("views", [True, False])
+def test_a_state_of_groups_is_loaded(bits: int, views: bool) -> None:
+    one, other = joined(views, bits=bits), learned()
+    other.load_state_dict(one.state_dict())
+    assert torch.equal(other(SIDE[1]), one(SIDE[1]))
+    torch.testing.assert_close(one(SIDE[1], one.unpacked()), one(SIDE[1]))
+    exact = copy.deepcopy(one).double()(SIDE[1].double())
+    assert exact.dtype == torch.float64
+    torch.testing.assert_close(exact.float(), one(SIDE[1]), rtol=0, atol=1e-4)
+    other.load_state_dict(learned().state_dict())
+    assert not other.members
+    assert torch.equal(other(VIEWS), learned()(VIEWS))
+
+
+def test_gradients_reach_the_members() -> None:
+    some = SIDE[1][:2].double().requires_grad_()
+    assert torch.autograd.gradcheck(joined(bits=4), (some,))
+
+
+@pytest.mark.parametrize(
+    ("call", "facts"),
+    [
+        (lambda: Whitening(groups=[]), ("the groups are []", "at least 1")),
+        (lambda: Whitening(groups=[40, 0]), ("the groups are [40, 0]", "at least 1")),
+        (lambda: Whitening(group_numbers=0), ("group_numbers=0", "at least 1")),
+        (lambda: joined(groups=[40, 20]), ("groups of 40 + 20", "(600, 65)", "expected (N, 60)")),
+        (lambda: joined(numbers=50), ("numbers is 50", "rank 21")),
+        (lambda: joined()(VIEWS), ("(600, 40)", "(B, 65)")),
+    ],
+)
+def test_groups_that_do_not_fit(call: Callable[[], Any], facts: tuple[str, ...]) -> None:
+    with refused(*facts):
+        call()
+
+
+def test_a_refused_group_leaves_the_whitening_as_it_was() -> None:
+    whitening = joined()
+    before, constant = whitening(SIDE[1]), torch.cat([PLACES, torch.ones(600, 25)], 1)
+    with refused("600 descriptors", "all alike"):
+        whitening.learn(constant, [(SIDE[1], torch.arange(600))])
+    assert torch.equal(whitening(SIDE[1]), before)
+
+
+@pytest.mark.parametrize("change", ["missing", "other", "wider"])
+def test_a_state_whose_groups_do_not_fit_is_refused(change: str) -> None:
+    state = joined(bits=8).state_dict()
+    if change == "missing":
+        state = {name: one for name, one in state.items() if not name.startswith("members.1.")}
+    elif change == "other":
+        state = {name.replace("members.1", "members.x"): one for name, one in state.items()}
+    else:
+        state["members.1.scale"] = torch.ones(300)
+    with pytest.raises((InputError, RuntimeError)):
+        Whitening().load_state_dict(state)

@@ -21,7 +21,7 @@ from dejavu_torch.cli import main
 FILE = Path(__file__).parent / "options.json"
 # the classes whose arguments are options of a part, as YAML files name them
 PARTS = (
-    *("HOG", "Embedding", "features.pixels.PatchPixels", "features.cnn.SmallCNN"),
+    *("HOG", "Embedding", "features.pixels.PatchPixels", "features.cnn.SmallCNN", "features.joined.Joined"),
     *("features.augmentation.Augmentation", "training.losses.Objective"),
     *("Preprocess", "Whitening", "GroundOdometry", "SpectralMapper", "TemplateMapper"),
     *("SpectrogramAnalysis", "periods.imposed.ImposedPeriods"),

@@ -261,6 +261,27 @@ MUTANTS = [
         ("tests/features/test_whitening.py::test_numbers_of_four_bits_come_back_from_their_bytes",),
     ),
     Mutant(
+        "The last step of joined features keeps their products, not what varies about their mean.",
+        "dejavu_torch/features/whitening.py",
+        "self._components(joined, kept, kept, centre=False)",
+        "self._components(joined, kept, kept, centre=True)",
+        ("tests/features/test_whitening.py::test_members_are_whitened_one_by_one_and_joined",),
+    ),
+    Mutant(
+        "A whitening learns each member of joined features by itself.",
+        "dejavu_torch/learning.py",
+        "groups = None if is_ready(traverse) else groups_of(self.pipeline)",
+        "groups = None",
+        ("tests/features/test_joined.py::test_a_whitening_takes_the_groups_of_the_features",),
+    ),
+    Mutant(
+        "Ready features do not have the groups of features that are not run.",
+        "dejavu_torch/learning.py",
+        "groups = None if is_ready(traverse) else groups_of(self.pipeline)",
+        "groups = groups_of(self.pipeline)",
+        ("tests/features/test_joined.py::test_ready_features_have_no_groups_but_those_that_are_asked_for",),
+    ),
+    Mutant(
         "A frame that is not in [0, 1] is refused live.",
         "dejavu_torch/live/localizer.py",
         "if not (low >= -ROUNDING and high <= 1 + ROUNDING):",

@@ -30,6 +30,7 @@ from dejavu_torch import HOG, DejaVu, SpectralMapper, TemplateMap, Whitening
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.features.embedding import Embedding
+from dejavu_torch.features.joined import Joined
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.training.export import LastCheckpoint
 from dejavu_torch.training.losses import Objective
@@ -74,6 +75,16 @@ def test_a_training_ends_in_a_map_that_finds_its_own_places(tmp_path: Path, sett
     assert recall(model, footage()) > 0.9
     assert model.trained is not None
     assert model.trained.steps == 4
+
+
+def test_members_of_joined_features_are_whitened_by_themselves(tmp_path: Path) -> None:
+    task = spectral(backbone=Joined([HOG(cell=4), backbone()]))
+    trainer(tmp_path).fit(task, data_of())
+    model = DejaVu.load(tmp_path / "map.safetensors")
+    assert_same_scores(task, model)
+    assert model.whitening is not None
+    assert model.whitening.sizes == [324, 8]
+    assert recall(model, footage()) > 0.9
 
 
 def test_the_file_holds_the_network_alone(tmp_path: Path) -> None:

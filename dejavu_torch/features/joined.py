@@ -1,0 +1,57 @@
+"""Features of several modules side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from dejavu_torch.features.extract import features_of
+from dejavu_torch.features.preprocess import check_frames
+from dejavu_torch.types import InputError
+
+
+class Joined(nn.Module):
+    """Features of several modules side by side, such as HOG and the descriptor of a network.
+
+    Args:
+        members: modules (B,C,H,W) -> (B,D_i), any whatsoever; all see the same frames.
+
+    Attributes:
+        groups: features of each member, of the frames seen last; the whitening learned from them takes these.
+
+    Shape: (B,C,H,W) -> (B, D_1 + D_2 + ..).
+
+    Raises:
+        InputError: no members, or some that are no modules; forward: a member that makes something else.
+
+    Example:
+        >>> from dejavu_torch.features.hog import HOG
+        >>> from dejavu_torch.features.pixels import PatchPixels
+        >>> features = Joined([HOG(), PatchPixels(channel="grey")])
+        >>> features(torch.rand(2, 3, 64, 64)).shape, features.groups
+        (torch.Size([2, 3812]), (1764, 2048))
+    """
+
+    def __init__(self, members: list[nn.Module]) -> None:
+        super().__init__()
+        modules = [*members] if isinstance(members, (Sequence, nn.ModuleList)) else [members]
+        if not modules or not all(isinstance(one, nn.Module) for one in modules):
+            seen = ", ".join(type(one).__name__ for one in modules) or "none"
+            raise InputError(f"the members of the features are {seen}; expected modules, at least one")
+        self.members = nn.ModuleList(modules)
+        self.groups: tuple[int, ...] | None = None
+
+    def forward(self, frames: Tensor) -> Tensor:
+        check_frames(frames, "Joined got")
+        made = [features_of(frames, member) for member in self.members]
+        if not torch.compiler.is_compiling():  # a graph changes nothing but its outputs
+            self.groups = tuple(one.shape[1] for one in made)
+        return torch.cat(made, 1)
+
+
+def groups_of(features: nn.Module) -> tuple[int, ...] | None:
+    """The `groups` of features, or of the last part of a pipeline; None of features that are not joined."""
+    last = features[-1] if isinstance(features, nn.Sequential) and len(features) else features
+    return last.groups if isinstance(last, Joined) else None

@@ -1,0 +1,241 @@
+"""Features of several modules side by side, in a model and on the command line."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from command_line import fails, run
+from helpers import refused
+from torch import Tensor, nn
+
+from dejavu_torch import HOG, DejaVu, Embedding, Preprocess, SpectralMapper, Whitening, open_source
+from dejavu_torch.cli.commands import run_learn
+from dejavu_torch.cli.parser import parse
+from dejavu_torch.features.joined import Joined, groups_of
+from dejavu_torch.features.pixels import PatchPixels
+from dejavu_torch.model import own_size
+
+ZOO = """
+from torch import nn
+
+def load(repo, model, **settings):
+    return nn.Sequential(nn.Conv2d(3, 4, 3), nn.ReLU(), nn.Conv2d(4, 50, 3))
+"""
+
+
+class Means(nn.Module):
+    """A user's own: the mean of each of some rows."""
+
+    def __init__(self, rows: int = 8) -> None:
+        super().__init__()
+        self.linear = nn.Linear(rows, 12)
+
+    def forward(self, frames: Tensor) -> Tensor:
+        rows = nn.functional.adaptive_avg_pool2d(frames.mean(1, keepdim=True), (8, 1))
+        made: Tensor = self.linear(rows.flatten(1))
+        return made
+
+
+def network() -> Embedding:
+    torch.manual_seed(0)
+    return Embedding(nn.Conv2d(3, 6, 3), None, resize=(20, 20), grid=2)
+
+
+def both() -> Joined:
+    return Joined([HOG(), PatchPixels((16, 24), channel="grey")])
+
+
+@pytest.fixture(scope="module")
+def flights() -> list[Tensor]:
+    """120 frames of a road and of another flight over it."""
+    sources = (open_source(f"sim:aerial?frames=120&traverse={i}") for i in range(2))
+    return [torch.cat([*source.batches(120)])[..., ::2, ::2].contiguous() for source in sources]
+
+
+def test_features_lie_side_by_side_and_tell_their_groups() -> None:
+    features, frames = Joined([HOG(), network(), Means()]).eval(), torch.rand(3, 3, 32, 40)
+    assert features.groups is None
+    made = features(frames)
+    parts = [member(frames) for member in features.members]
+    assert torch.equal(made, torch.cat(parts, 1))
+    assert features.groups == tuple(part.shape[1] for part in parts) == (432, 24, 12)
+    assert groups_of(nn.Sequential(Preprocess(), features)) == features.groups
+    assert groups_of(HOG()) is None
+
+
+def test_gradients_reach_the_members_weights_and_the_frames() -> None:
+    features, frames = Joined([Means(), PatchPixels((8, 8))]).double(), torch.rand(2, 1, 8, 8).double()
+    assert torch.autograd.gradcheck(features, (frames.requires_grad_(),))
+    features(frames).sum().backward()
+    assert all(one.grad is not None for one in features.parameters())
+
+
+def test_grey_pixels_are_those_of_grey_frames() -> None:
+    frames = torch.rand(2, 3, 16, 24)
+    grey = PatchPixels(channel="grey")(frames)
+    torch.testing.assert_close(grey, PatchPixels()(Preprocess("grey")(frames)))
+
+
+@pytest.mark.parametrize(
+    ("call", "facts"),
+    [
+        (lambda: Joined([]), ("members of the features are none", "at least one")),
+        (lambda: Joined([HOG(), "HOG"]), ("HOG, str", "expected modules")),  # type: ignore[list-item]
+        (lambda: Joined("HOG"), ("str, str, str", "expected modules")),  # type: ignore[arg-type]
+        (lambda: Joined([HOG(), nn.Identity()])(torch.rand(2, 3, 16, 16)), ("Identity made (2, 3, 16, 16)",)),
+        (lambda: both()(torch.rand(2, 7)), ("Joined got (2, 7)", "float frames")),
+        (lambda: PatchPixels(channel="mauve"), ("'mauve'", "'grey'")),
+    ],
+)
+def test_what_is_refused(call: Callable[[], Any], facts: tuple[str, ...]) -> None:
+    with refused(*facts):
+        call()
+
+
+def test_the_size_of_joined_features_is_that_of_the_largest() -> None:
+    tall, wide = HOG(resize=(64, 32)), Embedding(nn.Conv2d(3, 6, 3), None, resize=(32, 48))
+    assert own_size(Joined([tall, PatchPixels(), wide])) == (64, 48)
+    assert own_size(both()) is None
+    assert own_size(both(), block=True) == own_size(HOG(), block=True) == (16, 16)
+
+
+def test_a_whitening_takes_the_groups_of_the_features(flights: list[Tensor], tmp_path: Path) -> None:
+    model = DejaVu(both(), mapper=SpectralMapper(12.0)).learn(flights[0])
+    assert model.whitening is not None
+    assert model.whitening.sizes == [324, 384]
+    assert model.whitening.dimension == 30  # a quarter of the places, as without groups
+    assert model.features_per_frame == 708
+    found = model.localize(flights[1])
+    assert float(((found.index - torch.arange(120)).abs() <= 5).float().mean()) > 0.9
+    model.save(tmp_path / "map.safetensors")
+    again = DejaVu.load(tmp_path / "map.safetensors")  # its classes are the package's own
+    assert repr(again.features) == repr(model.features)
+    assert torch.equal(again.localize(flights[1]).score, found.score)
+    assert torch.equal(again(flights[1][:3]), model(flights[1][:3]))
+    other = DejaVu()
+    other.take_whitening(again)
+    assert other.learn(flights[1]).whitening is again.whitening
+
+
+def test_ready_features_have_no_groups_but_those_that_are_asked_for() -> None:
+    features = both()
+    features(torch.rand(1, 3, 32, 32))
+    rows = torch.randn(80, 300)
+    sizes = []
+    for groups in (None, [100, 200]):
+        model = DejaVu(features, Whitening(groups=groups)).learn(rows)
+        assert model.whitening is not None
+        sizes.append(model.whitening.sizes)
+    assert sizes == [[300], [100, 200]]
+    with refused("groups of 100 + 100", "(80, 300)", "(N, 200)"):
+        DejaVu(features, Whitening(groups=[100, 100])).learn(rows)
+
+
+def test_a_users_own_module_beside_ours_comes_from_the_caller(flights: list[Tensor], tmp_path: Path) -> None:
+    model = DejaVu(Joined([HOG(), Means()])).learn(flights[0])
+    model.save(tmp_path / "map.safetensors")
+    with refused("Means", "only the caller can load"):
+        DejaVu.load(tmp_path / "map.safetensors")
+    with refused("Joined of members"):
+        DejaVu.load(tmp_path / "map.safetensors", Joined([Means(), HOG()]))
+    expected = model(flights[1][:4])
+    for given in (Joined([HOG(), Means()]), Means()):
+        again = DejaVu.load(tmp_path / "map.safetensors", given)
+        assert torch.equal(again(flights[1][:4]), expected)
+
+
+def test_a_file_of_onnx_gives_the_same_scores(flights: list[Tensor], tmp_path: Path) -> None:
+    pytest.importorskip("onnxscript")
+    pytest.importorskip("onnxruntime")
+    from dejavu_torch.export import export_onnx, run_session, session_of
+
+    model = DejaVu(Joined([*both().members, network()]), Whitening(views=1)).learn(flights[0]).eval()
+    export_onnx(model, tmp_path / "map.onnx")
+    with torch.no_grad():
+        scores = model(flights[1])
+    found = run_session(session_of(str(tmp_path / "map.onnx")), flights[1])
+    torch.testing.assert_close(found, scores, rtol=0, atol=1e-4)
+
+
+# the command line -------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    (tmp_path / "zoo.py").write_text(ZOO)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "zoo", raising=False)
+    return tmp_path
+
+
+ROUTE = "sim:aerial?frames=60"
+LEARN = ("learn", ROUTE, "--map", "map.safetensors", "--calibration", "none", "--features")
+LIST = "[dejavu_torch.HOG, {class_path: PatchPixels, init_args: {channel: grey}}]"
+HUB = (
+    "[HOG, {class_path: dejavu_torch.Embedding, init_args: {dimension: null, resize: [16, 16], network: "
+    "{class_path: zoo.load, init_args: {repo: a/b, model: m}}}}]"
+)
+
+
+def features_of(*words: str) -> nn.Module:
+    model = parse("learn", run_learn, [ROUTE, "--map", "map.safetensors", *words])["model"]
+    assert isinstance(model, DejaVu)
+    return model.features
+
+
+@pytest.mark.parametrize("words", [("--features", LIST), (f"--features={LIST}",)])
+def test_a_list_of_features_is_joined(words: tuple[str, ...]) -> None:
+    expected = Joined([HOG(), PatchPixels(channel="grey")])
+    assert repr(features_of(*words)) == repr(expected)
+
+
+def test_a_list_in_a_config_file(folder: Path) -> None:
+    path = "dejavu_torch.features.joined.Joined"
+    (folder / "own.yaml").write_text(f"features: {{class_path: {path}, init_args: {{members: {LIST}}}}}\n")
+    assert repr(features_of("--config", "own.yaml")) == repr(features_of("--features", LIST))
+    assert repr(features_of("--config", "own.yaml", "--features", "[HOG]")) == repr(Joined([HOG()]))
+
+
+def test_learn_and_localize(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run(*LEARN, LIST)
+    assert "Whitening, 1764 + 2048 to 15 numbers" in capsys.readouterr().out
+    run("info", "map.safetensors")
+    told = capsys.readouterr().out
+    assert "HOG: orientations=9" in told
+    assert "PatchPixels: size=(32, 64), patch=8, channel='grey'" in told
+    run("localize", "map.safetensors", f"{ROUTE}&traverse=1", "--out", "matches.csv")
+    rows = [line.split(",") for line in (folder / "matches.csv").read_text().splitlines()[1:]]
+    assert sum(abs(int(query) - int(place)) <= 5 for query, place, *_ in rows) > 50
+
+
+def test_a_network_of_a_function_beside_hog(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run(*LEARN, HUB)
+    sys.modules.pop("zoo")
+    words = "localize", "map.safetensors", f"{ROUTE}&traverse=1", "--out", "matches.csv"
+    assert "Sequential" in fails(capsys, *words)
+    assert "zoo" not in sys.modules  # a map names no code
+    run(*words, "--features", HUB)
+    assert len((folder / "matches.csv").read_text().splitlines()) == 61
+
+
+@pytest.mark.parametrize(
+    ("words", "seen"),
+    [
+        (("[]",), "the members of the features are none; expected modules, at least one"),
+        (("[HOG, zoo.nothing]",), "--features.members: module 'zoo' has no attribute 'nothing'"),
+        (("[HOG, {",), "--features.members"),
+        (("[HOG, PatchPixels]", "--whitening.groups", "[1764, 10]"), "groups of 1764 + 10 numbers"),
+        (("HOG", "--whitening.groups", "[]"), "the groups are []"),
+    ],
+)
+def test_mistakes_are_one_line(
+    words: tuple[str, ...], seen: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert seen in fails(capsys, *LEARN, *words)
+    assert not (folder / "map.safetensors").exists()
