@@ -20,7 +20,7 @@ _GROWTH = {
     "dejavu": ("#5aa9d6", "#00406b", OURS),
     "null": (COLOURS["null"], COLOURS["null_same_plan"], GREY),
 }
-_OTHERS = ("#222222", "#e07b00", "#c21f0a", "#10b248", "#b43cff", "#f2b80f")
+_OTHERS = ("#222222", "#e07b00", "#c21f0a", "#10b248", "#b43cff", "#f2b80f", "#7a4a1f")
 FAMILIES = {  # of `plot_frontiers`: colour and line
     "dejavu": (OURS, "-"),
     "dejavu, given": ("#00406b", "--"),
