@@ -173,6 +173,9 @@ def build(recipe: Recipe, kind: type[M], given: nn.Module | None = None) -> M:
         # only learning needs what found the periods: without a finder of this package the mapper has none
         foreign = key == "periods" and parts[0].class_path not in REGISTRY
         made = [None if foreign else build(part, nn.Module, given) for part in parts]
+        if given is not None and sum(one is given for one in made) > 1:
+            seen = f"several members of the features are {recipe_of(given).class_path}"
+            raise InputError(f"{seen}, and one was given; expected all members, as a list")
         arguments[key] = made if isinstance(arguments[key], list) else made[0]
     module: Any = cls(**arguments)
     if "periods" in arguments:

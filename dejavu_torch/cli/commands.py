@@ -6,6 +6,7 @@ Only what every command needs is imported above: the rest, such as matplotlib, w
 from __future__ import annotations
 
 import copy
+import json
 import shlex
 import threading
 from collections import Counter
@@ -39,6 +40,7 @@ from dejavu_torch.data.output import check_output_file, check_output_folder, who
 from dejavu_torch.data.source import check_not_read, open_source
 from dejavu_torch.evaluation.answers import next_steps, probable_counts, told_line, told_probable
 from dejavu_torch.features.hog import HOG
+from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.views import Views
 from dejavu_torch.learning import SAMPLE as SHORT
 from dejavu_torch.learning import Checkpoint, ChunkCoder, Code
@@ -511,7 +513,7 @@ def run_info(map: Path, *, features: nn.Module | None = None, command: str) -> N
     if model.frame_shape is not None:
         kind = "frames of " if len(model.frame_shape) == 3 else "ready features, "
         print(f"learned from {kind}{' x '.join(str(n) for n in model.frame_shape)}")
-    made_by = [*getattr(model.features, "members", [model.features])]
+    made_by = [*model.features.members] if isinstance(model.features, Joined) else [model.features]
     parts = [model.preprocess, *made_by, model.mapper, *model.mapper.children()]
     if model.step is not None and model.velocity is not None:
         print(f"places are {model.step:.4g} pixels of ground apart")
@@ -612,7 +614,11 @@ def features_words(model: DejaVu, command: str, option: str = "--features") -> l
             told.append(f"--features{word.removeprefix(option)}" if own else word)
         named |= word.partition("=")[0] == option
         values = own and "=" not in word
-    return told if named else ["--features", foreign[0], *told]  # a config file has named it
+    if named:
+        return told
+    several = isinstance(model.features, Joined) and len(foreign) > 1
+    name = json.dumps(recipe_of(model.features).init_args["members"]) if several else foreign[0]
+    return ["--features", name, *told]  # a config file has named it
 
 
 def _check_report_folder(

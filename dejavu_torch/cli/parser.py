@@ -8,7 +8,6 @@ import json
 import pydoc
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import is_dataclass
 from itertools import islice, pairwise
 from pathlib import Path
@@ -153,13 +152,16 @@ def _with_members(words: Sequence[str]) -> Iterator[str]:
         named = option.startswith("--") and option.lstrip("-").rpartition(".")[2] in NETWORKS
         behind = [] if equals or not named else [*islice(following, 1)]
         value = behind[0] if behind else value
-        if not named or not value.startswith("["):
+        if not named or not value.lstrip().startswith("["):
             yield from (word, *behind)
             continue
-        with suppress(yaml.YAMLError):  # the parser says so
+        try:
             members = yaml.safe_load(value)
             made_in = _made_in(members)
             value = value if made_in == members else json.dumps(made_in)
+        except (yaml.YAMLError, ValueError, TypeError) as error:
+            expected = "expected a list of classes, such as [HOG, PatchPixels]"
+            raise UsageError(f"{option} is {value!r}; {expected}") from error
         yield from (f"{option}={Joined.__module__}.{Joined.__name__}", f"{option}.members={value}")
 
 

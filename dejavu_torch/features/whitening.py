@@ -282,7 +282,7 @@ class Whitening(nn.Module):
 
     def _member(self) -> Whitening:
         """The whitening of a group, not learned yet."""
-        return Whitening(bits=self.bits, power=self.power).to(self.scale.device)
+        return Whitening(bits=self.bits, power=self.power, seed=self.seed).to(self.scale.device)
 
     def _components(self, places: Tensor, kept: int, count: int, centre: bool = True) -> _Components:
         """`principal_components` up to the rank, and how many numbers are kept of those that are wanted."""

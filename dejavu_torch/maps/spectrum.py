@@ -55,7 +55,7 @@ def slots(
 ) -> tuple[Tensor, Tensor]:
     """The slot in which `from_slots` expects each of W lines, (W,) int64, and the factor that it expects on
     each of the S slots, (S,); slots without a line are 0. Both may be shared: they are not to be changed."""
-    if torch.compiler.is_compiling():
+    if torch.compiler.is_compiling() or type(torch.empty(0)) is not Tensor:  # of a mode that fakes tensors
         return _slots(count, transform, dtype, device)
     with torch.inference_mode(False):  # what is kept serves gradients too
         return _kept_slots(count, transform, dtype, device)

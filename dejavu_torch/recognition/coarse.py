@@ -18,7 +18,7 @@ from torch import Tensor
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.spectrum import half_cycles
-from dejavu_torch.recognition.search import Best, Wanted, lowest_needed, search
+from dejavu_torch.recognition.search import Best, Wanted, empty_topk, lowest_needed, search
 from dejavu_torch.recognition.select import best_candidates
 from dejavu_torch.types import InputError
 
@@ -186,6 +186,8 @@ class CoarseSearch:
 
     @torch.no_grad()
     def __call__(self, queries: Tensor, wanted: Wanted) -> Best:
+        if not len(queries):
+            return empty_topk(queries, max(k for k, _ in wanted))
         units = F.normalize(queries.to(torch.promote_types(queries.dtype, torch.float32))).float()
         best = self.coarse.best_of_groups(to_int8(units))
         place = self._windows(units, best, wanted)
@@ -233,14 +235,17 @@ class CoarseSearch:
         at = (middle[:, :, None] + offsets).clamp(0, len(self.fine.place) - 1).flatten(1)
         rows = self.fine.rows.index_select(0, at.flatten()).view(*at.shape, -1)
         cosines = (rows * units[:, None]).sum(2) / self.fine.norm[at]
-        width = plan.fine + 1 + max((k - 1) * (radius + 1) for k, radius in wanted)
+        width = min(places, plan.fine + 1 + max((k - 1) * (radius + 1) for k, radius in wanted))
         windows = best_candidates(-cosines, min(count + SPARE, at.shape[1]), width, self.fine.place[at])
         close = windows.score <= windows.score[:, :count].amax(1, keepdim=True) + CLOSE
         around = torch.arange(-width, width + 1, device=group.device)
         place = (windows.index[:, :, None] + around).clamp(0, places - 1)
         place = place.masked_fill(~(windows.accepted & close)[:, :, None], -1).flatten(1).sort(1).values
-        again = F.pad(place[:, 1:] == place[:, :-1], (0, 1))
-        return place.masked_fill(again, -1)
+        place = place.masked_fill(F.pad(place[:, 1:] == place[:, :-1], (0, 1)), -1)
+        if count == 1:
+            return place
+        place = place.sort(1).values  # windows of several candidates are wide and overlap
+        return place[:, -max(1, int((place >= 0).sum(1).amax())) :].contiguous()
 
     def _scores(self, units: Tensor, place: Tensor) -> Tensor:
         """Scores of places for each query, (Q,M), by the map's own products; +inf for none."""

@@ -149,6 +149,15 @@ def test_a_users_own_module_beside_ours_comes_from_the_caller(flights: list[Tens
         assert torch.equal(again(flights[1][:4]), expected)
 
 
+def test_one_module_is_not_two_members(flights: list[Tensor], tmp_path: Path) -> None:
+    model = DejaVu(Joined([Means(), Means()]), mapper=SpectralMapper(None, 0.1)).learn(flights[0])
+    model.save(tmp_path / "map")
+    with refused("several members of the features are", "Means", "as a list"):
+        DejaVu.load(tmp_path / "map", features=Means())
+    again = DejaVu.load(tmp_path / "map", features=Joined([Means(), Means()]))
+    torch.testing.assert_close(again.describe(flights[1]), model.describe(flights[1]))
+
+
 def test_a_file_of_onnx_gives_the_same_scores(flights: list[Tensor], tmp_path: Path) -> None:
     pytest.importorskip("onnxscript")
     pytest.importorskip("onnxruntime")
@@ -229,7 +238,8 @@ def test_a_network_of_a_function_beside_hog(folder: Path, capsys: pytest.Capture
     [
         (("[]",), "the members of the features are none; expected modules, at least one"),
         (("[HOG, zoo.nothing]",), "--features.members: module 'zoo' has no attribute 'nothing'"),
-        (("[HOG, {",), "--features.members"),
+        (("[HOG, {",), "--features is '[HOG, {'; expected a list of classes"),
+        (("[2020-13-45]",), "--features is '[2020-13-45]'; expected a list of classes"),
         (("[HOG, PatchPixels]", "--whitening.groups", "[1764, 10]"), "groups of 1764 + 10 numbers"),
         (("HOG", "--whitening.groups", "[]"), "the groups are []"),
     ],

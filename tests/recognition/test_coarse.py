@@ -197,3 +197,15 @@ def test_the_cosine_of_samples_is_near_that_of_places() -> None:
 
 def test_angles_are_not_understated() -> None:
     assert math.isclose(float(coarse.angle(torch.tensor(1.0))), math.acos(1 - coarse.ROUNDING), rel_tol=0.1)
+
+
+@pytest.mark.usefixtures("searched")
+def test_many_candidates_are_those_of_a_scan_and_no_query_has_none() -> None:
+    learned, queries = smooth_model().map, queries_of()[:5]
+    search, wanted = coarse_search(learned), [(40, 5)]
+    assert search is not None
+    score, place = search(queries, wanted)
+    assert score.shape[1] <= learned.places
+    found = best_candidates(score, *wanted[0], place)
+    assert (found.index == best_candidates(learned.scores(queries), *wanted[0]).index).float().mean() > 0.9
+    assert [tuple(one.shape) for one in search(queries[:0], wanted)] == [(0, 40)] * 2
