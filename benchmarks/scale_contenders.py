@@ -247,6 +247,6 @@ REPEATED: dict[str, Callable[[float, float], Store]] = {
     "interpolated frames": lambda room, _: Interpolated(room),
 }
 CONTENDERS = PLACED | REPEATED
-REQUESTED = ("usearch int8",)  # measured where they are named: this takes ten minutes to learn 10^6 places
+REQUESTED = ("usearch int8",)  # measured where they are named: this takes long to learn 10^6 places
 SEARCHED = ("exact", "scan", "64 probes")  # ways to search what a contender without them in its name keeps
 GIVEN = CONTENDERS.keys() - {ONE_CHUNK, FIXED, FLOWN}  # those whose bytes per place are given, and no result

@@ -71,7 +71,7 @@ def _slots(
     return slot, scale.new_zeros(size).index_copy(0, slot, scale)
 
 
-_kept_slots = lru_cache(32)(_slots)  # they take a third of the time of a chunk's products
+_kept_slots = lru_cache(32)(_slots)  # making them takes longer than the transform of a single query
 
 
 def from_slots(slotted: Tensor, count: int, transform: Transform) -> Tensor:

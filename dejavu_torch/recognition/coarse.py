@@ -270,7 +270,7 @@ class CoarseSearch:
         return torch.stack(last).amax(0)
 
     def _below(self, units: Tensor, best: Tensor, score: Tensor) -> Best:
-        """Places of each query that score at most so much, (Q,), and perhaps others of their chunks.
+        """Places of each query that score at most so much, (Q,), but for rounding.
 
         For unit vectors q, s and x, the angle of q and x is at least that of q and s less that of s and x.
         Here s are the fine samples of a group, and x the places near them.

@@ -8,6 +8,7 @@ from fractions import Fraction
 import pytest
 import torch
 from torch import Tensor
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 from dejavu_torch.maps.spectrum import Transform, from_spectrum, period_of, spectrum
 
@@ -58,3 +59,14 @@ def test_a_whole_number_of_cycles_is_one_line_of_the_dft_and_many_of_the_dct() -
     lines = {name: int((spectrum(wave, name).abs() > 1e-9).sum()) for name in TRANSFORMS}
     assert lines["dft"] == 2
     assert lines["dct"] > 50
+
+
+def test_what_an_inference_or_a_fake_tensor_left_serves_gradients() -> None:
+    with torch.inference_mode():
+        from_spectrum(torch.randn(37))
+    with FakeTensorMode():
+        from_spectrum(torch.zeros(38))
+    for count in (37, 38):
+        lines = torch.randn(count, requires_grad=True)
+        from_spectrum(lines).square().sum().backward()
+        torch.testing.assert_close(lines.grad, 2 * lines.detach())
