@@ -33,6 +33,7 @@ REFINED = 32  # best groups of a query that are refined; 4 times as many if the 
 SPARE = 3  # further windows of a query that are scored if they are as good
 CLOSE = 0.02  # cosines that differ by less are as good
 UNLIKE = 0.02  # a query whose best cosine is less is scanned: places without a direction have cosine 0
+TOGETHER = 16  # queries whose fine samples are compared at a time
 BLOCK, PRODUCTS = 8192, 2**20  # samples, and products with them, at a time: these stay in the cache
 LARGE = 6  # standard deviations of a component of a unit vector; larger ones are cut to it in 8 bits
 ROUNDING = 1e-5  # of products of unit vectors in float32
@@ -233,8 +234,9 @@ class CoarseSearch:
         offsets = torch.arange(-reach, reach + 1, device=group.device)
         middle = self.middle[GROUP * group + best % GROUP]
         at = (middle[:, :, None] + offsets).clamp(0, len(self.fine.place) - 1).flatten(1)
-        rows = self.fine.rows.index_select(0, at.flatten()).view(*at.shape, -1)
-        cosines = (rows * units[:, None]).sum(2) / self.fine.norm[at]
+        parts = zip(at.split(TOGETHER), units.split(TOGETHER), strict=True)  # these stay in the cache
+        products = [(self.fine.rows[near] * some[:, None]).sum(2) for near, some in parts]
+        cosines = torch.cat(products) / self.fine.norm[at]
         width = min(places, plan.fine + 1 + max((k - 1) * (radius + 1) for k, radius in wanted))
         windows = best_candidates(-cosines, min(count + SPARE, at.shape[1]), width, self.fine.place[at])
         close = windows.score <= windows.score[:, :count].amax(1, keepdim=True) + CLOSE

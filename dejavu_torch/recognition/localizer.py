@@ -97,9 +97,10 @@ class Localizer:
         if matching.platt is not None:
             wanted.append((min(2, places), TOLERANCE))
         n = lowest_needed(wanted, places)
-        few = n <= max(1, FEW * min(places, route.block_places)) or places > SCORES_AT_ONCE
+        few = self.find is not None or places > SCORES_AT_ONCE
+        few = few or n <= max(1, FEW * min(places, route.block_places))
         way, size = self._by_scores, places
-        if matching.sequence is None and matching.on_scores is None and (few or self.find is not None):
+        if matching.sequence is None and matching.on_scores is None and few:
             way, size = partial(self._by_search, wanted), max(LISTED * n, places // SAMPLED)
         parts = descriptors.split(max(1, min(ROWS, SCORES_AT_ONCE // size)))
         return Match.joined(way(part.to(route.positions.device)) for part in parts)
