@@ -443,7 +443,7 @@ def fit(
     # of what the file holds once, the sample pays its share alone
     share, once = len(rows) / frames, 2 * rows.shape[1]
     counted = round(share * mapper.overhead - (1 - share) * once)
-    fitted = mapper.with_overhead(counted, mapper.ready).fit(rows, sample.stretch)
+    fitted = mapper.with_overhead(counted).fit(rows, sample.stretch)
     return fitted.to(describer.device)
 
 
@@ -511,11 +511,11 @@ def learn_descriptors(mapper: Mapper, descriptors: Tensor) -> PlaceMap:
 
 def log_reached(route: SpectralMap, mapper: SpectralMapper) -> None:
     """The bytes of a long route, and the variance that it holds, if the sample promised others."""
-    hold, held = mapper.hold, route.held or 0
+    hold, held = mapper.share, route.held or 0
     if hold is not None and not mapper.resolution and abs(held - hold) > OFF:
         seen = "hold is %g, and the lines hold %.3g of the variance: their step is of %d of %d places"
         log.warning(seen, *(hold, held, SAMPLE, route.places))
-    wanted, places, summary = mapper.budget, route.places, route.summary()
+    wanted, places, summary = mapper.route_bytes_per_place, route.places, route.summary()
     if wanted is None or summary.route_bytes - summary.route["lines"] >= wanted * places:
         return
     overhead = mapper.overhead if 2 * mapper.overhead <= wanted * places else 0

@@ -20,6 +20,7 @@ from dejavu_torch.data.names import names_of
 from dejavu_torch.features.extract import features_of
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.joined import Joined
+from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import Views
 from dejavu_torch.features.whitening import WIDEST, Whitening
@@ -80,7 +81,8 @@ class DejaVu(nn.Module):
     """Learn a compressed map of a route from what repeats along it, and find places on it (section III).
 
     Args:
-        features: any nn.Module (B,C,H,W) -> (B,D); None is HOG with its defaults.
+        features: any nn.Module (B,C,H,W) -> (B,D); None is `default_features`: HOG and the pixels of small
+            frames side by side, HOG alone without whitening.
         whitening: reduces features to few numbers, learned anew with each map unless it is `fixed`; None is
             Whitening for a SpectralMapper and "none" for templates; "none" keeps the features, though a
             SpectralMapper gets the principal components of ready ones of over 256 numbers.
@@ -140,7 +142,9 @@ class DejaVu(nn.Module):
         if precision is not None and threshold is not None:
             raise InputError(f"a threshold, {threshold}, and a precision, {precision}; expected one of them")
         self.preprocess = Preprocess() if preprocess is None else preprocess
-        self.features = HOG() if features is None else features
+        self.mapper = SpectralMapper() if mapper is None else mapper
+        whitens = (whitening is None and self.mapper.whitens) or isinstance(whitening, Whitening)
+        self.features = default_features(whitens) if features is None else features
         for module in self.features.modules():  # no file can be loaded into expanded ones
             for name, buffer in module.named_buffers(recurse=False):
                 if not is_lazy(buffer):
@@ -151,8 +155,7 @@ class DejaVu(nn.Module):
                 "dimensions (of lazy layers: yet); expected 32"
             )
         self.weight_bits = weight_bits
-        self.mapper = SpectralMapper() if mapper is None else mapper
-        if whitening is None and self.mapper.whitens:
+        if whitening is None and whitens:
             whitening = Whitening()
         self.whitening = whitening if isinstance(whitening, Whitening) else None
         self._whitens = self.whitening is not None  # if not, wide features get their own
@@ -213,7 +216,7 @@ class DejaVu(nn.Module):
         """
         traverse = self.resample(as_traverse(traverse), progress=progress)
         describer, text = self._describer_of(traverse), "learning" if progress else None
-        mapper = self.mapper.with_overhead(positions_of(traverse).nbytes, is_ready(traverse))
+        mapper = self.mapper.with_overhead(positions_of(traverse).nbytes)
         route: PlaceMap
         counts: Tensor | None = None
         if visits is not None:
@@ -248,8 +251,7 @@ class DejaVu(nn.Module):
             traverse: what they come from, if known: then the map knows which frames to expect, and which
                 frame each place of resampled ones shows.
         """
-        overhead = positions_of(traverse).nbytes
-        mapper = self.mapper.with_overhead(overhead, is_ready(traverse))
+        mapper = self.mapper.with_overhead(positions_of(traverse).nbytes)
         return self._take(learn_descriptors(mapper, features), traverse)
 
     def describe_reference(
@@ -681,6 +683,12 @@ class DejaVu(nn.Module):
                 raise InputError(f"there is no map yet{purpose}; expected learn(...) or load(...) first")
             seen = f"this is a descriptor without a map{purpose}"
             raise InputError(f"{seen}; expected learn(...) of a route with it first")
+
+
+def default_features(whitens: bool = True) -> nn.Module:
+    """The features of a model that names none: HOG and the grey pixels of small frames side by side, which
+    whitening joins; HOG alone, as the paper has it, if nothing does."""
+    return Joined([HOG(), PatchPixels(channel="grey")]) if whitens else HOG()
 
 
 def own_size(features: nn.Module, block: bool = False) -> tuple[int, int] | None:

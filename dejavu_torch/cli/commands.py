@@ -34,12 +34,12 @@ from dejavu_torch.cli.options import (
     Searching,
     Sequences,
     load_map,
+    named_features,
 )
 from dejavu_torch.data.frame_range import chained
 from dejavu_torch.data.output import check_output_file, check_output_folder, whole_folder
 from dejavu_torch.data.source import check_not_read, open_source
 from dejavu_torch.evaluation.answers import next_steps, probable_counts, told_line, told_probable
-from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.views import Views
 from dejavu_torch.learning import SAMPLE as SHORT
@@ -313,7 +313,7 @@ def run_compare(
     matcher = sequences.matcher(max(0, judging.tolerance), acceptance.threshold)
     acceptance.check(matcher, judging.distractors)
     if map is not None:
-        model = load_map(map, None if isinstance(model.features, HOG) else model.features)
+        model = load_map(map, named_features(model))
         if model.map.routes:
             names = ", ".join(route.name for route in model.map.routes)
             raise InputError(f"--map {map} has the routes {names}; expected a map of {reference} alone")

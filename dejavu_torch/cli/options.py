@@ -13,9 +13,8 @@ from dejavu_torch import growth
 from dejavu_torch.cli.device import device_of
 from dejavu_torch.data.frame_range import parts_of
 from dejavu_torch.data.source import open_source
-from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.views import Views
-from dejavu_torch.model import DejaVu, check_precision
+from dejavu_torch.model import DejaVu, check_precision, default_features
 from dejavu_torch.model_file import NO_MAP, recipe_of
 from dejavu_torch.motion.resampling import source_of
 from dejavu_torch.recognition.coarse import MEMORY
@@ -135,6 +134,12 @@ class Loading:
         model = load_map(path, self.features).to(device_of(self.device))
         model.velocity = None if self.as_is else model.velocity
         return model
+
+
+def named_features(model: DejaVu) -> nn.Module | None:
+    """The features of a model, for a file to be read with; None if they are default ones, for its own."""
+    default = default_features(model.whitening is not None)
+    return None if recipe_of(model.features) == recipe_of(default) else model.features
 
 
 def load_map(path: Path, features: nn.Module | None = None) -> DejaVu:
@@ -273,8 +278,7 @@ class Growth:
         """That of --append, with the features and the acceptance of the given one; or that one."""
         if self.append is None:
             return given
-        default = recipe_of(given.features) == recipe_of(HOG())
-        model = load_map(self.append, None if default else given.features)
+        model = load_map(self.append, named_features(given))
         Acceptance(given.threshold, given.precision).of(model)
         return model
 

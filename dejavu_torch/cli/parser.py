@@ -19,6 +19,7 @@ import yaml
 from jsonargparse.typing import restricted_string_type
 from torch import nn
 
+from dejavu_torch.cli.options import named_features
 from dejavu_torch.cli.presets import check_config, check_word, find_config
 from dejavu_torch.data.files import LARGEST
 from dejavu_torch.data.source import check_not_read
@@ -32,7 +33,6 @@ MODEL = "model"  # the parameter of a command that is a DejaVu: each of its argu
 COMMAND = "command"  # the parameter that is the command line itself
 # classes whose options can be given alone, where the constructor's type is a base class
 DEFAULT_PARTS = {
-    "features": {"class_path": "dejavu_torch.HOG"},
     "mapper": {"class_path": "dejavu_torch.SpectralMapper"},
 }
 HINT = (
@@ -114,6 +114,10 @@ def with_made(words: Sequence[str]) -> list[str]:
     """
     words = list(_with_members(words))
     configured = any(word.startswith(("--config=", "-c")) or word == "--config" for word in words)
+    options = [word.partition("=")[0] for word in words]
+    of_hog = [one for one in options if one.startswith("--features.") and one[-5:] != ".help"]
+    if of_hog and not configured and "--features" not in options:
+        words.insert(options.index(of_hog[0]), f"--features={HOG.__module__}.{HOG.__name__}")
     makers = {}
     for word, after in pairwise([*words, ""]):
         option, equals, value = word.partition("=")
@@ -382,9 +386,8 @@ def _model_of(name: str, arguments: dict[str, Any], words: Sequence[str]) -> Dej
     if len(files) == 2:
         seen = f"--whitening {files['whitening']} has its own features"
         raise UsageError(f"{seen}; expected it or --descriptor {files['descriptor']}")
-    named = any(word.startswith("--features") for word in words) or not isinstance(model.features, HOG)
     for what, path in files.items():  # features of our own come from there as well
-        file = DejaVu.load(path, model.features if named else None)
+        file = DejaVu.load(path, named_features(model))
         if what == "descriptor":
             model.take_descriptor(file)
             continue

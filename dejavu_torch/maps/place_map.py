@@ -206,10 +206,6 @@ class Mapper(nn.Module, ABC):
     def empty(self) -> PlaceMap:
         """A map without places, which can load any map of this mapper."""
 
-    def with_overhead(self, overhead: int, ready: bool = False) -> Mapper:
-        """The mapper that leaves room in its budget, if any, for bytes of a file that grow with the places.
-
-        Args:
-            ready: whether the descriptors are of ready features, not of frames.
-        """
+    def with_overhead(self, overhead: int) -> Mapper:
+        """The mapper that leaves room in its budget, if any, for what else grows with the places."""
         return self

@@ -20,8 +20,7 @@ log = logging.getLogger("dejavu_torch")
 
 ROWS = 2**14  # of descriptors, checked at a time
 HALF = 0.5  # of the variance: a map that holds less says which bytes would hold `HELD`
-HELD = 0.85  # of the variance: such maps find nearly what their descriptors find
-ROUTE_BYTES = 5.0  # per place by default
+HELD = 0.85  # of the variance by default: such maps find nearly what their descriptors find
 
 
 class SpectralMapper(Mapper):
@@ -30,17 +29,17 @@ class SpectralMapper(Mapper):
     Args:
         route_bytes_per_place: bytes of the map for each place, without those that do not grow with the route;
             the step is the smallest whose coded lines fit. Positions of frames count, but come on top, with a
-            warning, if they would leave the lines less than half. None, without step and hold, is 5; more if
-            that holds less than .85 of the variance of ready features, or if mean and chunks alone take it.
+            warning, if they would leave the lines less than half. None leaves the step to `step` or `hold`.
         step: the step itself, in units of the descriptor, in place of the bytes.
         chunk: places of a chunk. Shorter chunks cost more bytes; a route no longer than one has one.
         transform, metric: of the maps, see `SpectralMap`.
         resolution: places; 0 codes all lines alike. The dead zone of a line of period P is
             1 + (resolution / P)^2 times as wide. For video with many frames for each place that a user tells
             apart 8 makes a better map; if every frame is another place it makes a worse one.
-        hold: in place of the bytes, the share of the descriptors' variance that the lines hold, such as .85:
-            1 - the sum of squares of what is missing / that of the differences from the mean. The step is
-            the largest that holds it; `resolution` then leaves out lines that count in it.
+        hold: in place of the bytes, the share of the descriptors' variance that the lines hold: 1 - the sum
+            of squares of what is missing / that of the differences from the mean. The step is the largest
+            that holds it; `resolution` then leaves out lines that count in it. None, without bytes and step,
+            is .85.
 
     Shape: descriptors (N,K) -> SpectralMap of N places.
 
@@ -83,7 +82,7 @@ class SpectralMapper(Mapper):
                 raise InputError(f"{name} is {value}; expected a number above 0{share}")
         self.route_bytes_per_place, self.step, self.hold = route_bytes_per_place, step, hold
         self.chunk, self.transform, self.metric, self.resolution = chunk, transform, metric, resolution
-        self.overhead, self.ready = 0, False  # see `with_overhead`
+        self.overhead = 0  # see `with_overhead`
         self.empty()  # checks the settings
 
     @classmethod
@@ -96,10 +95,10 @@ class SpectralMapper(Mapper):
         return cls(size, None, route.chunk, route.transform, route.metric)
 
     @property
-    def budget(self) -> float | None:
-        """Bytes per place; None where a step, or the variance that a map holds, decides."""
-        default = self.step is None and self.hold is None and not self.ready
-        return ROUTE_BYTES if self.route_bytes_per_place is None and default else self.route_bytes_per_place
+    def share(self) -> float | None:
+        """Of the variance that maps hold; None where bytes or a step decide."""
+        given = self.route_bytes_per_place is not None or self.step is not None
+        return None if given else self.hold or HELD
 
     @torch.no_grad()
     def forward(self, features: Tensor) -> SpectralMap:
@@ -120,9 +119,9 @@ class SpectralMapper(Mapper):
     def _map(self, means: Tensor | None = None, step: float = 0.0) -> SpectralMap:
         return SpectralMap(means, self.metric, self.transform, self.chunk, self.resolution, step)
 
-    def with_overhead(self, overhead: int, ready: bool = False) -> SpectralMapper:
+    def with_overhead(self, overhead: int) -> SpectralMapper:
         other = copy.copy(self)
-        other.overhead, other.ready = overhead, ready
+        other.overhead = overhead
         return other
 
     def extra_repr(self) -> str:
@@ -138,19 +137,20 @@ class SpectralMapper(Mapper):
         if not lines.scale > 1e-6 * float(lines.mean.float().square().mean().sqrt()):
             raise InputError(f"the {places} descriptors are all alike; expected a route that changes")
         fixed = lines.mean.nbytes + CHUNK_BYTES * len(lines.chunks)
-        if self.budget is not None:
-            if self.overhead <= max(0, self.budget * places - fixed) / 2:
+        budget = self.route_bytes_per_place
+        if budget is not None:
+            if self.overhead <= max(0, budget * places - fixed) / 2:
                 fixed += self.overhead
             else:
                 log.warning(
                     "positions of frames take %.3g bytes per place, over half of what "
                     "route_bytes_per_place=%g leaves for them and the lines: they come on top of it",
-                    *(self.overhead / places, self.budget),
+                    *(self.overhead / places, budget),
                 )
         step = float(torch.tensor(self._fitting_step(lines, fixed)))  # as the file holds it
         route = self._map(lines.mean[None], step)
         even = lines.even()  # what `resolution` leaves out is not missed
-        if self.hold is None and even.held(step) < HALF:
+        if self.share is None and even.held(step) < HALF:
             route.needed = (fixed + lines.coded_bytes(even.step_that_holds(HELD))) / places
         return route, lines
 
@@ -158,31 +158,18 @@ class SpectralMapper(Mapper):
         """The smallest step whose coded lines fit into the budget, to 2 %, or the mapper's own step."""
         if self.step is not None:
             return self.step
-        if self.hold is not None:
-            return lines.even().step_that_holds(self.hold)
+        if self.route_bytes_per_place is None:
+            return lines.even().step_that_holds(self.share or HELD)
         places, numbers = lines.lines.shape
-        given = self.route_bytes_per_place
-        nothing = lines.coded_bytes(lines.coarsest)
-        least = (fixed + nothing) / places
+        budget, least = self.route_bytes_per_place, (fixed + lines.coded_bytes(lines.coarsest)) / places
         most = math.floor(least) + 4 * numbers  # all numbers as floats
-        if given is not None and not least < given <= most:
+        if not least < budget <= most:
             works = math.ceil(least + min(5, 2 * numbers))
             raise InputError(
-                f"route_bytes_per_place is {given:g}; expected more than {least:.3g}, which the mean, "
+                f"route_bytes_per_place is {budget:g}; expected more than {least:.3g}, which the mean, "
                 f"chunks and positions take, such as {works}, and at most {most}, with all numbers as floats"
             )
-        budget = ROUTE_BYTES if given is None else given
-        short = budget <= least
-        if short:
-            log.warning(
-                "mean and chunks of %d places take %.3g bytes for each, more than the default "
-                "route_bytes_per_place of %g: they come on top of it",
-                *(places, least, budget),
-            )
-        step = lines.step_of(max(nothing, budget * places - fixed * (not short)))
-        if given is None and (self.ready or short):
-            step = min(step, lines.even().step_that_holds(HELD))
-        return step
+        return lines.step_of(budget * places - fixed)
 
 
 @torch.no_grad()

@@ -199,7 +199,8 @@ def beside_untrained(
     hog = hog_baselines(reference, query, model.batch_size, tolerance)
     found |= {HOG: hog["hog"].found} if hog else {}
     mapper = None if isinstance(model.mapper, TemplateMapper) else copy.deepcopy(model.mapper)
-    if isinstance(mapper, SpectralMapper) and mapper.budget is None:  # another descriptor takes other bytes
+    if isinstance(mapper, SpectralMapper) and mapper.route_bytes_per_place is None:
+        # another descriptor takes other bytes
         mapper.route_bytes_per_place = model.map.summary().route_bytes / model.map.places
         mapper.step = mapper.hold = None
     try:
