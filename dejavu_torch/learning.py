@@ -141,12 +141,12 @@ class Describer(NamedTuple):
             copies = whitening.copies(*features.shape)
             settings = copies, whitening.most_views, whitening.strengths, whitening.seed
             second, looks = augmented_route(traverse, len(features), *settings)
-        groups = None if is_ready(traverse) else groups_of(self.pipeline)
+        groups = (None, None) if is_ready(traverse) else groups_of(self.pipeline)
         if second is None:
-            whitening.learn(features, None, groups)
+            whitening.learn(features, None, *groups)
         else:
             batches = self.features(second.traverse, progress and f"learning what changes: {looks}")
-            whitening.learn(features, _with_places(batches, second.places.to(self.device)), groups)
+            whitening.learn(features, _with_places(batches, second.places.to(self.device)), *groups)
         whitening.to(self.device)
 
     def visits(self, views: Views, progress: str | None = None) -> tuple[Tensor, Tensor]:

@@ -688,7 +688,7 @@ class DejaVu(nn.Module):
 def default_features(whitens: bool = True) -> nn.Module:
     """The features of a model that names none: HOG and the grey pixels of small frames side by side, which
     whitening joins; HOG alone, as the paper has it, if nothing does."""
-    return Joined([HOG(), PatchPixels(channel="grey")]) if whitens else HOG()
+    return Joined([HOG(), PatchPixels((24, 48), channel="grey")], [1, 0.5]) if whitens else HOG()
 
 
 def own_size(features: nn.Module, block: bool = False) -> tuple[int, int] | None:

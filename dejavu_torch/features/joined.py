@@ -17,6 +17,8 @@ class Joined(nn.Module):
 
     Args:
         members: modules (B,C,H,W) -> (B,D_i), any whatsoever; all see the same frames.
+        shares: of each, above 0 and at most 1, None is 1 each: the part of the numbers of a whole member that
+            whitening keeps of it, and its squared length beside theirs.
 
     Attributes:
         groups: features of each member, of the frames seen last; the whitening learned from them takes these.
@@ -24,7 +26,8 @@ class Joined(nn.Module):
     Shape: (B,C,H,W) -> (B, D_1 + D_2 + ..).
 
     Raises:
-        InputError: no members, or some that are no modules; forward: a member that makes something else.
+        InputError: no members, some that are no modules, or shares that do not fit them; forward: a member
+            that makes something else.
 
     Example:
         >>> from dejavu_torch.features.hog import HOG
@@ -34,13 +37,16 @@ class Joined(nn.Module):
         (torch.Size([2, 3812]), (1764, 2048))
     """
 
-    def __init__(self, members: list[nn.Module]) -> None:
+    def __init__(self, members: list[nn.Module], shares: list[float] | None = None) -> None:
         super().__init__()
         modules = [*members] if isinstance(members, (Sequence, nn.ModuleList)) else [members]
         if not modules or not all(isinstance(one, nn.Module) for one in modules):
             seen = ", ".join(type(one).__name__ for one in modules) or "none"
             raise InputError(f"the members of the features are {seen}; expected modules, at least one")
-        self.members = nn.ModuleList(modules)
+        if shares is not None and not (len(shares) == len(modules) and all(0 < one <= 1 for one in shares)):
+            seen = f"the shares of {len(modules)} members of the features are {shares}"
+            raise InputError(f"{seen}; expected a number above 0 and at most 1 for each")
+        self.members, self.shares = nn.ModuleList(modules), shares
         self.groups: tuple[int, ...] | None = None
 
     def forward(self, frames: Tensor) -> Tensor:
@@ -51,7 +57,8 @@ class Joined(nn.Module):
         return torch.cat(made, 1)
 
 
-def groups_of(features: nn.Module) -> tuple[int, ...] | None:
-    """The `groups` of features, or of the last part of a pipeline; None of features that are not joined."""
+def groups_of(features: nn.Module) -> tuple[tuple[int, ...] | None, list[float] | None]:
+    """The `groups` and `shares` of features, or of the last part of a pipeline; None of features that are not
+    joined."""
     last = features[-1] if isinstance(features, nn.Sequential) and len(features) else features
-    return last.groups if isinstance(last, Joined) else None
+    return (last.groups, last.shares) if isinstance(last, Joined) else (None, None)

@@ -20,7 +20,7 @@ ROWS = 1024  # in double precision at a time
 SAMPLED = 4096  # rows that principal components are found in
 DIMENSIONS = 128  # unless said otherwise
 WIDEST = 256  # dimensions without whitening
-PLACES_PER_DIMENSION = 4  # a short route does not fill as many dimensions
+PLACES_PER_DIMENSION = 2  # a short route does not fill as many dimensions
 COMPONENTS = 400  # that whitening works on
 VIEWS = 4  # of a frame, on a long route
 VIEWS_PER_COMPONENT = 30  # on any: as 4 views of each of 3000 frames
@@ -91,8 +91,7 @@ class Whitening(nn.Module):
     copies of its frames, or frames of a second traverse.
 
     Args:
-        numbers: K, at most the rank. None is 128, on a short route a quarter of its places; without views
-            256.
+        numbers: K, at most the rank. None is 128, on a short route half of its places; without views 256.
         components: principal components that are whitened, at least K.
         shrinkage: of `learned_whitening`. None is 0.03, and more if there are few views.
         views: augmented copies of each frame. None is 4, up to 12 on a short route: 30 for each component.
@@ -244,24 +243,27 @@ class Whitening(nn.Module):
         places: Tensor,
         views: Iterable[tuple[Tensor, Tensor]] | None = None,
         groups: Sequence[int] | None = None,
+        shares: Sequence[float] | None = None,
     ) -> None:
         """Find the projection for one route.
 
         Args:
             places: (N,D), the descriptors of the route; they may lie in a file.
             views: batches of descriptors (B,D) and the places (B,) that they show; None has no views.
-            groups: of the features, if the constructor's are None.
+            groups, shares: of the features, see `Joined`, if the constructor's groups are None.
         """
-        groups = groups if self.groups is None else self.groups
+        groups, shares = (groups, shares) if self.groups is None else (self.groups, None)
         sizes = [places.shape[1]] if groups is None else [*groups]
         if sum(sizes) != places.shape[1]:
             seen = f"groups of {' + '.join(map(str, sizes))} numbers, and descriptors {tuple(places.shape)}"
             raise InputError(f"{seen}; expected (N, {sum(sizes)})")
         members = [self] if groups is None else [self._member() for _ in sizes]
         begun = []
-        for member, own in zip(members, places.split(sizes, 1), strict=True):
+        shares = [1.0] * len(members) if groups is None or shares is None else shares
+        for member, own, share in zip(members, places.split(sizes, 1), shares, strict=True):
             kept = self.kept(len(places), own.shape[1], views is not None)
-            kept = kept if groups is None or self.group_numbers is None else self.group_numbers
+            if groups is not None:
+                kept = math.ceil(share * (self.group_numbers or kept))
             begun.append(member._components(own, kept, kept if views is None else self.components))
         if views is None:
             for member, (mean, basis, variances, _) in zip(members, begun, strict=True):
@@ -273,11 +275,15 @@ class Whitening(nn.Module):
                 member.take(mean + basis @ centre, basis @ projection, None)
         if groups is not None:
             some = places[:: max(1, len(places) // SAMPLED)].to(self.scale.device).split(sizes, 1)
-            joined = torch.cat([member(own) for member, own in zip(members, some, strict=True)], 1)
+            weights = [math.sqrt(share) for share in shares]
+            each = zip(weights, members, some, strict=True)
+            joined = torch.cat([weight * member(own) for weight, member, own in each], 1)
             kept = self.kept(len(places), joined.shape[1], views is not None)
             # about zero, not their mean: the products of all pairs are kept, which cosines are made of
             mean, basis, *_ = self._components(joined, kept, kept, centre=False)
-            self.take(mean, basis, None)
+            sizes = [len(member.scale) + len(member.length) for member in members]
+            scaled = torch.cat([w * part for w, part in zip(weights, basis.split(sizes), strict=True)])
+            self.take(mean, scaled, None)
         self.members = nn.ModuleList([] if groups is None else members)
 
     def _member(self) -> Whitening:

@@ -182,7 +182,7 @@ class Trainee(pl.LightningModule):
                 torch.manual_seed(whitening.seed)
                 views = self.views_of(whitening.copies(*features.shape), whitening.most_views)
                 pairs = ((view, places[:, 0]) for view, places in views)
-                whitening.learn(features, None if whitening.views == 0 else pairs, groups_of(self.features))
+                whitening.learn(features, None if whitening.views == 0 else pairs, *groups_of(self.features))
             alone = self.data.reference if len(self.data.routes) == 1 else None
             model.learn_features(model.whitened(features), alone)
 
