@@ -30,6 +30,7 @@ PICTURES = (
 )
 LATE = 0.1  # recall at which a curve starts late
 HEADING = 11  # letters of a line of a heading
+SIZES = (1.0, 5.0)  # route bytes per place that stand in the table beside the map's own
 
 _MAIN = {"auc": "AUC", "recall_at_1": "recall@1", "recall_at_100_precision": "R@100P"}
 _MORE = {
@@ -91,7 +92,18 @@ def score_table(report: Report, every: bool = False) -> list[list[str]]:
                 size = [f"{one.bytes}", f"{one.bytes / frames:.1f}", f"{one.route_bytes / frames:.1f}"]
             row += size if every else size[1:]
         rows.append(row)
+    for size in report.facts.get("storage", {}).get("map", ()):  # behind ours, the largest first
+        route, scores = size["route_bytes_per_place"], [size.get(field) for field in columns]
+        if frames and round(route, 1) in SIZES:
+            whole = route * frames + report.ours.fixed
+            row = ["" if one is None else f"{one:.3f}" for one in scores] + [f"{whole:.0f}"] * every
+            rows.insert(2, [_in_bytes(route), *row, f"{whole / frames:.1f}", f"{route:.1f}"])
     return rows
+
+
+def _in_bytes(route: float) -> str:
+    """The name of the run's descriptors coded at another size."""
+    return f"the map in {route:.3g} route bytes per place"
 
 
 def sequence_table(report: Report) -> list[list[str]]:
@@ -101,7 +113,7 @@ def sequence_table(report: Report) -> list[list[str]]:
     """
     found = {one.name: sequences_as_json(one.sequences) for one in report.shown().values() if one.sequences}
     for size in report.facts.get("storage", {}).get("map", ()) if found else ():
-        found[f"the map in {size['route_bytes_per_place']:.3g} route bytes per place"] = size["sequences"]
+        found[_in_bytes(size["route_bytes_per_place"])] = size["sequences"]
     lengths = sorted({int(length) for one in found.values() for length in one})
     rows = [["AUC", *(f"T = {length}" for length in lengths)]]
     for name, one in found.items():
