@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -20,6 +20,8 @@ BATCH_NUMBERS = 2**26  # in the frames of a batch, of which there is at least on
 AT_ONCE = 64  # frames read at a time by default
 FRAME_NUMBERS = 2**28  # in one frame: 1 GB
 LONGEST_MESSAGE = 2000  # characters
+
+Together = int | Literal["filter"]  # T queries in a sequence, or all before by a filter
 
 
 class InputError(ValueError):
@@ -45,6 +47,7 @@ class Traverse(ABC):
     cut: tuple[tuple[int, ...], range] | None = None
     seeks: bool = False  # whether `between` reads nothing before the first frame asked for
     sized: bool = False  # whether the size of the frames was asked for, as by `width=` of a video
+    ordered: bool = False  # whether frames are known to follow one another along the route, as in a video
 
     @abstractmethod
     def batches(self, size: int) -> Iterator[Tensor]:
@@ -178,11 +181,12 @@ class Match(_Columns):
     index: (Q,) int64, the reported place, -1 if no place has a finite score; (Q,k) candidates, best first.
     score: float, lower is better, +inf where nothing covers. accepted: bool, see `DejaVu.acceptance`.
     probability: float64, of being right, if the map is calibrated, else None; NaN for all but the first
-        candidate. sequences: by T, matches (Q,) by sequences of T queries. Both are outside the tuple.
+        candidate. sequences: by T, matches (Q,) by sequences of T queries, or by a filter. Both are outside
+        the tuple.
     """
 
     probability: Tensor | None = None
-    sequences: Mapping[int, Match] = MappingProxyType({})
+    sequences: Mapping[Together, Match] = MappingProxyType({})
 
     def _replace(self, **changes: Any) -> Match:
         probability = changes.pop("probability", self.probability)

@@ -308,7 +308,7 @@ def run_compare(
     """
     from dejavu_torch.evaluation.compare import compare
 
-    where = device_of(learning.device, learns=map is None)
+    where, ordered = device_of(learning.device, learns=map is None), judging.in_order()
     acceptance = Acceptance(model.threshold, model.precision)
     matcher = sequences.matcher(max(0, judging.tolerance), acceptance.threshold)
     acceptance.check(matcher, judging.distractors)
@@ -351,6 +351,7 @@ def run_compare(
         calibration="none" if learning.calibration == NO_CALIBRATION else known,
         distractors=strange,
         storage_curve=judging.storage_curve,
+        ordered=ordered,
         progress=True,
     )
     _publish(result, out, f"{query} found on {reference}", command, map, judging.top)

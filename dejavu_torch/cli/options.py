@@ -309,6 +309,10 @@ class Judging:
         top: write so many places of each query, no two within the tolerance
         distractors: another route, or several, '[A,B]': how many of its frames are accepted
         storage_curve: also evaluate maps of other sizes, which takes as long as all the rest
+        ordered: the queries follow one another along the route, and a filter over them is set beside single
+            queries; as without it for a video, a strip, a simulated route, and a folder whose names end in
+            rising numbers
+        unordered: they do not
     """
 
     truth: str | None = None
@@ -318,6 +322,14 @@ class Judging:
     top: int | None = None
     distractors: list[str] | str | None = None
     storage_curve: bool = False
+    ordered: bool = False
+    unordered: bool = False
+
+    def in_order(self) -> bool | None:
+        """Whether the queries are in order; None if their source is to tell."""
+        if self.ordered and self.unordered:
+            raise InputError("--ordered and --unordered; expected one of them, or none")
+        return self.ordered if self.ordered or self.unordered else None
 
     def off_map(self, traverses: Collection[Traverse]) -> list[Traverse]:
         """The distractors, none of which may be one of the traverses."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,8 @@ BYTES_A_PIXEL = 24  # that reading takes at most: decoded, as an array, and as f
 
 
 class ImageFolder(IndexedTraverse):
-    """The images of a folder, sorted by name; numbers in names count as numbers (9 before 10).
+    """The images of a folder, sorted by name; numbers in names count as numbers (9 before 10). If all names
+    end in numbers that rise, such as frame_0001.png, the images are taken to be in order along the route.
 
     Grey images give one channel, all others three; an image that says how the camera was turned is upright;
     of several images in a file only the first counts.
@@ -55,6 +57,9 @@ class ImageFolder(IndexedTraverse):
         self.width, self.height, self.sized = width, height, bool(width or height)
         self.path, self.name = folder, printable(folder)
         self.length = len(self.files)
+        numbers = [re.search(r"\d+$", file.stem) for file in self.files]
+        rising = [int(one[0]) for one in numbers if one]
+        self.ordered = len(rising) == self.length and all(a < b for a, b in pairwise(rising))
         self.alike = False  # whether images of other aspect ratios are refused, as portraits
         self._first: tuple[str, str, tuple[int, int]] | None = None  # that was read: name, shape, own size
 

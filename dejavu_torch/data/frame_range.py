@@ -54,7 +54,7 @@ class Selection(Traverse):
     def __init__(self, traverse: Traverse, frame: Tensor | range) -> None:
         self.traverse, self.frame = traverse, frame
         self.name, self.length = traverse.name, len(frame)
-        self.seeks, self.sized = traverse.seeks, traverse.sized
+        self.seeks, self.sized, self.ordered = traverse.seeks, traverse.sized, traverse.ordered
         if traverse.place is not None:
             at = slice(frame.start, frame.stop, frame.step) if isinstance(frame, range) else frame
             self.place = traverse.place[at].contiguous()
@@ -156,6 +156,7 @@ class Chain(Traverse):
         self.name = " + ".join(one.name for one in self.traverses)
         self.seeks = all(one.seeks for one in self.traverses)
         self.sized = any(one.sized for one in self.traverses)
+        self.ordered = all(one.ordered for one in self.traverses)
         lengths = [one.length for one in self.traverses]
         if None not in lengths:
             self.length = sum(length or 0 for length in lengths)

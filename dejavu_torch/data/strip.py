@@ -32,6 +32,8 @@ class SlidingWindow(IndexedTraverse):
         (105, torch.Size([64, 1, 96, 96]))
     """
 
+    ordered = True
+
     def __init__(self, strip: Tensor, width: int, step: int = 1, name: str = "the strip") -> None:
         if strip.ndim != 3 or not strip.is_floating_point():
             raise InputError(f"{name} is {tuple(strip.shape)} {strip.dtype}; expected float (C,H,W)")

@@ -60,6 +60,8 @@ class Video(Traverse):
             between parts that each say it (of a fragmented .mp4, or an .avi of more than 1 GB).
     """
 
+    ordered = True
+
     def __init__(self, path: str | Path, width: int = 0, height: int = 0) -> None:
         self.path, self.name = Path(path), printable(path)
         check_size(self.path, width, height)

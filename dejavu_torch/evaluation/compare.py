@@ -24,7 +24,7 @@ from dejavu_torch.data.ground_truth import (
 )
 from dejavu_torch.evaluation.answers import own_facts
 from dejavu_torch.evaluation.baselines import Baseline, baselines_of
-from dejavu_torch.evaluation.contenders import Contender, contend, lengths_beside
+from dejavu_torch.evaluation.contenders import Contender, contend, models_beside
 from dejavu_torch.evaluation.evaluate import RANKS, evaluation_facts
 from dejavu_torch.evaluation.localization import Localization
 from dejavu_torch.evaluation.pictures import draw_pictures
@@ -89,6 +89,7 @@ def compare(
     calibration: Views | Literal["none"] | None = None,
     distractors: Sequence[Traverse] = (),
     storage_curve: bool = False,
+    ordered: bool | None = None,
     progress: bool = False,
 ) -> Comparison:
     """Learn the reference, find the queries on it, and evaluate that beside what else could be stored.
@@ -114,6 +115,8 @@ def compare(
         distractors: routes that are not on the map: how many of their frames are accepted.
         storage_curve: also code a spectral map at several sizes, see `coded_at_sizes`:
             the report gets `storage` and its picture. Needs a ground truth.
+        ordered: whether the queries follow one another along the route: then a filter over them is set beside
+            single queries, on the map and on all else. None is what their source tells.
         progress: show progress bars on a terminal.
 
     Raises:
@@ -167,9 +170,11 @@ def compare(
         queries = model.extract_all(query, "describing the query" if progress else None)
         if sequence is not None:
             sequence.check(len(queries), model.map.places)
-        matching = Matching(sequence, lengths_beside(sequence, len(queries), model.map.places))
+        ordered = source_of(query).ordered if ordered is None else ordered
+        ways = models_beside(sequence, ordered, len(queries), model.map.places, tolerance)
+        matching = Matching(sequence, ways)
         ranks = max(top, min(max(RANKS), model.map.places))
-        rule = rule._replace(lengths=matching.lengths, k=ranks, radius=tolerance)
+        rule = rule._replace(beside=ways, k=ranks, radius=tolerance)
         candidates = model.localize_descriptors(queries, rule)
     off_map = _match_distractors(model, distractors, sequence)
 

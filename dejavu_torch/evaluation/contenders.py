@@ -10,10 +10,13 @@ from torch import Tensor
 
 from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth, counted
 from dejavu_torch.evaluation.curves import PRCurve, Scores, curve_of, evaluate
+from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.sequence import SequenceMatcher
-from dejavu_torch.types import Match, SequenceModel
+from dejavu_torch.types import Match, SequenceModel, Together
 
 LENGTHS = (1, 5, 11, 21)  # queries of the sequences that a report sets side by side
+MOVES = 2  # places that a filter moves by at most
+FILTERED = 2**27  # scores of queries in order that are filtered without having been asked for
 
 # Told apart by the colour-blind where they share a picture; keys are those of report.json, `map` is ours.
 COLOURS = {
@@ -46,7 +49,7 @@ class Contender(NamedTuple):
 
     scores, curve: None where there is no ground truth. bytes: None where nothing is stored, as by a null.
     k: where every k-th frame is stored. fixed: those of the bytes that do not grow with the route.
-    sequences: by T, the scores of sequences of T queries; empty where single queries are matched.
+    sequences: by T, the scores of sequences of T queries, and of a filter; empty where there are none.
     """
 
     name: str
@@ -55,7 +58,13 @@ class Contender(NamedTuple):
     k: int | None = None
     curve: PRCurve | None = None
     fixed: int = 0
-    sequences: Mapping[int, Scores] = MappingProxyType({})
+    sequences: Mapping[Together, Scores] = MappingProxyType({})
+
+    @property
+    def by_length(self) -> Mapping[Together, Scores]:
+        """`sequences`, and by 1 the scores of single queries, where there are any."""
+        single = self.sequences and self.scores is not None and 1 not in self.sequences
+        return {1: self.scores, **self.sequences} if single and self.scores else self.sequences
 
     @property
     def route_bytes(self) -> int | None:
@@ -81,8 +90,8 @@ class Contender(NamedTuple):
         return scores | {name: value for name, value in extra.items() if value is not None}
 
 
-def sequences_as_json(sequences: Mapping[int, Scores]) -> dict[str, dict[str, float]]:
-    """What report.json holds of sequences, by T."""
+def sequences_as_json(sequences: Mapping[Together, Scores]) -> dict[str, dict[str, float]]:
+    """What report.json holds of sequences, by T, and of a filter."""
     return {str(T): {"auc": one.auc, "recall_at_1": one.recall_at_1} for T, one in sequences.items()}
 
 
@@ -103,8 +112,8 @@ def contend(
 
 
 def evaluate_each(
-    sequences: Mapping[int, Match], truth: Tensor | GroundTruth, tolerance: int
-) -> dict[int, Scores]:
+    sequences: Mapping[Together, Match], truth: Tensor | GroundTruth, tolerance: int
+) -> dict[Together, Scores]:
     """Scores by T, see `evaluate`; a T of which no query is left to judge is left out."""
     truth = as_ground_truth(truth)
     judged = {T: one for T, one in sequences.items() if counted(one.index, truth, tolerance).any()}
@@ -127,14 +136,24 @@ def distinct(contenders: Mapping[str, Contender]) -> dict[str, Contender]:
     return kept
 
 
-def lengths_beside(sequence: SequenceModel | None, queries: int, places: int) -> tuple[int, ...]:
-    """The T to set beside a sequence, its own among them, that so many queries and places have room for.
+def models_beside(
+    sequence: SequenceModel | None, ordered: bool, queries: int, places: int, within: int
+) -> dict[Together, SequenceModel]:
+    """What is set beside a sequence: others, its own length among them, that so many queries and places have
+    room for, and a filter; beside single queries in order the filter alone.
 
     Example:
-        >>> lengths_beside(SequenceMatcher(7), queries=100, places=12)
-        (1, 5, 7, 11)
+        >>> [*models_beside(SequenceMatcher(7), True, queries=100, places=12, within=5)]
+        [1, 5, 7, 11, 'filter']
     """
-    if sequence is None:
-        return ()
-    own = {sequence.length} if isinstance(sequence, SequenceMatcher) else set()
-    return tuple(length for length in sorted({*LENGTHS, *own}) if length <= min(queries, places))
+    found: dict[Together, SequenceModel] = {}
+    if sequence is not None:
+        own = {sequence.length} if isinstance(sequence, SequenceMatcher) else set()
+        speeds = sequence.speeds if isinstance(sequence, SequenceMatcher) else (1.0,)
+        lengths = (length for length in sorted({*LENGTHS, *own}) if length <= min(queries, places))
+        found |= {length: SequenceMatcher(length, speeds) for length in lengths}
+    if isinstance(sequence, PlaceFilter):
+        found["filter"] = sequence
+    elif ordered and places > MOVES and queries * places <= FILTERED:
+        found["filter"] = PlaceFilter(within=within)
+    return found

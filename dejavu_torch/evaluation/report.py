@@ -107,17 +107,19 @@ def _in_bytes(route: float) -> str:
 
 
 def sequence_table(report: Report) -> list[list[str]]:
-    """AUC over the number T of queries matched together, as rows of text, the header first.
+    """AUC over the number T of queries matched together, and of a filter, as rows of text, the header first.
 
-    No rows where single queries are matched.
+    No rows where there are only single queries.
     """
-    found = {one.name: sequences_as_json(one.sequences) for one in report.shown().values() if one.sequences}
-    for size in report.facts.get("storage", {}).get("map", ()) if found else ():
-        found[_in_bytes(size["route_bytes_per_place"])] = size["sequences"]
-    lengths = sorted({int(length) for one in found.values() for length in one})
-    rows = [["AUC", *(f"T = {length}" for length in lengths)]]
+    found = {one.name: sequences_as_json(one.by_length) for one in report.shown().values() if one.sequences}
+    for size in report.facts.get("storage", {}).get("map", ()):
+        if "sequences" in size:
+            found[_in_bytes(size["route_bytes_per_place"])] = size["sequences"]
+    keys = {key for one in found.values() for key in one}
+    lengths = [*sorted(keys - {"filter"}, key=int), *(keys & {"filter"})]
+    rows = [["AUC", *(key if key == "filter" else f"T = {key}" for key in lengths)]]
     for name, one in found.items():
-        areas = (one.get(f"{length}") for length in lengths)
+        areas = (one.get(key) for key in lengths)
         rows.append([name, *("" if scores is None else f"{scores['auc']:.3f}" for scores in areas)])
     return rows if found else []
 

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 from dejavu_torch.evaluation.contenders import COLOURS, Contender, colour_of, distinct, sequences_as_json
 from dejavu_torch.evaluation.curves import Scores
 from dejavu_torch.evaluation.plots import LETTERS, LINE, Picture, Plot, canvas, label, picture
+from dejavu_torch.types import Together
 
 _SHADES = (COLOURS["map"], "#00406b", "#5aa9d6")  # one map on several datasets
 NOTICED = 0.001  # of an area: less is no gain
@@ -24,13 +25,13 @@ _HATCHES = {"hog": "...", "null": "///"}
 class Stored(NamedTuple):
     """What a route is recognised at where it takes so many bytes.
 
-    sequences: by T, the scores of sequences of T queries; empty where single queries are matched.
+    sequences: as of a `Contender`.
     """
 
     route_bytes_per_place: float
     auc: float
     recall_at_1: float
-    sequences: Mapping[int, Scores] = MappingProxyType({})
+    sequences: Mapping[Together, Scores] = MappingProxyType({})
 
     def as_json(self) -> dict[str, Any]:
         """The entry of report.json."""
@@ -157,19 +158,20 @@ def draw_storage(
 def draw_sequences(
     contenders: Mapping[str, Contender], coded: Sequence[Stored], places: int, tolerance: str
 ) -> dict[str, Picture]:
-    """Areas over the number of queries matched together; nothing where single ones are.
+    """Areas over the number of queries matched together, and of a filter behind; nothing where single ones
+    are.
 
     The map is drawn at some of the sizes that it is coded at as well, unless it has about that size itself.
     """
     lines = {key: one for key, one in distinct(contenders).items() if one.sequences}
     if not lines:
         return {}
-    drawn = [(one.name, one.sequences, _style(key) | {"linewidth": 1.4}) for key, one in lines.items()]
+    drawn = [(one.name, one.by_length, _style(key) | {"linewidth": 1.4}) for key, one in lines.items()]
     if "map" in lines and coded:
         own, style = (lines["map"].route_bytes or 0) / places, _style("map")
-        drawn[0] = (f"this map, {own:.3g} route bytes per place", lines["map"].sequences, style)
+        drawn[0] = (f"this map, {own:.3g} route bytes per place", lines["map"].by_length, style)
         sizes = [own]
-        for budget in SHOWN:
+        for budget in SHOWN if coded[0].sequences else ():
             nearest = min(coded, key=lambda size: abs(size.route_bytes_per_place - budget))
             size = nearest.route_bytes_per_place
             if all(max(size, other) > ALIKE * min(size, other) for other in sizes):
@@ -177,12 +179,15 @@ def draw_sequences(
                 drawn.insert(len(sizes), (f"the same in {size:.3g} bytes", nearest.sequences, style | mark))
                 sizes.append(size)
     figure, axis = canvas(3.6 + 1.1 * LINE * sum(len(wrap(name, LETTERS - 8)) for name, *_ in drawn))
+    lengths = sorted({T for _, found, _ in drawn for T in found if T != "filter"})
+    at: dict[Together, float] = {T: T for T in lengths}
+    if any("filter" in found for _, found, _ in drawn):
+        at["filter"] = lengths[-1] + max(1, lengths[-1] / 4)
     for name, found, style in reversed(drawn):  # the first on top
         areas = drawn_areas([scores.auc for scores in found.values()])
         style = {"marker": "o", "markersize": 4.5} | style
-        axis.plot(list(found), areas, label=fill(name, LETTERS - 8), **style)
-    ticks = sorted({T for _, found, _ in drawn for T in found})
-    axis.set_xticks(ticks, [str(T) for T in ticks])
+        axis.plot([at[T] for T in found], areas, label=fill(name, LETTERS - 8), **style)
+    axis.set_xticks([*at.values()], [str(T) for T in at])
     area_axis(axis)
     axis.set(xlabel="queries matched together, T")
     axis.set_title(f"right within {tolerance}", fontsize=10)

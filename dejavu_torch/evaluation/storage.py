@@ -18,6 +18,7 @@ from dejavu_torch.evaluation.score_plots import Stored
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.spectrum import from_spectrum, spectrum
+from dejavu_torch.recognition.localizer import SINGLE
 from dejavu_torch.types import InputError, Match
 
 BUDGETS = (1.0, 2.5, 5.0, 10.0, 20.0)  # route bytes per place
@@ -31,7 +32,7 @@ def coded_at_sizes(
     Raises:
         InputError: a map of another kind, or no ground truth.
     """
-    route = run.model.map
+    run, route = run if run.sequence is not None else run._replace(matching=SINGLE), run.model.map
     if not isinstance(route, SpectralMap) or run.truth is None:
         truth = "no" if run.truth is None else "a"
         raise InputError(

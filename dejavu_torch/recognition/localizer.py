@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import accumulate
+from types import MappingProxyType
 from typing import NamedTuple
 
 import torch
@@ -18,7 +19,7 @@ from dejavu_torch.recognition.filter import LocalSearch, PlaceFilter
 from dejavu_torch.recognition.search import SCORES_AT_ONCE, Find, Search, Wanted, lowest_needed, search
 from dejavu_torch.recognition.select import Acceptance, accept, best_candidates, best_match
 from dejavu_torch.recognition.sequence import SequenceMatcher
-from dejavu_torch.types import Match, SequenceModel
+from dejavu_torch.types import Match, SequenceModel, Together
 
 ROWS = 4096  # descriptors on the device at a time
 CACHED = 2**20  # scores summed at a time: they stay in the processor's cache
@@ -31,7 +32,7 @@ class Matching(NamedTuple):
     """How queries are matched."""
 
     sequence: SequenceModel | None = None  # None matches each query by itself
-    lengths: tuple[int, ...] = ()  # T of further sequences beside it, at the speeds of a `SequenceMatcher`
+    beside: Mapping[Together, SequenceModel] = MappingProxyType({})  # further ways, see `Match.sequences`
     k: int | None = None  # candidates of a query; None gives matches (Q,)
     radius: int = 0  # places, any two candidates differ by more
     rule: Acceptance = Acceptance()
@@ -74,15 +75,12 @@ class Localizer:
     ) -> None:
         self.route, self.matching, self.find, self.track = route, matching, find, Track()
         sequence, routes = matching.sequence, () if route is None else route.routes
-        speeds = sequence.speeds if isinstance(sequence, SequenceMatcher) else (1.0,)
-        self.own = sequence.length if isinstance(sequence, SequenceMatcher) else 0
-        self.models: dict[int, SequenceModel] = {}  # by T, 0 of a filter; places are found by `own`
-        if sequence is not None:
-            self.models = {T: SequenceMatcher(T, speeds) for T in matching.lengths} | {self.own: sequence}
-        self.states: dict[int, Tensor] = {}  # of the models; none before the first query
+        self.own: Together = sequence.length if isinstance(sequence, SequenceMatcher) else "filter"
+        self.models = {**matching.beside, **({} if sequence is None else {self.own: sequence})}
+        self.states: dict[Together, Tensor] = {}  # of the models; none before the first query
         self.firsts = (0, *accumulate(one.places for one in routes[:-1]))  # the first place of each route
         self.local: LocalSearch | None = None
-        if route is not None and isinstance(sequence, PlaceFilter) and not matching.lengths:
+        if route is not None and isinstance(sequence, PlaceFilter) and not matching.beside:
             every = sequence.search_every
             self.local = LocalSearch(sequence, route, approximate or route.scores) if every > 1 else None
 
@@ -100,7 +98,7 @@ class Localizer:
         few = self.find is not None or places > SCORES_AT_ONCE
         few = few or n <= max(1, FEW * min(places, route.block_places))
         way, size = self._by_scores, places
-        if matching.sequence is None and matching.on_scores is None and few:
+        if not self.models and matching.on_scores is None and few:
             way, size = partial(self._by_search, wanted), max(LISTED * n, places // SAMPLED)
         parts = descriptors.split(max(1, min(ROWS, SCORES_AT_ONCE // size)))
         return Match.joined(way(part.to(route.positions.device)) for part in parts)
@@ -121,21 +119,24 @@ class Localizer:
             self.local.skipped += queries
         elif isinstance(filter, PlaceFilter) and self.states:
             for _ in range(queries):
-                self.states = self.states | {0: filter.moved(self.states[0], len(self.states[0]) - 1)}
+                state = self.states["filter"]
+                self.states = self.states | {"filter": filter.moved(state, len(state) - 1)}
 
     @property
     def posterior(self) -> Tensor | None:
         """(N+1,) of a filter after the latest query; None without one, or before the first query."""
-        return self.states.get(0) if self.local is None else self.local.posterior
+        return self.states.get("filter") if self.local is None else self.local.posterior
 
     def _in_sequence(self, scores: Tensor) -> Match:
         states = self.states or {T: one.start(scores.shape[1]).to(scores) for T, one in self.models.items()}
         steps = {T: one.step(scores, states[T], self.firsts) for T, one in self.models.items()}
-        together = steps[self.own][0]
-        confidence = None if self.matching.platt is None else self.track(together, scores)
+        single = self.matching.sequence is None
+        together, confidence = scores if single else steps[self.own][0], None
+        if self.matching.platt is not None:
+            confidence = confidence_of(scores) if single else self.track(together, scores)
         match = self._answer(self._candidates(together), confidence)
         self.states = {T: state for T, (_, state) in steps.items()}
-        beside = {T: best_match(steps[T][0]).map(Tensor.cpu) for T in self.matching.lengths}
+        beside = {T: best_match(steps[T][0]).map(Tensor.cpu) for T in self.matching.beside}
         return match._replace(sequences=beside)
 
     def _locally(self, descriptor: Tensor) -> Match:

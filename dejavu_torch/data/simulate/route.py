@@ -40,6 +40,7 @@ class SimulatedRoute(IndexedTraverse):
     """
 
     kind: ClassVar[str]  # its name, as in `sim:KIND?seed=0`
+    ordered: ClassVar[bool] = True  # type: ignore[misc]
     length: int
     place: Tensor
 
