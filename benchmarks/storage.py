@@ -31,7 +31,7 @@ from dejavu_torch.data.ground_truth import GroundTruth
 from dejavu_torch.data.source import open_source
 from dejavu_torch.evaluation.baselines import as_int8, between_keyframes, every, nearest_frames
 from dejavu_torch.evaluation.compare import check_places
-from dejavu_torch.evaluation.contenders import LENGTHS, evaluate_each, lengths_beside, sequences_as_json
+from dejavu_torch.evaluation.contenders import LENGTHS, evaluate_each, models_beside, sequences_as_json
 from dejavu_torch.evaluation.plots import Plot
 from dejavu_torch.evaluation.report import text_table
 from dejavu_torch.evaluation.reproduce import paper_model
@@ -98,7 +98,7 @@ class Route(NamedTuple):
     def matching(self) -> Matching:
         """Single queries, and sequences of each T that there is room for."""
         sequence = SequenceMatcher(max(length for length in LENGTHS if length <= len(self.places)))
-        return Matching(sequence, lengths_beside(sequence, len(self.queries), len(self.places)))
+        return Matching(sequence, models_beside(sequence, False, len(self.queries), len(self.places)))
 
     def another(self, what: str) -> Traverse:
         """The other route, which something is learned on."""

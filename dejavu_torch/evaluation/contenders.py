@@ -137,13 +137,13 @@ def distinct(contenders: Mapping[str, Contender]) -> dict[str, Contender]:
 
 
 def models_beside(
-    sequence: SequenceModel | None, ordered: bool, queries: int, places: int, within: int
+    sequence: SequenceModel | None, ordered: bool, queries: int, places: int, within: int = 5
 ) -> dict[Together, SequenceModel]:
     """What is set beside a sequence: others, its own length among them, that so many queries and places have
     room for, and a filter; beside single queries in order the filter alone.
 
     Example:
-        >>> [*models_beside(SequenceMatcher(7), True, queries=100, places=12, within=5)]
+        >>> [*models_beside(SequenceMatcher(7), True, queries=100, places=12)]
         [1, 5, 7, 11, 'filter']
     """
     found: dict[Together, SequenceModel] = {}

@@ -30,6 +30,24 @@ def with_alpha(pixels: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
+    ("names", "ordered"),
+    [
+        (("9.png", "10.png", "200.png"), True),
+        (("drive_0001.png", "drive_0002.png"), True),
+        (("a.png", "b.png"), False),
+        (("a_7.png", "b_3.png"), False),  # each of another drive
+        (("a_3.png", "b_3.png"), False),
+        (("1.png", "2_left.png"), False),
+    ],
+)
+def test_names_that_end_in_rising_numbers_are_in_order(
+    tmp_path: Path, names: tuple[str, ...], ordered: bool
+) -> None:
+    write(tmp_path, *names)
+    assert ImageFolder(tmp_path).ordered is ordered
+
+
+@pytest.mark.parametrize(
     ("image", "name", "expected"),
     [
         (Image.fromarray(GREY), "a.png", GREY[..., None] / 255),

@@ -15,6 +15,7 @@ from videos import H264, clip, pictures
 
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.folder import ImageFolder
+from dejavu_torch.data.frame_range import Chain
 from dejavu_torch.data.ground_truth import position_truth
 from dejavu_torch.data.simulate.aerial import AerialRoad
 from dejavu_torch.data.source import open_source
@@ -129,6 +130,7 @@ def test_a_part_of_every_source_means_the_same(sources: dict[str, str], kind: st
     torch.testing.assert_close(torch.cat(list(some.between(1, 3))), frames[5:8:2], atol=1e-6, rtol=0)
     assert some.length == (None if whole.length is None else 3)
     assert some.frame_shape == whole.frame_shape
+    assert some.ordered == whole.ordered == Chain([whole, some]).ordered == (not kind.endswith("npy"))
     assert [some.frame_name(i) for i in range(3)] == [whole.frame_name(i) for i in range(12)][chosen]
     if whole.place is not None:
         assert some.place is not None

@@ -11,6 +11,7 @@ from torch import Tensor
 from dejavu_torch.evaluation.baselines import every, fair_stride, nearest_frames
 from dejavu_torch.recognition.localizer import Matching
 from dejavu_torch.recognition.sequence import SequenceMatcher
+from dejavu_torch.types import SequenceModel, Together
 
 DISTANCES = {
     "l1": lambda a, b: (a - b).abs().sum(),
@@ -45,7 +46,8 @@ def test_the_nearest_stored_frame(metric: str) -> None:
 def test_frames_that_are_not_stored_are_driven_past_in_a_sequence(k: int) -> None:
     """Their distances are those of the nearest stored frame; a sequence tells where between them it is."""
     reference, query, matcher = torch.rand(30, 3), torch.rand(25, 3), SequenceMatcher(6)
-    found = nearest_frames(reference, query, k, matching=Matching(matcher, lengths=(1, 6)))
+    beside: dict[Together, SequenceModel] = {1: SequenceMatcher(1), 6: SequenceMatcher(6)}
+    found = nearest_frames(reference, query, k, matching=Matching(matcher, beside))
     nearest = [min(range(0, 30, k), key=lambda stored: (abs(stored - frame), -stored)) for frame in range(30)]
     score, index = matcher(torch.cdist(query, reference[nearest], p=1)).min(1)
     for match in (found, found.sequences[6]):

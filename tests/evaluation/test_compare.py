@@ -20,6 +20,7 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.evaluation.compare import compare
 from dejavu_torch.evaluation.controls import null_control, with_mapper
 from dejavu_torch.evaluation.curves import evaluate
+from dejavu_torch.evaluation.report import sequence_table, summary
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.maps.distance import phase_distances
 from dejavu_torch.maps.spectral_map import SpectralMap
@@ -229,11 +230,37 @@ def test_sequences_of_every_contender(kind: str) -> None:
             assert many["sequences"]["1"][name] == one[name]
             assert many["sequences"]["7"][name] == many[name]
         # of the very same scores
-        assert by_filter["sequences"] == {T: many["sequences"][T] for T in ("1", "5", "11", "21")}
+        assert by_filter["sequences"] == {
+            **{T: many["sequences"][T] for T in ("1", "5", "11", "21")},
+            "filter": {name: by_filter[name] for name in ("auc", "recall_at_1")},
+        }
     assert seven["sequences"]["1"]["auc"] < 0.7 < 0.9 < seven["sequences"]["21"]["auc"]
     # 20 queries have no sequence of 21
     short = compare(pair[0], ArrayTraverse(passing(2)[:20]), "0", model, sequence=SequenceMatcher(3))
     assert list(short.report.as_json()["null"]["sequences"]) == ["1", "3", "5", "11"]
+
+
+def test_a_filter_stands_beside_single_queries_in_order_and_changes_nothing_else() -> None:
+    pair, model = (ArrayTraverse(passing(1)), ArrayTraverse(passing(2))), DejaVu(whitening="none")
+
+    def report(ordered: bool | None, storage: bool = False) -> dict[str, Any]:
+        result = compare(*pair, "0", model, tolerance=1, ordered=ordered, storage_curve=storage).report
+        assert bool(sequence_table(result)) == bool(ordered)
+        assert ("(--filter)" in summary(result)) == bool(ordered)
+        return result.as_json()
+
+    single, ordered = report(False), report(True, storage=True)
+    assert "sequences" not in report(None)  # an array does not tell
+    filtered = compare(*pair, "0", model, tolerance=1, sequence=PlaceFilter(within=1)).report.as_json()
+    for key in (None, *(key for key, entry in single.items() if isinstance(entry, dict) and "auc" in entry)):
+        one, other, by_filter = (all_ if key is None else all_[key] for all_ in (single, ordered, filtered))
+        assert list(other["sequences"]) == ["filter"]
+        assert other["sequences"]["filter"]["auc"] == by_filter["auc"]
+        assert {name: other[name] for name in one if name.startswith(("auc", "recall"))} == {
+            name: one[name] for name in one if name.startswith(("auc", "recall"))
+        }
+    assert ordered["sequences"]["filter"]["auc"] > single["auc"] + 0.1
+    assert all("sequences" not in size for size in ordered["storage"]["map"])
 
 
 def test_the_scores_of_single_queries_are_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:

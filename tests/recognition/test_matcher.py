@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from itertools import pairwise
 
 import pytest
 import torch
 from helpers import streamed
 from torch import Tensor
 
-from dejavu_torch.evaluation.contenders import lengths_beside
+from dejavu_torch.evaluation.contenders import models_beside
+from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.recognition.calibration import Platt, confidence_of
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.localizer import Localizer, Matching
 from dejavu_torch.recognition.select import Acceptance, best_candidates, best_match
 from dejavu_torch.recognition.sequence import SequenceMatcher
-from dejavu_torch.types import Match, SequenceModel
+from dejavu_torch.types import Match, SequenceModel, Together
 
 SCORES = torch.rand(30, 40, generator=torch.Generator().manual_seed(3))
 
@@ -25,6 +25,10 @@ SCORES = torch.rand(30, 40, generator=torch.Generator().manual_seed(3))
 def matched(matching: Matching, scores: Tensor = SCORES, size: int = 30) -> Match:
     matcher = Localizer(None, matching)
     return Match.joined(map(matcher.match, scores.split(size)))
+
+
+def lengths(speeds: list[float]) -> dict[Together, SequenceModel]:
+    return {length: SequenceMatcher(length, speeds) for length in (1, 5, 11)}
 
 
 def same(one: Match, other: Match) -> bool:
@@ -38,15 +42,15 @@ def same(one: Match, other: Match) -> bool:
 def test_a_sequence_and_what_stands_beside_it(
     sequence: SequenceModel, speeds: list[float], size: int
 ) -> None:
-    """A matcher's at its own speeds, a filter's at speed 1, out of the scores of single queries."""
-    found = matched(Matching(sequence, (1, 5, 11)), size=size)
+    """All out of the scores of single queries."""
+    found = matched(Matching(sequence, lengths(speeds)), size=size)
     with torch.no_grad():
         (own,) = streamed(sequence, [SCORES])
     assert found.index.tolist() == own.argmin(1).tolist()
     assert torch.allclose(found.score, own.min(1).values)
     assert list(found.sequences) == [1, 5, 11]
-    for length, match in found.sequences.items():
-        assert same(match, best_match(SequenceMatcher(length, speeds)(SCORES)))
+    for length, model in lengths(speeds).items():
+        assert same(found.sequences[length], best_match(model(SCORES)))
 
 
 @pytest.mark.parametrize("sequence", [SequenceMatcher(5), PlaceFilter()])
@@ -62,7 +66,8 @@ def test_scores_pass_by_once_and_are_not_held(
             yield torch.rand(2, 50)
 
     with largest_tensor() as seen:
-        for number, _ in enumerate(map(Localizer(None, Matching(sequence, (1, 5, 11))).match, batches())):
+        matching = Matching(sequence, lengths([1.0]))
+        for number, _ in enumerate(map(Localizer(None, matching).match, batches())):
             assert asked == list(range(number + 1))
     assert len(asked) == 40
     assert seen.numel <= (11 - 1 + 2) * (50 + 2 * 10)  # a trajectory's places to each side
@@ -112,12 +117,44 @@ def test_places_are_renumbered_everywhere() -> None:
     assert both.sequences[5].index.tolist() == [30, -1] * 2
 
 
-def test_lengths_that_there_is_room_for() -> None:
-    assert lengths_beside(None, 100, 100) == ()
-    assert lengths_beside(PlaceFilter(), 100, 100) == (1, 5, 11, 21)
-    assert lengths_beside(SequenceMatcher(11), 21, 100) == (1, 5, 11, 21)
-    assert lengths_beside(SequenceMatcher(11), 100, 20) == (1, 5, 11)
-    assert lengths_beside(SequenceMatcher(30), 29, 100) == (1, 5, 11, 21)
-    beside = lengths_beside(SequenceMatcher(30), 30, 30)
-    assert all(one < other for one, other in pairwise(beside))
-    assert 30 in beside
+@pytest.mark.parametrize(
+    ("sequence", "ordered", "queries", "places", "keys"),
+    [
+        (None, False, 100, 100, []),
+        (None, True, 100, 100, ["filter"]),
+        (None, True, 100, 2, []),  # a filter moves by up to 2 places
+        (None, True, 10**6, 10**6, []),  # takes too long unless asked for
+        (PlaceFilter(), False, 100, 100, [1, 5, 11, 21, "filter"]),
+        (SequenceMatcher(11), False, 21, 100, [1, 5, 11, 21]),
+        (SequenceMatcher(11), True, 100, 20, [1, 5, 11, "filter"]),
+        (SequenceMatcher(30), False, 29, 100, [1, 5, 11, 21]),
+        (SequenceMatcher(30), False, 30, 30, [1, 5, 11, 21, 30]),
+    ],
+)
+def test_ways_to_match_that_there_is_room_for(
+    sequence: SequenceModel | None, ordered: bool, queries: int, places: int, keys: list[Together]
+) -> None:
+    found = models_beside(sequence, ordered, queries, places, within=3)
+    assert [*found] == keys
+    if isinstance(sequence, PlaceFilter):
+        assert found["filter"] is sequence
+    elif "filter" in keys:
+        assert getattr(found["filter"], "within", None) == 3
+
+
+def test_sequences_and_a_filter_beside_single_queries_change_nothing_of_them() -> None:
+    route = SpectralMapper(12.0)(torch.randn(60, 8).cumsum(0))
+    queries = route.decode(0)[10:40] + 0.3 * torch.randn(30, 8)
+    beside: dict[Together, SequenceModel] = {5: SequenceMatcher(5), "filter": PlaceFilter()}
+    platt = Platt(3.0, -1.0)
+    alone = Localizer(route, Matching(platt=platt))(queries)
+    localizer = Localizer(route, Matching(platt=platt, beside=beside))
+    parts = Match.joined(localizer(part) for part in queries.split(7))  # the state goes on
+    assert all(torch.allclose(one, other) for one, other in zip(parts, alone, strict=True))
+    assert parts.probability is not None
+    assert alone.probability is not None
+    torch.testing.assert_close(parts.probability, alone.probability)
+    for key, model in beside.items():
+        expected = best_match(model(route.scores(queries)))
+        assert torch.equal(parts.sequences[key].index, expected.index)
+        torch.testing.assert_close(parts.sequences[key].score, expected.score)
