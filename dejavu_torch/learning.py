@@ -512,7 +512,8 @@ def learn_descriptors(mapper: Mapper, descriptors: Tensor) -> PlaceMap:
 def log_reached(route: SpectralMap, mapper: SpectralMapper) -> None:
     """The bytes of a long route, and the variance that it holds, if the sample promised others."""
     hold, held = mapper.share, route.held or 0
-    if hold is not None and not mapper.resolution and abs(held - hold) > OFF:
+    more = mapper.hold is None and held > (hold or 0)  # as 5 bytes per place hold
+    if hold is not None and not mapper.resolution and abs(held - hold) > OFF and not more:
         seen = "hold is %g, and the lines hold %.3g of the variance: their step is of %d of %d places"
         log.warning(seen, *(hold, held, SAMPLE, route.places))
     wanted, places, summary = mapper.route_bytes_per_place, route.places, route.summary()
