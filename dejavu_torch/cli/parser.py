@@ -36,13 +36,12 @@ DEFAULT_PARTS = {
     "mapper": {"class_path": "dejavu_torch.SpectralMapper"},
 }
 HINT = (
-    "Parts have options of their own, such as --features.cell 4, --whitening.numbers 64 or "
-    "--mapper.route_bytes_per_place 2.5: see --features.help HOG, --whitening.help, --mapper.help "
+    "Parts have options of their own, such as --whitening.numbers 64, --mapper.route_bytes_per_place 2.5 "
+    "or, of HOG alone, --features.cell 4: see --features.help HOG, --whitening.help, --mapper.help "
     "SpectralMapper, --preprocess.help and --velocity.help. --config local_maxima makes a map of templates, "
     "with options such as --mapper.periods.window 512. --features '[HOG, PatchPixels]' joins the features of "
-    "several. --whitening also takes none, or a map file, with "
-    "the features that it was learned from; --descriptor takes those alone, from a map or from what "
-    "`dejavu train` makes of several routes."
+    "several. --whitening also takes none, or a map file, with the features that it was learned from; "
+    "--descriptor takes those alone, from a map or from what `dejavu train` makes of several routes."
 )
 BARE = {"velocity": "GroundOdometry", "page": 8765}  # what an option without a value means
 MapFile = restricted_string_type("MapFile", r".*\.safetensors")

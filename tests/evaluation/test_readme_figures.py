@@ -40,8 +40,7 @@ def test_the_imposed_periods_are_among_the_strongest(report: dict[str, Any]) -> 
 
 
 def test_convention_8_figures_stand_beside_their_null_and_fair_baselines(report: dict[str, Any]) -> None:
-    assert report["auc"] > report["hog"]["auc"] > report["null"]["auc"]
-    assert report["auc"] > report["stride"]["auc"]
+    assert report["auc"] > max(report[name]["auc"] for name in ("hog", "null", "stride"))
     # keyframes get the bytes of the route, and every 10th descriptor more of them
     assert report["interpolated"]["route_bytes"] <= report["route_bytes"] < report["stride"]["route_bytes"]
     assert report["interpolated"]["route_bytes"] > 0.9 * report["route_bytes"]
@@ -78,12 +77,15 @@ def test_it_ends_with_commands_to_try(demo: Path, tmp_path: Path, monkeypatch: p
 
 
 def told() -> dict[str, list[float]]:
-    """The rows of README's table: AUC, recall@1, recall at 100 % precision, and bytes where it has some."""
+    """The rows of README's table: AUC, recall@1, recall at 100 % precision, and bytes where it has some.
+
+    Of the map in other sizes, which lack the third, a test of the curve has the area.
+    """
     table = README.read_text().split("## Results")[1].split("Route bytes grow")[0]
     return {
         cells[1].strip(): [float(cell) for cell in cells[2:7] if cell.strip()]
         for line in table.splitlines()
-        if re.search(r"\| \d+\.\d", line) and (cells := line.split("|"))
+        if re.search(r"\| \d+\.\d", line) and "the map in" not in line and (cells := line.split("|"))
     }
 
 
