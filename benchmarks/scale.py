@@ -46,6 +46,7 @@ from dejavu_torch.data.frame_range import FrameRange, IndexedTraverse
 from dejavu_torch.data.output import temporary_folder
 from dejavu_torch.data.simulate.aerial import LONGEST, AerialRoad
 from dejavu_torch.evaluation.curves import evaluate
+from dejavu_torch.features.hog import HOG
 from dejavu_torch.maps import codec, distance
 from dejavu_torch.model import DejaVu
 from dejavu_torch.types import InputError, Match
@@ -217,7 +218,7 @@ class Folder:
     """
 
     def __init__(self, path: Path, drawn: int) -> None:
-        self.path, self.model = path, DejaVu()
+        self.path, self.model = path, DejaVu(HOG())  # `tiles_of` splits it
         first, self.second = AerialRoad(frames=drawn), AerialRoad(frames=drawn, traverse=1)
         self.model.describe_reference(FrameRange(first, 0, min(drawn, DESCRIBED)))
         self.keep("drawn", drawn, self.seen(first, range(drawn)))

@@ -243,8 +243,11 @@ def write_model(path: Path, model: Any) -> None:
 def read_model(make: Callable[..., M], path: Path, features: nn.Module | None) -> M:
     """See `DejaVu.load`; `make` is `DejaVu`."""
     with opened(path) as (tensors, header):
-        if features is not None and recipe_of(features) not in with_parts(header["features"]):
-            raise InputError(f"it was learned with {difference(header['features'], recipe_of(features))}")
+        if features is not None and (given := recipe_of(features)) != (whole := header["features"]):
+            # a part of them is given for what only the caller can load, not as features of its own
+            foreign = any(part.class_path not in REGISTRY for part in with_parts(given))
+            if not (foreign and given in with_parts(whole)):
+                raise InputError(f"it was learned with {difference(whole, given)}")
         weights = unpacked(tensors, "features.")
         if features is None:
             with torch.device("meta"):  # a claim of large layers allocates nothing

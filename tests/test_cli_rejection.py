@@ -32,7 +32,8 @@ def learned(tmp_path_factory: pytest.TempPathFactory) -> Path:
         patch.setattr("dejavu_torch.features.whitening.VIEWS", VIEWS)
         patch.setattr("dejavu_torch.features.whitening.VIEWS_PER_COMPONENT", VIEWS_PER_COMPONENT)
         patch.setattr("dejavu_torch.features.views.FEWEST", FEWEST)
-        run("learn", ROUTE, "--map", path)
+        # as many numbers as half of so few places make a filter less sure, not more
+        run("learn", ROUTE, "--map", path, "--whitening.numbers", "16")
     return path
 
 

@@ -43,6 +43,8 @@ def written(name: str) -> dict[str, Any]:
     """A preset as it is written, with classes by their names."""
 
     def plain(value: Any) -> Any:
+        if isinstance(value, list):
+            return [plain(one) for one in value]
         if not isinstance(value, dict):
             return value
         names = {"class_path": value["class_path"].rpartition(".")[2]} if "class_path" in value else {}

@@ -407,6 +407,7 @@ def test_maps_that_cannot_be_merged() -> None:
     plain = learned(walk(90))
     wide = learned(torch.randn(90, 7).cumsum(0))
     l2 = learned(walk(90), metric="l2")
+    hog = DejaVu(HOG()).learn(walk(90))
     cells = DejaVu(HOG(cell=4), "none", SpectralMapper()).learn(walk(90))
     grey = DejaVu(None, "none", SpectralMapper(), preprocess=Preprocess(channel="grey")).learn(walk(90))
     images, wider = image_model(), image_model()
@@ -414,7 +415,8 @@ def test_maps_that_cannot_be_merged() -> None:
     templates = template_model(whitening="none").learn(walk(90))
     for pair, words in (
         ((one, other), ("a and b", "whitening", "learned apart", "--whitening MAP")),
-        ((one, plain), ("whitening", "Whitening; got no whitening")),
+        ((one, plain), ("features differ", "Joined; got HOG")),  # the defaults with a whitening and without
+        ((hog, plain), ("whitening", "Whitening; got no whitening")),
         ((plain, wide), ("6 and 7",)),
         ((plain, l2), ("metric", "cosine", "l2")),
         ((plain, cells), ("features", "cell=8", "cell=4")),

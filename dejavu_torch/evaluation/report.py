@@ -6,6 +6,7 @@ import base64
 import html
 import io
 import json
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from itertools import zip_longest
@@ -66,7 +67,7 @@ class Report(NamedTuple):
     def __repr__(self) -> str:
         """What was scored, the main scores, and what else there is, in three lines."""
         rows = score_table(self._replace(contenders={}))
-        scores = ", ".join(f"{name} {value}" for name, value in zip(*rows, strict=True) if name)
+        scores = ", ".join(f"{name} {value}" for name, value in zip(*rows[:2], strict=True) if name)
         beside = f"; beside it {', '.join(self.contenders)}" if self.contenders else ""
         first = summary(self).partition(". ")[0].rstrip(".")
         line = told_line(self.facts, bool(scores))
@@ -94,7 +95,7 @@ def score_table(report: Report, every: bool = False) -> list[list[str]]:
         rows.append(row)
     for size in report.facts.get("storage", {}).get("map", ()):  # behind ours, the largest first
         route, scores = size["route_bytes_per_place"], [size.get(field) for field in columns]
-        if frames and round(route, 1) in SIZES:
+        if frames and any(math.isclose(route, one, rel_tol=0.02) for one in SIZES):
             whole = route * frames + report.ours.fixed
             row = ["" if one is None else f"{one:.3f}" for one in scores] + [f"{whole:.0f}"] * every
             rows.insert(2, [_in_bytes(route), *row, f"{whole / frames:.1f}", f"{route:.1f}"])
@@ -216,14 +217,15 @@ def write_report(
         data = as_png(picture)
         (folder / f"{name}.png").write_bytes(data)
         embedded.append((picture, _embedded(data)))
-    coded = facts.get("storage", {}).get("map", ())
+    coded, rows = facts.get("storage", {}).get("map", ()), score_table(report)
+    sizes = ["map"] * max(0, len(rows) - 1 - len(shown))  # rows of our descriptors in other sizes
     _write_page(
         folder,
         title=printable(title),
         lead=headline(report),
         notes=[summary(report)],
-        rows=score_table(report),
-        colours=[colour_of(key) for key in shown],
+        rows=rows,
+        colours=[colour_of(key) for key in (*sizes, *shown)],
         sequence_rows=sequence_table(report),
         sequence_colours=[colour_of(key) for key, one in shown.items() if one.sequences]
         + [colour_of("map")] * len(coded),

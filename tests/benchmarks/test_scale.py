@@ -27,6 +27,7 @@ from benchmarks.scale_report import exponents, scale_row, scale_tables
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.simulate.aerial import TILES, AerialRoad
 from dejavu_torch.evaluation.baselines import as_int8, interpolated
+from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.model import DejaVu
@@ -79,7 +80,7 @@ def test_a_made_route_and_its_queries_are_like_those_that_were_measured(like: Li
 
 
 def test_descriptors_of_tiles_are_those_of_the_frames() -> None:
-    model = DejaVu(whitening=Whitening(numbers=16))
+    model = DejaVu(HOG(), Whitening(numbers=16))
     assert model.whitening is not None
     still = {"ground": "repeat", "noise": 0, "drift": 0, "yaw": 0}
     features = torch.cat([model.describe(part) for part in AerialRoad(frames=200, **still).batches(64)])  # type: ignore[arg-type]

@@ -244,7 +244,7 @@ def test_rows_are_written_as_they_finish_the_map_that_is_given_among_them(
 
     monkeypatch.setattr(storage, "contenders_of", some)
     monkeypatch.setattr(storage, "judged", watched)
-    run("learn", pair[0], "--map", path)
+    run("learn", pair[0], "--map", path, "--mapper.route_bytes_per_place", "5")
     benchmark("storage", *pair, "--map", path, "--out", out)
     assert seen == [0, 1, 2, 3]
     written = json.loads((out / "bench.json").read_text())

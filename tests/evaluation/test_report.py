@@ -74,6 +74,30 @@ def test_the_table_has_bytes_where_the_places_are_known() -> None:
     assert score_table(report(), every=True) == [["", *main, *more], ["this map", *few, *many]]
 
 
+STORED: dict[str, Any] = {  # of a storage curve, as in report.json
+    "frames": 40,
+    "storage": {
+        "map": [
+            {"route_bytes_per_place": size, "auc": area, "recall_at_1": 0.5}
+            for size, area in ((0.981, 0.25), (2.5, 0.375), (4.91, 0.625), (9.9, 0.75))
+        ]
+    },
+}
+
+
+def test_the_table_has_the_map_in_five_bytes_and_in_one() -> None:
+    one = report(STORED, null=Contender("null", SCORES))
+    one = one._replace(ours=Contender("this map", SCORES, 440, fixed=40))
+    assert [row[0] for row in score_table(one)] == [
+        *("", "this map", "the map in 4.91 route bytes per place"),
+        *("the map in 0.981 route bytes per place", "null"),
+    ]
+    assert score_table(one)[2][1:] == ["0.625", "0.500", "", "5.9", "4.9"]
+    assert score_table(one, every=True)[3][1:] == ["0.250", "0.500", *4 * [""], "79", "2.0", "1.0"]
+    assert "AUC 0.500" in repr(one)  # the scores of the map itself
+    assert len(score_table(report({"storage": STORED["storage"]}))) == 2  # of no known number of places
+
+
 def test_areas_of_sequences_in_a_table_below_the_scores(tmp_path: Path) -> None:
     areas = {1: SCORES, 5: SCORES._replace(auc=0.875)}
     null = Contender("null", SCORES, sequences=areas)
@@ -211,6 +235,11 @@ def test_each_row_has_the_colour_of_its_curve(tmp_path: Path) -> None:
     colours = re.findall(r'<i style="background:(#\w+)"></i>([^<]+)', page)
     expected = [("map", "this map"), ("hog", "HOG"), ("null", "null")]
     assert colours == [(COLOURS[key], name) for key, name in expected] * 2  # in both tables
+    page = written(tmp_path, report(STORED, hog=Contender("HOG", SCORES), null=Contender("null", SCORES)))
+    found = re.findall(r'<i style="background:(#\w+)"></i>([^<]+)', page)
+    assert [colour for colour, _ in found] == [
+        COLOURS[key] for key in ("map", "map", "map", "hog", "null")
+    ] * 2
 
 
 def test_an_index_links_its_pages_and_shares_the_table(tmp_path: Path) -> None:

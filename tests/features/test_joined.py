@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -13,12 +14,22 @@ from command_line import fails, run
 from helpers import refused
 from torch import Tensor, nn
 
-from dejavu_torch import HOG, DejaVu, Embedding, Preprocess, SpectralMapper, Whitening, open_source
+from dejavu_torch import (
+    HOG,
+    DejaVu,
+    Embedding,
+    Preprocess,
+    SpectralMapper,
+    TemplateMapper,
+    Whitening,
+    open_source,
+)
 from dejavu_torch.cli.commands import run_learn
 from dejavu_torch.cli.parser import parse
 from dejavu_torch.features.joined import Joined, groups_of
 from dejavu_torch.features.pixels import PatchPixels
-from dejavu_torch.model import own_size
+from dejavu_torch.model import default_features, own_size
+from dejavu_torch.model_file import recipe_of
 
 ZOO = """
 from torch import nn
@@ -64,8 +75,9 @@ def test_features_lie_side_by_side_and_tell_their_groups() -> None:
     parts = [member(frames) for member in features.members]
     assert torch.equal(made, torch.cat(parts, 1))
     assert features.groups == tuple(part.shape[1] for part in parts) == (432, 24, 12)
-    assert groups_of(nn.Sequential(Preprocess(), features)) == features.groups
-    assert groups_of(HOG()) is None
+    assert groups_of(nn.Sequential(Preprocess(), features)) == (features.groups, None)
+    assert groups_of(Joined([HOG(), Means()], [1, 0.5])) == (None, [1, 0.5])
+    assert groups_of(HOG()) == (None, None)
 
 
 def test_gradients_reach_the_members_weights_and_the_frames() -> None:
@@ -90,6 +102,9 @@ def test_grey_pixels_are_those_of_grey_frames() -> None:
         (lambda: Joined([HOG(), nn.Identity()])(torch.rand(2, 3, 16, 16)), ("Identity made (2, 3, 16, 16)",)),
         (lambda: both()(torch.rand(2, 7)), ("Joined got (2, 7)", "float frames")),
         (lambda: PatchPixels(channel="mauve"), ("'mauve'", "'grey'")),
+        (lambda: Joined([HOG(), Means()], [1.0]), ("shares of 2 members", "[1.0]", "for each")),
+        (lambda: Joined([HOG(), Means()], [1, 0]), ("[1, 0]", "above 0")),
+        (lambda: Joined([HOG(), Means()], [1, 1.5]), ("[1, 1.5]", "at most 1")),
     ],
 )
 def test_what_is_refused(call: Callable[[], Any], facts: tuple[str, ...]) -> None:
@@ -108,7 +123,7 @@ def test_a_whitening_takes_the_groups_of_the_features(flights: list[Tensor], tmp
     model = DejaVu(both(), mapper=SpectralMapper(12.0)).learn(flights[0])
     assert model.whitening is not None
     assert model.whitening.sizes == [324, 384]
-    assert model.whitening.dimension == 30  # a quarter of the places, as without groups
+    assert model.whitening.dimension == 60  # half of the places, as without groups
     assert model.features_per_frame == 708
     found = model.localize(flights[1])
     assert float(((found.index - torch.arange(120)).abs() <= 5).float().mean()) > 0.9
@@ -120,6 +135,63 @@ def test_a_whitening_takes_the_groups_of_the_features(flights: list[Tensor], tmp
     other = DejaVu()
     other.take_whitening(again)
     assert other.learn(flights[1]).whitening is again.whitening
+
+
+def test_the_default_features_are_joined_where_something_whitens_them() -> None:
+    joined = Joined([HOG(), PatchPixels((24, 48), channel="grey")], [1, 0.5])
+    templates = TemplateMapper()
+    for model in (DejaVu(), DejaVu(whitening=Whitening()), DejaVu(whitening=Whitening(), mapper=templates)):
+        assert recipe_of(model.features) == recipe_of(joined)
+    for model in (DejaVu(whitening="none"), DejaVu(mapper=templates)):
+        assert recipe_of(model.features) == recipe_of(HOG())
+
+
+def members() -> tuple[list[Tensor], Tensor]:
+    """Features of 200 places, two members of 30 and 20 numbers, and of another visit: of both."""
+    random = torch.Generator().manual_seed(0)
+    own = [torch.randn(200, size, generator=random) for size in (30, 20)]
+    return own, torch.cat(own, 1) + 0.3 * torch.randn(200, 50, generator=random)
+
+
+@pytest.mark.parametrize("share", [0.3, 1.0])
+@pytest.mark.parametrize("views", [True, False])
+def test_a_share_is_that_of_a_members_numbers_and_of_its_squared_length(share: float, views: bool) -> None:
+    """With as many numbers in all as the members have, cosines are the weighted mean of theirs."""
+    own, other = members()
+    shown = [(other, torch.arange(200))] if views else None
+    whitening = Whitening(numbers=21 if views else None, group_numbers=15, bits=16)
+    whitening.numbers = math.ceil(15) + math.ceil(share * 15) + 2 * (not views)  # and one constant each
+    whitening.learn(torch.cat(own, 1), shown, [30, 20], [1, share])
+    constant = 0 if views else 1
+    each = whitening.parts[1:]
+    assert [len(member.scale) for member in each] == [15, math.ceil(share * 15)]
+    assert [len(member.length) for member in each] == 2 * [constant]
+    cosines = [made @ made.T for made in (one(part) for one, part in zip(each, own, strict=True))]
+    found = whitening(torch.cat(own, 1))
+    expected = (cosines[0] + share * cosines[1]) / (1 + share)
+    torch.testing.assert_close(found @ found.T, expected, atol=2e-3, rtol=0)
+
+
+def test_shares_are_those_of_the_features_and_not_of_other_groups() -> None:
+    own, other = members()
+    rows, shown = torch.cat(own, 1), [(other, torch.arange(200))]
+    for groups, shares, sizes in (
+        (None, [0.5, 0.1], [8, 2]),
+        (None, None, [15, 15]),
+        ([10, 40], [0.5, 0.1], [10, 15]),  # those of the constructor; the first has rank 10
+    ):
+        whitening = Whitening(group_numbers=15, groups=groups)
+        whitening.learn(rows, shown, [30, 20], shares)
+        assert [len(member.scale) for member in whitening.parts[1:]] == sizes
+    alone = Whitening(numbers=12)
+    alone.learn(rows, shown, None, [0.5])
+    assert len(alone.scale) == 12  # nothing is joined
+
+
+def test_a_model_hands_the_shares_of_its_features_to_the_whitening(flights: list[Tensor]) -> None:
+    model = DejaVu(Joined([*both().members], [1, 0.5]), Whitening(views=2)).learn(flights[0])
+    assert model.whitening is not None
+    assert [len(member.scale) for member in model.whitening.parts] == [60, 60, 30]
 
 
 def test_ready_features_have_no_groups_but_those_that_are_asked_for() -> None:
@@ -204,6 +276,29 @@ def test_a_list_of_features_is_joined(words: tuple[str, ...]) -> None:
     assert repr(features_of(*words)) == repr(expected)
 
 
+@pytest.mark.parametrize("words", [("--features.cell", "4"), ("--features.cell=4",)])
+def test_settings_of_hog_alone_mean_hog(words: tuple[str, ...]) -> None:
+    assert recipe_of(features_of(*words)) == recipe_of(HOG(cell=4))
+    assert recipe_of(features_of(*words, "--features.bins", "linear")) == recipe_of(
+        HOG(cell=4, bins="linear")
+    )
+    assert recipe_of(features_of()) == recipe_of(default_features())
+    assert recipe_of(features_of("--whitening", "none")) == recipe_of(HOG())
+    other = features_of("--features", "PatchPixels", "--features.patch", "4")
+    assert recipe_of(other) == recipe_of(PatchPixels(patch=4))
+
+
+def test_a_map_of_the_default_is_compared_with_its_own_features(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run("learn", ROUTE, "--map", "map.safetensors")
+    words = "compare", ROUTE, f"{ROUTE}&traverse=1", "--map", "map.safetensors", "--out", "out"
+    assert "it was learned with Joined; got HOG" in fails(capsys, *words, "--features.cell", "4")
+    assert "it was learned with Joined; got HOG" in fails(capsys, *words, "--features", "HOG")  # of a member
+    run(*words)
+    assert (folder / "out" / "report.json").exists()
+
+
 def test_a_list_in_a_config_file(folder: Path) -> None:
     path = "dejavu_torch.features.joined.Joined"
     (folder / "own.yaml").write_text(f"features: {{class_path: {path}, init_args: {{members: {LIST}}}}}\n")
@@ -213,7 +308,7 @@ def test_a_list_in_a_config_file(folder: Path) -> None:
 
 def test_learn_and_localize(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run(*LEARN, LIST)
-    assert "Whitening, 1764 + 2048 to 15 numbers" in capsys.readouterr().out
+    assert "Whitening, 1764 + 2048 to 30 numbers" in capsys.readouterr().out
     run("info", "map.safetensors")
     told = capsys.readouterr().out
     assert "HOG: orientations=9" in told

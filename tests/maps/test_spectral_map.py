@@ -63,6 +63,10 @@ def test_sparse_products_are_those_of_the_whole_rows(csr: bool, monkeypatch: pyt
     for queries in (torch.randn(1, 300), torch.randn(70, 300), torch.randn(5, 300).double()):
         found = sparse_products(queries, counts, feature, rows[rows != 0].to(torch.int8))
         assert torch.allclose(found, queries @ rows.T.to(queries), atol=1e-4)
+        alone = [
+            sparse_products(one, counts, feature, rows[rows != 0].to(torch.int8)) for one in queries.split(1)
+        ]
+        torch.testing.assert_close(torch.cat(alone), found, rtol=1e-5, atol=1e-4)
 
 
 def test_a_long_chunk_is_decoded_by_parts(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -88,15 +88,15 @@ MUTANTS = [
     Mutant(
         "Positions that take over half of what the budget leaves for the lines come on top of it.",
         "dejavu_torch/maps/spectral.py",
-        "if self.overhead <= max(0, self.budget * places - fixed) / 2:",
-        "if self.overhead <= max(0, self.budget * places - fixed):",
+        "if self.overhead <= max(0, budget * places - fixed) / 2:",
+        "if self.overhead <= max(0, budget * places - fixed):",
         ("tests/maps/test_spectral.py::test_positions_leave_the_lines_half_of_what_mean_and_chunks_leave",),
     ),
     Mutant(
         "A map whose bytes hold under half of its route tells what would hold .85 of it, and no other does.",
         "dejavu_torch/maps/spectral.py",
-        "if self.hold is None and even.held(step) < HALF:",
-        "if self.hold is None and even.held(step) > HALF:",
+        "if self.share is None and even.held(step) < HALF:",
+        "if self.share is None and even.held(step) > HALF:",
         ("tests/maps/test_spectral.py::test_noise_tells_what_would_hold_its_variance",),
     ),
     Mutant(
@@ -109,8 +109,8 @@ MUTANTS = [
     Mutant(
         "The step that holds a share does not make up for what `resolution` leaves out.",
         "dejavu_torch/maps/spectral.py",
-        "lines.even().step_that_holds(self.hold)",
-        "lines.step_that_holds(self.hold)",
+        "lines.even().step_that_holds(self.hold or HELD)",
+        "lines.step_that_holds(self.hold or HELD)",
         ("tests/maps/test_spectral.py::test_the_lines_hold_the_share_that_is_asked_for",),
     ),
     Mutant(
@@ -270,16 +270,37 @@ MUTANTS = [
     Mutant(
         "A whitening learns each member of joined features by itself.",
         "dejavu_torch/learning.py",
-        "groups = None if is_ready(traverse) else groups_of(self.pipeline)",
-        "groups = None",
+        "groups = (None, None) if is_ready(traverse) else groups_of(self.pipeline)",
+        "groups = (None, None)",
         ("tests/features/test_joined.py::test_a_whitening_takes_the_groups_of_the_features",),
     ),
     Mutant(
         "Ready features do not have the groups of features that are not run.",
         "dejavu_torch/learning.py",
-        "groups = None if is_ready(traverse) else groups_of(self.pipeline)",
+        "groups = (None, None) if is_ready(traverse) else groups_of(self.pipeline)",
         "groups = groups_of(self.pipeline)",
         ("tests/features/test_joined.py::test_ready_features_have_no_groups_but_those_that_are_asked_for",),
+    ),
+    Mutant(
+        "A share is the part of its numbers that a whitening keeps of a member.",
+        "dejavu_torch/features/whitening.py",
+        "kept = math.ceil(share * (self.group_numbers or kept))",
+        "kept = math.ceil(self.group_numbers or kept)",
+        ("tests/features/test_joined.py::-k share",),
+    ),
+    Mutant(
+        "A share is a member's squared length beside the others.",
+        "dejavu_torch/features/whitening.py",
+        "weights = [math.sqrt(share) for share in shares]",
+        "weights = [share for share in shares]",
+        ("tests/features/test_joined.py::-k squared_length",),
+    ),
+    Mutant(
+        "By default a map holds what 5 bytes per place hold, if that is more than .85.",
+        "dejavu_torch/maps/spectral.py",
+        "room = 0 if self.hold else ROUTE_BYTES * len(lines.lines)",
+        "room = 0",
+        ("tests/maps/test_spectral.py::-k 5_bytes",),
     ),
     Mutant(
         "A frame that is not in [0, 1] is refused live.",
