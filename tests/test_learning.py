@@ -238,6 +238,23 @@ def test_a_long_route_holds_the_share_that_its_sample_holds(
     assert "hold is 0.8, and the lines hold" in caplog.text
 
 
+def test_by_default_a_long_route_is_told_only_if_it_holds_less(caplog: pytest.LogCaptureFixture) -> None:
+    model, random = (
+        DejaVu(whitening="none", mapper=SpectralMapper(chunk=CHUNK)),
+        torch.Generator().manual_seed(0),
+    )
+    smooth = torch.randn(PLACES, 40, generator=random).cumsum(0)
+    route = model.learn(smooth).map
+    assert isinstance(route, SpectralMap)
+    assert route.held is not None
+    assert route.held > 0.9  # what 5 bytes per place hold
+    assert caplog.text == ""
+    noise = torch.randn(PLACES, 40, generator=random)
+    noise[Sample.of(PLACES, CHUNK).frame] *= 2  # its coarse step holds less of all else
+    model.learn(noise)
+    assert "hold is 0.85, and the lines hold" in caplog.text
+
+
 def test_the_partial_map_of_another_run_is_refused(tmp_path: Path) -> None:
     part = tmp_path / "map.safetensors.part"
 
