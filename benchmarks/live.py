@@ -19,6 +19,7 @@ from benchmarks.measure import Column, Row, table, write_bench
 from benchmarks.plots import plot_ratios
 from dejavu_torch.data.camera import shots_of
 from dejavu_torch.data.video import Video
+from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.live.feed import FrameReader, in_real_time
 from dejavu_torch.live.localizer import LiveLocalizer
@@ -139,7 +140,7 @@ def write_drive(path: Path, frames: int, size: tuple[int, int]) -> None:
 
 def long_model(video: Video, places: int, numbers: int) -> tuple[DejaVu, int]:
     """A model whose map has the frames of a video among many places, and the place of the first of them."""
-    model = DejaVu(whitening=Whitening(numbers=numbers)).eval()
+    model = DejaVu(HOG(), Whitening(numbers=numbers)).eval()
     assert model.whitening is not None
     features = torch.cat([model.describe(batch) for batch in video.batches(16)])
     generator = torch.Generator().manual_seed(0)

@@ -40,6 +40,7 @@ from benchmarks.scale_contenders import Mapped
 from dejavu_torch.data.frame_range import IndexedTraverse
 from dejavu_torch.data.output import temporary_folder
 from dejavu_torch.data.simulate.aerial import HEIGHT, VIEW, paint_route
+from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.maps.distance import l1_backend
 from dejavu_torch.maps.spectral import SpectralMapper
@@ -68,7 +69,7 @@ class Held(Store):
     """Descriptors of all frames in float32, compared with those of each query by one matrix product."""
 
     def __init__(self, whitened: bool) -> None:
-        self.model = DejaVu(whitening=Whitening() if whitened else "none").eval()
+        self.model = DejaVu(HOG(), Whitening() if whitened else "none").eval()
 
     def learn(self, route: IndexedTraverse, path: Path) -> int:
         model, fixed = self.model, {}

@@ -61,7 +61,8 @@ def test_default_yaml_is_the_constructors_defaults() -> None:
 @pytest.mark.parametrize("name", PRESETS)
 def test_presets_spell_out_every_argument(name: str) -> None:
     assert set(written(name)) == set(inspect.signature(DejaVu).parameters)
-    assert written(name) == settings(model_of(name))
+    given = {"features": None} if name == "default" else {}  # they depend on the whitening
+    assert written(name) == settings(model_of(name)) | given
 
 
 def test_convention_3_paper_yaml_is_the_letter() -> None:

@@ -308,9 +308,10 @@ def run_compare(
     """
     from dejavu_torch.evaluation.compare import compare
 
-    where, ordered = device_of(learning.device, learns=map is None), judging.in_order()
+    where = device_of(learning.device, learns=map is None)
     acceptance = Acceptance(model.threshold, model.precision)
     matcher = sequences.matcher(max(0, judging.tolerance), acceptance.threshold)
+    ordered = judging.in_order(matcher is not None)
     acceptance.check(matcher, judging.distractors)
     if map is not None:
         model = load_map(map, named_features(model))

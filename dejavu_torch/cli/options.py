@@ -309,10 +309,9 @@ class Judging:
         top: write so many places of each query, no two within the tolerance
         distractors: another route, or several, '[A,B]': how many of its frames are accepted
         storage_curve: also evaluate maps of other sizes, which takes as long as all the rest
-        ordered: the queries follow one another along the route, and a filter over them is set beside single
-            queries; as without it for a video, a strip, a simulated route, and a folder whose names end in
-            rising numbers
-        unordered: they do not
+        ordered: queries are in order, as those of videos and of numbered images are: a filter stands beside
+            single ones
+        unordered: they are not
     """
 
     truth: str | None = None
@@ -325,10 +324,11 @@ class Judging:
     ordered: bool = False
     unordered: bool = False
 
-    def in_order(self) -> bool | None:
-        """Whether the queries are in order; None if their source is to tell."""
-        if self.ordered and self.unordered:
-            raise InputError("--ordered and --unordered; expected one of them, or none")
+    def in_order(self, together: bool) -> bool | None:
+        """Whether queries, matched together or not, are in order; None if their source is to tell."""
+        if self.unordered and (self.ordered or together):
+            other = "--ordered" if self.ordered else "queries that are matched together"
+            raise InputError(f"--unordered and {other}; expected one of them, or none")
         return self.ordered if self.ordered or self.unordered else None
 
     def off_map(self, traverses: Collection[Traverse]) -> list[Traverse]:

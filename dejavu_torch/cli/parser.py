@@ -26,6 +26,7 @@ from dejavu_torch.data.source import check_not_read
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.joined import Joined
 from dejavu_torch.model import DejaVu
+from dejavu_torch.model_file import REGISTRY
 from dejavu_torch.text import one_line
 from dejavu_torch.types import InputError
 
@@ -113,10 +114,6 @@ def with_made(words: Sequence[str]) -> list[str]:
     """
     words = list(_with_members(words))
     configured = any(word.startswith(("--config=", "-c")) or word == "--config" for word in words)
-    options = [word.partition("=")[0] for word in words]
-    of_hog = [one for one in options if one.startswith("--features.") and one[-5:] != ".help"]
-    if of_hog and not configured and "--features" not in options:
-        words.insert(options.index(of_hog[0]), f"--features={HOG.__module__}.{HOG.__name__}")
     makers = {}
     for word, after in pairwise([*words, ""]):
         option, equals, value = word.partition("=")
@@ -155,6 +152,9 @@ def _with_members(words: Sequence[str]) -> Iterator[str]:
         named = option.startswith("--") and option.lstrip("-").rpartition(".")[2] in NETWORKS
         behind = [] if equals or not named else [*islice(following, 1)]
         value = behind[0] if behind else value
+        if named and value in REGISTRY:
+            yield f"{option}={_path_of(value)}"
+            continue
         if not named or not value.lstrip().startswith("["):
             yield from (word, *behind)
             continue
@@ -169,9 +169,9 @@ def _with_members(words: Sequence[str]) -> Iterator[str]:
 
 
 def _made_in(value: Any) -> Any:
-    """A value of YAML with what `made` makes where a `class_path` in it is a function."""
+    """A value of YAML with paths of our classes, and what `made` makes where a `class_path` is a function."""
     if isinstance(value, list):
-        return [_made_in(one) for one in value]
+        return [_path_of(one) if isinstance(one, str) else _made_in(one) for one in value]
     if not isinstance(value, dict):
         return value
     path, inner = value.get("class_path"), {key: _made_in(one) for key, one in value.items()}
@@ -179,6 +179,11 @@ def _made_in(value: Any) -> Any:
         return inner
     named = {"class_path": f"{__name__}.made", "init_args": {"function": path}}
     return named | {"dict_kwargs": inner.get("init_args") or {}}
+
+
+def _path_of(name: str) -> str:
+    """The import path of a class of ours; another name as it is, which jsonargparse looks for everywhere."""
+    return f"{REGISTRY[name].__module__}.{name}" if name in REGISTRY else name
 
 
 class HelpFormatter(jsonargparse.DefaultHelpFormatter):
@@ -212,6 +217,8 @@ class Parser(jsonargparse.ArgumentParser):
             check_word(word)
         # a null for a part of a part is handed to the parser of that part as None
         words = args and with_made([f"{w[:-4]}null" if w.endswith("=None") else w for w in args])
+        if words and self._has_features_of_no_class(words):
+            self.set_defaults({"features": {"class_path": f"{HOG.__module__}.{HOG.__name__}"}})
         parsed = super().parse_args(words and self._config_first(words), *rest, **settings)
         for key, value in vars(parsed.as_flat()).items():
             if any(abs(number) > LARGEST for number in whole_numbers(value)):
@@ -219,15 +226,37 @@ class Parser(jsonargparse.ArgumentParser):
         return parsed
 
     def _config_first(self, words: Sequence[str]) -> Sequence[str]:
+        start = 1 if self._subparsers is not None else 0  # behind the subcommand
+        configs, others = self._configs(words[start:])
+        return [*words[:start], *(f"--config={name}" for name in configs), *others]
+
+    def _configs(self, words: Sequence[str]) -> tuple[Sequence[str], Sequence[str]]:
+        """The values of --config, and the other words."""
         names = [name for name in ("-c", "--config") if name in self._option_string_actions]
         if not names:
-            return words
+            return [], words
         reader = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
         reader.error = self.error  # type: ignore[method-assign]
         reader.add_argument(*names, action="append", default=[])
-        start = 1 if self._subparsers is not None else 0  # behind the subcommand
-        found, others = reader.parse_known_args(words[start:])
-        return [*words[:start], *(f"--config={name}" for name in found.config), *others]
+        found, others = reader.parse_known_args(words)
+        return found.config, others
+
+    def _has_features_of_no_class(self, words: Sequence[str]) -> bool:
+        """Whether arguments of the features are given without their class: they are those of HOG."""
+        if "--features" not in self._option_string_actions:
+            return False
+        configs, others = self._configs(words)
+        if any(word.startswith("--features.") for word in others):
+            return True
+        for name in configs:
+            try:
+                check_config(path := find_config(name))
+            except InputError:
+                continue  # it is told where the config is parsed
+            given = yaml.safe_load(path.read_text()).get("features")
+            if isinstance(given, dict) and "class_path" not in given:
+                return True
+        return False
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         head, required, names = message.partition("required: ")

@@ -51,6 +51,7 @@ log = logging.getLogger("dejavu_torch")
 
 SAMPLED = 256  # reference frames that a given map is tried on
 NEAR = 10  # places within which it should find them, at least
+UNASKED = 2**25  # scores of queries in order that are filtered without having been asked for
 
 
 class Comparison(NamedTuple):
@@ -170,7 +171,9 @@ def compare(
         queries = model.extract_all(query, "describing the query" if progress else None)
         if sequence is not None:
             sequence.check(len(queries), model.map.places)
-        ordered = source_of(query).ordered if ordered is None else ordered
+        if ordered is None:
+            ordered = source_of(query).ordered and len(queries) * model.map.places <= UNASKED
+        ordered = ordered and (known is not None or not counted)  # else nothing shows it
         ways = models_beside(sequence, ordered, len(queries), model.map.places, tolerance)
         matching = Matching(sequence, ways)
         ranks = max(top, min(max(RANKS), model.map.places))

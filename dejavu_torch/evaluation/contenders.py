@@ -16,7 +16,6 @@ from dejavu_torch.types import Match, SequenceModel, Together
 
 LENGTHS = (1, 5, 11, 21)  # queries of the sequences that a report sets side by side
 MOVES = 2  # places that a filter moves by at most
-FILTERED = 2**27  # scores of queries in order that are filtered without having been asked for
 
 # Told apart by the colour-blind where they share a picture; keys are those of report.json, `map` is ours.
 COLOURS = {
@@ -154,6 +153,6 @@ def models_beside(
         found |= {length: SequenceMatcher(length, speeds) for length in lengths}
     if isinstance(sequence, PlaceFilter):
         found["filter"] = sequence
-    elif ordered and places > MOVES and queries * places <= FILTERED:
+    elif ordered and queries > 1 and places > MOVES:
         found["filter"] = PlaceFilter(within=within)
     return found

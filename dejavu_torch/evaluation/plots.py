@@ -87,7 +87,8 @@ def show_cells(axis: Any, x: Tensor, y: Tensor, values: Tensor, **style: Any) ->
 
 
 def pixels(frame: Tensor) -> np.ndarray[Any, Any]:
-    """A frame (C,H,W) in [0,1] as imshow takes it, (H,W,3)."""
+    """A frame (C,H,W) in [0,1] as imshow takes it, (H,W,3); of other than 1 or 3 channels the mean of all."""
+    frame = frame if len(frame) in (1, 3) else frame.mean(0, keepdim=True)
     values: np.ndarray[Any, Any] = frame.expand(3, -1, -1).permute(1, 2, 0).clamp(0, 1).numpy()
     return values
 

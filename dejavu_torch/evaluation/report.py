@@ -104,7 +104,7 @@ def score_table(report: Report, every: bool = False) -> list[list[str]]:
 
 def _in_bytes(route: float) -> str:
     """The name of the run's descriptors coded at another size."""
-    return f"the map in {route:.3g} route bytes per place"
+    return f"the map in {route:.2g} route byte{'s' * (round(route, 1) != 1)} per place"
 
 
 def sequence_table(report: Report) -> list[list[str]]:

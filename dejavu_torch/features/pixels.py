@@ -17,7 +17,8 @@ class PatchPixels(nn.Module):
     Args:
         size: (height, width) in pixels; smaller frames keep theirs, cut to whole patches.
         patch: side in pixels of the square patches, which lie side by side.
-        channel: that alone, as of `Preprocess`, such as "grey"; None takes all that the frames have.
+        channel: that alone, as of `Preprocess`, such as "grey", of frames of 2 or more than 3 channels their
+            mean; None takes all that the frames have.
 
     Shape: (B,C,H,W) -> (B, C x height x width).
 
@@ -39,7 +40,10 @@ class PatchPixels(nn.Module):
             raise InputError(
                 f"frames of {height} x {width} pixels; expected at least one patch, {side} x {side}"
             )
-        frames = frames if self.channel is None else select_channel(frames, self.channel)
+        if self.channel == "grey" and frames.shape[1] not in (1, 3):
+            frames = frames.mean(1, keepdim=True)
+        elif self.channel is not None:
+            frames = select_channel(frames, self.channel)
         small = (min(height, self.size[0]) // side * side, min(width, self.size[1]) // side * side)
         patches = resize_frames(frames, small).unflatten(-1, (-1, side)).unflatten(-3, (-1, side))
         centred = patches - patches.mean((-3, -1), keepdim=True)  # (B,C,rows,side,columns,side)

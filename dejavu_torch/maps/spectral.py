@@ -21,7 +21,7 @@ log = logging.getLogger("dejavu_torch")
 ROWS = 2**14  # of descriptors, checked at a time
 HALF = 0.5  # of the variance: a map that holds less says which bytes would hold `HELD`
 HELD = 0.85  # of the variance by default: such maps find nearly what their descriptors find
-ROUTE_BYTES = 5.0  # per place: what lines by default take at least, if they hold more in it
+LINE_BYTES = 5.0  # per place: what lines by default take at least, if they hold more in it
 
 
 class SpectralMapper(Mapper):
@@ -40,7 +40,8 @@ class SpectralMapper(Mapper):
         hold: in place of the bytes, the share of the descriptors' variance that the lines hold: 1 - the sum
             of squares of what is missing / that of the differences from the mean. The step is the largest
             that holds it; `resolution` then leaves out lines that count in it. None, without bytes and step,
-            is .85, and what else 5 bytes per place hold: few features tell places apart by small differences.
+            is .85, and more if lines of 5 bytes per place hold it: few features tell places apart by small
+            differences.
 
     Shape: descriptors (N,K) -> SpectralMap of N places.
 
@@ -161,7 +162,7 @@ class SpectralMapper(Mapper):
             return self.step
         if self.route_bytes_per_place is None:
             step = lines.even().step_that_holds(self.hold or HELD)
-            room = 0 if self.hold else ROUTE_BYTES * len(lines.lines)
+            room = 0 if self.hold else LINE_BYTES * len(lines.lines)
             return lines.step_of(room) if lines.coded_bytes(step) < room else step
         places, numbers = lines.lines.shape
         budget, least = self.route_bytes_per_place, (fixed + lines.coded_bytes(lines.coarsest)) / places

@@ -15,7 +15,7 @@ from helpers import Fixed, all_of, refused, template_model
 from PIL import Image
 from torch import Tensor, nn
 
-from dejavu_torch import HOG, DejaVu, SequenceMatcher, SpectrogramAnalysis
+from dejavu_torch import HOG, DejaVu, SequenceMatcher, SpectrogramAnalysis, open_source
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.evaluation.compare import compare
 from dejavu_torch.evaluation.controls import null_control, with_mapper
@@ -251,6 +251,7 @@ def test_a_filter_stands_beside_single_queries_in_order_and_changes_nothing_else
 
     single, ordered = report(False), report(True, storage=True)
     assert "sequences" not in report(None)  # an array does not tell
+    assert not compare(*pair, None, model, ordered=True).run.matching.beside  # nothing would show it
     filtered = compare(*pair, "0", model, tolerance=1, sequence=PlaceFilter(within=1)).report.as_json()
     for key in (None, *(key for key, entry in single.items() if isinstance(entry, dict) and "auc" in entry)):
         one, other, by_filter = (all_ if key is None else all_[key] for all_ in (single, ordered, filtered))
@@ -261,6 +262,15 @@ def test_a_filter_stands_beside_single_queries_in_order_and_changes_nothing_else
         }
     assert ordered["sequences"]["filter"]["auc"] > single["auc"] + 0.1
     assert all("sequences" not in size for size in ordered["storage"]["map"])
+
+
+def test_many_queries_in_order_are_filtered_if_that_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    pair = [open_source(f"sim:aerial?frames=30&traverse={i}") for i in range(2)]
+    found = []
+    for most in (900, 899):
+        monkeypatch.setattr("dejavu_torch.evaluation.compare.UNASKED", most)
+        found.append([bool(compare(*pair, ordered=ordered).run.matching.beside) for ordered in (None, True)])
+    assert found == [[True, True], [False, True]]
 
 
 def test_the_scores_of_single_queries_are_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:

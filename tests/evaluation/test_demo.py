@@ -13,7 +13,10 @@ from dejavu_torch.cli import commands, main
 from dejavu_torch.data.source import open_source
 
 FRAMES = 1024
-PICTURES = ("pairs", "coverage", "scores", "pr", "auc", "storage", "spectrum", "components", "reliability")
+PICTURES = (
+    *("pairs", "coverage", "scores", "pr", "auc", "storage", "sequences", "spectrum", "components"),
+    "reliability",
+)
 OF_TEMPLATES = {"chunks", "spectrogram", "templates", "features", "activations"}
 
 

@@ -87,6 +87,15 @@ def test_gradients_reach_the_members_weights_and_the_frames() -> None:
     assert all(one.grad is not None for one in features.parameters())
 
 
+@pytest.mark.parametrize("channels", [1, 2, 3, 4])
+def test_frames_of_any_number_of_channels_are_described(channels: int) -> None:
+    frames = torch.rand(40, channels, 32, 32)
+    assert DejaVu().learn(frames).localize(frames).index.tolist() == [*range(40)]
+    grey = frames.mean(1, keepdim=True) if channels in (2, 4) else frames
+    pixels = PatchPixels(channel="grey")
+    assert torch.equal(pixels(frames), pixels(grey))
+
+
 def test_grey_pixels_are_those_of_grey_frames() -> None:
     frames = torch.rand(2, 3, 16, 24)
     grey = PatchPixels(channel="grey")(frames)
@@ -276,8 +285,20 @@ def test_a_list_of_features_is_joined(words: tuple[str, ...]) -> None:
     assert repr(features_of(*words)) == repr(expected)
 
 
-@pytest.mark.parametrize("words", [("--features.cell", "4"), ("--features.cell=4",)])
-def test_settings_of_hog_alone_mean_hog(words: tuple[str, ...]) -> None:
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--features.cell", "4"),
+        ("--features.cell=4",),
+        ("--config", "settings.yaml"),
+        ("-c", "settings.yaml"),
+        ("--config", "default", "--features.cell", "4"),
+        ("--config=other.yaml", "--features.cell", "4"),
+    ],
+)
+def test_settings_of_hog_alone_mean_hog(folder: Path, words: tuple[str, ...]) -> None:
+    (folder / "settings.yaml").write_text("features: {init_args: {cell: 4}}")
+    (folder / "other.yaml").write_text("batch_size: 9")
     assert recipe_of(features_of(*words)) == recipe_of(HOG(cell=4))
     assert recipe_of(features_of(*words, "--features.bins", "linear")) == recipe_of(
         HOG(cell=4, bins="linear")
