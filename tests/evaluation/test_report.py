@@ -89,8 +89,8 @@ def test_the_table_has_the_map_in_five_bytes_and_in_one() -> None:
     one = report(STORED, null=Contender("null", SCORES))
     one = one._replace(ours=Contender("this map", SCORES, 440, fixed=40))
     assert [row[0] for row in score_table(one)] == [
-        *("", "this map", "the map in 4.91 route bytes per place"),
-        *("the map in 0.981 route bytes per place", "null"),
+        *("", "this map", "the map in 4.9 route bytes per place"),
+        *("the map in 0.98 route byte per place", "null"),
     ]
     assert score_table(one)[2][1:] == ["0.625", "0.500", "", "5.9", "4.9"]
     assert score_table(one, every=True)[3][1:] == ["0.250", "0.500", *4 * [""], "79", "2.0", "1.0"]
