@@ -253,7 +253,7 @@ class Parser(jsonargparse.ArgumentParser):
                 check_config(path := find_config(name))
             except InputError:
                 continue  # it is told where the config is parsed
-            given = yaml.safe_load(path.read_text()).get("features")
+            given = yaml.safe_load(path.read_text("utf-8")).get("features")
             if isinstance(given, dict) and "class_path" not in given:
                 return True
         return False

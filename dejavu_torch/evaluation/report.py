@@ -217,7 +217,8 @@ def write_report(
         data = as_png(picture)
         (folder / f"{name}.png").write_bytes(data)
         embedded.append((picture, _embedded(data)))
-    coded, rows = facts.get("storage", {}).get("map", ()), score_table(report)
+    coded = [size for size in facts.get("storage", {}).get("map", ()) if "sequences" in size]
+    rows = score_table(report)
     sizes = ["map"] * max(0, len(rows) - 1 - len(shown))  # rows of our descriptors in other sizes
     _write_page(
         folder,
