@@ -22,6 +22,7 @@ BRIGHTEST = 1.5  # of a frame in [0, 1], whatever was done to it
 APART = 1e-3  # of its length: by how much the features of a frame may differ alone and among others
 ULPS = 4  # and of the coarsest numbers
 TF32 = 2**-10  # what it rounds by
+READY = 256  # ready features at a time at least: a search takes longer for each of fewer
 FIRST, EVERY = 30.0, 60.0  # seconds before the first line of progress, and from one to the next
 
 
@@ -38,7 +39,7 @@ def feature_batches(
     Args:
         traverse: frames (B,C,H,W), or ready features (B,D), which pass unchanged.
         module: (B,C,H,W) -> (B,D). It runs in eval mode; the modes of its parts are restored.
-        batch_size: frames in memory at a time; fewer if they are large.
+        batch_size: frames in memory at a time; fewer if they are large, and of ready features at least 256.
         progress: what to call this work on stderr: a bar on a terminal, else a line now and then. Copies of
             one frame count once.
         on_first: called with the first batch and its features.
@@ -48,8 +49,9 @@ def feature_batches(
     """
     done, copies = 0, traverse.copies if isinstance(traverse, AugmentedTraverse) else 1
     total = traverse.length and traverse.length // copies
+    size = max(batch_size, READY) if len(traverse.frame_shape) == 1 else batch_size
     with _progress(progress, total) as update, in_mode(module, False):
-        for batch in traverse.batches(traverse.batch_size(batch_size)):
+        for batch in traverse.batches(traverse.batch_size(size)):
             with torch.no_grad():
                 features = features_of(batch.to(device), module, traverse.name).detach()
             if features.dtype in (torch.float16, torch.bfloat16):  # too coarse to add up and to transform
