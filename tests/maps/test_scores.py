@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from dejavu_torch import FrequencyLayer, PhaseTemplates, PlaceMap, SpectralMapper, TemplateMap, best_match
+from dejavu_torch.features.extract import READY
 from dejavu_torch.maps.template_map import log_posterior, segments
 from dejavu_torch.periods.support import common_period
 from dejavu_torch.types import Plan
@@ -221,7 +222,7 @@ def test_convention_10_nothing_of_queries_times_phases_times_features_is_built(
 def test_convention_10_memory_does_not_grow_with_the_queries(largest_tensor: type) -> None:
     values = torch.rand(500, 8)
     layer = whole(50, 500, tuple(range(8)))
-    model = template_model(periods=Fixed(layer), batch_size=16).learn(values)
+    model = template_model(periods=Fixed(layer)).learn(values)
 
     def largest(queries: int) -> int:
         with largest_tensor() as seen:
@@ -229,7 +230,7 @@ def test_convention_10_memory_does_not_grow_with_the_queries(largest_tensor: typ
         return seen.numel
 
     # the queries themselves and their matches, Q x 8 and Q, are smaller than one batch of scores
-    assert largest(900) == largest(64) == 16 * 500
+    assert largest(5 * READY) == largest(READY) == READY * 500
 
 
 @pytest.mark.parametrize(
