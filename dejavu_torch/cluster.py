@@ -27,7 +27,7 @@ from dejavu_torch.data.output import SIGNALS
 from dejavu_torch.learning import ChunkCoder
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.maps.spectral_map import Chunk, SpectralMap
-from dejavu_torch.recognition.coarse import MEMORY, coarse_search
+from dejavu_torch.recognition.coarse import coarse_search
 from dejavu_torch.recognition.search import Best, Search, Wanted, lowest_needed, search
 from dejavu_torch.text import one_line
 from dejavu_torch.types import InputError, Traverse
@@ -178,7 +178,7 @@ class ClusterSearch:
     """
 
     def __init__(
-        self, cluster: Cluster, route: PlaceMap, method: Search = "auto", memory: int = MEMORY
+        self, cluster: Cluster, route: PlaceMap, method: Search = "auto", memory: int | None = None
     ) -> None:
         if not isinstance(route, SpectralMap):
             raise InputError(
@@ -192,7 +192,7 @@ class ClusterSearch:
         for first, stop in pairwise([*bounds, len(starts)]):
             if first < stop:
                 self.parts.append(cluster.ray.put(route.between(first, stop).cpu()))
-                how = method, memory // workers
+                how = method, None if memory is None else memory // workers
                 self.actors.append(actor.remote(self.parts[-1], starts[first], *how))
 
     @torch.no_grad()
@@ -213,7 +213,7 @@ class ClusterSearch:
 class _Searcher:
     """Holds a part of a map, whose first place is that one of the whole."""
 
-    def __init__(self, part: SpectralMap, first: int, method: Search, memory: int) -> None:
+    def __init__(self, part: SpectralMap, first: int, method: Search, memory: int | None) -> None:
         torch.set_num_threads(1)
         self.part, self.first = part, first
         self.find = None if method == "scan" else coarse_search(part, memory, method == "exact")

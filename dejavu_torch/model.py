@@ -58,7 +58,7 @@ from dejavu_torch.model_file import (
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse, resampled, source_of
 from dejavu_torch.recognition.calibration import Calibration
-from dejavu_torch.recognition.coarse import MEMORY, CoarseSearch, coarse_search
+from dejavu_torch.recognition.coarse import CoarseSearch, coarse_search
 from dejavu_torch.recognition.localizer import Localizer, Matching
 from dejavu_torch.recognition.search import SCORES_AT_ONCE, Find, Search, check_search
 from dejavu_torch.recognition.select import HIGHEST, PROBABLE, Acceptance, check_candidates
@@ -170,7 +170,9 @@ class DejaVu(nn.Module):
         self.trained: Training | None = None
         self.calibration: Calibration | None = None
         self.search: Search = "auto"  # how single queries are searched for, see `localize`
-        self.search_memory = MEMORY  # bytes that it may take at most beyond the map
+        self.search_memory: int | None = (
+            None  # bytes that it may take beyond the map; None follows the places
+        )
         self.find: Find | None = None  # in its place, as a cluster does
         # its samples, and what they are of
         self._coarse: tuple[tuple[Any, ...], CoarseSearch | None] = (), None

@@ -17,7 +17,6 @@ from dejavu_torch.features.views import Views
 from dejavu_torch.model import DejaVu, check_precision, default_features
 from dejavu_torch.model_file import NO_MAP, recipe_of
 from dejavu_torch.motion.resampling import source_of
-from dejavu_torch.recognition.coarse import MEMORY
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.search import Search, check_search
 from dejavu_torch.recognition.sequence import SequenceMatcher
@@ -101,18 +100,19 @@ class Searching:
     Args:
         search: coarse scores the places near the best samples of a long spectral map, exact rules out all
             others, scan scores all; auto is the faster of coarse and scan
-        search_memory: MB for these samples
+        search_memory: MB for these samples; 100, of over 10^6 places 100 bytes each, if not given
     """
 
     search: Search = "auto"
-    search_memory: float = MEMORY / 1e6
+    search_memory: float | None = None
 
     def of(self, model: DejaVu) -> None:
         """How a model searches from now on."""
-        if not self.search_memory > 0:
-            raise InputError(f"--search_memory {self.search_memory:g}; expected a number above 0, in MB")
+        memory = self.search_memory
+        if memory is not None and not memory > 0:
+            raise InputError(f"--search_memory {memory:g}; expected a number above 0, in MB")
         check_search(self.search)
-        model.search, model.search_memory = self.search, int(1e6 * self.search_memory)
+        model.search, model.search_memory = self.search, None if memory is None else int(1e6 * memory)
 
 
 @dataclass

@@ -24,7 +24,7 @@ from dejavu_torch.types import InputError
 
 FEWEST = 20_000  # places; a shorter map is scanned, which takes no longer
 OTHERS = 16  # bytes of a sample beside its numbers
-MEMORY = 100_000_000  # bytes of the samples at most by default
+MEMORY, A_PLACE = 100_000_000, 100  # bytes of the samples at most by default, or for each place of more
 SPACINGS = (32, 16, 12, 8, 6, 4, 3, 2)  # places from one sample to the next
 COARSE, FINE = 0.93, 0.98  # shares of the lines' energy that coarse and fine samples hold
 GROUP = 8  # consecutive samples of which the best counts
@@ -60,12 +60,13 @@ class Plan(NamedTuple):
         )
 
 
-def plan(route: PlaceMap, limit: int = MEMORY, exact: bool = False) -> Plan | None:
+def plan(route: PlaceMap, limit: int | None = None, exact: bool = False) -> Plan | None:
     """The widest spacings at which samples hold enough of a map; None for what is scanned: a map of another
     kind or metric, of few places or a single chunk, or whose lines are not low.
 
     Args:
-        limit: bytes. Samples that do not fit are taken further apart, and more of them refined.
+        limit: bytes; None is 100 MB, of over 10^6 places 100 bytes each. Samples that do not fit are taken
+            further apart, and more of them refined.
         exact: a sample of every place, whatever the limit.
 
     Raises:
@@ -74,6 +75,7 @@ def plan(route: PlaceMap, limit: int = MEMORY, exact: bool = False) -> Plan | No
     if not isinstance(route, SpectralMap) or route.metric != "cosine" or not route.chunks:
         return None
     longest = max(stop - start for start, stop in route.chunks)
+    limit = max(MEMORY, A_PLACE * route.places) if limit is None else limit
 
     def size(places: int, *spacings: int) -> int:
         return sum(-(-places // d) * (route.dimension + OTHERS) for d in spacings)
@@ -113,7 +115,7 @@ def energy_held(route: SpectralMap) -> dict[int, float]:
     return {d: energy / whole for d, energy in below.items()}
 
 
-def coarse_search(route: PlaceMap, limit: int = MEMORY, exact: bool = False) -> CoarseSearch | None:
+def coarse_search(route: PlaceMap, limit: int | None = None, exact: bool = False) -> CoarseSearch | None:
     """A search by samples of a map; None for what is scanned, see `plan`."""
     chosen = plan(route, limit, exact)
     return CoarseSearch(route, chosen) if isinstance(route, SpectralMap) and chosen is not None else None

@@ -298,7 +298,7 @@ MUTANTS = [
     Mutant(
         "By default a map holds what 5 bytes per place hold, if that is more than .85.",
         "dejavu_torch/maps/spectral.py",
-        "room = 0 if self.hold else ROUTE_BYTES * len(lines.lines)",
+        "room = 0 if self.hold else LINE_BYTES * len(lines.lines)",
         "room = 0",
         ("tests/maps/test_spectral.py::-k 5_bytes",),
     ),

@@ -146,6 +146,21 @@ def test_products_are_the_same_without_those_of_integers(monkeypatch: pytest.Mon
 
 
 @pytest.mark.usefixtures("searched")
+@pytest.mark.parametrize(("least", "a_place", "chosen"), [(10**8, 0, True), (1, 100, True), (1, 1, False)])
+def test_the_memory_by_default_grows_with_the_places(
+    least: int, a_place: int, chosen: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    learned = smooth_model().map
+    expected = plan(learned, 10**9)
+    monkeypatch.setattr(coarse, "MEMORY", least)
+    monkeypatch.setattr(coarse, "A_PLACE", a_place)
+    if chosen:
+        assert plan(learned) == expected
+    else:
+        assert plan(learned) != expected  # further apart, or none
+
+
+@pytest.mark.usefixtures("searched")
 def test_samples_follow_from_the_energy_of_the_lines_and_the_memory() -> None:
     learned = smooth_model().map
     chosen = plan(learned)
