@@ -23,7 +23,6 @@ from dejavu_torch.cli.options import named_features
 from dejavu_torch.cli.presets import check_config, check_word, find_config
 from dejavu_torch.data.files import LARGEST
 from dejavu_torch.data.source import check_not_read
-from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.joined import Joined
 from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import REGISTRY
@@ -218,7 +217,7 @@ class Parser(jsonargparse.ArgumentParser):
         # a null for a part of a part is handed to the parser of that part as None
         words = args and with_made([f"{w[:-4]}null" if w.endswith("=None") else w for w in args])
         if words and self._has_features_of_no_class(words):
-            self.set_defaults({"features": {"class_path": f"{HOG.__module__}.{HOG.__name__}"}})
+            self.set_defaults({"features": {"class_path": _path_of("HOG")}})
         parsed = super().parse_args(words and self._config_first(words), *rest, **settings)
         for key, value in vars(parsed.as_flat()).items():
             if any(abs(number) > LARGEST for number in whole_numbers(value)):

@@ -15,7 +15,6 @@ from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.types import Match, SequenceModel, Together
 
 LENGTHS = (1, 5, 11, 21)  # queries of the sequences that a report sets side by side
-MOVES = 2  # places that a filter moves by at most
 
 # Told apart by the colour-blind where they share a picture; keys are those of report.json, `map` is ours.
 COLOURS = {
@@ -62,8 +61,9 @@ class Contender(NamedTuple):
     @property
     def by_length(self) -> Mapping[Together, Scores]:
         """`sequences`, and by 1 the scores of single queries, where there are any."""
-        single = self.sequences and self.scores is not None and 1 not in self.sequences
-        return {1: self.scores, **self.sequences} if single and self.scores else self.sequences
+        if not self.sequences or 1 in self.sequences or self.scores is None:
+            return self.sequences
+        return {1: self.scores, **self.sequences}
 
     @property
     def route_bytes(self) -> int | None:
@@ -146,6 +146,7 @@ def models_beside(
         [1, 5, 7, 11, 'filter']
     """
     found: dict[Together, SequenceModel] = {}
+    beside = PlaceFilter(within=within)
     if sequence is not None:
         own = {sequence.length} if isinstance(sequence, SequenceMatcher) else set()
         speeds = sequence.speeds if isinstance(sequence, SequenceMatcher) else (1.0,)
@@ -153,6 +154,6 @@ def models_beside(
         found |= {length: SequenceMatcher(length, speeds) for length in lengths}
     if isinstance(sequence, PlaceFilter):
         found["filter"] = sequence
-    elif ordered and queries > 1 and places > MOVES:
-        found["filter"] = PlaceFilter(within=within)
+    elif ordered and queries > 1 and places >= len(beside.move_logits):
+        found["filter"] = beside
     return found

@@ -32,7 +32,8 @@ def coded_at_sizes(
     Raises:
         InputError: a map of another kind, or no ground truth.
     """
-    run, route = run if run.sequence is not None else run._replace(matching=SINGLE), run.model.map
+    run = run._replace(matching=SINGLE) if run.sequence is None else run  # no filter for each size
+    route = run.model.map
     if not isinstance(route, SpectralMap) or run.truth is None:
         truth = "no" if run.truth is None else "a"
         raise InputError(
