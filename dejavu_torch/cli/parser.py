@@ -7,7 +7,9 @@ import inspect
 import json
 import pydoc
 import re
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import redirect_stdout
 from dataclasses import is_dataclass
 from itertools import islice, pairwise
 from pathlib import Path
@@ -23,6 +25,7 @@ from dejavu_torch.cli.options import named_features
 from dejavu_torch.cli.presets import check_config, check_word, find_config
 from dejavu_torch.data.files import LARGEST
 from dejavu_torch.data.source import check_not_read
+from dejavu_torch.features import hub
 from dejavu_torch.features.joined import Joined
 from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import REGISTRY
@@ -40,8 +43,8 @@ HINT = (
     "or, of HOG alone, --features.cell 4: see --features.help HOG, --whitening.help, --mapper.help "
     "SpectralMapper, --preprocess.help and --velocity.help. --config local_maxima makes a map of templates, "
     "with options such as --mapper.periods.window 512. --features '[HOG, PatchPixels]' joins the features of "
-    "several. --whitening also takes none, or a map file, with the features that it was learned from; "
-    "--descriptor takes those alone, from a map or from what `dejavu train` makes of several routes."
+    "several, hub:megaloc is a pretrained network. --whitening also takes none, or a map file, with the features "
+    "it was learned from; --descriptor takes those alone, from a map or from what `dejavu train` makes of routes."
 )
 BARE = {"velocity": "GroundOdometry", "page": 8765}  # what an option without a value means
 MapFile = restricted_string_type("MapFile", r".*\.safetensors")
@@ -88,12 +91,14 @@ def made(function: str, **arguments: Any) -> nn.Module:
     if maker is None:
         raise InputError(f"{function} is no function that can be imported; expected one, or a class")
     try:
-        network = maker(**arguments)
+        with redirect_stdout(sys.stderr):  # where nobody reads lines of JSON
+            network = maker(**arguments)
     except SystemExit as stop:  # it would end the command without a word
         raise InputError(f"{function} ends the program ({stop}); expected what makes a network") from stop
     if not isinstance(network, nn.Module):
         raise InputError(f"{function} made a {type(network).__name__}; expected an nn.Module")
-    return network
+    # it would take the first GPU, wherever the model is
+    return network.module.cpu() if isinstance(network, nn.DataParallel) else network
 
 
 def _function_at(path: str) -> Callable[..., Any] | None:
@@ -111,7 +116,7 @@ def with_made(words: Sequence[str]) -> list[str]:
     `--features timm.create_model --features.model_name NAME` is the name's call; jsonargparse itself takes
     functions only whose return value and arguments are annotated.
     """
-    words = list(_with_members(words))
+    words = list(_with_members(with_hub(words)))
     configured = any(word.startswith(("--config=", "-c")) or word == "--config" for word in words)
     makers = {}
     for word, after in pairwise([*words, ""]):
@@ -143,6 +148,24 @@ def with_made(words: Sequence[str]) -> list[str]:
     return spelt
 
 
+def with_hub(words: Sequence[str]) -> list[str]:
+    """The command line with the words that `hub:NAME` stands for, but for those that are typed, wherever."""
+    typed = [word.partition("=")[0] for word in words]
+    for at, (word, after) in enumerate(pairwise([*words, ""])):
+        option, equals, value = word.partition("=")
+        value = value if equals else after
+        if not value.startswith(hub.PREFIX) or option.lstrip("-").rpartition(".")[2] not in NETWORKS[:2]:
+            continue
+        whole = hub.known(value)
+        settings = whole["init_args"] | {"network": "torch.hub.load"}
+        settings |= {f"network.{key}": one for key, one in whole["init_args"]["network"]["init_args"].items()}
+        told = {f"{option}.{k}": v if type(v) is str else json.dumps(v) for k, v in settings.items()}
+        spelt = [f"{option}={whole['class_path']}", *(f"{k}={v}" for k, v in told.items() if k not in typed)]
+        first = next(i for i, one in enumerate(typed) if one.startswith(f"{option}.") or i == at)
+        return [*words[:first], *spelt, *words[first:at], *words[at + (1 if equals else 2) :]]
+    return [*words]
+
+
 def _with_members(words: Sequence[str]) -> Iterator[str]:
     """The command line with `Joined` where an option that names features is a list of them."""
     following = iter(words)
@@ -161,6 +184,8 @@ def _with_members(words: Sequence[str]) -> Iterator[str]:
             members = yaml.safe_load(value)
             made_in = _made_in(members)
             value = value if made_in == members else json.dumps(made_in)
+        except InputError:
+            raise
         except (yaml.YAMLError, ValueError, TypeError) as error:
             expected = "expected a list of classes, such as [HOG, PatchPixels]"
             raise UsageError(f"{option} is {value!r}; {expected}") from error
@@ -170,10 +195,15 @@ def _with_members(words: Sequence[str]) -> Iterator[str]:
 def _made_in(value: Any) -> Any:
     """A value of YAML with paths of our classes, and what `made` makes where a `class_path` is a function."""
     if isinstance(value, list):
-        return [_path_of(one) if isinstance(one, str) else _made_in(one) for one in value]
+        members = [{"class_path": one} if str(one).startswith(hub.PREFIX) else one for one in value]
+        return [_path_of(one) if isinstance(one, str) else _made_in(one) for one in members]
     if not isinstance(value, dict):
         return value
-    path, inner = value.get("class_path"), {key: _made_in(one) for key, one in value.items()}
+    path = value.get("class_path")
+    if isinstance(path, str) and path.startswith(hub.PREFIX):
+        whole = hub.known(path)
+        return _made_in({**whole, "init_args": whole["init_args"] | (value.get("init_args") or {})})
+    inner = {key: _made_in(one) for key, one in value.items()}
     if not isinstance(path, str) or _function_at(path) is None or path == f"{__name__}.made":
         return inner
     named = {"class_path": f"{__name__}.made", "init_args": {"function": path}}

@@ -21,7 +21,7 @@ from pytorch_lightning.callbacks import Checkpoint, ModelCheckpoint, ProgressBar
 from pytorch_lightning.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 
 from dejavu_torch.cli.commands import features_words, print_map, print_next
-from dejavu_torch.cli.parser import Parser, Preset, refusal
+from dejavu_torch.cli.parser import Parser, Preset, refusal, with_hub
 from dejavu_torch.cli.process import interrupts_raise
 from dejavu_torch.data.output import check_output_folder, make_output_folder, remove_empty_folders, whole_file
 from dejavu_torch.features.embedding import Embedding
@@ -421,7 +421,7 @@ def print_what_next(path: Path, data: RouteData, model: DejaVu, words: Sequence[
     option = "--model.backbone"
     if type(model.features) is Embedding:  # the map has its settings, all but those of the network
         option += ".network"
-    features = features_words(model, shlex.join(["train", *words]), option)
+    features = features_words(model, shlex.join(["train", *with_hub(words)]), option)
     if len(data.listed["source"]) > 1:
         print_next("learn", "ROUTE", "--descriptor", path, *features, "--map", "route.safetensors")
         return

@@ -1,0 +1,234 @@
+"""Short names of networks of torch.hub: the call that each stands for, with `torch.hub.load` replaced."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from command_line import fails, run
+from torch import Tensor, nn
+
+from dejavu_torch import HOG, DejaVu
+from dejavu_torch.cli.commands import run_compare, run_learn, run_live, run_localize
+from dejavu_torch.cli.parser import parse
+from dejavu_torch.features.embedding import Embedding
+from dejavu_torch.features.hub import NETWORKS, embedding
+from dejavu_torch.features.joined import Joined
+
+ROUTE = "sim:aerial?frames=40"
+MEAN, STD = [0.485, 0.456, 0.406], [0.229, 0.224, 0.225]
+RESNET = {"backbone": "ResNet50", "fc_output_dim": 2048}
+SELA = {"backbone": "dinov2-large", "aggregation": "gem", "hashing": True, "rerank": True}
+ANYLOC = {"backbone": "DINOv2", "domain": "urban"}
+# the call, the size of the frames, and how many numbers come of it
+CALLS: dict[str, tuple[tuple[str, str], dict[str, Any], tuple[int, int], int]] = {
+    "megaloc": (("gmberton/MegaLoc", "get_trained_model"), {}, (322, 322), 8448),
+    "eigenplaces": (("gmberton/eigenplaces", "get_trained_model"), RESNET, (480, 640), 2048),
+    "cosplace": (("gmberton/cosplace", "get_trained_model"), RESNET, (480, 640), 2048),
+    "salad": (("serizba/salad", "dinov2_salad"), {}, (322, 322), 8448),
+    "boq": (
+        ("amaralibey/bag-of-queries", "get_trained_boq"),
+        {"backbone_name": "dinov2", "output_dim": 12288},
+        (322, 322),
+        12288,
+    ),
+    "cricavpr": (("Lu-Feng/CricaVPR", "trained_model"), {}, (224, 224), 10752),
+    "anyloc": (
+        ("AnyLoc/DINO", "get_vlad_model"),
+        {"backbone": "DINOv2", "domain": "urban"},
+        (322, 322),
+        49152,
+    ),
+    "selavpr++": (("Lu-Feng/SelaVPRplusplus", "SelaVPRplusplus"), SELA, (322, 322), 512),
+}
+
+
+class Net(nn.Module):
+    """As many numbers as a network of the hub makes, in the form in which it makes them."""
+
+    def __init__(self, repository: str, numbers: int) -> None:
+        super().__init__()
+        self.repository, self.linear = repository, nn.Linear(12, numbers)
+
+    def forward(self, frames: Tensor) -> object:
+        made = self.linear(nn.functional.adaptive_avg_pool2d(frames, 2).flatten(1))
+        if "queries" in self.repository:  # the attention of each block
+            return made, [made.view(len(made), -1, 2)]
+        return (made[:, :99], made.sign(), made.repeat(1, 8)) if "Sela" in self.repository else made
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    """Calls of `torch.hub.load`."""
+    calls: list[dict[str, Any]] = []
+
+    def load(repo_or_dir: str, model: str, **arguments: Any) -> nn.Module:
+        calls.append({"repository": repo_or_dir, "entry": model, **arguments})
+        sys.stdout.write("Using a cache\n")  # as some do
+        torch.manual_seed(0)
+        numbers = next(one[3] for one in CALLS.values() if one[0][0] == repo_or_dir)
+        net = Net(repo_or_dir, numbers)
+        return nn.DataParallel(net) if repo_or_dir.startswith("Lu-Feng") else net
+
+    monkeypatch.setattr(torch.hub, "load", load)
+    return calls
+
+
+def features_of(*words: str) -> Any:
+    return parse("learn", run_learn, [ROUTE, "--map", "map.safetensors", *words])["model"].features
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_a_short_name_is_this_call(name: str, asked: list[dict[str, Any]]) -> None:
+    (repository, entry), arguments, size, numbers = CALLS[name]
+    net = features_of("--features", f"hub:{name}")
+    assert asked == [{"repository": repository, "entry": entry, "trust_repo": True} | arguments]
+    assert type(net) is Embedding
+    assert isinstance(net.network, Net)
+    assert (net.resize, net.mean, net.std, net.dimension, net.layer) == (size, MEAN, STD, None, None)
+    frames = torch.rand(2, 3, 60, 80)
+    with torch.no_grad():
+        features = net.eval()(frames)
+    assert features.shape == (2, numbers)
+    if name == "selavpr++":
+        assert set(features.unique().tolist()) == {-1.0, 1.0}
+
+
+def test_all_of_them_are_tried() -> None:
+    assert NETWORKS.keys() == CALLS.keys()
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "--features hub:anyloc --features.resize [28,42] --features.network.domain aerial",
+        "--features.network.domain=aerial --features.resize=[28,42] --features=hub:anyloc",
+    ],
+)
+def test_options_overrule_it_wherever_they_are(words: str, asked: list[dict[str, Any]]) -> None:
+    net = features_of(*words.split())
+    assert net.resize == (28, 42)
+    assert net.mean == MEAN
+    assert [one["domain"] for one in asked] == ["aerial"]
+
+
+def test_the_words_in_full_are_the_same(asked: list[dict[str, Any]]) -> None:
+    page = (Path(__file__).parents[1] / "docs" / "pretrained.md").read_text().replace("\\\n", " ")
+    shown = re.findall(r"^dejavu learn \S+ --map \S+ (.*eigenplaces.*)$", page, re.MULTILINE)
+    nets = [features_of(*shlex.split(words)) for words in shown]
+    assert len(nets) == 2
+    assert repr(nets[0]) == repr(nets[1])
+    assert asked[0] == asked[1]
+    assert asked[0]["repository"] == "gmberton/eigenplaces"
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        "[HOG, hub:cricavpr]",
+        "[{class_path: HOG}, {class_path: hub:cricavpr, init_args: {resize: [224, 224]}}]",
+    ],
+)
+def test_as_a_member_of_a_list(value: str, asked: list[dict[str, Any]]) -> None:
+    joined = features_of("--features", value)
+    assert isinstance(joined, Joined)
+    assert [type(one) for one in joined.members] == [HOG, Embedding]
+    assert repr(joined.members[1]) == repr(features_of("--features", "hub:cricavpr"))
+    assert asked[0] == asked[1]
+
+
+def test_a_member_has_settings_of_its_own(asked: list[dict[str, Any]]) -> None:
+    member = "{class_path: hub:megaloc, init_args: {resize: [28, 42], mean: .5}}"
+    net = features_of("--features", f"[HOG, {member}]").members[1]
+    assert (net.resize, net.mean, net.std) == ((28, 42), 0.5, STD)
+    assert len(asked) == 1
+
+
+@pytest.mark.parametrize("value", ["hub:megalock", "[HOG, hub:megalock]", "hub:"])
+def test_an_unknown_name_lists_the_known(value: str, capsys: pytest.CaptureFixture[str]) -> None:
+    error = fails(capsys, "learn", ROUTE, "--map", "map.safetensors", "--features", value)
+    assert ": hub:" in error
+    assert all(f"hub:{name}" in error for name in CALLS)
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (run_compare, (ROUTE, ROUTE, "--out", "report")),
+        (run_localize, ("map.safetensors", ROUTE, "--out", "matches.csv")),
+        (run_live, ("map.safetensors", ROUTE)),
+    ],
+)
+def test_other_commands_take_it(
+    call: Callable[..., None], words: tuple[str, ...], asked: list[dict[str, Any]]
+) -> None:
+    parsed = parse(call.__name__.removeprefix("run_"), call, [*words, "--features", "hub:megaloc"])
+    net = parsed["model"].features if "model" in parsed else parsed["loading"].features
+    assert isinstance(net, Embedding)
+    assert len(asked) == 1
+
+
+@pytest.mark.parametrize("value", ["hub:selavpr++", "[HOG, hub:eigenplaces]"])
+def test_the_next_line_runs(
+    value: str,
+    asked: list[dict[str, Any]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    run("learn", ROUTE, "--map", "map.safetensors", "--features", value)
+    told = shlex.split(capsys.readouterr().out.rpartition("next: dejavu ")[2])
+    assert value in told
+    words = [f"{ROUTE}&traverse=1" if word == "QUERY" else word for word in told]
+    run(*words)
+    assert len((tmp_path / "matches.csv").read_text().splitlines()) == 41
+    run("live", *words[1:-2])
+    lines = capsys.readouterr().out.splitlines()
+    assert len([json.loads(line) for line in lines[-40:]]) == 40  # nothing else is printed there
+    assert len(asked) == 3
+
+
+def test_a_training_takes_it_and_says_the_words(
+    asked: list[dict[str, Any]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    made = (
+        "--model.backbone",
+        "hub:cosplace",
+        "--model.backbone.dimension=4",
+        "--model.mapper",
+        "SpectralMapper",
+    )
+    steps = "--trainer.max_steps=1", "--trainer.accelerator=cpu", "--trainer.default_root_dir=run"
+    run("train", "fit", "--data.source", ROUTE, *made, *steps)
+    words = shlex.split(capsys.readouterr().out.splitlines()[-1].removeprefix("next: dejavu "))
+    begin = next(i for i, word in enumerate(words) if word.startswith("--features"))
+    features = [word for word in words[begin:] if word.startswith("--features")]
+    DejaVu.load("run/map.safetensors", features_of(*features))
+    assert asked[0] == asked[-1]
+
+
+def test_a_repository_that_is_really_loaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    code = (
+        "dependencies = ['torch']\n"
+        "from torch import nn\n"
+        "def get_trained_model(width=4):\n"
+        "    return nn.Conv2d(3, width, 3)\n"
+    )
+    (tmp_path / "hubconf.py").write_text(code)
+    local = embedding(str(tmp_path), "get_trained_model", source="local", width=5)
+    monkeypatch.setitem(NETWORKS, "megaloc", local)
+    for value in ("hub:megaloc", "[hub:megaloc]"):
+        net = features_of("--features", value)
+        assert net(torch.rand(2, 3, 20, 20)).shape == (2, 5)
