@@ -44,8 +44,8 @@ HINT = (
     "SpectralMapper, --preprocess.help and --velocity.help. --config local_maxima makes a map of templates, "
     "with options such as --mapper.periods.window 512. --features '[HOG, PatchPixels]' joins the features of "
     "several, hub:megaloc is a pretrained network. --whitening also takes none, or a map file, with the "
-    "features that it was learned from; --descriptor takes those alone, from a map or from what `dejavu train` "
-    "makes of several routes."
+    "features that it was learned from; --descriptor takes those alone, from a map or from what "
+    "`dejavu train` makes of several routes."
 )
 BARE = {"velocity": "GroundOdometry", "page": 8765}  # what an option without a value means
 MapFile = restricted_string_type("MapFile", r".*\.safetensors")
