@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from benchmarks import cluster, live, matcher, memory, scale, storage, train
+from benchmarks import cluster, live, matcher, memory, scale, storage, train, trainings
 from dejavu_torch.cli import errors_of_one_line, fail, main
 from dejavu_torch.cli.parser import command_parser
 from dejavu_torch.data.output import check_output_folder
@@ -16,6 +16,7 @@ BENCHES: dict[str, Any] = {  # each returns what is to be printed
     "matcher": matcher.run_matcher,
     "storage": storage.run_storage,
     "train": train.run_train,
+    "trainings": trainings.run_trainings,
     "live": live.run_live,
     "memory": memory.run_memory,
     "scale": scale.run_scale,
@@ -28,7 +29,7 @@ def run(given: Sequence[str]) -> None:
     if not given or given[0] in ("--help", "-h"):
         print("usage: python -m benchmarks NAME [...] --out DIR\n")
         for name, function in BENCHES.items():
-            print(f"  {name:<8}  {function.__doc__.splitlines()[0]}")
+            print(f"  {name:<9}  {function.__doc__.splitlines()[0]}")
         return
     if given[0] not in BENCHES:
         fail(f"{given[0]!r} is no benchmark; expected one of {', '.join(BENCHES)}")

@@ -162,7 +162,7 @@ def run_train(
 
 
 def spread(values: list[float]) -> str:
-    """Their mean, the lowest and the highest."""
-    if not values:
-        return "-"
+    """Their mean, the lowest and the highest; of one itself."""
+    if len(values) < 2:
+        return f"{values[0]:.3f}" if values else "-"
     return f"{sum(values) / len(values):.3f} ({min(values):.3f}-{max(values):.3f})"

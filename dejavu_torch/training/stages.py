@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from itertools import accumulate
 from typing import cast
 
 import torch
@@ -10,9 +12,10 @@ from torch import Tensor, nn
 
 from dejavu_torch.features.embedding import Coder, Embedding, to_length
 from dejavu_torch.features.extract import features_of, in_mode
+from dejavu_torch.features.hog import HOG
 from dejavu_torch.maps.distance import phase_distances
 from dejavu_torch.maps.spectrum import Transform
-from dejavu_torch.training.datamodule import Batch
+from dejavu_torch.training.datamodule import Batch, StoredFrames
 from dejavu_torch.training.losses import (
     STEP,
     Losses,
@@ -28,6 +31,8 @@ from dejavu_torch.types import InputError
 
 ROUNDS = 10  # views of each training frame, for whitening and code
 NUMBERS = 2**27  # of all views at most, but for one of each frame: half a gigabyte
+FAINT = 0.1  # correlation of neighbouring frames, below which they are not alike
+SAMPLES = 64  # stretches of each route that are looked at for how long frames stay alike
 BATCH = 128  # views of a step: they cost little
 TEMPERATURE = 0.1  # of cosine distances, at the start
 NOISE = 0.5  # on descriptors in training, beside components of about 1
@@ -37,8 +42,9 @@ class DescriptorStage(nn.Module):
     """The descriptor learns to tell stretches of the route apart.
 
     Place cross-entropy over the cosine distances of the descriptor to one proxy for each stretch, as long as
-    the tolerance, and shorter at the end of a route. If it is the last stage, the map is made of the
-    descriptor in closed form.
+    the tolerance, or as frames stay `alike` if that is shorter, and shorter at the end of a route. Places
+    within so many of the right one are right. If it is the last stage, the map is made of the descriptor in
+    closed form.
 
     Args:
         share: of the steps of the whole training; the last stage takes the steps that are left.
@@ -62,7 +68,7 @@ class DescriptorStage(nn.Module):
             seen = f"nothing of {type(task.features).__name__} can be trained"
             raise InputError(f"{seen}; expected parameters that are not frozen, or `dejavu learn`")
         data, known = task.data, len(self.proxies)
-        every = int(self.every) if known else max(1, data.tolerance)
+        every = int(self.every) if known else alike(data.sets["reference"], data.lengths, data.tolerance)
         begins = torch.cat([torch.arange(length) % every == 0 for length in data.lengths])
         count = int(begins.sum())
         numbers = data.apart(torch.arange(len(begins)))
@@ -97,7 +103,11 @@ class DescriptorStage(nn.Module):
 
     def chance(self, task: Trainee) -> dict[str, float]:
         """The least that each loss can be without a look at the frames."""
-        return {"descriptor": place_chance(sum(task.data.lengths), task.data.tolerance)}
+        return {"descriptor": place_chance(sum(task.data.lengths), self.tolerance(task))}
+
+    def tolerance(self, task: Trainee) -> int:
+        """Places within which one is right, in training."""
+        return min(task.data.tolerance, int(self.every))
 
     def losses_to(self, proxies: Tensor, task: Trainee, batch: Batch) -> Losses:
         """The losses of a batch, to proxies (W,K)."""
@@ -109,7 +119,7 @@ class DescriptorStage(nn.Module):
         distances = nn.functional.pad(distances, (0, 1), value=math.inf)  # between two routes
         scores, temperature = distances.index_select(1, self.stretch), self.log_temperature.exp()
         places = task.data.apart(batch.truth.positives)
-        found = place_cross_entropy(scores, places, task.data.tolerance, temperature)
+        found = place_cross_entropy(scores, places, self.tolerance(task), temperature)
         return Losses(found.loss, {"descriptor": found.loss}, found.left_out)
 
     def _load_from_state_dict(self, state: dict[str, Tensor], prefix: str, *args: object) -> None:
@@ -212,6 +222,33 @@ def stages_of(backbone: nn.Module, descriptor: float, made: bool, rate: float) -
     if (embedding := whitens(backbone)) and _trainable(embedding.network):
         return [DescriptorStage(descriptor), CodeStage()]
     return [CodeStage()]
+
+
+@torch.no_grad()
+def alike(frames: StoredFrames, lengths: Sequence[int], most: int) -> int:
+    """Frames of a stretch in which HOG correlates at least half as much as in neighbours, from 1 to `most`;
+    `most` where HOG cannot be computed.
+
+    The noise of a camera lowers all correlations alike: their ratio tells what changes along the route.
+
+    Args:
+        lengths: frames of each route, which follow one another.
+    """
+    first = [0, *accumulate(lengths)]
+    begins = [
+        start + torch.linspace(0, n - most - 1, SAMPLES).long()
+        for start, n in zip(first, lengths, strict=False)
+    ]
+    index = torch.cat(begins).unique()[:, None] + torch.arange(most + 1)
+    try:
+        hog = torch.cat([HOG()(frames[part.tolist()].frames) for part in index.flatten().split(64)])
+    except InputError:
+        return max(1, most)
+    units = to_length(hog - hog.mean(0)).unflatten(0, index.shape)
+    pairs = [(units[:, lag:], units[:, : most + 1 - lag]) for lag in range(1, most + 1)]
+    likeness = [float((one * other).sum(-1).mean()) / units.shape[-1] for one, other in pairs]
+    least = max([*likeness[:1], FAINT]) / 2
+    return next((lag for lag, one in enumerate(likeness[1:], 1) if one < least), max(1, most))
 
 
 def whitens(features: nn.Module) -> Embedding | None:

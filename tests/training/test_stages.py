@@ -25,11 +25,13 @@ from small_training import (
     trainer,
     warned,
 )
-from torch import Tensor
+from torch import Tensor, nn
 
-from dejavu_torch import HOG, DejaVu
+from dejavu_torch import HOG, DejaVu, SpectralMapper
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.training.stages import CodeStage, DescriptorStage
+from dejavu_torch.data.ground_truth import as_ground_truth
+from dejavu_torch.training.datamodule import StoredFrames
+from dejavu_torch.training.stages import CodeStage, DescriptorStage, alike
 from dejavu_torch.training.task import PlaceRecognitionTask
 
 ALL = [DescriptorStage, CodeStage]
@@ -173,3 +175,35 @@ def test_what_watches_a_figure_begins_with_the_last_stage(tmp_path: Path) -> Non
     assert int(best.best_model_path.partition("step=")[2].removesuffix(".ckpt")) > 10
     assert (tmp_path / "map.safetensors").is_file()
     assert running.callbacks == callbacks  # type: ignore[attr-defined]
+
+
+def slid(step: int, count: int = 200, noise: float = 0.0) -> StoredFrames:
+    """A window of 64 x 64 pixels, slid so many pixels a frame along a picture in which nothing repeats."""
+    random = torch.Generator().manual_seed(0)
+    coarse = torch.rand(1, 1, 4, (64 + step * count) // 16 + 1, generator=random)
+    picture = nn.functional.interpolate(coarse, scale_factor=16, mode="bicubic")[0]
+    frames = torch.stack([picture[:, :, step * i : step * i + 64] for i in range(count)])
+    frames = frames + noise * torch.randn(frames.shape, generator=random)
+    return StoredFrames([(255 * frames.clamp(0, 1)).byte()], as_ground_truth(torch.arange(count)[:, None]))
+
+
+@pytest.mark.parametrize(("step", "noise", "expected"), [(1, 0.0, 5), (1, 0.1, 5), (2, 0.0, 2), (80, 0.0, 1)])
+def test_a_stretch_is_as_long_as_frames_stay_alike(step: int, noise: float, expected: int) -> None:
+    frames = slid(step, noise=noise)
+    assert alike(frames, [200], 5) == expected
+    assert alike(frames, [100, 100], 1) == alike(frames, [200], 0) == 1  # no longer than the tolerance
+
+
+def test_frames_too_small_for_hog_have_stretches_of_the_tolerance() -> None:
+    small = StoredFrames(
+        [torch.zeros(9, 1, 4, 4, dtype=torch.uint8)], as_ground_truth(torch.arange(9)[:, None])
+    )
+    assert alike(small, [9], 5) == 5
+
+
+def test_places_are_right_within_a_stretch(tmp_path: Path) -> None:
+    task = new_task(mapper=SpectralMapper(6.0))
+    fit(tmp_path, task, data_of(slid(80).values.float() / 255, tolerance=5), max_steps=1)
+    assert isinstance(task.stage, DescriptorStage)
+    assert (int(task.stage.every), len(task.stage.proxies)) == (1, 200)
+    assert (task.stage.tolerance(task), task.metric.tolerance) == (1, 5)

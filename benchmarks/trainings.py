@@ -1,0 +1,227 @@
+"""What a training is worth on routes of many kinds, beside the untrained map: `benchmarks trainings`."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import subprocess
+import sys
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from tqdm import tqdm
+
+from benchmarks.measure import Row, write_bench
+from benchmarks.plots import plot_ratios
+from benchmarks.train import spread
+from dejavu_torch.data.source import open_source
+from dejavu_torch.evaluation.baselines import hog_baselines
+from dejavu_torch.evaluation.controls import null_control
+from dejavu_torch.evaluation.curves import evaluate
+from dejavu_torch.evaluation.report import text_table
+from dejavu_torch.maps.spectral import SpectralMapper
+from dejavu_torch.maps.spectral_map import SpectralMap
+from dejavu_torch.model import DejaVu
+from dejavu_torch.motion.resampling import ground_truth_of
+from dejavu_torch.text import one_line
+from dejavu_torch.types import InputError, Match
+
+SEEDS = (0, 1, 2)
+ROAD = "strip:{{data}}/aerial_road/pass{}.png?halve=1&rows=32:128&width=96{}"
+TRAINED, UNTRAINED, HOG = "trained", "untrained", "HOG of all frames"
+NULL = "null"  # shuffled frames in as many bytes
+SIZES = {"1 B": SpectralMapper(1.0), "5 B": SpectralMapper(5.0), "default": SpectralMapper()}
+
+
+class Route(NamedTuple):
+    """Two traverses and their truth, {data} being the folder of the footage.
+
+    preset, options: of the training. start: another training, whose weights it begins with.
+    """
+
+    reference: str
+    query: str
+    tolerance: int = 5
+    truth: str | None = None
+    preset: str = "train_road"
+    options: str = ""
+    start: Route | None = None
+
+    def below(self, data: Path) -> Route:
+        """With the folder in place."""
+        placed: dict[str, Any] = {
+            k: one.format(data=data) for k, one in self._asdict().items() if isinstance(one, str)
+        }
+        return self._replace(**placed, start=self.start and self.start.below(data))
+
+
+def road(part: str = "", preset: str = "train_road") -> Route:
+    return Route(ROAD.format(1, part), ROAD.format(2, part), preset=preset)
+
+
+def simulated(kind: str, preset: str) -> Route:
+    return Route(f"sim:{kind}?seed=1", f"sim:{kind}?seed=1&traverse=1", preset=preset)
+
+
+def drive(name: str, tolerance: int) -> Route:
+    folder = f"{{data}}/{name}"
+    return Route(f"{folder}/reference.npy", f"{folder}/query.npy", tolerance, f"{folder}/truth.csv")
+
+
+def nordland(places: str, options: str, start: Route | None = None) -> Route:
+    summer, winter = (f"{{data}}/nordland/{one}?{places}" for one in ("summer", "winter"))
+    return Route(summer, winter, 1, None, "train_nordland", options.format(winter=winter), start)
+
+
+ROUTES = {
+    "road, first half": road("&stop=1348"),
+    "road, second half": road("&start=1348"),
+    **{f"city {i}": drive(f"robotcar/{name}", 2) for i, name in enumerate(("t1", "t2", "t5"), 1)},
+    "corridor": Route("{data}/corridor/ref", "{data}/corridor/query", 0, "{data}/corridor/truth.csv"),
+    "laps": drive("donkey_lap", 10),
+}
+# the other presets, each on a route like that which it was made for
+PRESETS = {
+    "train_small, sim:aerial": simulated("aerial", "train_small"),
+    "train_railway, sim:outdoor": simulated("outdoor", "train_railway"),
+    "train_residues, road": road(preset="train_residues"),
+    "train_nordland, railway": nordland(
+        "start=900&stop=1800",
+        "--data.held_out 0",
+        nordland("stop=900", "--data.second {winter} --data.held_out 0 --trainer.max_steps 100"),
+    ),
+}
+
+
+def trained(name: str, route: Route, seed: int, out: Path, options: str) -> Path | str:
+    """The map of a training, by the command that a user would run, or what that said where it made none.
+
+    One that is there is kept, so that a run goes on where another was stopped.
+    """
+    begin: list[str] = []
+    if route.start is not None:
+        first = trained(f"{name} start", route.start, seed, out, options)
+        if not isinstance(first, Path):
+            return first
+        begin = ["--model.start", str(first)]
+    folder = out / f"{name.replace(', ', '_').replace(' ', '_').replace(':', '_')}_{seed}"
+    path, log = folder / "map.safetensors", folder / "log.txt"
+    if not path.exists():
+        command = [sys.executable, "-m", "dejavu_torch.cli", "train", "fit", "--config", route.preset]
+        command += ["--data.source", route.reference, "--seed_everything", str(seed)]
+        command += [
+            "--trainer.default_root_dir",
+            str(folder),
+            *begin,
+            *shlex.split(f"{route.options} {options}"),
+        ]
+        folder.mkdir(parents=True, exist_ok=True)
+        with log.open("w", encoding="utf-8") as file:
+            subprocess.run(
+                command,
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                check=False,
+                env=os.environ | {"OMP_NUM_THREADS": "1"},  # several at a time
+            )
+    said = log.read_text(encoding="utf-8").strip().splitlines() if log.exists() else []
+    return path if path.exists() else one_line(said[-1].removeprefix("dejavu: ") if said else "no word")
+
+
+class Judge:
+    """Compares maps of a route on its second traverse."""
+
+    def __init__(self, name: str, route: Route) -> None:
+        self.name, self.tolerance = name, route.tolerance
+        self.reference, self.query = open_source(route.reference), open_source(route.query)
+        self.truth = ground_truth_of(route.truth, self.reference, self.query, aligned=True)
+
+    def row(self, contender: str, found: Match, seed: int | None = None, size: float | None = None) -> Row:
+        assert self.truth is not None  # of all routes above
+        scores = evaluate(found, self.truth, self.tolerance)
+        row = {"case": self.name, "contender": contender, "seed": seed, "tolerance": self.tolerance}
+        return row | {"auc": scores.auc, "recall_at_1": scores.recall_at_1, "route_bytes_per_place": size}
+
+    def of(self, contender: str, model: DejaVu, seed: int | None = None) -> list[Row]:
+        """Rows of a model's descriptors in maps of several sizes, or of its templates, and of their nulls."""
+        places, queries = model.extract_all(self.reference), model.extract_all(self.query)
+        rows = []
+        for name, mapper in SIZES.items() if isinstance(model.map, SpectralMap) else [("", None)]:
+            if mapper is not None:
+                model.mapper = mapper
+                try:
+                    model.learn_features(places, self.reference)
+                except InputError:  # too few bytes for a short route
+                    continue
+            size = model.map.summary().route_bytes / model.map.places
+            founds = model.localize_descriptors(queries), null_control(model, places, queries)
+            for kind, found in zip((contender, f"{contender}, {NULL}"), founds, strict=True):
+                rows.append(self.row(f"{kind} {name}".strip(), found, seed, size))
+        return rows
+
+    def hog(self) -> Row:
+        found = hog_baselines(self.reference, self.query, 64, self.tolerance)["hog"].found
+        return self.row(HOG, found)
+
+
+def run_trainings(
+    data: Path,
+    *,
+    out: Path,
+    routes: Sequence[str] = (),
+    seeds: Sequence[int] = (),
+    presets: bool = False,
+    jobs: int = 1,
+    options: str = "",
+) -> list[str]:
+    """What `dejavu train` is worth on routes of many kinds, beside the untrained map and HOG.
+
+    Args:
+        data: folder of the footage, as the tests have it
+        out: folder for bench.json, bench.png and the trained maps, which a later run takes from there
+        routes: names; all seven if not given
+        seeds: a training each; 0, 1 and 2 if not given
+        presets: the other presets, each on a route of its own, in place of `train_road` on all
+        jobs: trainings at a time, each of one thread
+        options: more of `dejavu train fit`, the same for all, as in '--options=--model.rate 0'
+
+    Convention: the second traverse is seen by no training. Bytes are of the route, per place; where they are
+        too few for a short route there is no row.
+
+    Raises:
+        InputError: a name that is none of the routes, or a seed out of range.
+    """
+    cases, seeds = PRESETS if presets else ROUTES, seeds or SEEDS
+    if unknown := [name for name in routes if name not in cases]:
+        raise InputError(f"{unknown[0]!r} is no route; expected one of {', '.join(map(repr, cases))}")
+    if jobs < 1 or not all(0 <= seed < 2**32 for seed in seeds):
+        seen = f"bench trainings got {jobs} jobs and seeds {list(seeds)}"
+        raise InputError(f"{seen}; expected at least one, and seeds from 0 to 2^32 - 1")
+    chosen = {name: cases[name].below(data) for name in routes or cases}
+    judges = {name: Judge(name, route) for name, route in chosen.items()}  # refuses what is not there
+    works = [(name, seed) for name in chosen for seed in seeds]
+    with ThreadPoolExecutor(jobs) as pool:
+        made = pool.map(lambda work: trained(work[0], chosen[work[0]], work[1], out, options), works)
+        maps = dict(zip(works, tqdm(made, "trainings", len(works), disable=None, leave=False), strict=True))
+    rows: list[Row] = []
+    for name, judge in judges.items():
+        found = {seed: maps[name, seed] for seed in seeds}
+        rows.append(judge.hog())
+        rows += judge.of(UNTRAINED, DejaVu().learn(judge.reference))
+        for seed, one in found.items():
+            if isinstance(one, Path):
+                rows += judge.of(TRAINED, DejaVu.load(one), seed)
+            else:
+                rows.append({"case": name, "contender": TRAINED, "seed": seed, "skipped": one})
+    areas: dict[str, dict[str, list[float]]] = {name: {} for name in chosen}
+    for row in rows:
+        if "auc" in row:
+            areas[row["case"]].setdefault(row["contender"], []).append(row["auc"])
+    means = {name: {key: sum(of) / len(of) for key, of in own.items()} for name, own in areas.items()}
+    write_bench(out, rows, plot_ratios(means, "AUC, mean of the seeds"), options=options)
+    keys = dict.fromkeys(key for own in areas.values() for key in own)
+    table = [["", *areas], *([key, *(spread(own.get(key, [])) for own in areas.values())] for key in keys)]
+    said = [f"{row['case']}, seed {row['seed']}: {row['skipped']}" for row in rows if "skipped" in row]
+    return [text_table(table), *said, f"AUC of the second traverse, one query; seeds {list(seeds)}"]

@@ -1,0 +1,54 @@
+"""`benchmarks trainings`: trainings beside the untrained map, taken up where an earlier run was stopped."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from command_line import benchmark
+
+from benchmarks import trainings
+from benchmarks.trainings import PRESETS, ROUTES, Route
+
+
+def test_a_training_is_set_beside_the_untrained_map_and_made_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flight = Route(
+        "sim:aerial?frames=120", "sim:aerial?frames=120&traverse=1", options="--trainer.max_steps 2"
+    )
+    broken = flight._replace(options="--model.lr 0")
+    monkeypatch.setattr(trainings, "ROUTES", {"flight, short": flight, "broken": broken})
+    given = ("trainings", tmp_path, "--out", tmp_path / "out", "--seeds", "3", "--jobs", "2")
+    benchmark(*given)
+    rows = json.loads((tmp_path / "out" / "bench.json").read_text())["rows"]
+    found = {(row["case"], row["contender"]): row for row in rows}
+    for kind in (
+        "HOG of all frames",
+        "untrained 5 B",
+        "untrained, null 5 B",
+        "trained 5 B",
+        "trained default",
+    ):
+        assert 0 <= found["flight, short", kind]["auc"] <= 1
+    assert found["flight, short", "trained 5 B"]["seed"] == 3
+    assert found["flight, short", "trained 5 B"]["route_bytes_per_place"] <= 5
+    assert found["broken", "trained"]["skipped"].startswith("lr is 0")  # told, not lost
+    assert "broken, seed 3: " in capsys.readouterr().out
+    assert (tmp_path / "out" / "bench.png").is_file()
+    made = tmp_path / "out" / "flight_short_3" / "map.safetensors"
+    before = made.stat().st_mtime_ns
+    monkeypatch.setattr(trainings, "ROUTES", {"flight, short": flight})
+    benchmark(*given)
+    assert made.stat().st_mtime_ns == before
+
+
+def test_the_routes_are_below_the_folder_of_the_footage() -> None:
+    for route in (one.below(Path("/films")) for one in (*ROUTES.values(), *PRESETS.values())):
+        for name in (route.reference, route.query, *filter(None, [route.truth])):
+            assert "/films/" in name or name.startswith("sim:")
+        assert route.reference != route.query
+    start = PRESETS["train_nordland, railway"].below(Path("/films")).start
+    assert start is not None
+    assert "--data.second /films/nordland/winter?stop=900" in start.options
