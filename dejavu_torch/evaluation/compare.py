@@ -189,15 +189,8 @@ def compare(
     run = Localization(
         model, reference, query, places.cpu(), queries.cpu(), match, known, tolerance, matching
     )
-    ours, contenders = _contend(run, "this map", match, model), {}
-    if known is not None or leave_out is not None:
-        baselines = baselines_of(run, seed, leave_out, progress)
-        contenders = {key: _beside(run, key, baseline) for key, baseline in baselines.items()}
-    for key, (name, other) in (others or {}).items() if known is not None else ():
-        other.learn(reference)
-        found = other.localize_descriptors(other.extract_all(query), matching)
-        contenders[key] = _contend(run, name, found, other)
-
+    ours = _contend(run, "this map", match, model)
+    contenders = _set_beside(run, others or {}, leave_out, seed, progress)
     route, scored = model.map, ours.scores is not None and isinstance(model.map, SpectralMap)
     storage = coded_at_sizes(run, seed=seed, progress=progress) if storage_curve and scored else None
     pictures = draw_pictures(run, {"map": ours, **contenders}, storage)
@@ -215,6 +208,25 @@ def compare(
     if scored and isinstance(route, SpectralMap) and len(route.chunks) == 1:
         facts["noise_over_map"] = noise_over_map(route, run.reference_features, seed)
     return Comparison(Report(ours, contenders, facts), pictures, run, candidates)
+
+
+def _set_beside(
+    run: Localization,
+    others: Mapping[str, tuple[str, DejaVu]],
+    leave_out: int | None,
+    seed: int,
+    progress: bool,
+) -> dict[str, Contender]:
+    """What else could be stored, and what further models find of the same reference."""
+    known, contenders = run.truth is not None, {}
+    if known or leave_out is not None:
+        baselines = baselines_of(run, seed, leave_out, progress)
+        contenders = {key: _beside(run, key, baseline) for key, baseline in baselines.items()}
+    for key, (name, other) in others.items() if known else ():
+        other.learn(run.reference)
+        found = other.localize_descriptors(other.extract_all(run.query), run.matching)
+        contenders[key] = _contend(run, name, found, other)
+    return contenders
 
 
 def _check_leave_out(model: DejaVu, leave_out: int | None) -> None:
