@@ -60,6 +60,7 @@ from dejavu_torch.motion.resampling import ResampledTraverse, resampled, source_
 from dejavu_torch.recognition.calibration import Calibration
 from dejavu_torch.recognition.coarse import CoarseSearch, coarse_search
 from dejavu_torch.recognition.localizer import Localizer, Matching
+from dejavu_torch.recognition.sample_file import kept_search
 from dejavu_torch.recognition.search import SCORES_AT_ONCE, Find, Search, check_search
 from dejavu_torch.recognition.select import HIGHEST, PROBABLE, Acceptance, check_candidates
 from dejavu_torch.resize import reduced_size
@@ -173,6 +174,7 @@ class DejaVu(nn.Module):
         self.search_memory: int | None = (
             None  # bytes that it may take beyond the map; None follows the places
         )
+        self.search_file: Path | str | None = None  # keeps what it takes from one process to the next
         self.find: Find | None = None  # in its place, as a cluster does
         # its samples, and what they are of
         self._coarse: tuple[tuple[Any, ...], CoarseSearch | None] = (), None
@@ -508,6 +510,10 @@ class DejaVu(nn.Module):
         searches = getattr(sequence, "search_every", 1) > 1 if sequence else matching.on_scores is None
         if searches and self.find is None and matching.search != "scan":
             coarse = self._coarse_search(matching.search == "exact")
+        if coarse is None and self.search_file is not None:
+            seen = f"search_file {self.search_file}: no samples are searched, all places are"
+            expected = "single queries, or a filter with search_every, without scores of all places"
+            raise InputError(f"{seen}; expected {expected}, on a long spectral map of several chunks")
         if coarse is None:
             return Localizer(self.map, matching, self.find)
         return Localizer(self.map, matching, coarse, coarse.approximate)
@@ -516,9 +522,11 @@ class DejaVu(nn.Module):
         """Samples of the map as it is, made when they are first needed; None where it is scanned."""
         norms = getattr(self.map, "norms", None)  # another tensor if the map is another
         known, found = self._coarse
-        if not known or known[0] is not norms or known[1:] != (self.search_memory, exact):
-            found = coarse_search(self.map, self.search_memory, exact)
-            self._coarse = (norms, self.search_memory, exact), found
+        how = self.search_memory, exact
+        if not known or known[0] is not norms or known[1:] != (self.search_file, *how):
+            file = self.search_file
+            found = coarse_search(self.map, *how) if file is None else kept_search(Path(file), self.map, *how)
+            self._coarse = (norms, file, *how), found
         return found
 
     def matches(

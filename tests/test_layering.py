@@ -22,7 +22,7 @@ ARROWS = {
     "features": "text types resize",
     "periods": "text types memory",
     "maps": "types memory data periods",
-    "recognition": "types maps",
+    "recognition": "types data maps",
     "motion": "text types memory data",
     "learning": "types memory data features maps recognition motion",
     "model_file": "text version types data features periods maps recognition motion learning",

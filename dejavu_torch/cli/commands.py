@@ -27,6 +27,7 @@ from dejavu_torch.cli.options import (
     Acceptance,
     Growth,
     Judging,
+    KeptSearching,
     Learning,
     LiveSearches,
     Loading,
@@ -176,7 +177,7 @@ def run_localize(
     top: int | None = None,
     corners: list[list[float]] | None = None,
     sequences: Searches,
-    searching: Searching,
+    searching: KeptSearching,
     cluster: str | None = None,
     loading: Loading,
 ) -> None:
@@ -193,13 +194,16 @@ def run_localize(
     """
     device_of(loading.device)
     check_output_file(out)
-    check_not_read(out, map, source)
+    check_not_read(out, map, source, searching.search_file)
     matcher = sequences.matcher(APART, acceptance.threshold)
     acceptance.check(matcher)
     if cluster is not None:
         _check_cluster(cluster, loading.device)
         if sequences.filter or sequences.sequence != 1:
             together = "--filter" if sequences.filter else f"--sequence {sequences.sequence}"
+            raise InputError(f"--cluster {cluster} and {together}; expected one of them")
+        if searching.search_file is not None:
+            together = f"--search_file {searching.search_file}"
             raise InputError(f"--cluster {cluster} and {together}; expected one of them")
     model = loading.model(map)
     searching.of(model)
@@ -244,7 +248,7 @@ def run_live(
     source: str,
     *,
     sequences: LiveSearches,
-    searching: Searching,
+    searching: KeptSearching,
     acceptance: Acceptance,
     page: int | None = None,
     reference: str | None = None,

@@ -116,6 +116,22 @@ class Searching:
 
 
 @dataclass
+class KeptSearching(Searching):
+    """As above, for what searches one map again and again.
+
+    Args:
+        search_file: file that keeps these samples for the next time: they are written there if it does not
+            exist, else read; one of another map, --search or --search_memory is refused
+    """
+
+    search_file: Path | None = None
+
+    def of(self, model: DejaVu) -> None:
+        super().of(model)
+        model.search_file = self.search_file
+
+
+@dataclass
 class Loading:
     """How a map is loaded.
 

@@ -305,12 +305,9 @@ class SpectralMap(PlaceMap):
         for some in units.split(max(1, LONG // (stop - start))):
             yield self.products(some, range(chunk, chunk + 1))
 
-    def samples(self, chunk: int, count: int) -> tuple[Tensor, Tensor]:
+    def samples(self, chunk: int, count: int) -> Tensor:
         """Descriptors at so many even positions of a chunk, low-passed: the inverse transform of as many
-        lines.
-
-        Shape: -> (M,K), and the places in the chunk that are nearest to the positions, (M,) int64.
-        """
+        lines, -> (M,K)."""
         (start, stop), (line, feature, value) = self.chunks[chunk], self.lines(chunk)
         slot, factor = slots(stop - start, self.transform, value.dtype, value.device)
         size = len(slots(count, self.transform, value.dtype, value.device)[1])
@@ -322,10 +319,14 @@ class SpectralMap(PlaceMap):
         low[:, 0] += mean * (math.sqrt(stop - start) * factor[0])
         if self.transform == "dft" and count % 2 == 0 and count < stop - start:  # half is aliased
             low[:, -2:] = 0
-        rows = from_slots(low, count, self.transform).T * math.sqrt(count / (stop - start))
+        return from_slots(low, count, self.transform).T * math.sqrt(count / (stop - start))
+
+    def sampled(self, chunk: int, count: int) -> Tensor:
+        """The places in a chunk that are nearest to so many even positions, (M,) int64."""
+        start, stop = self.chunks[chunk]
         half = 0.5 if self.transform == "dct" else 0.0  # its places are in the middle of a step
-        at = (torch.arange(count, device=value.device) + half) * ((stop - start) / count) - half
-        return rows, at.round().long().clamp(max=stop - start - 1)
+        at = (torch.arange(count, device=self.norms.device) + half) * ((stop - start) / count) - half
+        return at.round().long().clamp(max=stop - start - 1)
 
     def inverse_norms(self, start: int = 0, stop: int | None = None) -> Tensor:
         """1 / norm of the places [start, stop), 0 for a norm of 0."""

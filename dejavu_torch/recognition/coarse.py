@@ -7,8 +7,9 @@ best places are near the best of these samples; only places near them are scored
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import cache
+from types import MappingProxyType
 from typing import NamedTuple
 
 import torch
@@ -130,16 +131,22 @@ class Samples:
         place: (S,) that each is nearest to, in order.
     """
 
-    def __init__(self, route: SpectralMap, spacing: int) -> None:
-        rows, places = [], []
+    def __init__(self, route: SpectralMap, spacing: int, rows: Tensor | None = None) -> None:
+        """Make the rows, if they are not given as they were made before: then only their shape is checked."""
+        places = []
         for chunk, (start, stop) in enumerate(route.chunks):
-            row, at = route.samples(chunk, -(-(stop - start) // spacing))
-            padding = -len(row) % GROUP  # rows of 0, which are never the best
-            rows.append(F.pad(to_int8(F.normalize(row)), (0, 0, 0, padding)))
-            places.append(F.pad(at, (0, padding), value=stop - start - 1) + start)
-        padding = -sum(map(len, rows)) % (GROUP * BESIDE)
-        self.rows = torch.cat([*rows, rows[0].new_zeros(padding, route.dimension)])
-        self.place = F.pad(torch.cat(places), (0, padding), value=route.places - 1)
+            at = route.sampled(chunk, -(-(stop - start) // spacing))
+            places.append(F.pad(at, (0, -len(at) % GROUP), value=stop - start - 1) + start)
+        place = torch.cat(places)
+        self.place = F.pad(place, (0, -len(place) % (GROUP * BESIDE)), value=route.places - 1)
+        shape = len(self.place), route.dimension
+        if rows is None:  # those that fill up groups and blocks are 0, which are never the best
+            rows, first = self.place.new_zeros(shape, dtype=torch.int8), 0
+            for chunk, (start, stop) in enumerate(route.chunks):
+                row = route.samples(chunk, -(-(stop - start) // spacing))
+                rows[first : first + len(row)] = to_int8(F.normalize(row))
+                first += len(places[chunk])
+        self.rows = fitting(rows, shape, torch.int8).to(self.place.device)
         norms = [torch.linalg.vector_norm(some.float(), dim=1) for some in self.rows.split(BLOCK)]
         self.norm = torch.cat(norms).clamp(min=1)
 
@@ -171,21 +178,37 @@ class CoarseSearch:
 
     Args:
         route: the map; it is not changed.
-        chosen: see `plan`.
+        chosen: see `plan`. kept: what another search of the same map and plan has `made`; none makes it.
 
     Shape: queries (Q,K), wanted -> scores and places (Q,M), by place, +inf for none, in which the wanted
         candidates are; see `Wanted`.
 
     Convention: scores are those of a scan. A query of length 0, or one that is like no place, is scanned.
+
+    Raises:
+        InputError: what is kept is of other shapes or types than what would be made.
     """
 
-    def __init__(self, route: SpectralMap, chosen: Plan) -> None:
+    def __init__(
+        self, route: SpectralMap, chosen: Plan, kept: Mapping[str, Tensor] = MappingProxyType({})
+    ) -> None:
         self.route, self.plan, self.exact = route, chosen, chosen.fine == 1
         self.starts = torch.tensor([start for start, _ in route.chunks], device=route.norms.device)
-        self.fine = Samples(route, chosen.fine)
-        self.coarse = self.fine if self.exact else Samples(route, chosen.coarse)
+        self.fine = Samples(route, chosen.fine, kept.get("fine"))
+        self.coarse = self.fine if self.exact else Samples(route, chosen.coarse, kept.get("coarse"))
         self.middle = torch.searchsorted(self.fine.place, self.coarse.place, out_int32=True)
-        self.bounds = self._bounds() if self.exact else None
+        self.bounds = None
+        if self.exact:
+            bounds = kept["bounds"] if "bounds" in kept else self._bounds()
+            self.bounds = fitting(bounds, (len(self.fine.norm) // GROUP, 3), torch.float32).to(
+                self.starts.device
+            )
+
+    @property
+    def made(self) -> dict[str, Tensor]:
+        """What takes long to make: the rows of samples, and the bounds of an exact search."""
+        coarse = {"coarse": self.coarse.rows} if self.bounds is None else {"bounds": self.bounds}
+        return {"fine": self.fine.rows, **coarse}
 
     @torch.no_grad()
     def __call__(self, queries: Tensor, wanted: Wanted) -> Best:
@@ -348,6 +371,13 @@ def to_int8(units: Tensor) -> Tensor:
     scale = 127 * max(1.0, math.sqrt(units.shape[1]) / LARGE)
     rounded: Tensor = (units * scale).round().clamp(-127, 127)
     return rounded.to(torch.int8)
+
+
+def fitting(kept: Tensor, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+    """A tensor, if it is of this shape and type; else an InputError."""
+    if kept.shape != shape or kept.dtype != dtype:
+        raise InputError(f"samples are {tuple(kept.shape)} {kept.dtype}; expected {shape} {dtype}")
+    return kept
 
 
 @cache
