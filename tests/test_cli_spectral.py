@@ -72,6 +72,22 @@ def test_searches_of_localize(
     run("localize", path, SECOND, "--filter", "--search_every", "8", "--out", out)
     assert sum(a == b for a, b in zip(places(out), always, strict=True)) > 90
     assert "scan" in fails(capsys, "localize", path, SECOND, "--search", "ivf", "--out", out)
+    kept, said = tmp_path / "route.samples", "search_file"
+    for _ in range(2):  # written, read
+        run("localize", path, SECOND, "--search_file", kept, "--out", out)
+        assert places(out) == found[2]
+    written = kept.read_bytes()
+    for words in (("--filter",), ("--search", "scan"), ("--cluster", "auto")):
+        assert said in fails(capsys, "localize", path, SECOND, "--search_file", kept, *words, "--out", out)
+    assert said in fails(capsys, "live", path, SECOND, "--search_file", kept)  # its filter takes all scores
+    assert "what is read" in fails(capsys, "localize", path, SECOND, "--search_file", kept, "--out", kept)
+    assert "no whole file" in fails(capsys, "localize", path, SECOND, "--search_file", path, "--out", out)
+    capsys.readouterr()
+    run("live", path, f"{SECOND}&stop=3", "--sequence", "1", "--search_file", kept)
+    assert [json.loads(line)["place"] for line in capsys.readouterr().out.splitlines()] == [
+        *map(int, found[2][:3])
+    ]
+    assert kept.read_bytes() == written
     for memory, words in (("0", "search_memory 0"), ("1e-4", "expected at least")):
         assert words in fails(capsys, "localize", path, SECOND, "--search_memory", memory, "--out", out)
     run("info", path)

@@ -65,4 +65,5 @@ def read_samples(path: Path, route: SpectralMap, chosen: Plan) -> CoarseSearch:
 def key_of(route: SpectralMap, chosen: Plan) -> dict[str, Any]:
     """What samples are of, as JSON values: a digest of the map, and places from one sample to the next."""
     sums = checksums({f"map.{name}": one for name, one in route.packed().items()}, route.get_extra_state())
-    return {"format": FORMAT, "map": sums["map"] + sums[HEADER], "coarse": chosen.coarse, "fine": chosen.fine}
+    spacings = {"coarse spacing": chosen.coarse, "fine spacing": chosen.fine}
+    return {"format": FORMAT, "map": sums["map"] + sums[HEADER], **spacings}

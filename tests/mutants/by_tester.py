@@ -497,4 +497,18 @@ MUTANTS = [
         "reach = angle(1 - score) * 0.9 +",
         ("tests/recognition/test_coarse.py::test_exact_finds_what_a_scan_finds",),
     ),
+    Mutant(
+        "Samples in a file are of this very map.",
+        "dejavu_torch/recognition/sample_file.py",
+        "if header[name] != key[name]",
+        'if name != "map" and header[name] != key[name]',
+        ("tests/recognition/test_sample_file.py::-k another_map",),
+    ),
+    Mutant(
+        "A file of samples that would not be used is refused.",
+        "dejavu_torch/model.py",
+        "if coarse is None and self.search_file is not None:",
+        "if False:",
+        ("tests/recognition/test_sample_file.py::-k no_samples_are_searched",),
+    ),
 ]
