@@ -474,7 +474,8 @@ class DejaVu(nn.Module):
         Shape: -> Match of (Q,) on the CPU.
 
         Raises:
-            InputError: no map, no frames, NaN, or features of another dimension than the map's.
+            InputError: no map, no frames, NaN, or features of another dimension than the map's; a
+                `self.search_file` that is of another map, or where no samples are searched.
         """
         return Match.joined(self.matches(queries, progress, sequence, search))
 
