@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Sequence
 from itertools import accumulate
@@ -28,6 +29,8 @@ from dejavu_torch.training.losses import (
 from dejavu_torch.training.processes import noise_like, own_part, own_random
 from dejavu_torch.training.trainee import Trainee, coded
 from dejavu_torch.types import InputError
+
+log = logging.getLogger("dejavu_torch")
 
 ROUNDS = 10  # views of each training frame, for whitening and code
 NUMBERS = 2**27  # of all views at most, but for one of each frame: half a gigabyte
@@ -75,6 +78,12 @@ class DescriptorStage(nn.Module):
         between = torch.full((int(numbers[-1]) + 1,), count)
         self.stretch = between.scatter(0, numbers, begins.cumsum(0) - 1).to(task.device)
         if not known:
+            if every < data.tolerance:
+                log.warning(
+                    "frames of %s stay alike for %d, fewer than data.tolerance %d: places are told apart "
+                    "within that; unless bytes are few, the untrained map of `dejavu learn` is likely better",
+                    *(data.route_name, every, data.tolerance),
+                )
             self.every.fill_(every)
             with torch.no_grad(), in_mode(task.features, False):
                 dimension = task.described(data.sets["reference"][[0]].frames).shape[1]

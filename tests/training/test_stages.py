@@ -201,9 +201,11 @@ def test_frames_too_small_for_hog_have_stretches_of_the_tolerance() -> None:
     assert alike(small, [9], 5) == 5
 
 
-def test_places_are_right_within_a_stretch(tmp_path: Path) -> None:
+def test_places_are_right_within_a_stretch(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     task = new_task(mapper=SpectralMapper(6.0))
     fit(tmp_path, task, data_of(slid(80).values.float() / 255, tolerance=5), max_steps=1)
     assert isinstance(task.stage, DescriptorStage)
     assert (int(task.stage.every), len(task.stage.proxies)) == (1, 200)
     assert (task.stage.tolerance(task), task.metric.tolerance) == (1, 5)
+    (line,) = [line for line in warned(caplog) if "alike" in line]
+    assert all(fact in line for fact in ("for 1, fewer than data.tolerance 5", "dejavu learn"))
