@@ -236,7 +236,7 @@ def stages_of(backbone: nn.Module, descriptor: float, made: bool, rate: float) -
 @torch.no_grad()
 def alike(frames: StoredFrames, lengths: Sequence[int], most: int) -> int:
     """Frames of a stretch in which HOG correlates at least half as much as in neighbours, from 1 to `most`;
-    `most` where HOG cannot be computed.
+    `most` where HOG cannot be computed, or is the same in all.
 
     The noise of a camera lowers all correlations alike: their ratio tells what changes along the route.
 
@@ -252,6 +252,8 @@ def alike(frames: StoredFrames, lengths: Sequence[int], most: int) -> int:
     try:
         hog = torch.cat([HOG()(frames[part.tolist()].frames) for part in index.flatten().split(64)])
     except InputError:
+        hog = torch.zeros(index.numel(), 1)
+    if bool((hog == hog[0]).all()):
         return max(1, most)
     units = to_length(hog - hog.mean(0)).unflatten(0, index.shape)
     pairs = [(units[:, lag:], units[:, : most + 1 - lag]) for lag in range(1, most + 1)]
