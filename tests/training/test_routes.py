@@ -18,7 +18,7 @@ from dejavu_torch import DejaVu, RouteData, SpectralMapper, open_source
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.source import routes_of
 from dejavu_torch.features.embedding import to_length
-from dejavu_torch.training.stages import DescriptorStage
+from dejavu_torch.training.stages import DescriptorStage, alike
 from dejavu_torch.training.task import PlaceRecognitionTask
 
 LENGTHS = [40, 31, 23]
@@ -67,8 +67,10 @@ def test_neither_stretches_nor_the_tolerance_cross_from_one_route_to_the_next(tm
     stage = task.stage
     assert isinstance(stage, DescriptorStage)
     stage.begin(task)
+    every = alike(data.sets["reference"], data.lengths, 3)
+    assert every == 2  # shorter than the tolerance
     places = [(route, i) for route, length in enumerate(LENGTHS) for i in range(length)]
-    stretches = list(dict.fromkeys((route, i // 3) for route, i in places))
+    stretches = list(dict.fromkeys((route, i // every) for route, i in places))
     assert len(stage.proxies) == len(stretches)
     shown = [0, 38, 39, 40, 41, 70, 71, 93]
     batch = data.sets["reference"][shown]
@@ -81,9 +83,9 @@ def test_neither_stretches_nor_the_tolerance_cross_from_one_route_to_the_next(tm
     distance = 1 - nn.functional.cosine_similarity(noisy[:, None], stage.proxies[None], dim=2)
     surprise = []
     for row, place in zip(-distance / stage.log_temperature.exp(), shown, strict=True):
-        logits = torch.stack([row[stretches.index((route, i // 3))] for route, i in places])
+        logits = torch.stack([row[stretches.index((route, i // every))] for route, i in places])
         here, at = places[place]
-        right = [k for k, (route, i) in enumerate(places) if route == here and abs(i - at) <= 3]
+        right = [k for k, (route, i) in enumerate(places) if route == here and abs(i - at) <= every]
         surprise.append(logits.logsumexp(0) - logits[right].logsumexp(0))
     torch.testing.assert_close(loss, torch.stack(surprise).mean(), rtol=1e-4, atol=1e-4)
     loss.backward()
