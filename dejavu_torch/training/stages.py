@@ -34,8 +34,9 @@ log = logging.getLogger("dejavu_torch")
 
 ROUNDS = 10  # views of each training frame, for whitening and code
 NUMBERS = 2**27  # of all views at most, but for one of each frame: half a gigabyte
+SPARSE = 3  # frames, below which stretches have little for a training to average
 FAINT = 0.1  # correlation of neighbouring frames, below which they are not alike
-SAMPLES = 64  # stretches of each route that are looked at for how long frames stay alike
+LOOKED_AT = 400  # frames, for how long they stay alike
 BATCH = 128  # views of a step: they cost little
 TEMPERATURE = 0.1  # of cosine distances, at the start
 NOISE = 0.5  # on descriptors in training, beside components of about 1
@@ -45,9 +46,8 @@ class DescriptorStage(nn.Module):
     """The descriptor learns to tell stretches of the route apart.
 
     Place cross-entropy over the cosine distances of the descriptor to one proxy for each stretch, as long as
-    the tolerance, or as frames stay `alike` if that is shorter, and shorter at the end of a route. Places
-    within so many of the right one are right. If it is the last stage, the map is made of the descriptor in
-    closed form.
+    the tolerance, or as frames stay `alike` if that is shorter, and shorter at the end of a route. An answer
+    is right within as many places. If it is the last stage, the map is made of the descriptor in closed form.
 
     Args:
         share: of the steps of the whole training; the last stage takes the steps that are left.
@@ -78,7 +78,7 @@ class DescriptorStage(nn.Module):
         between = torch.full((int(numbers[-1]) + 1,), count)
         self.stretch = between.scatter(0, numbers, begins.cumsum(0) - 1).to(task.device)
         if not known:
-            if every < data.tolerance:
+            if every < min(data.tolerance, SPARSE):
                 log.warning(
                     "frames of %s stay alike for %d, fewer than data.tolerance %d: places are told apart "
                     "within that; unless bytes are few, the untrained map of `dejavu learn` is likely better",
@@ -235,31 +235,32 @@ def stages_of(backbone: nn.Module, descriptor: float, made: bool, rate: float) -
 
 @torch.no_grad()
 def alike(frames: StoredFrames, lengths: Sequence[int], most: int) -> int:
-    """Frames of a stretch in which HOG correlates at least half as much as in neighbours, from 1 to `most`;
-    `most` where HOG cannot be computed, or is the same in all.
+    """The longest stretch, in frames, over which HOG features correlate at least half as much as those of
+    neighbouring frames, from 1 to `most`; `most` where HOG cannot be computed.
 
-    The noise of a camera lowers all correlations alike: their ratio tells what changes along the route.
+    The noise of a camera lowers all correlations alike: their ratio tells what changes along the route. It is
+    that of medians over the route, so that a stop does not count.
 
     Args:
         lengths: frames of each route, which follow one another.
     """
-    first = [0, *accumulate(lengths)]
-    begins = [
-        start + torch.linspace(0, n - most - 1, SAMPLES).long()
-        for start, n in zip(first, lengths, strict=False)
-    ]
-    index = torch.cat(begins).unique()[:, None] + torch.arange(most + 1)
-    try:
-        hog = torch.cat([HOG()(frames[part.tolist()].frames) for part in index.flatten().split(64)])
-    except InputError:
-        hog = torch.zeros(index.numel(), 1)
-    if bool((hog == hog[0]).all()):
-        return max(1, most)
-    units = to_length(hog - hog.mean(0)).unflatten(0, index.shape)
-    pairs = [(units[:, lag:], units[:, : most + 1 - lag]) for lag in range(1, most + 1)]
-    likeness = [float((one * other).sum(-1).mean()) / units.shape[-1] for one, other in pairs]
-    least = max([*likeness[:1], FAINT]) / 2
-    return next((lag for lag, one in enumerate(likeness[1:], 1) if one < least), max(1, most))
+    if most < 2:
+        return 1
+    found, samples = [], max(2, LOOKED_AT // ((most + 1) * len(lengths)))
+    for start, length in zip(accumulate([0, *lengths]), lengths, strict=False):
+        begins = start + torch.linspace(0, length - most - 1, samples).long().unique()
+        index = (begins[:, None] + torch.arange(most + 1)).tolist()
+        try:
+            hog = torch.stack([HOG()(frames[part].frames) for part in index])
+        except InputError:
+            return most
+        units = nn.functional.normalize(hog - hog.mean((0, 1)), dim=2)
+        like = units @ units.mT
+        found.append(torch.stack([like.diagonal(lag, 1, 2).mean(1) for lag in range(1, most + 1)]))
+    correlation = torch.cat(found, 1).median(1).values
+    least = max(float(correlation[0]), FAINT) / 2
+
+    return next((lag for lag, one in enumerate(correlation.tolist()[1:], 1) if one < least), most)
 
 
 def whitens(features: nn.Module) -> Embedding | None:

@@ -177,21 +177,35 @@ def test_what_watches_a_figure_begins_with_the_last_stage(tmp_path: Path) -> Non
     assert running.callbacks == callbacks  # type: ignore[attr-defined]
 
 
-def slid(step: int, count: int = 200, noise: float = 0.0) -> StoredFrames:
+def stored(*routes: Tensor) -> StoredFrames:
+    count = sum(map(len, routes))
+    return StoredFrames([(255 * one).byte() for one in routes], as_ground_truth(torch.arange(count)[:, None]))
+
+
+def slid(step: int, count: int = 200, noise: float = 0.0, seed: int = 0) -> Tensor:
     """A window of 64 x 64 pixels, slid so many pixels a frame along a picture in which nothing repeats."""
-    random = torch.Generator().manual_seed(0)
+    random = torch.Generator().manual_seed(seed)
     coarse = torch.rand(1, 1, 4, (64 + step * count) // 16 + 1, generator=random)
     picture = nn.functional.interpolate(coarse, scale_factor=16, mode="bicubic")[0]
     frames = torch.stack([picture[:, :, step * i : step * i + 64] for i in range(count)])
-    frames = frames + noise * torch.randn(frames.shape, generator=random)
-    return StoredFrames([(255 * frames.clamp(0, 1)).byte()], as_ground_truth(torch.arange(count)[:, None]))
+    return (frames + noise * torch.randn(frames.shape, generator=random)).clamp(0, 1)
 
 
-@pytest.mark.parametrize(("step", "noise", "expected"), [(1, 0.0, 5), (1, 0.1, 5), (2, 0.0, 2), (80, 0.0, 1)])
+@pytest.mark.parametrize(("step", "noise", "expected"), [(1, 0.0, 5), (1, 0.1, 5), (80, 0.0, 1)])
 def test_a_stretch_is_as_long_as_frames_stay_alike(step: int, noise: float, expected: int) -> None:
     frames = slid(step, noise=noise)
-    assert alike(frames, [200], 5) == expected
-    assert alike(frames, [100, 100], 1) == alike(frames, [200], 0) == 1  # no longer than the tolerance
+    assert alike(stored(frames), [200], 5) == expected
+    assert alike(stored(frames), [200], 1) == alike(stored(frames), [200], 0) == 1  # the tolerance at most
+    stop = torch.cat([frames[:100], frames[100:101].expand(60, -1, -1, -1), frames[100:]])
+    assert alike(stored(stop), [260], 5) == expected
+
+
+def test_what_a_route_always_shows_is_no_likeness() -> None:
+    below, other = torch.rand(2, 1, 32, 64, generator=torch.Generator().manual_seed(1))
+    routes = [slid(80, 60, seed=seed) for seed in (2, 3)]
+    routes[0][:, :, 32:], routes[1][:, :, 32:] = below, other
+    assert alike(stored(*routes), [60, 60], 5) == 1
+    assert alike(stored(slid(1)[:60], *routes), [60, 60, 60], 5) == 1  # not the first route alone
 
 
 def test_frames_too_small_for_hog_have_stretches_of_the_tolerance() -> None:
@@ -203,7 +217,7 @@ def test_frames_too_small_for_hog_have_stretches_of_the_tolerance() -> None:
 
 def test_places_are_right_within_a_stretch(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     task = new_task(mapper=SpectralMapper(6.0))
-    fit(tmp_path, task, data_of(slid(80).values.float() / 255, tolerance=5), max_steps=1)
+    fit(tmp_path, task, data_of(slid(80), tolerance=5), max_steps=1)
     assert isinstance(task.stage, DescriptorStage)
     assert (int(task.stage.every), len(task.stage.proxies)) == (1, 200)
     assert (task.stage.tolerance(task), task.metric.tolerance) == (1, 5)
