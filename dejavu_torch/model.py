@@ -60,7 +60,7 @@ from dejavu_torch.motion.resampling import ResampledTraverse, resampled, source_
 from dejavu_torch.recognition.calibration import Calibration
 from dejavu_torch.recognition.coarse import CoarseSearch, coarse_search
 from dejavu_torch.recognition.localizer import Localizer, Matching
-from dejavu_torch.recognition.sample_file import kept_search
+from dejavu_torch.recognition.sample_file import check_searches, kept_search
 from dejavu_torch.recognition.search import SCORES_AT_ONCE, Find, Search, check_search
 from dejavu_torch.recognition.select import HIGHEST, PROBABLE, Acceptance, check_candidates
 from dejavu_torch.resize import reduced_size
@@ -171,12 +171,10 @@ class DejaVu(nn.Module):
         self.trained: Training | None = None
         self.calibration: Calibration | None = None
         self.search: Search = "auto"  # how single queries are searched for, see `localize`
-        self.search_memory: int | None = (
-            None  # bytes that it may take beyond the map; None follows the places
-        )
-        self.search_file: Path | str | None = None  # keeps what it takes from one process to the next
+        self.search_memory: int | None = None  # bytes of its samples; None follows the places
+        self.search_file: Path | str | None = None  # keeps its samples for other processes
         self.find: Find | None = None  # in its place, as a cluster does
-        # its samples, and what they are of
+        # the samples, and what they are of
         self._coarse: tuple[tuple[Any, ...], CoarseSearch | None] = (), None
         self._warned: set[tuple[str, str]] = set()  # traverse and line of warnings that are logged once
 
@@ -508,13 +506,11 @@ class DejaVu(nn.Module):
         sequence, coarse = matching.sequence, None
         if sequence is not None:
             sequence.check(None, self.map.places)
+        if self.search_file is not None:
+            check_searches(self.search_file, matching, self.find is not None)
         searches = getattr(sequence, "search_every", 1) > 1 if sequence else matching.on_scores is None
         if searches and self.find is None and matching.search != "scan":
             coarse = self._coarse_search(matching.search == "exact")
-        if coarse is None and self.search_file is not None:
-            seen = f"search_file {self.search_file}: no samples are searched, all places are"
-            expected = "single queries, or a filter with search_every, without scores of all places"
-            raise InputError(f"{seen}; expected {expected}, on a long spectral map of several chunks")
         if coarse is None:
             return Localizer(self.map, matching, self.find)
         return Localizer(self.map, matching, coarse, coarse.approximate)

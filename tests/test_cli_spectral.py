@@ -72,14 +72,23 @@ def test_searches_of_localize(
     run("localize", path, SECOND, "--filter", "--search_every", "8", "--out", out)
     assert sum(a == b for a, b in zip(places(out), always, strict=True)) > 90
     assert "scan" in fails(capsys, "localize", path, SECOND, "--search", "ivf", "--out", out)
-    kept, said = tmp_path / "route.samples", "search_file"
+    kept = tmp_path / "route.samples"
+    (tmp_path / "link").symlink_to(tmp_path)
+    for new in (kept, tmp_path / "link" / kept.name):  # before it is there
+        assert "what is read" in fails(capsys, "localize", path, SECOND, "--search_file", kept, "--out", new)
+    assert not kept.exists()
     for _ in range(2):  # written, read
         run("localize", path, SECOND, "--search_file", kept, "--out", out)
         assert places(out) == found[2]
     written = kept.read_bytes()
-    for words in (("--filter",), ("--search", "scan"), ("--cluster", "auto")):
+    scored = "a filter scores all places of every query; expected a filter with search_every above 1, or "
+    for words, said in (
+        (("--filter",), scored),
+        (("--search", "scan"), "search scan scores all places"),
+        (("--cluster", "auto"), "expected one of them"),
+    ):
         assert said in fails(capsys, "localize", path, SECOND, "--search_file", kept, *words, "--out", out)
-    assert said in fails(capsys, "live", path, SECOND, "--search_file", kept)  # its filter takes all scores
+    assert scored in fails(capsys, "live", path, SECOND, "--search_file", kept)
     assert "what is read" in fails(capsys, "localize", path, SECOND, "--search_file", kept, "--out", kept)
     assert "no whole file" in fails(capsys, "localize", path, SECOND, "--search_file", path, "--out", out)
     capsys.readouterr()

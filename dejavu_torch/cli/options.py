@@ -120,8 +120,9 @@ class KeptSearching(Searching):
     """As above, for what searches one map again and again.
 
     Args:
-        search_file: file that keeps these samples for the next time: they are written there if it does not
-            exist, else read; one of another map, --search or --search_memory is refused
+        search_file: file of the samples of a coarse or exact search, written if it does not exist, else read;
+            a file made from another map, or with another --search or --search_memory, is refused. A filter
+            needs --search_every above 1 with it: else it scores all places
     """
 
     search_file: Path | None = None

@@ -80,13 +80,14 @@ def routes_of(source: str | Path) -> list[str]:
 def check_not_read(out: Path, *sources: str | Path | None) -> None:
     """Refuse an output that is what a command reads, or an image of a folder that it reads: it would be lost.
 
-    `sources` are as of `open_source`, or any other text; of them the paths that are there count.
+    `sources` are as of `open_source`, or any other text; a path counts, though nothing may be there yet.
     """
     for source in filter(None, sources):
         place = Path(_split(str(source))[0].removeprefix("strip:"))
         read = False
-        with suppress(OSError, ValueError):  # one of them is not there, or can be no path
-            read = out.samefile(place) or (out.suffix.lower() in SUFFIXES and out.parent.samefile(place))
+        with suppress(OSError, ValueError, RuntimeError):  # one is not there, no path, or links to itself
+            read = out.resolve() == place.resolve() or out.samefile(place)
+            read = read or (out.suffix.lower() in SUFFIXES and out.parent.samefile(place))
         if read:
             raise InputError(f"{out} is what is read; expected another name")
 

@@ -178,7 +178,7 @@ class CoarseSearch:
 
     Args:
         route: the map; it is not changed.
-        chosen: see `plan`. kept: what another search of the same map and plan has `made`; none makes it.
+        chosen: see `plan`. kept: what another search of the same map and plan has `made`; made here if empty.
 
     Shape: queries (Q,K), wanted -> scores and places (Q,M), by place, +inf for none, in which the wanted
         candidates are; see `Wanted`.
@@ -199,10 +199,9 @@ class CoarseSearch:
         self.middle = torch.searchsorted(self.fine.place, self.coarse.place, out_int32=True)
         self.bounds = None
         if self.exact:
-            bounds = kept["bounds"] if "bounds" in kept else self._bounds()
-            self.bounds = fitting(bounds, (len(self.fine.norm) // GROUP, 3), torch.float32).to(
-                self.starts.device
-            )
+            bounds, shape = kept.get("bounds"), (len(self.fine.norm) // GROUP, 3)
+            bounds = fitting(self._bounds() if bounds is None else bounds, shape, torch.float32)
+            self.bounds = bounds.to(self.starts.device)
 
     @property
     def made(self) -> dict[str, Tensor]:

@@ -11,26 +11,51 @@ from dejavu_torch.data.output import check_output_file
 from dejavu_torch.maps.file import HEADER, SHOWN, checksums, read_map, write_map
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.maps.spectral_map import SpectralMap
-from dejavu_torch.recognition.coarse import CoarseSearch, Plan, plan
+from dejavu_torch.recognition.coarse import FEWEST, CoarseSearch, Plan, plan
+from dejavu_torch.recognition.localizer import Matching
 from dejavu_torch.types import InputError
 
-FORMAT = 1  # one more where samples of the same map and plan are others
+FORMAT = 1  # raise when the same map and plan give other samples
 
 
-def kept_search(
-    path: Path, route: PlaceMap, limit: int | None = None, exact: bool = False
-) -> CoarseSearch | None:
+def check_searches(path: Any, matching: Matching, elsewhere: bool) -> None:
+    """Refuse a file of samples where queries are matched without samples, whatever the map.
+
+    Args:
+        path: of the file. elsewhere: something else finds places, as a cluster does.
+    """
+    if not isinstance(path, str | Path):
+        raise InputError(f"search_file is {path!r:.{SHOWN}}; expected the path of a file")
+    single, every = matching.sequence is None, getattr(matching.sequence, "search_every", 0)
+    always = f"a {'filter' if every else 'sequence'} scores all places of every query"
+    others = "a filter with search_every above 1, or single queries (--sequence 1)"
+    for refused, seen, expected in (
+        (not single and every <= 1, always, others),
+        (single and matching.on_scores, "scores of all places are kept", "none kept (no --page)"),
+        (elsewhere, "places are found elsewhere, as by a cluster", "one of the two"),
+        (matching.search == "scan", "search scan scores all places", "search auto, coarse or exact"),
+    ):
+        if refused:
+            raise InputError(f"search_file {path}: {seen}; expected {expected}")
+
+
+def kept_search(path: Path, route: PlaceMap, limit: int | None = None, exact: bool = False) -> CoarseSearch:
     """As `coarse_search`, by samples that are read from a file, or written there if there is none.
 
     Args:
         path: of the file. limit: bytes of the samples. exact: a sample of every place; see `plan`.
 
     Raises:
-        InputError: the file is of another map or plan, damaged or no such file, or it cannot be written.
+        InputError: the map is scanned; the file is of another map or plan, damaged or no such file, or it
+            cannot be written.
     """
+    if not isinstance(route, SpectralMap):
+        raise InputError(f"search_file {path}: the map is a {type(route).__name__}; expected a SpectralMap")
     chosen = plan(route, limit, exact)
-    if chosen is None or not isinstance(route, SpectralMap):
-        return None
+    if chosen is None:
+        seen = f"metric {route.metric}, {route.places} places, chunks: {len(route.chunks)}"
+        expected = f"cosine, at least {FEWEST} that change smoothly, several chunks, or more search_memory"
+        raise InputError(f"search_file {path}: the map is scanned, {seen}; expected {expected}")
     if os.path.exists(path):  # False also of what can be no path, which is refused below
         return read_samples(path, route, chosen)
     check_output_file(path)
@@ -45,10 +70,10 @@ def read_samples(path: Path, route: SpectralMap, chosen: Plan) -> CoarseSearch:
     try:
         made, header = read_map(path)
         if not isinstance(header, dict) or header.keys() != key.keys():
-            raise InputError("it is another file of this package")
+            raise InputError("is a map or another file of this package")
     except InputError as error:
-        reason = f" ({why(error.__cause__)})" if isinstance(error.__cause__, Exception) else ""
-        seen = f"{path} is no whole file of a search's samples{reason}"
+        reason = why(error).removeprefix(f"{path} ").partition(";")[0]  # what is expected is of maps
+        seen = f"{path} is no whole file of a search's samples: it {reason}"
         raise InputError(f"{seen}; expected one, or none to be there") from error
     other = [name for name in key if header[name] != key[name]]
     if other:
@@ -57,9 +82,13 @@ def read_samples(path: Path, route: SpectralMap, chosen: Plan) -> CoarseSearch:
         )
         raise InputError(f"{path} has samples of {seen}; expected {expected}: remove it, or name another")
     try:
-        return CoarseSearch(route, chosen, made)
+        search = CoarseSearch(route, chosen, made)
+        if search.made.keys() != made.keys():
+            seen, expected = (", ".join(sorted(one)) or "nothing" for one in (made, search.made))
+            raise InputError(f"samples are {seen}; expected {expected}")
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
+    return search
 
 
 def key_of(route: SpectralMap, chosen: Plan) -> dict[str, Any]:

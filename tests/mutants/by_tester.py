@@ -507,7 +507,7 @@ MUTANTS = [
     Mutant(
         "A file of samples that would not be used is refused.",
         "dejavu_torch/model.py",
-        "if coarse is None and self.search_file is not None:",
+        "if self.search_file is not None:",
         "if False:",
         ("tests/recognition/test_sample_file.py::-k no_samples_are_searched",),
     ),

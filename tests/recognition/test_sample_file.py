@@ -13,7 +13,7 @@ from safetensors import SafetensorError
 from test_coarse import queries_of, smooth_model
 from test_search import walk
 
-from dejavu_torch import DejaVu, PlaceFilter, SequenceMatcher, SpectralMapper
+from dejavu_torch import DejaVu, PlaceFilter, SequenceMatcher, SpectralMapper, TemplateMapper
 from dejavu_torch.growth import append
 from dejavu_torch.live.localizer import LiveLocalizer
 from dejavu_torch.maps.file import read_map, write_map
@@ -116,13 +116,21 @@ def a_map(file: Path, model: DejaVu) -> None:
     model.save(file)
 
 
-@pytest.mark.parametrize("change", [cut, damage, text, a_map], ids=lambda change: change.__name__)
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (cut, "truncated"),
+        (damage, "damaged: its fine"),
+        (text, "no map file"),
+        (a_map, "a map or another file of this package"),
+    ],
+)
 def test_what_is_no_whole_file_of_samples_is_refused_and_stays(
-    change: Callable[[Path, DejaVu], None], kept: DejaVu, file: Path
+    change: Callable[[Path, DejaVu], None], reason: str, kept: DejaVu, file: Path
 ) -> None:
     change(file, kept)
     before = file.read_bytes()
-    with refused(str(file), "is no whole file of a search's samples", "or none to be there"):
+    with refused(str(file), "is no whole file of a search's samples: it is ", reason, "or none to be there"):
         again(kept, file).localize(queries_of()[:1])
     assert file.read_bytes() == before
 
@@ -134,6 +142,26 @@ def test_samples_of_other_shapes_are_refused(kept: DejaVu, file: Path) -> None:
         write_map(file, tensors | {"fine": fine}, header)
         with refused(str(file), "samples are ", "; expected ("):
             again(kept, file).localize(queries_of()[:1])
+
+
+@pytest.mark.parametrize(("search", "parts"), [("coarse", "coarse, fine"), ("exact", "bounds, fine")])
+def test_a_file_without_some_of_its_samples_is_refused(search: Search, parts: str, file: Path) -> None:
+    model = smooth_model()
+    model.search_file = file
+    model.localize(queries_of()[:1], search=search)
+    tensors, header = read_map(file)
+    for left in ({}, {"fine": tensors["fine"]}, tensors | {"more": tensors["fine"]}):
+        write_map(file, left, header)
+        with refused(f"{file}: samples are {', '.join(sorted(left)) or 'nothing'}; expected {parts}"):
+            again(model, file).localize(queries_of()[:1], search=search)
+
+
+@pytest.mark.parametrize("name", [5, b"route.samples"])
+def test_what_is_no_path_is_refused(name: object) -> None:
+    model = smooth_model()
+    model.search_file = name  # type: ignore[assignment]
+    with refused(f"search_file is {name!r}; expected the path of a file"):
+        model.localize(queries_of()[:1])
 
 
 def test_a_file_that_cannot_be_written_is_refused(
@@ -155,20 +183,26 @@ def test_a_file_that_cannot_be_written_is_refused(
         model.localize(queries_of()[:1])
 
 
-def test_where_no_samples_are_searched_a_file_is_refused(file: Path) -> None:
+def test_where_no_samples_are_searched_a_file_is_refused(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     queries = queries_of()[:3]
     short = DejaVu(whitening="none", mapper=SpectralMapper(None, 0.1, 256)).learn(walk(300, 24))
-    for model, way in (
-        (short, {}),
-        (smooth_model(metric="l2"), {}),
-        (smooth_model(), {"search": "scan"}),
-        (smooth_model(), {"sequence": SequenceMatcher(3)}),
-        (smooth_model(), {"sequence": PlaceFilter()}),
+    templates = DejaVu(whitening="none", mapper=TemplateMapper()).learn(walk(300, 24))
+    single = "; expected a filter with search_every above 1, or single queries"
+    for model, way, words in (
+        (short, {}, ("the map is scanned, ", "300 places, chunks: 2;", "at least 20000")),
+        (smooth_model(metric="l2"), {}, ("metric l2", "; expected cosine")),
+        (templates, {}, ("the map is a TemplateMap", "; expected a SpectralMap")),
+        (smooth_model(), {"search": "scan"}, ("search scan", "; expected search auto, coarse or exact")),
+        (smooth_model(), {"sequence": SequenceMatcher(3)}, ("a sequence scores all places", single)),
+        (smooth_model(), {"sequence": PlaceFilter()}, ("a filter scores all places", single)),
     ):
         model.search_file = file
-        with refused(f"search_file {file}: no samples are searched", "; expected single queries"):
+        with refused(f"search_file {file}: ", *words):
             model.localize(queries, **way)  # type: ignore[arg-type]
-    with refused("without scores of all places"):
+    with refused("scores of all places are kept", "; expected none kept (no --page)"):
         LiveLocalizer(model, None)
+    with monkeypatch.context() as patch, refused("places are found elsewhere", "; expected one of the two"):
+        patch.setattr(model, "find", lambda *_: pytest.fail("searched"))
+        model.localize(queries)
     assert LiveLocalizer(model, None, keep_scores=False)(queries[0]).place >= 0
     assert file.exists()
