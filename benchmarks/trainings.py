@@ -95,39 +95,36 @@ PRESETS = {
 }
 
 
-def trained(name: str, route: Route, seed: int, out: Path, options: str) -> Path | str:
-    """The map of a training, by the command that a user would run, or what that said where it made none.
+def trained(name: str, route: Route, seed: int, out: Path, options: Sequence[str]) -> Path | str:
+    """The map of a training, by the command that a user would run, or what that said where it failed.
 
-    One that is there is kept, so that a run goes on where another was stopped.
+    Where the same command ended well before, its map is kept: a run goes on where another was stopped.
     """
-    begin: list[str] = []
-    if route.start is not None:
-        first = trained(f"{name} start", route.start, seed, out, options)
-        if not isinstance(first, Path):
-            return first
-        begin = ["--model.start", str(first)]
     folder = out / f"{name.replace(', ', '_').replace(' ', '_').replace(':', '_')}_{seed}"
-    path, log = folder / "map.safetensors", folder / "log.txt"
-    if not path.exists():
-        command = [sys.executable, "-m", "dejavu_torch.cli", "train", "fit", "--config", route.preset]
-        command += ["--data.source", route.reference, "--seed_everything", str(seed)]
-        command += [
-            "--trainer.default_root_dir",
-            str(folder),
-            *begin,
-            *shlex.split(f"{route.options} {options}"),
-        ]
+    words = ["train", "fit", "--config", route.preset, "--data.source", route.reference]
+    words += ["--seed_everything", str(seed), *shlex.split(route.options), *options]
+    if route.start is not None:
+        start = trained(f"{name} start", route.start, seed, out, options)
+        if not isinstance(start, Path):
+            return start
+        words += ["--model.start", str(start)]
+    words += ["--trainer.default_root_dir", str(folder)]
+    path, log, well = folder / "map.safetensors", folder / "log.txt", folder / "command.txt"
+    if not (path.exists() and well.exists() and well.read_text(encoding="utf-8") == shlex.join(words)):
         folder.mkdir(parents=True, exist_ok=True)
+        well.unlink(missing_ok=True)
+        alone = os.environ | {"OMP_NUM_THREADS": "1"}  # several at a time
         with log.open("w", encoding="utf-8") as file:
-            subprocess.run(
-                command,
-                stdout=file,
-                stderr=subprocess.STDOUT,
-                check=False,
-                env=os.environ | {"OMP_NUM_THREADS": "1"},  # several at a time
+            command = [sys.executable, "-m", "dejavu_torch.cli", *words]
+            status = subprocess.run(command, stdout=file, stderr=file, check=False, env=alone).returncode
+        if status:
+            said = log.read_text(encoding="utf-8").strip().splitlines()
+            seen = (
+                said[-1].removeprefix("dejavu: ") if said and status == 2 else f"ended with status {status}"
             )
-    said = log.read_text(encoding="utf-8").strip().splitlines() if log.exists() else []
-    return path if path.exists() else one_line(said[-1].removeprefix("dejavu: ") if said else "no word")
+            return one_line(seen)
+        well.write_text(shlex.join(words), encoding="utf-8")
+    return path
 
 
 class Judge:
@@ -153,8 +150,10 @@ class Judge:
                 model.mapper = mapper
                 try:
                     model.learn_features(places, self.reference)
-                except InputError:  # too few bytes for a short route
-                    continue
+                except InputError:
+                    if mapper.share is not None:
+                        raise
+                    continue  # too few bytes for a short route
             size = model.map.summary().route_bytes / model.map.places
             founds = model.localize_descriptors(queries), null_control(model, places, queries)
             for kind, found in zip((contender, f"{contender}, {NULL}"), founds, strict=True):
@@ -187,23 +186,27 @@ def run_trainings(
         jobs: trainings at a time, each of one thread
         options: more of `dejavu train fit`, the same for all, as in '--options=--model.rate 0'
 
-    Convention: the second traverse is seen by no training. Bytes are of the route, per place; where they are
-        too few for a short route there is no row.
+    Convention: no training sees the second traverse; its tolerance is that of the preset. Bytes are of the
+        route, per place; where they are too few for a short route there is no row.
 
     Raises:
         InputError: a name that is none of the routes, or a seed out of range.
     """
-    cases, seeds = PRESETS if presets else ROUTES, seeds or SEEDS
+    cases, seeds = PRESETS if presets else ROUTES, list(dict.fromkeys(seeds or SEEDS))
+    try:
+        words = shlex.split(options)
+    except ValueError as error:
+        raise InputError(f"--options is {options!r} ({error}); expected words of a command line") from error
     if unknown := [name for name in routes if name not in cases]:
         raise InputError(f"{unknown[0]!r} is no route; expected one of {', '.join(map(repr, cases))}")
     if jobs < 1 or not all(0 <= seed < 2**32 for seed in seeds):
-        seen = f"bench trainings got {jobs} jobs and seeds {list(seeds)}"
+        seen = f"bench trainings got {jobs} jobs and seeds {seeds}"
         raise InputError(f"{seen}; expected at least one, and seeds from 0 to 2^32 - 1")
     chosen = {name: cases[name].below(data) for name in routes or cases}
     judges = {name: Judge(name, route) for name, route in chosen.items()}  # refuses what is not there
     works = [(name, seed) for name in chosen for seed in seeds]
     with ThreadPoolExecutor(jobs) as pool:
-        made = pool.map(lambda work: trained(work[0], chosen[work[0]], work[1], out, options), works)
+        made = pool.map(lambda work: trained(work[0], chosen[work[0]], work[1], out, words), works)
         maps = dict(zip(works, tqdm(made, "trainings", len(works), disable=None, leave=False), strict=True))
     rows: list[Row] = []
     for name, judge in judges.items():
@@ -224,4 +227,4 @@ def run_trainings(
     keys = dict.fromkeys(key for own in areas.values() for key in own)
     table = [["", *areas], *([key, *(spread(own.get(key, [])) for own in areas.values())] for key in keys)]
     said = [f"{row['case']}, seed {row['seed']}: {row['skipped']}" for row in rows if "skipped" in row]
-    return [text_table(table), *said, f"AUC of the second traverse, one query; seeds {list(seeds)}"]
+    return [text_table(table), *said, f"AUC of the second traverse, one query; seeds {seeds}"]

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
-from command_line import benchmark
+from command_line import benchmark, benchmark_fails
 
 from benchmarks import trainings
 from benchmarks.trainings import PRESETS, ROUTES, Route
@@ -37,11 +40,32 @@ def test_a_training_is_set_beside_the_untrained_map_and_made_once(
     assert found["broken", "trained"]["skipped"].startswith("lr is 0")  # told, not lost
     assert "broken, seed 3: " in capsys.readouterr().out
     assert (tmp_path / "out" / "bench.png").is_file()
-    made = tmp_path / "out" / "flight_short_3" / "map.safetensors"
-    before = made.stat().st_mtime_ns
+    # the same training again is not run; another is, and one that did not end well
+    calls: list[list[str]] = []
+    real = subprocess.run
+
+    def counted(command: list[str], **settings: Any) -> subprocess.CompletedProcess[bytes]:
+        calls.append(command)
+        return real([sys.executable, "-c", "raise SystemExit(3)"], **settings)
+
+    monkeypatch.setattr(subprocess, "run", counted)
     monkeypatch.setattr(trainings, "ROUTES", {"flight, short": flight})
     benchmark(*given)
-    assert made.stat().st_mtime_ns == before
+    assert not calls
+    for repeat in range(2):
+        benchmark(*given, "--options=--model.rate 0")
+        assert len(calls) == repeat + 1
+    assert "status 3" in capsys.readouterr().out
+
+
+def test_bad_options_are_refused_ahead_of_the_first_training(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = ("trainings", tmp_path, "--out", tmp_path / "out")
+    assert "No closing quotation" in benchmark_fails(capsys, *given, "--options=--foo '")
+    assert "expected one of 'road, first half'" in benchmark_fails(capsys, *given, "--routes", "roads")
+    assert "at least one" in benchmark_fails(capsys, *given, "--jobs", "0")
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_routes_are_below_the_folder_of_the_footage() -> None:
