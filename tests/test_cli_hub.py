@@ -151,6 +151,75 @@ def test_a_member_has_settings_of_its_own(asked: list[dict[str, Any]]) -> None:
     assert len(asked) == 1
 
 
+def test_a_member_has_arguments_of_its_own(asked: list[dict[str, Any]]) -> None:
+    page = (Path(__file__).parents[1] / "docs" / "pretrained.md").read_text().replace("\n", " ")
+    shown = re.findall(r"`(\[HOG, \{class_path: hub.*?\}\])`", page)
+    assert len(shown) == 1
+    net = features_of("--features", shown[0]).members[1]
+    assert (net.resize, net.mean) == ((224, 224), MEAN)
+    call = {"repository": "AnyLoc/DINO", "entry": "get_vlad_model", "trust_repo": True}
+    assert asked == [call | ANYLOC | {"domain": "aerial"}]
+
+
+@pytest.mark.parametrize(
+    ("beside", "seen"),
+    [
+        ("dict_kwargs: {domain: aerial}", "hub:anyloc with dict_kwargs;"),
+        ("network: {domain: aerial}", "hub:anyloc with network;"),
+        ("init_args: {network.domain: aerial}", "hub:anyloc with network.domain;"),
+        ("init_args: {network: {domain: aerial}}", "torch.hub.load with domain;"),
+    ],
+)
+def test_what_stands_beside_a_member_is_not_dropped(
+    beside: str, seen: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    value = f"[HOG, {{class_path: hub:anyloc, {beside}}}]"
+    error = fails(capsys, "learn", ROUTE, "--map", "map.safetensors", "--features", value)
+    assert f"{seen} expected settings under init_args" in error
+
+
+CONFIGS = [
+    "{class_path: HOG, init_args: {cell: 4}}",
+    "{class_path: dejavu_torch.Embedding, init_args: {dimension: null, layer: linear, network: {class_path: "
+    "dejavu_torch.cli.parser.made, init_args: {function: torch.hub.load}, dict_kwargs: {repo_or_dir: "
+    "AnyLoc/DINO, model: get_vlad_model, domain: urban}}}}",
+]
+
+
+@pytest.mark.parametrize("features", CONFIGS)
+def test_settings_of_a_config_are_not_its_own(
+    features: str, asked: list[dict[str, Any]], tmp_path: Path
+) -> None:
+    config = tmp_path / "own.yaml"
+    config.write_text(f"features: {features}\nmapper: {{init_args: {{route_bytes_per_place: 3}}}}\n")
+    words = "--features", "hub:megaloc", "--features.resize=[28,42]"
+    net = features_of(*words, "--config", str(config))
+    assert repr(net) == repr(features_of(*words))
+    assert (net.cell, net.layer) == (0, None)
+    assert asked[0] == asked[1]
+
+
+@pytest.mark.parametrize("value", ["hub:megaloc", "[HOG, hub:megaloc]", "{class_path: hub:megaloc}"])
+@pytest.mark.parametrize("option", ["--features", "--model.backbone"])
+def test_a_config_does_not_take_it_and_says_what_does(
+    option: str, value: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    learn, train = ("learn", ROUTE, "--map", "map.safetensors"), ("train", "fit", "--data.source", ROUTE)
+    text = f"features: {value}" if option == "--features" else f"model: {{backbone: {value}}}"
+    (tmp_path / "own.yaml").write_text(text)
+    words = learn if option == "--features" else train
+    expected = f"{option}: hub:megaloc; expected a short name behind --features or --model.backbone on"
+    assert expected in fails(capsys, *words, "--config", str(tmp_path / "own.yaml"))
+    if value.startswith("{"):
+        assert expected in fails(capsys, *words, option, value)
+
+
+def test_two_of_them_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    words = "--features", "hub:boq", "--features=hub:salad"
+    error = fails(capsys, "learn", ROUTE, "--map", "map.safetensors", *words)
+    assert "hub:boq and hub:salad; expected one of them" in error
+
+
 @pytest.mark.parametrize("value", ["hub:megalock", "[HOG, hub:megalock]", "hub:"])
 def test_an_unknown_name_lists_the_known(value: str, capsys: pytest.CaptureFixture[str]) -> None:
     error = fails(capsys, "learn", ROUTE, "--map", "map.safetensors", "--features", value)
@@ -190,13 +259,16 @@ def test_the_next_line_runs(
     words = [f"{ROUTE}&traverse=1" if word == "QUERY" else word for word in told]
     run(*words)
     assert len((tmp_path / "matches.csv").read_text().splitlines()) == 41
+    capsys.readouterr()
     run("live", *words[1:-2])
     lines = capsys.readouterr().out.splitlines()
-    assert len([json.loads(line) for line in lines[-40:]]) == 40  # nothing else is printed there
+    assert len([json.loads(line) for line in lines]) == 40  # nothing else is printed there
     assert len(asked) == 3
 
 
+@pytest.mark.parametrize("config", [(), ("--config", "train_road")])
 def test_a_training_takes_it_and_says_the_words(
+    config: tuple[str, ...],
     asked: list[dict[str, Any]],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -211,11 +283,13 @@ def test_a_training_takes_it_and_says_the_words(
         "SpectralMapper",
     )
     steps = "--trainer.max_steps=1", "--trainer.accelerator=cpu", "--trainer.default_root_dir=run"
-    run("train", "fit", "--data.source", ROUTE, *made, *steps)
+    run("train", "fit", "--data.source", ROUTE, *config, *made, *steps)
     words = shlex.split(capsys.readouterr().out.splitlines()[-1].removeprefix("next: dejavu "))
     begin = next(i for i, word in enumerate(words) if word.startswith("--features"))
     features = [word for word in words[begin:] if word.startswith("--features")]
-    DejaVu.load("run/map.safetensors", features_of(*features))
+    trained = DejaVu.load("run/map.safetensors", features_of(*features)).features
+    assert isinstance(trained, Embedding)
+    assert trained.cell == 0  # that of train_road is 8
     assert asked[0] == asked[-1]
 
 

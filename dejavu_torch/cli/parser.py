@@ -43,9 +43,9 @@ HINT = (
     "or, of HOG alone, --features.cell 4: see --features.help HOG, --whitening.help, --mapper.help "
     "SpectralMapper, --preprocess.help and --velocity.help. --config local_maxima makes a map of templates, "
     "with options such as --mapper.periods.window 512. --features '[HOG, PatchPixels]' joins the features of "
-    "several, hub:megaloc is a pretrained network. --whitening also takes none, or a map file, with the "
-    "features that it was learned from; --descriptor takes those alone, from a map or from what "
-    "`dejavu train` makes of several routes."
+    "several. --features hub:megaloc is a pretrained network: it downloads and runs code of GitHub. "
+    "--whitening also takes none, or a map file, with the features that it was learned from; --descriptor "
+    "takes those alone, from a map or from what `dejavu train` makes of several routes."
 )
 BARE = {"velocity": "GroundOdometry", "page": 8765}  # what an option without a value means
 MapFile = restricted_string_type("MapFile", r".*\.safetensors")
@@ -152,19 +152,25 @@ def with_made(words: Sequence[str]) -> list[str]:
 def with_hub(words: Sequence[str]) -> list[str]:
     """The command line with the words that `hub:NAME` stands for, but for those that are typed, wherever."""
     typed = [word.partition("=")[0] for word in words]
+    found = []
     for at, (word, after) in enumerate(pairwise([*words, ""])):
         option, equals, value = word.partition("=")
         value = value if equals else after
-        if not value.startswith(hub.PREFIX) or option.lstrip("-").rpartition(".")[2] not in NETWORKS[:2]:
-            continue
-        whole = hub.known(value)
-        settings = whole["init_args"] | {"network": "torch.hub.load"}
-        settings |= {f"network.{key}": one for key, one in whole["init_args"]["network"]["init_args"].items()}
-        told = {f"{option}.{k}": v if type(v) is str else json.dumps(v) for k, v in settings.items()}
-        spelt = [f"{option}={whole['class_path']}", *(f"{k}={v}" for k, v in told.items() if k not in typed)]
-        first = next(i for i, one in enumerate(typed) if one.startswith(f"{option}.") or i == at)
-        return [*words[:first], *spelt, *words[first:at], *words[at + (1 if equals else 2) :]]
-    return [*words]
+        if value.startswith(hub.PREFIX) and option.lstrip("-").rpartition(".")[2] in NETWORKS[:2]:
+            found.append((at, at + (1 if equals else 2), option, value))
+    if not found:
+        return [*words]
+    if len(found) > 1:
+        raise UsageError(f"{' and '.join(one[3] for one in found)}; expected one of them, or a list")
+    at, end, option, value = found[0]
+    whole = hub.known(value)
+    settings = whole["init_args"] | {"network": "torch.hub.load"}
+    settings |= {f"network.{key}": one for key, one in whole["init_args"]["network"]["init_args"].items()}
+    told = {f"{option}.{k}": v if type(v) is str else json.dumps(v) for k, v in settings.items()}
+    spelt = [f"{option}=null", f"{option}={whole['class_path']}"]  # nothing of a config
+    spelt += [f"{k}={v}" for k, v in told.items() if k not in typed]
+    first = next(i for i, one in enumerate(typed) if one.startswith(f"{option}.") or i == at)
+    return [*words[:first], *spelt, *words[first:at], *words[end:]]
 
 
 def _with_members(words: Sequence[str]) -> Iterator[str]:
@@ -200,15 +206,24 @@ def _made_in(value: Any) -> Any:
         return [_path_of(one) if isinstance(one, str) else _made_in(one) for one in members]
     if not isinstance(value, dict):
         return value
-    path = value.get("class_path")
-    if isinstance(path, str) and path.startswith(hub.PREFIX):
-        whole = hub.known(path)
-        return _made_in({**whole, "init_args": whole["init_args"] | (value.get("init_args") or {})})
-    inner = {key: _made_in(one) for key, one in value.items()}
-    if not isinstance(path, str) or _function_at(path) is None or path == f"{__name__}.made":
-        return inner
-    named = {"class_path": f"{__name__}.made", "init_args": {"function": path}}
-    return named | {"dict_kwargs": inner.get("init_args") or {}}
+    path, given = str(value.get("class_path")), value.get("init_args") or {}
+    short = path.startswith(hub.PREFIX)
+    if not short and (_function_at(path) is None or path == f"{__name__}.made"):
+        return {key: _made_in(one) for key, one in value.items()}
+    odd = [key for key in value if key not in ("class_path", "init_args")]
+    odd += [key for key in given if "." in str(key)]
+    if odd:
+        raise UsageError(f"{path} with {odd[0]}; expected settings under init_args, without dots in names")
+    if short:
+        return _made_in(_merged(hub.known(path), {"init_args": given}))
+    return {"class_path": f"{__name__}.made", "init_args": {"function": path}, "dict_kwargs": _made_in(given)}
+
+
+def _merged(base: Any, over: Any) -> Any:
+    """A mapping, and those in it, with what overrules it; another class has none of the settings."""
+    if not isinstance(base, dict) or not isinstance(over, dict) or "class_path" in over:
+        return over
+    return base | {key: _merged(base.get(key), one) for key, one in over.items()}
 
 
 def _path_of(name: str) -> str:
@@ -310,6 +325,10 @@ def _by_options(message: str, error: Exception | None) -> str:
             return f"no stage given; expected one of {stages[1].replace(',', ', ')}"
         return re.sub(r"^Option '([\w.]+)'", r"--\1", message)
     option = "--" + key[1].replace(".init_args", "")
+    short = re.search(rf"\b{hub.PREFIX}[\w+.-]*", message)
+    if short:
+        where = "a short name behind --features or --model.backbone on the command line, alone or in a list"
+        return f"{option}: {short[0]}; expected {where}"
     chain = list(causes(error))
     part = next((one for one in chain if isinstance(one, UsageError)), None)
     if part is not None:
