@@ -72,7 +72,7 @@ def drive(name: str, tolerance: int) -> Route:
 
 def nordland(places: str, options: str, start: Route | None = None) -> Route:
     summer, winter = (f"{{data}}/nordland/{one}?{places}" for one in ("summer", "winter"))
-    return Route(summer, winter, 1, None, "train_nordland", options.format(winter=winter), start)
+    return Route(summer, winter, 5, None, "train_nordland", options.format(winter=winter), start)
 
 
 ROUTES = {
