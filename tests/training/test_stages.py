@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -215,11 +216,18 @@ def test_frames_too_small_for_hog_have_stretches_of_the_tolerance() -> None:
     assert alike(small, [9], 5) == 5
 
 
-def test_places_are_right_within_a_stretch(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_places_are_right_within_a_stretch(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
     task = new_task(mapper=SpectralMapper(6.0))
     fit(tmp_path, task, data_of(slid(80), tolerance=5), max_steps=1)
     assert isinstance(task.stage, DescriptorStage)
     assert (int(task.stage.every), len(task.stage.proxies)) == (1, 200)
     assert (task.stage.tolerance(task), task.metric.tolerance) == (1, 5)
+    assert task.stage.chance(task) == {"descriptor": pytest.approx(math.log(200 / 3))}
+    # one that is resumed keeps its stretches
+    monkeypatch.setattr("dejavu_torch.training.stages.alike", lambda *_: pytest.fail("looked again"))
+    task.stage.begin(task)
+    assert int(task.stage.every) == 1
     (line,) = [line for line in warned(caplog) if "alike" in line]
     assert all(fact in line for fact in ("for 1, fewer than data.tolerance 5", "dejavu learn"))
