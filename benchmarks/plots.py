@@ -55,6 +55,32 @@ def plot_ratios(cases: Mapping[str, Mapping[str, float]], label: str = RATIO) ->
     return figure, axes[:, 0]
 
 
+def plot_areas(cases: Mapping[str, Mapping[str, float]], kinds: Mapping[str, str]) -> Plot:
+    """Areas of contenders, a row for each case.
+
+    Args:
+        kinds: the colour of those whose names begin so; what follows gives the mark.
+    """
+    figure, axis = canvas(1.2 + 0.3 * len(kinds) + 0.5 * len(cases))
+    marks: dict[str, str] = {}
+    for row, areas in enumerate(cases.values()):
+        for name, area in areas.items():
+            kind = next(kind for kind in kinds if name.startswith(kind))
+            mark = marks.setdefault(name.removeprefix(kind).strip(), "Dsov^"[len(marks) % 5])
+            axis.plot(area, row, mark, color=kinds[kind], markersize=7, alpha=0.8)
+    for name, mark in marks.items():
+        if name:
+            axis.plot([], [], mark, color=GREY, label=name)
+    for kind, colour in kinds.items():
+        axis.plot([], [], "-", color=colour, linewidth=4, label=kind)
+    axis.set(yticks=range(len(cases)), yticklabels=[fill(case, 18) for case in cases], xlim=(-0.02, 1.02))
+    axis.set_ylim(len(cases) - 0.5, -0.5)
+    axis.grid(axis="x", alpha=0.3)
+    axis.set_xlabel("AUC, mean of the seeds")
+    figure.legend(*axis.get_legend_handles_labels(), loc="outside lower left", ncols=2, frameon=False)
+    return figure, axis
+
+
 def plot_growth(
     panels: Mapping[str, Mapping[str, Sequence[tuple[float, float]]]], linear: Collection[str] = ()
 ) -> Plot:

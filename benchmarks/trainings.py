@@ -14,10 +14,11 @@ from typing import Any, NamedTuple
 from tqdm import tqdm
 
 from benchmarks.measure import Row, write_bench
-from benchmarks.plots import plot_ratios
+from benchmarks.plots import OURS, plot_areas
 from benchmarks.train import spread
 from dejavu_torch.data.source import open_source
 from dejavu_torch.evaluation.baselines import hog_baselines
+from dejavu_torch.evaluation.contenders import COLOURS
 from dejavu_torch.evaluation.controls import null_control
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.report import text_table
@@ -222,8 +223,12 @@ def run_trainings(
     for row in rows:
         if "auc" in row:
             areas[row["case"]].setdefault(row["contender"], []).append(row["auc"])
-    means = {name: {key: sum(of) / len(of) for key, of in own.items()} for name, own in areas.items()}
-    write_bench(out, rows, plot_ratios(means, "AUC, mean of the seeds"), options=options)
+    means = {
+        name: {key: sum(of) / len(of) for key, of in own.items() if NULL not in key}
+        for name, own in areas.items()
+    }
+    kinds = {HOG: COLOURS["hog"], UNTRAINED: "#222222", TRAINED: OURS}
+    write_bench(out, rows, plot_areas(means, kinds), options=options)
     keys = dict.fromkeys(key for own in areas.values() for key in own)
     table = [["", *areas], *([key, *(spread(own.get(key, [])) for own in areas.values())] for key in keys)]
     said = [f"{row['case']}, seed {row['seed']}: {row['skipped']}" for row in rows if "skipped" in row]
