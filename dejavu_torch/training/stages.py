@@ -78,7 +78,7 @@ class DescriptorStage(nn.Module):
         between = torch.full((int(numbers[-1]) + 1,), count)
         self.stretch = between.scatter(0, numbers, begins.cumsum(0) - 1).to(task.device)
         if not known:
-            if every < min(data.tolerance, SPARSE):
+            if every < SPARSE <= data.tolerance:
                 log.warning(
                     "frames of %s stay alike for %d, fewer than data.tolerance %d: places are told apart "
                     "within that; unless bytes are few, the untrained map of `dejavu learn` is likely better",
@@ -236,7 +236,7 @@ def stages_of(backbone: nn.Module, descriptor: float, made: bool, rate: float) -
 @torch.no_grad()
 def alike(frames: StoredFrames, lengths: Sequence[int], most: int) -> int:
     """The longest stretch, in frames, over which HOG features correlate at least half as much as those of
-    neighbouring frames, from 1 to `most`; `most` where HOG cannot be computed.
+    neighbouring frames, from 1 to `most`; `most` where HOG cannot be computed, or never changes.
 
     The noise of a camera lowers all correlations alike: their ratio tells what changes along the route. It is
     that of medians over the route, so that a stop does not count.
@@ -254,9 +254,12 @@ def alike(frames: StoredFrames, lengths: Sequence[int], most: int) -> int:
             hog = torch.stack([HOG()(frames[part].frames) for part in index])
         except InputError:
             return most
-        units = nn.functional.normalize(hog - hog.mean((0, 1)), dim=2)
-        like = units @ units.mT
-        found.append(torch.stack([like.diagonal(lag, 1, 2).mean(1) for lag in range(1, most + 1)]))
+        if bool((hog != hog[0, 0]).any()):
+            units = nn.functional.normalize(hog - hog.mean((0, 1)), dim=2)
+            like = units @ units.mT
+            found.append(torch.stack([like.diagonal(lag, 1, 2).mean(1) for lag in range(1, most + 1)]))
+    if not found:
+        return most
     correlation = torch.cat(found, 1).median(1).values
     least = max(float(correlation[0]), FAINT) / 2
 

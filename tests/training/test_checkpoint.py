@@ -160,7 +160,7 @@ def test_a_resumed_run_finds_layers_anew_when_it_is_time_to(tmp_path: Path) -> N
         ("templates 3", {"backbone": coded()}, FRAMES, ["['CodeStage']", "['DescriptorStage', 'CodeStage']"]),
         ("templates 3", {}, 30, ["the map is of 40 places", "the array has 30"]),
         ("spectral 4", {"mapper": mapper()}, FRAMES, ["['DescriptorStage']", "'CodeStage'"]),
-        ("spectral 4", {}, 30, ["20 stretches of 2 frames", "the array has 15", "the route"]),
+        ("spectral 4", {}, 30, ["40 stretches of 1 frames", "the array has 30", "the route"]),
         ("spectral 4", {"freeze": ["network.linear"]}, FRAMES, ["network.linear.bias", "not in both"]),
     ],
     ids=str,
