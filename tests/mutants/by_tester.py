@@ -216,7 +216,7 @@ MUTANTS = [
         "dejavu_torch/evaluation/contenders.py",
         "if length <= min(queries, places))",
         "if length <= queries)",
-        ("tests/recognition/test_matcher.py::test_lengths_that_there_is_room_for",),
+        ("tests/recognition/test_matcher.py::test_ways_to_match_that_there_is_room_for",),
     ),
     Mutant(
         "HOG's blocks are clipped at 0.2 and normalised again.",
