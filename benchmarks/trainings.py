@@ -53,7 +53,9 @@ class Route(NamedTuple):
     def below(self, data: Path) -> Route:
         """With the folder in place."""
         placed: dict[str, Any] = {
-            k: one.format(data=data) for k, one in self._asdict().items() if isinstance(one, str)
+            name: one.format(data=shlex.quote(str(data)) if name == "options" else data)
+            for name, one in self._asdict().items()
+            if isinstance(one, str)
         }
         return self._replace(**placed, start=self.start and self.start.below(data))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -76,3 +77,6 @@ def test_the_routes_are_below_the_folder_of_the_footage() -> None:
     start = PRESETS["train_nordland, railway"].below(Path("/films")).start
     assert start is not None
     assert "--data.second /films/nordland/winter?stop=900" in start.options
+    spaced = PRESETS["train_nordland, railway"].below(Path("/my films")).start
+    assert spaced is not None
+    assert "/my films/nordland/winter?stop=900" in shlex.split(spaced.options)
