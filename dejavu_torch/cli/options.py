@@ -117,7 +117,7 @@ class Searching:
 
 @dataclass
 class KeptSearching(Searching):
-    """As above, for what searches one map again and again.
+    """How single queries find places on a map that is opened again and again.
 
     Args:
         search_file: file of the samples of a coarse or exact search, written if it does not exist, else read;

@@ -43,7 +43,7 @@ HINT = (
     "or, of HOG alone, --features.cell 4: see --features.help HOG, --whitening.help, --mapper.help "
     "SpectralMapper, --preprocess.help and --velocity.help. --config local_maxima makes a map of templates, "
     "with options such as --mapper.periods.window 512. --features '[HOG, PatchPixels]' joins the features of "
-    "several. --features hub:megaloc is a pretrained network: it downloads and runs code of GitHub. "
+    "several. --features hub:megaloc is a pretrained network: it downloads and runs code from GitHub. "
     "--whitening also takes none, or a map file, with the features that it was learned from; --descriptor "
     "takes those alone, from a map or from what `dejavu train` makes of several routes."
 )

@@ -262,7 +262,6 @@ def alike(frames: StoredFrames, lengths: Sequence[int], most: int) -> int:
         return most
     correlation = torch.cat(found, 1).median(1).values
     least = max(float(correlation[0]), FAINT) / 2
-
     return next((lag for lag, one in enumerate(correlation.tolist()[1:], 1) if one < least), most)
 
 
