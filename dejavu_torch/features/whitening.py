@@ -33,6 +33,7 @@ STRENGTHS: Mapping[str, Any] = {  # of augmented copies: those of `Augmentation`
     for name, strength in Augmentation().strengths.items()
     if max(strength)
 }
+LEVELLING = 0.25  # power of their root mean square that joined numbers are divided by
 LEAST = 1e-12  # absolute value that a power is applied to: keeps gradients finite
 ROUNDING = 1e-7  # of the largest variance: below it there is none
 _Components: TypeAlias = tuple[Tensor, Tensor, Tensor, int]  # mean, basis, variances, how many to keep
@@ -102,8 +103,9 @@ class Whitening(nn.Module):
         power: of the absolute value of each whitened number, above 0 and at most 1. Below 1 large ones, such
             as those of something new in the frame, count for less.
         groups: D_1, D_2, .. of a descriptor whose members lie side by side. Each is whitened by itself, to
-            length 1, and these are reduced to the K numbers that keep most of their products. None is what
-            the features tell (`Joined`); of those that tell nothing the descriptor is whitened as a whole.
+            length 1, and these are reduced to the K numbers that keep most of their products. Of these the
+            large ones are lowered a little, or a few of them would decide what is alike. None is what the
+            features tell (`Joined`); of those that tell nothing the descriptor is whitened as a whole.
         group_numbers: that are kept of each member, its rank at most; None is as many as of a descriptor.
 
     Shape: (B,D) -> (B,K).
@@ -280,7 +282,8 @@ class Whitening(nn.Module):
             joined = torch.cat([weight * member(own) for weight, member, own in each], 1)
             kept = self.kept(len(places), joined.shape[1], views is not None)
             # about zero, not their mean: the products of all pairs are kept, which cosines are made of
-            mean, basis, *_ = self._components(joined, kept, kept, centre=False)
+            mean, basis, squares, _ = self._components(joined, kept, kept, centre=False)
+            basis = basis / (squares / squares.mean()) ** (LEVELLING / 2)
             sizes = [len(member.scale) + len(member.length) for member in members]
             scaled = torch.cat([w * part for w, part in zip(weights, basis.split(sizes), strict=True)])
             self.take(mean, scaled, None)
