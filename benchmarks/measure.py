@@ -209,14 +209,19 @@ def end_with_parent() -> None:
 
 
 def truth_of(
-    reference: Traverse, query: Traverse, frames: int | None = None, queries: int | None = None
+    reference: Traverse,
+    query: Traverse,
+    frames: int | None = None,
+    queries: int | None = None,
+    given: str | None = None,
 ) -> GroundTruth:
-    """What the sources say, or frame i is place i; frames, queries: of those that do not know their length.
+    """What is given or the sources say, or frame i is place i; frames, queries: of those that do not know
+    their length.
 
     Raises:
         InputError: nothing tells the right places.
     """
-    truth = ground_truth_of(None, reference, query, frames, queries, aligned=True)
+    truth = ground_truth_of(given, reference, query, frames, queries, aligned=True)
     if truth is None:
         seen = f"{reference.name} has {frames or reference.length} frames"
         raise InputError(

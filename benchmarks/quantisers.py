@@ -1,9 +1,12 @@
-"""Ways to store descriptors in few bytes, and what each gives back: keyframes, PCA, product quantisation."""
+"""Ways to store descriptors in few bytes, and what each gives back: keyframes, PCA, quantisers."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -12,6 +15,7 @@ from torch import Tensor
 from dejavu_torch.evaluation.baselines import as_int8, between_keyframes, keyframes
 from dejavu_torch.evaluation.controls import shuffled
 from dejavu_torch.maps.spectral import SpectralMapper
+from dejavu_torch.text import one_line
 from dejavu_torch.types import InputError
 
 CENTROIDS = 256  # of a codebook: a code is a byte
@@ -79,54 +83,56 @@ def signs(places: Tensor) -> Tensor:
     return torch.where(places >= 0, 1.0, -1.0)
 
 
-class ProductQuantiser:
-    """Codes of m bytes, each the nearest of 256 centroids of a part of the descriptor (Jegou et al., 2011).
+class Quantiser:
+    """What a code of faiss gives back, by the key of its factory: product codes `PQ8x8np` (Jegou et al.,
+    2011) and `OPQ8,PQ8x8np` (Ge et al., 2013), residual ones `RQ8x8`, `LSQ8x8`, `PRQ2x4x8`, and without
+    codebooks `PCAR64,SQtqmse1` (TurboQuant), `RR128,RaBitQ`, `RR128,EDEN`.
 
-    rotated: trains a rotation ahead of it too (OPQ: Ge et al., 2013). int8: keeps codebooks and rotation in
-    int8, if they count; it changes next to nothing. bytes: of codebooks and rotation, a byte a number.
+    Args:
+        training: descriptors (n,K).
+        multiple: of K that the code needs; descriptors are padded by zeros.
+
+    each: bytes of a code. width: K, padded.
+
+    Raises:
+        InputError: a code that faiss lacks, or that it cannot train on these.
     """
 
-    def __init__(self, training: Tensor, m: int, rotated: bool = False, int8: bool = False) -> None:
+    def __init__(self, training: Tensor, key: str, multiple: int = 1) -> None:
         import faiss
 
-        if len(training) < CENTROIDS:
+        if "x8" in key and len(training) < CENTROIDS:
             raise InputError(
                 f"{len(training)} places to train codebooks on; expected at least {CENTROIDS}, one a centroid"
             )
         self.numbers = training.shape[1]
-        self.width = -(-self.numbers // m) * m
-        rows = self._padded(training)
-        self.rotation: Tensor | None = None
-        if rotated:
-            inner, turn = self._quantiser(m), faiss.OPQMatrix(self.width, m)
-            turn.pq = inner  # which must outlive the training
-            turn.train(rows.numpy())
-            matrix = torch.from_numpy(faiss.vector_to_array(turn.A).reshape(self.width, self.width))
-            self.rotation = as_int8(matrix) if int8 else matrix
-            rows = rows @ self.rotation.T
-        self.pq = self._quantiser(m)
-        self.pq.train(rows.contiguous().numpy())
-        if int8:
-            centroids = torch.from_numpy(faiss.vector_to_array(self.pq.centroids))
-            faiss.copy_array_to_vector(as_int8(centroids).numpy(), self.pq.centroids)
-        self.bytes = CENTROIDS * self.width + (self.width**2 if rotated else 0)
+        self.width = -(-self.numbers // multiple) * multiple
+        try:
+            self.index = faiss.index_factory(self.width, key)
+            with silent():
+                self.index.train(self._padded(training))
+        except RuntimeError as error:
+            raise InputError(f"faiss {faiss.__version__} refuses {key}: {one_line(error)}"[:200]) from error
+        self.each: int = self.index.sa_code_size()
 
-    def _quantiser(self, m: int):  # type: ignore[no-untyped-def]
-        import faiss
-
-        pq = faiss.ProductQuantizer(self.width, m, 8)
-        pq.cp.min_points_per_centroid = 1  # it warns of fewer than 39
-        return pq
-
-    def _padded(self, rows: Tensor) -> Tensor:
-        return F.pad(rows.float(), (0, self.width - self.numbers)).contiguous()
+    def _padded(self, rows: Tensor) -> Any:
+        return F.pad(rows.float(), (0, self.width - self.numbers)).contiguous().numpy()
 
     def __call__(self, descriptors: Tensor) -> Tensor:
-        """What the codes of descriptors give back. Shape: (n,K) -> (n,K)."""
-        rows = self._padded(descriptors)
-        if self.rotation is not None:
-            rows = rows @ self.rotation.T
-        back = torch.from_numpy(self.pq.decode(self.pq.compute_codes(rows.contiguous().numpy())))
-        if self.rotation is not None:
-            back = back @ self.rotation
-        return back[:, : self.numbers]
+        """Shape: (n,K) -> (n,K)."""
+        codes = self.index.sa_encode(self._padded(descriptors))
+        return torch.from_numpy(self.index.sa_decode(codes))[:, : self.numbers]
+
+
+@contextmanager
+def silent() -> Iterator[None]:
+    """In the block no warnings: faiss has one for each codebook with fewer than 39 places a centroid."""
+    sys.stderr.flush()
+    kept = os.dup(2)
+    try:
+        with open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)

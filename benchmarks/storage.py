@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache, partial
 from itertools import product
 from pathlib import Path
@@ -26,7 +26,7 @@ from benchmarks.measure import (
     write_bench,
 )
 from benchmarks.plots import plot_frontiers
-from benchmarks.quantisers import Kept, ProductQuantiser, every_kth, principal, signs, spectral
+from benchmarks.quantisers import Kept, Quantiser, every_kth, principal, signs, spectral
 from dejavu_torch.data.ground_truth import GroundTruth
 from dejavu_torch.data.source import open_source
 from dejavu_torch.evaluation.baselines import as_int8, between_keyframes, every, nearest_frames
@@ -48,9 +48,22 @@ NEAR = 1.02  # a budget is met by what takes at most so much of it
 SPACED = (1, 2, 3, 4, 5, 8, 10)  # k of every k-th frame as it is
 BETWEEN = (8, 10, 16, 25, 40, 64, 100)  # and with straight lines between
 COMPONENTS, COMPONENT_SPACED = (2, 4, 8, 16, 32), (1, 2, 5, 10)
-CODE_BYTES, CODE_SPACED = (4, 8, 16, 32), (2, 3, 4, 5, 8)
+CODE_SPACED = (1, 2, 3, 4, 5, 8)
 BIT_SPACED = (1, 2, 3, 4, 5, 8, 10, 16)
 QUALITIES, VIDEO_SPACED = (24, 32, 40, 51), (1, 4, 8)  # crf
+CODES = {  # keys of faiss's factory by their bytes, and numbers of the codebooks over those of a descriptor
+    "PQ": [(f"PQ{m}x8np", m, 256) for m in (4, 8, 16, 32)],
+    "OPQ": [(f"OPQ{m},PQ{m}x8np", m, 256) for m in (4, 8, 16, 32)],
+    "RQ": [(f"RQ{m}x8", 1, 256 * m) for m in (4, 8, 16)],
+    "LSQ": [(f"LSQ{m}x8", 1, 256 * m) for m in (4, 8)],
+    "PRQ": [(f"PRQ2x{m // 2}x8", 2, 128 * m) for m in (8, 16)],
+}
+MOST = 32  # route bytes per place of codebooks that count; larger ones are a row without figures
+ROTATED = {  # keys of codes without codebooks, behind a rotation, and axes that it keeps: none, if by chance
+    "TurboQuant": [(f"PCAR{n},SQtqmse1", n) for n in (32, 64, 128)],
+    "RaBitQ": [("PCAR64,RaBitQ", 64), ("RR{},RaBitQ", 0)],
+    "EDEN": [("PCAR64,EDEN", 64), ("RR{},EDEN", 0)],
+}
 BUILT_IN = {"aerial": (3072, 10_000), "outdoor": (0,), "underground": (0,)}  # frames, 0 the whole route
 WHITENINGS: dict[str, dict[str, Any]] = {  # other settings than the defaults
     "16 bits": {"bits": 16},
@@ -66,7 +79,7 @@ KEYS = (
     *("family", "seconds", "peak_bytes", "bytes", "fixed_bytes", "route_bytes", "route_bytes_per_place"),
     *("recall_at_1", "auc", "sequences", "ratio_to_ours", "skipped"),
 )
-OURS, NULL, OTHERS = "dejavu", "null", "dejavu, other whitenings"
+OURS, NULL, OTHERS, GIVEN = "dejavu", "null", "dejavu, other whitenings", "dejavu, given maps"
 
 Answer = tuple[Match, int, int]  # what a contender finds, its bytes that grow with the route, and all others
 Points = Sequence[tuple[float, float]]  # bytes per place and area
@@ -87,6 +100,7 @@ class Route(NamedTuple):
     queries: Tensor
     truth: GroundTruth
     other: Traverse | None
+    tolerance: int = TOLERANCE
 
     @property
     def fixed(self) -> int:
@@ -112,28 +126,36 @@ def run_storage(
     sources: Sequence[str] = (),
     *,
     out: Path,
-    map: Path | None = None,
+    map: Sequence[Path] = (),
     codebooks: str | None = None,
     whitening: Path | None = None,
     places: Sequence[int] = (),
+    truth: str | None = None,
+    tolerance: int = TOLERANCE,
 ) -> list[str]:
     """Accuracy over bytes of ways to store the descriptors of a route.
 
     Args:
         sources: pairs REFERENCE QUERY; the built-in routes if not given
         out: folder for bench.json and bench.png
-        map: a map of the REFERENCE to set beside the others
+        map: maps of the REFERENCE to set beside the others, each with descriptors of its own
         codebooks: another route, where codebooks and a whitening are learned that count nothing
         whitening: a map whose whitening describes all routes; each learns its own if not given
         places: frames of the built-in sim:aerial; 3072 and 10000 if not given
+        truth: places of the queries, as `dejavu compare` takes it; by default frame i is place i
+        tolerance: places that a right answer may be off
     """
-    given = None if map is None else DejaVu.load(map)
+    if tolerance < 0:
+        raise InputError(f"--tolerance {tolerance}; expected at least 0")
+    if truth is not None and len(sources) != 2:
+        raise InputError(f"--truth is of one pair, and there are {len(sources)} sources; expected 2")
+    given = {path.stem: DejaVu.load(path) for path in map}
     shared = None if whitening is None else DejaVu.load(whitening)
     rows: list[Row] = []
-    for row in bench_storage(sources, places, codebooks, given, shared):  # written as rows are finished
-        rows = with_ratios([*rows, row])
-        write_bench(out, rows, equal_auc=equal_areas(rows), tolerance=TOLERANCE)
-    write_bench(out, rows, pictured(rows), equal_auc=equal_areas(rows), tolerance=TOLERANCE)
+    for row in bench_storage(sources, places, codebooks, given, shared, truth, tolerance):
+        rows = with_ratios([*rows, row])  # written as they are finished
+        write_bench(out, rows, equal_auc=equal_areas(rows), tolerance=tolerance)
+    write_bench(out, rows, pictured(rows), equal_auc=equal_areas(rows), tolerance=tolerance)
     note = "the best of each family, T queries matched together"
     return [*storage_tables(rows), *skipped_lines(rows), note]
 
@@ -142,8 +164,10 @@ def bench_storage(
     sources: Sequence[str] = (),
     places: Sequence[int] = (),
     codebooks: str | None = None,
-    given: DejaVu | None = None,
+    given: Mapping[str, DejaVu] | None = None,
     whitening: DejaVu | None = None,
+    truth: str | None = None,
+    tolerance: int = TOLERANCE,
 ) -> Iterator[Row]:
     """Accuracy over bytes of all contenders on all routes, a row at a time; see `run_storage`.
 
@@ -155,26 +179,26 @@ def bench_storage(
         grow with the route are `fixed_bytes`, the others `route_bytes`. sequences: by T, scores of T queries
         together. skipped: why there are no figures.
     """
-    routes = routes_of(sources, places, codebooks, given)
+    given = {} if given is None else given
+    routes = routes_of(sources, places, codebooks, bool(given))
     for _, reference, query, _ in routes:
-        for model in (model_by(whitening), given):
-            if model is not None:
-                check(model, reference, query)
+        for model in (model_by(whitening), *given.values()):
+            check(model, reference, query, truth)
     for name, reference, query, other in routes:
-        route = described(name, reference, query, model_by(whitening), other)
+        route = described(name, reference, query, model_by(whitening), other, truth, tolerance)
         for contender in tqdm(list(contenders_of(route, given)), name, disable=None, leave=False):
             yield judged(route, contender)
 
 
 def routes_of(
-    sources: Sequence[str], places: Sequence[int], codebooks: str | None, given: DejaVu | None
+    sources: Sequence[str], places: Sequence[int], codebooks: str | None, given: bool
 ) -> list[tuple[str, Traverse, Traverse, Traverse | None]]:
     """Name, reference, query and the route of the free codebooks of each route; all refused early."""
     pairs = list(zip(sources[::2], sources[1::2], strict=False))
     twice = [f"{a} and {b}" for i, (a, b) in enumerate(pairs) if (a, b) in pairs[:i]]
     if len(sources) % 2:
         raise InputError(f"bench storage got {len(sources)} sources; expected pairs, REFERENCE QUERY ...")
-    if given is not None and len(pairs) != 1:
+    if given and len(pairs) != 1:
         raise InputError(f"a map is of one route, and there are {len(sources)} sources; expected one pair")
     if sources and places:
         raise InputError("--places are of the built-in sim:aerial; expected none beside sources")
@@ -205,7 +229,7 @@ def model_by(whitening: DejaVu | None) -> DejaVu:
     return model
 
 
-def check(model: DejaVu, reference: Traverse, query: Traverse) -> None:
+def check(model: DejaVu, reference: Traverse, query: Traverse, truth: str | None = None) -> None:
     """Refuse, before the long work, a pair that does not fit the model or each other."""
     features, whitening = model.describer.check_sizes(reference, query), model.whitening
     if whitening is not None and whitening.learned and sum(whitening.sizes) != features:
@@ -214,7 +238,7 @@ def check(model: DejaVu, reference: Traverse, query: Traverse) -> None:
             "a frame; expected as many, as frames of one size give"
         )
     if reference.length is not None and query.length is not None:
-        truth_of(reference, query, reference.length, query.length)
+        truth_of(reference, query, reference.length, query.length, truth)
     if model.map.places and reference.length is not None:
         check_places(model, reference.length, reference.name)
 
@@ -225,16 +249,23 @@ def described(
     query: Traverse,
     model: DejaVu | None = None,
     other: Traverse | None = None,
+    truth: str | None = None,
+    tolerance: int = TOLERANCE,
 ) -> Route:
     """A route's descriptors by a model, which learns its whitening where it has none; None is the default."""
     model = DejaVu() if model is None else model
+    places, queries = both(model, reference, query)
+    right = truth_of(reference, query, len(places), len(queries), truth)
+    return Route(name, model, reference, query, places, queries, right, other, tolerance)
+
+
+def both(model: DejaVu, reference: Traverse, query: Traverse) -> tuple[Tensor, Tensor]:
+    """Descriptors of the reference, which a whitening is learned from if there is none, and of the query."""
     places = model.describe_reference(reference, None, "describing")
-    queries = model.extract_all(query, "describing the query")
-    truth = truth_of(reference, query, len(places), len(queries))
-    return Route(name, model, reference, query, places.float(), queries.float(), truth, other)
+    return places.float(), model.extract_all(query, "describing the query").float()
 
 
-def contenders_of(route: Route, given: DejaVu | None = None) -> Iterator[Contender]:
+def contenders_of(route: Route, given: Mapping[str, DejaVu] | None = None) -> Iterator[Contender]:
     """All that is set side by side on a route, ours first; given: see `run_storage`."""
     yield from stores_of(route)
     assert route.model.whitening is not None
@@ -242,8 +273,8 @@ def contenders_of(route: Route, given: DejaVu | None = None) -> Iterator[Contend
         for name in (*WHITENINGS, "of another route"):
             answer = partial(by_other_whitening, route, name)
             yield ready(f"dejavu {WHITENED:g}, whitening {name}", OTHERS, answer)
-    if given is not None:
-        yield ready("dejavu, the map that was given", "dejavu, given", partial(by_map, route, lambda: given))
+    for name, model in (given or {}).items():
+        yield ready(f"dejavu, {name}", GIVEN, partial(by_map, route, partial(lambda one: one, model)))
     # template means of the features themselves at frequencies found in them, frame by frame
     paper = partial(by_map, route, lambda: paper_model().learn(route.reference))
     yield ready("the paper", "the paper", paper)
@@ -285,22 +316,34 @@ def stores_of(route: Route) -> Iterator[Contender]:
         return route.model.extract_all(route.another("train codebooks on")).float()
 
     @cache  # one training for all strides
-    def quantiser(m: int, rotated: bool, own: bool) -> ProductQuantiser:
-        return ProductQuantiser(places if own else elsewhere(), m, rotated, int8=own)
+    def quantiser(key: str, multiple: int, own: bool) -> Quantiser:
+        return Quantiser(places if own else elsewhere(), key, multiple)
 
-    def quantised(k: int, m: int, rotated: bool, own: bool, between: bool) -> Kept:
-        code = quantiser(m, rotated, own)
-        return every_kth(places, k, m, code, between, code.bytes if own else 0)
+    def coded(key: str, multiple: int, k: int, own: bool, book: int = 0, fixed: int = 0) -> Kept:
+        if book > MOST * len(places):
+            each = f"{book / len(places):.0f} bytes a place"
+            raise InputError(f"codebooks of the route take {each}; tried up to {MOST}")
+        code = quantiser(key, multiple, own)
+        return every_kth(places, k, code.each, code, k > 1, book)._replace(fixed=fixed)
 
-    both = (False, True)
-    for own, rotated, m, k, between in product(both, both, CODE_BYTES, CODE_SPACED, both):
-        family = "PQ, own codebooks" if own else "PQ, codebooks of another route"
-        name = f"{'O' * rotated}PQ, {m} bytes of {every(k, 'frame')}"
-        name += f"{', interpolated' * between}{', own codebooks' * own}"
-        yield store(family, name, quantised, k, m, rotated, own, between)
+    for own, (family, keys) in product((False, True), CODES.items()):
+        of = f"{family}, {'own codebooks' if own else 'codebooks of another route'}"
+        for (key, multiple, learned), k in product(keys, CODE_SPACED):
+            width = -(-numbers // multiple) * multiple
+            book = own * width * (learned + (width if family == "OPQ" else 0))
+            yield store(of, named(key, k) + ", own codebooks" * own, coded, key, multiple, k, own, book)
+    for family, keyed in ROTATED.items():
+        for (key, axes), k in product(keyed, CODE_SPACED):
+            key, fixed = key.format(numbers), numbers * (axes + 4)
+            yield store(family, named(key, k), coded, key, 1, k, True, fixed=fixed)
     for codec, crf, k in product(("libx264", "libx265"), QUALITIES, VIDEO_SPACED):
         name = f"{codec[3:]}, crf {crf}, {every(k, 'frame')}{', interpolated' * (k > 1)}"
         yield store("video", name, video, route, codec, crf, k)
+
+
+def named(code: str, k: int) -> str:
+    """A code of every k-th place, straight lines between them."""
+    return f"{code} of {every(k, 'frame')}{', interpolated' * (k > 1)}"
 
 
 def video(route: Route, codec: str, crf: int, k: int) -> Kept:
@@ -319,8 +362,9 @@ def by_other_whitening(route: Route, name: str) -> Answer:
         source = DejaVu()
         source.describe_reference(route.another("learn a whitening on"))
         model.take_whitening(source)
-    again = described(route.name, route.reference, route.query, model)
-    return among(again, partial(spectral, again.places, WHITENED))
+    places, queries = both(model, route.reference, route.query)
+    again = route._replace(model=model, places=places, queries=queries)
+    return among(again, partial(spectral, places, WHITENED))
 
 
 def among(route: Route, keep: Callable[[], Kept]) -> Answer:
@@ -350,7 +394,7 @@ def judged(route: Route, contender: Contender) -> Row:
     except (ImportError, ValueError) as error:  # a program that is not installed, a codec that is not there
         return row | {"skipped": failure(error)}
     seconds, ((found, size, fixed),) = time.perf_counter() - began, answers
-    scores = evaluate_each(found.sequences, route.truth, TOLERANCE)
+    scores = evaluate_each(found.sequences, route.truth, route.tolerance)
     return row | {
         "seconds": seconds,
         "peak_bytes": peak,

@@ -73,10 +73,10 @@ def test_all_families_are_there_and_what_is_skipped_says_why(rows: list[Row]) ->
     pytest.importorskip("faiss")
     ran = {row["family"] for row in rows if row["skipped"] is None}
     stores = {"dejavu", "null", "frames", "interpolated", "PCA", "binary", "PQ, own codebooks"}
-    assert ran == stores | {"dejavu, other whitenings"}
+    assert ran == stores | {"dejavu, other whitenings", "RaBitQ", "EDEN", "OPQ, own codebooks"}
     assert [row["contender"] for row in rows[:2]] == ["dejavu 0.5", "dejavu 1"]
     assert len({row["contender"] for row in rows}) == len(rows)
-    reasons = {row["skipped"] for row in rows if row["family"] == "PQ, codebooks of another route"}
+    reasons = {row["skipped"] for row in rows if "of another route" in row["family"]}
     assert reasons == {"no other route to train codebooks on; expected --codebooks SOURCE"}
     video = [row["skipped"] or "" for row in rows if row["family"] == "video"]
     assert all("ready features" in reason for reason in video)
@@ -102,10 +102,14 @@ def test_all_bytes_are_counted_fixed_and_growing_apart(rows: list[Row]) -> None:
 
 def test_codebooks_count_where_they_are_of_the_route(route: Route) -> None:
     pytest.importorskip("faiss")
-    names = [f"{kind}PQ, 4 bytes of every 3rd frame" for kind in ("", "O")]
+    names = [f"{key} of every 3rd frame, interpolated" for key in ("PQ4x8np", "OPQ4,PQ4x8np")]
     names = [names[0], *(f"{name}, own codebooks" for name in names)]
-    free, own, rotated = (row_of(route, name)["route_bytes"] - 100 * 4 for name in names)
+    free, own, rotated = (row_of(route, name)["route_bytes"] - 101 * 4 for name in names)
     assert (free, own, rotated) == (0, 256 * 28, 256 * 28 + 28 * 28)  # 25 numbers, padded
+    large = row_of(route, "RQ8x8 of every frame, own codebooks")["skipped"]
+    assert f"{8 * 256 * 25 / PLACES:.0f} bytes a place" in large
+    turned = row_of(route, "RR25,RaBitQ of every 8th frame, interpolated")
+    assert turned["route_bytes"] == 39 * (4 + 8)  # a bit a number, and two factors
 
 
 def test_more_bytes_recognise_more_and_the_whole_database_most(rows: list[Row]) -> None:
@@ -179,9 +183,9 @@ def test_what_cannot_be_stored_is_a_row(route: Route, monkeypatch: pytest.Monkey
     short = described("short", *(ArrayTraverse(series(seed)[:40]) for seed in (0, 1)))
     assert "route_bytes_per_place is 0.5; expected more than" in row_of(short, "dejavu 0.5")["skipped"]
     assert "principal components" in row_of(short, "PCA, 32 numbers of every frame, int8")["skipped"]
-    name = "PQ, 4 bytes of every 2nd frame, own codebooks"
+    name = "PQ4x8np of every 2nd frame, interpolated, own codebooks"
     if not row_of(route, name)["skipped"]:
-        assert "40 places" in row_of(short, name)["skipped"]
+        assert "bytes a place; tried up to 32" in row_of(short, name)["skipped"]
     monkeypatch.setitem(sys.modules, "faiss", None)
     assert "faiss" in row_of(route, name)["skipped"]
     assert (row_of(route, "whole database, float")["peak_bytes"] is not None) == PROCESS.exists()
@@ -232,7 +236,7 @@ def test_rows_are_written_as_they_finish_the_map_that_is_given_among_them(
     pair: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen, out, path = [], tmp_path / "out", tmp_path / "map.safetensors"
-    given = "dejavu, the map that was given"
+    given = "dejavu, map"
 
     def some(*arguments: Any) -> list[Contender]:
         names = ("dejavu 5", "dejavu 10", "null 5", given)
@@ -267,7 +271,7 @@ def test_a_line_for_each_family_and_ours_the_thickest() -> None:
 
 
 def test_built_in_routes() -> None:
-    routes = storage.routes_of((), (64, 300), None, None)
+    routes = storage.routes_of((), (64, 300), None, False)
     names = ["sim:aerial, 64 places", "sim:aerial, 300 places", "sim:outdoor", "sim:underground"]
     assert [name.startswith(known) for (name, *_), known in zip(routes, names, strict=True)] == [True] * 4
     for route, said in zip(routes[0][1:], ("seed=0&traverse=0", "seed=0&traverse=1", "seed=1"), strict=True):
@@ -275,7 +279,26 @@ def test_built_in_routes() -> None:
         assert said in route.name
 
 
+def test_a_truth_and_a_tolerance_that_are_given(
+    pair: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(storage, "contenders_of", lambda route, *_: list(stores_of(route))[:8])
+    places = np.load(pair[0])
+    np.save(tmp_path / "later.npy", places[100:])
+    (tmp_path / "truth.csv").write_text("".join(f"{i},{i + 97}\n" for i in range(200)))
+    found = {}
+    for tolerance in (2, 3):
+        words = ("--truth", tmp_path / "truth.csv", "--tolerance", tolerance, "--out", tmp_path / "out")
+        benchmark("storage", pair[0], tmp_path / "later.npy", *words)
+        written = json.loads((tmp_path / "out" / "bench.json").read_text())
+        assert written["tolerance"] == tolerance
+        found[tolerance] = written["rows"][-2]["recall_at_1"]
+    assert found[2] < 0.5 < found[3]
+
+
 REFUSALS = {
+    "storage A B --tolerance -1": ["--tolerance -1", "at least 0"],
+    "storage --truth 0": ["--truth", "0 sources", "expected 2"],
     "storage A": ["1 sources", "pairs"],
     "storage --map OF_SHORT": ["0 sources", "one pair"],
     "storage A B --places 64 300": ["--places", "sim:aerial"],
