@@ -170,22 +170,30 @@ def routes(draw: Callable, most_layers: int = 4) -> Route:
     return Route(values, tuple(plan))
 
 
-def joined_rows(places: Sequence[Table], queries: Sequence[Table], kept: int) -> Tensor:
-    """Cosines (Q,N) of queries and places from their whitened members: each to length 1, side by side, turned
-    to the `kept` directions with the largest mean square over the places."""
+def joined_rows(
+    places: Sequence[Table],
+    queries: Sequence[Table],
+    kept: int,
+    level: float,
+    shares: Sequence[float] = (1, 1),
+) -> Tensor:
+    """Cosines (Q,N) of queries and places from their whitened members: each to the root of its share, side by
+    side, turned to the `kept` directions with the largest mean square over the places, and each number
+    divided by that power of its root mean square."""
 
     def side_by_side(members: Sequence[Table]) -> list[list[float]]:
         rows = []
         for parts in zip(*members, strict=True):
             row: list[float] = []
-            for part in parts:
-                length = math.sqrt(sum(number**2 for number in part))
+            for part, share in zip(parts, shares, strict=False):
+                length = math.sqrt(sum(number**2 for number in part) / share)
                 row += [number / length for number in part]
             rows.append(row)
         return rows
 
     own, asked = (torch.tensor(side_by_side(one), dtype=torch.float64) for one in (places, queries))
     directions = torch.linalg.eigh(own.T @ own / len(own)).eigenvectors.flip(1)[:, :kept]
-    ours, theirs = (rows @ directions for rows in (own, asked))
+    sizes = (own @ directions).square().mean(0).sqrt() ** level
+    ours, theirs = (rows @ directions / sizes for rows in (own, asked))
     lengths = theirs.norm(dim=1)[:, None] * ours.norm(dim=1)
     return (theirs @ ours.T / lengths).float()

@@ -283,7 +283,8 @@ class Whitening(nn.Module):
             kept = self.kept(len(places), joined.shape[1], views is not None)
             # about zero, not their mean: the products of all pairs are kept, which cosines are made of
             mean, basis, squares, _ = self._components(joined, kept, kept, centre=False)
-            basis = basis / (squares / squares.mean()) ** (LEVELLING / 2)
+            if views is not None:
+                basis = basis / (squares / squares.mean()) ** (LEVELLING / 2)
             sizes = [len(member.scale) + len(member.length) for member in members]
             scaled = torch.cat([w * part for w, part in zip(weights, basis.split(sizes), strict=True)])
             self.take(mean, scaled, None)

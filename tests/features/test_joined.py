@@ -12,6 +12,7 @@ import pytest
 import torch
 from command_line import fails, run
 from helpers import refused
+from reference import joined_rows
 from torch import Tensor, nn
 
 from dejavu_torch import (
@@ -165,7 +166,7 @@ def members() -> tuple[list[Tensor], Tensor]:
 @pytest.mark.parametrize("share", [0.3, 1.0])
 @pytest.mark.parametrize("views", [True, False])
 def test_a_share_is_that_of_a_members_numbers_and_of_its_squared_length(share: float, views: bool) -> None:
-    """With as many numbers in all as the members have, cosines are the weighted mean of theirs."""
+    """With as many numbers as the members have and no views, cosines are the weighted mean of theirs."""
     own, other = members()
     shown = [(other, torch.arange(200))] if views else None
     whitening = Whitening(numbers=21 if views else None, group_numbers=15, bits=16)
@@ -175,9 +176,12 @@ def test_a_share_is_that_of_a_members_numbers_and_of_its_squared_length(share: f
     each = whitening.parts[1:]
     assert [len(member.scale) for member in each] == [15, math.ceil(share * 15)]
     assert [len(member.length) for member in each] == 2 * [constant]
-    cosines = [made @ made.T for made in (one(part) for one, part in zip(each, own, strict=True))]
+    alone = [one(part) for one, part in zip(each, own, strict=True)]
     found = whitening(torch.cat(own, 1))
-    expected = (cosines[0] + share * cosines[1]) / (1 + share)
+    expected = (alone[0] @ alone[0].T + share * alone[1] @ alone[1].T) / (1 + share)
+    if views:
+        rows = [one.tolist() for one in alone]
+        expected = joined_rows(rows, rows, whitening.dimension, 0.25, (1, share))
     torch.testing.assert_close(found @ found.T, expected, atol=2e-3, rtol=0)
 
 
