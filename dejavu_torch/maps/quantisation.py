@@ -19,6 +19,7 @@ ROUNDING = 0.35  # what is added before rounding down: a dead zone of 1.3 steps 
 FINEST = 64  # steps in an RMS line at most: a finer step changes no score
 HALVINGS = 14  # of the range of steps, which leaves 0.1 % of a step
 BLOCK = 2**23  # numbers at a time
+SMALL = 0.01  # of the mean square of descriptors: below it their mean is cheaper among the lines
 CLOSE = 0.995  # of the budget of a route of more numbers: no finer step is looked for
 
 
@@ -52,7 +53,8 @@ class RouteLines:
 
     Args:
         lengths: places of each chunk. transform, resolution: see `spectrum`, `dead_zone`.
-        mean: (K,) that is subtracted; None is that of the route, in bfloat16 as a map stores it.
+        mean: (K,) that is subtracted; None is that of the route, in bfloat16 as a map stores it, or 0 where
+            it is so small that it is cheaper among the lines, as line 0.
 
     Shape: features (N,K), float of any kind.
     """
@@ -68,8 +70,13 @@ class RouteLines:
         places, numbers = features.shape
         self.rows = max(1, BLOCK // numbers)
         if mean is None:
-            means = [part.float().mean(0).double() * len(part) for part in features.split(self.rows)]
-            mean = (torch.stack(means).sum(0) / places).to(torch.bfloat16)
+            sums, power = features.new_zeros(numbers, dtype=torch.float64), 0.0
+            for part in features.split(self.rows):
+                sums += part.float().mean(0).double() * len(part)
+                power += float(part.float().square().sum()) / places
+            mean = (sums / places).to(torch.bfloat16)
+            if float(mean.double().square().sum()) < SMALL * power:
+                mean = torch.zeros_like(mean)
         self.mean = mean
         self.chunks = [*pairwise(accumulate(lengths, initial=0))]
         self.lines = empty(places, numbers, features.device)
@@ -79,6 +86,11 @@ class RouteLines:
                 part = features[start:stop, columns].float() - mean[columns].float()
                 self.lines[start:stop, columns] = spectrum(part.T, transform).T
         self.width = dead_zone(self.lines, lengths, resolution, transform)
+
+    @property
+    def mean_bytes(self) -> int:
+        """Of the mean in a file."""
+        return self.mean.nbytes if bool(self.mean.any()) else 0
 
     def even(self) -> RouteLines:
         """The same lines, all with the dead zone of line 0."""

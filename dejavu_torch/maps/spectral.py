@@ -138,7 +138,7 @@ class SpectralMapper(Mapper):
         lines = RouteLines(features, lengths, self.transform, self.resolution)
         if not lines.scale > 1e-6 * float(lines.mean.float().square().mean().sqrt()):
             raise InputError(f"the {places} descriptors are all alike; expected a route that changes")
-        fixed = lines.mean.nbytes + CHUNK_BYTES * len(lines.chunks)
+        fixed = lines.mean_bytes + CHUNK_BYTES * len(lines.chunks)
         budget = self.route_bytes_per_place
         if budget is not None:
             if self.overhead <= max(0, budget * places - fixed) / 2:

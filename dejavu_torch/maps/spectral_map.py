@@ -86,7 +86,7 @@ class SpectralMap(PlaceMap):
     Buffers, the tensors of a file:
         lengths: (G,) int64, places of each chunk. steps: (G,) float32, of each chunk.
         streams, stream_table: coded levels; bytes and checksum of each chunk.
-        means: (R,K) bfloat16, of the descriptors of each route: the lines code the difference.
+        means: (R,K) bfloat16, of the descriptors of each route, small ones 0: the lines code the difference.
     Buffers that follow from these:
         counts, feature, level: coefficients of each of N lines; of each of L coefficients the feature,
             ascending within a line, and the value in steps; in the smallest types that hold them.
@@ -443,7 +443,8 @@ class SpectralMap(PlaceMap):
         fits = min(sizes, default=0) >= 0 and sum(sizes) == size
         require(fits, f"the coded lines are {size} bytes; the table claims {sizes!s:.100}")
         shape = max(1, len(self.routes)), self.dimension
-        fits = not self.places or (means.shape == shape and bool(means.isfinite().all()))
+        fits = means.shape in (shape, (0, self.dimension)) and bool(means.isfinite().all())
+        fits = not self.places or fits
         require(fits, f"means {tuple(means.shape)}; expected {shape} finite numbers")
         if self.routes:
             self._check_routes()
@@ -461,11 +462,18 @@ class SpectralMap(PlaceMap):
         require(fits, f"routes of {[*frames]!s:.100} frames; expected {self.table.frames} in all")
 
     def loaded(self) -> None:
-        """Decode the chunks of a file."""
+        """Decode the chunks of a file, and give its routes the means 0 that it leaves out."""
         chunks, visits = self.coded(), self.visits
+        if chunks and not len(self.means):
+            self.means = self.means.new_zeros(max(1, len(self.routes)), self.dimension)
         self._clear()
         self.extend(chunks)
         self.visits = visits
+
+    def packed(self) -> dict[str, Tensor]:
+        """See `PlaceMap`; means that are all 0 are left out."""
+        packed = super().packed()
+        return packed if bool(self.means.any()) else packed | {"means": self.means[:0]}
 
     def summary(self) -> MapSummary:
         """See `MapSummary`; the parts are those of the route."""
