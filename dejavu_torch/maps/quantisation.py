@@ -19,7 +19,7 @@ ROUNDING = 0.35  # what is added before rounding down: a dead zone of 1.3 steps 
 FINEST = 64  # steps in an RMS line at most: a finer step changes no score
 HALVINGS = 14  # of the range of steps, which leaves 0.1 % of a step
 BLOCK = 2**23  # numbers at a time
-SMALL = 0.01  # of the mean square of descriptors: below it their mean is cheaper among the lines
+SMALL = 0.05  # of the mean square of descriptors: below it their mean is cheaper among the lines
 CLOSE = 0.995  # of the budget of a route of more numbers: no finer step is looked for
 
 

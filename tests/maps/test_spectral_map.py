@@ -91,6 +91,26 @@ def test_a_map_takes_few_bytes_for_each_place(budget: float) -> None:
     assert taken / learned.places <= {1.0: 12, 4.0: 36}[budget]  # and 4 of a position
 
 
+def test_a_mean_that_is_next_to_nothing_takes_no_bytes() -> None:
+    centred = route(200, 12)
+    centred = centred - centred.mean(0)
+    size = float(centred.square().mean().sqrt())
+    maps = [SpectralMapper(step=0.1 * size)(centred + shift * size) for shift in (0, 0.1, 0.4)]
+    shapes = [tuple(one.packed()["means"].shape) for one in maps]
+    assert shapes == [(0, 12), (0, 12), (1, 12)]
+    for one, shift in zip(maps, (0, 0.1, 0.4), strict=True):
+        missed = (centred + shift * size - held(one)).square().mean().sqrt()
+        assert missed < 0.06 * size  # a mean that is left out is a line
+        again = SpectralMap()
+        again.load_packed(one.packed(), one.get_extra_state())
+        assert torch.equal(again.scores(centred[:9]), one.scores(centred[:9]))
+    both = [SpectralMap.merged(pair, ("a", "b")) for pair in (maps[:2], maps[1:])]
+    assert [len(one.packed()["means"]) for one in both] == [0, 2]
+    again = SpectralMap()
+    again.load_packed(both[0].packed(), both[0].get_extra_state())
+    assert torch.equal(again.part("b").decode(0), maps[1].decode(0))
+
+
 def test_a_map_that_was_loaded_is_saved_without_coding_anew(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
