@@ -60,7 +60,7 @@ def test_searches_of_localize(
 ) -> None:
     monkeypatch.setattr(coarse, "FEWEST", 0)  # as a long map is searched
     path, out = tmp_path / "m.safetensors", tmp_path / "m.csv"
-    run("learn", ROUTE, "--map", path, "--mapper.chunk", "32", "--whitening.views", "2")
+    run("learn", ROUTE, "--map", path, "--mapper.chunk", "32", "--features", "HOG")
     found = []
     for search in ("scan", "exact", "auto"):
         run("localize", path, SECOND, "--search", search, "--out", out)
@@ -244,7 +244,7 @@ def test_a_map_that_holds_a_share(folder: Path, capsys: pytest.CaptureFixture[st
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        ("--mapper.route_bytes_per_place 0.5", ("route_bytes_per_place is 0.5", "the mean")),
+        ("--mapper.route_bytes_per_place 0.4", ("route_bytes_per_place is 0.4", "chunks")),
         ("--whitening.strengths.colour2 0", ("colour2", "expected colour, rotation")),
         ("--mapper.periods.window 64", ("--mapper", "unrecognized", "periods.window")),
         ("--whitening nowhere.safetensors", ("nowhere.safetensors is not there",)),

@@ -170,7 +170,7 @@ class SpectralMapper(Mapper):
         if not least < budget <= most:
             works = math.ceil(least + min(5, 2 * numbers))
             raise InputError(
-                f"route_bytes_per_place is {budget:g}; expected more than {least:.3g}, which the mean, "
+                f"route_bytes_per_place is {budget:g}; expected more than {least:.3g}, which a mean, "
                 f"chunks and positions take, such as {works}, and at most {most}, with all numbers as floats"
             )
         return lines.step_of(budget * places - fixed)

@@ -212,11 +212,21 @@ def test_equal_areas() -> None:
     assert entry["null_over_ours"] == pytest.approx(4)
 
 
+def test_what_is_missed_is_set_beside_the_best_rival() -> None:
+    rows = [of(size, auc, "dejavu") for size, auc in ((1, 0.5), (3.2, 0.9), (5, 0.9999))]
+    rivals = [of(1, 0.75), of(1.62, 0.8, "more"), of(5, 0.6), of(1, 0.99, "null"), of(1, 0.99, storage.GIVEN)]
+    ratios = (0.5 / 0.25, 0.5 / 0.2, 0.1 / 0.2, 0.002 / 0.2)
+    assert storage.missed([*rows, *rivals]) == {"case": pytest.approx(np.prod(ratios) ** 0.25)}
+    assert storage.missed(rivals) == {"case": pytest.approx((1 / (0.25 * 0.2**3)) ** 0.25)}
+
+
 def test_the_tables() -> None:
     rows = [of(1, 0.5, "dejavu"), of(3.2, 0.75, "dejavu"), of(1.01, 0.4), of(10, 0.8), of(2, 0.99, "more")]
     skipped = [new_row("case", name, KEYS, family="none", skipped="absent") for name in "abc"]
     best, equal = storage_tables([*rows, *skipped], at=3.2)
     assert best.startswith("case: AUC\n")
+    best, _, rest = best.rpartition("1 - AUC of dejavu")
+    assert f"{storage.missed(rows)['case']:.2f}" in rest
     assert best.split()[-16:] == [
         *("dejavu", "0.500", "0.500", "0.750", "0.750", "0.750"),
         *("other", "0.400", "0.400", "0.400", "0.400", "0.800"),
