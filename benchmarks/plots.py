@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
@@ -23,14 +24,22 @@ _GROWTH = {
 _OTHERS = ("#222222", "#e07b00", "#c21f0a", "#10b248", "#b43cff", "#f2b80f", "#7a4a1f")
 FAMILIES = {  # of `plot_frontiers`: colour and line
     "dejavu": (OURS, "-"),
-    "dejavu, given": ("#00406b", "--"),
+    "dejavu, given maps": ("#00406b", "--"),
     "null": (COLOURS["null"], ":"),
     "frames": (COLOURS["stride"], "-"),
     "interpolated": (COLOURS["interpolated"], "-"),
     "PCA": ("#10b248", "-"),
     "binary": ("#785567", "-"),
-    "PQ, codebooks of another route": ("#c21f0a", "-"),
-    "PQ, own codebooks": ("#f28e6b", "--"),
+    "PQ": ("#c21f0a", "-"),
+    "OPQ": ("#c21f0a", "--"),
+    "RQ": ("#e07b00", "-"),
+    "LSQ": ("#e07b00", "--"),
+    "PRQ": ("#e07b00", ":"),
+    "PQ, own codebooks": ("#f28e6b", "-"),
+    "OPQ, own codebooks": ("#f28e6b", "--"),
+    "TurboQuant": ("#b43cff", "-"),
+    "RaBitQ": ("#7a4a1f", "-"),
+    "EDEN": ("#7a4a1f", ":"),
     "video": ("#56b4e9", "-"),
     "the paper": (COLOURS["paper"], "-"),
 }
@@ -147,7 +156,7 @@ def plot_frontiers(
     """
     names = list(dict.fromkeys(name for families in cases.values() for name in families))
     panels = [share for case in cases for share in ([1.0, 0.6] if case in whitenings else [1.0])]
-    height = 3.0 * sum(panels) + 1.1 * LINE * len(names)
+    height = 3.0 * sum(panels) + 1.1 * LINE * math.ceil(len(names) / 2)
     figure, axes = canvas(height, len(panels), squeeze=False, height_ratios=panels)
     column = iter(axes[:, 0])
     shown = []
@@ -172,7 +181,8 @@ def plot_frontiers(
         if case in whitenings:
             _plot_whitenings(next(column), whitenings[case])
     lines = {text: h for a in shown for h, text in zip(*a.get_legend_handles_labels(), strict=True)}
-    figure.legend([lines[name] for name in names], names, loc="outside lower left", frameon=False, fontsize=9)
+    style = {"loc": "outside lower left", "frameon": False, "fontsize": 9, "ncols": 2}
+    figure.legend([lines[name] for name in names], names, **style)
     return figure, axes[:, 0]
 
 

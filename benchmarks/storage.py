@@ -329,7 +329,7 @@ def stores_of(route: Route) -> Iterator[Contender]:
         return every_kth(places, k, code.each, code, k > 1, book)._replace(fixed=fixed)
 
     for own, (family, keys) in product((False, True), CODES.items()):
-        of = f"{family}, {'own codebooks' if own else 'codebooks of another route'}"
+        of = family + ", own codebooks" * own  # those of another route count nothing
         for (key, multiple, learned), k in product(keys, CODE_SPACED):
             width = -(-numbers // multiple) * multiple
             book = own * width * (learned + (width if family == "OPQ" else 0))
