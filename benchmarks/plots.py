@@ -164,7 +164,7 @@ def plot_frontiers(
         axis = next(column)
         shown.append(axis)
         for name, points in reversed(list(families.items())):  # ours, the first, on top
-            colour, line = FAMILIES.get(name, (GREY, "-"))
+            colour, line = FAMILIES.get(name) or FAMILIES.get(name.partition(",")[0], (GREY, "-"))
             ours = name.startswith("dejavu")
             style = {"color": colour, "linestyle": line, "linewidth": 3 if ours else 1.4}
             sizes, areas = zip(*points, strict=True)

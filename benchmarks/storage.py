@@ -51,7 +51,7 @@ COMPONENTS, COMPONENT_SPACED = (2, 4, 8, 16, 32), (1, 2, 5, 10)
 CODE_SPACED = (1, 2, 3, 4, 5, 8)
 BIT_SPACED = (1, 2, 3, 4, 5, 8, 10, 16)
 QUALITIES, VIDEO_SPACED = (24, 32, 40, 51), (1, 4, 8)  # crf
-CODES = {  # keys of faiss's factory by their bytes, and numbers of the codebooks over those of a descriptor
+CODES = {  # keys of faiss's factory, what K must be a multiple of, and numbers of the codebooks for each of K
     "PQ": [(f"PQ{m}x8np", m, 256) for m in (4, 8, 16, 32)],
     "OPQ": [(f"OPQ{m},PQ{m}x8np", m, 256) for m in (4, 8, 16, 32)],
     "RQ": [(f"RQ{m}x8", 1, 256 * m) for m in (4, 8, 16)],
@@ -59,10 +59,10 @@ CODES = {  # keys of faiss's factory by their bytes, and numbers of the codebook
     "PRQ": [(f"PRQ2x{m // 2}x8", 2, 128 * m) for m in (8, 16)],
 }
 MOST = 32  # route bytes per place of codebooks that count; larger ones are a row without figures
-ROTATED = {  # keys of codes without codebooks, behind a rotation, and axes that it keeps: none, if by chance
-    "TurboQuant": [(f"PCAR{n},SQtqmse1", n) for n in (32, 64, 128)],
-    "RaBitQ": [("PCAR64,RaBitQ", 64), ("RR{},RaBitQ", 0)],
-    "EDEN": [("PCAR64,EDEN", 64), ("RR{},EDEN", 0)],
+ROTATED = {  # keys of codes without codebooks, axes that count, bytes of a code that decoding does not read
+    "TurboQuant": [(f"PCAR{n},SQtqmse1", n, 0) for n in (32, 64, 128)],
+    "RaBitQ": [("PCAR64,RaBitQ", 64, 4), ("RR{},RaBitQ", 0, 4)],
+    "EDEN": [("PCAR64,EDEN", 64, 4), ("RR{},EDEN", 0, 4)],
 }
 BUILT_IN = {"aerial": (3072, 10_000), "outdoor": (0,), "underground": (0,)}  # frames, 0 the whole route
 WHITENINGS: dict[str, dict[str, Any]] = {  # other settings than the defaults
@@ -80,6 +80,7 @@ KEYS = (
     *("recall_at_1", "auc", "sequences", "ratio_to_ours", "skipped"),
 )
 OURS, NULL, OTHERS, GIVEN = "dejavu", "null", "dejavu, other whitenings", "dejavu, given maps"
+PAPER = "the paper"
 LEAST_MISSED = 0.002  # 1 - AUC of a store that is as good as perfect: below it single queries decide
 
 Answer = tuple[Match, int, int]  # what a contender finds, its bytes that grow with the route, and all others
@@ -151,6 +152,8 @@ def run_storage(
     if truth is not None and len(sources) != 2:
         raise InputError(f"--truth is of one pair, and there are {len(sources)} sources; expected 2")
     given = {path.stem: DejaVu.load(path) for path in map}
+    if len(given) < len(map):
+        raise InputError(f"--map {' '.join(str(path) for path in map)}; expected files of different names")
     shared = None if whitening is None else DejaVu.load(whitening)
     rows: list[Row] = []
     for row in bench_storage(sources, places, codebooks, given, shared, truth, tolerance):
@@ -279,7 +282,7 @@ def contenders_of(route: Route, given: Mapping[str, DejaVu] | None = None) -> It
         yield ready(f"dejavu, {name}", GIVEN, partial(by_map, route, partial(lambda one: one, model)))
     # template means of the features themselves at frequencies found in them, frame by frame
     paper = partial(by_map, route, lambda: paper_model().learn(route.reference))
-    yield ready("the paper", "the paper", paper)
+    yield ready(PAPER, PAPER, paper)
 
 
 def ready(name: str, family: str, answer: Callable[[], Answer]) -> Contender:
@@ -321,12 +324,14 @@ def stores_of(route: Route) -> Iterator[Contender]:
     def quantiser(key: str, multiple: int, own: bool) -> Quantiser:
         return Quantiser(places if own else elsewhere(), key, multiple)
 
-    def coded(key: str, multiple: int, k: int, own: bool, book: int = 0, fixed: int = 0) -> Kept:
+    def coded(
+        key: str, multiple: int, k: int, own: bool, book: int = 0, fixed: int = 0, unread: int = 0
+    ) -> Kept:
         if book > MOST * len(places):
             each = f"{book / len(places):.0f} bytes a place"
             raise InputError(f"codebooks of the route take {each}; tried up to {MOST}")
         code = quantiser(key, multiple, own)
-        return every_kth(places, k, code.each, code, k > 1, book)._replace(fixed=fixed)
+        return every_kth(places, k, code.each - unread, code, k > 1, book)._replace(fixed=fixed)
 
     for own, (family, keys) in product((False, True), CODES.items()):
         of = family + ", own codebooks" * own  # those of another route count nothing
@@ -335,9 +340,9 @@ def stores_of(route: Route) -> Iterator[Contender]:
             book = own * width * (learned + (width if family == "OPQ" else 0))
             yield store(of, named(key, k) + ", own codebooks" * own, coded, key, multiple, k, own, book)
     for family, keyed in ROTATED.items():
-        for (key, axes), k in product(keyed, CODE_SPACED):
+        for (key, axes, unread), k in product(keyed, CODE_SPACED):
             key, fixed = key.format(numbers), numbers * (axes + 4)
-            yield store(family, named(key, k), coded, key, 1, k, True, fixed=fixed)
+            yield store(family, named(key, k), coded, key, 1, k, True, fixed=fixed, unread=unread)
     for codec, crf, k in product(("libx264", "libx265"), QUALITIES, VIDEO_SPACED):
         name = f"{codec[3:]}, crf {crf}, {every(k, 'frame')}{', interpolated' * (k > 1)}"
         yield store("video", name, video, route, codec, crf, k)
@@ -481,21 +486,23 @@ def equal_areas(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 def missed(rows: Sequence[Row]) -> dict[str, float]:
     """1 - AUC of ours over that of the best rival with as many bytes, for each case: the geometric mean over
-    1 to 5 route bytes per place. Rivals are all stores of the same descriptors but the null."""
+    1 to 5 route bytes per place. Rivals are the stores of the same descriptors but the null."""
     found = {}
     for case, own in by("case", rows).items():
         known = families(own)
-        rivals = [row for name, some in known.items() if name not in (OURS, NULL, GIVEN) for row in some]
+        rivals = [
+            row for name, some in known.items() if name not in (OURS, NULL, GIVEN, PAPER) for row in some
+        ]
         pair = (known.get(OURS, []), rivals)
         sizes = [size for size in SHOWN if size <= WHITENED]
-        left = [[max(LEAST_MISSED, 1 - best(some, size)) for size in sizes] for some in pair]
+        left = [[max(LEAST_MISSED, 1 - (best(some, size) or 0.0)) for size in sizes] for some in pair]
         found[case] = math.prod(a / b for a, b in zip(*left, strict=True)) ** (1 / len(sizes))
     return found
 
 
-def best(rows: Sequence[Row], size: float) -> float:
-    """The largest area that takes so many route bytes per place, 0 if none does."""
-    return max((auc for taken, auc in front(rows) if taken <= NEAR * size), default=0.0)
+def best(rows: Sequence[Row], size: float) -> float | None:
+    """The largest area that takes so many route bytes per place, if any does."""
+    return max((auc for taken, auc in front(rows) if taken <= NEAR * size), default=None)
 
 
 def whitenings(rows: Sequence[Row]) -> dict[str, list[tuple[str, int, float]]]:
@@ -530,8 +537,8 @@ def storage_tables(rows: Sequence[Row], at: float = AT) -> Iterator[str]:
         table = [["route bytes per place:", *(f"{budget:g}" for budget in SHOWN)]]
         for name, some in families(own).items():
             areas = (best(some, size) for size in SHOWN)
-            table.append([name, *(f"{area:.3f}" if area else "" for area in areas)])
-        rest = f"1 - AUC of dejavu over that of the best rival, at 1 to 5 bytes: {missed(own)[case]:.2f}"
+            table.append([name, *("" if area is None else f"{area:.3f}" for area in areas)])
+        rest = f"(1 - AUC) of dejavu / (1 - AUC) of the best rival, at 1 to 5 bytes: {missed(own)[case]:.2f}"
         yield f"{printable(case)}: AUC\n{text_table(table)}\n{rest}\n"
         ours = {T: front(families(own).get(OURS, ()), T) for T in LENGTHS}
         near = {T: [auc for size, auc in points if size <= NEAR * at] for T, points in ours.items()}

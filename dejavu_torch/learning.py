@@ -440,10 +440,8 @@ def fit(
     rows = describer.reference(Selection(traverse, sample.frame), own, progress and "sampling")
     if visits is not None:
         rows = describer.averaged(rows, shown_of(visits, sample.frame))
-    # of what the file holds once, the sample pays its share alone
-    share, once = len(rows) / frames, 2 * rows.shape[1]
-    counted = round(share * mapper.overhead - (1 - share) * once)
-    fitted = mapper.with_overhead(counted).fit(rows, sample.stretch)
+    share = len(rows) / frames  # of what the file holds once, the sample pays its share alone
+    fitted = mapper.with_overhead(round(share * mapper.overhead)).fit(rows, sample.stretch, share)
     return fitted.to(describer.device)
 
 

@@ -123,7 +123,7 @@ def test_every_command_on_pretrained_networks_is_understood() -> None:
     (road,) = re.findall(r"^road=\((.*)\)$", text, re.MULTILINE)
     text = text.replace("$lite", lite).replace('"${road[@]}"', road)
     shown = re.findall(r"^dejavu .*$", text, re.MULTILINE)
-    assert len(shown) == 7
+    assert len(shown) == 6
     for line in shown:
         understand(line)
 

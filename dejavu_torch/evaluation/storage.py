@@ -73,8 +73,9 @@ def noise_over_map(route: SpectralMap, features: Tensor, seed: int = 0) -> float
     noise = from_spectrum(energy.sqrt() * normal.to(energy), route.transform).T + route.means[0].float()
     settings = route.chunk, route.transform, route.metric, route.resolution
     mapper = SpectralMapper(None, float(route.steps.mean()), *settings)
-    streams = [one.packed()["streams"].nbytes for one in (mapper(noise), route)]
-    return streams[0] / streams[1]
+    packed = [one.packed() for one in (mapper(noise), route)]
+    taken = [one["streams"].nbytes + one["means"].nbytes for one in packed]
+    return taken[0] / taken[1]
 
 
 def _coded(

@@ -68,15 +68,16 @@ class RouteLines:
         mean: Tensor | None = None,
     ) -> None:
         places, numbers = features.shape
+        self.left = 0.0  # energy of a mean that is among the lines
         self.rows = max(1, BLOCK // numbers)
         if mean is None:
             sums, power = features.new_zeros(numbers, dtype=torch.float64), 0.0
             for part in features.split(self.rows):
                 sums += part.float().mean(0).double() * len(part)
                 power += float(part.float().square().sum()) / places
-            mean = (sums / places).to(torch.bfloat16)
-            if float(mean.double().square().sum()) < SMALL * power:
-                mean = torch.zeros_like(mean)
+            mean, square = (sums / places).to(torch.bfloat16), float((sums / places).square().sum())
+            if square < SMALL * power:
+                mean, self.left = torch.zeros_like(mean), places * square
         self.mean = mean
         self.chunks = [*pairwise(accumulate(lengths, initial=0))]
         self.lines = empty(places, numbers, features.device)
@@ -134,8 +135,8 @@ class RouteLines:
 
     @cached_property
     def energy(self) -> float:
-        """The sum of the squares of the lines."""
-        return sum(float(part.square().sum()) for part in self.lines.split(self.rows))
+        """The sum of the squares of the lines, without those of a mean among them."""
+        return sum(float(part.square().sum()) for part in self.lines.split(self.rows)) - self.left
 
     @property
     def scale(self) -> float:

@@ -111,9 +111,12 @@ class SpectralMapper(Mapper):
         return route
 
     @torch.no_grad()
-    def fit(self, sample: Tensor, stretch: int) -> SpectralMap:
-        """A map without places: mean and step for chunks of a route, from descriptors (n,K) of stretches."""
-        return self._fitted(sample, stretch)[0]
+    def fit(self, sample: Tensor, stretch: int, share: float = 1.0) -> SpectralMap:
+        """A map without places: mean and step for chunks of a route, from descriptors (n,K) of stretches.
+
+        share: of the places of the route that are in the sample, which pays as much of the mean.
+        """
+        return self._fitted(sample, stretch, share)[0]
 
     def empty(self) -> SpectralMap:
         return self._map()
@@ -130,7 +133,7 @@ class SpectralMapper(Mapper):
         names = ("route_bytes_per_place", "step", "chunk", "transform", "metric", "resolution", "hold")
         return ", ".join(f"{name}={getattr(self, name)!r}" for name in names)
 
-    def _fitted(self, features: Tensor, chunk: int) -> tuple[SpectralMap, RouteLines]:
+    def _fitted(self, features: Tensor, chunk: int, share: float = 1.0) -> tuple[SpectralMap, RouteLines]:
         """The map without places, and the lines to code in its step."""
         check_descriptors(features)
         places = len(features)
@@ -138,7 +141,7 @@ class SpectralMapper(Mapper):
         lines = RouteLines(features, lengths, self.transform, self.resolution)
         if not lines.scale > 1e-6 * float(lines.mean.float().square().mean().sqrt()):
             raise InputError(f"the {places} descriptors are all alike; expected a route that changes")
-        fixed = lines.mean_bytes + CHUNK_BYTES * len(lines.chunks)
+        fixed = round(share * lines.mean_bytes) + CHUNK_BYTES * len(lines.chunks)
         budget = self.route_bytes_per_place
         if budget is not None:
             if self.overhead <= max(0, budget * places - fixed) / 2:

@@ -464,7 +464,7 @@ class SpectralMap(PlaceMap):
     def loaded(self) -> None:
         """Decode the chunks of a file, and give its routes the means 0 that it leaves out."""
         chunks, visits = self.coded(), self.visits
-        if chunks and not len(self.means):
+        if self.dimension and not len(self.means):
             self.means = self.means.new_zeros(max(1, len(self.routes)), self.dimension)
         self._clear()
         self.extend(chunks)

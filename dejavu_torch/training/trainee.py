@@ -192,6 +192,8 @@ class Trainee(pl.LightningModule):
         whitening = self.dejavu.whitening
         numbers = dimension if whitening is None else whitening.kept(places, dimension, True)
         descriptors = torch.randn(places, numbers, generator=torch.Generator().manual_seed(0))
+        if whitening is None:
+            descriptors += 1  # a mean that takes bytes
         wanted = getattr(mapper, "route_bytes_per_place", None)
         gives_way, self.gives_way = self.gives_way, False  # it is settled
         try:

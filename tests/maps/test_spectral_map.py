@@ -104,11 +104,26 @@ def test_a_mean_that_is_next_to_nothing_takes_no_bytes() -> None:
         again = SpectralMap()
         again.load_packed(one.packed(), one.get_extra_state())
         assert torch.equal(again.scores(centred[:9]), one.scores(centred[:9]))
+    wide = [SpectralMapper(hold=0.85)(centred + shift * size) for shift in (0, 0.2)]
+    missed = [
+        (centred + shift * size - held(one)).square().sum() for one, shift in zip(wide, (0, 0.2), strict=True)
+    ]
+    shares = [1 - float(error / centred.square().sum()) for error in missed]
+    assert shares == pytest.approx([0.85, 0.85], abs=0.003)  # of the variance, which has no mean
     both = [SpectralMap.merged(pair, ("a", "b")) for pair in (maps[:2], maps[1:])]
     assert [len(one.packed()["means"]) for one in both] == [0, 2]
     again = SpectralMap()
     again.load_packed(both[0].packed(), both[0].get_extra_state())
     assert torch.equal(again.part("b").decode(0), maps[1].decode(0))
+
+
+@pytest.mark.parametrize("shift", [0.0, 1.0])
+def test_a_sample_pays_its_share_of_a_mean(shift: float) -> None:
+    features = route(400, 12) - route(400, 12).mean(0) + shift
+    mapper = SpectralMapper(6.0)
+    whole, part = (mapper.fit(features, 400, share).step for share in (1.0, 0.1))
+    assert (part < whole) == bool(shift)
+    assert part == whole or shift
 
 
 def test_a_map_that_was_loaded_is_saved_without_coding_anew(
