@@ -55,8 +55,8 @@ MUTANTS = [
         "The route's bytes stay within route_bytes_per_place with many chunks too: the header of every "
         "chunk counts.",
         "dejavu_torch/maps/spectral.py",
-        "fixed = lines.mean.nbytes + CHUNK_BYTES * len(lines.chunks)",
-        "fixed = lines.mean.nbytes + CHUNK_BYTES",
+        "fixed = round(share * lines.mean_bytes) + CHUNK_BYTES * len(lines.chunks)",
+        "fixed = round(share * lines.mean_bytes) + CHUNK_BYTES",
         ("tests/maps/test_spectral.py::-k budget and not summary",),
     ),
     Mutant(
