@@ -50,7 +50,7 @@ def test_order_saves_bytes_and_most_of_all_where_they_are_few(report: dict[str, 
     map, null, interpolated = (report["storage"][name] for name in ("map", "null", "interpolated"))
     assert len(map) == len(null) == 5
     assert map[0]["auc"] > 0.95
-    assert max(null[0]["auc"], interpolated[0]["auc"]) < 0.25
+    assert max(null[0]["auc"], interpolated[0]["auc"]) < 0.3
     text = " ".join(README.read_text().split())
     found = re.search(r"takes (\d+) to (\d+) times the bytes", text)
     assert found is not None
