@@ -181,8 +181,8 @@ def plot_frontiers(
         if case in whitenings:
             _plot_whitenings(next(column), whitenings[case])
     lines = {text: h for a in shown for h, text in zip(*a.get_legend_handles_labels(), strict=True)}
-    style = {"loc": "outside lower left", "frameon": False, "fontsize": 9, "ncols": 2}
-    figure.legend([lines[name] for name in names], names, **style)
+    handles = [lines[name] for name in names]
+    figure.legend(handles, names, loc="outside lower left", frameon=False, fontsize=9, ncols=2)
     return figure, axes[:, 0]
 
 
