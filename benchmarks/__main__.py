@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from benchmarks import cluster, live, matcher, memory, scale, storage, train, trainings
+from benchmarks import cluster, distil, live, matcher, memory, scale, storage, train, trainings
 from dejavu_torch.cli import errors_of_one_line, fail, main
 from dejavu_torch.cli.parser import command_parser
 from dejavu_torch.data.output import check_output_folder
@@ -17,6 +17,7 @@ BENCHES: dict[str, Any] = {  # each returns what is to be printed
     "storage": storage.run_storage,
     "train": train.run_train,
     "trainings": trainings.run_trainings,
+    "distil": distil.run_distil,
     "live": live.run_live,
     "memory": memory.run_memory,
     "scale": scale.run_scale,

@@ -12,6 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dejavu_torch.data.arrays import as_traverse
+from dejavu_torch.data.frame_range import chained
 from dejavu_torch.data.ground_truth import find_ground_truth
 from dejavu_torch.data.names import names_of
 from dejavu_torch.data.positions import positions_behind
@@ -238,14 +239,26 @@ def associate(model: DejaVu, reference: Traverse | None, second: Traverse, truth
     return Views(second, places)
 
 
-def second_traverse(model: DejaVu, reference: Traverse, second: Traverse, truth: str | None = None) -> Views:
-    """As `associate`, for the whitening to learn from.
+def second_traverse(
+    model: DejaVu,
+    reference: Traverse,
+    second: Traverse | Sequence[Traverse],
+    truth: str | Sequence[str | None] | None = None,
+) -> Views:
+    """As `associate`, for the whitening to learn from; of several, with a truth for each or one for all.
 
     Raises:
-        InputError: no whitening that could learn from it, or as `associate`.
+        InputError: no whitening that could learn from it, truths of another number, traverses with frames of
+            other sizes, or as `associate`.
     """
-    model.describer.require_learning(second.name)
-    return associate(model, reference, second, truth)
+    visits = [second] if isinstance(second, Traverse) else [*second]
+    model.describer.require_learning(" + ".join(one.name for one in visits))
+    truths = [truth] * len(visits) if isinstance(truth, str | None) else [*truth]
+    if len(truths) != len(visits):
+        seen = f"{len(visits)} further traverses and {len(truths)} truths"
+        raise InputError(f"{seen}; expected one for each, or one for all")
+    views = [associate(model, reference, *pair) for pair in zip(visits, truths, strict=True)]
+    return Views(chained([one.traverse for one in views]), torch.cat([one.places for one in views]))
 
 
 def calibrate_if_possible(

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from dejavu_torch.data.names import decode_names, encode_names
 from dejavu_torch.features.cnn import SmallCNN
+from dejavu_torch.features.distilled import Distilled
 from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.joined import Joined
@@ -60,6 +61,7 @@ CLASSES: tuple[type[nn.Module], ...] = (
     Preprocess,
     HOG,
     PatchPixels,
+    Distilled,
     SmallCNN,
     Embedding,
     Joined,

@@ -191,6 +191,23 @@ def test_compare_learns_its_whitening_from_a_third_traverse(folder: Path) -> Non
     assert report_of(out)["kind"] == "spectral"
 
 
+def test_whitening_learns_from_several_visits(folder: Path) -> None:
+    fourth = ROUTE + "&traverse=3"
+    both = f"['{THIRD}','{fourth}']"
+    given = {
+        "both": (both,),
+        "one": (THIRD,),
+        "named": (both, "--second_truth", f"[null,'{folder}/fourth.csv']"),
+    }
+    (folder / "fourth.csv").write_text("\n".join(f"{i},{i}" for i in range(40)))
+    for name, words in given.items():
+        run("learn", ROUTE, "--map", folder / f"{name}.safetensors", "--second", *words)
+    assert not same_maps(folder / "both.safetensors", folder / "one.safetensors")
+    assert not same_maps(folder / "both.safetensors", folder / "named.safetensors")  # of the fourth 40 frames
+    run("compare", ROUTE, SECOND, "--map", folder / "both.safetensors", "--out", folder / "of_both")
+    assert report_of(folder / "of_both")["recall_at_1"] > 0.9
+
+
 def test_a_route_of_noise_says_what_it_needs(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source, options = folder / "noise.npy", ("--whitening", "none")
     budget = "--mapper.route_bytes_per_place", "1"
@@ -256,6 +273,10 @@ def test_a_map_that_holds_a_share(folder: Path, capsys: pytest.CaptureFixture[st
         ("--second_truth 0", ("--second_truth 0", "--second SOURCE")),
         ("--second c.npy --second_truth 70", ("no query has a right answer",)),
         ("--second b.npy --whitening none", ("no whitening", "b.npy")),
+        ("--second []", ("no traverses", "at least one")),
+        ("--second [b.npy,./b.npy]", ("--second ./b.npy is b.npy itself",)),
+        ("--second [b.npy,a.npy]", ("--second a.npy is a.npy itself",)),
+        ("--second [b.npy,c.npy] --second_truth [0,0,0]", ("2 further traverses and 3 truths",)),
         ("--filter", ("unrecognized arguments: --filter",)),
     ],
 )

@@ -28,6 +28,7 @@ from dejavu_torch import (
     Whitening,
 )
 from dejavu_torch.features.cnn import SmallCNN
+from dejavu_torch.features.distilled import Distilled
 from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.preprocess import VALUES_AT_ONCE
@@ -79,6 +80,7 @@ MODELS: dict[str, Callable[[], DejaVu]] = {
     "patches": partial(templates, HOG, preprocess=Preprocess("R-B", "patch")),
     "spectral": partial(spectral, HOG),
     "spectral Embedding": partial(spectral, embedding),
+    "HOG and Distilled": partial(spectral, lambda: Joined([HOG(), Distilled()])),
     "joined": partial(spectral, lambda: Joined([HOG(), PatchPixels(channel="grey"), embedding()])),
     "in parts": partial(spectral, HOG, (64, 64)),  # eagerly HOG takes 42 frames of this size at a time
     "spectral chunks": partial(whitened, chunk=25),

@@ -122,8 +122,8 @@ def test_every_command_on_pretrained_networks_is_understood() -> None:
     (lite,) = re.findall(r'^lite="(.*)"$', text, re.MULTILINE)
     (road,) = re.findall(r"^road=\((.*)\)$", text, re.MULTILINE)
     text = text.replace("$lite", lite).replace('"${road[@]}"', road)
-    shown = re.findall(r"^dejavu .*$", text, re.MULTILINE)
-    assert len(shown) == 6
+    shown = re.findall(r"^(?:dejavu|python -m benchmarks) .*$", text, re.MULTILINE)
+    assert len(shown) == 9
     for line in shown:
         understand(line)
 

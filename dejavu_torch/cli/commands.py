@@ -36,6 +36,7 @@ from dejavu_torch.cli.options import (
     Sequences,
     load_map,
     named_features,
+    several,
 )
 from dejavu_torch.data.frame_range import chained
 from dejavu_torch.data.output import check_output_file, check_output_folder, whole_folder
@@ -67,19 +68,25 @@ APART = 5  # places: any two candidates of a query are further apart
 
 
 def run_demo(
-    *, out: Path = Path("dejavu_demo"), seed: int = 0, second: str | None = None, model: DejaVu, command: str
+    *,
+    out: Path = Path("dejavu_demo"),
+    seed: int = 0,
+    second: list[str] | str | None = None,
+    model: DejaVu,
+    command: str,
 ) -> None:
     """The main job on the built-in route: learn, localize a second traverse, report.
 
     Args:
         out: folder for report and pictures
         seed: which route, and of the whitening and the null control
-        second: another traverse of the route, from which whitening learns what a visit changes
+        second: another traverse of the route, or several, '[A,B]', from which whitening learns what a visit
+            changes
     """
     from dejavu_torch.evaluation.compare import compare
     from dejavu_torch.evaluation.reproduce import paper_model
 
-    _check_report_folder(out, COMPARED, [second])
+    _check_report_folder(out, COMPARED, several(second))
     given = Learning(seed, second)
     given.seed_whitening(model)
     learned, localized = f"sim:aerial?seed={seed}", f"sim:aerial?seed={seed}&traverse=1"
@@ -327,8 +334,10 @@ def run_compare(
         model.threshold = None  # it is of the filter's probabilities, and none for the map to keep
     searching.of(model.to(where))
     first, queries = open_source(reference), open_source(query)
-    _check_report_folder(out, COMPARED, [reference, query, learning.second], [judging.truth, *learning.files])
-    beside = [open_source(one) for one in (learning.second, learning.calibration) if one not in UNREAD]
+    read = [reference, query, *several(learning.second)]
+    _check_report_folder(out, COMPARED, read, [judging.truth, *learning.files])
+    others = *several(learning.second), learning.calibration
+    beside = [open_source(one) for one in others if one not in UNREAD]
     strange = judging.off_map([first, queries, *beside])
     if map is None:
         learning.check_precision(model, first)

@@ -207,8 +207,9 @@ class Learning:
 
     Args:
         seed: of the whitening, if it has none of its own, and of the null control
-        second: another traverse of the places, from which whitening learns what a visit changes
-        second_truth: places that it shows, as --truth of `dejavu compare`
+        second: another traverse of the places, or several, '[A,B]', from which whitening learns what a visit
+            changes
+        second_truth: places that it shows, as --truth of `dejavu compare`; of several, '[A,B]' or one of all
         descriptor: file whose features are taken, as `dejavu train` makes, or a map
         calibration: a further traverse, which tells how probably answers are right, or none; changed frames
             of the route if not given
@@ -217,8 +218,8 @@ class Learning:
     """
 
     seed: int = 0
-    second: str | None = None
-    second_truth: str | None = None
+    second: list[str] | str | None = None
+    second_truth: list[str | int | None] | str | None = None
     descriptor: Path | None = None
     calibration: str | None = None
     calibration_truth: str | None = None
@@ -227,7 +228,8 @@ class Learning:
     @property
     def files(self) -> list[Any]:
         """What is read."""
-        return [self.second, self.second_truth, self.descriptor, self.calibration, self.calibration_truth]
+        given = [*several(self.second), *map(str, several(self.second_truth))]
+        return [*given, self.descriptor, self.calibration, self.calibration_truth]
 
     def seed_whitening(self, model: DejaVu) -> None:
         """The command's seed for a whitening that is to be learned and has none of its own."""
@@ -237,13 +239,18 @@ class Learning:
     def with_second(
         self, model: DejaVu, reference: Traverse, query: Traverse | None = None
     ) -> tuple[Traverse, Views | None]:
-        """The reference, and the second traverse that whitening learns from."""
+        """The reference, and the further traverses that whitening learns from."""
         if self.second is None:
             check_no_truth("second", self.second_truth)
             return reference, None
-        traverse = open_another("second", self.second, [query])
+        traverses: list[Traverse] = []
+        for source in several(self.second):
+            others = query, *parts_of(source_of(reference)), *traverses
+            traverses.append(open_another("second", source, others))
         reference = model.resample(reference, progress=True, shape=model.frame_shape)
-        return reference, growth.second_traverse(model, reference, traverse, self.second_truth)
+        truths = [None if one is None else str(one) for one in several(self.second_truth)]
+        truth = truths if len(truths) > 1 else (truths or [None])[0]
+        return reference, growth.second_traverse(model, reference, traverses, truth)
 
     def with_calibration(
         self, model: DejaVu, reference: Reference, query: Traverse | None = None
@@ -255,7 +262,7 @@ class Learning:
             return reference, None
         others: list[Traverse | None] = [query]
         others += [] if reference is None else parts_of(source_of(reference))
-        others += [] if self.second is None else [open_source(self.second)]
+        others += [open_source(one) for one in several(self.second)]
         traverse = open_another("calibration", source, others)
         if reference is not None:
             reference = model.resample(reference, model.step, True, model.frame_shape)
@@ -350,14 +357,18 @@ class Judging:
 
     def off_map(self, traverses: Collection[Traverse]) -> list[Traverse]:
         """The distractors, none of which may be one of the traverses."""
-        given = [self.distractors] if isinstance(self.distractors, str) else self.distractors or []
-        return [open_another("distractors", one, traverses) for one in given]
+        return [open_another("distractors", one, traverses) for one in several(self.distractors)]
 
 
-def check_no_truth(option: str, truth: str | None) -> None:
+def check_no_truth(option: str, truth: object) -> None:
     """Refuse a truth of a traverse that is not given."""
     if truth is not None:
         raise InputError(f"--{option}_truth {truth} is of no traverse; expected --{option} SOURCE with it")
+
+
+def several(given: Any) -> list[Any]:
+    """What an option names that takes one or several."""
+    return [] if given is None else [*given] if isinstance(given, list) else [given]
 
 
 def open_another(option: str, source: str, others: Iterable[Traverse | None]) -> Traverse:

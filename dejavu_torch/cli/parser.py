@@ -42,7 +42,7 @@ HINT = (
     "Parts have options of their own, such as --whitening.numbers 64, --mapper.route_bytes_per_place 2.5 "
     "or, of HOG alone, --features.cell 4: see --features.help HOG, --whitening.help, --mapper.help "
     "SpectralMapper, --preprocess.help and --velocity.help. --config local_maxima makes a map of templates, "
-    "with options such as --mapper.periods.window 512. --features '[HOG, PatchPixels]' joins the features of "
+    "with options such as --mapper.periods.window 512. --features '[HOG, Distilled]' joins the features of "
     "several. --features hub:megaloc is a pretrained network: it downloads and runs code from GitHub. "
     "--whitening also takes none, or a map file, with the features that it was learned from; --descriptor "
     "takes those alone, from a map or from what `dejavu train` makes of several routes."

@@ -152,7 +152,7 @@ class Chain(Traverse):
             if other.frame_shape != first.frame_shape:
                 own, expected = (" x ".join(map(str, one.frame_shape)) for one in (other, first))
                 seen = f"{other.name} has frames of {own}"
-                raise InputError(f"{seen}; expected {expected} as {first.name}, which it follows")
+                raise InputError(f"{seen}; expected {expected}, as those of {first.name}")
         self.name = " + ".join(one.name for one in self.traverses)
         self.seeks = all(one.seeks for one in self.traverses)
         self.sized = any(one.sized for one in self.traverses)

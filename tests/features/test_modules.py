@@ -10,6 +10,7 @@ from torch import nn
 from dejavu_torch import HOG, GroundOdometry, ImposedPeriods, Preprocess, SpectrogramAnalysis, Whitening
 from dejavu_torch.features import preprocess
 from dejavu_torch.features.cnn import SmallCNN
+from dejavu_torch.features.distilled import Distilled
 from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.model_file import build, recipe_of
@@ -20,6 +21,7 @@ MODULES: dict[str, nn.Module] = {
     "pixels": PatchPixels((16, 24), patch=4),
     "grey pixels": PatchPixels((16, 24), 4, "grey"),
     "joined": Joined([HOG(), PatchPixels((16, 24), channel="grey")]),
+    "distilled": Distilled(grid=2),
     "network": SmallCNN(dimension=6, resize=(16, 24), widths=[4, 6]).eval(),
     "grey": Preprocess("grey"),
     "patches": Preprocess(contrast="patch"),

@@ -22,7 +22,7 @@ FILE = Path(__file__).parent / "options.json"
 # the classes whose arguments are options of a part, as YAML files name them
 PARTS = (
     *("HOG", "Embedding", "features.pixels.PatchPixels", "features.cnn.SmallCNN", "features.joined.Joined"),
-    *("features.augmentation.Augmentation", "training.losses.Objective"),
+    *("features.distilled.Distilled", "features.augmentation.Augmentation", "training.losses.Objective"),
     *("Preprocess", "Whitening", "GroundOdometry", "SpectralMapper", "TemplateMapper"),
     *("SpectrogramAnalysis", "periods.imposed.ImposedPeriods"),
 )

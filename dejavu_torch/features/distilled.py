@@ -1,0 +1,100 @@
+"""What the first blocks of an ImageNet network see, from a network that is small enough for the package."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import load_file
+from torch import Tensor, nn
+from torch.nn.functional import adaptive_avg_pool2d, conv2d
+
+from dejavu_torch.features.preprocess import check_frames
+from dejavu_torch.resize import resize_frames
+from dejavu_torch.text import settings_of
+from dejavu_torch.types import InputError
+
+SIZE = (96, 96)  # pixels of the frames that it was trained on
+STRIDES = (2, 2, 2, 1, 1)  # of its convolutions
+WIDEST = 12  # cells along a side of its maps
+WEIGHTS = {"lite0": Path(__file__).with_name("lite0.safetensors")}
+
+
+class Distilled(nn.Module):
+    """Textures and colours, where HOG has edges, as the first blocks of an ImageNet network see them.
+
+    Convolutions that were trained on drawn images to give what the first four blocks of EfficientNet-Lite0
+    (Tan and Le, ICML 2019) give after training on ImageNet, averaged over a grid.
+
+    Args:
+        grid: cells along each side of the frame, at most 12.
+        weights: "lite0", so far the only ones, which `python -m benchmarks distil` makes. They come with the
+            package, 8 bits each; a map file holds their checksum alone, and no training changes them.
+
+    Shape: (B,C,H,W) float in [0, 1] -> (B, 40 x grid^2).
+
+    Convention: frames are resized to 96 x 96; those of 2, or of more than 3, channels are averaged to grey.
+
+    Raises:
+        InputError: settings out of range; forward: frames that are not (B,C,H,W) float; load_state_dict: the
+            checksum of other weights.
+
+    Example:
+        >>> import torch
+        >>> Distilled()(torch.rand(2, 1, 64, 64)).shape
+        torch.Size([2, 1440])
+    """
+
+    checksum: Tensor
+
+    def __init__(self, grid: int = 6, weights: str = "lite0") -> None:
+        super().__init__()
+        self.grid, self.weights, self.resize = grid, weights, SIZE
+        if not 1 <= grid <= WIDEST or weights not in WEIGHTS:
+            seen = f"Distilled got {settings_of(self)}; expected a grid of 1 to {WIDEST}"
+            raise InputError(f"{seen}, and weights {' or '.join(WEIGHTS)}")
+        for name, tensor in loaded(WEIGHTS[weights]).items():
+            self.register_buffer(name, tensor, persistent=name == "checksum")
+
+    def forward(self, frames: Tensor) -> Tensor:
+        check_frames(frames, "Distilled got")
+        if frames.shape[1] not in (1, 3):
+            frames = frames.mean(1, keepdim=True)
+        maps = distilled_maps(resize_frames(frames, self.resize), dict(self.named_buffers()))
+        return adaptive_avg_pool2d(maps, self.grid).flatten(1)
+
+    def _load_from_state_dict(self, state: dict[str, Any], prefix: str, *args: Any) -> None:
+        stored = state.get(f"{prefix}checksum")
+        if stored is not None and not torch.equal(stored.cpu(), self.checksum.cpu()):
+            raise InputError(
+                f"it was learned with other weights {self.weights} of Distilled than this version has; "
+                "expected the version that learned it, or a map learned anew"
+            )
+        super()._load_from_state_dict(state, prefix, *args)
+
+    extra_repr = settings_of
+
+
+def loaded(path: Path) -> dict[str, Tensor]:
+    """The weights (O,I,k,k) and biases (O,) of a file of whole numbers and scales, and a checksum."""
+    stored, layers = load_file(path), {}
+    # of the order of all whole numbers, too; in place of a hash, which is no tensor
+    sums = [stored[f"{i}.weight"].flatten().long().cumsum(0).sum() for i in range(len(STRIDES))]
+    layers["checksum"] = torch.stack(sums)
+    for i in range(len(STRIDES)):
+        layers[f"weight{i}"] = stored[f"{i}.weight"] * stored[f"{i}.scale"].float().view(-1, 1, 1, 1)
+        layers[f"bias{i}"] = stored[f"{i}.bias"]
+    return layers
+
+
+def distilled_maps(frames: Tensor, layers: Mapping[str, Tensor]) -> Tensor:
+    """Grey or RGB frames in [0, 1] through the convolutions: (B,C,96,96) -> (B,40,12,12)."""
+    values = 2 * frames - 1
+    for i, stride in enumerate(STRIDES):
+        weight, bias = (layers[f"{name}{i}"].to(values) for name in ("weight", "bias"))
+        if not i and values.shape[1] == 1:  # as three equal channels
+            weight = weight.sum(1, keepdim=True)
+        values = conv2d(values.relu() if i else values, weight, bias, stride, weight.shape[-1] // 2)
+    return values
