@@ -207,9 +207,8 @@ class Learning:
 
     Args:
         seed: of the whitening, if it has none of its own, and of the null control
-        second: another traverse of the places, or several, '[A,B]', from which whitening learns what a visit
-            changes
-        second_truth: places that it shows, as --truth of `dejavu compare`; of several, '[A,B]' or one of all
+        second: another visit, or several, '[A,B]', to learn from them what changes
+        second_truth: places it shows, as --truth; one for all, or '[A,B]'
         descriptor: file whose features are taken, as `dejavu train` makes, or a map
         calibration: a further traverse, which tells how probably answers are right, or none; changed frames
             of the route if not given
@@ -331,10 +330,9 @@ class Judging:
         interpolate: fill in a csv that lists some queries only
         leave_out: of templates, a diagnostic: the reference on itself, without so many frames each side
         top: write so many places of each query, no two within the tolerance
-        distractors: another route, or several, '[A,B]': how many of its frames are accepted
+        distractors: another route, or several, '[A,B]': what is accepted there
         storage_curve: also evaluate maps of other sizes, which takes as long as all the rest
-        ordered: queries are in order, as those of videos and of numbered images are: a filter stands beside
-            single ones
+        ordered: queries are in order, as those of videos are: a filter stands beside single ones
         unordered: they are not
     """
 
