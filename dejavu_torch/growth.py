@@ -253,7 +253,8 @@ def second_traverse(
     """
     visits = [second] if isinstance(second, Traverse) else [*second]
     model.describer.require_learning(" + ".join(one.name for one in visits))
-    truths = [truth] * len(visits) if isinstance(truth, str | None) else [*truth]
+    truths = [truth] if isinstance(truth, str | None) else [*truth]
+    truths *= len(visits) if len(truths) == 1 else 1
     if len(truths) != len(visits):
         seen = f"{len(visits)} further traverses and {len(truths)} truths"
         raise InputError(f"{seen}; expected one for each, or one for all")

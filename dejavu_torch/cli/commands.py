@@ -80,7 +80,7 @@ def run_demo(
     Args:
         out: folder for report and pictures
         seed: which route, and of the whitening and the null control
-        second: another visit, or several, '[A,B]', to learn from them what changes
+        second: another visit, or several, '[A,B]', from which to learn what changes
     """
     from dejavu_torch.evaluation.compare import compare
     from dejavu_torch.evaluation.reproduce import paper_model

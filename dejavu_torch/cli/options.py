@@ -207,7 +207,7 @@ class Learning:
 
     Args:
         seed: of the whitening, if it has none of its own, and of the null control
-        second: another visit, or several, '[A,B]', to learn from them what changes
+        second: another visit, or several, '[A,B]', from which to learn what changes
         second_truth: places it shows, as --truth; one for all, or '[A,B]'
         descriptor: file whose features are taken, as `dejavu train` makes, or a map
         calibration: a further traverse, which tells how probably answers are right, or none; changed frames
@@ -248,8 +248,7 @@ class Learning:
             traverses.append(open_another("second", source, others))
         reference = model.resample(reference, progress=True, shape=model.frame_shape)
         truths = [None if one is None else str(one) for one in several(self.second_truth)]
-        truth = truths if len(truths) > 1 else (truths or [None])[0]
-        return reference, growth.second_traverse(model, reference, traverses, truth)
+        return reference, growth.second_traverse(model, reference, traverses, truths or None)
 
     def with_calibration(
         self, model: DejaVu, reference: Reference, query: Traverse | None = None

@@ -114,7 +114,8 @@ class SpectralMapper(Mapper):
     def fit(self, sample: Tensor, stretch: int, share: float = 1.0) -> SpectralMap:
         """A map without places: mean and step for chunks of a route, from descriptors (n,K) of stretches.
 
-        share: of the places of the route that are in the sample, which pays as much of the mean.
+        Args:
+            share: of the route's places that are in the sample, which pays for as much of the mean.
         """
         return self._fitted(sample, stretch, share)[0]
 

@@ -87,7 +87,7 @@ def test_a_map_of_other_weights_is_refused(tmp_path: Path, monkeypatch: pytest.M
 
 def test_of_unseen_frames_it_tells_what_its_teacher_does() -> None:
     pytest.importorskip("efficientnet_lite_pytorch")
-    network = distil.teacher().network
+    network = distil.teacher()
     frames = torch.cat([leaves(32, 96, 10_000), *(part for part in _held("aerial"))])
     with torch.no_grad():
         found, target = distilled_maps(frames, loaded(WEIGHTS["lite0"])), distil.maps_of(network, frames)
