@@ -17,10 +17,10 @@ from torch.nn.parameter import is_lazy
 from dejavu_torch.data.arrays import as_traverse
 from dejavu_torch.data.fitted import at_size, resize_like, size_like
 from dejavu_torch.data.names import names_of
+from dejavu_torch.features.distilled import Distilled
 from dejavu_torch.features.extract import features_of
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.joined import Joined
-from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import Views
 from dejavu_torch.features.whitening import WIDEST, Whitening
@@ -82,8 +82,8 @@ class DejaVu(nn.Module):
     """Learn a compressed map of a route from what repeats along it, and find places on it (section III).
 
     Args:
-        features: any nn.Module (B,C,H,W) -> (B,D); None is `default_features`: HOG and the pixels of small
-            frames side by side, HOG alone without whitening.
+        features: any nn.Module (B,C,H,W) -> (B,D); None is `default_features`: HOG and the network of the
+            package side by side, HOG alone without whitening.
         whitening: reduces features to few numbers, learned anew with each map unless it is `fixed`; None is
             Whitening for a SpectralMapper and "none" for templates; "none" keeps the features, though a
             SpectralMapper gets the principal components of ready ones of over 256 numbers.
@@ -693,9 +693,9 @@ class DejaVu(nn.Module):
 
 
 def default_features(whitens: bool = True) -> nn.Module:
-    """The features of a model that names none: HOG and the grey pixels of small frames side by side, which
-    whitening joins; HOG alone, as the paper has it, if nothing does."""
-    return Joined([HOG(), PatchPixels((24, 48), channel="grey")], [1, 0.5]) if whitens else HOG()
+    """The features of a model that names none: HOG and a small network side by side, which whitening joins;
+    HOG alone, as the paper has it, if nothing does."""
+    return Joined([HOG(), Distilled()]) if whitens else HOG()
 
 
 def own_size(features: nn.Module, block: bool = False) -> tuple[int, int] | None:
