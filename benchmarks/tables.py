@@ -16,7 +16,7 @@ from statistics import mean
 from typing import Any
 
 from benchmarks.measure import Row
-from benchmarks.results import FOOTAGE, SEEDS, rounded
+from benchmarks.results import FOOTAGE, rounded
 from benchmarks.storage import SHOWN, best, families, missed
 from dejavu_torch.evaluation.contenders import LENGTHS
 
@@ -36,9 +36,13 @@ CODES = {  # of the same kind in one row
 
 
 def kept(bench: dict[str, Any]) -> dict[str, Any]:
-    """A bench.json without what is not known and what tables do not show."""
-    left_out = ("equal_auc", "seconds", "peak_bytes", "ratio_to_ours")
+    """A bench.json without what is unknown and what no table shows."""
+    left_out = ("equal_auc", "seconds", "peak_bytes", "ratio_to_ours", "missed_over_best")
     rows = [{k: v for k, v in row.items() if v is not None and k not in left_out} for row in bench["rows"]]
+    for row in rows:
+        if "family" in row:  # of a store: what the curve shows
+            for name in ("sequences", "bytes", "route_bytes", "recall_at_1"):
+                row.pop(name, None)
     facts = {name: of for name, of in bench.items() if name not in ("rows", *left_out)}
     return facts | {"rows": rounded(rows)}
 
@@ -77,7 +81,7 @@ def by_seeds(found: dict[str, Row], figures: Callable[[Row], Sequence[float | No
         means = [
             None if None in column else mean(one for one in column if one is not None) for column in columns
         ]
-        yield [f"`{name}`, {len(SEEDS)} seeds" if len(rows) > 1 else name, *map(area, means)]
+        yield [f"`{name}`" if name.startswith("sim:") else name, *map(area, means)]
 
 
 def routes() -> str:
@@ -144,7 +148,8 @@ def sequences() -> str:
     table = [["AUC of map, null, HOG", *(f"T = {key}" if key.isdigit() else key for key in keys)]]
     for name, row in (*reports("sequence").items(), *reports("visits").items()):
         each = [of["sequences"] for of in (row, row["null"], row["hog"])]
-        cells = (", ".join(area(of[key]["auc"]) for of in each) for key in keys)
+        each = [of for of in each if of]
+        cells = [", ".join(area(of[key]["auc"]) for of in each if key in of) for key in keys]
         seen = ", whitened by both visits to the first" if row["contender"] == "visits" else ""
         table.append([name + seen, *cells])
     return markdown(table)
@@ -174,7 +179,9 @@ def filtered() -> str:
 def storage(name: str) -> str:
     """The best area of each kind of code in so many bytes, on a route."""
     rows = read(f"storage_{name}")["rows"]
-    rows = [row | {"skipped": row.get("skipped")} for row in rows]
+    rows = [
+        row | {"skipped": row.get("skipped"), "sequences": {"1": {"auc": row.get("auc")}}} for row in rows
+    ]
     table = [["AUC, route bytes per place", *(f"{budget:g}" for budget in SHOWN)]]
     known = families(rows)
     for kind, codes in CODES.items():
@@ -190,9 +197,30 @@ def storage(name: str) -> str:
     )
 
 
+def trainings() -> str:
+    """The AUC of untrained and trained maps and the nulls of these, by size: the mean over seeds."""
+    sizes = ("1 B", "5 B", "default")
+    table = [["AUC of untrained, **trained**, its null", "HOG", *sizes, "trained, lowest to highest"]]
+    found: dict[str, dict[str, list[float]]] = {}
+    for row in read("trainings")["rows"]:
+        if "auc" in row:
+            found.setdefault(row["case"], {}).setdefault(row["contender"], []).append(row["auc"])
+    for case, own in found.items():
+        cells = []
+        for each in sizes:
+            kinds = [own.get(f"{kind} {each}") for kind in ("untrained", "trained", "trained, null")]
+            figures = [area(mean(some)) if some else "" for some in kinds]
+            cells.append("{}, **{}**, {}".format(*figures))
+        spread = ", ".join(
+            f"{area(min(some))}-{area(max(some))}" for each in sizes if (some := own.get(f"trained {each}"))
+        )
+        table.append([case, area(own["HOG of all frames"][0]), *cells, spread])
+    return markdown(table)
+
+
 TABLES: dict[str, Callable[[], str]] = {
     **{"routes": routes, "sizes": sizes, "descriptors": descriptors, "sequences": sequences},
-    **{"rejection": rejection, "filtered": filtered},
+    **{"rejection": rejection, "filtered": filtered, "trainings": trainings},
     **{f"storage {name}": partial(storage, name) for name in ("aerial", "road1", "road2", "city", "railway")},
 }
 
