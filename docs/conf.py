@@ -5,7 +5,7 @@ from pathlib import Path
 
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
 
-from dejavu_torch import __version__
+from dejavu_torch import __version__  # noqa: E402
 
 project = "dejavu_torch"
 copyright = "the dejavu_torch developers"
@@ -24,5 +24,7 @@ default_role = "py:obj"  # `name` in a docstring
 autodoc_default_options = {"members": True, "member-order": "bysource", "show-inheritance": True}
 autodoc_inherit_docstrings = False  # nn.Module's own say nothing of these
 autodoc_typehints_format = "short"
+viewcode_follow_imported_members = False
+add_module_names = False  # a heading has them
 python_use_unqualified_type_names = True
 toc_object_entries_show_parents = "hide"

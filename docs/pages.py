@@ -1,4 +1,4 @@
-"""What the site has beyond the files in docs/: the reference, from help texts and docstrings; links out of docs/."""
+"""What the site has beyond the files in docs/: the reference, from help texts and docstrings."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def help_of(line: str) -> str:
 
 @cache
 def public_names() -> dict[str, Any]:
-    """Classes and functions that are documented for users, by the name to import them with.
+    """Classes and functions that are documented for users, by module and name.
 
     Those of the front door, those whose docstring has a section such as Args, and the classes that these
     inherit from or name in their signatures.
@@ -52,11 +52,11 @@ def public_names() -> dict[str, Any]:
     for found in pkgutil.walk_packages(dejavu_torch.__path__, "dejavu_torch."):
         if not found.name.startswith("dejavu_torch.cli"):
             for name, value in vars(import_module(found.name)).items():
-                defined = inspect.isclass(value) or inspect.isfunction(value)
-                if defined and value.__module__ == found.name and value.__name__ == name and name[0] != "_":
-                    door = name in dejavu_torch.__all__ and getattr(dejavu_torch, name) is value
-                    own[value] = f"dejavu_torch.{name}" if door else f"{found.name}.{name}"
-    public = {one for one, name in own.items() if name.count(".") == 1 or SECTION.search(inspect.cleandoc(one.__doc__ or ""))}
+                defined = callable(value) and getattr(value, "__name__", "") == name and name[0] != "_"
+                if defined and value.__module__ == found.name:
+                    own[value] = f"{found.name}.{name}"
+    door = {getattr(dejavu_torch, name) for name in dejavu_torch.__all__}
+    public = door | {one for one in own if SECTION.search(inspect.cleandoc(one.__doc__ or ""))}
     while more := {other for one in public for other in named_by(one) if other in own} - public:
         public |= more
     return {name: value for value, name in own.items() if value in public}
@@ -82,6 +82,14 @@ def room_of(one: Any) -> str:
     return ".".join(parts[:2]) if (ROOT / "/".join(parts[:2])).is_dir() else parts[0]
 
 
+def front_door() -> list[str]:
+    """The names that `import dejavu_torch` has, and where each part of the paper is."""
+    import dejavu_torch
+
+    names = [f"[{name}](#dejavu_torch.{dejavu_torch._HOMES[name]}.{name})" for name in dejavu_torch.__all__]
+    return [f"`from dejavu_torch import ...` has {', '.join(names)}.", "", dejavu_torch.__doc__ or "", ""]
+
+
 def api_of(room: str) -> str:
     """Public names of a room, module by module."""
     modules: dict[str, list[str]] = {}
@@ -89,7 +97,7 @@ def api_of(room: str) -> str:
         if room_of(one) == room:
             kind = "autoclass" if inspect.isclass(one) else "autofunction"
             modules.setdefault(one.__module__, []).append(f".. {kind}:: {name}")
-    lines = []
+    lines = front_door() if room == "dejavu_torch" else []
     for module, directives in modules.items():
         lines += [f"## {module.removeprefix('dejavu_torch.')}", "", import_module(module).__doc__ or "", ""]
         lines += ["```{eval-rst}", *directives, "```", ""]
@@ -135,7 +143,8 @@ def as_rst(app: Any, what: str, name: str, one: Any, options: Any, lines: list[s
         parts = [line] if section == "Raises" else re.split(r"(?<=\.) (?=[a-z]\w*(?:, \w+)*: )", line)
         for part in (parts[0], *(f"    {part}" for part in parts[1:])):
             entry = re.match(r"    (\w+(?:, \w+)*): (.*)", part)
-            lines.append(f"    * **{entry[1]}**: {entry[2]}" if entry else f"      {part[8:] or part.strip()}")
+            point = f"    * **{entry[1]}**: {entry[2]}" if entry else f"      {part[8:] or part.strip()}"
+            lines.append(point)
     if example:
         lines += ["", ":Example:", "", *example.split("\n"), ""]
 
