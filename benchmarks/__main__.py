@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from benchmarks import cluster, distil, live, matcher, memory, scale, storage, train, trainings
+from benchmarks import cluster, distil, live, matcher, memory, results, scale, storage, train, trainings
 from dejavu_torch.cli import errors_of_one_line, fail, main
 from dejavu_torch.cli.parser import command_parser
 from dejavu_torch.data.output import check_output_folder
@@ -13,6 +13,7 @@ from dejavu_torch.data.source import check_not_read
 from dejavu_torch.text import printable
 
 BENCHES: dict[str, Any] = {  # each returns what is to be printed
+    "results": results.run_results,
     "matcher": matcher.run_matcher,
     "storage": storage.run_storage,
     "train": train.run_train,
@@ -41,7 +42,8 @@ def run(given: Sequence[str]) -> None:
         check_not_read(out / "bench.json", *options.get("sources", ()), options.get("codebooks"))
         check_output_folder(out)  # before the long work
         *tables, note = BENCHES[given[0]](**options)
-        print(*tables, printable(f"{note}; next: open {out / 'bench.png'}"), sep="\n")
+        shown = out / ("bench.png" if (out / "bench.png").exists() else "bench.json")
+        print(*tables, printable(f"{note}; next: open {shown}"), sep="\n")
 
 
 if __name__ == "__main__":

@@ -7,6 +7,8 @@ import gc
 import json
 import math
 import os
+import platform
+import shlex
 import signal
 import subprocess
 import sys
@@ -14,6 +16,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -203,6 +206,31 @@ def in_process(module: str, arguments: object) -> dict[str, Any]:
     return facts
 
 
+def done_once(words: Sequence[str], folder: Path, made: Path) -> str | None:
+    """Run `dejavu`, with a log in a folder, unless the same command made a file before.
+
+    So a run of many commands goes on where another was stopped.
+
+    Returns:
+        what it said last if it failed.
+    """
+    well, log = folder / "command.txt", folder / "log.txt"
+    if made.exists() and well.exists() and well.read_text(encoding="utf-8") == shlex.join(words):
+        return None
+    folder.mkdir(parents=True, exist_ok=True)
+    well.unlink(missing_ok=True)
+    alone = os.environ | {"OMP_NUM_THREADS": "1"}  # several at a time
+    with log.open("w", encoding="utf-8") as file:
+        command = [sys.executable, "-m", "dejavu_torch.cli", *words]
+        status = subprocess.run(command, stdout=file, stderr=file, check=False, env=alone).returncode
+    if status:
+        said = log.read_text(encoding="utf-8").strip().splitlines()
+        told = status == 2 and said
+        return one_line(said[-1].removeprefix("dejavu: ") if told else f"ended with status {status}")
+    well.write_text(shlex.join(words), encoding="utf-8")
+    return None
+
+
 def end_with_parent() -> None:
     """Have the system end this process when its parent ends, as by Ctrl-C."""
     ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
@@ -245,12 +273,23 @@ def write_bench(out: Path, rows: Sequence[Row], picture: Plot | None = None, **f
         "cpu_capability": torch.backends.cpu.get_cpu_capability(),
         "version": dejavu_torch.__version__,
         "versions": dict.fromkeys(COMPARED) | versions,
+        "date": f"{datetime.now(UTC):%Y-%m-%d}",
+        "machine": f"{os.cpu_count()} cores, {platform.machine()}",
+        "commit": commit(),
     }
     with whole_folder(out) as folder:
         text = json.dumps({"rows": rows} | facts | programs, indent=1)
         (folder / "bench.json").write_text(text + "\n", encoding="utf-8")
         if picture is not None:
             picture[0].savefig(folder / "bench.png")
+
+
+def commit() -> str | None:
+    """That of the clone this runs in."""
+    told = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"]
+    with suppress(OSError, subprocess.SubprocessError):
+        return subprocess.run(told, capture_output=True, text=True, check=True).stdout.strip()
+    return None
 
 
 def bars(rows: Sequence[Row], key: str = "ratio_to_ours", unit: float = 1.0, **label: str) -> Plot | None:

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import json
-import os
-import platform
+import re
 import shlex
-import subprocess
-import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from datetime import UTC, datetime
+from functools import reduce
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from tqdm import tqdm
 
+from benchmarks.measure import Row, done_once, write_bench
 from benchmarks.trainings import ROAD, drive
 from dejavu_torch.types import InputError
 
@@ -72,17 +70,33 @@ FOOTAGE = {
         for seed in SEEDS
     },
 }
-IN_ORDER = [name for name in FOOTAGE if name not in ("corridor", "road", "road, first half") and name[-1] not in "34"]
-WAYS = {  # of `dejavu compare`; {map} is the map of the default
+IN_ORDER = (  # a route of each kind that is long enough for 21 queries together
+    *("city 1", "city 2", "laps", "railway, first half", "railway, second half", "road, second half"),
+    *("sim:aerial, seed 0", "sim:outdoor, seed 0", "sim:underground, seed 0"),
+)
+SEEDED = ("default", "HOG and pixels")  # on all seeds, the others on the first
+SECOND = "railway, second half"
+PIXELS = (
+    "{class_path: dejavu_torch.features.joined.Joined, init_args: {shares: [1, .5], members: "
+    "[{class_path: dejavu_torch.HOG}, {class_path: PatchPixels, init_args: "
+    "{size: [24, 48], channel: grey}}]}}"
+)
+WAYS = {  # of `dejavu compare`; {default} and {visits} are folders of maps
     "default": "--storage_curve",
     "HOG": "--features HOG --calibration none",
-    "filter": "--map {map} --filter",
-    "sequence": "--map {map} --sequence 21",
+    "HOG and pixels": f"--features {shlex.quote(PIXELS)} --calibration none",
+    "filter": "--map {default}/{footage}/map.safetensors --filter",
+    "sequence": "--map {default}/{footage}/map.safetensors --sequence 21",
+    "visits": "--whitening {visits}/first.safetensors --sequence 21 --storage_curve",
 }
+VISITS = (
+    "learn {data}/nordland/summer?stop=900 --second {data}/nordland/winter?stop=900 "
+    "--map {visits}/first.safetensors"
+)
 
 
 class Run(NamedTuple):
-    """A command line and where its report goes."""
+    """A command line of `dejavu compare`."""
 
     footage: str
     way: str
@@ -90,14 +104,88 @@ class Run(NamedTuple):
 
 
 def runs(ways: Sequence[str]) -> Iterator[Run]:
-    """Every way on every footage that it is for, the default first."""
+    """Every way on every footage that it is for."""
     for way in ways:
         for name, one in FOOTAGE.items():
-            if way == "sequence" and name not in IN_ORDER:
-                continue
-            if way == "filter" and not one.strange:
+            for_it = {"sequence": name in IN_ORDER, "filter": bool(one.strange), "visits": name == SECOND}
+            again = name.endswith(tuple(f"seed {seed}" for seed in SEEDS[1:]))
+            if not for_it.get(way, True) or (again and way not in SEEDED):
                 continue
             words = ["compare", one.reference, one.query, *shlex.split(one.words), *shlex.split(WAYS[way])]
+            words = [word.replace("{footage}", slug(name)) for word in words]
             if way in ("default", "filter") and one.strange:
                 words += ["--distractors", one.strange]
             yield Run(name, way, words)
+
+
+def slug(name: str) -> str:
+    """A name as that of a folder."""
+    return re.sub(r"\W+", "_", name)
+
+
+def kept(report: dict[str, Any]) -> Row:
+    """The figures of a report, without what is long: of the map, its curve, and all that stands beside it."""
+    figures = ("auc", "recall_at_1", "recall_at_100_precision", "route_bytes", "bytes", "sequences")
+    own = ("frames", "fixed_bytes", "route_bytes_per_place", "noise_over_map", "storage", "rejection")
+    beside = {
+        name: of for name, of in report.items() if isinstance(of, dict) and "auc" in of and name not in own
+    }
+    row = {name: report[name] for name in (*figures, *own) if name in report}
+    return row | {name: {key: of[key] for key in figures if key in of} for name, of in beside.items()}
+
+
+def rounded(value: Any) -> Any:
+    """With four decimals."""
+    if isinstance(value, dict):
+        return {name: rounded(one) for name, one in value.items()}
+    if isinstance(value, list):
+        return [rounded(one) for one in value]
+    return round(value, 4) if isinstance(value, float) else value
+
+
+def run_results(data: Path, *, out: Path, ways: Sequence[str] = (), jobs: int = 1) -> list[str]:
+    """`dejavu compare` on footage of every kind, for the tables of the documentation.
+
+    Args:
+        data: folder of the footage, as the tests have it
+        out: folder for bench.json and the reports, which a later run takes from there
+        ways: by name; all if not given. "filter" and "sequence" take the maps that "default" made
+        jobs: commands at a time, each of one thread
+
+    Convention: commands in bench.json have data/, default/ and visits/ in place of the folders.
+
+    Raises:
+        InputError: a name that is none of the ways, or less than one job.
+    """
+    if unknown := [way for way in ways if way not in WAYS]:
+        raise InputError(f"{unknown[0]!r} is no way; expected one of {', '.join(map(repr, WAYS))}")
+    if jobs < 1:
+        raise InputError(f"bench results got {jobs} jobs; expected at least one")
+    shown = {"{data}": "data", "{default}": "default", "{visits}": "visits"}
+    folders = {"{data}": str(data), "{default}": str(out / "default"), "{visits}": str(out / "visits")}
+
+    def placed(words: Sequence[str], where: dict[str, str]) -> list[str]:
+        return [reduce(lambda text, name: text.replace(name, where[name]), where, word) for word in words]
+
+    def row_of(run: Run) -> Row:
+        folder = out / slug(run.way) / slug(run.footage)
+        row = {"case": run.footage, "contender": run.way}
+        row["command"] = shlex.join(["dejavu", *placed(run.words, shown)])
+        words, report = [*placed(run.words, folders), "--out", str(folder)], folder / "report.json"
+        if (said := done_once(words, folder, report)) is not None:
+            return row | {"skipped": said}
+        return row | kept(json.loads(report.read_text(encoding="utf-8")))
+
+    planned = list(runs(ways or list(WAYS)))
+    if any(run.way == "visits" for run in planned):
+        made = out / "visits" / "first.safetensors"
+        if (said := done_once(placed(VISITS.split(), folders), made.parent, made)) is not None:
+            raise InputError(said)
+    rows: list[Row] = []
+    for first in (True, False):  # the others need the maps of the default
+        part = [run for run in planned if (run.way == "default") == first]
+        with ThreadPoolExecutor(jobs) as pool:
+            rows += tqdm(pool.map(row_of, part), "results", len(part), disable=None, leave=False)
+    write_bench(out, rounded(rows))
+    failed = [f"{row['case']}, {row['contender']}: {row['skipped']}" for row in rows if "skipped" in row]
+    return [*failed, f"{len(rows)} reports"]

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import shlex
-import subprocess
-import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -13,7 +10,7 @@ from typing import Any, NamedTuple
 
 from tqdm import tqdm
 
-from benchmarks.measure import Row, write_bench
+from benchmarks.measure import Row, done_once, write_bench
 from benchmarks.plots import OURS, plot_areas
 from benchmarks.train import spread
 from dejavu_torch.data.source import open_source
@@ -26,7 +23,6 @@ from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.resampling import ground_truth_of
-from dejavu_torch.text import one_line
 from dejavu_torch.types import InputError, Match
 
 SEEDS = (0, 1, 2)
@@ -112,21 +108,9 @@ def trained(name: str, route: Route, seed: int, out: Path, options: Sequence[str
             return start
         words += ["--model.start", str(start)]
     words += ["--trainer.default_root_dir", str(folder)]
-    path, log, well = folder / "map.safetensors", folder / "log.txt", folder / "command.txt"
-    if not (path.exists() and well.exists() and well.read_text(encoding="utf-8") == shlex.join(words)):
-        folder.mkdir(parents=True, exist_ok=True)
-        well.unlink(missing_ok=True)
-        alone = os.environ | {"OMP_NUM_THREADS": "1"}  # several at a time
-        with log.open("w", encoding="utf-8") as file:
-            command = [sys.executable, "-m", "dejavu_torch.cli", *words]
-            status = subprocess.run(command, stdout=file, stderr=file, check=False, env=alone).returncode
-        if status:
-            said = log.read_text(encoding="utf-8").strip().splitlines()
-            seen = (
-                said[-1].removeprefix("dejavu: ") if said and status == 2 else f"ended with status {status}"
-            )
-            return one_line(seen)
-        well.write_text(shlex.join(words), encoding="utf-8")
+    path = folder / "map.safetensors"
+    if (said := done_once(words, folder, path)) is not None:
+        return said
     return path
 
 

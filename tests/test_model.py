@@ -348,6 +348,13 @@ def test_what_is_known_of_a_map_is_part_of_its_state() -> None:
     assert (model.trained, model.frame_name(7)) == (None, "")
 
 
+class Paired(nn.Module):
+    """Makes features and something else, as many networks do."""
+
+    def forward(self, frames: Tensor) -> tuple[Tensor, int]:
+        return frames.flatten(1), 1
+
+
 class Wrong(nn.Module):
     """Makes no features."""
 
@@ -385,6 +392,10 @@ def on_waves(query: Tensor) -> Any:
         (
             lambda: template_model(Wrong(), layers(8)).learn(pictures()),
             ("Wrong", "expected features (64, D)"),
+        ),
+        (
+            lambda: template_model(Paired(), layers(8)).learn(pictures()),
+            ("Paired made a tuple", "expected features (64, D)"),
         ),
         (lambda: DejaVu(batch_size=0), ("batch_size is 0", "expected")),
         (lambda: DejaVu(threshold=torch.nan), ("threshold is nan", "expected")),

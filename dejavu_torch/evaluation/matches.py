@@ -31,9 +31,11 @@ _ACCEPTED = {"1": True, "true": True, "0": False, "false": False}
 class Matches(NamedTuple):
     """Matches read from a file, in its order.
 
-    query: (Q,) int64, the frame number of each query. match: Match of (Q,), its index a frame number as well.
-    candidates: (Q,K) int64, the frames of the K ranks of each query, -1 for none; K is 1 without ranks. Both
-        have `ELSEWHERE` for what lies on another route than the one asked for.
+    Attributes:
+        query: (Q,) int64, the frame number of each query.
+        match: Match of (Q,), its index a frame number as well.
+        candidates: (Q,K) int64, the frames of the K ranks of each query, -1 for none; K is 1 without ranks.
+            Both have `ELSEWHERE` for what lies on another route than the one asked for.
     """
 
     query: Tensor

@@ -101,13 +101,13 @@ def features_of(batch: Tensor, describe: Callable[[Tensor], Tensor], name: str =
         return batch
     check_frames(batch, f"{name} is", " or float features (B,D)")
     features = describe(batch)
-    if features.ndim != 2 or features.shape[0] != batch.shape[0]:
+    made = tuple(features.shape) if isinstance(features, Tensor) else f"a {type(features).__name__}"
+    if not isinstance(features, Tensor) or len(made) != 2 or len(features) != len(batch):
         owner = describe[-1] if isinstance(describe, nn.Sequential) else describe
         owner = getattr(owner, "__self__", owner)  # of a method
         owner = getattr(owner, "features", owner)
         raise InputError(
-            f"{type(owner).__name__} made {tuple(features.shape)} of {tuple(batch.shape)}; "
-            f"expected features ({len(batch)}, D)"
+            f"{type(owner).__name__} made {made} of {tuple(batch.shape)}; expected features ({len(batch)}, D)"
         )
     return features
 

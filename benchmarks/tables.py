@@ -1,0 +1,245 @@
+"""Tables of docs/results from the json beside them: `python -m benchmarks.tables [NAME=bench.json ...]`.
+
+A given file is first kept there, as NAME.json. Pages have tables between `<!-- table: NAME -->` and
+`<!-- end of table -->`.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from pathlib import Path
+from statistics import mean
+from typing import Any
+
+from benchmarks.measure import Row
+from benchmarks.results import FOOTAGE, rounded
+from benchmarks.storage import SHOWN, best, families, missed
+from dejavu_torch.evaluation.contenders import LENGTHS
+
+FOLDER = Path(__file__).parents[1] / "docs" / "results"
+MARKED = re.compile(r"(<!-- table: ([\w ,:]+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
+CODES = {  # of the same kind in one row
+    **{"dejavu": ("dejavu",), "null": ("null",), "dejavu, trained": ("dejavu, given maps",)},
+    **{
+        "every k-th frame": ("interpolated",),
+        "PCA": ("PCA",),
+        "signs": ("binary",),
+        "PQ, OPQ": ("PQ", "OPQ"),
+    },
+    **{"RQ, LSQ, PRQ": ("RQ", "LSQ", "PRQ"), "TurboQuant": ("TurboQuant",)},
+    **{"RaBitQ, EDEN": ("RaBitQ", "EDEN"), "video": ("video",)},
+}
+
+
+def kept(bench: dict[str, Any]) -> dict[str, Any]:
+    """A bench.json without what is unknown and what no table shows."""
+    left_out = ("equal_auc", "seconds", "peak_bytes", "ratio_to_ours", "missed_over_best")
+    rows = [{k: v for k, v in row.items() if v is not None and k not in left_out} for row in bench["rows"]]
+    for row in rows:
+        if "family" in row:  # of a store: what the curve shows
+            for name in ("sequences", "bytes", "route_bytes", "recall_at_1"):
+                row.pop(name, None)
+    facts = {name: of for name, of in bench.items() if name not in ("rows", *left_out)}
+    return facts | {"rows": rounded(rows)}
+
+
+def read(name: str) -> dict[str, Any]:
+    bench: dict[str, Any] = json.loads((FOLDER / f"{name}.json").read_text(encoding="utf-8"))
+    return bench
+
+
+def reports(way: str) -> dict[str, Row]:
+    """What `benchmarks results` measured in a way, by footage."""
+    return {row["case"]: row for row in read("routes")["rows"] if row["contender"] == way}
+
+
+def markdown(rows: Sequence[Sequence[str]]) -> str:
+    lines = [f"| {' | '.join(row)} |" for row in rows]
+    return "\n".join([lines[0], "|---" * len(rows[0]) + "|", *lines[1:]]) + "\n"
+
+
+def area(auc: float | None) -> str:
+    return "" if auc is None else f"{auc:.3f}"
+
+
+def size(each: float) -> str:
+    return f"{each:.1f}" if each < 10 else f"{each:.0f}"
+
+
+def by_seeds(found: dict[str, Row], figures: Callable[[Row], Sequence[float | None]]) -> Iterable[list[str]]:
+    """A row for each footage: figures of it, or their mean over the seeds of a simulated route."""
+    groups: dict[str, list[Row]] = {}
+    for name in FOOTAGE:
+        if name in found:
+            groups.setdefault(name.partition(", seed")[0], []).append(found[name])
+    for name, rows in groups.items():
+        columns = zip(*map(figures, rows), strict=True)
+        means = [
+            None if None in column else mean(one for one in column if one is not None) for column in columns
+        ]
+        yield [f"`{name}`" if name.startswith("sim:") else name, *map(area, means)]
+
+
+def routes() -> str:
+    """The default map of each route beside its null and the baselines."""
+    head = ["AUC of the second traverse", "**map**", "null", "its descriptors, float", "HOG, all frames"]
+    head += ["HOG, every k-th", "recall@1, map", "HOG", "route bytes per place", "fixed kB"]
+
+    def figures(row: Row) -> list[float | None]:
+        beside = [row[name]["auc"] for name in ("null", "uncompressed", "hog", "hog_stride_coarsest")]
+        recalls = [row["recall_at_1"], row["hog"]["recall_at_1"]]
+        return [row["auc"], *beside, *recalls, row["route_bytes_per_place"], row["fixed_bytes"] / 1000]
+
+    rows = [
+        [*row[:-2], size(float(row[-2])), f"{float(row[-1]):.0f}"]
+        for row in by_seeds(reports("default"), figures)
+    ]
+    return markdown([head, *rows])
+
+
+def sizes() -> str:
+    """The AUC of map and null at each size."""
+    known = reports("default")
+    budgets = (1, 2.5, 5, 10, 20)
+
+    def at(row: Row, contender: str, budget: float) -> float | None:
+        return next(
+            (
+                one["auc"]
+                for one in row["storage"][contender]
+                if abs(one["route_bytes_per_place"] / budget - 1) < 0.1
+            ),
+            None,
+        )
+
+    def figures(row: Row) -> list[float | None]:
+        return [at(row, name, budget) for budget in budgets for name in ("map", "null")]
+
+    rows = []
+    for name, *cells in by_seeds(known, figures):
+        pairs = zip(cells[::2], cells[1::2], strict=True)
+        rows.append([name, *(f"{map}, {null}" if map else "" for map, null in pairs)])
+    return markdown([["AUC of map, null; route bytes per place", *map(str, budgets)], *rows])
+
+
+def descriptors() -> str:
+    """The AUC of maps by the descriptor."""
+    ways = {"default": "HOG, `Distilled`", "HOG and pixels": "HOG, pixels", "HOG": "HOG alone"}
+    columns = [
+        dict_of(by_seeds(reports(way), lambda row: [row["auc"], row["uncompressed"]["auc"]])) for way in ways
+    ]
+    head = ["AUC of map, of its descriptors in float", *ways.values()]
+    return markdown(
+        [head, *([name, *(", ".join(column[name]) for column in columns)] for name in columns[0])]
+    )
+
+
+def dict_of(rows: Iterable[list[str]]) -> dict[str, list[str]]:
+    return {name: cells for name, *cells in rows}
+
+
+def sequences() -> str:
+    """The AUC of T queries together and of a filter: of the map, its null, and HOG of all frames."""
+    keys = [*map(str, LENGTHS), "filter"]
+    table = [["AUC of map, null, HOG", *(f"T = {key}" if key.isdigit() else key for key in keys)]]
+    for name, row in (*reports("sequence").items(), *reports("visits").items()):
+        each = [of["sequences"] for of in (row, row["null"], row["hog"])]
+        each = [of for of in each if of]
+        cells = [", ".join(area(of[key]["auc"]) for of in each if key in of) for key in keys]
+        seen = ", whitened by both visits to the first" if row["contender"] == "visits" else ""
+        table.append([name + seen, *cells])
+    return markdown(table)
+
+
+def rejection(way: str = "default") -> str:
+    """Precision asked for and reached, right answers accepted, and frames of other places accepted."""
+    table: list[list[str]] = []
+    for name, row in reports(way).items():
+        found = row.get("rejection", {}).get("precision")
+        if not found:
+            continue
+        asked = [f"{one['asked']:g}" for one in found]
+        strange = [one["accepted"] for one in row["rejection"].get("off_map", {}).values()]
+        if not table:
+            table.append(["precision reached, right answers accepted, others accepted", *asked])
+        cells = [[area(one["precision"]), area(one["kept"])] for one in found]
+        cells = [[*cell, *(area(of[key]) for of in strange)] for cell, key in zip(cells, asked, strict=True)]
+        table.append([name, *map(", ".join, cells)])
+    return markdown(table)
+
+
+def filtered() -> str:
+    return rejection("filter")
+
+
+def storage(name: str) -> str:
+    """The best area of each kind of code in so many bytes, on a route."""
+    rows = read(f"storage_{name}")["rows"]
+    rows = [
+        row | {"skipped": row.get("skipped"), "sequences": {"1": {"auc": row.get("auc")}}} for row in rows
+    ]
+    table = [["AUC, route bytes per place", *(f"{budget:g}" for budget in SHOWN)]]
+    known = families(rows)
+    for kind, codes in CODES.items():
+        some = [row for code in codes for row in known.get(code, ())]
+        if some:
+            table.append(
+                [f"**{kind}**" if kind == "dejavu" else kind, *(area(best(some, one)) for one in SHOWN)]
+            )
+    ratio = next(iter(missed(rows).values()))
+    return (
+        markdown(table)
+        + f"\nThe map misses {ratio:.2f} times as much as the best rival, on average over 1 to 5 bytes.\n"
+    )
+
+
+def trainings() -> str:
+    """The AUC of untrained and trained maps and the nulls of these, by size: the mean over seeds."""
+    sizes = ("1 B", "5 B", "default")
+    table = [["AUC of untrained, **trained**, its null", "HOG", *sizes, "trained, lowest to highest"]]
+    found: dict[str, dict[str, list[float]]] = {}
+    for row in read("trainings")["rows"]:
+        if "auc" in row:
+            found.setdefault(row["case"], {}).setdefault(row["contender"], []).append(row["auc"])
+    for case, own in found.items():
+        cells = []
+        for each in sizes:
+            kinds = [own.get(f"{kind} {each}") for kind in ("untrained", "trained", "trained, null")]
+            figures = [area(mean(some)) if some else "" for some in kinds]
+            cells.append("{}, **{}**, {}".format(*figures))
+        spread = ", ".join(
+            f"{area(min(some))}-{area(max(some))}" for each in sizes if (some := own.get(f"trained {each}"))
+        )
+        table.append([case, area(own["HOG of all frames"][0]), *cells, spread])
+    return markdown(table)
+
+
+TABLES: dict[str, Callable[[], str]] = {
+    **{"routes": routes, "sizes": sizes, "descriptors": descriptors, "sequences": sequences},
+    **{"rejection": rejection, "filtered": filtered, "trainings": trainings},
+    **{f"storage {name}": partial(storage, name) for name in ("aerial", "road1", "road2", "city", "railway")},
+}
+
+
+def filled(page: str) -> str:
+    """A page with its tables made anew."""
+    return MARKED.sub(lambda found: f"{found[1]}\n{TABLES[found[2]]()}\n{found[3]}", page)
+
+
+def main(given: Sequence[str]) -> None:
+    for name, _, path in (word.partition("=") for word in given):
+        bench = kept(json.loads(Path(path).read_text(encoding="utf-8")))
+        rows = ",\n".join(json.dumps(row) for row in bench.pop("rows"))  # a line each
+        (FOLDER / f"{name}.json").write_text(
+            f'{json.dumps(bench)[:-1]}, "rows": [\n{rows}\n]}}\n', encoding="utf-8"
+        )
+    for page in FOLDER.parent.rglob("*.md"):
+        page.write_text(filled(page.read_text(encoding="utf-8")), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

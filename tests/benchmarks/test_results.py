@@ -1,0 +1,99 @@
+"""`benchmarks results` and the tables made from it: what is run, what is kept, and where it stands."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from pathlib import Path
+from typing import Any
+
+import pytest
+from command_line import benchmark, benchmark_fails
+
+from benchmarks import results, tables
+from benchmarks.results import FOOTAGE, SEEDS, WAYS, Footage, runs
+from dejavu_torch.cli import commands
+from dejavu_torch.cli.parser import command_parser
+
+
+def test_every_command_is_understood_and_every_way_is_used() -> None:
+    parser = command_parser("compare", commands.run_compare)
+    planned = list(runs(list(WAYS)))
+    for run in planned:
+        parser.parse_args([word.replace("{data}", "data") for word in run.words[1:]] + ["--out", "out"])
+    assert {run.way for run in planned} == set(WAYS)
+    assert {run.footage for run in planned if run.way == "default"} == set(FOOTAGE)
+
+
+def test_reports_are_kept_and_made_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flight = Footage("sim:aerial?frames=120", "sim:aerial?frames=120&traverse=1")
+    broken = flight._replace(query="{data}/nowhere.mp4")
+    monkeypatch.setattr(results, "FOOTAGE", {"flight": flight, "broken": broken})
+    given = ("results", tmp_path, "--out", tmp_path / "out", "--ways", "HOG", "--jobs", "2")
+    benchmark(*given)
+    bench = json.loads((tmp_path / "out" / "bench.json").read_text())
+    good, bad = bench["rows"]
+    assert shlex.split(good["command"])[:3] == ["dejavu", "compare", "sim:aerial?frames=120"]
+    assert 0 <= good["null"]["auc"] <= 1
+    assert good["hog"]["auc"] == round(good["hog"]["auc"], 4)
+    assert "nowhere.mp4" in bad["skipped"]
+    assert str(tmp_path) not in bad["command"]
+    assert bench["date"] > "2026"
+    said = capsys.readouterr().out
+    assert "broken, HOG: " in said
+    assert "bench.json" in said
+    (tmp_path / "out" / "HOG" / "flight" / "log.txt").unlink()
+    benchmark(*given)
+    assert not (tmp_path / "out" / "HOG" / "flight" / "log.txt").exists()  # not run again
+
+
+def test_bad_options_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given = ("results", tmp_path, "--out", tmp_path / "out")
+    assert "expected one of 'default'" in benchmark_fails(capsys, *given, "--ways", "all")
+    assert "0 jobs" in benchmark_fails(capsys, *given, "--jobs", "0")
+    assert not (tmp_path / "out").exists()
+
+
+def rows() -> list[dict[str, Any]]:
+    def one(auc: float, **more: Any) -> dict[str, Any]:
+        return {"auc": auc, "recall_at_1": auc, **more}
+
+    curve = {name: [one(0.5, route_bytes_per_place=1.0)] for name in ("map", "null")}
+    beside = {name: one(0.25) for name in ("null", "uncompressed", "hog", "hog_stride_coarsest")}
+    known = {"route_bytes_per_place": 5.25, "fixed_bytes": 2000, "storage": curve, **beside}
+    names = ["city 1", *(f"sim:aerial, seed {seed}" for seed in SEEDS)]
+    areas = [0.5, 0.25, 0.75, 0.5]
+    return [
+        {"case": name, "contender": "default", **one(area), **known}
+        for name, area in zip(names, areas, strict=True)
+    ]
+
+
+def test_tables_stand_where_they_are_marked_and_seeds_are_means(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "results").mkdir()
+    monkeypatch.setattr(tables, "FOLDER", tmp_path / "results")
+    page = tmp_path / "page.md"
+    page.write_text("A\n<!-- table: routes -->\nold\n<!-- end of table -->\nB\n")
+    (tmp_path / "bench.json").write_text(json.dumps({"rows": rows(), "commit": "abc", "equal_auc": 1}))
+    tables.main([f"routes={tmp_path / 'bench.json'}"])
+    kept = json.loads((tmp_path / "results" / "routes.json").read_text())
+    assert kept == {"commit": "abc", "rows": rows()}
+    head, _, city, aerial = [line for line in page.read_text().splitlines() if line.startswith("|")]
+    assert [cell.strip() for cell in city.split("|")][1:4] == ["city 1", "0.500", "0.250"]
+    assert aerial.startswith("| `sim:aerial` | 0.500 | 0.250 |")
+    assert aerial.endswith("| 5.2 | 2 |")
+    assert head.count("|") == aerial.count("|")
+    assert "old" not in page.read_text()
+    before = page.read_text()
+    tables.main([])
+    assert page.read_text() == before
+
+
+@pytest.mark.parametrize("page", sorted(tables.FOLDER.parent.rglob("*.md")), ids=lambda page: page.stem)
+def test_the_tables_of_the_documentation_are_those_of_its_json(page: Path) -> None:
+    text = page.read_text()
+    assert tables.filled(text) == text
