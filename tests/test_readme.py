@@ -22,6 +22,7 @@ from benchmarks.__main__ import BENCHES
 from dejavu_torch import PlaceFilter
 from dejavu_torch.cli import COMMANDS, commands, train
 from dejavu_torch.cli.parser import command_parser
+from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.model_file import CLASSES
 
@@ -185,7 +186,7 @@ def options() -> set[str]:
     """Names of options of all commands, and of the arguments of the classes that they take."""
     parsers = [parser_of("dejavu", name) for name in COMMANDS if name != "train"]
     parsers += [parser_of("python -m benchmarks", name) for name in BENCHES]
-    classes = [*CLASSES, train.RouteData, train.PlaceRecognitionTask]
+    classes = [*CLASSES, Augmentation, train.RouteData, train.PlaceRecognitionTask]
     printed = io.StringIO()
     with redirect_stdout(printed), pytest.raises(SystemExit):
         train.run_train(["fit", "--help"])
