@@ -164,7 +164,7 @@ def run_learn(
         seen = f"{model.map.places} frames are learned here"
         print(f"{seen}: --cluster {cluster} is for the chunks of over {SHORT}")
     if learning.calibration != NO_CALIBRATION:
-        growth.calibrate_if_possible(model, traverse, known, places)
+        growth.calibrate_if_possible(model, traverse, known, places, True)
     model.matching()
     model.save(map)
     checkpoint.remove()
