@@ -403,7 +403,7 @@ def test_a_full_disk_is_one_line_and_leaves_what_was_there(folder: Path) -> None
     )
     found = mounted(
         folder,
-        "size=64k",
+        "size=84k",
         "mkdir disk/old; echo old > disk/old/matches.csv; echo old > disk/old/pr.png",
         "cp map.safetensors disk; dd if=/dev/zero of=disk/full bs=1k count=36 status=none",
         f"{words} | grep ^status",
