@@ -307,7 +307,7 @@ def test_frames_keep_their_size_where_it_was_asked_for(tmp_path: Path) -> None:
     images.mkdir()
     for i in range(3):
         Image.new("L", (400, 200), 40 * i).save(images / f"{i}.png")
-    model = DejaVu()  # the network of the package takes 96 x 96 pixels
+    model = DejaVu()
     assert model.fit(open_source(images)).frame_shape == (1, 80, 160)
     assert model.fit(open_source(f"{images}?start=1")).frame_shape == (1, 80, 160)
     assert model.fit(open_source(f"{images}?width=300&start=1")).frame_shape == (1, 150, 300)
