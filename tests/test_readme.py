@@ -1,67 +1,117 @@
-"""What README and docs show works as it stands there."""
+"""What README and every page of docs show works as it stands there."""
 
 from __future__ import annotations
 
+import inspect
+import io
 import json
+import os
 import re
 import shlex
+import subprocess
+from contextlib import redirect_stdout
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+import yaml
 
 from benchmarks.__main__ import BENCHES
-from dejavu_torch import DejaVu, ImposedPeriods, PlaceFilter, TemplateMapper
-from dejavu_torch.cli import commands, train
+from dejavu_torch import PlaceFilter
+from dejavu_torch.cli import COMMANDS, commands, train
 from dejavu_torch.cli.parser import command_parser
+from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.cnn import SmallCNN
+from dejavu_torch.model_file import CLASSES
 
 ROOT = Path(__file__).parents[1]
-README = (ROOT / "README.md").read_text()
-DOCS = {path.stem: path.read_text() for path in (ROOT / "docs").glob("*.md")}
-BLOCKS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
-TRAINING = DOCS["training"].replace("\n  ", " ")
-OPTIONS = [
-    option
-    for option in re.findall(r"`(--(?:model|data|trainer)\.[^`*\s]+ [^`]+)`", TRAINING)
-    if "my_module" not in option
-]
+DOCS = ROOT / "docs"
+KEPT_AT_ROOT = ("index.md", "pitfalls.md")  # other pages there are older than the site
+PAGES = {
+    str(path.relative_to(ROOT)): path.read_text()
+    for path in [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
+}
+SITE = {
+    name: text
+    for name, text in PAGES.items()
+    if (ROOT / name).parent != DOCS or Path(name).name in KEPT_AT_ROOT
+}
+LONGEST = 900  # words
+FENCED = re.compile(r"(<!-- not run: [^>]+-->\n+)?^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+BLOCKS = {
+    name: [found[3] for found in FENCED.finditer(text) if found[2] in ("python", "py") and not found[1]]
+    for name, text in SITE.items()
+}
 
 
-def test_python_runs_and_its_shapes_are_true(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def with_block(*words: str) -> list[Any]:
+    """Blocks of all pages that have these words."""
+    return [
+        pytest.param(found[3], id=f"{name}:{found[2]}")
+        for name, text in SITE.items()
+        for found in FENCED.finditer(text)
+        if all(word in found[3] for word in words)
+    ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [name for name, blocks in BLOCKS.items() if blocks])
+def test_python_runs_and_its_shapes_are_true(
+    page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The blocks of a page one after another; a comment ahead of one says why it is not run."""
     monkeypatch.chdir(tmp_path)
-    space: dict[str, object] = {}
-    (block,) = BLOCKS
+    space: dict[str, Any] = {"__name__": "__main__"}
+    for block in BLOCKS[page]:
+        exec(compile(block, page, "exec"), space)
+        for name, shape in re.findall(r"^(\w+) = .*# \(([\d,]+)\)", block, re.MULTILINE):
+            assert str(tuple(space[name].shape)).replace(" ", "") == f"({shape})", name
+
+
+def test_readme_shows_the_whole_in_twelve_lines() -> None:
+    (block,) = BLOCKS["README.md"]
     assert len([line for line in block.splitlines() if line.strip()]) <= 12
-    assert block.count("1024") == 5
-    exec(block.replace("1024", "128"), space)  # a shorter route
-    assert tuple(space["frames"].shape) == (4, 3, 64, 64)
-    assert tuple(space["scores"].shape) == (4, 128)
-    assert space["frames"].grad.abs().sum() > 0
-    assert (tmp_path / "road.safetensors").is_file()
+    assert all(word in block for word in (".learn(", ".localize(", ".backward()", ".save("))
+
+
+@pytest.mark.parametrize("page", [name for name in SITE if "/results/" not in name])
+def test_a_page_is_short(page: str) -> None:
+    assert len(SITE[page].split()) <= LONGEST
+
+
+@cache
+def kept() -> set[Path]:
+    """Files of the repository, those that are about to be added among them."""
+    command = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
+    listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    if listed.returncode:
+        pytest.skip("not a clone of the repository")
+    return {ROOT / line for line in listed.stdout.splitlines()}
 
 
 def test_every_linked_file_is_there() -> None:
-    pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
+    """Where GitHub looks for it: generated and ignored files are not."""
     lost = []
-    for page in pages:
-        links = re.findall(r"\]\(([^)\s]+)\)", page.read_text())
-        assert links
-        for link in links:
+    for name, text in PAGES.items():
+        page = ROOT / name
+        for link in re.findall(r"\]\(([^)\s]+)\)", re.sub(r"^```.*?^```$", "", text, flags=re.M | re.S)):
             file, _, anchor = link.partition("#")
-            target = page.parent / file if file else page
-            known = link.startswith("http") or (
-                target.exists() and (not anchor or anchor in anchors_of(target))
+            target = Path(os.path.normpath(page.parent / file)) if file else page
+            known = re.match(r"\w+:", link) or (
+                (target in kept() or target.is_dir()) and (not anchor or anchor in anchors_of(target))
             )
-            lost += [] if known else [f"{page.name}: {link}"]
+            lost += [] if known else [f"{name}: {link}"]
+    assert len(PAGES) > 20
     assert lost == []
 
 
+@cache
 def anchors_of(page: Path) -> set[str]:
     """Of the headings of a page."""
-    headings = [line.lstrip("# ").lower() for line in page.read_text().splitlines() if line[:1] == "#"]
+    text = re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+    headings = [line.lstrip("# ").lower() for line in text.splitlines() if line[:1] == "#"]
     return {re.sub(r"[^\w\- ]", "", heading).replace(" ", "-") for heading in headings}
 
 
@@ -90,6 +140,8 @@ def understand(line: str) -> None:
     """Parse a command as it is shown, without running it."""
     program, line = re.match(f"({PROGRAMS}) (.*)", line, re.DOTALL).groups()
     name, *words = shlex.split(line, comments=True)
+    for end in {"|", ">", ">>", "&&", ";", "&"} & {*words}:  # what the shell does with it
+        words = words[: words.index(end)] if end in words else words
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(ROOT)  # where the configs lie
         if program != "dejavu" or name != "train":
@@ -100,82 +152,91 @@ def understand(line: str) -> None:
             train.run_train(words)
 
 
-SHOWN = ("training", "real_routes", "spectral_maps", "sequences", "storage", "live", "rejection", "growing")
-
-
-@pytest.mark.parametrize("page", ["README", *SHOWN, "scale", "cluster"])
-def test_every_command_shown_is_understood(page: str) -> None:
-    text = (DOCS | {"README": README})[page]
+def lines_shown(text: str) -> list[str]:
+    """Command lines of a page, in blocks and in prose, with the variables of its shell put in."""
+    text = text.replace("\\\n", " ")
+    variables = re.findall(r"^(\w+)=(?:[\"(]|\$\()(.*)[\")]$", text, re.MULTILINE)
+    for name, value in variables + re.findall(r"^for (\w+) in ([^\s;]+)", text, re.MULTILINE):
+        value = "weights.pth" if "python" in value else value
+        text = re.sub(rf'"?\$(?:{name}\b|\{{{name}(?:\[@\])?\}})"?', lambda _, value=value: value, text)
     setting = r"(?:[A-Z_]+=\S+ )*"  # of the environment
-    shown = re.findall(rf"^{setting}((?:{PROGRAMS}) .*)$", text.replace("\\\n", " "), re.MULTILINE)
+    shown = re.findall(rf"^{setting}((?:{PROGRAMS}) .*)$", text, re.MULTILINE)
     inline = re.findall(rf"`{setting}((?:{PROGRAMS}) [^`]+)`", text)
-    shown += [line for line in inline if " -" in line.removeprefix("python -m") and "--help" not in line]
-    assert len(shown) >= 2
-    for line in dict.fromkeys(shown):
-        understand(line)
+    shown += [line for line in inline if " -" in line.removeprefix("python -m")]
+    return [line for line in dict.fromkeys(shown) if not re.search(r"help\b|--version|\.\.\.|COMMAND", line)]
 
 
-def test_every_command_on_pretrained_networks_is_understood() -> None:
-    """With the words that its shell puts in; what is loaded is not asked for here."""
-    pytest.importorskip("efficientnet_lite_pytorch")
-    text = DOCS["pretrained"].replace("\\\n", " ").replace("$weights", "weights.pth")
-    (lite,) = re.findall(r'^lite="(.*)"$', text, re.MULTILINE)
-    (road,) = re.findall(r"^road=\((.*)\)$", text, re.MULTILINE)
-    text = text.replace("$lite", lite).replace('"${road[@]}"', road)
-    shown = re.findall(r"^(?:dejavu|python -m benchmarks) .*$", text, re.MULTILINE)
-    assert len(shown) == 9
-    for line in shown:
-        understand(line)
+@pytest.mark.parametrize("page", [name for name, text in PAGES.items() if lines_shown(text)])
+def test_every_command_shown_is_understood(page: str, tmp_path: Path) -> None:
+    """A configuration that the page shows is in the file that its commands name."""
+    for found in FENCED.finditer(PAGES[page]):
+        if found[2] == "yaml":
+            (tmp_path / "shown.yaml").write_text(found[3])
+    for line in lines_shown(PAGES[page]):
+        understand(re.sub(r"(?<=--config )(?!configs/)[\w/]+\.yaml", str(tmp_path / "shown.yaml"), line))
 
 
-def test_lines_over_cycles_are_those_of_the_code_shown(capsys: pytest.CaptureFixture[str]) -> None:
-    (shown,) = re.findall(r"```python\n(.*?)```", DOCS["spectral_maps"], re.DOTALL)
-    exec(shown, {})
-    printed = [line.split() for line in capsys.readouterr().out.splitlines()]
-    rows = [
-        line.strip("| ").split(" | ")
-        for line in DOCS["spectral_maps"].splitlines()
-        if line.startswith(("| dft", "| dct"))
+def test_commands_are_shown() -> None:
+    shown = {" ".join(line.split()[:2]) for text in PAGES.values() for line in lines_shown(text)}
+    assert {f"dejavu {name}" for name in COMMANDS} - shown <= {"dejavu info"}
+
+
+@cache
+def options() -> set[str]:
+    """Names of options of all commands, and of the arguments of the classes that they take."""
+    parsers = [parser_of("dejavu", name) for name in COMMANDS if name != "train"]
+    parsers += [parser_of("python -m benchmarks", name) for name in BENCHES]
+    classes = [*CLASSES, Augmentation, train.RouteData, train.PlaceRecognitionTask]
+    printed = io.StringIO()
+    with redirect_stdout(printed), pytest.raises(SystemExit):
+        train.run_train(["fit", "--help"])
+    known = {option for parser in parsers for option in parser._option_string_actions}
+    known |= {*re.findall(r"--[a-z][\w.]*", printed.getvalue())}
+    return known | {f".{name}" for one in classes for name in inspect.signature(one).parameters}
+
+
+@pytest.mark.parametrize("page", SITE)
+def test_options_in_prose_exist(page: str) -> None:
+    """`--mapper.hold .85` is known by its last part."""
+    prose = re.sub(r"^```.*?^```$", "", SITE[page], flags=re.MULTILINE | re.DOTALL)
+    shown = re.findall(r"`(--[a-z][\w.]*)[^`]*`", prose)
+    unknown = [
+        name
+        for name in dict.fromkeys(shown)
+        if name not in options()
+        and "." + name.rpartition(".")[2] not in options()
+        and not name.endswith("help")
     ]
-    assert len(rows) == len(printed) == 12
-    for row, line in zip(rows, printed, strict=True):
-        assert row[:3] == line[:3]
-        assert [float(cell) for cell in row[3:]] == pytest.approx([float(cell) for cell in line[3:]], rel=0.1)
+    assert unknown == []
 
 
-def test_the_python_on_rejection_runs(capsys: pytest.CaptureFixture[str]) -> None:
-    (shown,) = re.findall(r"```python\n(.*?)```", DOCS["rejection"], re.DOTALL)
-    exec(shown.replace("frames=400", "frames=100"), {})
-    assert capsys.readouterr().out.count("tensor(") == 2
+TRAINING = [
+    pytest.param(option, id=f"{name}:{option}")
+    for name, text in SITE.items()
+    for option in re.findall(r"`(--(?:model|data|trainer)\.[^`*\s]+ [^`]+)`", text.replace("\n  ", " "))
+    if "my_module" not in option
+]
 
 
-@pytest.mark.parametrize("option", OPTIONS)
-def test_options_that_the_text_on_training_names_are_understood(option: str) -> None:
+@pytest.mark.parametrize("option", TRAINING)
+def test_options_of_training_in_prose_are_understood(option: str) -> None:
     understand(f"dejavu train fit --config train_small --data.source sim:aerial {option}")
 
 
-def test_yaml_on_training_is_understood(tmp_path: Path) -> None:
-    (shown,) = re.findall(r"```yaml\n(.*?)```", DOCS["training"], re.DOTALL)
-    (tmp_path / "stop.yaml").write_text(shown)
-    config = f"--config train_small --config {tmp_path / 'stop.yaml'}"
-    understand(f"dejavu train fit {config} --data.source sim:aerial")
+@pytest.mark.parametrize("shown", with_block("class_path:"))
+def test_yaml_is_understood(shown: str, tmp_path: Path) -> None:
+    (tmp_path / "shown.yaml").write_text(shown)
+    if {*yaml.safe_load(shown)} & {"trainer", "model", "data"}:
+        config = f"--config train_small --config {tmp_path / 'shown.yaml'}"
+        understand(f"dejavu train fit {config} --data.source sim:aerial")
+    else:
+        understand(f"dejavu learn morning/ --map route.safetensors --config {tmp_path / 'shown.yaml'}")
 
 
-def test_export_as_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.slow
+@pytest.mark.parametrize("shown", with_block("MapExport()", "RouteData("))
+def test_training_in_python_as_shown(shown: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "road").mkdir()
-    shown = re.findall(r"```py\n(.*?)```", DOCS["training"], re.DOTALL)[-1]
-    features = SmallCNN(dimension=4, resize=(16, 16), widths=(2,), squeeze=2).eval()
-    model = DejaVu(features, mapper=TemplateMapper(ImposedPeriods([3, 4]))).learn(torch.rand(50, 3, 64, 64))
-    model.save("road/map.safetensors")
-    exec(shown, {})
-    frames, program = torch.rand(5, 3, 64, 64), torch.export.load(tmp_path / "road.pt2")
-    torch.testing.assert_close(program.module()(frames), model.eval()(frames))
-
-
-def test_training_in_python_as_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    shown = re.findall(r"```py\n(.*?)```", DOCS["training"], re.DOTALL)[0]
     shorter = {"max_steps=3000": "max_steps=2, logger=False", "morning/": "sim:aerial?frames=80"}
     for given, short in shorter.items():
         assert given in shown
@@ -185,35 +246,25 @@ def test_training_in_python_as_shown(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert space["model"](torch.rand(2, 3, 64, 64)).shape == (2, 80)
 
 
-def test_a_filter_is_learned_as_the_documentation_shows() -> None:
-    (shown,) = re.findall(r"```python\n(.*?)```", DOCS["sequences"], re.DOTALL)
-    quick = (("max_epochs=30", "max_epochs=2"), ("=240", "=60"))
-    for slow, fast in quick:
-        assert slow in shown
-        shown = shown.replace(slow, fast)
+@pytest.mark.slow
+@pytest.mark.parametrize("shown", with_block("PlaceFilter()", "optimizer"))
+def test_a_filter_is_learned_as_the_documentation_shows(shown: str) -> None:
     space: dict[str, Any] = {}
-    exec(shown, space)
-    learned, fresh = space["learn"].filter, PlaceFilter()
+    exec(shown.replace("=240", "=60"), space)
     near, scores = space["near"], space["scores"]
-    right = [float((one.posterior(scores)[:, :-1] * near).sum(1).log().mean()) for one in (fresh, learned)]
+    learned = next(one for one in space.values() if isinstance(one, PlaceFilter))
+    right = [
+        float((one.posterior(scores)[:, :-1] * near).sum(1).log().mean()) for one in (PlaceFilter(), learned)
+    ]
     assert right[1] > right[0]
     assert (space["match"].index - torch.arange(60)).abs().median() <= 5
 
 
-def test_live_in_python_as_shown(capsys: pytest.CaptureFixture[str]) -> None:
-    (shown,) = re.findall(r"```python\n(.*?)```", DOCS["live"], re.DOTALL)
-    assert shown.count("frames=256") == 2
-    space: dict[str, Any] = {}
-    exec(shown.replace("frames=256", "frames=64"), space)
-    assert capsys.readouterr().out == f"{space['match'].place} True\n"
-    assert abs(space["match"].place - 63) <= 5
-
-
-def test_the_line_of_json_shown_has_the_keys_of_those_printed() -> None:
+@pytest.mark.parametrize("shown", with_block('"reference_frame":'))
+def test_the_line_of_json_shown_has_the_keys_of_those_printed(shown: str) -> None:
     from dejavu_torch.cli.live import line_of
     from dejavu_torch.data.camera import Frame
     from dejavu_torch.live.localizer import LiveMatch
 
-    (shown,) = re.findall(r"```json\n(.*?)```", DOCS["live"], re.DOTALL)
     printed = line_of(Frame(0, 0.0, torch.zeros(1, 1, 1)), LiveMatch(0, 0, "", 0.0, 1.0, 1.0, True, 1.0))
     assert list(json.loads(shown)) == list(json.loads(printed))

@@ -47,7 +47,7 @@ class SpectralMapper(Mapper):
 
     Convention: the written route is within 2 % of the budget and not above it, unless steps so fine that they
         change no score take less. Without `resolution` the share that a map holds is at least `hold`, unless
-            even such steps hold less; that of a long route is as its sample tells.
+        even such steps hold less; that of a long route is as its sample tells.
 
     Raises:
         InputError: settings out of range; forward: fewer than two places, descriptors that are not finite or

@@ -1,0 +1,165 @@
+"""What the site has beyond the files in docs/: the reference, from help texts and docstrings."""
+
+from __future__ import annotations
+
+import inspect
+import io
+import os
+import pkgutil
+import re
+import shlex
+import shutil
+import sys
+from contextlib import redirect_stdout, suppress
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+DOCS = Path(__file__).parent
+ROOT = DOCS.parent
+NOTEBOOKS = DOCS / "notebooks"  # copies, as Sphinx reads one folder
+TEXTS = (r"Convention(?: \d+)?", "Environment", "Returns", "Shape", "Source")  # sections without entries
+SECTION = re.compile(rf"^(Args|Attributes|Buffers[\w ,]*|Example|Raises|{'|'.join(TEXTS)}):(?: (.*))?$", re.M)
+MARKUP = re.compile(r"(`[^`]*`|\*[\w'][^*\n]*[\w']\*)|[|*\\]|(?<=\w)_(?!\w)")  # what stays; what is escaped
+WIDTH = "100"  # characters of a line of help
+
+
+def help_of(line: str) -> str:
+    """What a command line such as `dejavu learn --help` prints."""
+    from benchmarks.__main__ import run
+    from dejavu_torch.cli import run_command
+
+    words = shlex.split(line)
+    program, words = (run_command, words[1:]) if words[0] == "dejavu" else (run, words[3:])
+    printed = io.StringIO()
+    os.environ["COLUMNS"] = WIDTH
+    with redirect_stdout(printed), suppress(SystemExit):
+        program(words)
+    return f"```text\n{printed.getvalue().strip()}\n```"
+
+
+@cache
+def public_names() -> dict[str, Any]:
+    """Classes and functions that are documented for users, by module and name.
+
+    Those of the front door, those whose docstring has a section such as Args, and the classes that these
+    inherit from or name in their signatures.
+    """
+    import dejavu_torch
+
+    own: dict[Any, str] = {}
+    for found in pkgutil.walk_packages(dejavu_torch.__path__, "dejavu_torch."):
+        if not found.name.startswith("dejavu_torch.cli"):
+            for name, value in vars(import_module(found.name)).items():
+                defined = callable(value) and getattr(value, "__name__", "") == name and name[0] != "_"
+                if defined and value.__module__ == found.name:
+                    own[value] = f"{found.name}.{name}"
+    door = {getattr(dejavu_torch, name) for name in dejavu_torch.__all__}
+    public = door | {one for one in own if SECTION.search(inspect.cleandoc(one.__doc__ or ""))}
+    while more := {other for one in public for other in named_by(one) if other in own} - public:
+        public |= more
+    return {name: value for value, name in own.items() if value in public}
+
+
+def named_by(one: Any) -> set[type]:
+    """The bases of a class, and the classes in signatures."""
+    members = [value for name, value in vars(one).items() if name[0] != "_" or name == "__init__"]
+    words = {
+        word
+        for annotated in [one, *members]
+        for text in getattr(annotated, "__annotations__", {}).values()
+        for word in re.findall(r"\w+", str(text))
+    }
+    space = vars(sys.modules[one.__module__])
+    named = {space[word] for word in words if inspect.isclass(space.get(word))}
+    return named | set(getattr(one, "__mro__", ()))
+
+
+def room_of(one: Any) -> str:
+    """The folder of the package that a class or function lives in."""
+    parts = one.__module__.split(".")
+    return ".".join(parts[:2]) if (ROOT / "/".join(parts[:2])).is_dir() else parts[0]
+
+
+def front_door() -> list[str]:
+    """The names that `import dejavu_torch` has, and where each part of the paper is."""
+    import dejavu_torch
+
+    names = [f"[{name}](#dejavu_torch.{dejavu_torch._HOMES[name]}.{name})" for name in dejavu_torch.__all__]
+    return [f"`from dejavu_torch import ...` has {', '.join(names)}.", "", dejavu_torch.__doc__ or "", ""]
+
+
+def api_of(room: str) -> str:
+    """Public names of a room, module by module."""
+    modules: dict[str, list[str]] = {}
+    for name, one in public_names().items():
+        if room_of(one) == room:
+            kind = "autoclass" if inspect.isclass(one) else "autofunction"
+            modules.setdefault(one.__module__, []).append(f".. {kind}:: {name}")
+    lines = front_door() if room == "dejavu_torch" else []
+    for module, directives in modules.items():
+        lines += [f"## {module.removeprefix('dejavu_torch.')}", "", import_module(module).__doc__ or "", ""]
+        lines += ["```{eval-rst}", *directives, "```", ""]
+    return "\n".join(lines)
+
+
+GENERATED = {"help": help_of, "api": api_of}
+
+
+def write(app: Any, docname: str, source: list[str]) -> None:
+    """Put in what is generated, and let links lead where they lead on GitHub."""
+    page = Path(app.env.doc2path(docname))
+    folder = ROOT / "notebooks" if page.parent == NOTEBOOKS else page.parent
+
+    def link(found: re.Match[str]) -> str:
+        target, anchor = Path(os.path.normpath(folder / found[1])), found[2] or ""
+        if target == ROOT / "README.md":
+            target, anchor = DOCS / "index.md", ""
+        elif target.parent == ROOT / "notebooks":
+            target = NOTEBOOKS / target.name
+        return f"]({os.path.relpath(target, page.parent)}{anchor})" if target.is_file() else found[0]
+
+    text = re.sub(
+        r"^```\{(help|api)\}\n(.*)\n```$", lambda found: GENERATED[found[1]](found[2]), source[0], flags=re.M
+    )
+    source[0] = re.sub(r"\]\(([\w./-]+)(#[^)\s]*)?\)", link, text)
+
+
+def as_rst(app: Any, what: str, name: str, one: Any, options: Any, lines: list[str]) -> None:
+    """A docstring in reStructuredText: each section a field, each argument a point."""
+    text, _, example = "\n".join(lines).partition("\nExample:\n")
+    lines[:], section = [], ""
+    for line in MARKUP.sub(lambda found: found[1] or f"\\{found[0]}", text).split("\n"):
+        if found := SECTION.match(line):
+            section = found[1]
+            lines += ["", f":{section}:"]
+            line = f"    {found[2] or ''}"
+        elif section and line[:1].strip() and not lines[-1].strip():
+            section = ""  # a paragraph of its own
+        if not section or re.fullmatch("|".join(TEXTS), section):
+            lines.append(f"    {line}" if section and line[:1].strip() else line)
+            continue
+        parts = [line] if section == "Raises" else re.split(r"(?<=\.) (?=[a-z]\w*(?:, \w+)*: )", line)
+        for part in (parts[0], *(f"    {part}" for part in parts[1:])):
+            entry = re.match(r"    (\w+(?:, \w+)*): (.*)", part)
+            point = f"    * **{entry[1]}**: {entry[2]}" if entry else f"      {part[8:] or part.strip()}"
+            lines.append(point)
+    if example:
+        lines += ["", ":Example:", "", *example.split("\n"), ""]
+
+
+def is_skipped(app: Any, what: str, name: str, one: Any, skip: bool, options: Any) -> bool | None:
+    """Fields of a NamedTuple have no docstring of their own."""
+    return True if type(one).__name__ == "_tuplegetter" else None
+
+
+def setup(app: Any) -> dict[str, bool]:
+    """What Sphinx calls first."""
+    shutil.rmtree(NOTEBOOKS, ignore_errors=True)
+    shutil.copytree(ROOT / "notebooks", NOTEBOOKS, ignore=shutil.ignore_patterns(".*"))
+    app.connect("source-read", write)
+    app.connect("autodoc-process-docstring", as_rst)
+    app.connect("autodoc-skip-member", is_skipped)
+    app.connect("env-get-outdated", lambda *_: ["reference/commands"])  # it follows the code
+    return {"parallel_read_safe": True}

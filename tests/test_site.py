@@ -1,0 +1,119 @@
+"""The documentation's site: built without a warning, with every public name and command, its links whole."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+from functools import cache
+from html import unescape
+from pathlib import Path
+from urllib.parse import unquote
+
+import pytest
+
+import dejavu_torch
+from benchmarks.__main__ import BENCHES
+from dejavu_torch.cli import COMMANDS
+
+pytestmark = pytest.mark.slow
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "dejavu_torch"
+SECTIONS = re.compile("^(Args|Attributes|Convention|Raises|Returns|Shape|Example):", re.MULTILINE)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    for needed in ("sphinx", "furo", "myst_nb"):
+        pytest.importorskip(needed)
+    out = tmp_path_factory.mktemp("site")
+    command = [
+        sys.executable,
+        "-m",
+        "sphinx",
+        "-W",
+        "--keep-going",
+        "-q",
+        "-d",
+        out / "trees",
+        "docs",
+        out / "html",
+    ]
+    ran = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert (ran.returncode, ran.stdout, ran.stderr) == (0, "", "")
+    return out / "html"
+
+
+def documented() -> dict[str, str]:
+    """Public names and their docstrings: those of the front door, and those with sections."""
+    found = {}
+    for path in PACKAGE.rglob("*.py"):
+        module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.ClassDef | ast.FunctionDef) and not node.name.startswith("_"):
+                text, home = ast.get_docstring(node) or "", dejavu_torch._HOMES.get(node.name)
+                door = f"dejavu_torch.{home}" == module
+                if door or (SECTIONS.search(text) and path.parent.name != "cli"):
+                    found[f"{module}.{node.name}"] = text
+    return found
+
+
+def words(text: str) -> str:
+    """What is left of marked-up text."""
+    return " ".join(re.findall(r"\w+", text))
+
+
+@cache
+def shown(page: Path) -> str:
+    return words(unescape(re.sub(r"<[^>]*>", "", page.read_text())))
+
+
+def test_every_public_name_has_its_docstring_on_the_page_of_its_folder(site: Path) -> None:
+    from sphinx.util.inventory import InventoryFile
+
+    with (site / "objects.inv").open("rb") as file:
+        objects = InventoryFile.load(file, "", lambda base, uri: uri)
+    entries = objects["py:class"] | objects["py:function"] | objects.get("py:exception", {})
+    names = documented()
+    assert len(names) > 150
+    assert {f"dejavu_torch.{home}.{name}" for name, home in dejavu_torch._HOMES.items()} <= set(names)
+    assert set(names) <= set(entries)
+    for name, text in names.items():
+        page = site / entries[name].uri.partition("#")[0]
+        assert page.parent == site / "reference" / "api"
+        assert words(text.partition("\n\n")[0]) in shown(page), name
+        assert "/_modules/" in page.read_text()
+
+
+def test_every_command_has_its_help(site: Path) -> None:
+    text = shown(site / "reference" / "commands.html")
+    for name in (*COMMANDS, "train options fit"):
+        assert f"usage dejavu {name} " in text
+    for name in BENCHES:
+        assert f"usage python m benchmarks {name} " in text
+    for option in ("search_every", "mapper route_bytes_per_place", "model rate", "codebooks"):
+        assert option in text
+
+
+def test_every_link_within_the_site_leads_somewhere(site: Path) -> None:
+    anchors = {
+        page: {unescape(name) for name in re.findall(r'\bid="([^"]+)"', page.read_text())}
+        for page in site.rglob("*.html")
+    }
+    lost = []
+    for page in anchors:
+        for link in set(re.findall(r'\b(?:href|src)="([^"<]+)"', page.read_text())):
+            file, _, anchor = unquote(unescape(link)).partition("#")
+            if re.match(r"\w+:|//", file):
+                continue
+            target = (page.parent / file.partition("?")[0]).resolve() if file else page
+            whole = target.is_file() and (not anchor or anchor in anchors.get(target, ()))
+            lost += [] if whole else [f"{page.relative_to(site)}: {link}"]
+    assert len(anchors) > 20
+    assert lost == []
+
+
+def test_notebooks_are_pages(site: Path) -> None:
+    for notebook in (ROOT / "notebooks").glob("*.ipynb"):
+        assert (site / "notebooks" / notebook.stem).with_suffix(".html").is_file()
