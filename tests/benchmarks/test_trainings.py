@@ -50,6 +50,9 @@ def test_a_training_is_set_beside_the_untrained_map_and_made_once(
     assert "broken, seed 3: " in capsys.readouterr().out
     assert (tmp_path / "out" / "bench.png").is_file()
     # the same training again is not run; another is, and one that did not end well
+    row = found["flight, short", "trained 5 B"]
+    monkeypatch.setattr(trainings.Judge, "of", lambda *_: [row])
+    monkeypatch.setattr(trainings.Judge, "hog", lambda *_: row)
     calls: list[list[str]] = []
 
     def counted(command: list[str], **settings: Any) -> subprocess.CompletedProcess[bytes]:

@@ -268,6 +268,7 @@ def test_a_filter_stands_beside_single_queries_in_order_and_changes_nothing_else
 def test_many_queries_in_order_are_filtered_if_that_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     pair = [open_source(f"sim:aerial?frames=30&traverse={i}") for i in range(2)]
     found = []
+    monkeypatch.setattr("dejavu_torch.evaluation.compare.draw_pictures", lambda *_: {})
     for most in (900, 899):
         monkeypatch.setattr("dejavu_torch.evaluation.compare.UNASKED", most)
         found.append([bool(compare(*pair, ordered=ordered).run.matching.beside) for ordered in (None, True)])

@@ -11,8 +11,10 @@ from PIL import Image
 
 from dejavu_torch.cli import commands, main
 from dejavu_torch.data.source import open_source
+from dejavu_torch.evaluation import reproduce
+from dejavu_torch.evaluation.reproduce import paper_model
 
-FRAMES = 1024
+FRAMES = 256
 PICTURES = (
     *("pairs", "coverage", "scores", "pr", "auc", "storage", "sequences", "spectrum", "components"),
     "reliability",
@@ -23,7 +25,10 @@ OF_TEMPLATES = {"chunks", "spectrogram", "templates", "features", "activations"}
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("demo")
+    paper = paper_model()
+    paper.mapper.periods.window = FRAMES  # type: ignore[union-attr]
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(reproduce, "paper_model", lambda: paper)
         patch.setattr(commands, "open_source", lambda source: open_source(f"{source}&frames={FRAMES}"))
         with (out / "printed.txt").open("w") as printed, redirect_stdout(printed):
             main(["demo", "--out", str(out)])
