@@ -20,7 +20,7 @@ import yaml
 
 from benchmarks.__main__ import BENCHES
 from dejavu_torch import PlaceFilter
-from dejavu_torch.cli import COMMANDS, commands, train
+from dejavu_torch.cli import COMMANDS, commands, completion, train
 from dejavu_torch.cli.parser import command_parser
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.cnn import SmallCNN
@@ -133,7 +133,8 @@ class ParseOnly(train.TrainCLI):
 @cache
 def parser_of(program: str, name: str) -> Any:
     """The parser of a command, which takes as long to make as to read a line with."""
-    return command_parser(name, getattr(commands, f"run_{name}") if program == "dejavu" else BENCHES[name])
+    room = completion if name == "completion" else commands
+    return command_parser(name, getattr(room, f"run_{name}") if program == "dejavu" else BENCHES[name])
 
 
 def understand(line: str) -> None:
