@@ -120,7 +120,7 @@ def test_options_overrule_it_wherever_they_are(words: str, asked: list[dict[str,
 
 
 def test_the_words_in_full_are_the_same(asked: list[dict[str, Any]]) -> None:
-    page = (Path(__file__).parents[1] / "docs" / "pretrained.md").read_text().replace("\\\n", " ")
+    page = (Path(__file__).parents[1] / "docs" / "howto" / "pretrained.md").read_text().replace("\\\n", " ")
     shown = re.findall(r"^dejavu learn \S+ --map \S+ (.*eigenplaces.*)$", page, re.MULTILINE)
     nets = [features_of(*shlex.split(words)) for words in shown]
     assert len(nets) == 2
@@ -152,7 +152,7 @@ def test_a_member_has_settings_of_its_own(asked: list[dict[str, Any]]) -> None:
 
 
 def test_a_member_has_arguments_of_its_own(asked: list[dict[str, Any]]) -> None:
-    page = (Path(__file__).parents[1] / "docs" / "pretrained.md").read_text().replace("\n", " ")
+    page = (Path(__file__).parents[1] / "docs" / "howto" / "pretrained.md").read_text().replace("\n", " ")
     shown = re.findall(r"`(\[HOG, \{class_path: hub.*?\}\])`", page)
     assert len(shown) == 1
     net = features_of("--features", shown[0]).members[1]

@@ -220,7 +220,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
 def test_the_documentation_runs_and_a_filter_goes_from_state_to_state(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    page = (Path(__file__).parents[1] / "docs" / "export.md").read_text()
+    page = (Path(__file__).parents[1] / "docs" / "howto" / "export.md").read_text()
     monkeypatch.chdir(tmp_path)
     frame = next(open_source("sim:aerial?frames=64&traverse=1").between(40, 41))[0]
     Image.fromarray((frame * 255).byte().permute(1, 2, 0).numpy()).save("frame.png")
