@@ -34,7 +34,7 @@ FRAMES = 250  # of a route
 BATCH = 64
 LEAST = 30  # steps
 LEARNING_RATE, WEIGHT_DECAY = 6e-3, 0.02
-JUDGED = 8  # batches that a share is of
+JUDGED_ON, JUDGED = 512, 8  # drawn images, and batches of their views that a share is of
 POOLED = 6  # cells of a grid, on which the teacher is met as well as in each cell of the maps
 
 
@@ -197,7 +197,7 @@ def run_distil(*, out: Path, steps: int = 8000, seed: int = 0) -> Sequence[str]:
     with whole_folder(out) as folder:
         save_file(tensors, folder / path.name)
     layers = loaded(path)
-    judged = {"leaves": drawn(IMAGES, 512), **{kind: frames_of(kind, HELD) for kind in ROUTES}}
+    judged = {"leaves": drawn(IMAGES, JUDGED_ON), **{kind: frames_of(kind, HELD) for kind in ROUTES}}
     rows: list[Row] = []
     for name, held in judged.items():
         cells, grid = explained(layers, network, held)

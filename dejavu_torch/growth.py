@@ -263,15 +263,19 @@ def second_traverse(
 
 
 def calibrate_if_possible(
-    model: DejaVu, reference: Traverse, views: Views | None = None, places: Tensor | None = None
+    model: DejaVu,
+    reference: Traverse,
+    views: Views | None = None,
+    places: Tensor | None = None,
+    progress: bool = False,
 ) -> None:
     """As `DejaVu.calibrate`; without views a map is left as it is if it is calibrated, or cannot be by its
     reference."""
     if views is not None:
-        model.calibrate(reference, views)
+        model.calibrate(reference, views, progress=progress)
     elif model.calibration is None and len(reference.frame_shape) == 3 and model.map.summary().covered:
         try:
-            model.calibrate(reference, places=places)
+            model.calibrate(reference, None, places, progress)
         except InputError as error:
             log.warning("the map is not calibrated: %s", error)
 

@@ -569,6 +569,7 @@ def calibration_of(
     reference: Traverse | None,
     views: Views | None = None,
     places: Tensor | None = None,
+    progress: str | None = None,
 ) -> Calibration:
     """How probably answers of a map are right, by their confidence; see `DejaVu.calibrate`."""
     if views is None:
@@ -585,7 +586,7 @@ def calibration_of(
     else:
         length = max(STRETCH, min(LONGEST_SEGMENT, SEGMENT_SCORES // route.places))
         views = _segments_of(views, length, max(LEAST, CALIBRATION_SCORES // route.places))
-    name, descriptors = views.traverse.name, concatenate(describer.descriptors(views.traverse))
+    name, descriptors = views.traverse.name, concatenate(describer.descriptors(views.traverse, progress))
     if len(descriptors) != len(views.places):
         seen = f"{name} has {len(descriptors)} frames and {len(views.places)} places"
         raise InputError(f"{seen}; expected as many")

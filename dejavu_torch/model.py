@@ -64,6 +64,7 @@ from dejavu_torch.recognition.sample_file import check_searches, kept_search
 from dejavu_torch.recognition.search import SCORES_AT_ONCE, Find, Search, check_search
 from dejavu_torch.recognition.select import HIGHEST, PROBABLE, Acceptance, check_candidates
 from dejavu_torch.resize import reduced_size
+from dejavu_torch.text import bar
 from dejavu_torch.types import (
     BATCH_NUMBERS,
     InputError,
@@ -399,6 +400,7 @@ class DejaVu(nn.Module):
         reference: Traverse | Tensor | None,
         views: Views | None = None,
         places: Tensor | None = None,
+        progress: bool = False,
     ) -> DejaVu:
         """Learn how probably answers are right by their confidence, for `Match.probability`.
 
@@ -410,6 +412,7 @@ class DejaVu(nn.Module):
                 those that show no place are left out, and very many are sampled.
             places: (n,) int64, which place each frame of the reference shows, -1 for none; None is frame i at
                 place i.
+            progress: see `learn`.
 
         Returns:
             self, with `self.calibration`.
@@ -429,7 +432,8 @@ class DejaVu(nn.Module):
         own = None
         if reference is not None and views is None:
             own = self.fit(as_traverse(reference), self.frame_shape or ())
-        self.calibration = calibration_of(self.describer, self.map, own, views, places)
+        text = "calibrating" if progress else None
+        self.calibration = calibration_of(self.describer, self.map, own, views, places, text)
         return self
 
     def describe(self, frames: Tensor) -> Tensor:
@@ -482,20 +486,21 @@ class DejaVu(nn.Module):
         descriptors: Tensor,
         matching: Matching | SequenceModel | None = None,
         order: Tensor | None = None,
+        progress: str | None = None,
     ) -> Match:
         """As `localize`, of descriptors (Q,K) as the map's own are: whitened if the model whitens.
 
         Args:
             matching: or the sequence of `localize`. order: (N,) which frame each place of a shuffled map is;
-                the match then counts frames.
+                the match then counts frames. progress: text of a progress bar on a terminal; None is no bar.
         """
         matching = matching if isinstance(matching, Matching) else self.matching(matching)
         localizer = self.localizer(matching)
         if order is None:
-            return localizer(descriptors)
+            return localizer(descriptors, progress)
         matcher, place = Localizer(None, matching), order.argsort()
         parts = descriptors.split(max(1, SCORES_AT_ONCE // self.map.places))
-        scores = (self.map.scores(part.to(self.map.positions.device)) for part in parts)
+        scores = (self.map.scores(part.to(self.map.positions.device)) for part in bar(parts, progress))
         with torch.no_grad():
             return Match.joined(matcher.match(part[:, place.to(part.device)]) for part in scores)
 

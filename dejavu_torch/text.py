@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from inspect import signature
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 from unicodedata import category
 
 if TYPE_CHECKING:
     from torch import nn
+
+Step = TypeVar("Step")
 
 
 def printable(text: object) -> str:
@@ -27,3 +30,11 @@ def settings_of(module: nn.Module, *hidden: str) -> str:
     """The constructor's arguments, as `extra_repr` shows them."""
     names = (name for name in signature(type(module)).parameters if name not in hidden)
     return ", ".join(f"{name}={getattr(module, name)!r}" for name in names)
+
+
+def bar(steps: Sequence[Step], text: str | None) -> Iterable[Step]:
+    """The steps of a long work, with a progress bar on stderr if that is a terminal; no text is no bar."""
+    from tqdm import tqdm
+
+    shown: Iterable[Step] = tqdm(steps, text, disable=None if text else True, leave=False)
+    return shown

@@ -45,7 +45,7 @@ FEW_VIEWS = {
     *("test_cli", "test_cli_evaluate", "test_cli_spectral", "test_cli_resampling", "test_several_places"),
     *("test_cli_growth", "test_faults", "test_readme", "test_memory_bench", "test_scale", "test_demo"),
     *("test_cli_networks", "test_pretrained", "test_cli_rejection", "test_onnx_export", "test_reproduce"),
-    *("test_routes", "test_spectral_training"),
+    *("test_routes", "test_spectral_training", "test_trainings", "test_compare", "test_stages"),
 }
 PIXELS = FEW_VIEWS - {"test_demo"} | {"test_real_routes"}
 

@@ -139,7 +139,7 @@ def test_learn_and_info_tell_what_the_map_holds(folder: Path, capsys: pytest.Cap
         assert f"{summary.route_bytes} of the route, {per_place:.2f} per place" in told
         assert f"{summary.fixed_bytes} fixed" in told
         assert f"whitening {summary.fixed['whitening']}" in told
-        assert "1764 + 1152 to 48 numbers" in told
+        assert "1764 + 1440 to 48 numbers" in told
         assert "views=2" in told
         assert "less than half" not in told
     assert "route_bytes_per_place=None" in info
@@ -265,7 +265,7 @@ def test_a_map_that_holds_a_share(folder: Path, capsys: pytest.CaptureFixture[st
         ("--whitening.strengths.colour2 0", ("colour2", "expected colour, rotation")),
         ("--mapper.periods.window 64", ("--mapper", "unrecognized", "periods.window")),
         ("--whitening nowhere.safetensors", ("nowhere.safetensors is not there",)),
-        ("--whitening m.safetensors", ("(64, 1092)", "(B, 2916)")),
+        ("--whitening m.safetensors", ("(64, 1764)", "(B, 3204)")),
         ("--whitening m.safetensors --whitening.views 2", ("--whitening.views", "no settings")),
         ("--whitening=m.safetensors --preprocess.patch 5", ("--preprocess.patch", "has its own")),
         ("--whitening m.safetensors --features.cell 16", ("learned with Joined; got HOG",)),

@@ -326,6 +326,9 @@ def test_what_a_writer_could_not_take_is_refused_ahead_of_the_work(
         "localize map.safetensors b.npy --out map.safetensors",
         "localize map.safetensors b.npy?start=3 --out ./b.npy",
         "localize map.safetensors images?width=8 --out images/0.png",
+        "localize map.safetensors b.npy --out b.txt",
+        "localize map.safetensors b.npy --out new.csv --pairs map.safetensors",
+        "localize map.safetensors b.npy?start=3 --out new.csv --pairs ./b.txt",
         "learn link.npy --map link.safetensors",
         "learn a.npy --second b.npy --second_truth link.safetensors --map link.safetensors",
         "learn a.npy --whitening map.safetensors --map ./map.safetensors",
@@ -400,7 +403,7 @@ def test_a_full_disk_is_one_line_and_leaves_what_was_there(folder: Path) -> None
     )
     found = mounted(
         folder,
-        "size=64k",
+        "size=84k",
         "mkdir disk/old; echo old > disk/old/matches.csv; echo old > disk/old/pr.png",
         "cp map.safetensors disk; dd if=/dev/zero of=disk/full bs=1k count=36 status=none",
         f"{words} | grep ^status",

@@ -12,6 +12,8 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from benchmarks.results import Run, runs
+from benchmarks.tables import reports
 from dejavu_torch import HOG
 from dejavu_torch.cli import main
 from dejavu_torch.data.source import open_source
@@ -243,34 +245,14 @@ def test_a_stretch_of_the_road_trained_on_one_flight_is_known_on_the_other(
 
 
 @pytest.mark.figures
-@pytest.mark.parametrize(
-    ("column", "name", "options"),
-    [
-        (0, "road", ()),
-        (1, "road", ("--mapper.route_bytes_per_place", "2.5")),
-        (2, "corridor", ("--tolerance", "0", "--truth", "{}/corridor/truth.csv")),
-        (3, "railway", ()),
-    ],
-)
-def test_spectral_maps(
-    column: int, name: str, options: tuple[str, ...], data_dir: Path, tmp_path: Path
-) -> None:
-    report = compare(tmp_path, *(one.format(data_dir) for one in (*SOURCES[name], *options)))
-    table = rows(section("Spectral maps"))
-    names = {
-        "**this map**": "",
-        "its descriptors of all frames, float": "uncompressed",
-        "its descriptors, int8, of every 10th frame (corridor: of all)": "stride",
-        "interpolated, as many route bytes": "interpolated",
-        "null: shuffled frames, as many bytes": "null",
-        "HOG of all frames": "hog",
-        "HOG of every 10th frame": "hog_stride_coarsest",
-    }
-    for row, key in names.items():
-        if told := numbers(table[row][column]):  # the corridor is too short for every 10th frame
-            assert told == pytest.approx(scores(report, key), abs=0.03), row
-    for key in ("route_bytes_per_place", "bytes_per_place"):
-        assert numbers(table[key.replace("_", " ")][column]) == pytest.approx([report[key]], rel=0.02)
+@pytest.mark.parametrize("run", [run for run in runs(["default"]) if not run.footage.startswith("sim:")])
+def test_maps_of_all_footage_are_what_the_results_say(run: Run, data_dir: Path, tmp_path: Path) -> None:
+    report = compare(tmp_path, *(word.replace("{data}", str(data_dir)) for word in run.words[1:]))
+    told = reports("default")[run.footage]
+    for key in ("", "uncompressed", "null", "hog", "hog_stride_coarsest"):
+        assert scores(report, key) == pytest.approx(scores(told, key), abs=0.03), key
+    for key in ("route_bytes_per_place", "fixed_bytes"):
+        assert report[key] == pytest.approx(told[key], rel=0.02)
 
 
 @pytest.mark.parametrize(

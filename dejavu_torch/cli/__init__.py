@@ -11,21 +11,9 @@ from typing import NoReturn
 
 from dejavu_torch import __version__
 from dejavu_torch.cli import process
+from dejavu_torch.cli.names import COMMANDS, FIRST_DAY
 from dejavu_torch.text import one_line, printable
 
-COMMANDS = {  # what `dejavu --help` says of them; each is `run_NAME` of commands.py, or train.py
-    "demo": "learn the built-in route, localize a second traverse of it, report",
-    "learn": "learn a map",
-    "localize": "find the frames of a source on a map",
-    "live": "find the frames of a camera on a map, one by one",
-    "compare": "learn, localize and evaluate, beside baselines and null control",
-    "evaluate": "evaluate the matches in a csv, whatever found them",
-    "reproduce": "the paper's experiments on simulated routes, beside its own numbers",
-    "train": "train features that repeat: fit, validate, test or export",
-    "merge": "join the maps of several routes",
-    "export": "write a map, and what is ahead of it, as an ONNX file",
-    "info": "what is in a map",
-}
 LONGEST = 300  # characters of a message of torch's
 
 
@@ -112,6 +100,8 @@ def run_command(given: Sequence[str]) -> None:
 
             run_train(words)
             return
+        if name == "completion":
+            from dejavu_torch.cli import completion as commands  # type: ignore[no-redef]
         function = getattr(commands, f"run_{name}")
         chosen = parse(name, function, words)
         if COMMAND in function.__annotations__:
@@ -149,9 +139,10 @@ def overview(word: str) -> NoReturn:
     if word == "--version":
         print(f"dejavu_torch {__version__}")
     elif word in ("--help", "-h"):
-        print("usage: dejavu COMMAND ...\n\nPlace recognition from repeating features.\n\ncommands:")
-        for name, text in COMMANDS.items():
-            print(f"  {name:<10}  {text}")
+        print("usage: dejavu COMMAND ...\n\nPlace recognition from repeating features.")
+        more = [name for name in COMMANDS if name not in FIRST_DAY]
+        for heading, names in (("commands", FIRST_DAY), ("more", more)):
+            print(f"\n{heading}:", *(f"  {name:<10}  {COMMANDS[name]}" for name in names), sep="\n")
         print("\n`dejavu COMMAND --help` shows its options, `dejavu --version` the version.")
     elif word == "bench":
         where = "in a clone of the repository, with pip install '.[bench]'"

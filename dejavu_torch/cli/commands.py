@@ -39,6 +39,7 @@ from dejavu_torch.cli.options import (
     several,
 )
 from dejavu_torch.data.frame_range import chained
+from dejavu_torch.data.names import names_of
 from dejavu_torch.data.output import check_output_file, check_output_folder, whole_folder
 from dejavu_torch.data.source import check_not_read, open_source
 from dejavu_torch.evaluation.answers import next_steps, probable_counts, told_line, told_probable
@@ -116,8 +117,9 @@ def run_learn(
     """Learn a map; print its plan, its summary and the bytes per place.
 
     Args:
-        sources: folder of images, video (clip.mp4?width=160), .npy of frames or features,
-            sim:NAME?seed=0&traverse=0, or strip:IMAGE?width=96; several are one route, one behind the other
+        sources: folder of images (9 before 10, or photos?order=lexicographic), video (clip.mp4?width=160),
+            .npy of frames or features, .h5 of hloc's global descriptors, sim:NAME?seed=0&traverse=0, or
+            strip:IMAGE?width=96; several are one route, one behind the other
         map: map file to write (.safetensors)
         cluster: Ray workers that make the chunks of a long route: auto, one for each processor of this
             machine, or the address of a cluster. Sources are read there, by the same paths
@@ -164,7 +166,7 @@ def run_learn(
         seen = f"{model.map.places} frames are learned here"
         print(f"{seen}: --cluster {cluster} is for the chunks of over {SHORT}")
     if learning.calibration != NO_CALIBRATION:
-        growth.calibrate_if_possible(model, traverse, known, places)
+        growth.calibrate_if_possible(model, traverse, known, places, True)
     model.matching()
     model.save(map)
     checkpoint.remove()
@@ -181,6 +183,7 @@ def run_localize(
     out: Path,
     acceptance: Acceptance,
     top: int | None = None,
+    pairs: Path | None = None,
     corners: list[list[float]] | None = None,
     sequences: Searches,
     searching: KeptSearching,
@@ -195,12 +198,20 @@ def run_localize(
         out: csv of query,place,score,accepted[,probability][,rank][,route],query_name,place_name
         top: write so many places of each query, no two within 5 of each other, a row each with its rank; a
             probability is that of the first
+        pairs: also write lines `query_name place_name`, as hloc and COLMAP read them, one for each place
         corners: where this camera sees the ground that the map's saw in its --velocity.corners
         cluster: Ray workers among which the map is divided, as of `dejavu learn`; they take single queries
     """
+    from dejavu_torch.evaluation.matches import check_pair_names
+
     device_of(loading.device)
     check_output_file(out)
     check_not_read(out, map, source, searching.search_file)
+    if pairs is not None:
+        check_output_file(pairs)
+        check_not_read(pairs, map, source, searching.search_file)
+        if pairs.resolve() == out.resolve():
+            raise InputError(f"--pairs {pairs} is --out as well; expected another name")
     matcher = sequences.matcher(APART, acceptance.threshold)
     acceptance.check(matcher)
     if cluster is not None:
@@ -220,6 +231,9 @@ def run_localize(
     if top is not None:
         check_candidates(top, APART, model.map.places)
     query = model.fit(open_source(source), model.frame_shape or ())
+    if pairs is not None:
+        check_pair_names(model.frame_names, f"the map {map}")
+        check_pair_names(names_of(query, query.length or 1), query.name)
     if model.step is not None:
         query = model.resample(query, model.step, True, model.frame_shape)
         _print_steps(query)
@@ -235,7 +249,7 @@ def run_localize(
             yield match
 
     with _searching(cluster, model):
-        total, accepted = _write_matches(out, counted(), query, model, top)
+        total, accepted = _write_matches(out, counted(), query, model, top, pairs)
     if not model.map.summary().covered:
         print("the map holds no layers: no place can be reported")
     elif not rule.given:
@@ -381,6 +395,7 @@ def run_evaluate(
     query: str | None = None,
     map: Path | None = None,
     route: str | None = None,
+    recall_values: Sequence[int] = (),
     command: str,
 ) -> None:
     """Evaluate the matches in a csv, whatever found them: scores, curve, coverage.
@@ -396,17 +411,27 @@ def run_evaluate(
         map: says how many frames there are, and which place each of them is where the map's are resampled
         route: of matches on a merged map, the route that --truth, --reference and the query are of; answers
             on other routes are wrong
+        recall_values: such as 1 5 10 20: also print the share of all queries that have a right answer among
+            their first N ranks; with --tolerance 0 the figures of VPR-methods-evaluation
     """
     from dejavu_torch.evaluation.evaluate import evaluate_file
     from dejavu_torch.evaluation.report import report_folder, write_report
 
     first, second = (None if source is None else open_source(source) for source in (reference, query))
     _check_report_folder(out, (), [reference, query], [matches, truth, map])
-    result = evaluate_file(matches, truth, tolerance, interpolate, first, second, map, route)
+    result = evaluate_file(matches, truth, tolerance, interpolate, first, second, map, route, recall_values)
     with report_folder(out) as folder:
         title = f"{matches} evaluated by {truth}"
         write_report(folder, result.report, result.pictures, title, command)
     _print_contradiction(result.report)
+    if recall_values:
+        recalls = result.report.facts["recall_values"]
+        print(", ".join(f"R@{first}: {100 * recall:.1f}" for first, recall in recalls.items()))
+        if tolerance:
+            unit = result.report.facts["unit"]
+            print(
+                f"these allow {tolerance} {unit} beside the right places; VPR-methods-evaluation allows none"
+            )
     _print_scores(result.report, out)
 
 
@@ -744,7 +769,12 @@ def _publish(
 
 
 def _write_matches(
-    path: Path, matches: Iterable[Match], query: Traverse, model: DejaVu, ranks: int | None = None
+    path: Path,
+    matches: Iterable[Match],
+    query: Traverse,
+    model: DejaVu,
+    ranks: int | None = None,
+    pairs: Path | None = None,
 ) -> tuple[int, int]:
     """Write the matches of a query that the map was asked for; returns how many (queries, accepted)."""
     from dejavu_torch.evaluation.matches import write_matches
@@ -753,7 +783,7 @@ def _write_matches(
     if isinstance(query, ResampledTraverse):
         frames, source = query.frame, query.traverse
     names = source.frame_name, model.frame_name
-    return write_matches(path, matches, frames, model.map.frame_of, *names, ranks, model.map.routes)
+    return write_matches(path, matches, frames, model.map.frame_of, *names, ranks, model.map.routes, pairs)
 
 
 def _print_contradiction(report: Report) -> None:

@@ -323,8 +323,8 @@ class Judging:
     """How answers are judged, and what else a report of them has.
 
     Args:
-        truth: offset (place = query + offset), csv of query,place[,place...], npz with GThard, or utm:25 for
-            coordinates in image names
+        truth: offset (place = query + offset), csv of query,place[,place...], json of a list per query, npz
+            with GThard, or utm:25 by image names
         tolerance: right within so many places, inclusive
         interpolate: fill in a csv that lists some queries only
         leave_out: of templates, a diagnostic: the reference on itself, without so many frames each side

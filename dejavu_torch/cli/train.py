@@ -130,7 +130,8 @@ class TrainCLI(LightningCLI):
         every = LightningCLI.subcommands() | {"export": {"model", "datamodule"}}
         return {name: every[name] for name in ("fit", "validate", "test", "export")}
 
-    def init_parser(self, **kwargs: Any) -> LightningArgumentParser:
+    @staticmethod
+    def init_parser(**kwargs: Any) -> LightningArgumentParser:
         """A parser whose errors are one line."""
         parser = TrainParser(**kwargs)
         parser.add_argument(
@@ -146,12 +147,21 @@ class TrainCLI(LightningCLI):
             return self.init_parser(**kwargs)
         return super()._prepare_subcommand_parser(klass, subcommand, **kwargs)
 
-    def add_core_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+    @staticmethod
+    def add_core_arguments_to_parser(parser: LightningArgumentParser) -> None:
         """Our options ahead of Lightning's."""
         parser.add_lightning_class_args(PlaceRecognitionTask, "model")
         parser.add_lightning_class_args(RouteData, "data")
         parser.add_lightning_class_args(MapTrainer, "trainer")
         parser.set_defaults({f"trainer.{name}": value for name, value in TRAINER.items()} | PARTS)
+
+    @classmethod
+    def stage_parser(cls) -> LightningArgumentParser:
+        """The options that all stages share."""
+        parser = cls.init_parser()
+        cls.add_core_arguments_to_parser(parser)
+        parser.add_argument("--ckpt_path", type=Path, help="checkpoint to go on from, or to take")
+        return parser
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
         """Refuse numbers that Lightning fails on later."""

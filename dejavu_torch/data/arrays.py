@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.files import reading, state_of
-from dejavu_torch.data.folder import ROUNDING
+from dejavu_torch.data.files import read_text, reading, state_of
+from dejavu_torch.data.folder import ROUNDING, rising
 from dejavu_torch.data.frame_range import IndexedTraverse
 from dejavu_torch.memory import check_room
 from dejavu_torch.text import printable
@@ -38,6 +39,7 @@ class ArrayTraverse(IndexedTraverse):
     """
 
     path: Path | None = None  # of the file that has all of the values, and nothing else
+    names: Sequence[str] = ()  # of the images that features are of, where a file beside theirs has them
 
     def __init__(self, values: Tensor | np.ndarray, name: str = UNNAMED) -> None:
         shape = tuple(values.shape)
@@ -78,6 +80,9 @@ class ArrayTraverse(IndexedTraverse):
         # writable, of this machine
         return torch.from_numpy(np.array(part, dtype=part.dtype.newbyteorder("=")))
 
+    def frame_name(self, i: int) -> str:
+        return self.names[i] if self.names else ""
+
     def state(self, start: int, stop: int) -> str:
         if self.path is not None:
             return state_of(self.path)
@@ -92,15 +97,31 @@ class ArrayTraverse(IndexedTraverse):
 def read_array(path: Path) -> ArrayTraverse:
     """An `.npy` file of frames or features, memory-mapped.
 
+    Features (N,D) get the names of their images from a text file of the same name beside theirs, `X.txt`
+    beside `X.npy`, if there is one: a line for each.
+
     Raises:
-        InputError: not a whole .npy file, an array of another shape or type, or no memory for a frame.
+        InputError: not a whole .npy file, an array of another shape or type, no memory for a frame, or
+            another number of names.
     """
     with reading(path, "is no whole .npy array", EXPECTED):
         values = np.lib.format.open_memmap(path, mode="r")
         traverse = ArrayTraverse(values, printable(path))
         check_room(24.0 * math.prod(values.shape[1:]), f"a frame of {path}")
     traverse.path = path
+    beside = names_beside(path)
+    if values.ndim == 2 and beside.exists():
+        expected = f"{len(values)} names, a line for each row of {path}"
+        names = [line.strip() for line in read_text(beside, expected).splitlines() if line.strip()]
+        if len(names) != len(values):
+            raise InputError(f"{beside} has {len(names)} names; expected {expected}")
+        traverse.names, traverse.ordered = names, rising(names)
     return traverse
+
+
+def names_beside(path: Path) -> Path:
+    """Where the names of the images of an `.npy` file of features are."""
+    return path.with_suffix(".txt")
 
 
 def as_traverse(source: Traverse | Tensor) -> Traverse:

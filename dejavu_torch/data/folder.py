@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import re
+from collections.abc import Iterable, Sequence
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,6 +21,9 @@ from dejavu_torch.resize import MOST_PIXELS, is_stretched, resize_frames
 from dejavu_torch.text import printable
 from dejavu_torch.types import InputError
 
+log = logging.getLogger("dejavu_torch")
+
+NATURAL, LEXICOGRAPHIC = "natural", "lexicographic"  # orders of names
 SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"}
 MOST_READ = 2**28  # pixels of an image, such as a long strip; a small file can claim any number
 ROUNDING = 1e-3  # by which a number may miss the range from 0 to 1
@@ -36,30 +42,30 @@ class ImageFolder(IndexedTraverse):
     Args:
         width, height: pixels to resize each image to as it is read, antialiased; 0 keeps the image's
             own, or its aspect ratio where only the other is given.
+        order: "natural", as above, or "lexicographic", by text (10 before 9); "" is natural, and a line says
+            so where the two differ.
 
     Raises:
-        InputError: width or height out of range; no such folder, or no images in it; while reading, an image
-            that cannot be read or that has another size than the first.
+        InputError: width or height out of range; another order; no such folder, or no images in it; while
+            reading, an image that cannot be read or that has another size than the first.
     """
 
-    def __init__(self, path: str | Path, width: int = 0, height: int = 0) -> None:
+    def __init__(self, path: str | Path, width: int = 0, height: int = 0, order: str = "") -> None:
         folder = Path(path)
         check_size(folder, width, height)
         if not folder.is_dir():
             raise InputError(f"{folder} is not there; expected a folder of images")
-        inside = sorted(folder.iterdir(), key=lambda file: natural(file.name))
+        inside = list(folder.iterdir())
         images = [file for file in inside if file.suffix.lower() in SUFFIXES and file.name[0] != "."]
-        self.files = [file for file in images if file.is_file()]
-        if not self.files:
-            names = [file.name for file in inside if file.is_dir()]
-            inner = f"; it has folders such as {names[0]}" if names else ""
+        names = in_order([file.name for file in images if file.is_file()], order, printable(folder))
+        self.files = [folder / name for name in names]
+        if not names:
+            folders = sorted((file.name for file in inside if file.is_dir()), key=natural)
+            inner = f"; it has folders such as {folders[0]}" if folders else ""
             raise InputError(f"{folder} holds no images{inner}; expected files such as .png or .jpg")
         self.width, self.height, self.sized = width, height, bool(width or height)
         self.path, self.name = folder, printable(folder)
-        self.length = len(self.files)
-        numbers = [re.search(r"\d+$", file.stem) for file in self.files]
-        rising = [int(one[0]) for one in numbers if one]
-        self.ordered = len(rising) == self.length and all(a < b for a, b in pairwise(rising))
+        self.length, self.order, self.ordered = len(names), order, rising(names)
         self.alike = False  # whether images of other aspect ratios are refused, as portraits
         self._first: tuple[str, str, tuple[int, int]] | None = None  # that was read: name, shape, own size
 
@@ -71,7 +77,8 @@ class ImageFolder(IndexedTraverse):
         return self.files[i].name
 
     def identity(self) -> str:
-        return f"{super().identity()} {self.width} x {self.height}"
+        by_text = " by text" * (self.order == LEXICOGRAPHIC)
+        return f"{super().identity()} {self.width} x {self.height}{by_text}"
 
     def state(self, start: int, stop: int) -> str:
         return state_of(*self.files[start:stop])
@@ -160,3 +167,30 @@ def natural(name: str) -> tuple[list[str | int], str]:
     # odd positions are the digit runs, so that numbers only ever meet numbers
     parts = re.split(r"(\d+)", name)
     return [int(part) if j % 2 else part for j, part in enumerate(parts)], name
+
+
+def in_order(names: Iterable[str], order: str, source: str) -> list[str]:
+    """The names of the images of a source in an order, as of `ImageFolder`; `source` is for messages."""
+    if order not in ("", NATURAL, LEXICOGRAPHIC):
+        raise InputError(f"{source}: order is {order!r}; expected {NATURAL} or {LEXICOGRAPHIC}")
+    by_number = sorted(names, key=natural)
+    by_text = sorted(by_number)
+    differing = [(a, b) for a, b in zip(by_number, by_text, strict=True) if a != b]
+    if differing and not order:
+        first, other = differing[0]
+        _say_once(
+            f"{source} is in natural order, {first} before {other}; ?order={LEXICOGRAPHIC} sorts by text, "
+            f"?order={NATURAL} leaves this line out"
+        )
+    return by_text if order == LEXICOGRAPHIC else by_number
+
+
+@cache  # a command opens some sources several times
+def _say_once(line: str) -> None:
+    log.warning("%s", line)
+
+
+def rising(names: Sequence[str]) -> bool:
+    """Whether all names, but for their suffixes, end in numbers that rise."""
+    numbers = [re.search(r"\d{1,99}$", Path(name).stem) for name in names]  # int refuses some thousand digits
+    return None not in numbers and all(int(a[0]) < int(b[0]) for a, b in pairwise(filter(None, numbers)))

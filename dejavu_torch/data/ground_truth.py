@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 import zipfile
@@ -14,14 +15,14 @@ import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from dejavu_torch.data.files import LARGEST, as_number, check_regular, read_rows, reading
+from dejavu_torch.data.files import LARGEST, as_number, check_regular, read_rows, read_text, reading
 from dejavu_torch.memory import check_room
 from dejavu_torch.types import InputError, Traverse
 
 PAIRS_AT_ONCE = 2**20
 EXPECTED = (
-    "an integer offset such as 0, a .csv of query,place, an .npz with GThard or utm:25 for coordinates in "
-    "image names"
+    "an integer offset such as 0, a .csv of query,place, a .json with a list of places for each query, an "
+    ".npz with GThard or utm:25 for coordinates in image names"
 )
 PLACE_BYTES = 32  # of each place in a table of right places, with what is computed from it
 
@@ -136,7 +137,7 @@ def check_ground_truth(truth: str, interpolate: bool = False) -> int | float | P
     suffix = path.suffix.lower()
     if interpolate and suffix != ".csv":
         raise InputError(f"truth {truth} cannot be interpolated; expected a .csv of query,place")
-    if suffix in (".csv", ".npz"):
+    if suffix in (".csv", ".json", ".npz"):
         check_regular(path, EXPECTED)
         return path
     offset = offset_of(truth)
@@ -168,6 +169,7 @@ def find_ground_truth(
             - a `.csv` of `query,place[,place...]`, with or without such a header: every listed place is
               right. A query listed without a place, or with -1, has no right answer; one that is not listed
               is left out of the scores;
+            - a `.json` with a list for each query, in order, of all its right places; an empty one has none;
             - an `.npz` with the boolean matrices (reference frames, query frames) `GThard` and/or `GTsoft`,
               as in the visual place recognition tutorial of Schubert et al. What is in GThard is right (in
               GTsoft, if that is the only one); what is in GTsoft only counts neither way;
@@ -215,9 +217,13 @@ def find_ground_truth(
         coordinates = utm_coordinates(query)
         coordinates = coordinates[_below(numbers, len(coordinates))]
         found = as_ground_truth(near_truth(utm_coordinates(reference), coordinates, said))
-    elif said.suffix.lower() == ".csv":
+    elif said.suffix.lower() in (".csv", ".json"):
         length = query.length if query is not None and resampled else None
-        found = _read_table(said, numbers, frames, length, interpolate, resampled)
+        if said.suffix.lower() == ".csv":
+            places = _listed(said, frames, interpolate)
+        else:
+            places = _listed_in_json(said, frames, len(numbers) if every else length, int(numbers.max()) + 1)
+        found = _read_table(said, places, numbers, length, interpolate, resampled)
     else:
         found = _read_matrices(said, numbers, frames, every)
     if (found.positives >= 0).any():
@@ -280,7 +286,9 @@ def utm_coordinates(traverse: Traverse) -> Tensor:
     """Easting and northing in the names of a traverse's images, metres: (N,2) float64."""
     names = [traverse.frame_name(i) for i in range(traverse.length or 0)]
     if not any(names):
-        raise InputError(f"{traverse.name} has no image names; expected folders of images for truth utm")
+        raise InputError(
+            f"{traverse.name} has no image names; expected them for truth utm, as of folders of images"
+        )
     rows = [[as_number(part) for part in name.split("@")[1:3]] for name in names]
     for name, row in zip(names, rows, strict=True):
         if len(row) != 2 or None in row:
@@ -290,10 +298,14 @@ def utm_coordinates(traverse: Traverse) -> Tensor:
 
 
 def _read_table(
-    path: Path, numbers: Tensor, frames: int | None, length: int | None, interpolate: bool, resampled: bool
+    path: Path,
+    places: dict[int, list[float]],
+    numbers: Tensor,
+    length: int | None,
+    interpolate: bool,
+    resampled: bool,
 ) -> GroundTruth:
-    """A csv of `query,place[,place...]`; `length`: of a query traverse that is resampled."""
-    places = _listed(path, frames, interpolate)
+    """The places that a file lists for queries; `length`: of a query traverse that is resampled."""
     first, last = min(places), max(places)
     queries = numbers.tolist()
     if interpolate:
@@ -365,6 +377,30 @@ def _listed(path: Path, frames: int | None, interpolate: bool) -> dict[int, list
     if not listed:
         raise InputError(f"{path} lists no query; expected lines of query,place")
     return listed
+
+
+def _listed_in_json(path: Path, frames: int | None, count: int | None, least: int) -> dict[int, list[float]]:
+    """The places of each query in a list of lists.
+
+    Args:
+        count, least: how many queries there are, None where unknown, and there are so many at least.
+    """
+    expected = "a list of whole numbers, its right places, for each query"
+    with reading(path, "is no JSON", expected):
+        rows = json.loads(read_text(path, expected))
+    if not isinstance(rows, list) or len(rows) < least or count not in (None, len(rows)):
+        seen = f"a list of {len(rows)}" if isinstance(rows, list) else f"a {type(rows).__name__}"
+        queries = f"{least} queries or more" if count is None else f"{count} queries"
+        raise InputError(f"{path} holds {seen}; expected {expected}, {queries}")
+    end = LARGEST if frames is None else frames
+    for query, row in enumerate(rows):
+        listed = isinstance(row, list)
+        wrong = [one for one in (row if listed else [row]) if type(one) is not int or not 0 <= one < end]
+        if wrong or not listed:
+            last = "" if frames is None else f" to {frames - 1}"
+            seen = f"{path}, query {query}: {json.dumps(wrong[0] if listed else row)[:40]}"
+            raise InputError(f"{seen}; expected a list of frames of the reference from 0{last}")
+    return dict(enumerate(rows))
 
 
 def _rounded(place: float) -> int:

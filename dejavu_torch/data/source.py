@@ -11,9 +11,11 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl
 
-from dejavu_torch.data.arrays import read_array
+from dejavu_torch.data.arrays import names_beside, read_array
 from dejavu_torch.data.folder import SUFFIXES, ImageFolder, natural
 from dejavu_torch.data.frame_range import FrameRange
+from dejavu_torch.data.h5 import SUFFIXES as H5_SUFFIXES
+from dejavu_torch.data.h5 import DescriptorFile
 from dejavu_torch.data.simulate import SIMULATORS
 from dejavu_torch.data.strip import read_strip
 from dejavu_torch.data.video import SUFFIXES as VIDEO_SUFFIXES
@@ -23,7 +25,8 @@ from dejavu_torch.types import InputError, Traverse
 KINDS = {int: "integer", float: "floating-point number"}  # what the values of options are
 PART = {"start": 0, "stop": 0, "step": 1}  # options of every source, see `FrameRange`
 EXPECTED = (
-    "a folder of images or a video, such as clip.mp4?width=160, an .npy file of frames or features, "
+    "a folder of images or a video, such as clip.mp4?width=160, an .npy file of frames or features, an .h5 "
+    "file of hloc's descriptors, "
     "sim:aerial?seed=0&traverse=0&frames=3072, sim:outdoor, sim:underground, or strip:IMAGE?width=96"
 )
 
@@ -32,12 +35,14 @@ def open_source(source: str | Path, size: tuple[int, int] | None = None) -> Trav
     """Open what a command was given to read.
 
     Args:
-        source: a folder of images (sorted by name), `photos` or `photos?width=160&height=90`; a video file,
-            `clip.mp4` or with the same options; an `.npy` file of frames (N,H,W) or (N,H,W,3) uint8, or of
-            features (N,D) float; `sim:NAME?seed=0&traverse=0&frames=3072`, NAME being aerial, outdoor or
-            underground; or `strip:IMAGE?width=96&rows=32:128&halve=1&grey=1`, a window slid along one long
-            image. Of all of them `start=`, `stop=` and `step=` take the frames [start, stop) only, every
-            step-th of them.
+        source: a folder of images (sorted by name, see `ImageFolder`), `photos`,
+            `photos?width=160&height=90` or `photos?order=lexicographic`; a video file, `clip.mp4` or with
+            the same width and height; an `.npy` file of frames (N,H,W) or (N,H,W,3) uint8, or of features
+            (N,D) float, with the names of their images in an `.txt` file beside it; an `.h5` file of hloc's
+            global descriptors, also with `order=`; `sim:NAME?seed=0&traverse=0&frames=3072`, NAME being
+            aerial, outdoor or underground; or `strip:IMAGE?width=96&rows=32:128&halve=1&grey=1`, a window
+            slid along one long image. Of all of them `start=`, `stop=` and `step=` take the frames
+            [start, stop) only, every step-th of them.
         size: (height, width) in pixels that images of a folder and frames of a video are brought to where
             the source names neither.
 
@@ -78,7 +83,8 @@ def routes_of(source: str | Path) -> list[str]:
 
 
 def check_not_read(out: Path, *sources: str | Path | None) -> None:
-    """Refuse an output that is what a command reads, or an image of a folder that it reads: it would be lost.
+    """Refuse an output that is what a command reads, be it an image of a folder or the names beside an array:
+    it would be lost.
 
     `sources` are as of `open_source`, or any other text; a path counts, though nothing may be there yet.
     """
@@ -86,7 +92,8 @@ def check_not_read(out: Path, *sources: str | Path | None) -> None:
         place = Path(_split(str(source))[0].removeprefix("strip:"))
         read = False
         with suppress(OSError, ValueError, RuntimeError):  # one is not there, no path, or links to itself
-            read = out.resolve() == place.resolve() or out.samefile(place)
+            names = [names_beside(place)] if place.suffix.lower() == ".npy" else []
+            read = any(out.resolve() == one.resolve() for one in (place, *names)) or out.samefile(place)
             read = read or (out.suffix.lower() in SUFFIXES and out.parent.samefile(place))
         if read:
             raise InputError(f"{out} is what is read; expected another name")
@@ -120,6 +127,8 @@ def _reader(text: str, address: str) -> Callable[..., Traverse]:
         return partial(Video, path)
     if suffix == ".npy":
         return partial(read_array, path)
+    if suffix in H5_SUFFIXES:
+        return partial(DescriptorFile, path)
     seen = "a single image" if suffix in SUFFIXES else "none of the kinds that can be read"
     raise InputError(f"{path} is {seen}; expected {EXPECTED}")
 

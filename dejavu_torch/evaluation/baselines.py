@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from dejavu_torch.evaluation.controls import leave_out_match, null_control
 from dejavu_torch.features.hog import HOG
@@ -22,6 +21,7 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import recipe_of
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.recognition.localizer import SINGLE, Localizer, Matching
+from dejavu_torch.text import bar
 from dejavu_torch.types import InputError, Match, Traverse
 
 if TYPE_CHECKING:  # training needs the baselines of HOG, and no plots
@@ -69,12 +69,7 @@ def nearest_frames(
     nearest = ((torch.arange(len(reference), device=reference.device) + k // 2) // k).clamp(
         max=len(stored) - 1
     )
-    batches = tqdm(
-        query.split(max(1, DISTANCES_AT_ONCE // len(reference))),
-        progress,
-        disable=None if progress else True,
-        leave=False,
-    )
+    batches = bar(query.split(max(1, DISTANCES_AT_ONCE // len(reference))), progress)
     scores = (phase_distances(batch.to(stored.device), stored, metric) for batch in batches)
     if k > 1:
         scores = (part[:, nearest] for part in scores)
@@ -157,7 +152,7 @@ def baselines_of(
         }
         found = {key: nearest(name, reference, k, size(own, k), k) for key, (name, k) in names.items()}
 
-    found |= _null_controls(run, seed, one)
+    found |= _null_controls(run, seed, one, progress)
     if leave_out is not None:
         index, score, *_ = leave_out_match(model, reference, leave_out)
         itself = Match(index, score, score.isfinite())
@@ -172,13 +167,15 @@ def baselines_of(
     return found
 
 
-def _null_controls(run: Localization, seed: int, one: str) -> dict[str, Baseline]:
+def _null_controls(run: Localization, seed: int, one: str, progress: bool) -> dict[str, Baseline]:
     """Maps of the same frames in random order; `one` is what a place is called."""
     model, spectral = run.model, isinstance(run.model.map, SpectralMap)
     found = {}
 
     def null(name: str, same_plan: bool = False) -> Baseline:
-        match = null_control(model, run.reference_features, run.query_features, seed, same_plan, run.matching)
+        text = "null control" if progress else None
+        pair = run.reference_features, run.query_features
+        match = null_control(model, *pair, seed, same_plan, run.matching, text)
         return Baseline(f"null: {name}", match)
 
     foreign = isinstance(model.mapper, TemplateMapper) and model.mapper.periods is None

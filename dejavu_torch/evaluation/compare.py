@@ -163,7 +163,7 @@ def compare(
             places = model.describe_reference(reference, second, text)
             model.learn_features(places, reference)
         if isinstance(calibration, Views) or (calibration is None and not has_map):
-            calibrate_if_possible(model, reference, calibration)
+            calibrate_if_possible(model, reference, calibration, progress=progress)
 
     with timed(seconds, "localize"):
         rule = model.matching(sequence)
@@ -178,8 +178,8 @@ def compare(
         matching = Matching(sequence, ways)
         ranks = max(top, min(max(RANKS), model.map.places))
         rule = rule._replace(beside=ways, k=ranks, radius=tolerance)
-        candidates = model.localize_descriptors(queries, rule)
-    off_map = _match_distractors(model, distractors, sequence)
+        candidates = model.localize_descriptors(queries, rule, progress="localizing" if progress else None)
+    off_map = _match_distractors(model, distractors, sequence, progress)
 
     model.cpu()
     known = known if counted else find_truth(len(places), len(queries))
@@ -223,8 +223,10 @@ def _set_beside(
         baselines = baselines_of(run, seed, leave_out, progress)
         contenders = {key: _beside(run, key, baseline) for key, baseline in baselines.items()}
     for key, (name, other) in others.items() if known else ():
-        other.learn(run.reference)
-        found = other.localize_descriptors(other.extract_all(run.query), run.matching)
+        other.learn(run.reference, progress)
+        queries = other.extract_all(run.query, f"describing the query for {name}" if progress else None)
+        text = f"localizing with {name}" if progress else None
+        found = other.localize_descriptors(queries, run.matching, progress=text)
         contenders[key] = _contend(run, name, found, other)
     return contenders
 
@@ -269,7 +271,7 @@ def _check_given_map(model: DejaVu, places: Tensor, name: str, tolerance: int) -
 
 
 def _match_distractors(
-    model: DejaVu, distractors: Sequence[Traverse], sequence: SequenceModel | None
+    model: DejaVu, distractors: Sequence[Traverse], sequence: SequenceModel | None, progress: bool
 ) -> dict[str, Tensor]:
     """By name, the probability of what is found for each frame of other routes, (n,)."""
     if distractors and not model.matching(sequence).platt:
@@ -277,7 +279,8 @@ def _match_distractors(
         return {}
     found = {}
     for one in distractors:
-        descriptors = model.extract_all(Fitted(one, model.frame_shape or ()))
+        text = f"describing {one.name}" if progress else None
+        descriptors = model.extract_all(Fitted(one, model.frame_shape or ()), text)
         probability = model.localize_descriptors(descriptors, sequence).probability
         assert probability is not None
         found[one.name] = probability

@@ -44,6 +44,7 @@ def null_control(
     seed: int = 0,
     same_plan: bool = False,
     sequence: Matching | SequenceModel | None = None,
+    progress: str | None = None,
 ) -> Match:
     """Matches of a map learned from the reference in shuffled order.
 
@@ -54,7 +55,7 @@ def null_control(
         reference: (N,D) features. query: (Q,D) features.
         same_plan: keep the layers of the model's template map and learn only the templates anew. Otherwise
             the periods are sought anew too, and a finder that tests them finds none in noise.
-        sequence: as of `DejaVu.localize`.
+        sequence: as of `DejaVu.localize`. progress: text of a progress bar on a terminal; None is no bar.
 
     Returns:
         Match of (Q,) whose index is the reference frame *stored* at the reported place; -1 where
@@ -74,7 +75,7 @@ def null_control(
             null.learn_features(mixed)
         finally:
             log.setLevel(level)
-    return null.localize_descriptors(query, sequence, order)
+    return null.localize_descriptors(query, sequence, order, progress)
 
 
 def shuffled(reference: Tensor, seed: int = 0) -> tuple[Tensor, Tensor]:

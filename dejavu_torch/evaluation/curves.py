@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import torch
@@ -174,6 +175,33 @@ def recall_at(candidates: Tensor, truth: Tensor | GroundTruth, tolerance: int, f
     positives = truth.positives[kept]
     right = torch.stack([is_right(place, positives, tolerance) for place in candidates[kept, :first].T])
     return int(right.any(0).sum()) / max(1, int((positives >= 0).any(1).sum()))
+
+
+def recall_over_all(
+    candidates: Tensor, truth: Tensor | GroundTruth, tolerance: int, firsts: Sequence[int]
+) -> dict[str, float]:
+    """Share of all judged queries that have a right answer among their first N candidates, for each N.
+
+    As tools for image retrieval count, and unlike `recall_at`: a query that has no right answer is a miss.
+
+    Shape: (Q,K).
+
+    Raises:
+        InputError: an N that is not from 1 to K.
+
+    Example:
+        >>> places, right = torch.tensor([[7, 0], [9, 4]]), torch.tensor([[0], [-1]])
+        >>> recall_over_all(places, right, 0, [1, 2]), recall_at(places, right, 0, 2)
+        ({'1': 0.0, '2': 0.5}, 1.0)
+    """
+    truth, ranks = as_ground_truth(truth), candidates.shape[1]
+    for first in firsts:
+        if not 1 <= first <= ranks:
+            more = f", or matches written with --top {first}" * (first > ranks)
+            raise InputError(f"recall among the first {first} of {ranks} ranks; expected 1 to {ranks}{more}")
+    right = torch.stack([is_right(place, truth.positives, tolerance) for place in candidates.T], 1)
+    found = right[truth.judged].cumsum(1) > 0
+    return {str(first): int(found[:, first - 1].sum()) / max(1, len(found)) for first in firsts}
 
 
 def count_queries(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> dict[str, int]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -26,6 +26,7 @@ from dejavu_torch.evaluation.curves import (
     count_queries,
     curve_of,
     recall_at,
+    recall_over_all,
     threshold_of_full_precision,
 )
 from dejavu_torch.evaluation.match_plots import draw_coverage
@@ -62,6 +63,7 @@ def evaluate_file(
     query: Traverse | None = None,
     map: Path | None = None,
     route: str | None = None,
+    recall_values: Sequence[int] = (),
 ) -> Evaluation:
     """Scores and pictures of the matches in a csv.
 
@@ -76,6 +78,7 @@ def evaluate_file(
             truth are turned from frames into places.
         route: of matches on a merged map, the route that `truth` and `reference` are of: answers on other
             routes are wrong.
+        recall_values: see `recall_over_all`; each at most the ranks of a query.
 
     Raises:
         InputError: matches, ground truth or map that cannot be read, do not fit each other, or leave no query
@@ -119,6 +122,8 @@ def evaluate_file(
     accepted = facts["accepted"]
     facts["accepted_precision"] = facts["accepted_right"] / accepted if accepted else None
     facts |= {"matches": str(matches), "places": places}
+    if recall_values:
+        facts["recall_values"] = recall_over_all(candidates, known, tolerance, recall_values)
     if route is not None:
         facts |= {"route": route, "elsewhere": int(elsewhere[:, 0].sum())}
     ours = contend(printable(matches.name), match, known, tolerance)

@@ -8,8 +8,9 @@ import logging
 import math
 from bisect import bisect_right
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TextIO
 
 import torch
 from torch import Tensor
@@ -52,6 +53,7 @@ def write_matches(
     place_name: Callable[[int], str] | None = None,
     ranks: int | None = None,
     routes: Sequence[Route] = (),
+    pairs: Path | None = None,
 ) -> tuple[int, int]:
     """Write matches that come in parts as a csv; returns how many (queries, accepted at their first rank).
 
@@ -64,6 +66,8 @@ def write_matches(
         ranks: how many matches each query has; None is one, and no column for the rank.
         routes: of a merged map, which get a column with the name of each: the place is then a frame of that
             route, while `frame_of` and `place_name` count through all of them.
+        pairs: another file, for a line `query_name place_name` for each match that reports a place: the pairs
+            of images that hloc and COLMAP read.
 
     Convention 11: query and place count frames of the sources, -1 where no place is reported.
     """
@@ -73,7 +77,13 @@ def write_matches(
     matches = iter(matches)
     start = next(matches, None)
     known = start is not None and start.probability is not None
-    with whole_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+    with ExitStack() as stack:
+
+        def opened(path: Path) -> TextIO:
+            temporary = stack.enter_context(whole_file(path))
+            return stack.enter_context(temporary.open("w", newline="", encoding="utf-8"))
+
+        file, paired = opened(path), None if pairs is None else opened(pairs)
         told = {"probability": known, "rank": ranks is not None, "route": bool(routes)}
         columns = [*NUMBERS, *(name for name, is_told in told.items() if is_told), *NAMES]
         writer = csv.DictWriter(file, columns, extrasaction="ignore")
@@ -100,8 +110,20 @@ def write_matches(
                     "place_name": _name(place_name, place),
                 }
                 writer.writerow(row)
+                if paired and place >= 0:
+                    paired.write(f"{row['query_name']} {row['place_name']}\n")
                 accepted += good and at == 1
     return total, accepted
+
+
+def check_pair_names(names: Sequence[str], whose: str) -> None:
+    """Refuse what a file of pairs, two names with a space between them, cannot hold: frames without a name,
+    or a name with spaces; `whose` they are is for the message.
+    """
+    for name in names or [""]:
+        if name.split() != [name]:
+            seen = f"the name {name!r}" if name else "a frame without a name"
+            raise InputError(f"{whose} has {seen}; expected names without spaces for --pairs")
 
 
 def _name(name_of: Callable[[int], str] | None, frame: int) -> str:

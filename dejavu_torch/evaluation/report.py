@@ -155,6 +155,16 @@ def summary(report: Report) -> str:
     return _told(report, "summary")
 
 
+def verdict(report: Report) -> str:
+    """Whether it worked, in a sentence or two."""
+    return _told(report, "verdict")
+
+
+def steps(report: Report) -> list[str]:
+    """What to do next, a sentence each."""
+    return [step.strip() for step in _told(report, "next").split("¶") if step.strip()]
+
+
 def _told(report: Report, part: str) -> str:
     facts, scores = report.facts, report.ours.scores
     counts = facts.get("probably_right")
@@ -167,6 +177,7 @@ def _told(report: Report, part: str) -> str:
         baseline=report.contenders.get("uncompressed"),
         line=told_line(facts, scores is not None),
         probable=told_probable(counts, facts["queries"]) if counts else "",
+        likely=counts[f"{PROBABLE:g}"] / max(1, facts["queries"]) if counts else None,
         steps=steps_after(facts),
         late=any(is_late(one) for one in report.shown().values()),
         late_recall=LATE,
@@ -212,18 +223,22 @@ def write_report(
     plan: str | None = None,
 ) -> None:
     """Write report.json, one PNG for each picture, and index.html with all of it inside."""
-    facts, shown, embedded = report.facts, report.shown(), []
+    facts, shown, embedded = report.facts, report.shown(), {}
     for name, picture in pictures.items():
         data = as_png(picture)
         (folder / f"{name}.png").write_bytes(data)
-        embedded.append((picture, _embedded(data)))
+        embedded[name] = (picture, _embedded(data))
+    first = next((name for name in ("pairs", "coverage") if name in embedded), "")
     coded = [size for size in facts.get("storage", {}).get("map", ()) if "sequences" in size]
     rows = score_table(report)
     sizes = ["map"] * max(0, len(rows) - 1 - len(shown))  # rows of our descriptors in other sizes
     _write_page(
         folder,
         title=printable(title),
+        verdict=verdict(report),
         lead=headline(report),
+        steps=steps(report),
+        first=embedded.pop(first, None),
         notes=[summary(report)],
         rows=rows,
         colours=[colour_of(key) for key in (*sizes, *shown)],
@@ -234,7 +249,7 @@ def write_report(
         every_row=score_table(report, every=True),
         contenders=report.contenders,
         facts=facts,
-        pictures=embedded,
+        pictures=[*embedded.values()],
         plan=plan,
         made_by=f"{printable(command)}\ndejavu_torch {facts['version']}, torch {facts['torch']}",
     )

@@ -7,7 +7,6 @@ from functools import partial
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from dejavu_torch.evaluation.baselines import as_int8, interpolated, nearest_frames
 from dejavu_torch.evaluation.contenders import evaluate_each
@@ -19,6 +18,7 @@ from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.spectrum import from_spectrum, spectrum
 from dejavu_torch.recognition.localizer import SINGLE
+from dejavu_torch.text import bar
 from dejavu_torch.types import InputError, Match
 
 BUDGETS = (1.0, 2.5, 5.0, 10.0, 20.0)  # route bytes per place
@@ -49,7 +49,7 @@ def coded_at_sizes(
     }
     found: dict[str, list[Stored]] = {key: [] for key in kinds}
     cases = [(key, budget) for key in kinds for budget in budgets]
-    for key, budget in tqdm(cases, "storage", disable=None if progress else True, leave=False):
+    for key, budget in bar(cases, "storage" if progress else None):
         for answers, size in kinds[key](budget):
             answers = answers.renumbered(route.table.scored)
             scores = evaluate(answers, run.truth, run.tolerance)

@@ -101,8 +101,9 @@ def features_of(batch: Tensor, describe: Callable[[Tensor], Tensor], name: str =
         return batch
     check_frames(batch, f"{name} is", " or float features (B,D)")
     features = describe(batch)
-    made = tuple(features.shape) if isinstance(features, Tensor) else f"a {type(features).__name__}"
-    if not isinstance(features, Tensor) or len(made) != 2 or len(features) != len(batch):
+    # no len(): it would fix the batch of an exported graph
+    if not isinstance(features, Tensor) or features.ndim != 2 or features.shape[0] != batch.shape[0]:
+        made = tuple(features.shape) if isinstance(features, Tensor) else f"a {type(features).__name__}"
         owner = describe[-1] if isinstance(describe, nn.Sequential) else describe
         owner = getattr(owner, "__self__", owner)  # of a method
         owner = getattr(owner, "features", owner)

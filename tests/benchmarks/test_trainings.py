@@ -20,12 +20,20 @@ def test_a_training_is_set_beside_the_untrained_map_and_made_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     flight = Route(
-        "sim:aerial?frames=120", "sim:aerial?frames=120&traverse=1", options="--trainer.max_steps 2"
+        "sim:aerial?frames=120", "sim:aerial?frames=120&traverse=1", options="--trainer.max_steps 1"
     )
     broken = flight._replace(options="--model.lr 0")
     monkeypatch.setattr(trainings, "ROUTES", {"flight, short": flight, "broken": broken})
     given = ("trainings", tmp_path, "--out", tmp_path / "out", "--seeds", "3", "--jobs", "2")
-    benchmark(*given)
+    real = subprocess.run
+
+    def refusing(command: list[str], **settings: Any) -> subprocess.CompletedProcess[bytes]:
+        refused = ["sh", "-c", "echo 'dejavu: lr is 0'; exit 2"]  # sooner than a training
+        return real(refused if "--model.lr" in command else command, **settings)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(subprocess, "run", refusing)
+        benchmark(*given)
     rows = json.loads((tmp_path / "out" / "bench.json").read_text())["rows"]
     found = {(row["case"], row["contender"]): row for row in rows}
     for kind in (
@@ -43,7 +51,6 @@ def test_a_training_is_set_beside_the_untrained_map_and_made_once(
     assert (tmp_path / "out" / "bench.png").is_file()
     # the same training again is not run; another is, and one that did not end well
     calls: list[list[str]] = []
-    real = subprocess.run
 
     def counted(command: list[str], **settings: Any) -> subprocess.CompletedProcess[bytes]:
         if command[0] == "git":  # asks for the commit

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +45,43 @@ def test_values(values: np.ndarray, expected: Tensor, kind: str, tmp_path: Path)
     assert found.dtype == expected.dtype
     assert torch.equal(found, expected)
     assert traverse.length == 7
+
+
+@pytest.mark.parametrize(
+    ("text", "ordered"),
+    [
+        ("".join(f"db/{i}.jpg\n" for i in range(5, 12)), True),
+        ("\ufeff" + "\r\n".join(f" {i % 3} é.jpg " for i in range(7)) + "\n\n", False),
+        ("".join(f"{'9' * 5000}{i}\n" for i in range(7)), True),
+    ],
+)
+def test_a_file_beside_features_names_their_images(tmp_path: Path, text: str, ordered: bool) -> None:
+    np.save(tmp_path / "a.npy", FEATURES)
+    (tmp_path / "a.txt").write_bytes(text.encode())
+    traverse = read_array(tmp_path / "a.npy")
+    names = [line.strip("\ufeff ") for line in text.splitlines() if line]
+    for one in (traverse, pickle.loads(pickle.dumps(traverse))):
+        assert [one.frame_name(i) for i in range(7)] == names
+    assert traverse.ordered is ordered
+    assert torch.equal(all_of(traverse), torch.tensor(FEATURES))
+
+
+@pytest.mark.parametrize("count", [0, 6, 8])
+def test_another_number_of_names_is_refused(tmp_path: Path, count: int) -> None:
+    np.save(tmp_path / "a.npy", FEATURES)
+    (tmp_path / "a.txt").write_text("a.jpg\n" * count)
+    with refused("a.txt", f"has {count} names", "expected 7 names", "a.npy"):
+        read_array(tmp_path / "a.npy")
+
+
+def test_names_that_are_no_text_are_refused_and_frames_have_none(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", FEATURES)
+    np.save(tmp_path / "b.npy", GREY)
+    for name in ("a.txt", "b.txt"):
+        (tmp_path / name).write_bytes(b"\xff\xfe\n" * 7)
+    with refused("a.txt", "UTF-8"):
+        read_array(tmp_path / "a.npy")
+    assert read_array(tmp_path / "b.npy").frame_name(0) == ""
 
 
 def test_another_byte_order_is_read(tmp_path: Path) -> None:

@@ -88,6 +88,36 @@ def test_numbers_in_names_count_as_numbers(tmp_path: Path) -> None:
     assert torch.equal(all_of(folder)[:, 0, 0, 0] * 255, torch.arange(8.0))
 
 
+def test_the_order_of_names_that_two_tools_sort_differently(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write(tmp_path, "f9.png", "f10.png", "g.png")
+    natural, texts = ([0, 1, 2], [1, 0, 2])
+    for order, expected in (("natural", natural), ("lexicographic", texts)):
+        folder = ImageFolder(tmp_path, order=order)
+        assert (all_of(folder)[:, 0, 0, 0] * 255).tolist() == expected
+        assert [folder.frame_name(i) for i in range(3)] == [
+            ["f9.png", "f10.png", "g.png"][i] for i in expected
+        ]
+        assert not folder.ordered
+    assert caplog.text == ""
+    for _ in range(2):
+        assert torch.equal(all_of(ImageFolder(tmp_path)), all_of(ImageFolder(tmp_path, order="natural")))
+    (line,) = caplog.messages  # once
+    for words in (str(tmp_path), "f9.png before f10.png", "?order=lexicographic", "?order=natural"):
+        assert words in line
+    identities = {ImageFolder(tmp_path, order=order).identity() for order in ("", "natural", "lexicographic")}
+    assert len(identities) == 2
+
+
+def test_names_of_one_width_need_no_word_on_their_order(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write(tmp_path, "f08.png", "f09.png", "f10.png", "g.png")
+    assert ImageFolder(tmp_path).identity() == ImageFolder(tmp_path, order="natural").identity()
+    assert caplog.text == ""
+
+
 @pytest.mark.parametrize(
     ("name", "given", "words"),
     [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import math
 import zipfile
 from contextlib import chdir
@@ -267,8 +268,11 @@ NO_TRUTH = ["x", "", "1.5", "utm:", "utm:far", "utm:-1", "utm:nan", "utm2", "9" 
     ("truth", "options", "words"),
     [
         *((text, {}, (f"truth {text!r}", "an integer offset", "utm:25")) for text in NO_TRUTH),
-        *((name, {}, (name, "is not there")) for name in ("none.csv", "none.npz", "none.CSV")),
-        *((text, {"interpolate": True}, (text, "interpolated", ".csv")) for text in ("3", "utm:7.5")),
+        *((name, {}, (name, "is not there")) for name in ("none.csv", "none.npz", "none.CSV", "none.json")),
+        *(
+            (text, {"interpolate": True}, (text, "interpolated", ".csv"))
+            for text in ("3", "utm:7.5", "a.json")
+        ),
         ("folder.csv", {}, ("folder.csv", "is a folder")),
     ],
 )
@@ -483,6 +487,64 @@ def test_other_npz_files_are_refused(tmp_path: Path) -> None:
 
 def images(*points: tuple[float, float]) -> Traverse:
     return Named([f"{i:03}@{east:.2f}@{north:.2f}@33@T@@@.png" for i, (east, north) in enumerate(points)])
+
+
+# a list for each query
+
+
+def listed(folder: Path, rows: object) -> str:
+    path = folder / "truth.json"
+    path.write_text(rows if isinstance(rows, str) else json.dumps(rows))
+    return str(path)
+
+
+@given(st.lists(st.lists(st.integers(0, 9), max_size=4), min_size=1, max_size=9).filter(any))
+def test_json_lists_all_right_places_of_each_query(scratch: Path, rows: list[list[int]]) -> None:
+    path = listed(scratch, rows)
+    for frames in (10, None):
+        truth = read(path, frames, len(rows))
+        assert sets(truth.positives) == [set(row) for row in rows]
+        assert truth.judged.all()
+        assert truth.ignored.numel() == 0
+    last = max(query for query, row in enumerate(rows) if row)
+    some = torch.tensor([last, 0])  # in any order
+    assert sets(read(path, 10, some).positives) == [set(rows[last]), set(rows[0])]
+
+
+@pytest.mark.parametrize(
+    ("rows", "queries", "words"),
+    [
+        ("[[1], [2]", 2, ("is no JSON",)),
+        ("[" * 99_999, 2, ("is no JSON",)),
+        ({"0": [1]}, 1, ("holds a dict", "expected a list")),
+        (3, 1, ("holds a int", "expected a list")),
+        ([[1], [2]], 3, ("holds a list of 2", "3 queries")),
+        ([[1], [2]], 1, ("holds a list of 2", "1 queries")),
+        ([[1], [2]], torch.tensor([0, 2]), ("holds a list of 2", "3 queries or more")),
+        ([1, 2], 2, ("query 0: 1;", "expected a list")),
+        ([[1], [2, "3"]], 2, ('query 1: "3"', "from 0 to 9")),
+        ([[1], [2.0]], 2, ("query 1: 2.0", "from 0 to 9")),
+        ([[1], [True]], 2, ("query 1: true", "from 0 to 9")),
+        ([[1], [[2]]], 2, ("query 1: [2]", "from 0 to 9")),
+        ([[1], [10]], 2, ("query 1: 10", "from 0 to 9")),
+        ([[-1], [1]], 2, ("query 0: -1", "from 0 to 9")),
+        ([[], []], 2, ("no query has a right answer", "truth.json")),
+    ],
+)
+def test_a_json_of_another_shape_is_refused(
+    tmp_path: Path, rows: object, queries: int | Tensor, words: tuple[str, ...]
+) -> None:
+    with refused("truth.json", *words):
+        read(listed(tmp_path, rows), 10, queries)
+
+
+def test_a_list_counts_frames_of_queries_that_are_resampled(tmp_path: Path) -> None:
+    path, query = listed(tmp_path, [[4], [5], [6], [7]]), ArrayTraverse(torch.rand(4, 2))
+    shown = torch.tensor([0, 2, 2])
+    truth = known(path, None, query, 10, shown, resampled=True)
+    assert sets(truth.positives) == [{4}, {6}, {6}]
+    with refused("list of 4", "5 queries"):
+        known(path, None, ArrayTraverse(torch.rand(5, 2)), 10, shown, resampled=True)
 
 
 def test_utm_makes_every_reference_frame_near_by_right() -> None:

@@ -3,6 +3,7 @@ from __future__ import annotations
 import base64
 import io
 import re
+import sys
 from collections.abc import Iterator
 from typing import Any
 from xml.etree import ElementTree
@@ -313,3 +314,19 @@ def test_seqslam_s_pixels_stand_beside_a_sequence_of_frames() -> None:
     right = (expected - torch.arange(64)).abs() <= 3
     assert one.scores is not None
     assert one.scores.recall_at_1 == float(right.double().mean())
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_each_long_step_has_a_bar_on_a_terminal(terminal: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    stream = Terminal() if terminal else io.StringIO()
+    monkeypatch.setattr(sys, "stderr", stream)
+    pair = [open_source(f"sim:aerial?frames=200&traverse={one}") for one in (0, 1)]
+    compare(*pair, distractors=[open_source("sim:outdoor?frames=40")], progress=True)
+    steps = "describing the reference", "calibrating", "describing the query", "localizing", "null control"
+    steps += "describing sim:outdoor", "baselines: HOG"
+    assert [step for step in steps if step in stream.getvalue()] == ([*steps] if terminal else [])

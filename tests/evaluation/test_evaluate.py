@@ -120,6 +120,31 @@ def test_truth_that_lies_in_the_traverses(tmp_path: Path) -> None:
     assert evaluate_file(path, None, 0, reference=stored, query=seen).report.facts["accepted_right"] == 3
 
 
+def test_recall_values_by_hand(tmp_path: Path) -> None:
+    rows = [
+        (0, (5, 0, 9)),
+        (1, (1, 8, 7)),
+        (2, (9, 8, 3)),
+        (3, (0, 0, 0)),
+        (4, (4, 5, 6)),
+    ]  # 3: no right answer
+    text = "".join(f"{q},{p},0.1,{r}\n" for q, places in rows for r, p in enumerate(places, 1))
+    path = written(tmp_path, "query,place,score,rank\n" + text)
+    every = written(tmp_path, "[[0, 1], [1], [2], [], [9]]", "truth.json")
+    some = written(tmp_path, "0,0,1\n1,1\n2,2\n3\n", "truth.csv")  # nothing on query 4
+    for truth, tolerance, expected in (
+        (every, 0, {"3": 2 / 5, "1": 1 / 5}),
+        (every, 1, {"3": 3 / 5, "1": 1 / 5}),
+        (some, 0, {"3": 2 / 4, "1": 1 / 4}),
+    ):
+        facts = evaluate_file(path, str(truth), tolerance, recall_values=[3, 1]).report.facts
+        assert facts["recall_values"] == expected
+    assert "recall_values" not in evaluate_file(path, "0").report.facts
+    for first, words in ((0, "1 to 3"), (4, "--top 4"), (-1, "1 to 3")):
+        with refused(f"first {first} of 3 ranks", words):
+            evaluate_file(path, "0", recall_values=[1, first])
+
+
 def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
     path = written(tmp_path, MATCHES)
     with refused("tolerance is -1"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -11,9 +12,9 @@ from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dejavu_torch.evaluation.matches import ELSEWHERE, read_matches, write_matches
+from dejavu_torch.evaluation.matches import ELSEWHERE, check_pair_names, read_matches, write_matches
 from dejavu_torch.maps.place_map import Route
-from dejavu_torch.types import Match
+from dejavu_torch.types import InputError, Match
 
 INF = float("inf")
 ROWS = st.lists(
@@ -194,6 +195,54 @@ def test_any_name_leaves_the_file_readable(scratch: Path, names: list[str]) -> N
         assert row["query_name"].isprintable()
         if name.isprintable():
             assert row["query_name"] == name
+
+
+# pairs of images
+
+
+@given(ROWS, st.none() | st.integers(1, 4))
+def test_pairs_are_the_names_of_the_rows_that_report_a_place(
+    scratch: Path, rows: list[tuple[int, float, bool]], ranks: int | None
+) -> None:
+    index, score, accepted = (torch.tensor(column) for column in zip(*rows * (ranks or 1), strict=True))
+    index = torch.where(index % 5 == 0, -1, index)
+    path, pairs, names = scratch / "m.csv", scratch / "pairs.txt", ("q/{}.jpg".format, "r\n{}.jpg".format)
+    write_matches(path, [Match(index, score, accepted)], None, None, *names, ranks, (), pairs)
+    with path.open(newline="") as file:
+        kept = [row for row in csv.DictReader(file) if row["place"] != "-1"]
+    expected = [[row["query_name"], row["place_name"]] for row in kept]
+    assert [line.split() for line in pairs.read_bytes().decode().splitlines()] == expected
+    assert expected == [
+        [f"q/{i // (ranks or 1)}.jpg", f"r\\n{place}.jpg"]
+        for i, place in enumerate(index.tolist())
+        if place >= 0
+    ]
+
+
+def test_neither_matches_nor_pairs_are_half_written(tmp_path: Path) -> None:
+    def breaks_off() -> Iterator[Match]:
+        yield MATCH
+        raise InputError("a frame is damaged")
+
+    path, pairs = written(tmp_path, PLAIN), tmp_path / "pairs.txt"
+    names = "q{}".format, "r{}".format
+    with refused("damaged"):
+        write_matches(path, breaks_off(), None, None, *names, pairs=pairs)
+    assert [file.name for file in tmp_path.iterdir()] == [path.name]
+    assert path.read_text() == PLAIN
+    pairs.mkdir()
+    with refused("pairs.txt is a folder"):
+        write_matches(path, [MATCH], None, None, *names, pairs=pairs)
+    assert path.read_text() == PLAIN
+
+
+@pytest.mark.parametrize(
+    "names", [[], [""], ["a.jpg", ""], ["a.jpg", "b c.jpg"], [" a"], ["a\tb"], ["a\u2003b"]]
+)
+def test_names_that_no_pair_can_hold_are_refused(names: list[str]) -> None:
+    check_pair_names(["a.jpg", "b/é.jpg"], "the query")
+    with refused("the query", repr(names[-1]) if names and names[-1] else "without a name", "--pairs"):
+        check_pair_names(names, "the query")
 
 
 def test_places_of_several_routes_are_told_by_route_and_frame(tmp_path: Path) -> None:

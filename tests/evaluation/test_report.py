@@ -19,8 +19,10 @@ from dejavu_torch.evaluation.report import (
     report_folder,
     score_table,
     sequence_table,
+    steps,
     summary,
     text_table,
+    verdict,
     write_index,
     write_report,
 )
@@ -161,11 +163,57 @@ def test_the_page_begins_with_plain_words() -> None:
     assert "Of the 16 that have a right place, 75.0 %" in some  # recall is of those, not of all 20
     ours = Contender("this map", SCORES, 4000, fixed=3900)
     spectral = report({"frames": 32, "kind": "spectral"}, uncompressed=baseline)._replace(ours=ours)
-    for words in ("strongest lines of its spectrum along the route", "125 bytes", "3.12 of them", "2000"):
+    for words in ("125 bytes", "3.12 of them", "2000"):
         assert words in headline(spectral)
     unscored = report()._replace(ours=Contender("this map", None))
     assert "no ground truth" in headline(unscored)
     assert "None" not in headline(unscored) + summary(unscored)
+
+
+STEPS: list[tuple[dict[str, Any], float | None, str, list[str]]] = [  # facts, recall@1, verdict, steps
+    ({"kind": "spectral"}, 0.95, "Yes: 19 of 20 queries", ["localize"]),
+    ({"with_answer": 10}, 0.6, "Partly: 6 of 10 queries that have a right place", []),
+    ({"kind": "templates"}, 0.2, "No: 4 of 20", ["--filter", "--second", "localize"]),
+    ({"kind": "spectral", "filter": True, "trained": {"steps": 1}}, 0.2, "No: ", ["localize"]),
+    ({"with_answer": 0}, 0.0, "No query has a right place", []),
+    (
+        {"rejection": {"off_map": {}}, "accepted": 9, "accepted_right": 8},
+        *(1.0, "Of 9 accepted answers 8 are right", ["--precision .99"]),
+    ),
+    (
+        {"line": {"offset": 7, "answers": 9, "confident": 9}, "truth": "place = query"},
+        *(0.0, "Not by this ground truth", ["--truth 7"]),
+    ),
+    ({"probably_right": {"0.9": 18, "0.5": 19}}, None, "Probably: ", ["--filter", "--precision", "--truth"]),
+    (
+        {"probably_right": {"0.9": 0, "0.5": 1}},
+        None,
+        "Probably not: ",
+        ["--filter", "--precision", "--truth"],
+    ),
+    ({}, None, "neither a ground truth", ["--truth 12"]),
+]
+
+
+@pytest.mark.parametrize(("facts", "recall", "told", "after"), STEPS)
+def test_whether_it_worked_and_what_to_do_next(
+    facts: dict[str, Any], recall: float | None, told: str, after: list[str]
+) -> None:
+    scores = None if recall is None else SCORES._replace(recall_at_1=recall)
+    one = report(facts)._replace(ours=Contender("this map", scores, 4000))
+    assert told in verdict(one)
+    found = steps(one)
+    assert len(found) == len(after), found
+    assert [word for word, step in zip(after, found, strict=True) if word not in step] == []
+
+
+def test_the_next_step_is_a_filter_or_more_bytes_if_these_find_more() -> None:
+    ours = Contender("this map", SCORES, 4000, sequences={"filter": SCORES._replace(recall_at_1=0.875)})
+    floats = Contender("all frames", SCORES._replace(recall_at_1=0.9), 64000, 1)
+    one = report({"kind": "spectral"}, uncompressed=floats)._replace(ours=ours)
+    found = " ".join(steps(one)).replace("\xa0", " ")
+    assert "87.5 % are found" in found
+    assert "--mapper.hold .95" in found
 
 
 def key(page: str) -> dict[str, str]:
@@ -215,11 +263,11 @@ def test_pictures_of_an_earlier_report_are_removed_and_other_files_stay(tmp_path
 
 
 def test_the_page_fits_a_phone_and_needs_no_other_file(tmp_path: Path) -> None:
-    page = written(tmp_path, report({"frames": 32}), pr=picture("curves"), coverage=picture("places"))
+    page = written(tmp_path, report({"frames": 32}), coverage=picture("places"), pr=picture("curves"))
     assert '<meta name="viewport" content="width=device-width,initial-scale=1">' in page
     assert page.count("data:image/png;base64,") == 2
     assert not re.findall(r'(?:src|href)="(?!data:)', page)
-    assert page.index("<dl>") < page.index("<table") < page.index("curves</h2>") < page.index("places</h2>")
+    assert page.index("places</h2>") < page.index("<dl>") < page.index("<table") < page.index("curves</h2>")
     # on a narrow screen a cell of the wide table carries its own heading
     assert '<table class="cards">' in page
     assert 'data-label="AUC rep."' in page
@@ -228,6 +276,40 @@ def test_the_page_fits_a_phone_and_needs_no_other_file(tmp_path: Path) -> None:
     write_report(tmp_path, report(), {}, "a title", "a command")
     bare = (tmp_path / "index.html").read_text()
     assert not [text for text in ("the map</h2>", "<img", "<ul>", "None", "bytes", "null") if text in bare]
+
+
+def test_the_first_screen_answers_and_the_pairs_are_beside_it(tmp_path: Path) -> None:
+    page = written(
+        tmp_path, report({"frames": 32, "kind": "spectral"}), pr=picture("curves"), pairs=picture("pairs")
+    )
+    order = (
+        "did it work?",
+        "pairs</h2>",
+        "how well?",
+        "what next?",
+        "<code>",
+        "<table",
+        "curves</h2>",
+        "<footer>",
+    )
+    places = [page.index(one) for one in order]
+    assert places == sorted(places)
+    assert page.count("pairs</h2>") == 1
+    # definitions and details are folded
+    assert len(re.findall(r"<dl>", page)) == len(
+        re.findall(r"<details>(?:(?!</details>).)*?<dl>", page, re.DOTALL)
+    )
+
+
+def test_the_page_has_landmarks_headings_in_order_and_named_headers(tmp_path: Path) -> None:
+    page = written(tmp_path, report({"frames": 32}, null=Contender("null", SCORES)), pr=picture("curves"))
+    assert '<html lang="en">' in page
+    assert [page.count(f"<{one}>") for one in ("header", "main", "footer")] == [1, 1, 1]
+    levels = [*map(int, re.findall(r"<h(\d)>", page))]
+    assert levels[0] == 1
+    assert {*levels[1:]} == {2}
+    assert re.findall(r"<th(?! scope=| ?e)", page) == []
+    assert re.findall(r'<img(?! alt="\w)', page) == []
 
 
 def test_each_row_has_the_colour_of_its_curve(tmp_path: Path) -> None:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 
 import pytest
 import torch
-from command_line import benchmark, benchmark_fails, report_of, run
+from command_line import benchmark, benchmark_fails
 from helpers import refused
 from safetensors.torch import load_file
 from torch import Tensor, nn
@@ -16,10 +15,12 @@ from torch.nn.functional import adaptive_avg_pool2d
 
 from benchmarks import distil
 from benchmarks.leaves import leaves
-from dejavu_torch import HOG, DejaVu, open_source
+from dejavu_torch import HOG, DejaVu, SpectralMapper, evaluate, open_source
 from dejavu_torch.features import distilled
 from dejavu_torch.features.distilled import STRIDES, WEIGHTS, Distilled, distilled_maps, loaded
 from dejavu_torch.features.joined import Joined
+from dejavu_torch.features.pixels import PatchPixels
+from dejavu_torch.motion.resampling import ground_truth_of
 from dejavu_torch.resize import resize_frames
 
 
@@ -109,9 +110,9 @@ def test_the_bench_makes_weights_that_the_class_reads(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("efficientnet_lite_pytorch")
-    monkeypatch.setattr(distil, "IMAGES", 64)
+    for name, few in {"IMAGES": 16, "JUDGED_ON": 16, "FRAMES": 8, "BATCH": 16, "JUDGED": 2}.items():
+        monkeypatch.setattr(distil, name, few)
     monkeypatch.setattr(distil, "ROUTES", {"underground": 1})
-    monkeypatch.setattr(distil, "FRAMES", 8)
     benchmark("distil", "--out", tmp_path / "out", "--steps", "30")
     assert "65 kB" in capsys.readouterr().out
     rows = json.loads((tmp_path / "out" / "bench.json").read_text())["rows"]
@@ -138,13 +139,14 @@ def test_normalisation_and_scale_are_folded_into_the_weights(tmp_path: Path) -> 
     assert (found - expected).square().mean() < 1e-3 * expected.var()  # of 8 bits
 
 
-@pytest.mark.skipif("DEJAVU_TEST_DATA" not in os.environ, reason="needs the real data")
-def test_beside_hog_it_is_worth_more_than_the_default_in_the_city(tmp_path: Path) -> None:
-    city = Path(os.environ["DEJAVU_TEST_DATA"]) / "robotcar" / "t5"
-    given = [city / "reference.npy", city / "query.npy", "--truth", city / "truth.csv", "--tolerance", "2"]
-    given += ["--mapper.route_bytes_per_place", "5", "--calibration", "none"]
+def test_beside_hog_it_is_worth_more_than_pixels_in_the_city(data_dir: Path) -> None:
+    city = data_dir / "robotcar" / "t5"
+    reference, query = (open_source(city / f"{name}.npy") for name in ("reference", "query"))
+    truth = ground_truth_of(str(city / "truth.csv"), reference, query)
+    assert truth is not None
+    pixels = Joined([HOG(), PatchPixels((24, 48), channel="grey")], [1, 0.5])
     areas = []
-    for name, words in (("default", []), ("joined", ["--features", "[HOG, Distilled]"])):
-        run("compare", *given, *words, "--out", tmp_path / name)
-        areas.append(report_of(tmp_path / name)["auc"])
+    for features in (pixels, None):  # with it is the default
+        model = DejaVu(features, mapper=SpectralMapper(5.0)).learn(reference)
+        areas.append(evaluate(model.localize(query), truth, 2).auc)
     assert areas[1] > areas[0] + 0.04

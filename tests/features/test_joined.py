@@ -27,6 +27,7 @@ from dejavu_torch import (
 )
 from dejavu_torch.cli.commands import run_learn
 from dejavu_torch.cli.parser import parse
+from dejavu_torch.features.distilled import Distilled
 from dejavu_torch.features.joined import Joined, groups_of
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.model import default_features, own_size
@@ -148,7 +149,7 @@ def test_a_whitening_takes_the_groups_of_the_features(flights: list[Tensor], tmp
 
 
 def test_the_default_features_are_joined_where_something_whitens_them() -> None:
-    joined = Joined([HOG(), PatchPixels((24, 48), channel="grey")], [1, 0.5])
+    joined = Joined([HOG(), Distilled()])
     templates = TemplateMapper()
     for model in (DejaVu(), DejaVu(whitening=Whitening()), DejaVu(whitening=Whitening(), mapper=templates)):
         assert recipe_of(model.features) == recipe_of(joined)

@@ -24,6 +24,7 @@ from pathlib import Path
 from random import Random
 from typing import Any, NamedTuple
 
+import h5py
 import numpy as np
 import safetensors.torch
 import torch
@@ -582,6 +583,36 @@ def npy(case: Case) -> None:
         DejaVu(HOG(cell=2), mapper=TemplateMapper(ImposedPeriods([3]))).learn(traverse)
 
 
+@reader("h5", share=1)
+def h5(case: Case) -> None:
+    random, written = case.random, io.BytesIO()
+    noise = np.random.default_rng(random.randrange(2**32))
+    odd = (noise.random((2, 3)), 0.5, "text", np.zeros(0), np.array([np.nan] * 5), np.arange(5), np.zeros(4))
+    texts = [text for text in TEXTS if text.strip("/.") and not {*"\0\udcff"} & {*text}]
+    with h5py.File(written, "w", libver=random.choice(("latest", "earliest"))) as file:
+        for i in range(9):
+            row = noise.normal(size=5).astype(np.float16)
+            changed = random.random() < 0.05
+            name = f"{random.choice(texts)}/{i}" if random.random() < 0.05 else f"db/{i}.jpg"
+            file.create_dataset(f"{name}/global_descriptor", data=random.choice(odd) if changed else row)
+    data = written.getvalue()
+    Path("in/a.h5").write_bytes(mutate_bytes(random, data) if random.random() < 0.7 else data)
+    case.begin()
+    take(open_source(f"in/a.h5{random.choice(('', '?order=natural', '?order=lexicographic'))}"))
+
+
+@reader("names", share=0.5)
+def names_beside_features(case: Case) -> None:
+    random = case.random
+    np.save("in/a.npy", np.random.default_rng(0).normal(size=(9, 5)))
+    text = "".join(f"@{i}@{i + 1}@.jpg\n" for i in range(9))
+    Path("in/a.txt").write_bytes(mutate_text(random, text) if random.random() < 0.8 else text.encode())
+    case.begin()
+    traverse = open_source("in/a.npy")
+    take(traverse)
+    find_ground_truth("utm:2", traverse, traverse, 9, 9)
+
+
 def mutated_image(random: Random, folder: Path) -> tuple[str, bytes]:
     """An image's suffix and its bytes."""
     path = random.choice(sorted(folder.iterdir()))
@@ -736,6 +767,15 @@ def truth_table(case: Case) -> None:
     rows = "".join(f"{i},{(i + random.randint(-1, 1)) % 30}\n" for i in range(12))
     Path("in/truth.csv").write_bytes(mutate_text(random, header + rows))
     judge(case, "in/truth.csv")
+
+
+@reader("truth lists", share=0.5)
+def truth_lists(case: Case) -> None:
+    random = case.random
+    held: Any = [[i, (i + random.randint(0, 2)) % 30] for i in range(12)]
+    text = json_text(mutate_json(random, held)).encode(errors="surrogatepass")
+    Path("in/truth.json").write_bytes(random.choice((text, mutate_text(random, json.dumps(held)))))
+    judge(case, "in/truth.json")
 
 
 def changed_array(random: Random, held: bytes) -> bytes:

@@ -8,6 +8,7 @@ import inspect
 import io
 import json
 import pydoc
+import re
 import types
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import Any, Literal, Union, get_args, get_origin
 import jsonargparse
 from pytorch_lightning import Trainer
 
-from dejavu_torch.cli import main
+from dejavu_torch.cli import COMMANDS, main
 
 FILE = Path(__file__).parent / "options.json"
 # the classes whose arguments are options of a part, as YAML files name them
@@ -48,8 +49,8 @@ def commands() -> dict[str, str]:
     """What `dejavu --help` lists."""
     with contextlib.suppress(SystemExit), contextlib.redirect_stdout(io.StringIO()) as printed:
         main(["--help"])
-    lines = printed.getvalue().partition("commands:\n")[2].partition("\n\n")[0].splitlines()
-    return {line.split()[0]: " ".join(line.split()[1:]) for line in lines}
+    listed = dict(re.findall(r"^  (\w+)  +(.+)$", printed.getvalue(), re.MULTILINE))
+    return {name: listed[name] for name in COMMANDS}
 
 
 def kinds(annotation: Any) -> list[str]:

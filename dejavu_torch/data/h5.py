@@ -1,0 +1,101 @@
+"""Global descriptors in an HDF5 file, as hloc writes them, as a traverse."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dejavu_torch.data.files import reading, state_of
+from dejavu_torch.data.folder import LEXICOGRAPHIC, in_order, rising
+from dejavu_torch.data.frame_range import IndexedTraverse
+from dejavu_torch.memory import check_room
+from dejavu_torch.text import one_line, printable
+from dejavu_torch.types import InputError
+
+SUFFIXES = {".h5", ".hdf5"}
+KEY = "global_descriptor"
+EXPECTED = f"a group for each image that holds a dataset {KEY} (D,) of floats, as hloc writes it"
+
+
+class DescriptorFile(IndexedTraverse):
+    """The global descriptors in an HDF5 file of hloc (Hierarchical-Localization), sorted by the names of
+    their images as the images of a folder are; only what is used is read.
+
+    Args:
+        path: a file with a group for each image, whose name may hold slashes, and in it a dataset
+            `global_descriptor` (D,) float; other datasets are ignored.
+        order: as of `ImageFolder`.
+
+    Shape: batches (B,D) float32.
+
+    Raises:
+        InputError: h5py is not installed, a file that cannot be read, no descriptors in it, or descriptors of
+            different lengths; while reading, NaN or infinite numbers.
+    """
+
+    def __init__(self, path: str | Path, order: str = "") -> None:
+        self.path, self.name = Path(path), printable(path)
+        found: dict[str, tuple[int, ...]] = {}
+
+        def visit(name: str, item: Any) -> None:
+            image, _, leaf = name.rpartition("/")
+            if leaf != KEY or not image:
+                return
+            shape, kind = getattr(item, "shape", None) or (), getattr(item, "dtype", np.dtype("O"))
+            elsewhere = getattr(item, "external", None) or getattr(item, "is_virtual", False)
+            if len(shape) != 1 or kind.kind != "f" or elsewhere:
+                seen = f"{shape} {kind.name}{' of another file' if elsewhere else ''}"
+                raise InputError(f"{self.name}: {KEY} of {image} is {seen}; expected {EXPECTED}")
+            found[image] = shape
+
+        with self._open() as file:
+            file.visititems(visit)
+            self.names = in_order(found, order, self.name)
+        if not found:
+            raise InputError(f"{self.name} holds no {KEY}; expected {EXPECTED}")
+        (width,) = found[self.names[0]]
+        for image in self.names:
+            if found[image] != (width,) or not width:
+                seen = f"{KEY} of {image} has {found[image][0]} numbers"
+                raise InputError(f"{self.name}: {seen}; expected {width or 'some'}, as of {self.names[0]}")
+        check_room(24.0 * width, f"a descriptor of {self.name}")
+        self.length, self.order, self.ordered = len(self.names), order, rising(self.names)
+
+    def read(self, frames: range) -> Tensor:
+        with self._open() as file:
+            rows = np.stack([file[f"{self.names[i]}/{KEY}"][()] for i in frames])
+            batch = torch.from_numpy(rows.astype(np.float32))
+        bad = ~batch.isfinite().all(1)
+        if bad.any():
+            image = self.names[frames[int(bad.nonzero()[0])]]
+            raise InputError(f"{self.name}: {KEY} of {image} holds NaN or infinite numbers; expected none")
+        return batch
+
+    def frame_name(self, i: int) -> str:
+        return self.names[i]
+
+    def identity(self) -> str:
+        return f"{super().identity()}{' by text' * (self.order == LEXICOGRAPHIC)}"
+
+    def state(self, start: int, stop: int) -> str:
+        return state_of(self.path)
+
+    @contextmanager
+    def _open(self) -> Iterator[Any]:
+        try:
+            h5py = import_module("h5py")
+        except ImportError as error:
+            seen = f"{self.name}: h5py, which reads it, is not there ({one_line(error)})"
+            raise InputError(f"{seen}; expected it: pip install 'dejavu_torch[h5]'") from error
+        with (
+            reading(self.path, "cannot be read as an HDF5 file", EXPECTED),
+            h5py.File(self.path, "r") as file,
+        ):
+            yield file

@@ -1,0 +1,105 @@
+"""What shells complete."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from command_line import fails, run
+
+from dejavu_torch.cli import COMMANDS, FIRST_DAY
+from dejavu_torch.cli.presets import preset_names
+
+
+@pytest.fixture(scope="module")
+def scripts(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The script of each shell, as a file."""
+    pytest.importorskip("shtab")
+    folder = tmp_path_factory.mktemp("completion")
+    for shell in ("bash", "zsh"):
+        command = [sys.executable, "-m", "dejavu_torch.cli", "completion", shell]
+        ran = subprocess.run(command, capture_output=True, text=True, check=True)
+        assert ran.stderr == ""
+        (folder / shell).write_text(ran.stdout)
+    return {shell: folder / shell for shell in ("bash", "zsh")}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shell", ["bash", "zsh"])
+def test_the_shell_accepts_it(shell: str, scripts: dict[str, Path]) -> None:
+    if shutil.which(shell) is None:
+        pytest.skip(f"{shell} is not installed")
+    subprocess.run([shell, "-n", str(scripts[shell])], check=True)
+
+
+def completed(script: Path, line: str) -> list[str]:
+    """What bash offers for the last word of a line, in the folder of the script."""
+    words = line.split(" ")
+    code = (
+        f'source "{script}"; COMP_WORDS=("$@"); COMP_CWORD={len(words) - 1}\n'
+        '[[ $(complete -p dejavu) =~ -F.([^ ]+) ]]; "${BASH_REMATCH[1]}"; printf "%s\\n" "${COMPREPLY[@]}"'
+    )
+    ran = subprocess.run(["bash", "-c", code, "-", *words], capture_output=True, text=True, cwd=script.parent)
+    assert ran.stderr == ""
+    return ran.stdout.split()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
+@pytest.mark.parametrize(
+    ("line", "offered"),
+    [
+        ("dejavu compa", {"compare"}),
+        ("dejavu ", {*COMMANDS}),
+        ("dejavu compare --trut", {"--truth"}),
+        ("dejavu compare --search ", {"auto", "coarse", "exact", "scan"}),
+        ("dejavu compare --config pap", {"paper"}),
+        ("dejavu learn morning --mapper.hol", {"--mapper.hold"}),
+        ("dejavu learn --mapper.periods.win", {"--mapper.periods.window"}),
+        ("dejavu compare --features.ce", {"--features.cell"}),
+        ("dejavu compare ba", {"bash"}),  # a file of the folder
+        ("dejavu compare --truth zs", {"zsh"}),
+        ("dejavu train f", {"fit"}),
+        ("dejavu train fit --trainer.max_st", {"--trainer.max_steps"}),
+        ("dejavu train fit --config ", {*preset_names(), "bash", "zsh"}),
+    ],
+)
+def test_a_tab_completes(line: str, offered: set[str], scripts: dict[str, Path]) -> None:
+    assert {*completed(scripts["bash"], line)} == offered
+
+
+def test_another_shell_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "'fish'; expected bash or zsh" in fails(capsys, "completion", "fish")
+
+
+def test_without_shtab_it_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "shtab", None)
+    assert "[completion]" in fails(capsys, "completion")
+
+
+def test_help_begins_with_the_commands_of_a_first_day(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        run("--help")
+    assert stop.value.code == 0
+    first, more = capsys.readouterr().out.split("\nmore:\n")
+    listed = [re.findall(r"^  (\w+)  +\S", part, re.MULTILINE) for part in (first, more)]
+    assert listed[0] == [*FIRST_DAY]
+    assert listed[1] == [name for name in COMMANDS if name not in FIRST_DAY]
+
+
+def test_a_command_loads_nothing_of_completion() -> None:
+    code = (
+        "import sys, json, dejavu_torch.cli as cli\n"
+        "try: cli.main(['info', '--help'])\n"
+        "except SystemExit: pass\n"
+        "names = 'dejavu_torch.cli.completion', 'shtab'\n"
+        "print([name for name in names if name in sys.modules])"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ran.stdout.splitlines()[-1] == "[]"
