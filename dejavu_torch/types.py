@@ -179,7 +179,7 @@ class Match(_Columns):
     """Where each query was found (eq. 5) and whether to believe it (eq. 6): index, score, accepted.
 
     Attributes:
-        index: (Q,) int64, the reported place, -1 if no place has a finite score; (Q,k) candidates, best first.
+        index: (Q,) int64, the place found, -1 if no place has a finite score; (Q,k) candidates, best first.
         score: float, lower is better, +inf where nothing covers. accepted: bool, see `DejaVu.acceptance`.
         probability: float64, of being right, if the map is calibrated, else None; NaN for all but the first
             candidate; outside the tuple.

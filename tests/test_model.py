@@ -307,16 +307,16 @@ def test_frames_keep_their_size_where_it_was_asked_for(tmp_path: Path) -> None:
     images.mkdir()
     for i in range(3):
         Image.new("L", (400, 200), 40 * i).save(images / f"{i}.png")
-    model = DejaVu()  # the network of the package takes 96 x 96 pixels
-    assert model.fit(open_source(images)).frame_shape == (1, 96, 192)
-    assert model.fit(open_source(f"{images}?start=1")).frame_shape == (1, 96, 192)
+    model = DejaVu()
+    assert model.fit(open_source(images)).frame_shape == (1, 80, 160)
+    assert model.fit(open_source(f"{images}?start=1")).frame_shape == (1, 80, 160)
     assert model.fit(open_source(f"{images}?width=300&start=1")).frame_shape == (1, 150, 300)
     assert DejaVu(HOG()).fit(open_source(images)).frame_shape == (1, 80, 160)
     block = DejaVu(HOG()).fit(ArrayTraverse(torch.rand(1, 1, 20, 500)))
     assert block.frame_shape == (1, 16, 400)
     assert DejaVu(HOG(resize=(100, 100))).fit(open_source(images)).frame_shape == (1, 100, 200)
     assert DejaVu(preprocess=Preprocess(size=None)).fit(open_source(images)).frame_shape == (1, 200, 400)
-    assert DejaVu(HOG(), preprocess=Preprocess(size=50)).fit(open_source(images)).frame_shape == (1, 25, 50)
+    assert DejaVu(preprocess=Preprocess(size=50)).fit(open_source(images)).frame_shape == (1, 25, 50)
     for size in (0, 1.5):
         with refused("size is", "at least 1"):
             Preprocess(size=size)  # type: ignore[arg-type]

@@ -51,7 +51,7 @@ class Distilled(nn.Module):
 
     def __init__(self, grid: int = 6, weights: str = "lite0") -> None:
         super().__init__()
-        self.grid, self.weights, self.resize = grid, weights, SIZE
+        self.grid, self.weights = grid, weights
         if not 1 <= grid <= WIDEST or weights not in WEIGHTS:
             seen = f"Distilled got {settings_of(self)}; expected a grid of 1 to {WIDEST}"
             raise InputError(f"{seen}, and weights {' or '.join(WEIGHTS)}")
@@ -62,7 +62,7 @@ class Distilled(nn.Module):
         check_frames(frames, "Distilled got")
         if frames.shape[1] not in (1, 3):
             frames = frames.mean(1, keepdim=True)
-        maps = distilled_maps(resize_frames(frames, self.resize), dict(self.named_buffers()))
+        maps = distilled_maps(resize_frames(frames, SIZE), dict(self.named_buffers()))
         return adaptive_avg_pool2d(maps, self.grid).flatten(1)
 
     def _load_from_state_dict(self, state: dict[str, Any], prefix: str, *args: Any) -> None:
