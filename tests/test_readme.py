@@ -20,7 +20,7 @@ import yaml
 
 from benchmarks.__main__ import BENCHES
 from dejavu_torch import PlaceFilter
-from dejavu_torch.cli import COMMANDS, commands, train
+from dejavu_torch.cli import COMMANDS, commands, completion, train
 from dejavu_torch.cli.parser import command_parser
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.cnn import SmallCNN
@@ -39,6 +39,7 @@ SITE = {
     if (ROOT / name).parent != DOCS or Path(name).name in KEPT_AT_ROOT
 }
 LONGEST = 900  # words
+OF_OTHER_TOOLS = {"--save_descriptors"}
 FENCED = re.compile(r"(<!-- not run: [^>]+-->\n+)?^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 BLOCKS = {
     name: [found[3] for found in FENCED.finditer(text) if found[2] in ("python", "py") and not found[1]]
@@ -133,7 +134,9 @@ class ParseOnly(train.TrainCLI):
 @cache
 def parser_of(program: str, name: str) -> Any:
     """The parser of a command, which takes as long to make as to read a line with."""
-    return command_parser(name, getattr(commands, f"run_{name}") if program == "dejavu" else BENCHES[name])
+    if program != "dejavu":
+        return command_parser(name, BENCHES[name])
+    return command_parser(name, getattr(completion if name == "completion" else commands, f"run_{name}"))
 
 
 def understand(line: str) -> None:
@@ -184,7 +187,7 @@ def test_every_command_shown_is_understood(page: str, tmp_path: Path) -> None:
 
 def test_commands_are_shown() -> None:
     shown = {" ".join(line.split()[:2]) for page in PAGES for line in lines_shown(page)}
-    assert {f"dejavu {name}" for name in COMMANDS} - shown <= {"dejavu info"}
+    assert {f"dejavu {name}" for name in COMMANDS} - shown <= {"dejavu info", "dejavu completion"}
 
 
 @cache
@@ -209,7 +212,8 @@ def test_options_in_prose_exist(page: str) -> None:
     unknown = [
         name
         for name in dict.fromkeys(shown)
-        if not name.startswith("--features.network.")  # of the user's own network
+        if name not in OF_OTHER_TOOLS
+        and not name.startswith("--features.network.")  # of the user's own network
         and name not in options()
         and "." + name.rpartition(".")[2] not in options()
         and not name.endswith("help")
