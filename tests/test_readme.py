@@ -39,6 +39,7 @@ SITE = {
     if (ROOT / name).parent != DOCS or Path(name).name in KEPT_AT_ROOT
 }
 LONGEST = 900  # words
+OF_OTHER_TOOLS = {"--save_descriptors"}
 FENCED = re.compile(r"(<!-- not run: [^>]+-->\n+)?^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 BLOCKS = {
     name: [found[3] for found in FENCED.finditer(text) if found[2] in ("python", "py") and not found[1]]
@@ -133,8 +134,9 @@ class ParseOnly(train.TrainCLI):
 @cache
 def parser_of(program: str, name: str) -> Any:
     """The parser of a command, which takes as long to make as to read a line with."""
-    room = completion if name == "completion" else commands
-    return command_parser(name, getattr(room, f"run_{name}") if program == "dejavu" else BENCHES[name])
+    if program != "dejavu":
+        return command_parser(name, BENCHES[name])
+    return command_parser(name, getattr(completion if name == "completion" else commands, f"run_{name}"))
 
 
 def understand(line: str) -> None:
@@ -153,33 +155,39 @@ def understand(line: str) -> None:
             train.run_train(words)
 
 
-def lines_shown(text: str) -> list[str]:
+def lines_shown(page: str) -> list[str]:
     """Command lines of a page, in blocks and in prose, with the variables of its shell put in."""
-    text = text.replace("\\\n", " ")
+    text = PAGES[page].replace("\\\n", " ")
     variables = re.findall(r"^(\w+)=(?:[\"(]|\$\()(.*)[\")]$", text, re.MULTILINE)
     for name, value in variables + re.findall(r"^for (\w+) in ([^\s;]+)", text, re.MULTILINE):
         value = "weights.pth" if "python" in value else value
-        text = re.sub(rf'"?\$(?:{name}\b|\{{{name}(?:\[@\])?\}})"?', lambda _, value=value: value, text)
+        for used in (rf'"\$\{{{name}\[@\]\}}"', rf"\$(?:{name}\b|\{{{name}\}})"):
+            text = re.sub(used, lambda _, value=value: value, text)
     setting = r"(?:[A-Z_]+=\S+ )*"  # of the environment
     shown = re.findall(rf"^{setting}((?:{PROGRAMS}) .*)$", text, re.MULTILINE)
     inline = re.findall(rf"`{setting}((?:{PROGRAMS}) [^`]+)`", text)
-    shown += [line for line in inline if " -" in line.removeprefix("python -m")]
-    return [line for line in dict.fromkeys(shown) if not re.search(r"help\b|--version|\.\.\.|COMMAND", line)]
+    if page in SITE:
+        shown += [line for line in inline if " -" in line.removeprefix("python -m")]
+    return [
+        line
+        for line in dict.fromkeys(shown)
+        if not re.search(r"help\b|--version|\.\.\.|COMMAND|my_module", line)
+    ]
 
 
-@pytest.mark.parametrize("page", [name for name, text in PAGES.items() if lines_shown(text)])
+@pytest.mark.parametrize("page", [name for name in PAGES if lines_shown(name)])
 def test_every_command_shown_is_understood(page: str, tmp_path: Path) -> None:
     """A configuration that the page shows is in the file that its commands name."""
     for found in FENCED.finditer(PAGES[page]):
         if found[2] == "yaml":
             (tmp_path / "shown.yaml").write_text(found[3])
-    for line in lines_shown(PAGES[page]):
+    for line in lines_shown(page):
         understand(re.sub(r"(?<=--config )(?!configs/)[\w/]+\.yaml", str(tmp_path / "shown.yaml"), line))
 
 
 def test_commands_are_shown() -> None:
-    shown = {" ".join(line.split()[:2]) for text in PAGES.values() for line in lines_shown(text)}
-    assert {f"dejavu {name}" for name in COMMANDS} - shown <= {"dejavu info"}
+    shown = {" ".join(line.split()[:2]) for page in PAGES for line in lines_shown(page)}
+    assert {f"dejavu {name}" for name in COMMANDS} - shown <= {"dejavu info", "dejavu completion"}
 
 
 @cache
@@ -200,11 +208,13 @@ def options() -> set[str]:
 def test_options_in_prose_exist(page: str) -> None:
     """`--mapper.hold .85` is known by its last part."""
     prose = re.sub(r"^```.*?^```$", "", SITE[page], flags=re.MULTILINE | re.DOTALL)
-    shown = re.findall(r"`(--[a-z][\w.]*)[^`]*`", prose)
+    shown = re.findall(r"`(--[a-z]\w*(?:\.\w+)*)[^`]*`", prose)
     unknown = [
         name
         for name in dict.fromkeys(shown)
-        if name not in options()
+        if name not in OF_OTHER_TOOLS
+        and not name.startswith("--features.network.")  # of the user's own network
+        and name not in options()
         and "." + name.rpartition(".")[2] not in options()
         and not name.endswith("help")
     ]
@@ -221,7 +231,10 @@ TRAINING = [
 
 @pytest.mark.parametrize("option", TRAINING)
 def test_options_of_training_in_prose_are_understood(option: str) -> None:
-    understand(f"dejavu train fit --config train_small --data.source sim:aerial {option}")
+    """By a preset of phase templates, or by one of spectral maps."""
+    spectral = ".mapper.route_bytes" in option
+    preset = "train_road" if spectral else "train_small"
+    understand(f"dejavu train fit --config {preset} --data.source sim:aerial {option}")
 
 
 @pytest.mark.parametrize("shown", with_block("class_path:"))
