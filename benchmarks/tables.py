@@ -225,9 +225,17 @@ TABLES: dict[str, Callable[[], str]] = {
 }
 
 
+def made(name: str) -> str:
+    """A table, and what it was measured with."""
+    source = name.replace(" ", "_") if (FOLDER / f"{name.replace(' ', '_')}.json").exists() else "routes"
+    facts = read(source)
+    said = ", ".join(str(facts[key]) for key in ("commit", "date", "machine") if key in facts)
+    return f"{TABLES[name]()}\n*{source}.json: {said}.*\n"
+
+
 def filled(page: str) -> str:
     """A page with its tables made anew."""
-    return MARKED.sub(lambda found: f"{found[1]}\n{TABLES[found[2]]()}\n{found[3]}", page)
+    return MARKED.sub(lambda found: f"{found[1]}\n{made(found[2])}\n{found[3]}", page)
 
 
 def main(given: Sequence[str]) -> None:
