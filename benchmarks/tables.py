@@ -86,8 +86,7 @@ def by_seeds(found: dict[str, Row], figures: Callable[[Row], Sequence[float | No
 
 def routes() -> str:
     """The default map of each route beside its null and the baselines."""
-    head = ["AUC of the second traverse", "**map**", "null", "its descriptors, float", "HOG, all frames"]
-    head += ["HOG, every k-th", "recall@1, map", "HOG", "route bytes per place", "fixed kB"]
+    head = ["AUC", "**map**", "null", "float", "HOG", "every k-th", "recall@1", "of HOG", "bytes", "fixed kB"]
 
     def figures(row: Row) -> list[float | None]:
         beside = [row[name]["auc"] for name in ("null", "uncompressed", "hog", "hog_stride_coarsest")]
