@@ -51,12 +51,15 @@ PIXELS = FEW_VIEWS - {"test_demo", "test_compare"} | {"test_real_routes"}
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """What runs whole commands is marked `slow` as well as single tests above 5 s."""
+    """What runs whole commands is marked `slow` as well as single tests above 5 s, and goes first, so that
+    processes that share the files end together."""
     here = Path(__file__).parent
     for item in items:
         path = item.path.relative_to(here) if item.path.is_relative_to(here) else item.path
         if str(path).startswith(SLOW) or path.suffix == ".ipynb":
             item.add_marker("slow")
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)  # stable
 
 
 def pytest_collection_finish() -> None:

@@ -17,6 +17,7 @@ from PIL import Image
 from torch import Tensor, nn
 
 from dejavu_torch import (
+    HOG,
     DejaVu,
     ImposedPeriods,
     PlaceFilter,
@@ -30,6 +31,9 @@ from dejavu_torch import (
 from dejavu_torch import export as onnx_file
 from dejavu_torch.export import METADATA, OPSET, export_onnx, run_session, session_of
 from dejavu_torch.features.cnn import SmallCNN
+from dejavu_torch.features.distilled import Distilled
+from dejavu_torch.features.joined import Joined
+from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.types import FrequencyLayer, SequenceModel
 
 pytest.importorskip("onnxscript")
@@ -64,7 +68,9 @@ def flights() -> tuple[Tensor, Tensor]:
 def test_a_file_says_what_it_is(flights: tuple[Tensor, Tensor], tmp_path: Path) -> None:
     import onnx
 
-    model = of_frames(flights[0], chunk=30, metric="l2")
+    network = SmallCNN(8, channels=3, resize=(16, 16), widths=(4, 8), squeeze=4)
+    features = Joined([HOG(), Distilled(), PatchPixels(channel="grey"), network])
+    model = of_frames(flights[0], features, chunk=30, metric="l2")
     model.threshold = 0.25
     written = export_onnx(model, tmp_path / "map.onnx")
     assert written.bytes == (tmp_path / "map.onnx").stat().st_size

@@ -244,19 +244,6 @@ def test_one_module_is_not_two_members(flights: list[Tensor], tmp_path: Path) ->
     torch.testing.assert_close(again.describe(flights[1]), model.describe(flights[1]))
 
 
-def test_a_file_of_onnx_gives_the_same_scores(flights: list[Tensor], tmp_path: Path) -> None:
-    pytest.importorskip("onnxscript")
-    pytest.importorskip("onnxruntime")
-    from dejavu_torch.export import export_onnx, run_session, session_of
-
-    model = DejaVu(Joined([*both().members, network()]), Whitening(views=1)).learn(flights[0]).eval()
-    export_onnx(model, tmp_path / "map.onnx")
-    with torch.no_grad():
-        scores = model(flights[1])
-    found = run_session(session_of(str(tmp_path / "map.onnx")), flights[1])
-    torch.testing.assert_close(found, scores, rtol=0, atol=1e-4)
-
-
 # the command line -------------------------------------------------------------------------------------
 
 
