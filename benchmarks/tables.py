@@ -147,7 +147,6 @@ def sequences() -> str:
     table = [["AUC of map, null, HOG", *(f"T = {key}" if key.isdigit() else key for key in keys)]]
     for name, row in (*reports("sequence").items(), *reports("visits").items()):
         each = [of["sequences"] for of in (row, row["null"], row["hog"])]
-        each = [of for of in each if of]
         cells = [", ".join(area(of[key]["auc"]) for of in each if key in of) for key in keys]
         seen = ", whitened by both visits to the first" if row["contender"] == "visits" else ""
         table.append([name + seen, *cells])
