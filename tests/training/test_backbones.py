@@ -129,7 +129,7 @@ def test_ready_features_leave_a_backbone_out(tmp_path: Path, caplog: pytest.LogC
     running.fit(task, data_of(features))
     model = DejaVu.load(tmp_path / "map.safetensors")  # by itself
     running.validate(task, data_of(features), verbose=False)
-    assert warned(caplog) == ["these are ready features: the backbone is left out"]
+    assert warned(caplog) == ["the source holds ready features: the backbone is not used"]
     assert "backbone" not in model.summary().fixed
     assert model.summary().map_bytes < sum(p.nbytes for p in backbone().parameters())
     torch.testing.assert_close(model(features[:3]), task(features[:3]))
