@@ -56,8 +56,7 @@ class Camera:
         note: a warning that `size` stretches the frames, set after the first one; else "".
 
     Raises:
-        InputError: while iterating: no such camera, no video, a damaged stream, a frame of another size than
-            the first, or a camera or address that ends.
+        InputError: on iterating: no camera or video, a damaged stream, a size change, or an unexpected end.
     """
 
     def __init__(self, source: str, size: tuple[int, int] | None = None) -> None:

@@ -35,7 +35,7 @@ class ImageFolder(IndexedTraverse):
     """The images of a folder, sorted by name; numbers in names compare as numbers (9 before 10). If all names
     end in increasing numbers, such as frame_0001.png, the images are assumed to be in order along the route.
 
-    Grey images have one channel, all others three. EXIF orientation is applied. A file is one image.
+    Grey images have one channel, others three. EXIF orientation is applied. A file's first image is read.
 
     Args:
         width, height: pixels to resize to, antialiased; 0 for both keeps the size, for one the aspect ratio.
@@ -91,7 +91,7 @@ class ImageFolder(IndexedTraverse):
         self._first = self._first or (file.name, shape, own)
         name, expected, first = self._first
         if shape != expected:
-            raise InputError(f"{file} is {shape}; expected {expected} as {name}")
+            raise InputError(f"{file} is {shape}; expected {expected} like {name}")
         if self.same_aspect and is_stretched(own, first):
             ratio = f"the aspect ratio of {name}, {first[0]} x {first[1]}"
             raise InputError(f"{file} is {own[0]} x {own[1]} pixels; expected {ratio}")
@@ -114,7 +114,7 @@ def check_pixels(path: Path, rows: int, columns: int, most: int) -> None:
 
 
 def fitted_size(path: Path, rows: int, columns: int, width: int, height: int) -> tuple[int, int]:
-    """(rows, columns) after resizing to width and height; 0 keeps their own, or their aspect ratio."""
+    """(rows, columns) after resizing to width and height; 0 for both keeps the size, for one the aspect."""
     wide = width or (max(1, round(columns * height / rows)) if height else columns)
     high = height or (max(1, round(rows * width / columns)) if width else rows)
     if (high, wide) != (rows, columns) and high * wide > MOST_PIXELS:
@@ -132,10 +132,8 @@ def read_image(path: Path, least: int = 0) -> Tensor:
     Raises:
         InputError: not an image, over 2^28 pixels, more than fit in memory, or values outside [0, 1].
     """
-    with (
-        reading(path, "cannot be read as an image", "an image such as .png or .jpg"),
-        Image.open(path, formats=FORMATS) as opened,
-    ):
+    unread, expected = "cannot be read as an image", "an image such as .png or .jpg"
+    with reading(path, unread, expected), Image.open(path, formats=FORMATS) as opened:
         if least:
             opened.draft(None, (least, least))
         check_pixels(path, opened.height, opened.width, MAX_IMAGE_PIXELS)
@@ -159,8 +157,7 @@ def read_image(path: Path, least: int = 0) -> Tensor:
 
 def natural(name: str) -> tuple[list[str | int], str]:
     """A sort key that compares numbers in names as numbers."""
-    # odd positions are digits, so numbers are only compared with numbers
-    parts = re.split(r"(\d+)", name)
+    parts = re.split(r"(\d+)", name)  # digits at odd positions: numbers are compared only with numbers
     return [int(part) if j % 2 else part for j, part in enumerate(parts)], name
 
 

@@ -114,11 +114,9 @@ class FrameRange(Selection):
             expected = "a step of at least 1" if step < 1 else f"a part of its {frames}"
             raise InputError(f"{traverse.name}: start={start}, stop={stop}, step={step}; expected {expected}")
         end = stop or length or LARGEST
-        # any longer step gives the same one frame
-        super().__init__(traverse, range(start, end, min(step, max(1, end - start))))
+        super().__init__(traverse, range(start, end, min(step, max(1, end - start))))  # at least one frame
         self.name = f"{traverse.name}[{start}:{stop or ''}{f':{step}' if step > 1 else ''}]"
-        if length is None:
-            self.length = None
+        self.length = None if length is None else self.length
         if traverse.cut is not None:
             self.cut = traverse.cut[0], traverse.cut[1][start : stop or None : self.frame.step]
         self._least = len(self.frame) if stop else 1

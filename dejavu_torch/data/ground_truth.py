@@ -43,7 +43,7 @@ class GroundTruth(NamedTuple):
 
 
 def as_ground_truth(truth: Tensor | GroundTruth) -> GroundTruth:
-    """Correct places (Q,R), -1 as padding, as a GroundTruth of judged queries."""
+    """Correct places (Q,R), -1 as padding, as a GroundTruth in which every query is judged."""
     if isinstance(truth, GroundTruth):
         return truth
     judged = torch.ones(len(truth), dtype=torch.bool)
@@ -114,7 +114,7 @@ def is_right(index: Tensor, truth: Tensor, tolerance: int) -> Tensor:
         >>> is_right(torch.tensor([5, 6, -1]), torch.tensor([[0], [0], [0]]), tolerance=5).tolist()
         [True, False, False]
     """
-    tolerance = min(tolerance, LARGEST)  # more than int64 would compare wrong
+    tolerance = min(tolerance, LARGEST)  # int64 cannot hold every int
     near = (index[:, None] - truth).abs() <= tolerance
     return (near & (truth >= 0) & (index >= 0)[:, None]).any(1)
 
@@ -140,8 +140,7 @@ def check_ground_truth(truth: str, interpolate: bool = False) -> int | float | P
     if suffix in (".csv", ".json", ".npz"):
         check_regular(path, EXPECTED)
         return path
-    offset = offset_of(truth)
-    if offset is not None:
+    if (offset := offset_of(truth)) is not None:
         return offset
     name, colon, radius = truth.partition(":")
     metres = as_number(radius) if colon else 25.0
@@ -180,8 +179,8 @@ def find_ground_truth(
         frames: the number of reference frames, None if unknown.
         queries: their number, or (Q,) int64 the frame of each query in its source.
         interpolate: interpolate the place of a query between two listed in the .csv, rounded.
-        resampled: whether queries and places are resampled by distance. A listed frame that is no query then
-            applies to the nearest query whose frame is not listed.
+        resampled: whether queries and places are resampled by distance. A listed frame that is not a query
+            then applies to the nearest query, unless that is listed too.
         aligned: take any two traverses of equal length as aligned.
 
     Convention 11: a ground truth counts frames of the sources; see `ground_truth_in_places`. The tolerance
@@ -232,9 +231,8 @@ def find_ground_truth(
 
 
 def _rows_of(table: Tensor, numbers: Tensor) -> Tensor:
-    """The rows of a table for the queries with these numbers."""
-    if int(numbers.max()) >= len(table):
-        raise InputError(f"query {int(numbers.max())} does not exist; expected numbers below {len(table)}")
+    if (last := int(numbers.max())) >= len(table):
+        raise InputError(f"there is a query {last}; expected numbers below {len(table)}")
     return table[numbers]
 
 
@@ -330,8 +328,8 @@ def _read_csv(path: Path, frames: int | None, interpolate: bool) -> Listed:
         number, names = rows.pop(0)
         # any other column, such as a distance, would be read as a right place
         if names[0].lower() != "query" or not all(re.match("place|$", name.lower()) for name in names[1:]):
-            seen = f"{path}, line {number}: columns {','.join(names)}"
-            raise InputError(f"{seen}; expected query,place[,place...]")
+            expected = "query,place[,place...]"
+            raise InputError(f"{path}, line {number}: columns {','.join(names)}; expected {expected}")
     end, valid = (LARGEST, "0") if frames is None else (frames, f"0 to {frames - 1}")
     listed: Listed = {}
     for line, cells in rows:
@@ -371,7 +369,7 @@ def _read_json(path: Path, frames: int | None, count: int | None, least: int) ->
     if not isinstance(rows, list) or len(rows) < least or count not in (None, len(rows)):
         seen = f"a list of {len(rows)}" if isinstance(rows, list) else f"a {type(rows).__name__}"
         queries = f"{least} queries or more" if count is None else f"{count} queries"
-        raise InputError(f"{path} holds {seen}; expected {expected}, {queries}")
+        raise InputError(f"{path} contains {seen}; expected {expected}, {queries}")
     end, valid = (LARGEST, "0") if frames is None else (frames, f"0 to {frames - 1}")
     for query, row in enumerate(rows):
         listed = isinstance(row, list)

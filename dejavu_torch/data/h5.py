@@ -25,8 +25,7 @@ EXPECTED = f"a group for each image with a dataset {KEY} (D,) of floats, as hloc
 
 
 class DescriptorFile(IndexedTraverse):
-    """The global descriptors in an HDF5 file of hloc (Hierarchical-Localization), sorted by image names as in
-    `ImageFolder` and read as needed.
+    """The global descriptors in an HDF5 file of hloc (Hierarchical-Localization), sorted as in `ImageFolder`.
 
     Args:
         path: a file with a group for each image, whose name may contain slashes, each with a dataset

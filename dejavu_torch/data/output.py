@@ -241,7 +241,6 @@ def _refusing(path: Path, what: str, also: type[Exception] = OSError) -> Iterato
 
 
 def _target(path: Path) -> Path:
-    """The path with links resolved."""
     return Path(os.path.realpath(path))
 
 

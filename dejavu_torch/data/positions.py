@@ -52,8 +52,7 @@ def positions_behind(positions: Tensor, places: int) -> Tensor:
         expected = f"at most {MAX_PLACES}, as float32 cannot number more: learn several maps and merge them"
         raise InputError(f"{total} places at even steps on one route; expected {expected}")
     moved = (double + places).float()
-    # large positions may round up to the next place in float32
-    reached = (double + NEAR).floor() + places
+    reached = (double + NEAR).floor() + places  # float32 may round large positions up to the next place
     below = torch.nextafter((reached + 1 - NEAR).float(), torch.zeros_like(moved))
     return torch.where((moved.double() + NEAR).floor() > reached, below, moved)
 

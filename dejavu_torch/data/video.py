@@ -132,7 +132,7 @@ class Video(Traverse):
             with self._open() as (container, stream):
                 base = stream.time_base
                 avi = container.format.name == "avi"
-                # packets are in decoding order; frames of .avi have no other timestamps, wrong once decoded
+                # packets are in decoding order; .avi stores no other, so its frames get wrong times
                 in_order = decode and not avi
                 if in_order and not self._complete:
                     self._seconds = seconds
@@ -179,8 +179,7 @@ class Video(Traverse):
         import av
 
         options = {"format_whitelist": FORMATS, "protocol_whitelist": "file"}
-        # a sequence of JPEGs is often detected as another format
-        kind = "mjpeg" if self.path.suffix.lower() == ".mjpeg" else None
+        kind = "mjpeg" if self.path.suffix.lower() == ".mjpeg" else None  # often detected as another
         with reading(self.path, "cannot be read as a video", "a video file"):
             name = f"file:{self.path}"  # may contain a colon
             container = av.open(name, "r", kind, container_options=options, metadata_errors="replace")
@@ -263,8 +262,7 @@ def _elements_fit(file: BinaryIO, start: int, stop: int) -> bool:
     while start < stop:
         file.seek(start)
         head = file.read(12)
-        # an identifier and a length; their leading zero bits give their sizes
-        i = 9 - head[0].bit_length()
+        i = 9 - head[0].bit_length()  # leading zero bits give the sizes of an identifier and a length
         j = i + 9 - head[i].bit_length() if i <= 4 and i < len(head) else 13
         if j > len(head):
             return False

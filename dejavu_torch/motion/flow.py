@@ -73,8 +73,7 @@ def _shift(track: Tracker, first: Array, second: Array) -> tuple[float, float]:
         target = points + median
         inside = ((target >= 0) & (target <= (first.shape[1] - 1, first.shape[0] - 1))).all(1)
         agree = inside & returned & (np.abs(moved - median) < TOLERANCE).all(1)
-        # among fewer than 8 points, some agree by chance
-        confidence = float(agree.sum() / max(inside.sum(), len(points) / 2, 8))
+        confidence = float(agree.sum() / max(inside.sum(), len(points) / 2, 8))  # few agree by chance
         best = max(best, (float(median[1]), confidence), key=lambda found: found[1])
         if confidence >= SUFFICIENT_CONFIDENCE:
             break
@@ -95,7 +94,6 @@ def _track_corners(cv2: Any, first: Array, second: Array, start: float) -> tuple
 
 
 def _track_pixels(cv2: Any, first: Array, second: Array, start: float) -> tuple[Array, Array, Array]:
-    """As `_track_corners`."""
     search = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     mean = partial(cv2.boxFilter, ddepth=-1, ksize=(9, 9))
     y, x = np.indices(first.shape, np.float32)

@@ -32,8 +32,7 @@ def phase_shifts(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
         patches that are flat or not finite.
     """
     count, _, height, _ = first.shape
-    # coarse: all integer lags at half resolution
-    reach = int(MAX_SHIFT * (height // 2))
+    reach = int(MAX_SHIFT * (height // 2))  # coarse: all integer lags at half resolution
     lags = torch.arange(-reach, reach + 1.0).to(first)
     one, other = (avg_pool2d(patch, 2)[:, 0] for patch in (first, second))
     score = _coherence(one, other, first.new_zeros(count), lags, SWAY // 2 + 1, 2 * BAND)

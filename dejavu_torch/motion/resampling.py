@@ -60,7 +60,7 @@ class ResampledTraverse(Selection):
         forward, back = int((moved > 0).sum()), int((moved < 0).sum())
         if back > MAX_BACKWARD * forward:
             log.warning(
-                "%s: %d of %d steps go forward and %d backwards: check that the corners lie on the ground",
+                "%s: %d of %d steps go forward and %d backwards: do the corners show the ground ahead?",
                 *(traverse.name, forward, len(moved), back),
             )
         step = odometry.step if step is None else step

@@ -31,8 +31,7 @@ ROAD = 40.0  # image row of the road's centre
 HALF, LANE = 14.0, 6.3  # rows from the road's centre to its edge, to the centre of a lane
 SUN = (0.75, -0.66)  # direction towards the sun, (x, y)
 
-# colours, rrggbb
-WHITE, GRAVEL, GLASS, DARK = "edebe0", "998f7a", "1a212b", "0d0f12"
+WHITE, GRAVEL, GLASS, DARK = "edebe0", "998f7a", "1a212b", "0d0f12"  # colours, rrggbb
 ASPHALT, MEADOW = "69696b", "597036"
 ROOFS = ("99452e", "7a3d2e", "5c5e66", "856b54")
 LEAVES = ("2e5c1f", "3d6626", "4f5e24", "266633", "47612b")

@@ -62,26 +62,17 @@ class Rays(NamedTuple):
 
 @dataclass(eq=False)
 class Thing:
-    """Equal boxes on a sheet, one at each position along the track.
+    """Equal boxes on a sheet, one at each position along the track; lengths in metres."""
 
-    Args:
-        sheet: its name. colour: rrggbb.
-        low, high: extent across the sheet, in metres from its first edge.
-        at: (n,) increasing positions, or one, of the side that faces the camera, in metres.
-        length: metres along the track.
-        depth: height of the box over the sheet towards the camera's path, in metres.
-        opacity: 0 to 1. lit: whether it emits light.
-    """
-
-    sheet: str
-    low: float
+    sheet: str  # name
+    low: float  # extent across the sheet, from its first edge
     high: float
-    colour: str
-    at: Tensor | float
-    length: float
-    depth: float = 0.0
+    colour: str  # rrggbb
+    at: Tensor | float  # (n,) increasing positions, or one, of the side that faces the camera
+    length: float  # along the track
+    depth: float = 0.0  # height over the sheet, towards the camera's path
     opacity: float = 1.0
-    lit: bool = False
+    lit: bool = False  # emits light
 
     def __post_init__(self) -> None:
         at = torch.as_tensor(self.at, dtype=torch.float64).flatten()
@@ -89,8 +80,7 @@ class Thing:
         self._at = torch.cat([torch.tensor([-math.inf]), at.float()])
         self._gap = float(at.diff().min()) if len(at) > 1 else math.inf
         self.first = float(at[0])
-        # the face of a box hides the sheet up to FAR metres after it
-        self.last = float(at[-1]) + self.length + (FAR if self.depth else 0)
+        self.last = float(at[-1]) + self.length + (FAR if self.depth else 0)  # its face hides more
 
     def _last(self, s: Tensor) -> tuple[Tensor, Tensor]:
         """The number of boxes up to s, and the distance to the last of them, infinite for none."""
@@ -122,17 +112,12 @@ class Thing:
 
 
 class Light(NamedTuple):
-    """The light of a traverse.
+    """The light of a traverse."""
 
-    lamp: strength of the headlight next to the train; it falls off over `reach` metres.
-    ambient: (S,) light along the track, one value per metre.
-    haze: (3,1) colour of the distance, reached over `fade` metres.
-    """
-
-    lamp: float
+    lamp: float  # strength of the headlight next to the train, which falls off over `reach` metres
     reach: float
-    ambient: Tensor
-    haze: Tensor
+    ambient: Tensor  # (S,) light along the track, one value per metre
+    haze: Tensor  # (3,1) colour of the distance, reached over `fade` metres
     fade: float
 
     def at(self, ahead: Tensor, s: Tensor) -> Tensor:
@@ -209,7 +194,7 @@ class Sheet:
         half = (rays.wide + step[:, None].float()) / 2
         near, far = float(s.min()), float(s.max()) + FAR
         fog = torch.exp(-rays.ahead / light.fade)
-        for lit in (False, True):  # lit things are not shaded
+        for lit in (False, True):  # things that emit light are not shaded
             for thing in self.things:
                 if thing.lit == lit and thing.first < far and thing.last > near:
                     thing.draw(rays, place, across, half, paint, alpha)

@@ -40,7 +40,7 @@ class Railway(SimulatedRoute):
         seed: selects the railway, at least 0.
         traverse: selects the ride, 0 to 9, its speeds, stops, light, sway, people, trains; 0: the reference.
         frames: number of frames from the start; 0 for the whole route.
-        height, width: of a frame in pixels, 16 to 512 and 16 to 1024; the width is 0.5 to 4 heights.
+        height, width: of a frame in pixels, 16 to 512 and 16 to 1024; the width 0.5 to 4 times the height.
         speed: cruising speed of the reference in m/s, 5 to 40; other rides have 0.85 to 1.2 of it.
         noise: standard deviation of the sensor noise, 0 to 1; white is 1.
         shake: camera sway, 0 to 3; 1 is up to 6 cm sideways and 0.5 degrees of roll, half that at traverse 0.
@@ -81,14 +81,12 @@ class Railway(SimulatedRoute):
         self.size = self.height, self.width
         self.length = self.frames or len(distance)
         self.distance = distance[: self.length]
-        self.place = torch.arange(self.length).double()
-        if self.traverse:
-            self.place = reference_place(reference, self.distance)
+        numbers = torch.arange(self.length).double()
+        self.place = reference_place(reference, self.distance) if self.traverse else numbers
         self._step = distance.diff(append=distance[-1:])[: self.length] * EXPOSURE
         self._paths = self._wander(len(distance))
         view = View(*self.size)
-        # with a margin of 5 % to the bottom row and the right column
-        near = 1.05 * max(FOOT / float(view.up.min()), RIGHT / float(view.right.max()))
+        near = 1.05 * max(FOOT / float(view.up.min()), RIGHT / float(view.right.max()))  # margin 5 %
         corners = (LEFT, AHEAD), (RIGHT, AHEAD), (RIGHT, near), (LEFT, near)
         self.corners = tuple(view.project(x, FOOT, ahead) for x, ahead in corners)
         self.ground_span = AHEAD - near
