@@ -422,7 +422,7 @@ BOW_TIE = ((0.2, 0.5), (0.8, 0.9), (0.8, 0.5), (0.2, 0.9))
         (lambda: GroundOdometry()(short().values[:1]), ("the input has 1 frame;", "at least 2")),
         (lambda: distance(short().values[:1]), ("the drive has 1 frame;", "at least 2")),
         (lambda: distance(torch.zeros(5, 1, 60, 80)), ("none of 4 steps", "expected corners on the ground")),
-        (lambda: distance(torch.rand(5, 7)), ("features", "(5, 7)", "frames (B,C,H,W)")),
+        (lambda: distance(torch.rand(5, 7)), ("features", "(5, 7)", "expected (B,C,H,W)")),
     ],
 )
 def test_what_is_refused(call: Callable[[], Any], facts: tuple[str, ...]) -> None:
