@@ -28,7 +28,7 @@ from dejavu_torch.learning import ChunkCoder
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.maps.spectral_map import Chunk, SpectralMap
 from dejavu_torch.recognition.coarse import coarse_search
-from dejavu_torch.recognition.search import Best, Search, Wanted, lowest_needed, search
+from dejavu_torch.recognition.search import Best, Search, Wanted, num_needed, search
 from dejavu_torch.text import one_line
 from dejavu_torch.types import InputError, Traverse
 
@@ -222,7 +222,7 @@ class _Searcher:
         """Scores and places in which the wanted candidates of the part are, as arrays."""
         own = torch.from_numpy(queries.copy())
         if self.find is None:
-            score, place = search(self.part, own, lowest_needed(wanted, self.part.places), scan=True)
+            score, place = search(self.part, own, num_needed(wanted, self.part.places), scan=True)
         else:
             score, place = self.find(own, wanted)
         return score.numpy(), torch.where(score.isfinite(), place + self.first, place).numpy()
