@@ -260,8 +260,8 @@ MUTANTS = [
     Mutant(
         "A third visit that is averaged into a map weighs a third.",
         "dejavu_torch/growth.py",
-        "means = with_visits(route.decode(g), counts[start:stop], rows",
-        "means = with_visits(route.decode(g), torch.ones(stop - start), rows",
+        "means = learning.with_visits(route.decode(g), counts[start:stop], rows",
+        "means = learning.with_visits(route.decode(g), torch.ones(stop - start), rows",
         ("tests/test_behaviour.py::test_a_third_visit_weighs_a_third",),
     ),
     Mutant(
