@@ -75,7 +75,7 @@ def test_searches_of_localize(
     kept = tmp_path / "route.samples"
     (tmp_path / "link").symlink_to(tmp_path)
     for new in (kept, tmp_path / "link" / kept.name):  # before it is there
-        assert "what is read" in fails(capsys, "localize", path, SECOND, "--search_file", kept, "--out", new)
+        assert "is an input" in fails(capsys, "localize", path, SECOND, "--search_file", kept, "--out", new)
     assert not kept.exists()
     for _ in range(2):  # written, read
         run("localize", path, SECOND, "--search_file", kept, "--out", out)
@@ -89,7 +89,7 @@ def test_searches_of_localize(
     ):
         assert said in fails(capsys, "localize", path, SECOND, "--search_file", kept, *words, "--out", out)
     assert scored in fails(capsys, "live", path, SECOND, "--search_file", kept)
-    assert "what is read" in fails(capsys, "localize", path, SECOND, "--search_file", kept, "--out", kept)
+    assert "is an input" in fails(capsys, "localize", path, SECOND, "--search_file", kept, "--out", kept)
     assert "complete file" in fails(capsys, "localize", path, SECOND, "--search_file", path, "--out", out)
     capsys.readouterr()
     run("live", path, f"{SECOND}&stop=3", "--sequence", "1", "--search_file", kept)

@@ -542,7 +542,7 @@ MUTANTS = [
     Mutant(
         "The names beside an array are no place for an output.",
         "dejavu_torch/data/source.py",
-        'if place.suffix.lower() == ".npy" else []',
+        'if path.suffix.lower() == ".npy" else []',
         "if False else []",
         ("tests/test_faults.py::-k what_is_read",),
     ),
