@@ -58,7 +58,7 @@ def same_maps(first: Path, second: Path) -> bool:
 def test_searches_of_localize(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(coarse, "FEWEST", 0)  # as a long map is searched
+    monkeypatch.setattr(coarse, "MIN_PLACES", 0)  # as a long map is searched
     path, out = tmp_path / "m.safetensors", tmp_path / "m.csv"
     run("learn", ROUTE, "--map", path, "--mapper.chunk", "32", "--features", "HOG")
     found = []
@@ -75,7 +75,7 @@ def test_searches_of_localize(
     kept = tmp_path / "route.samples"
     (tmp_path / "link").symlink_to(tmp_path)
     for new in (kept, tmp_path / "link" / kept.name):  # before it is there
-        assert "what is read" in fails(capsys, "localize", path, SECOND, "--search_file", kept, "--out", new)
+        assert "is an input" in fails(capsys, "localize", path, SECOND, "--search_file", kept, "--out", new)
     assert not kept.exists()
     for _ in range(2):  # written, read
         run("localize", path, SECOND, "--search_file", kept, "--out", out)
@@ -89,8 +89,8 @@ def test_searches_of_localize(
     ):
         assert said in fails(capsys, "localize", path, SECOND, "--search_file", kept, *words, "--out", out)
     assert scored in fails(capsys, "live", path, SECOND, "--search_file", kept)
-    assert "what is read" in fails(capsys, "localize", path, SECOND, "--search_file", kept, "--out", kept)
-    assert "no whole file" in fails(capsys, "localize", path, SECOND, "--search_file", path, "--out", out)
+    assert "is an input" in fails(capsys, "localize", path, SECOND, "--search_file", kept, "--out", kept)
+    assert "complete file" in fails(capsys, "localize", path, SECOND, "--search_file", path, "--out", out)
     capsys.readouterr()
     run("live", path, f"{SECOND}&stop=3", "--sequence", "1", "--search_file", kept)
     assert [json.loads(line)["place"] for line in capsys.readouterr().out.splitlines()] == [

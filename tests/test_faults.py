@@ -350,7 +350,7 @@ def test_an_output_that_is_what_is_read_is_refused_and_stays(
     (folder / "report" / "matches.csv").write_text("query,place\n0,0\n")
     shutil.copy("report/matches.csv", "m.csv")
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    assert "is what is read; expected another" in fails(capsys, *words.split())
+    assert "is an input; expected another" in fails(capsys, *words.split())
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
 

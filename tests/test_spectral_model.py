@@ -135,7 +135,7 @@ def test_views_of_a_second_traverse(reference: Traverse, second: Traverse) -> No
     assert second_traverse(model, reference, second, "290").places.tolist() == [*range(290, 300), *[-1] * 290]
     plain = ArrayTraverse(torch.rand(FRAMES, 1, 9, 9), "plain"), ArrayTraverse(torch.rand(9, 1, 9, 9), "few")
     assert second_traverse(model, plain[0], plain[0]).places.tolist() == list(range(FRAMES))
-    with refused("few has 9 frames", "plain 300", "a truth that says"):
+    with refused("few has 9 frames", "plain 300", "a truth for its places"):
         second_traverse(model, *plain)
     with refused("no whitening", "few"):
         second_traverse(DejaVu(whitening="none"), *plain, "0")

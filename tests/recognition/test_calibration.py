@@ -169,7 +169,7 @@ def test_of_many_views_evenly_spaced_stretches_are_taken(monkeypatch: pytest.Mon
     route, seen = torch.randn(2000, 6), list[Tensor]()
     views = Views(as_traverse(route + 0.2 * torch.randn_like(route)), torch.arange(2000))
     model = DejaVu(whitening="none", mapper=SpectralMapper(12.0)).learn(route)
-    monkeypatch.setattr("dejavu_torch.learning.LONGEST_SEGMENT", 20)
+    monkeypatch.setattr("dejavu_torch.learning.MAX_SEGMENT", 20)
     monkeypatch.setattr("dejavu_torch.learning.CALIBRATION_SCORES", 400 * 2000)
 
     def noted(_: object, segments: Iterable[tuple[Tensor, Tensor]], another: bool) -> Calibration:
@@ -300,7 +300,7 @@ def views_of(frames: int, first: int = 0) -> Views:
     [
         (lambda model: model.calibrate(torch.rand(64, 8)), ["ready features"]),
         (lambda _: DejaVu().calibrate(torch.rand(64, 8)), ["no map"]),
-        (lambda model: model.calibrate(None), ["neither a reference nor views"]),
+        (lambda model: model.calibrate(None), ["no reference and no views"]),
         (lambda model: model.calibrate(None, Views(views_of(60).traverse, torch.arange(64))), ["60 frames"]),
         (lambda model: model.calibrate(None, views_of(64, 1)), ["shows place 64", "one of 64"]),
         (lambda model: model.calibrate(None, views_of(1, 60)), ["calibrating by", "none of"]),
