@@ -161,12 +161,14 @@ class LastCheckpoint(Checkpoint):
         if isinstance(exception, KeyboardInterrupt):
             self._save(trainer)
 
-    def _save(self, trainer: pl.Trainer, pl_module: Any = None) -> None:
+    def on_train_end(self, trainer: pl.Trainer, pl_module: Any) -> None:
+        """Save the last step."""
+        self._save(trainer)
+
+    def _save(self, trainer: pl.Trainer) -> None:
         if trainer.state.fn == "fit" and trainer.global_step not in (0, self.saved):
             trainer.save_checkpoint(Path(trainer.default_root_dir) / "checkpoints" / "last.ckpt")
             self.saved = trainer.global_step
-
-    on_train_end = _save
 
 
 def compare_with_untrained(

@@ -186,7 +186,7 @@ def test_the_untrained_map_takes_as_many_bytes(
 def test_a_short_route_is_told_before_the_training(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     trainer(tmp_path, **SHORT).fit(new_task(), data_of())
     (line,) = warned(caplog)
-    assert all(fact in line for fact in ("40 frames, below 300", "dejavu learn", "data.validation"))
+    assert all(fact in line for fact in ("40 frames, fewer than 300", "dejavu learn", "data.validation"))
     assert DejaVu.load(tmp_path / "map.safetensors").calibration is None
 
 

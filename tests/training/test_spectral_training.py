@@ -198,8 +198,8 @@ def test_settings_that_do_not_fit_are_refused(settings: dict[str, Any], facts: t
 @pytest.mark.parametrize(
     ("settings", "frames", "facts"),
     [
-        ({"backbone": coded(network=HOG())}, None, ("can be trained", "dejavu learn")),
-        ({"freeze": [""]}, None, ("can be trained", "dejavu learn")),
+        ({"backbone": coded(network=HOG())}, None, ("nothing to train", "dejavu learn")),
+        ({"freeze": [""]}, None, ("nothing to train", "dejavu learn")),
         ({}, torch.eye(FRAMES), ("ready features", "SpectralMapper is not trained", "dejavu learn")),
         ({"mapper": SpectralMapper(0.1)}, None, ("route_bytes_per_place is 0.1",)),
     ],
