@@ -112,7 +112,7 @@ def test_what_is_of_templates_alone_is_refused_in_one_line() -> None:
         lambda: leave_out_match(model, values, 1),
         lambda: null_control(model, values, values, same_plan=True),
     ):
-        with refused("template maps", "'stored'"):
+        with refused("a template map", "'stored'"):
             use()
 
 
@@ -185,7 +185,7 @@ def test_a_loaded_map_says_that_its_period_finder_is_missing(
     report = compare(ArrayTraverse(values, "a"), ArrayTraverse(values + 0.01, "b"), "0", model).report
     assert "null" not in report.contenders
     assert "null_same_plan" in report.contenders
-    assert "not of this package" in caplog.text
+    assert "outside this package" in caplog.text
     model.save(tmp_path / "again.safetensors")
     assert DejaVu.load(tmp_path / "again.safetensors").mapper.periods is None
 

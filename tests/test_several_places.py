@@ -140,7 +140,7 @@ def test_without_top_compare_counts_and_writes_matches_only(
     route: Path, pair: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run("compare", *pair, "--map", route, "--truth", "0", "--tolerance", "1", "--out", tmp_path / "c")
-    assert "among their first 5 candidates" in capsys.readouterr().out
+    assert "among the first 5 candidates" in capsys.readouterr().out
     assert report_of(tmp_path / "c")["recall_at_10"] > 0
     assert len(rows_of(tmp_path / "c" / "matches.csv")) == 96
     assert "rank" not in rows_of(tmp_path / "c" / "matches.csv")[0]

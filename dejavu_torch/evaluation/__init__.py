@@ -1,1 +1,1 @@
-"""Places + truth -> figures."""
+"""From places and a ground truth to scores, pictures and reports."""

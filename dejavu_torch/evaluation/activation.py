@@ -1,8 +1,7 @@
-"""How single layers answer, and how often they, and their fusion, are right (figure 17 of the paper)."""
+"""How often single layers, and all layers fused, are right (figure 17 of the paper)."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -12,14 +11,11 @@ from dejavu_torch.data.ground_truth import GroundTruth, counted, is_right
 from dejavu_torch.maps.template_map import TemplateMap
 from dejavu_torch.types import FrequencyLayer
 
-DISTANCES_AT_ONCE = 2**22  # numbers of Q x P held at a time
+BLOCK_DISTANCES = 2**22  # of Q x P, computed at a time
 
 
 class Rate(NamedTuple):
-    """Share of right answers among queries inside and outside a chunk, and by chance.
-
-    None where there are no such queries.
-    """
+    """Share of right answers among queries inside and outside a chunk (None without any), and by chance."""
 
     inside: float | None
     outside: float | None
@@ -35,25 +31,19 @@ class Rate(NamedTuple):
 
 
 def activation_rates(
-    route: TemplateMap,
-    chosen: Sequence[int],
-    queries: Tensor,
-    index: Tensor,
-    truth: GroundTruth,
-    tolerance: int,
+    route: TemplateMap, chosen: list[int], queries: Tensor, index: Tensor, truth: GroundTruth, tolerance: int
 ) -> list[Rate]:
-    """How often each of some layers of one chunk answers in phase, and, last, how often the map is right.
+    """How often each of the chosen layers of one chunk answers in phase, followed by the rate of the map.
 
-    A query of known truth is *inside* where one of its right places lies in the chunk, *outside* where it has
-    right places but none in the chunk.
+    A query is *inside* if one of its right places lies in the chunk, *outside* if all of them lie elsewhere.
 
-    A layer is right where its best phase (argmin over k of eq. 3) is within the tolerance of the phase of a
-    right place (`in_phase`): inside, one in the chunk; outside, any, as if the layer went on, so that a rate
-    near chance says that its period ends with the chunk, or slips there. Chance is the share of phases within
-    the tolerance of any one, (2 * tolerance + 1) / period where phases = period.
+    A layer is right if its best phase (argmin over k of eq. 3) is within the tolerance of the phase of a
+    right place (`in_phase`): inside, of one in the chunk; outside, of any, as if the layer continued. A rate
+    near chance there means that the period ends, or slips, at the end of the chunk. Chance is the share of
+    phases within the tolerance of any one: (2 * tolerance + 1) / period if phases = period.
 
-    The map is right where the reported place is within the tolerance of a right one; outside, that is the
-    work of the layers of other chunks. Chance is (2 * tolerance + 1) / places.
+    The map is right if the reported place is within the tolerance of a right one; outside, the layers of
+    other chunks answer. Chance is (2 * tolerance + 1) / places.
 
     Shape: queries (Q,D), index (Q,) the places reported for them.
     """
@@ -74,10 +64,10 @@ def activation_rates(
 
 
 def best_phases(route: TemplateMap, queries: Tensor, j: int) -> Tensor:
-    """The phase of one layer, among those its chunk has, nearest to each query: (Q,D) -> (Q,) int64."""
+    """The phase of one layer that is nearest to each query, among the phases of its chunk: (Q,D) -> (Q,)."""
     layer = route.plan[j]
     present: Tensor = layer.place_phases.unique()
-    parts = queries.split(max(1, DISTANCES_AT_ONCE // max(layer.phases, queries.shape[1])))
+    parts = queries.split(max(1, BLOCK_DISTANCES // max(layer.phases, queries.shape[1])))
     nearest = [layer_distances(route, part, j)[:, present].argmin(1) for part in parts]
     return present[torch.cat(nearest)]
 
@@ -90,13 +80,12 @@ def layer_distances(route: TemplateMap, queries: Tensor, j: int) -> Tensor:
 
 
 def in_phase(layer: FrequencyLayer, best: Tensor, places: Tensor, tolerance: int) -> Tensor:
-    """Whether the best phase of each query is the phase of any of these places, within the tolerance.
+    """Whether the best phase of each query is within the tolerance of the phase of any of these places.
 
     Shape: best (Q,) int64, places (Q,R) int64 with -1 as padding -> (Q,) bool.
 
-    Convention: the distance of two phases is counted around the cycle, in places, and may be at most
-        the tolerance. Phases count from absolute place 0, so a place outside the layer's chunk has
-        the phase it would have if the layer went on.
+    Convention: the distance of two phases is measured around the cycle, in places. Phases count from absolute
+        place 0, so that a place outside the layer's chunk has the phase of a layer that continues.
 
     Example:
         >>> from fractions import Fraction
@@ -104,9 +93,9 @@ def in_phase(layer: FrequencyLayer, best: Tensor, places: Tensor, tolerance: int
         >>> in_phase(layer, torch.tensor([9, 9]), torch.tensor([[21], [25]]), tolerance=2).tolist()
         [True, False]
     """
-    apart = (best[:, None] - layer.phase(places)).abs()
-    apart = torch.minimum(apart, layer.phases - apart)
-    return ((apart <= _phases_within(layer, tolerance)) & (places >= 0)).any(1)
+    distance = (best[:, None] - layer.phase(places)).abs()
+    distance = torch.minimum(distance, layer.phases - distance)
+    return ((distance <= _phases_within(layer, tolerance)) & (places >= 0)).any(1)
 
 
 def _phases_within(layer: FrequencyLayer, tolerance: int) -> int:

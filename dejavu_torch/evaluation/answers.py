@@ -1,4 +1,4 @@
-"""What answers tell by themselves, also where nothing says which of them are right."""
+"""What the answers show by themselves, with or without a ground truth."""
 
 from __future__ import annotations
 
@@ -11,19 +11,16 @@ from torch import Tensor
 from dejavu_torch.recognition.select import PROBABLE
 from dejavu_torch.types import Match
 
-COUNTED = (0.9, PROBABLE)  # the answers that are at least so probably right
-THIRD = 3  # without probabilities, one of so many is, by its score
-FEWEST = 10  # answers that show a line,
-SHARE = 0.2  # and of all queries: few that are sure by mistake are so one behind the other
-NEAR = 5  # frames from a line, at least
-TIMES = 2  # as many answers near a line as the same places and queries in any order
+LEVELS = (0.9, PROBABLE)  # probabilities of being right at which answers are counted
+CONFIDENT = 3  # without probabilities, one answer in three is confident, by its score
+MIN_ANSWERS = 10  # that a line needs,
+MIN_SHARE = 0.2  # and as a share of all queries: consecutive queries may share a confident mistake
+MIN_WIDTH = 5  # frames to each side of a line
+OVER_CHANCE = 2  # times as many answers near a line as with places and queries paired at random
 
 
 class Line(NamedTuple):
-    """The line place = query + offset near which most confident answers lie, in frames of the sources.
-
-    answers: how many of the `confident` ones lie near it.
-    """
+    """The line place = query + offset, in frames, near which `answers` of the `confident` answers lie."""
 
     offset: int
     answers: int
@@ -36,14 +33,14 @@ class Line(NamedTuple):
 
 
 def probable_counts(match: Match) -> dict[str, int]:
-    """How many answers are at least so probably right, by that probability; empty without probabilities."""
+    """Number of answers whose probability of being right is at least each level; empty without any."""
     if match.probability is None:
         return {}
-    return {f"{least:g}": int((match.probability >= least).sum()) for least in COUNTED}
+    return {f"{level:g}": int((match.probability >= level).sum()) for level in LEVELS}
 
 
 def told_probable(counts: Mapping[str, int], answers: int) -> str:
-    """The counts in words.
+    """The counts of `probable_counts` in words.
 
     Example:
         >>> told_probable({"0.9": 106, "0.5": 209}, 392)
@@ -54,38 +51,38 @@ def told_probable(counts: Mapping[str, int], answers: int) -> str:
 
 
 def next_steps(together: bool, strict: bool) -> list[str]:
-    """What to try on answers that have a probability, in words."""
+    """What to try next on answers that have a probability, in words."""
     steps = {
         "--filter also uses the preceding queries, if they are consecutive": not together,
         "--precision .9 accepts only answers that are at least that probable": not strict,
     }
-    return [step for step, fits in steps.items() if fits]
+    return [step for step, applies in steps.items() if applies]
 
 
 def confident(match: Match) -> Tensor:
-    """Which answers (Q,) are believed most: by their probability, else the third that scores best; bool."""
+    """The most confident answers, (Q,) bool: by their probability, else the third with the best scores."""
     if match.probability is not None:
         return match.probability >= PROBABLE
-    found = match.score.isfinite()
-    if not found.any():
-        return found
-    count = -(-int(found.sum()) // THIRD)
-    return found & (match.score <= match.score[found].sort().values[count - 1])
+    reported = match.score.isfinite()
+    if not reported.any():
+        return reported
+    count = -(-int(reported.sum()) // CONFIDENT)
+    return reported & (match.score <= match.score[reported].sort().values[count - 1])
 
 
-def line_of(places: Tensor, queries: Tensor, within: int, fewest: float = FEWEST) -> Line | None:
-    """The line of slope one that more than half of some answers lie near, None where there is none.
+def line_of(places: Tensor, queries: Tensor, within: int, min_answers: float = MIN_ANSWERS) -> Line | None:
+    """The line of slope one near which more than half of the answers lie; None if there is none.
 
-    Convention: the offset is the median of those in the densest stretch of twice `within`. A line has to have
-        twice as many answers as the same places and queries have when paired at random: in few frames, and
-        where all answers are one place, any line is near.
+    Convention: the offset is the median of the differences in their densest interval of width 2 * `within`.
+        A line needs twice as many answers as lie near it if places and queries are paired at random: with
+        few frames, or a single reported place, every line has some.
 
     Example:
         >>> line_of(torch.arange(40) + 7, torch.arange(40), within=5)
         Line(offset=7, answers=40, confident=40)
     """
     n = len(places)
-    if n < fewest:
+    if n < min_answers:
         return None
     difference = (places - queries).sort().values
     starts = torch.searchsorted(difference, difference - within)
@@ -97,28 +94,27 @@ def line_of(places: Tensor, queries: Tensor, within: int, fewest: float = FEWEST
     pairs = torch.searchsorted(ordered, middle + within, right=True)
     pairs = pairs - torch.searchsorted(ordered, middle - within)
     by_chance = float(pairs.sum()) / n
-    shows = near >= fewest and near > n / 2 and near >= TIMES * by_chance
-    return Line(offset, near, n) if shows else None
+    significant = near >= max(min_answers, OVER_CHANCE * by_chance) and near > n / 2
+    return Line(offset, near, n) if significant else None
 
 
 def own_facts(
     match: Match, queries: Tensor, tolerance: int, scored: bool, offset: int | None = None
 ) -> dict[str, Any]:
-    """What report.json holds of answers by themselves."""
+    """The entries of report.json about the answers by themselves."""
     counts = probable_counts(match)
     facts: dict[str, Any] = {"probably_right": counts} if counts else {}
     if scored and offset is None:
         return facts
-    within, sure = max(tolerance, NEAR), confident(match) & (match.index >= 0)
-    fewest = max(FEWEST, SHARE * len(queries))
-    line = line_of(match.index[sure], queries[sure], within, fewest)
+    within, sure = max(tolerance, MIN_WIDTH), confident(match) & (match.index >= 0)
+    line = line_of(match.index[sure], queries[sure], within, max(MIN_ANSWERS, MIN_SHARE * len(queries)))
     if line is not None and not (scored and abs(line.offset - (offset or 0)) <= within):
         facts["line"] = line._asdict()
     return facts
 
 
 def told_line(facts: Mapping[str, Any], scored: bool) -> str:
-    """What `own_facts` found of a line, in words; "" for nothing."""
+    """The line of `own_facts` in words; "" without one."""
     if "line" not in facts:
         return ""
     line = Line(**facts["line"])

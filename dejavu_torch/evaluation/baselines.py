@@ -1,4 +1,4 @@
-"""What a user would store instead of the map, and the null controls: every contender of a report."""
+"""The baselines, which a user could store instead of the map, and the null controls of a report."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ from dejavu_torch.recognition.localizer import SINGLE, Localizer, Matching
 from dejavu_torch.text import bar
 from dejavu_torch.types import InputError, Match, Traverse
 
-if TYPE_CHECKING:  # training needs the baselines of HOG, and no plots
+if TYPE_CHECKING:  # training needs the HOG baselines without matplotlib
     from dejavu_torch.evaluation.localization import Localization
 
 log = logging.getLogger("dejavu_torch")
 
-DISTANCES_AT_ONCE = 2**22
+BLOCK_DISTANCES = 2**22  # of Q x N, computed at a time
 
 
 class Baseline(NamedTuple):
-    """What another way to store the route finds.
+    """The matches of another way to store the route.
 
-    name: for tables. bytes: that it stores. k: where it stores every k-th frame. fixed: those of the bytes
-    that do not grow with the route, such as a backbone's.
+    name: for tables. bytes: in all. k: the stride, if every k-th frame is stored. fixed: the part of the
+    bytes that does not grow with the route, such as a backbone.
     """
 
     name: str
@@ -54,36 +54,35 @@ def nearest_frames(
     progress: str | None = None,
     matching: Matching = SINGLE,
 ) -> Match:
-    """Nearest stored frame of each query, where every k-th reference frame is stored.
+    """The nearest stored frame of each query, if every k-th reference frame is stored.
 
     Args:
         reference: (N,D) features. query: (Q,D) features.
-        k: 1 stores all frames. A frame that is not stored has the distance of the nearest one that is.
-        progress: text of a progress bar on a terminal; None is no bar.
+        k: 1 stores all frames. Other frames have the distance of the nearest stored one.
+        progress: text of a progress bar on a terminal; None shows no bar.
 
     Returns:
-        What is found: by single queries, reference frames that are stored; by sequences, which tell frames
-        between these apart, any.
+        Match of (Q,). Single queries find stored frames only, sequences also frames between these.
     """
     stored = reference[:: min(k, len(reference))]
     nearest = ((torch.arange(len(reference), device=reference.device) + k // 2) // k).clamp(
         max=len(stored) - 1
     )
-    batches = bar(query.split(max(1, DISTANCES_AT_ONCE // len(reference))), progress)
+    batches = bar(query.split(max(1, BLOCK_DISTANCES // len(reference))), progress)
     scores = (phase_distances(batch.to(stored.device), stored, metric) for batch in batches)
     if k > 1:
         scores = (part[:, nearest] for part in scores)
     matcher, nearest = Localizer(None, matching), nearest.cpu()
     found = Match.joined(map(matcher.match, scores))
 
-    def of_one(frame: Tensor) -> Tensor:
+    def stored_frame(frame: Tensor) -> Tensor:
         return torch.where(frame >= 0, k * nearest[frame], -1)
 
     sequences = dict(found.sequences)
     if 1 in sequences:
-        sequences[1] = sequences[1].renumbered(of_one)
+        sequences[1] = sequences[1].renumbered(stored_frame)
     if matching.sequence is None or matcher.own == 1:  # single queries
-        found = found._replace(index=of_one(found.index))
+        found = found._replace(index=stored_frame(found.index))
     return found._replace(probability=None, sequences=sequences)
 
 
@@ -93,14 +92,14 @@ def stride_bytes(frames: int, dimension: int, itemsize: int, k: int) -> int:
 
 
 def fair_stride(frames: int, dimension: int, itemsize: int, map_bytes: int, tolerance: int) -> int:
-    """The largest k, at most twice the tolerance, whose frames take at least the map's bytes.
+    """The largest stride k, at most twice the tolerance, whose frames take at least the map's bytes.
 
     Example:
         >>> fair_stride(frames=1000, dimension=10, itemsize=4, map_bytes=8000, tolerance=5)
         5
     """
     coarsest = max(1, 2 * tolerance)
-    strides = *range(1, min(coarsest, frames) + 1), coarsest  # beyond the route one frame is left
+    strides = *range(1, min(coarsest, frames) + 1), coarsest  # a stride beyond the route stores one frame
     fair = [k for k in strides if stride_bytes(frames, dimension, itemsize, k) >= map_bytes]
     return max(fair, default=1)
 
@@ -108,47 +107,47 @@ def fair_stride(frames: int, dimension: int, itemsize: int, map_bytes: int, tole
 def baselines_of(
     run: Localization, seed: int = 0, leave_out: int | None = None, progress: bool = False
 ) -> dict[str, Baseline]:
-    """What is set beside the map of a run, by the keys of report.json; see design convention 8.
+    """The baselines and null controls of a run, by their keys in report.json (convention 8).
 
     Args:
-        seed: of the shuffle of the null controls.
+        seed: for shuffling the null controls.
         leave_out: also query the reference with itself, see `leave_out_match`; single queries.
         progress: show progress bars on a terminal.
     """
     model, reference, matching = run.model, run.reference_features, run.matching
     spectral = isinstance(model.map, SpectralMap)
-    text = "baselines: what is stored as it is" if progress else None
+    text = "baselines: uncompressed" if progress else None
     one = "place" if len(model.map.positions) else "frame"
     summary, coarsest, (frames, dimension) = model.summary(), max(1, 2 * run.tolerance), reference.shape
-    needed = ("backbone", "whitening") if spectral else ("backbone",)  # by whatever is stored
+    needed = ("backbone", "whitening") if spectral else ("backbone",)  # by every baseline
     fixed = sum(summary.fixed.get(part, 0) for part in needed)
     metric: Metric = getattr(model.map, "metric", "l1")
     if spectral and metric != "l2":
         metric = "cosine"
 
-    def nearest(name: str, stored: Tensor, k: int, bytes: int, apart: int = 1) -> Baseline:
-        match = nearest_frames(stored, run.query_features, apart, metric, text, matching)
+    def nearest(name: str, stored: Tensor, k: int, bytes: int, stride: int = 1) -> Baseline:
+        match = nearest_frames(stored, run.query_features, stride, metric, text, matching)
         return Baseline(name, match, bytes + fixed, k, fixed)
 
     size, own = partial(stride_bytes, frames, dimension), reference.element_size()
     if spectral:
         short = as_int8(reference)
         between, spaced, keys = interpolated(short, summary.route_bytes)
-        floats, kept = f"all {frames} {one}s, float", f"{every(coarsest, one)}, int8"
-        lines = f"interpolated between {every(spaced, one)}, int8"
+        name, interpolating = "its descriptors of", f"interpolated between {every(spaced, one)}, int8"
+        strided = f"{name} {every(coarsest, one)}, int8"
         found = {
-            "uncompressed": nearest(f"its descriptors of {floats}", reference, 1, size(4, 1)),
-            "stride": nearest(f"its descriptors of {kept}", short, coarsest, size(1, coarsest), coarsest),
-            "interpolated": nearest(lines, between, spaced, keys * dimension),
+            "uncompressed": nearest(f"{name} all {frames} {one}s, float", reference, 1, size(4, 1)),
+            "stride": nearest(strided, short, coarsest, size(1, coarsest), coarsest),
+            "interpolated": nearest(interpolating, between, spaced, keys * dimension),
         }
     else:
         fair = fair_stride(frames, dimension, own, summary.map_bytes - fixed, run.tolerance)
-        of = "" if isinstance(model.features, HOG) else "same features, "
-        skipped = "" if run.tolerance else ", of which tolerance 0 lets none be left out"
+        name = "" if isinstance(model.features, HOG) else "same features, "
+        skipped = "" if run.tolerance else " (tolerance 0 needs all of them)"
         names = {
-            "uncompressed": (f"{of}all {frames} {one}s{skipped}", 1),
-            "stride": (f"{of}{every(fair, one)} (at least the map's bytes)", fair),
-            "stride_coarsest": (f"{of}{every(coarsest, one)} (2 x tolerance)", coarsest),
+            "uncompressed": (f"{name}all {frames} {one}s{skipped}", 1),
+            "stride": (f"{name}{every(fair, one)} (at least the map's bytes)", fair),
+            "stride_coarsest": (f"{name}{every(coarsest, one)} (2 x tolerance)", coarsest),
         }
         found = {key: nearest(name, reference, k, size(own, k), k) for key, (name, k) in names.items()}
 
@@ -168,7 +167,7 @@ def baselines_of(
 
 
 def _null_controls(run: Localization, seed: int, one: str, progress: bool) -> dict[str, Baseline]:
-    """Maps of the same frames in random order; `one` is what a place is called."""
+    """Maps of the same frames in random order; `one` is the word for a place."""
     model, spectral = run.model, isinstance(run.model.map, SpectralMap)
     found = {}
 
@@ -180,7 +179,7 @@ def _null_controls(run: Localization, seed: int, one: str, progress: bool) -> di
 
     foreign = isinstance(model.mapper, TemplateMapper) and model.mapper.periods is None
     if foreign:
-        log.warning("no null control learned anew: what found the map's periods is not of this package")
+        log.warning("no null control with new periods: the map's periods come from outside this package")
     if spectral:
         found["null"] = null(f"shuffled {one}s, as many bytes")
     elif model.trained is None and not foreign:
@@ -188,41 +187,39 @@ def _null_controls(run: Localization, seed: int, one: str, progress: bool) -> di
     if isinstance(model.map, TemplateMap):
         if model.trained is None:
             found["null_same_plan"] = null(f"this map's layers, shuffled {one}s", same_plan=True)
-        else:  # training anew is a run of its own
+        else:  # a second training would take too long
             found["null"] = null(f"templates of shuffled {one}s", same_plan=True)
     return found
 
 
 def _is_plain_hog(model: DejaVu) -> bool:
-    """Whether the uncompressed baseline is HOG with its defaults, by L1."""
+    """Whether the uncompressed baseline is default HOG by L1."""
     pairs = (model.preprocess, Preprocess()), (model.features, HOG())
     same = all(recipe_of(own) == recipe_of(plain) for own, plain in pairs)
     return same and model.whitening is None and getattr(model.map, "metric", "l1") == "l1"
 
 
 def as_int8(descriptors: Tensor) -> Tensor:
-    """Descriptors as a store of int8 with one scale gives them back. (N,K) -> (N,K) float."""
+    """Descriptors rounded to int8 with one scale for all. (N,K) -> (N,K) float."""
     scale = descriptors.abs().max().clamp(min=1e-30) / 127
     return (descriptors / scale).round() * scale
 
 
 def interpolated(descriptors: Tensor, route_bytes: float) -> tuple[Tensor, int, int]:
-    """Descriptors of all frames on straight lines between keyframes: every k-th, and the last.
+    """Descriptors of all frames, interpolated between keyframes: (N,K) -> (N,K), k, number of keyframes.
 
-    k is the smallest whose keyframes take at most so many bytes, at a byte a number; two of them where none
-    do.
-
-    Shape: (N,K) -> (N,K), k, number of keyframes.
+    k is the smallest stride whose `keyframes` fit in `route_bytes`, at one byte per dimension; at least two
+    keyframes are used.
     """
     frames, dimension = descriptors.shape
-    fair = (k for k in range(1, frames) if (-(-(frames - 1) // k) + 1) * dimension <= route_bytes)
-    k = next(fair, max(1, frames - 1))
+    fitting = (k for k in range(1, frames) if (-(-(frames - 1) // k) + 1) * dimension <= route_bytes)
+    k = next(fitting, max(1, frames - 1))
     keys = descriptors[keyframes(frames, k)]
     return between_keyframes(keys, frames, k), k, len(keys)
 
 
 def keyframes(frames: int, k: int) -> Tensor:
-    """Every k-th of so many frames, and the last.
+    """The numbers of every k-th frame and of the last.
 
     Example:
         >>> keyframes(10, 4)
@@ -232,7 +229,7 @@ def keyframes(frames: int, k: int) -> Tensor:
 
 
 def between_keyframes(keys: Tensor, frames: int, k: int) -> Tensor:
-    """Descriptors of all frames on straight lines between those of `keyframes`. Shape: (n,K) -> (N,K)."""
+    """Descriptors of all frames, interpolated linearly between those of `keyframes`. (n,K) -> (N,K)."""
     position = torch.arange(frames, device=keys.device)
     low = (position // k).clamp(max=len(keys) - 1)
     high = (low + 1).clamp(max=len(keys) - 1)
@@ -249,10 +246,7 @@ def hog_baselines(
     progress: bool = False,
     matching: Matching = SINGLE,
 ) -> dict[str, Baseline]:
-    """HOG of all frames, `hog`, and of every k-th, k = 2 x tolerance, by L1.
-
-    Nothing where the traverses hold ready features, or frames too small for HOG.
-    """
+    """HOG of all frames and of every k-th, k = 2 x tolerance, by L1; empty if HOG cannot be computed."""
     one = "place" if isinstance(reference, ResampledTraverse) else "frame"
     strides = {"hog": 1, "hog_stride_coarsest": max(1, 2 * tolerance)}
     names = {key: (f"HOG, {every(k, one)}", k) for key, k in strides.items()}
@@ -268,7 +262,7 @@ def _described_baselines(
     progress: bool,
     matching: Matching,
 ) -> dict[str, Baseline]:
-    """Every k-th frame of the first of two traverses, described by `plain`; by L1."""
+    """Baselines by L1 that store every k-th reference frame, described by `plain`."""
     if len(traverses[0].frame_shape) != 3:
         return {}
     text = f"baselines: {what}" if progress else None
@@ -285,6 +279,6 @@ def _described_baselines(
 
 
 def every(k: int, one: str) -> str:
-    """In words: every k-th frame, or place where these are not frames."""
+    """Every k-th frame or place, in words."""
     ending = "th" if k % 100 in (11, 12, 13) else {1: "st", 2: "nd", 3: "rd"}.get(k % 10, "th")
     return f"every {one}" if k == 1 else f"every {k}{ending} {one}"

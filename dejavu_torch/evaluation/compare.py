@@ -1,4 +1,4 @@
-"""Learn, localize and evaluate, beside the baselines and the null controls."""
+"""Learn, localize and evaluate, with baselines and null controls."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from dejavu_torch.evaluation.contenders import Contender, contend, models_beside
 from dejavu_torch.evaluation.evaluate import RANKS, evaluation_facts
 from dejavu_torch.evaluation.localization import Localization
 from dejavu_torch.evaluation.pictures import draw_pictures
-from dejavu_torch.evaluation.plots import Picture
+from dejavu_torch.evaluation.plots import Pictures
 from dejavu_torch.evaluation.rejection import draw_reliability
 from dejavu_torch.evaluation.report import Report, as_html
 from dejavu_torch.evaluation.storage import coded_at_sizes, noise_over_map
@@ -49,20 +49,21 @@ from dejavu_torch.types import InputError, Match, SequenceModel, Traverse
 
 log = logging.getLogger("dejavu_torch")
 
-SAMPLED = 256  # reference frames that a given map is tried on
+SAMPLED = 256  # reference frames that a given map is checked with
 NEAR = 10  # places within which it should find them, at least
-UNASKED = 2**25  # scores of queries in order that are filtered without having been asked for
+MAX_FILTERED = 2**25  # scores up to which ordered queries are also filtered by default
+
+OtherModels = Mapping[str, tuple[str, DejaVu]]  # their names and models, by their keys in report.json
 
 
 class Comparison(NamedTuple):
-    """A comparison's figures and pictures, and their run; a notebook shows the scores and two pictures.
+    """The report, pictures and run of a comparison, of which a notebook shows the scores and two pictures.
 
-    The run's traverses are resampled where the model asks for it; its match and truth count places.
-    candidates: of each query the best places, no two within the tolerance.
+    candidates: the best places of each query, no two within the tolerance.
     """
 
     report: Report
-    pictures: Mapping[str, Picture]
+    pictures: Pictures
     run: Localization
     candidates: Match
 
@@ -84,7 +85,7 @@ def compare(
     seed: int = 0,
     interpolate: bool = False,
     second: Views | None = None,
-    others: Mapping[str, tuple[str, DejaVu]] | None = None,
+    others: OtherModels | None = None,
     sequence: SequenceModel | None = None,
     top: int = 1,
     calibration: Views | Literal["none"] | None = None,
@@ -93,35 +94,34 @@ def compare(
     ordered: bool | None = None,
     progress: bool = False,
 ) -> Comparison:
-    """Learn the reference, find the queries on it, and evaluate that beside what else could be stored.
+    """Learn the reference, localize the queries on it, and compare with other ways to store the route.
 
     Args:
         reference: the traverse to learn. query: a second traverse of the route.
-        truth: see `find_ground_truth`. Without one, and where the sources have none, there are matches and
-            pictures, but neither scores nor baselines.
-        model: settings; None is DejaVu with its defaults. A map that it has is kept and evaluated as it is:
-            it has to be of this reference. The model is on the CPU afterwards.
+        truth: see `find_ground_truth`. Without any, there are matches and pictures, but no scores and no
+            baselines.
+        model: settings; None is DejaVu with its defaults. A map that it already has is evaluated as it is; it
+            must be of this reference. The model is on the CPU afterwards.
         tolerance: places within which a match is right, inclusive.
-        leave_out: also query the reference with itself, without the frames within this many of the query in
-            any mean; a diagnostic.
-        seed: of the shuffle of the null control.
+        leave_out: also query the reference with itself, see `leave_out_match`; a diagnostic.
+        seed: for shuffling the null control.
         interpolate: see `find_ground_truth`.
         second: see `DejaVu.describe_reference`; another traverse than the query.
         others: further models that learn the same reference, by their keys in report.json, with their names
             in tables. They need a ground truth, and none of them resamples.
-        sequence: matches consecutive queries together, on the map and on all that it is compared with.
+        sequence: matches consecutive queries together, on the map and on all baselines.
         top: candidates of each query.
-        calibration: see `DejaVu.calibrate`; another traverse than the query. None calibrates a map that is
-            learned by changed frames of the reference, "none" does not.
-        distractors: routes that are not on the map: how many of their frames are accepted.
+        calibration: see `DejaVu.calibrate`; another traverse than the query. None calibrates a newly learned
+            map with changed frames of the reference, "none" does not.
+        distractors: routes that are not on the map, to see how many of their frames are accepted.
         storage_curve: also code a spectral map at several sizes, see `coded_at_sizes`:
             the report gets `storage` and its picture. Needs a ground truth.
-        ordered: whether the queries follow one another along the route: then a filter over them is set beside
-            single queries, on the map and on all else. None is what their source tells.
+        ordered: whether the queries are consecutive. If so, the report also has the scores of a filter.
+            None: as their source says.
         progress: show progress bars on a terminal.
 
     Raises:
-        InputError: bad input of any of the stages, or a map of another number of places.
+        InputError: bad input to any of the stages, or a map of another number of places.
     """
     model = DejaVu() if model is None else model
     has_map, itself = model.map.places > 0, reference is query
@@ -146,11 +146,11 @@ def compare(
         sequence.check(None, reference.length)
     if itself or (reference.name == query.name != UNNAMED):
         log.warning(
-            "%s is matched with itself, every frame with its own; evaluate on a second traverse", query.name
+            "%s is matched with itself, each frame with its own copy; expected a second traverse", query.name
         )
     find_truth = partial(ground_truth_of, truth, reference, query, interpolate=interpolate)
     counted = reference.length is not None and query.length is not None
-    known = find_truth() if counted else None  # refused early
+    known = find_truth() if counted else None  # early, so that a bad truth is refused before the long work
 
     text = "describing the reference" if progress else None
     with timed(seconds, "describe" if has_map else "learn"):
@@ -172,12 +172,12 @@ def compare(
         if sequence is not None:
             sequence.check(len(queries), model.map.places)
         if ordered is None:
-            ordered = source_of(query).ordered and len(queries) * model.map.places <= UNASKED
-        ordered = ordered and (known is not None or not counted)  # else nothing shows it
-        ways = models_beside(sequence, ordered, len(queries), model.map.places, tolerance)
-        matching = Matching(sequence, ways)
+            ordered = source_of(query).ordered and len(queries) * model.map.places <= MAX_FILTERED
+        ordered = ordered and (known is not None or not counted)  # without truth it has no scores
+        models = models_beside(sequence, ordered, len(queries), model.map.places, tolerance)
+        matching = Matching(sequence, models)
         ranks = max(top, min(max(RANKS), model.map.places))
-        rule = rule._replace(beside=ways, k=ranks, radius=tolerance)
+        rule = rule._replace(beside=models, k=ranks, radius=tolerance)
         candidates = model.localize_descriptors(queries, rule, progress="localizing" if progress else None)
     off_map = _match_distractors(model, distractors, sequence, progress)
 
@@ -190,7 +190,7 @@ def compare(
         model, reference, query, places.cpu(), queries.cpu(), match, known, tolerance, matching
     )
     ours = _contend(run, "this map", match, model)
-    contenders = _set_beside(run, others or {}, leave_out, seed, progress)
+    contenders = _other_contenders(run, others or {}, leave_out, seed, progress)
     route, scored = model.map, ours.scores is not None and isinstance(model.map, SpectralMap)
     storage = coded_at_sizes(run, seed=seed, progress=progress) if storage_curve and scored else None
     pictures = draw_pictures(run, {"map": ours, **contenders}, storage)
@@ -210,18 +210,14 @@ def compare(
     return Comparison(Report(ours, contenders, facts), pictures, run, candidates)
 
 
-def _set_beside(
-    run: Localization,
-    others: Mapping[str, tuple[str, DejaVu]],
-    leave_out: int | None,
-    seed: int,
-    progress: bool,
+def _other_contenders(
+    run: Localization, others: OtherModels, leave_out: int | None, seed: int, progress: bool
 ) -> dict[str, Contender]:
-    """What else could be stored, and what further models find of the same reference."""
+    """The baselines, null controls and further models, scored."""
     known, contenders = run.truth is not None, {}
     if known or leave_out is not None:
         baselines = baselines_of(run, seed, leave_out, progress)
-        contenders = {key: _beside(run, key, baseline) for key, baseline in baselines.items()}
+        contenders = {key: _score_baseline(run, key, baseline) for key, baseline in baselines.items()}
     for key, (name, other) in others.items() if known else ():
         other.learn(run.reference, progress)
         queries = other.extract_all(run.query, f"describing the query for {name}" if progress else None)
@@ -232,50 +228,42 @@ def _set_beside(
 
 
 def _check_leave_out(model: DejaVu, leave_out: int | None) -> None:
-    """Refuse what `leave_out_match` would, before the long work."""
+    """Refuse early what `leave_out_match` refuses later."""
     if leave_out is None:
         return
     if leave_out < 0:
         raise InputError(f"leave_out is {leave_out}; expected at least 0")
     if not isinstance(model.mapper, TemplateMapper):
-        raise InputError(
-            f"leave_out is {leave_out}, but it is of template maps: expected a TemplateMapper, "
-            "as of --config local_maxima"
-        )
+        seen = f"leave_out is {leave_out}, which needs a template map"
+        raise InputError(f"{seen}; expected a TemplateMapper, as with --config local_maxima")
     if model.map.places and model.trained is not None:
-        raise InputError(
-            f"leave_out is {leave_out}, but trained templates are no means of frames to leave out"
-        )
+        raise InputError(f"leave_out is {leave_out} and the templates are trained; expected means of frames")
 
 
 def check_places(model: DejaVu, places: int, name: str) -> None:
-    """Refuse a reference of another number of places than the map's."""
+    """Refuse a reference whose number of places differs from the map's."""
     if places != model.map.places:
-        raise InputError(
-            f"{name} gives {places} places, the map holds {model.map.places}; "
-            "expected the reference that it was made of"
-        )
+        seen = f"{name} has {places} places, the map has {model.map.places}"
+        raise InputError(f"{seen}; expected the reference that the map was made of")
 
 
 def _check_given_map(model: DejaVu, places: Tensor, name: str, tolerance: int) -> None:
-    """Whether the map is of these descriptors (N,K): refuse another number, and warn of another route."""
+    """Check that the map was made of these descriptors (N,K): refuse another number, warn of a bad fit."""
     check_places(model, len(places), name)
     sample = torch.arange(0, len(places), max(1, len(places) // SAMPLED))
-    away = (model.localize_descriptors(places[sample]).index - sample).abs()
-    found = int((away <= max(tolerance, NEAR)).sum())
+    distance = (model.localize_descriptors(places[sample]).index - sample).abs()
+    found = int((distance <= max(tolerance, NEAR)).sum())
     if found < 0.5 * len(sample) and model.map.summary().covered:
-        log.warning(
-            "the map finds %d of %d frames of %s; expected the reference that it was made of",
-            *(found, len(sample), name),
-        )
+        expected = "expected the reference that the map was made of"
+        log.warning("the map finds %d of %d frames of %s; %s", found, len(sample), name, expected)
 
 
 def _match_distractors(
     model: DejaVu, distractors: Sequence[Traverse], sequence: SequenceModel | None, progress: bool
 ) -> dict[str, Tensor]:
-    """By name, the probability of what is found for each frame of other routes, (n,)."""
+    """The probability of the match of each frame of other routes, (n,) by name."""
     if distractors and not model.matching(sequence).platt:
-        log.warning("the map is not calibrated: nothing tells what of other routes would be accepted")
+        log.warning("the map is not calibrated, so no frame of other routes has a probability")
         return {}
     found = {}
     for one in distractors:
@@ -288,13 +276,13 @@ def _match_distractors(
 
 
 def _contend(run: Localization, name: str, found: Match, model: DejaVu) -> Contender:
-    """What a model found of the run's places."""
+    """The matches of a model as a contender."""
     found, summary = found.renumbered(run.model.map.table.scored), model.summary()
     return contend(name, found, run.truth, run.tolerance, bytes=summary.map_bytes, fixed=summary.fixed_bytes)
 
 
-def _beside(run: Localization, key: str, baseline: Baseline) -> Contender:
-    """A baseline by its key in report.json, scored as the map is."""
+def _score_baseline(run: Localization, key: str, baseline: Baseline) -> Contender:
+    """A baseline as a contender, scored in the same way as the map."""
     name, found, bytes, k, fixed = baseline
     route, truth = run.model.map, run.truth
     if key == "leave_out":  # its queries are the places themselves
@@ -305,43 +293,32 @@ def _beside(run: Localization, key: str, baseline: Baseline) -> Contender:
 
 @contextmanager
 def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
-    """Add the seconds of a block to those under a name."""
+    """Add the seconds that a block takes to `seconds[name]`."""
     began = time.perf_counter()
     yield
     seconds[name] += time.perf_counter() - began
 
 
 def _map_facts(summary: MapSummary, features: Tensor) -> dict[str, Any]:
-    """What report.json holds of the map, whose places have these features (N,D)."""
+    """The entries of report.json about the map, whose places have these features (N,D)."""
     chunks: list[dict[str, Any]] = [
-        {
-            "start": chunk.start,
-            "stop": chunk.stop,
-            "periods": [plain_number(period) for period in chunk.periods],
-            "features": list(chunk.features),
-        }
+        chunk._asdict() | {"periods": [plain_number(period) for period in chunk.periods]}
         for chunk in summary.chunks
     ]
+    names = ("kind", "map_bytes", "fixed_bytes", "route_bytes", "bytes_per_place", "lines")
     return {
+        **{name: getattr(summary, name) for name in (*names, "templates", "template_numbers")},
         "frames": len(features),
-        "kind": summary.kind,
-        "map_bytes": summary.map_bytes,
         "backbone_bytes": summary.fixed.get("backbone", 0),
-        "fixed_bytes": summary.fixed_bytes,
-        "route_bytes": summary.route_bytes,
-        "bytes_per_place": summary.bytes_per_place,
         "route_bytes_per_place": summary.route_bytes / len(features),
         "full_bytes": features.nbytes,
-        "templates": summary.templates,
-        "template_numbers": summary.template_numbers,
-        "lines": summary.lines,
         "periods": sorted({period for chunk in chunks for period in chunk["periods"]}),
         "chunks": chunks,
     }
 
 
 def _run_facts(run: Localization, seconds: Mapping[str, float]) -> dict[str, Any]:
-    """What report.json holds of the run beside its scores; nothing is learned where the map is given."""
+    """The entries of report.json about the run; no seconds to learn if the map is given."""
     model, reference, query = run.model, run.reference, run.query
     rule = model.acceptance(run.sequence)
     facts = {
@@ -368,6 +345,6 @@ def _run_facts(run: Localization, seconds: Mapping[str, float]) -> dict[str, Any
 
 
 def plain_number(period: object) -> int | float:
-    """An exact period as a number of JSON."""
+    """An exact period as a JSON number."""
     value = float(period)  # type: ignore[arg-type]
     return int(value) if value.is_integer() else value

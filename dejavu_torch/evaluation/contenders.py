@@ -1,4 +1,4 @@
-"""What stands side by side in a report: ways to store a route, their scores, and a fixed colour for each."""
+"""The contenders of a report: ways to store a route, with their scores and colours."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.types import Match, SequenceModel, Together
 
-LENGTHS = (1, 5, 11, 21)  # queries of the sequences that a report sets side by side
+LENGTHS = (1, 5, 11, 21)  # queries of the sequences that a report compares
 
-# Told apart by the colour-blind where they share a picture; keys are those of report.json, `map` is ours.
+# By the keys of report.json; `map` is ours. The colour-blind can distinguish those that share a picture.
 COLOURS = {
     "map": "#0072b2",
     "uncompressed": "#222222",
@@ -43,11 +43,10 @@ def colour_of(key: str) -> str:
 
 
 class Contender(NamedTuple):
-    """One way to store the route, how well it is recognised, and what it costs.
+    """One way to store the route, with its scores (None without ground truth) and bytes (None for a null).
 
-    scores, curve: None where there is no ground truth. bytes: None where nothing is stored, as by a null.
-    k: where every k-th frame is stored. fixed: those of the bytes that do not grow with the route.
-    sequences: by T, the scores of sequences of T queries, and of a filter; empty where there are none.
+    k: the stride, if every k-th frame is stored. fixed: the part of the bytes that does not grow with the
+    route. sequences: scores of sequences of T queries, by T, and of a filter; may be empty.
     """
 
     name: str
@@ -60,37 +59,33 @@ class Contender(NamedTuple):
 
     @property
     def by_length(self) -> Mapping[Together, Scores]:
-        """`sequences`, and by 1 the scores of single queries, where there are any."""
+        """`sequences` with the scores of single queries under 1; empty if `sequences` is."""
         if not self.sequences or 1 in self.sequences or self.scores is None:
             return self.sequences
         return {1: self.scores, **self.sequences}
 
     @property
     def route_bytes(self) -> int | None:
-        """Those of the bytes that grow with the route."""
+        """The part of the bytes that grows with the route."""
         return None if self.bytes is None else self.bytes - self.fixed
 
     @property
     def starts(self) -> float | None:
-        """Recall at which the curve starts: that of all queries that share the best score."""
+        """Recall at which the curve starts, that of the queries that share the best score."""
         return float(self.curve.recall[0]) if self.curve and len(self.curve.recall) else None
 
     def as_json(self) -> dict[str, Any]:
         """The nested entry of report.json."""
         scores = self.scores._asdict() if self.scores else dict.fromkeys(Scores._fields)
-        extra: dict[str, Any] = {
-            "bytes": self.bytes,
-            "route_bytes": self.route_bytes,
-            "k": self.k,
-            "curve_starts_at_recall": self.starts,
-        }
+        extra: dict[str, Any] = {"bytes": self.bytes, "route_bytes": self.route_bytes, "k": self.k}
+        extra["curve_starts_at_recall"] = self.starts
         if self.sequences:
             extra["sequences"] = sequences_as_json(self.sequences)
         return scores | {name: value for name, value in extra.items() if value is not None}
 
 
 def sequences_as_json(sequences: Mapping[Together, Scores]) -> dict[str, dict[str, float]]:
-    """What report.json holds of sequences, by T, and of a filter."""
+    """The entry `sequences` of report.json."""
     return {str(T): {"auc": one.auc, "recall_at_1": one.recall_at_1} for T, one in sequences.items()}
 
 
@@ -103,7 +98,7 @@ def contend(
     k: int | None = None,
     fixed: int = 0,
 ) -> Contender:
-    """Matches as a contender, without scores where there is no ground truth or no query that it scores."""
+    """Matches as a contender, without scores if there is no ground truth or it scores no query."""
     if truth is None or not counted(match.index, as_ground_truth(truth), tolerance).any():
         return Contender(name, None, bytes, k, fixed=fixed)
     scores, curve = evaluate(match, truth, tolerance), curve_of(match, truth, tolerance)
@@ -113,14 +108,14 @@ def contend(
 def evaluate_each(
     sequences: Mapping[Together, Match], truth: Tensor | GroundTruth, tolerance: int
 ) -> dict[Together, Scores]:
-    """Scores by T, see `evaluate`; a T of which no query is left to judge is left out."""
+    """Scores by T, see `evaluate`; without any T that has no query to judge."""
     truth = as_ground_truth(truth)
     judged = {T: one for T, one in sequences.items() if counted(one.index, truth, tolerance).any()}
     return {T: evaluate(one, truth, tolerance) for T, one in judged.items()}
 
 
 def distinct(contenders: Mapping[str, Contender]) -> dict[str, Contender]:
-    """Contenders without those that store the same frames as one before.
+    """Contenders, without any that stores the same frames as an earlier one.
 
     Example:
         >>> row = Contender("every 2nd frame", None, bytes=100, k=2)
@@ -138,22 +133,21 @@ def distinct(contenders: Mapping[str, Contender]) -> dict[str, Contender]:
 def models_beside(
     sequence: SequenceModel | None, ordered: bool, queries: int, places: int, within: int = 5
 ) -> dict[Together, SequenceModel]:
-    """What is set beside a sequence: others, its own length among them, that so many queries and places have
-    room for, and a filter; beside single queries in order the filter alone.
+    """The sequence models to compare: for a sequence, its own and other lengths up to the number of queries
+    and places, and a filter; for single queries in order, a filter only.
 
     Example:
         >>> [*models_beside(SequenceMatcher(7), True, queries=100, places=12)]
         [1, 5, 7, 11, 'filter']
     """
-    found: dict[Together, SequenceModel] = {}
-    beside = PlaceFilter(within=within)
+    models: dict[Together, SequenceModel] = {}
+    place_filter = PlaceFilter(within=within)
     if sequence is not None:
-        own = {sequence.length} if isinstance(sequence, SequenceMatcher) else set()
-        speeds = sequence.speeds if isinstance(sequence, SequenceMatcher) else (1.0,)
-        lengths = (length for length in sorted({*LENGTHS, *own}) if length <= min(queries, places))
-        found |= {length: SequenceMatcher(length, speeds) for length in lengths}
+        own = sequence if isinstance(sequence, SequenceMatcher) else SequenceMatcher(1)
+        lengths = (length for length in sorted({*LENGTHS, own.length}) if length <= min(queries, places))
+        models |= {length: SequenceMatcher(length, own.speeds) for length in lengths}
     if isinstance(sequence, PlaceFilter):
-        found["filter"] = sequence
-    elif ordered and queries > 1 and places >= len(beside.move_logits):
-        found["filter"] = beside
-    return found
+        models["filter"] = sequence
+    elif ordered and queries > 1 and places >= len(place_filter.move_logits):
+        models["filter"] = place_filter
+    return models

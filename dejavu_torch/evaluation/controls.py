@@ -1,4 +1,4 @@
-"""Controls: does the figure come from what repeats, or from something else?"""
+"""Controls: do the scores come from repetition along the route, or from something else?"""
 
 from __future__ import annotations
 
@@ -22,18 +22,14 @@ from dejavu_torch.types import FrequencyLayer, InputError, Match, SequenceModel
 
 
 def with_mapper(model: DejaVu, mapper: Mapper) -> DejaVu:
-    """A model for the descriptors of another one, whitened already: its settings, this mapper, no map."""
+    """A model without a map for descriptors that are already whitened: the other's settings, this mapper."""
     return DejaVu(**model.settings() | {"mapper": mapper, "whitening": "none"})
 
 
 def template_map_of(model: DejaVu, what: str) -> TemplateMap:
-    """The model's map, where it is one of templates.
-
-    Raises:
-        InputError: a map of another kind.
-    """
+    """The model's map; an InputError if it is not a template map."""
     if not isinstance(model.map, TemplateMap):
-        raise InputError(f"{what} is of template maps; got a map of kind {model.map.kind!r}")
+        raise InputError(f"{what} needs a template map; got a map of kind {model.map.kind!r}")
     return model.map
 
 
@@ -48,29 +44,28 @@ def null_control(
 ) -> Match:
     """Matches of a map learned from the reference in shuffled order.
 
-    Nothing repeats in time any more, so what such a map still recognises does not come from periods
-    but from templates that hold few frames each, as any store of frames does.
+    Nothing repeats in time, so its right answers do not come from periods, but from templates that hold
+    few frames each, as in any store of frames.
 
     Args:
         reference: (N,D) features. query: (Q,D) features.
-        same_plan: keep the layers of the model's template map and learn only the templates anew. Otherwise
-            the periods are sought anew too, and a finder that tests them finds none in noise.
-        sequence: as of `DejaVu.localize`. progress: text of a progress bar on a terminal; None is no bar.
+        same_plan: keep the layers of the model's template map and learn only the templates. Otherwise
+            the periods are searched again too; a finder that tests them finds none in noise.
+        sequence: as in `DejaVu.localize`. progress: text of a progress bar on a terminal; None shows no bar.
 
     Returns:
-        Match of (Q,) whose index is the reference frame *stored* at the reported place; -1 where
-        the map reports nothing.
+        Match of (Q,) whose index is the reference frame *stored* at the reported place, or -1.
     """
     order, mixed = shuffled(reference, seed)
     mapper = model.mapper
-    if isinstance(model.map, SpectralMap):  # as many bytes, however the map's own step was chosen
+    if isinstance(model.map, SpectralMap):  # as many bytes as the map
         mapper = SpectralMapper.of_equal_size(model.map)
     null = with_mapper(model, mapper)
     if same_plan:
         null.map = _same_layers(template_map_of(model, "the null of the same layers"), mixed)
     else:
         log, level = logging.getLogger("dejavu_torch"), logging.getLogger("dejavu_torch").level
-        log.setLevel(logging.ERROR)  # of a null the user asked nothing
+        log.setLevel(logging.ERROR)  # warnings about the null would confuse the user
         try:
             null.learn_features(mixed)
         finally:
@@ -79,13 +74,13 @@ def null_control(
 
 
 def shuffled(reference: Tensor, seed: int = 0) -> tuple[Tensor, Tensor]:
-    """Descriptors in random order: which each is, (N,), and the descriptors (N,D)."""
+    """A random order (N,), and the descriptors (N,D) in it."""
     order = torch.randperm(len(reference), generator=torch.Generator().manual_seed(seed))
     return order, concatenate(reference[part] for part in order.to(reference.device).split(256))
 
 
 def _same_layers(route: TemplateMap, features: Tensor) -> TemplateMap:
-    """The layers and settings of a map, with the phase means of other features."""
+    """A map with the same layers and settings, and the phase means of other features."""
     null = copy.deepcopy(route)
     null.freeze()
     null.positions = null.positions[:0]
@@ -96,21 +91,21 @@ def _same_layers(route: TemplateMap, features: Tensor) -> TemplateMap:
 
 
 def leave_out_match(model: DejaVu, reference: Tensor, width: int = 0) -> Match:
-    """The reference localised on its own map, all frames within `width` of the query taken out of every mean.
+    """The reference localized on its own map, without the frames within `width` of the query in any mean.
 
-    A diagnostic, never instead of a second traverse: a query that is its own reference stands in its
-    template's mean. On sliding footage width = 0 cures nothing, the neighbours carry the answer.
+    This is a diagnostic and does not replace a second traverse. A query that is its own reference is part of
+    its template's mean; on sliding footage width = 0 is not enough, since the neighbours carry the answer.
 
     Args:
         reference: (N,D), the features the map was learned from.
         width: w, frames to each side.
 
     Returns:
-        Match of (N,). A phase left without frames scores +inf at its places.
+        Match of (N,). A phase without remaining frames scores +inf at its places.
 
     Raises:
         InputError: a width below 0, features of another shape than the map's, or a map whose templates are
-            not means of them: one of another kind, or a trained one.
+            not their means (another kind, or trained).
     """
     route = template_map_of(model, "leave_out")
     if width < 0 or tuple(reference.shape) != (route.places, route.dimension):
@@ -120,7 +115,7 @@ def leave_out_match(model: DejaVu, reference: Tensor, width: int = 0) -> Match:
         )
     width = min(width, route.places)  # all frames
     if model.trained is not None:
-        raise InputError("leave-out got trained templates, no means; expected a map that was not trained")
+        raise InputError("leave-out got trained templates, which are not means; expected an untrained map")
     if not route.plan:
         return model.localize(reference)
     matches, reference = [], route.weighted(reference)
@@ -129,14 +124,11 @@ def leave_out_match(model: DejaVu, reference: Tensor, width: int = 0) -> Match:
         for frames in torch.arange(len(reference), device=reference.device).split(256):
             first = max(0, int(frames[0]) - width)
             rows = reference[first : int(frames[-1]) + width + 1]  # of the queries and windows
-            scores = route.combine(
-                [
-                    _distances_without(
-                        rows.index_select(1, index), first, layer, block, frames, width, route.metric
-                    )
-                    for layer, block, index in layers
-                ]
-            )
+            distances = [
+                _distances_without(rows.index_select(1, i), first, layer, block, frames, width, route.metric)
+                for layer, block, i in layers
+            ]
+            scores = route.combine(distances)
             if route.temperature is not None:
                 scores = log_posterior(scores, route.temperature)
             matches.append(best_match(scores, model.threshold).map(Tensor.cpu))
@@ -144,32 +136,27 @@ def leave_out_match(model: DejaVu, reference: Tensor, width: int = 0) -> Match:
 
 
 def _distances_without(
-    values: Tensor,
-    first: int,
-    layer: FrequencyLayer,
-    block: Tensor,
-    frames: Tensor,
-    width: int,
-    metric: Metric,
+    rows: Tensor, first: int, layer: FrequencyLayer, block: Tensor, frames: Tensor, width: int, metric: Metric
 ) -> Tensor:
-    """Phase distances of the queries `frames`, each without the frames within `width` of it: (B,P).
+    """Phase distances (B,P) of the queries `frames`, without the frames within `width` of each in the means.
 
-    Shape: values (n,F), of the frames from `first` on.
+    Shape: rows (n,F), of the frames from `first` on.
     """
     near = frames[:, None] + torch.arange(-width, width + 1, device=frames.device)  # (B,K)
     inside = (near >= layer.start) & (near < layer.stop)
-    near = near.clamp(first, first + len(values) - 1)
+    near = near.clamp(first, first + len(rows) - 1)
     phase = layer.phase(near)
-    # frames of the window that share a phase leave its mean together
-    together = (phase[:, :, None] == phase[:, None, :]) & inside[:, None, :]
-    taken = together.to(values.dtype) @ values[near - first]  # (B,K,F)
+    # frames of the window with the same phase are removed from its mean together
+    same = (phase[:, :, None] == phase[:, None, :]) & inside[:, None, :]
+    removed = same.to(rows.dtype) @ rows[near - first]  # (B,K,F)
     count = torch.bincount(layer.place_phases, minlength=layer.phases).to(frames.device)[phase]
-    left = count - together.sum(2)
-    mean = (block[phase] * count[..., None] - taken) / left.clamp(min=1)[..., None]
-    rows = zip(values[frames - first].split(1), mean, strict=True)
-    distance = torch.cat([phase_distances(query, means, metric) for query, means in rows])
+    left = count - same.sum(2)
+    mean = (block[phase] * count[..., None] - removed) / left.clamp(min=1)[..., None]
+    queries = rows[frames - first]
+    pairs = zip(queries.split(1), mean, strict=True)
+    distance = torch.cat([phase_distances(query, means, metric) for query, means in pairs])
     distance = torch.where(left > 0, distance, torch.inf)
-    table = phase_distances(values[frames - first], block, metric)
+    table = phase_distances(queries, block, metric)
     row = torch.arange(len(frames), device=frames.device)[:, None].expand_as(phase)
     table[row[inside], phase[inside]] = distance[inside]
     return table

@@ -1,4 +1,4 @@
-"""Precision and recall, exactly: every distinct score is a threshold (section IV-C)."""
+"""Exact precision and recall, with every distinct score as a threshold (section IV-C)."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ class PRCurve(NamedTuple):
 
 
 class Scores(NamedTuple):
-    """How well matches agree with the truth; the fields are keys of report.json.
+    """The scores of matches against a truth; the fields are keys of report.json.
 
-    recall = TP / all queries with a right answer; in the *_reported fields TP / (TP + FN), where
-    only a query that reports nothing is a false negative.
+    recall = TP / all queries with a right answer; in the *_reported fields TP / (TP + FN), in which only
+    a query that reports nothing is a false negative.
     """
 
     auc: float
@@ -42,13 +42,13 @@ class Scores(NamedTuple):
 def pr_curve(
     score: Tensor, right: Tensor, answerable: Tensor, recall: Literal["all", "reported"] = "all"
 ) -> PRCurve:
-    """Precision and recall when the queries up to each distinct score report (section IV-C).
+    """Precision and recall if the queries up to each distinct score report (section IV-C).
 
     Args:
         score: best score of each query, lower is better; +inf reports nothing.
         right: whether the reported place is right.
-        answerable: whether the query has a right answer at all.
-        recall: "all" is TP / all answerable queries; "reported" is TP / (TP + FN), where a query that
+        answerable: whether the query has a right answer.
+        recall: "all" is TP / all answerable queries; "reported" is TP / (TP + FN), in which a query that
             reports a wrong place is a false positive only.
 
     Shape: (Q,), (Q,) bool, (Q,) bool -> PRCurve of (T,), T distinct finite scores, increasing.
@@ -77,27 +77,27 @@ def pr_curve(
     tp = true_positives[last]
     accepted = torch.arange(1, len(ordered) + 1, dtype=torch.float64)[last]
     total = answerable.sum().double()
-    # every answerable query that has not reported yet is a false negative
+    # each answerable query that has not reported yet is a false negative
     relevant = total if recall == "all" else tp + (total - answered[last])
     fraction = torch.where(tp > 0, tp / torch.as_tensor(relevant).clamp(min=1), 0.0)
     return PRCurve(tp / accepted, fraction, ordered[last])
 
 
 def area(curve: PRCurve) -> float:
-    """Area under the curve: trapezoid over its own points, no starting point added."""
+    """Area under the curve, by trapezoids over its own points without an added starting point."""
     return float(torch.trapezoid(curve.precision, curve.recall)) if len(curve.recall) else 0.0
 
 
 def recall_at_full_precision(curve: PRCurve) -> float:
-    """Largest recall at which every report is right."""
+    """The largest recall at which every report is right."""
     perfect = curve.recall[curve.precision == 1]
     return float(perfect.max()) if len(perfect) else 0.0
 
 
 def threshold_of_full_precision(curve: PRCurve) -> float | None:
-    """The threshold that accepts as many as possible while every report is right; None where none does.
+    """The threshold that accepts the most queries while all of them are right; None if there is none.
 
-    It lies half way from the last score that does to the first that does not.
+    It is half way between the last accepted score and the next one.
 
     Example:
         >>> scores, right = torch.tensor([1.0, 2.0, 3.0]), torch.tensor([True, True, False])
@@ -125,14 +125,13 @@ def evaluate(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> Score
     """All scores of matches against a truth.
 
     Args:
-        truth: (Q,R) int64, every right place of each query, -1 as padding; or a GroundTruth. Queries of which
-            nothing is known, and queries that report an ignored place, are left out, as if they were never
-            asked: of precision, of recall, and of the count of queries.
+        truth: (Q,R) int64, every right place of each query, -1 as padding; or a GroundTruth. Queries that are
+            not judged, or that report an ignored place, are excluded from precision, recall and the number of
+            queries.
         tolerance: places, inclusive.
 
     Raises:
-        InputError: a truth of another length than the matches, a negative tolerance, or no query left
-            to judge.
+        InputError: a truth of another length than the matches, a negative tolerance, or no query to judge.
 
     Example:
         >>> match = Match(torch.tensor([0, 7]), torch.tensor([0.1, 0.2]), torch.tensor([True, True]))
@@ -159,9 +158,7 @@ def evaluate(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> Score
 
 
 def recall_at(candidates: Tensor, truth: Tensor | GroundTruth, tolerance: int, first: int) -> float | None:
-    """Share of the queries with a right answer that have one among their first candidates.
-
-    Shape: (Q,K).
+    """Share of the queries with a right answer that have it among their `first` candidates (Q,K).
 
     Example:
         >>> places, right = torch.tensor([[7, 0], [9, 4]]), torch.tensor([[0], [1]])
@@ -180,11 +177,9 @@ def recall_at(candidates: Tensor, truth: Tensor | GroundTruth, tolerance: int, f
 def recall_over_all(
     candidates: Tensor, truth: Tensor | GroundTruth, tolerance: int, firsts: Sequence[int]
 ) -> dict[str, float]:
-    """Share of all judged queries that have a right answer among their first N candidates, for each N.
+    """Share of all judged queries that have a right answer among their first N candidates (Q,K), for each N.
 
-    As tools for image retrieval count, and unlike `recall_at`: a query that has no right answer is a miss.
-
-    Shape: (Q,K).
+    As in image retrieval, and unlike in `recall_at`, a query without a right answer is a miss.
 
     Raises:
         InputError: an N that is not from 1 to K.
@@ -205,23 +200,16 @@ def recall_over_all(
 
 
 def count_queries(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> dict[str, int]:
-    """How many queries there are, and how many of them the scores count; the keys are keys of report.json.
+    """The numbers of queries, by their keys in report.json.
 
-    queries = judged + unknown + ignored: unknown to the truth, or ignored because an ignored
-    place is reported. with_answer are those of the judged that have a right answer; accepted those that are
-    accepted; accepted_right those accepted in a right place.
-
-    Raises:
-        InputError: as `evaluate`.
+    queries = judged + unknown (to the truth) + ignored (an ignored place is reported). Of the judged ones,
+    with_answer have a right answer, accepted are accepted, and accepted_right are accepted at a right place.
     """
     kept, right = _judged(match, truth, tolerance)
     good = is_right(kept.index, right.positives, tolerance)
     queries, judged, unknown = len(match.index), len(kept.index), int((~as_ground_truth(truth).judged).sum())
-    return {
-        "queries": queries,
-        "judged": judged,
-        "unknown": unknown,
-        "ignored": queries - judged - unknown,
+    counts = {"queries": queries, "judged": judged, "unknown": unknown, "ignored": queries - judged - unknown}
+    return counts | {
         "with_answer": int((right.positives >= 0).any(1).sum()),
         "accepted": int(kept.accepted.sum()),
         "accepted_right": int((kept.accepted & good).sum()),
@@ -231,14 +219,12 @@ def count_queries(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> 
 def check_truth(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> None:
     """Refuse a truth that does not fit the matches."""
     if not isinstance(match, Match) or not isinstance(truth, Tensor | GroundTruth):
-        raise InputError(
-            f"evaluate got a {type(match).__name__} and a {type(truth).__name__}; expected a Match, as "
-            "`localize` gives, and a tensor (Q,R) or a GroundTruth"
-        )
+        seen = f"evaluate got a {type(match).__name__} and a {type(truth).__name__}"
+        raise InputError(f"{seen}; expected a Match of `localize`, and a tensor (Q,R) or a GroundTruth")
     right, *others = (truth,) if isinstance(truth, Tensor) else (truth.positives, truth.judged, truth.ignored)
     queries = len(match.index)
     if right.ndim != 2 or len(right) != queries:
-        raise InputError(f"the truth is {tuple(right.shape)}; expected ({queries}, R), a row a query")
+        raise InputError(f"the truth is {tuple(right.shape)}; expected ({queries}, R), one row per query")
     if others and (others[0].shape != (queries,) or others[1].ndim != 2 or len(others[1]) != queries):
         shapes = " and ".join(str(tuple(other.shape)) for other in others)
         raise InputError(f"judged and ignored are {shapes}; expected ({queries},) and ({queries}, S)")
@@ -247,13 +233,11 @@ def check_truth(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> No
 
 
 def _judged(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> tuple[Match, GroundTruth]:
-    """Matches and truth of the queries that the scores count."""
+    """Matches and truth of the queries that are scored."""
     check_truth(match, truth, tolerance)
     truth = as_ground_truth(truth)
     kept = counted(match.index, truth, tolerance)
     if not kept.any():
-        raise InputError(
-            f"of {len(kept)} queries {int(truth.judged.sum())} are in the truth and none is left to judge; "
-            "expected at least one in the truth that does not report an ignored place"
-        )
+        seen = f"of {len(kept)} queries {int(truth.judged.sum())} are in the truth and none can be judged"
+        raise InputError(f"{seen}; expected one in the truth that does not report an ignored place")
     return match.map(lambda column: column[kept]), GroundTruth(*(column[kept] for column in truth))

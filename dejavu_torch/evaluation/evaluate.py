@@ -1,4 +1,4 @@
-"""Evaluate the matches in a file, whatever method found them."""
+"""Evaluate the matches in a file, from any method."""
 
 from __future__ import annotations
 
@@ -19,19 +19,12 @@ from dejavu_torch.data.ground_truth import (
     offset_of,
 )
 from dejavu_torch.data.positions import unit_of
+from dejavu_torch.evaluation import curves
 from dejavu_torch.evaluation.answers import own_facts
 from dejavu_torch.evaluation.contenders import contend
-from dejavu_torch.evaluation.curves import (
-    RECALL_DEFINITION,
-    count_queries,
-    curve_of,
-    recall_at,
-    recall_over_all,
-    threshold_of_full_precision,
-)
 from dejavu_torch.evaluation.match_plots import draw_coverage
 from dejavu_torch.evaluation.matches import ELSEWHERE, read_matches
-from dejavu_torch.evaluation.plots import Picture
+from dejavu_torch.evaluation.plots import Pictures
 from dejavu_torch.evaluation.rejection import draw_reliability, rejection_facts
 from dejavu_torch.evaluation.report import Report
 from dejavu_torch.evaluation.score_plots import draw_curves
@@ -41,17 +34,17 @@ from dejavu_torch.text import printable
 from dejavu_torch.types import InputError, Match, Traverse
 from dejavu_torch.version import __version__
 
-RANKS = (5, 10)  # among so many candidates a right place is looked for
+RANKS = (5, 10)  # the N of recall@N
 
 
 class Evaluation(NamedTuple):
-    """An evaluation's figures, what they are of, and its pictures; `queries` (Q,) is the frame of each."""
+    """A report with the matches and truth that it scores, and pictures; `queries` (Q,) are their frames."""
 
     report: Report
     queries: Tensor
     match: Match
     truth: GroundTruth
-    pictures: Mapping[str, Picture]
+    pictures: Pictures
 
 
 def evaluate_file(
@@ -70,14 +63,14 @@ def evaluate_file(
     Args:
         matches: see `read_matches`.
         truth: see `find_ground_truth`; None needs both traverses.
-        tolerance: frames within which a report is right, inclusive; places where the map's are resampled.
+        tolerance: frames within which an answer is right, inclusive; places if the map is resampled.
         interpolate: see `find_ground_truth`.
-        reference, query: the traverses, where the ground truth lies in them. Without a reference or a map
-            nothing says how many frames there are: an offset gives every query a right answer.
-        map: file of a map of the reference; where its places are resampled by distance, matches and ground
-            truth are turned from frames into places.
-        route: of matches on a merged map, the route that `truth` and `reference` are of: answers on other
-            routes are wrong.
+        reference, query: the traverses, if they carry the ground truth. Without a reference or a map the
+            number of frames is unknown, and an offset gives every query a right answer.
+        map: file of a map of the reference. If its places are resampled by distance, matches and ground
+            truth are translated from frames to places.
+        route: for matches on a merged map, the route of `truth` and `reference`: answers on other routes are
+            wrong.
         recall_values: see `recall_over_all`; each at most the ranks of a query.
 
     Raises:
@@ -92,7 +85,7 @@ def evaluate_file(
     if isinstance(place_map, SpectralMap) and place_map.routes:
         if route is None:
             names = ", ".join(one.name for one in place_map.routes)
-            raise InputError(f"{map} has the routes {names}; expected --route with the one that truth is of")
+            raise InputError(f"{map} has the routes {names}; expected --route with the one of the truth")
         place_map = place_map.part(route)
     positions = torch.zeros(0) if place_map is None else place_map.positions
     resampled = len(positions) > 0
@@ -106,14 +99,14 @@ def evaluate_file(
         raise InputError(f"{matches} reports place {int(candidates.max())}; expected one below {frames}")
     known = find_ground_truth(truth, reference, query, frames, queries, interpolate, resampled)
     if known is None:
-        raise InputError("there is no ground truth; expected one, or traverses that carry their positions")
+        raise InputError("there is no ground truth; expected one, or traverses that carry positions")
     carried = all(one is not None and one.place is not None for one in (reference, query))
     own = own_facts(match, queries, tolerance, True, offset_of(truth, carried))
     if place_map is not None:
         known = ground_truth_in_places(known, place_map.place_of)
         candidates = place_map.place_of(candidates)
     here = match._replace(index=candidates[:, 0].masked_fill(elsewhere[:, 0], -1))
-    if route is not None:  # other routes lie behind all of this one, and all that its truth has
+    if route is not None:  # number places on other routes beyond every place of this one and its truth
         highest = max(int(table.max()) for table in (candidates, known.positives) if table.numel())
         candidates = candidates.masked_fill(elsewhere, max(places or 0, 1 + highest) + tolerance)
     match = match._replace(index=candidates[:, 0])
@@ -123,7 +116,7 @@ def evaluate_file(
     facts["accepted_precision"] = facts["accepted_right"] / accepted if accepted else None
     facts |= {"matches": str(matches), "places": places}
     if recall_values:
-        facts["recall_values"] = recall_over_all(candidates, known, tolerance, recall_values)
+        facts["recall_values"] = curves.recall_over_all(candidates, known, tolerance, recall_values)
     if route is not None:
         facts |= {"route": route, "elsewhere": int(elsewhere[:, 0].sum())}
     ours = contend(printable(matches.name), match, known, tolerance)
@@ -144,12 +137,12 @@ def evaluation_facts(
     described: str,
     off_map: Mapping[str, Tensor] = MappingProxyType({}),
 ) -> dict[str, Any]:
-    """What every report.json holds beside the scores.
+    """The entries of every report.json besides the scores.
 
     Args:
-        candidates: (Q,K), best first, places as a ground truth counts them.
-        truth: None where nothing tells the right places. described: the same in words.
-        positions: of the map's places, empty where they are the frames; see `PlaceMap`.
+        candidates: (Q,K), best first, in the places of the ground truth.
+        truth: None if unknown. described: the same in words.
+        positions: of the map's places, empty if places are frames; see `PlaceMap`.
         off_map: see `rejection_facts`.
     """
     facts: dict[str, Any] = {
@@ -157,15 +150,15 @@ def evaluation_facts(
         "accepted": int(match.accepted.sum()),
         "tolerance": tolerance,
         "unit": unit_of(positions),
-        "recall_definition": RECALL_DEFINITION,
+        "recall_definition": curves.RECALL_DEFINITION,
         "version": __version__,
         "torch": torch.__version__,
     }
     for first in RANKS:
-        found = None if truth is None else recall_at(candidates, truth, tolerance, first)
+        found = None if truth is None else curves.recall_at(candidates, truth, tolerance, first)
         facts[f"recall_at_{first}"] = found
     if truth is not None:
-        facts |= count_queries(match, truth, tolerance)
-        facts["truth"] = described
-        facts["threshold_of_full_precision"] = threshold_of_full_precision(curve_of(match, truth, tolerance))
+        facts |= curves.count_queries(match, truth, tolerance) | {"truth": described}
+        curve = curves.curve_of(match, truth, tolerance)
+        facts["threshold_of_full_precision"] = curves.threshold_of_full_precision(curve)
     return facts | rejection_facts(match, truth, tolerance, off_map)

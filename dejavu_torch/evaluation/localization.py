@@ -1,4 +1,4 @@
-"""A localization run: what pictures are drawn from, and what is coded at several sizes."""
+"""A localization run, from which pictures and storage curves are made."""
 
 from __future__ import annotations
 
@@ -16,11 +16,10 @@ from dejavu_torch.types import Match, SequenceModel, Traverse
 
 
 class Localization(NamedTuple):
-    """A map, the traverses it was made of and queried with, and what was found.
+    """A map, its reference traverse, a query traverse, and the matches.
 
-    reference_features (N,D) and query_features (Q,D) may lie in a file. truth: None where there is none.
-    tolerance: distance from a right place, in places, up to which a reported one is right.
-    matching: how the map and all that it is set beside are matched.
+    reference_features (N,D) and query_features (Q,D) may lie in a file. truth: None if unknown.
+    tolerance: in places, inclusive. matching: for the map and all baselines.
 
     Convention 11: match and truth count places and queries, pictures show frames of the sources.
     """
@@ -40,17 +39,17 @@ class Localization(NamedTuple):
 
     @property
     def sequence(self) -> SequenceModel | None:
-        """What scores consecutive queries together."""
+        """The model that scores consecutive queries together, if any."""
         return self.matching.sequence
 
     @property
     def scored(self) -> Match:
-        """The matches as the scores count them."""
+        """The matches with the places that are scored."""
         return self.match._replace(index=self.model.map.table.scored(self.match.index))
 
     @property
     def borders(self) -> Tensor:
-        """(N+1,) the reference frame with which each place begins, and the number of frames."""
+        """(N+1,) the first reference frame of each place, and the number of frames."""
         return self.model.map.table.borders.cpu()
 
     @property
@@ -62,22 +61,22 @@ class Localization(NamedTuple):
 
     @property
     def unit(self) -> str:
-        """What periods and the tolerance count."""
+        """The unit of periods and of the tolerance."""
         return unit_of(self.model.map.positions)
 
     @property
     def has_frames(self) -> bool:
-        """Whether both traverses hold frames, not ready features."""
+        """Whether both traverses hold frames rather than ready features."""
         return len(self.reference.frame_shape) == len(self.query.frame_shape) == 3
 
     @torch.no_grad()
     def scores(self, numbers: Tensor) -> Tensor:
-        """Scores of single queries by the map, on the CPU: their numbers (B,) -> (B,N)."""
+        """Scores of single queries, on the CPU: their indices (B,) -> (B,N)."""
         route = self.model.map
         return route.scores(self.query_features[numbers].to(route.positions.device)).float().cpu()
 
     def example_query(self, start: int, stop: int) -> tuple[int, list[int]]:
-        """A query near to the middle of a chunk, and its right places there; without truth the middle one."""
+        """A query near the middle of a chunk, and its right places there; without truth the middle query."""
         if self.truth is None:
             return len(self.query_features) // 2, []
         query = nearest_query(self.truth, (start + stop) / 2)
@@ -86,7 +85,7 @@ class Localization(NamedTuple):
 
 
 def nearest_query(truth: GroundTruth, place: float) -> int:
-    """The query one of whose right places is nearest to a place; the first where none has any."""
+    """The query with the right place nearest to a place; the first one if none has any."""
     right = torch.where(truth.judged[:, None] & (truth.positives >= 0), truth.positives, torch.inf)
     return int((right - place).abs().amin(1).argmin())
 

@@ -1,4 +1,4 @@
-"""Pictures of a spectral map, how it answers a query, and the ground that gives the steps between places."""
+"""Pictures of a spectral map, of its answer to a query, and of the ground motion used for resampling."""
 
 from __future__ import annotations
 
@@ -11,52 +11,34 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from dejavu_torch.evaluation import plots
 from dejavu_torch.evaluation.contenders import COLOURS
 from dejavu_torch.evaluation.localization import Localization, frame_at
-from dejavu_torch.evaluation.plots import (
-    DARK,
-    GREY,
-    LAYERS,
-    LETTERS,
-    PLACE,
-    WIDTH,
-    WRONG,
-    Picture,
-    Plot,
-    canvas,
-    label,
-    picture,
-    pixels,
-    show_frame,
-)
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.spectrum import from_spectrum, period_of, spectrum
 from dejavu_torch.motion.ground_plane import ground_patch
 from dejavu_torch.motion.resampling import ResampledTraverse
 
 BLUE = COLOURS["map"]
-STRONGEST = 3  # numbers of the descriptor whose spectrum is shown
-COUNTS = (1, 4, 16)  # strongest periods that are added up, beside all
-FAINTEST = 0.02  # of a step: what is below is drawn there
+STRONGEST = 3  # descriptor dimensions whose spectrum is shown
+COUNTS = (1, 4, 16)  # strongest periods that are added up, besides all
+FAINTEST = 0.02  # of a step: smaller lines are drawn at this size
 
 
 class Lines(NamedTuple):
-    """The spectrum of one number of the descriptor.
-
-    amplitudes: (n,) of its lines, without their signs. kept: (n,) bool, those that the map holds.
-    """
+    """The absolute spectrum of one descriptor dimension, (n,), and which of its lines the map keeps."""
 
     amplitudes: Tensor
     kept: Tensor
 
 
 def longest_chunk(route: SpectralMap) -> int:
-    """Its number; the first of equals."""
+    """The number of the longest chunk; of equals the first."""
     return max(range(len(route.chunks)), key=lambda j: route.chunks[j][1] - route.chunks[j][0])
 
 
-def draw_spectrum(run: Localization, route: SpectralMap) -> dict[str, Picture]:
-    """The spectra of those numbers of the descriptor of which the longest chunk keeps most energy."""
+def draw_spectrum(run: Localization, route: SpectralMap) -> plots.Pictures:
+    """The spectra of the descriptor dimensions of which the longest chunk keeps the most energy."""
     chunk = longest_chunk(route)
     start, stop = route.chunks[chunk]
     lines = route.lines(chunk)
@@ -74,18 +56,19 @@ def draw_spectrum(run: Localization, route: SpectralMap) -> dict[str, Picture]:
     features = {int(j): Lines(own[1:], kept[j, 1:]) for j, own in zip(chosen, amplitudes, strict=True)}
     plot = plot_spectrum(features, torch.tensor(periods), float(route.steps[chunk]), run.unit)
     edges = run.borders[[start, stop]].tolist() if len(route.chunks) > 1 else None
-    return picture("spectrum", plot, chunk=edges)
+    return plots.picture("spectrum", plot, chunk=edges)
 
 
-def plot_spectrum(features: Mapping[int, Lines], periods: Tensor, step: float, unit: str) -> Plot:
-    """Spectra of numbers of the descriptor, a row each, with the lines kept (figure 3 of the paper)."""
-    figure, axes = canvas(1.1 + 1.15 * len(features), len(features), squeeze=False, sharex=True, sharey=True)
+def plot_spectrum(features: Mapping[int, Lines], periods: Tensor, step: float, unit: str) -> plots.Plot:
+    """Spectra of descriptor dimensions, a row each, with the kept lines marked (figure 3 of the paper)."""
+    count, grid = len(features), {"squeeze": False, "sharex": True, "sharey": True}
+    figure, axes = plots.canvas(1.1 + 1.15 * count, count, **grid)
     for axis, (feature, (amplitudes, kept)) in zip(axes[:, 0], features.items(), strict=True):
         size = (amplitudes / step).clamp(min=FAINTEST)
-        axis.plot(periods[~kept], size[~kept], ".", color=GREY, markersize=2, label="coded as 0")
+        axis.plot(periods[~kept], size[~kept], ".", color=plots.GREY, markersize=2, label="coded as 0")
         axis.vlines(periods[kept], FAINTEST, size[kept], color=BLUE, linewidth=0.5, alpha=0.5)
         axis.plot(periods[kept], size[kept], ".", color=BLUE, markersize=3.5, label="kept")
-        axis.axhline(1, color=DARK, linewidth=0.9, linestyle="--", label="step")
+        axis.axhline(1, color=plots.DARK, linewidth=0.9, linestyle="--", label="step")
         share = float(amplitudes[kept].square().sum() / amplitudes.square().sum().clamp(min=1e-30))
         text = f"feature {feature}: {int(kept.sum())} of {len(kept)} lines, {100 * share:.0f} % of the energy"
         axis.set_title(text, loc="left", fontsize=9)
@@ -106,8 +89,8 @@ def plot_spectrum(features: Mapping[int, Lines], periods: Tensor, step: float, u
     return figure, axes[:, 0]
 
 
-def draw_components(run: Localization, route: SpectralMap) -> dict[str, Picture]:
-    """One query's scores with its strongest periods only, and with all; nothing where no period is kept."""
+def draw_components(run: Localization, route: SpectralMap) -> plots.Pictures:
+    """One query's scores with its strongest periods only, and with all; empty if no period is kept."""
     chunk = longest_chunk(route)
     start, stop = route.chunks[chunk]
     query, places = run.example_query(start, stop)
@@ -125,24 +108,24 @@ def draw_components(run: Localization, route: SpectralMap) -> dict[str, Picture]
             right = [place - start for place in places]
             better.append(better_places(scores, right, run.tolerance))
             title += f": {better[-1]} places fit better"
-        curves.append((fill(title, LETTERS), scores, BLUE if number == len(sums) else DARK))
+        curves.append((fill(title, plots.LETTERS), scores, BLUE if number == len(sums) else plots.DARK))
     numbers = {"places_that_fit_better": better} if places else {}
     plot = plot_answers(run, query, (start, stop), places, curves, sharey=True)
-    return picture("components", plot, numbers, truth=places)
+    return plots.picture("components", plot, numbers, truth=places)
 
 
 @torch.no_grad()
 def components(
     route: SpectralMap, query: Tensor, chunk: int = 0
 ) -> list[tuple[tuple[Fraction, ...], Tensor]]:
-    """Scores of a query with its 1, 4 and 16 strongest periods only, and with all: the map's own scores.
+    """Scores of a query with its 1, 4 and 16 strongest periods only, and with all (the map's own scores).
 
-    The product of a query with all descriptors of a chunk is a sum of waves, one for each period, besides a
-    constant; the strongest have the largest energy. Cosine and sine of a period count together.
+    The product of a query with all descriptors of a chunk is a constant plus one wave for each period. The
+    strongest periods have the largest energy, cosine and sine together.
 
-    Shape: query (K,) -> periods, the strongest first, and scores (W,) of the places of the chunk, each.
+    Shape: query (K,) -> for each sum its periods, the strongest first, and scores (W,) of the chunk's places.
 
-    Convention: the constant, and what the metric does with products and norms, are part of every sum.
+    Convention: every sum includes the constant and follows the metric.
     """
     start, stop = route.chunks[chunk]
     kept_lines = route.lines(chunk)
@@ -157,7 +140,7 @@ def components(
         if lines[line]:
             lines_of[period_of(line, stop - start, route.transform)].append(line)
     strongest = sorted(lines_of, key=lambda period: -float(lines[lines_of[period]].square().sum()))
-    found = []
+    sums = []
     for count in (*(count for count in COUNTS if count < len(strongest)), len(strongest)):
         kept = torch.zeros_like(lines)
         for chosen in ([0], *(lines_of[period] for period in strongest[:count])):
@@ -167,12 +150,12 @@ def components(
             scores = 1 - products * route.inverse_norms(start, stop)
         else:
             scores = length.square() - 2 * products + route.norms[start:stop].square()
-        found.append((tuple(strongest[:count]), scores.cpu()))
-    return found
+        sums.append((tuple(strongest[:count]), scores.cpu()))
+    return sums
 
 
 def better_places(scores: Tensor, right: Sequence[int], tolerance: int) -> int:
-    """How many places score lower than the best of those within the tolerance of a right one."""
+    """The number of places that score lower than every place within the tolerance of a right one."""
     distance = (torch.arange(len(scores))[:, None] - torch.tensor(right)).abs().amin(1)
     inside = distance <= tolerance
     return int((scores[~inside] < scores[inside].min()).sum())
@@ -186,70 +169,70 @@ def plot_answers(
     curves: Sequence[tuple[str, Tensor, str]],
     strip: Tensor | None = None,
     sharey: bool = False,
-) -> Plot:
-    """Scores of one query over the places of a chunk: a row for each title, scores and colour.
+) -> plots.Plot:
+    """Scores of one query over the places of a chunk, a row for each (title, scores, colour).
 
-    places: the right ones. strip: (C,H,W), drawn above along the chunk. sharey: rows have one scale.
+    places: the right ones. strip: (C,H,W), drawn along the chunk at the top. sharey: rows share one scale.
     """
     begin, end = (int(run.borders[edge]) for edge in chunk)
     above = strip is not None
     count = len(curves) + above
-    figure, rows = canvas(1.4 + 0.9 * count, count, squeeze=False, sharex=True, sharey=sharey)
+    figure, rows = plots.canvas(1.4 + 0.9 * count, count, squeeze=False, sharex=True, sharey=sharey)
     rows = rows[:, 0]
     if strip is not None:
-        rows[0].imshow(pixels(strip), extent=(begin, end, 0, 1), aspect="auto")
+        rows[0].imshow(plots.pixels(strip), extent=(begin, end, 0, 1), aspect="auto")
         rows[0].set_yticks([])
-        rows[0].set_title("middle image column of each frame", loc="left", fontsize=10)
+        rows[0].set_title("middle column of each frame", loc="left", fontsize=10)
     where = run.borders[slice(*chunk)]
     for axis, (title, values, colour) in zip(rows[above:], curves, strict=True):
         axis.plot(where, values, color=colour, linewidth=1.1)
         best = int(values.argmin())
-        style = {"color": WRONG, "markersize": 7, "clip_on": False, "label": "best (first of equals)"}
+        style = {"color": plots.WRONG, "markersize": 7, "clip_on": False, "label": "best (first of equals)"}
         axis.plot(where[best], values[best], "v", **style)
         axis.set_title(title, loc="left", fontsize=9)
         axis.set_yticks([])
     for axis in rows:
         for place in places:
-            style = {"color": DARK, "linewidth": 0.9, "linestyle": "--", "label": "true place"}
+            style = {"color": plots.DARK, "linewidth": 0.9, "linestyle": "--", "label": "true place"}
             axis.axvline(int(run.borders[place]), **style)
     handles, labels = rows[-1].get_legend_handles_labels()
     unique = dict(zip(labels, handles, strict=True))
     figure.legend(unique.values(), unique.keys(), ncols=2, frameon=False, loc="outside lower right")
     figure.supylabel(f"difference of query {run.query_frames[query]} (lower is better)", fontsize=10)
-    rows[-1].set(xlabel=PLACE, xlim=(begin, end))
+    rows[-1].set(xlabel=plots.PLACE, xlim=(begin, end))
     return figure, rows
 
 
-def draw_motion(run: Localization) -> dict[str, Picture]:
-    """The ground and its motion; nothing where the reference is not resampled."""
+def draw_motion(run: Localization) -> plots.Pictures:
+    """The ground and its motion; empty if the reference is not resampled."""
     reference = run.reference
     if not isinstance(reference, ResampledTraverse):
         return {}
     frame, odometry = frame_at(reference, reference.length // 2), reference.odometry
     corners, (height, width) = odometry.corners, frame.shape[-2:]
-    figure, (left, right) = canvas(0.65 * WIDTH * height / width + 0.4, 1, 2, width_ratios=(2, 1))
-    show_frame(left, frame, "the ground in a frame")
-    show_frame(right, ground_patch(frame[None], corners, odometry.size)[0], "from above")
+    figure, (left, right) = plots.canvas(0.65 * plots.WIDTH * height / width + 0.4, 1, 2, width_ratios=(2, 1))
+    plots.show_frame(left, frame, "the ground in a frame")
+    plots.show_frame(right, ground_patch(frame[None], corners, odometry.size)[0], "from above")
     x, y = (torch.tensor([*edge, edge[0]]) for edge in zip(*corners, strict=True))
-    left.plot(x * (width - 1), y * (height - 1), color=LAYERS[0], linewidth=1.5)
-    ground = picture("ground", (figure, (left, right)))
+    left.plot(x * (width - 1), y * (height - 1), color=plots.LAYERS[0], linewidth=1.5)
+    ground = plots.picture("ground", (figure, (left, right)))
     distances = {
-        label(f"{role}: {one.name}"): one.positions * one.step
+        plots.label(f"{role}: {one.name}"): one.positions * one.step
         for role, one in (("reference", reference), ("query", run.query))
         if isinstance(one, ResampledTraverse)
     }
-    return ground | picture("velocity", plot_velocity(distances, reference.step))
+    return ground | plots.picture("velocity", plot_velocity(distances, reference.step))
 
 
-def plot_velocity(distances: Mapping[str, Tensor], step: float) -> Plot:
-    """How fast the ground moves along traverses, and at which steps it is sampled (section IV-B)."""
-    figure, axes = canvas(1 + 1.4 * len(distances), len(distances), squeeze=False, sharey=True)
-    for axis, (name, travelled), colour in zip(axes.flat, distances.items(), LAYERS, strict=False):
+def plot_velocity(distances: Mapping[str, Tensor], step: float) -> plots.Plot:
+    """The speed of the ground along traverses, and the step of the resampling (section IV-B)."""
+    figure, axes = plots.canvas(1 + 1.4 * len(distances), len(distances), squeeze=False, sharey=True)
+    for axis, (name, travelled), colour in zip(axes.flat, distances.items(), plots.LAYERS, strict=False):
         axis.plot(torch.arange(1, len(travelled)), travelled.diff(), color=colour, linewidth=0.8)
-        axis.axhline(0, color=GREY, linewidth=0.6)
-        axis.axhline(step, color=DARK, linewidth=0.8, linestyle=":")
+        axis.axhline(0, color=plots.GREY, linewidth=0.6)
+        axis.axhline(step, color=plots.DARK, linewidth=0.8, linestyle=":")
         axis.set(xlim=(0, len(travelled)), ylabel="pixels of ground\nper frame")
-        axis.set_title(fill(name, LETTERS - 10), loc="left", fontsize=9)
+        axis.set_title(fill(name, plots.LETTERS - 10), loc="left", fontsize=9)
         axis.grid(alpha=0.25)
     axes[-1, 0].set_xlabel("frame (dotted: step between places)")
     return figure, axes

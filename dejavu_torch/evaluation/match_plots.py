@@ -15,28 +15,9 @@ from torch.nn.functional import max_pool1d
 
 from dejavu_torch.data.ground_truth import GroundTruth, counted, is_right
 from dejavu_torch.data.positions import look_up
+from dejavu_torch.evaluation import plots
 from dejavu_torch.evaluation.contenders import COLOURS
 from dejavu_torch.evaluation.localization import Localization, frame_at, nearest_query
-from dejavu_torch.evaluation.plots import (
-    DARK,
-    GREY,
-    LAYERS,
-    LETTERS,
-    LINE,
-    PLACE,
-    QUERY,
-    RIGHT,
-    WIDTH,
-    WRONG,
-    Picture,
-    Plot,
-    canvas,
-    empty,
-    label,
-    picture,
-    show_cells,
-    show_frame,
-)
 from dejavu_torch.motion.resampling import source_of
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.sequence import SequenceMatcher
@@ -45,21 +26,21 @@ from dejavu_torch.types import Match, Traverse
 CELLS = 400  # rows and columns of a score matrix, at most
 PIXELS = 1000  # rows and columns of a posterior, at most
 MARKS = 24  # queries whose right places are marked on a posterior, at most
-LEAST = 1e-6  # probability that is told from 0
-LINES = 8  # about as many right places of a query are drawn
-SCORES_AT_ONCE = 2**22  # numbers of Q x N held at a time
-EXAMPLES = 4  # places of which the frames of both traverses are shown
+MIN_PROBABILITY = 1e-6  # lower ones are drawn as this
+LINES = 8  # right places drawn for each query, about
+BLOCK_SCORES = 2**22  # of Q x N, computed at a time
+EXAMPLES = 4  # places at which frames of both traverses are shown
 
 
-def draw_pairs(run: Localization) -> dict[str, Picture]:
-    """Some queries beside the frames found for them; nothing for ready features, or where none is found."""
+def draw_pairs(run: Localization) -> plots.Pictures:
+    """Example queries with the frames reported for them; empty for ready features, or if none is reported."""
     examples = example_queries(run.scored, run.truth, run.tolerance) if run.has_frames else {}
     if not examples:
         return {}
 
     def named(role: str, traverse: Traverse, frame: Tensor) -> str:
         name = source_of(traverse).frame_name(int(frame))
-        return f"{role}:\n{label(f'frame {frame} {name}'.strip())}"
+        return f"{role}:\n{plots.label(f'frame {frame} {name}'.strip())}"
 
     rows = []
     for query, why in examples.items():
@@ -76,17 +57,15 @@ def draw_pairs(run: Localization) -> dict[str, Picture]:
             title = named("right", run.reference, run.borders[nearest])
             frames[title] = frame_at(run.reference, nearest)
         elif run.truth is not None:
-            frames["right:\nnone is known"] = None
+            frames["right:\nunknown or none"] = None
         rows.append((f"{why}, score {float(run.match.score[query]):.3g}", frames))
     rejected = any("not accepted" in why for why in examples.values())
-    return picture("pairs", plot_rows(rows), truth=run.truth, rejected=rejected)
+    return plots.picture("pairs", plot_rows(rows), truth=run.truth, rejected=rejected)
 
 
 def example_queries(match: Match, truth: GroundTruth | None, tolerance: int) -> dict[int, str]:
-    """The queries that a report shows, and why: the surest right, the surest wrong, and one at the border.
-
-    The last is the surest that is not accepted, or, where all are, the least sure of all.
-    Without ground truth the surest of all stands for the first two.
+    """The queries that a report shows, with the reason: the surest right and wrong ones (without truth, the
+    surest), and the surest one that is not accepted (if all are, the least sure).
     """
     reported = match.index >= 0
     rejected = reported & ~match.accepted
@@ -109,8 +88,8 @@ def example_queries(match: Match, truth: GroundTruth | None, tolerance: int) -> 
     return reasons
 
 
-def draw_frames(run: Localization) -> dict[str, Picture]:
-    """The same places on both traverses; nothing for ready features, or where no place is known."""
+def draw_frames(run: Localization) -> plots.Pictures:
+    """The same places in both traverses; empty for ready features, or if no right place is known."""
     if run.truth is None or not (run.truth.positives >= 0).any() or not run.has_frames:
         return {}
     rows = []
@@ -122,37 +101,37 @@ def draw_frames(run: Localization) -> dict[str, Picture]:
             f"second, frame {run.query_frames[query]}": frame_at(run.query, query),
         }
         rows.append(("", frames))
-    return picture("frames", plot_rows(rows))
+    return plots.picture("frames", plot_rows(rows))
 
 
-def plot_rows(rows: Sequence[tuple[str, Mapping[str, Tensor | None]]]) -> Plot:
-    """Rows of frames by their titles, below a heading each, or none; a frame that is None is left out."""
+def plot_rows(rows: Sequence[tuple[str, Mapping[str, Tensor | None]]]) -> plots.Plot:
+    """Rows of frames by their titles, each row with a heading ("" for none); a frame may be None."""
     columns = max(len(frames) for _, frames in rows)
-    headings = [fill(heading, LETTERS) for heading, _ in rows]
+    headings = [fill(heading, plots.LETTERS) for heading, _ in rows]
     titles, heights = [], []
     for heading, (_, frames) in zip(headings, rows, strict=True):
         titles.append(
-            ["\n".join(fill(line, LETTERS // columns) for line in text.split("\n")) for text in frames]
+            ["\n".join(fill(line, plots.LETTERS // columns) for line in text.split("\n")) for text in frames]
         )
         lines = 1 + max(title.count("\n") for title in titles[-1]) + len(heading.splitlines())
         side = max(one.shape[1] / one.shape[2] for one in frames.values() if one is not None)
-        heights.append(WIDTH / columns * side + lines * LINE)
-    figure, axes = empty(sum(heights)), []
+        heights.append(plots.WIDTH / columns * side + lines * plots.LINE)
+    figure, axes = plots.empty(sum(heights)), []
     parts = figure.subfigures(len(rows), 1, squeeze=False, height_ratios=heights)[:, 0]
     for part, heading, above, (_, frames) in zip(parts, headings, titles, rows, strict=True):
         if heading:
             part.suptitle(heading, x=0.01, ha="left", fontsize=9, weight="bold")
         axes.append(part.subplots(1, columns, squeeze=False)[0])
         for axis, title, frame in zip(axes[-1], above, frames.values(), strict=True):
-            show_frame(axis, frame, title)
+            plots.show_frame(axis, frame, title)
     return figure, np.stack(axes)
 
 
 def draw_coverage(
     match: Match, truth: GroundTruth | None, tolerance: int, borders: Tensor, queries: Tensor, unit: str
-) -> dict[str, Picture]:
-    """Where along the route each query was put, right or wrong (coverage plot of the paper, figure 9)."""
-    figure, axis = canvas(3.8)
+) -> plots.Pictures:
+    """The place reported for each query, right or wrong (coverage plot of the paper, figure 9)."""
+    figure, axis = plots.canvas(3.8)
     reported, frames = match.index >= 0, int(borders[-1])
     shown = borders[match.index] if len(borders) > 1 else match.index
     probability = match.probability if truth is None and reported.any() else None
@@ -161,13 +140,13 @@ def draw_coverage(
         scored = counted(match.index, truth, tolerance)
         right = scored & is_right(match.index, truth.positives, tolerance)
         wrong = scored & reported & ~right
-        groups.append((reported & ~scored, GREY, 3, f"{(~scored).sum()} not scored"))
-        groups.append((wrong, WRONG, 3, f"{wrong.sum()} wrong"))
-        groups.append((right, RIGHT, 4, f"{right.sum()} right"))
+        groups.append((reported & ~scored, plots.GREY, 3, f"{(~scored).sum()} not scored"))
+        groups.append((wrong, plots.WRONG, 3, f"{wrong.sum()} wrong"))
+        groups.append((right, plots.RIGHT, 4, f"{right.sum()} right"))
         axis.set_title(f"right within {tolerance} {unit}", fontsize=10)
         missing = missing & scored
     elif probability is not None:
-        order = probability.argsort()  # the surest above the others
+        order = probability.argsort()  # the surest drawn last
         order = order[reported[order]]
         style: dict[str, Any] = {"cmap": "viridis_r", "vmin": 0, "vmax": 1, "linewidths": 0}
         points = axis.scatter(queries[order], shown[order], s=9, c=probability[order], **style)
@@ -179,21 +158,20 @@ def draw_coverage(
             axis.plot(queries[which], shown[which], ".", color=colour, markersize=size, label=name)
     if missing.any():
         where = queries[missing]
-        axis.plot(where, torch.zeros(len(where)), "|", color=DARK, label=f"{len(where)} not reported")
+        axis.plot(where, torch.zeros(len(where)), "|", color=plots.DARK, label=f"{len(where)} not reported")
     first, last = int(queries.min()), int(queries.max())
-    axis.set(xlabel=QUERY, ylabel=f"reported {PLACE}")
+    axis.set(xlabel=plots.QUERY, ylabel=f"reported {plots.PLACE}")
     axis.set(xlim=(first, max(last, first + 1)), ylim=(-0.01 * frames, frames))
     if axis.get_legend_handles_labels()[0]:
         figure.legend(loc="outside lower left", ncols=2, frameon=False, markerscale=3)
-    return picture("coverage", (figure, axis), truth=truth, probable=probability is not None)
+    return plots.picture("coverage", (figure, axis), truth=truth, probable=probability is not None)
 
 
-def draw_scores(run: Localization, cells: int = CELLS) -> dict[str, Picture]:
-    """The scores of queries at places, and on them what a sequence adds up; nothing where all are +inf.
+def draw_scores(run: Localization, cells: int = CELLS) -> plots.Pictures:
+    """The scores of all queries at all places, and the cells that a sequence adds up; empty if all are +inf.
 
-    Convention: at most `cells` queries and blocks of neighbouring places are drawn. Each query is scaled by
-        itself, from its best score (0) to its median (1), since scores grow with all that a query has in no
-        place.
+    Convention: at most `cells` queries and blocks of neighbouring places are drawn. Each query is scaled
+        from its best score (0) to its median (1), since content that is in no place raises all its scores.
     """
     queries, borders = run.query_frames, run.borders
     chosen = torch.arange(0, len(queries), -(-len(queries) // cells))
@@ -204,12 +182,12 @@ def draw_scores(run: Localization, cells: int = CELLS) -> dict[str, Picture]:
         return {}
     found = (run.match.index >= 0).nonzero()[:, 0]
     zoomed = isinstance(run.sequence, SequenceMatcher) and len(found) > 0
-    figure, axes = canvas(6.9, 2) if zoomed else canvas(3.8, squeeze=False)
+    figure, axes = plots.canvas(6.9, 2) if zoomed else plots.canvas(3.8, squeeze=False)
     above, below = axes.flat[0], axes.flat[-1]
-    below.set(xlabel=QUERY)
+    below.set(xlabel=plots.QUERY)
     x = torch.cat([queries[chosen], queries[-1:] + 1])
     image = _show_scores(above, run, x, torch.cat([borders[:-1:block], borders[-1:]]), values)
-    bar = figure.colorbar(image, ax=above, pad=0.01, aspect=30, ticks=[0, 1], label="score within a query")
+    bar = figure.colorbar(image, ax=above, pad=0.01, aspect=30, ticks=[0, 1], label="score of the query")
     bar.ax.set_yticklabels(["best", "median"])
     facts: dict[str, Any] = {"sequence": run.sequence}
     if zoomed:
@@ -218,81 +196,81 @@ def draw_scores(run: Localization, cells: int = CELLS) -> dict[str, Picture]:
     handles, names = below.get_legend_handles_labels()
     style = {"ncols": len(names), "markerscale": 1 if zoomed else 4, "handlelength": 1.5, "columnspacing": 1}
     figure.legend(handles, names, loc="outside lower left", frameon=False, **style)
-    shares = []
+    shown = []
     if len(chosen) < len(queries):
-        shares.append(f"{len(chosen)} of the queries")
+        shown.append(f"{len(chosen)} of {len(queries)} queries")
     if block > 1:
-        shares.append(f"of {block} neighbouring places the one that fits best")
-    return picture("scores", (figure, axes), drawn="; ".join(shares), **facts)
+        shown.append(f"the best of every {block} neighbouring places")
+    return plots.picture("scores", (figure, axes), drawn="; ".join(shown), **facts)
 
 
-def _score_rows(run: Localization, numbers: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-    """Numbers of queries and their scores at all places, a few rows of Q x N at a time."""
-    for part in numbers.split(max(1, SCORES_AT_ONCE // (len(run.borders) - 1))):
+def _score_rows(run: Localization, indices: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    """Indices of queries and their scores at all places, a few rows of Q x N at a time."""
+    for part in indices.split(max(1, BLOCK_SCORES // (len(run.borders) - 1))):
         yield part, run.scores(part)
 
 
 def _scaled(scores: Tensor) -> Tensor:
-    """Each query's scores from 0, its best, to 1, its median and above; +inf where nothing covers."""
-    closed, least = scores.isinf(), scores.amin(1, keepdim=True)
-    median = scores.masked_fill(closed, torch.nan).nanmedian(1, keepdim=True).values
-    scaled = ((scores - least) / (median - least).clamp(min=1e-12)).clamp(max=1)
-    return scaled.masked_fill(closed, torch.inf)
+    """Scores scaled for each query: its best to 0, its median and all above to 1; uncovered stays +inf."""
+    uncovered, best = scores.isinf(), scores.amin(1, keepdim=True)
+    median = scores.masked_fill(uncovered, torch.nan).nanmedian(1, keepdim=True).values
+    scaled = ((scores - best) / (median - best).clamp(min=1e-12)).clamp(max=1)
+    return scaled.masked_fill(uncovered, torch.inf)
 
 
 def _show_scores(axis: Any, run: Localization, x: Tensor, y: Tensor, values: Tensor, dots: float = 2) -> Any:
-    """Draw scores (h,w) between the frames x (h+1,) and y (w+1,), the places reported, and those right."""
-    axis.set_facecolor(GREY)  # where nothing covers
+    """Draw scores (h,w) between the frames x (h+1,) and y (w+1,), with the reported and right places."""
+    axis.set_facecolor(plots.GREY)  # uncovered places
     values = values.masked_fill(values.isinf(), torch.nan)
     x, y = x - 0.5, y - 0.5
-    image = show_cells(axis, x, y, values.T, cmap="gray", vmin=0, vmax=1)
+    image = axis.pcolorfast(x.numpy(), y.numpy(), values.T.numpy(), cmap="gray", vmin=0, vmax=1)
     index, queries = run.scored.index, run.query_frames
     found = index >= 0
     style: dict[str, Any] = {"color": COLOURS["map"], "markersize": dots, "label": "reported place"}
     axis.plot(queries[found], run.borders[index[found]], ".", **style)
     if run.truth is not None:
-        style = {"color": RIGHT, "linewidth": 1, "dashes": (4, 4)}
+        style = {"color": plots.RIGHT, "linewidth": 1, "dashes": (4, 4)}
         axis.plot(queries, _right_frames(run.truth, run.borders), **style)
         axis.plot([], [], label="right place", **style)
-    axis.set(xlim=x[[0, -1]].tolist(), ylim=y[[0, -1]].tolist(), ylabel=PLACE)
+    axis.set(xlim=x[[0, -1]].tolist(), ylim=y[[0, -1]].tolist(), ylabel=plots.PLACE)
     return image
 
 
 def _show_added_up(above: Any, below: Any, run: Localization, query: int) -> int:
-    """Draw, and count, the cells that a sequence adds up for a query, with as much on all sides of them."""
+    """Draw the cells that a sequence adds up for a query, and a margin of its length; return their number."""
     assert isinstance(run.sequence, SequenceMatcher)
-    room, place = run.sequence.length, int(run.match.index[query])
-    back = [round(speed * (room - 1)) for speed in run.sequence.speeds]
-    top, bottom = max(0, query - 2 * room + 1), min(len(run.query_frames), query + room + 1)
-    left, right = max(0, place - max(0, *back) - room), place - min(0, *back) + room + 1
-    seen, scaled = [], []
+    margin, place = run.sequence.length, int(run.match.index[query])
+    back = [round(speed * (margin - 1)) for speed in run.sequence.speeds]
+    top, bottom = max(0, query - 2 * margin + 1), min(len(run.query_frames), query + margin + 1)
+    left, right = max(0, place - max(0, *back) - margin), place - min(0, *back) + margin + 1
+    window, scaled = [], []
     for _, rows in _score_rows(run, torch.arange(top, bottom)):
-        seen.append(rows[:, left:right].clone())  # a view would keep the whole rows
+        window.append(rows[:, left:right].clone())  # a view would keep the whole rows
         scaled.append(_scaled(rows)[:, left:right].clone())
-    cells = run.sequence.trajectory(torch.cat(seen)[: query - top + 1], place - left)
+    cells = run.sequence.trajectory(torch.cat(window)[: query - top + 1], place - left)
     x = torch.cat([run.query_frames, run.query_frames[-1:] + 1])[top : bottom + 1]
     y = run.borders[left : right + 1]
     _show_scores(below, run, x, y, torch.cat(scaled), dots=4)
     corner, width, height = (int(x[0]), int(y[0])), int(x[-1] - x[0]), int(y[-1] - y[0])
-    above.add_patch(Rectangle(corner, width, height, fill=False, color=LAYERS[0], linewidth=1))
-    style = {"color": LAYERS[0], "markersize": min(5, 60 / len(cells)), "mfc": "none", "linewidth": 0.8}
+    above.add_patch(Rectangle(corner, width, height, fill=False, color=plots.LAYERS[0], linewidth=1))
+    style = {"color": plots.LAYERS[0], "markersize": min(5, 60 / len(cells)), "mfc": "none", "linewidth": 0.8}
     added = run.query_frames[cells[:, 0] + top], run.borders[cells[:, 1] + left]
     below.plot(*added, "o-", label="added up", **style)
-    below.set_title("the marked part", loc="left", fontsize=10)
+    below.set_title("the marked region", loc="left", fontsize=10)
     return len(cells)
 
 
 def _right_frames(truth: GroundTruth, borders: Tensor) -> Tensor:
-    """(Q,R) frames of some right places of each query, NaN where there is none."""
+    """(Q,R) frames of some right places of each query, padded with NaN."""
     known = truth.judged[:, None] & (truth.positives >= 0)
     right = torch.where(known, look_up(borders, truth.positives), torch.nan)
     return right[:, :: max(1, right.shape[1] // LINES)]
 
 
-def draw_posterior(run: Localization, cells: int = PIXELS) -> dict[str, Picture]:
-    """What a filter believes behind each query; nothing without one.
+def draw_posterior(run: Localization, cells: int = PIXELS) -> plots.Pictures:
+    """The probabilities of all places after each query, by a filter; empty without one.
 
-    Convention: the greatest probabilities of at most `cells` blocks of queries and places are drawn.
+    Convention: the highest probability in each of at most `cells` blocks of queries and places is drawn.
     """
     if not isinstance(run.sequence, PlaceFilter):
         return {}
@@ -301,26 +279,26 @@ def draw_posterior(run: Localization, cells: int = PIXELS) -> dict[str, Picture]
     x = torch.cat([queries[::block], queries[-1:] + 1]) - 0.5
     y = torch.cat([borders[:-1:width], borders[-1:]]) - 0.5
     values, off, before = torch.zeros(len(x) - 1, len(y) - 1), torch.zeros(len(queries)), None
-    for numbers, scores in _score_rows(run, torch.arange(len(queries))):
+    for indices, scores in _score_rows(run, torch.arange(len(queries))):
         with torch.no_grad():
             posterior = run.sequence.posterior(scores, before)
-        before, off[numbers] = posterior[-1], posterior[:, -1]
+        before, off[indices] = posterior[-1], posterior[:, -1]
         pooled = max_pool1d(posterior[:, :-1], width, ceil_mode=True)
-        values.scatter_reduce_(0, (numbers // block)[:, None].expand_as(pooled), pooled, "amax")
-    figure, (axis, below) = canvas(5.2, 2, sharex=True, height_ratios=(4, 1))
-    norm = LogNorm(LEAST, 1)
-    image = show_cells(axis, x, y, values.T.clamp(LEAST, 1), cmap="gray_r", norm=norm)
+        values.scatter_reduce_(0, (indices // block)[:, None].expand_as(pooled), pooled, "amax")
+    figure, (axis, below) = plots.canvas(5.2, 2, sharex=True, height_ratios=(4, 1))
+    shown, norm = values.T.clamp(MIN_PROBABILITY, 1).numpy(), LogNorm(MIN_PROBABILITY, 1)
+    image = axis.pcolorfast(x.numpy(), y.numpy(), shown, cmap="gray_r", norm=norm)
     figure.colorbar(image, ax=axis, pad=0.01, aspect=30, label="probability of a place")
     below.plot(queries, off, color=COLOURS["map"], linewidth=1)
     if truth is not None:
         right, some = _right_frames(truth, borders), slice(None, None, -(-len(queries) // MARKS))
-        style = {"color": RIGHT, "markersize": 5, "markerfacecolor": "none", "clip_on": False}
+        style = {"color": plots.RIGHT, "markersize": 5, "markerfacecolor": "none", "clip_on": False}
         axis.plot(queries[some], right[some], "o", **style)
         figure.legend(axis.lines[:1], ["right place"], loc="outside lower left", frameon=False)
-        nowhere = truth.judged & right.isnan().all(1)
-        if nowhere.any():
-            below.fill_between(queries, 0, 1, where=nowhere.numpy(), step="mid", color=GREY, linewidth=0)
-    axis.set(xlim=x[[0, -1]].tolist(), ylim=y[[0, -1]].tolist(), ylabel=PLACE)
-    below.set(ylim=(0, 1), xlabel=QUERY, ylabel="off the map")
-    plot = figure, (axis, below)
-    return picture("posterior", plot, truth=truth, queries=block, places=width)
+        off_map = truth.judged & right.isnan().all(1)
+        if off_map.any():
+            style = {"step": "mid", "color": plots.GREY, "linewidth": 0}
+            below.fill_between(queries, 0, 1, where=off_map.numpy(), **style)
+    axis.set(xlim=x[[0, -1]].tolist(), ylim=y[[0, -1]].tolist(), ylabel=plots.PLACE)
+    below.set(ylim=(0, 1), xlabel=plots.QUERY, ylabel="off the map")
+    return plots.picture("posterior", (figure, (axis, below)), truth=truth, queries=block, places=width)

@@ -24,7 +24,7 @@ from dejavu_torch.types import InputError, Match
 log = logging.getLogger("dejavu_torch")
 
 NUMBERS, NAMES = ("query", "place", "score", "accepted"), ("query_name", "place_name")
-EXPECTED = "columns query,place,score and, if wanted, accepted, probability, rank and route"
+EXPECTED = "columns query,place,score and optionally accepted, probability, rank and route"
 ELSEWHERE = -2  # the place of an answer on another route
 _ACCEPTED = {"1": True, "true": True, "0": False, "false": False}
 
@@ -34,9 +34,9 @@ class Matches(NamedTuple):
 
     Attributes:
         query: (Q,) int64, the frame number of each query.
-        match: Match of (Q,), its index a frame number as well.
+        match: Match of (Q,), whose index is also a frame number.
         candidates: (Q,K) int64, the frames of the K ranks of each query, -1 for none; K is 1 without ranks.
-            Both have `ELSEWHERE` for what lies on another route than the one asked for.
+            Both have `ELSEWHERE` for places on another route than the given one.
     """
 
     query: Tensor
@@ -55,21 +55,21 @@ def write_matches(
     routes: Sequence[Route] = (),
     pairs: Path | None = None,
 ) -> tuple[int, int]:
-    """Write matches that come in parts as a csv; returns how many (queries, accepted at their first rank).
+    """Write batches of matches as a csv; return the numbers of (queries, queries with an accepted match).
 
     Args:
-        matches: one a query, in order; with `ranks`, that many a query, as `Found.ranked` gives.
-        query_frames: (Q,) int64, the frame of its source that each query shows; None: query i is frame i.
-        frame_of: the reference frame that each place shows, as `PlaceMap.frame_of`; None: place i is frame i.
-        query_name, place_name: the name of a frame, as `Traverse.frame_name`; None leaves the column empty. A
-            character that is not printable, such as a line break, is escaped.
-        ranks: how many matches each query has; None is one, and no column for the rank.
-        routes: of a merged map, which get a column with the name of each: the place is then a frame of that
-            route, while `frame_of` and `place_name` count through all of them.
-        pairs: another file, for a line `query_name place_name` for each match that reports a place: the pairs
-            of images that hloc and COLMAP read.
+        matches: one per query, in order; with `ranks`, that many per query, as from `Found.ranked`.
+        query_frames: (Q,) int64, the source frame of each query; None: query i is frame i.
+        frame_of: the reference frame of each place, as `PlaceMap.frame_of`; None: place i is frame i.
+        query_name, place_name: the name of a frame, as `Traverse.frame_name`; None leaves the column empty.
+            Unprintable characters, such as line breaks, are escaped.
+        ranks: matches per query; None is one, without a column for the rank.
+        routes: of a merged map: their names get a column, and the place is a frame of that route. `frame_of`
+            and `place_name` count through all routes.
+        pairs: another file, with a line `query_name place_name` for each reported place: the image pairs
+            that hloc and COLMAP read.
 
-    Convention 11: query and place count frames of the sources, -1 where no place is reported.
+    Convention 11: query and place count frames of the sources; -1 if no place is reported.
     """
     total = accepted = 0
     each = 1 if ranks is None else ranks
@@ -84,12 +84,12 @@ def write_matches(
             return stack.enter_context(temporary.open("w", newline="", encoding="utf-8"))
 
         file, paired = opened(path), None if pairs is None else opened(pairs)
-        told = {"probability": known, "rank": ranks is not None, "route": bool(routes)}
-        columns = [*NUMBERS, *(name for name, is_told in told.items() if is_told), *NAMES]
+        optional = {"probability": known, "rank": ranks is not None, "route": bool(routes)}
+        columns = [*NUMBERS, *(name for name, given in optional.items() if given), *NAMES]
         writer = csv.DictWriter(file, columns, extrasaction="ignore")
         writer.writeheader()
         for match in () if start is None else itertools.chain([start], matches):
-            digits = 17 if match.score.dtype == torch.float64 else 9  # so that reading gives the same number
+            digits = 17 if match.score.dtype == torch.float64 else 9  # exact when read again
             first, total = total, total + len(match.index) // each
             queries = torch.arange(first, total) if query_frames is None else query_frames[first:total]
             places = match.index if frame_of is None else frame_of(match.index)
@@ -117,9 +117,7 @@ def write_matches(
 
 
 def check_pair_names(names: Sequence[str], whose: str) -> None:
-    """Refuse what a file of pairs, two names with a space between them, cannot hold: frames without a name,
-    or a name with spaces; `whose` they are is for the message.
-    """
+    """Refuse frame names that a file of pairs, separated by spaces, cannot hold; `whose` names the source."""
     for name in names or [""]:
         if name.split() != [name]:
             seen = f"the name {name!r}" if name else "a frame without a name"
@@ -131,25 +129,25 @@ def _name(name_of: Callable[[int], str] | None, frame: int) -> str:
 
 
 def read_matches(path: Path, route: str | None = None) -> Matches:
-    """The matches of a csv, which may come from any method.
+    """Read the matches in a csv, from any method.
 
     Args:
-        path: a csv with a header, of these columns; others are ignored.
-            query: number of the query frame, in any order, each once or in lines that follow one another, as
-            where resampled footage shows a frame several times. place: number of the reported frame of the
-            reference, -1 for none. score: lower is better, inf for none.
-            accepted: 1 or 0; without it every match with a finite score is. probability: of being right.
-            rank: the lines of a query are its candidates, ranks 1 to K in this order with one K for all
-            queries; the first is its match, whose probability alone counts.
-            route: whose frame the place is.
-        route: whose places count, of a file with that column.
+        path: a csv whose header has these columns; others are ignored.
+            query: number of the query frame, in any order, each once or in consecutive lines (resampled
+            footage may show a frame several times). place: number of the reported reference frame, -1 for
+            none. score: lower is better, inf for none.
+            accepted: 1 or 0; without this column every match with a finite score is. probability: of being
+            right. rank: the lines of a query are its candidates, ranks 1 to K in this order, with the same K
+            for all queries; the first is its match, and only its probability is used.
+            route: the route of the place.
+        route: the route whose places can be right; needed if the file has that column.
 
-    Convention: a row whose place is -1 or whose score is inf reports nothing: place -1, score inf, not
-        accepted, probability 0.
+    Convention: a row with place -1 or score inf reports nothing: place -1, score inf, not accepted,
+        probability 0.
 
     Raises:
-        InputError: what cannot be read, with the number of the line, or a route where there is no such
-            column, or none where there is one.
+        InputError: an unreadable file, with the number of the line, or a route without such a column, or the
+            reverse.
     """
     answers: list[_Answer] = []  # of rank 1
     ranked: list[list[int]] = []
@@ -164,7 +162,7 @@ def read_matches(path: Path, route: str | None = None) -> Matches:
         if rank == 1 and query in seen and query != last:
             raise InputError(f"{where}: query {query} is there twice; expected each once")
         if route is not None and "route" not in cells:
-            raise InputError(f"{where}: no column route for --route {route}; expected none")
+            raise InputError(f"{where}: no column route for --route {route}; expected no --route")
         if "route" in cells and answer.place >= 0:
             routes[cells["route"]] = None
             answer = answer if cells["route"] == route else answer._replace(place=ELSEWHERE)
@@ -177,7 +175,7 @@ def read_matches(path: Path, route: str | None = None) -> Matches:
         raise InputError(f"{path} holds no matches; expected a line for each query")
     if route is None and "route" in cells:
         known = f", with answers on {', '.join(routes)}" if routes else ""
-        raise InputError(f"{path} has a column route{known}; expected --route with the one that truth is of")
+        raise InputError(f"{path} has a column route{known}; expected --route with the one of the truth")
     if route is not None and route not in routes:
         known = f"; it has answers on {', '.join(routes)}" if routes else ""
         log.warning("%s: no answer is on route %s%s", path, route, known)
@@ -193,7 +191,7 @@ def read_matches(path: Path, route: str | None = None) -> Matches:
 
 
 class _Answer(NamedTuple):
-    """A row; the defaults are of one that reports nothing. The probability is of rank 1 alone."""
+    """A row; by default one that reports nothing. Only rank 1 has a probability."""
 
     query: int
     rank: int
@@ -213,7 +211,7 @@ def _answer(where: str, cells: dict[str, str]) -> _Answer:
         score = math.nan
     if math.isnan(score) or score == -math.inf:
         seen = f"score is {cells['score']!r}"
-        raise InputError(f"{where}: {seen}; expected a number, or inf where nothing is reported")
+        raise InputError(f"{where}: {seen}; expected a number, or inf if nothing is reported")
     accepted = _ACCEPTED.get(cells.get("accepted", "1").lower())
     if accepted is None:
         raise InputError(f"{where}: accepted is {cells['accepted']!r}; expected 1 or 0")
@@ -227,7 +225,7 @@ def _answer(where: str, cells: dict[str, str]) -> _Answer:
 
 
 def _rows(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
-    """Where each row stands, and its cells by name."""
+    """The location of each row, for messages, and its cells by name."""
     names: list[str] = []
     for number, cells in read_rows(path, EXPECTED):
         where = f"{path}, line {number}"
@@ -242,8 +240,8 @@ def _rows(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
             yield where, dict(zip(names, cells, strict=False))
 
 
-def _whole(text: str, name: str, least: int, where: str) -> int:
+def _whole(text: str, name: str, minimum: int, where: str) -> int:
     value = as_number(text)
-    if value is None or value % 1 or value < least:
-        raise InputError(f"{where}: {name} is {text!r}; expected a whole number of at least {least}")
+    if value is None or value % 1 or value < minimum:
+        raise InputError(f"{where}: {name} is {text!r}; expected a whole number of at least {minimum}")
     return int(value)

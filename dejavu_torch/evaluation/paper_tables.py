@@ -1,16 +1,16 @@
-"""The table of the paper's section V, its figures beside ours, and the lines that go with it."""
+"""The table of the paper's section V with its figures and ours, and the notes below it."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
-if TYPE_CHECKING:  # the command line needs the names of the datasets alone, and no plots
+if TYPE_CHECKING:  # the command line needs the names of the datasets without matplotlib
     from dejavu_torch.evaluation.report import Report
 
 
 class Published(NamedTuple):
-    """A row of the paper's section V; recall is TP / (TP + FN), None where the paper gives no figure."""
+    """A row of the paper's section V; recall is TP / (TP + FN). None: not in the paper."""
 
     recall_at_100_precision_reported: float
     precision_at_100_recall: float | None
@@ -31,13 +31,13 @@ COLUMNS = {
 }
 IDEAL = ("ideal", "ideal_leave_out")
 FOOTAGE = (
-    "The paper's footage is not available: these routes are simulated after its description, so its figures "
-    "are beside ours, not a reference for them."
+    "The paper's footage is not available. These routes are simulated from its description; its figures are "
+    "shown for comparison only."
 )
 
 
 def section_five(reports: Mapping[str, Report]) -> list[list[str]]:
-    """The table of section V, the paper's figures beside ours, as rows of text, the header first."""
+    """The table of section V with the paper's figures and ours, as rows of text, the header first."""
     rows = [["", *COLUMNS.values(), "bytes per place"]]
     for dataset, report in reports.items():
         paper = [_text(report.facts["published"].get(field)) for field in COLUMNS]
@@ -52,7 +52,7 @@ def section_five(reports: Mapping[str, Report]) -> list[list[str]]:
 
 
 def route_lines(reports: Mapping[str, Report]) -> list[str]:
-    """What each map holds and how long it took, a line for each dataset."""
+    """The content of each map and the time it took, a line for each dataset."""
     lines = []
     for dataset, report in reports.items():
         facts = report.facts
@@ -65,13 +65,13 @@ def route_lines(reports: Mapping[str, Report]) -> list[str]:
         )
         shares = [f"{share:.3f}" for share in facts.get("measured_distance", {}).values() if share]
         if shares:
-            line += f"; the distance measured on the ground is {' and '.join(shares)} of the true one"
+            line += f"; the measured distance along the ground is {' and '.join(shares)} of the true one"
         lines.append(line)
     return lines
 
 
 def boundary_lines(reports: Mapping[str, Report]) -> list[str]:
-    """What it costs that chunks do not end where structures do, a line for each dataset that has some."""
+    """The cost of chunks that do not end where structures end, a line for each dataset with structures."""
     lines = []
     for dataset, report in reports.items():
         boundaries = report.facts.get("boundaries")
@@ -82,9 +82,9 @@ def boundary_lines(reports: Mapping[str, Report]) -> list[str]:
         effect = boundaries["known_boundaries"]
         near, far = (_text(effect[f"recall_at_1_{where}"]) or "unknown" for where in ("near", "far"))
         lines.append(
-            f"{dataset}: something that repeats starts or stops at {boundaries['cuts']} places. recall@1 is "
+            f"{dataset}: repeating structures start or stop at {boundaries['cuts']} places. recall@1 is "
             f"{printed} as printed, {fixed} with scores that are comparable between chunks, and {known} "
-            f"where chunks also end there: then {near} within {effect['near']} places of such an end "
+            f"if chunks also end there: {near} within {effect['near']} places of an end "
             f"({effect['queries_near']} queries), {far} elsewhere ({effect['queries_far']})"
         )
     return lines

@@ -1,4 +1,4 @@
-"""Every picture of a report, drawn from one localization run."""
+"""All pictures of a report, drawn from one localization run."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from dejavu_torch.evaluation.match_plots import (
     draw_posterior,
     draw_scores,
 )
-from dejavu_torch.evaluation.plots import Picture
+from dejavu_torch.evaluation.plots import Pictures
 from dejavu_torch.evaluation.score_plots import Stored, draw_curves, draw_sequences, draw_storage
 from dejavu_torch.evaluation.template_plots import draw_paper, draw_template_map
 from dejavu_torch.maps.spectral_map import SpectralMap
@@ -26,8 +26,8 @@ def draw_pictures(
     run: Localization,
     contenders: Mapping[str, Contender],
     storage: Mapping[str, Sequence[Stored]] | None = None,
-) -> dict[str, Picture]:
-    """Every picture that can be drawn: one that needs ground truth, frames or layers is left out without."""
+) -> Pictures:
+    """All pictures that can be drawn; some need ground truth, frames or layers."""
     route, tolerance, storage = run.model.map, f"{run.tolerance} {run.unit}", storage or {}
     pictures = draw_pairs(run)
     pictures |= draw_coverage(run.scored, run.truth, run.tolerance, run.borders, run.query_frames, run.unit)
@@ -43,6 +43,6 @@ def draw_pictures(
     return pictures
 
 
-def paper_pictures(run: Localization) -> dict[str, Picture]:
-    """Frames, autocorrelogram and layers, which `reproduce` adds (figures 1, 2 and 5 to 7 of the paper)."""
+def paper_pictures(run: Localization) -> Pictures:
+    """The pictures that `reproduce` adds: frames, autocorrelogram and layers (figures 1, 2 and 5 to 7)."""
     return draw_frames(run) | draw_paper(run, template_map_of(run.model, "the picture of layers"))

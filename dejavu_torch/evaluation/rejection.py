@@ -1,4 +1,4 @@
-"""Whether the probabilities of a calibrated map hold, and what accepting by them keeps and lets in."""
+"""Evaluate the probabilities of a calibrated map, and acceptance by them."""
 
 from __future__ import annotations
 
@@ -11,56 +11,49 @@ from torch import Tensor
 
 from dejavu_torch.data.ground_truth import GroundTruth, counted, is_right
 from dejavu_torch.evaluation.curves import evaluate
-from dejavu_torch.evaluation.plots import DARK, GREY, RIGHT, Picture, canvas
+from dejavu_torch.evaluation.plots import DARK, GREY, RIGHT, Pictures, canvas, picture
 from dejavu_torch.types import Match
 
-ASKED = (0.5, 0.8, 0.9, 0.95, 0.99)  # precisions that a report tells of
+ASKED = (0.5, 0.8, 0.9, 0.95, 0.99)  # precisions in a report
 BINS = 10
 
 
 def rejection_facts(
     match: Match, truth: GroundTruth | None, tolerance: int, off_map: Mapping[str, Tensor]
 ) -> dict[str, Any]:
-    """What report.json holds of the probabilities of matches; nothing where they have none."""
+    """The entry `rejection` of report.json; empty if matches have no probabilities."""
     if match.probability is None:
         return {}
-    facts: dict[str, Any] = {
-        "off_map": {
-            name: {
-                "frames": len(found),
-                "accepted": {f"{asked:g}": float((found >= asked).double().mean()) for asked in ASKED},
-            }
-            for name, found in off_map.items()
-        }
-    }
+    facts: dict[str, Any] = {"off_map": {}}
+    for name, found in off_map.items():
+        accepted = {f"{asked:g}": float((found >= asked).double().mean()) for asked in ASKED}
+        facts["off_map"][name] = {"frames": len(found), "accepted": accepted}
     if truth is not None:
         probability, right = judged(match, truth, tolerance)
         scores = evaluate(match._replace(score=1 - match.probability), truth, tolerance)
         facts |= {
             "auc": scores.auc,
             "recall_at_100_precision": scores.recall_at_100_precision,
-            "expected_calibration_error": calibration_error(probability, right, BINS),
-            "precision": [
-                {
-                    "asked": asked,
-                    "precision": float(right[accepted].double().mean()) if accepted.any() else None,
-                    "kept": int((accepted & right).sum()) / max(1, int(right.sum())),
-                }
-                for asked, accepted in ((asked, probability >= asked) for asked in ASKED)
-            ],
+            "precision": [],
         }
+        facts["expected_calibration_error"] = calibration_error(probability, right, BINS)
+        for asked in ASKED:
+            kept = probability >= asked
+            reached = float(right[kept].double().mean()) if kept.any() else None
+            share = int((kept & right).sum()) / max(1, int(right.sum()))
+            facts["precision"].append({"asked": asked, "precision": reached, "kept": share})
     return {"rejection": facts}
 
 
 def judged(match: Match, truth: GroundTruth, tolerance: int) -> tuple[Tensor, Tensor]:
-    """Probability (n,) of the queries that the scores count, and whether they are right (n,) bool."""
+    """Probability (n,) of the queries that are scored, and whether they are right (n,) bool."""
     assert match.probability is not None
     kept = counted(match.index, truth, tolerance)
     return match.probability[kept], is_right(match.index[kept], truth.positives[kept], tolerance)
 
 
 def rejection_table(facts: Mapping[str, Any]) -> list[list[str]]:
-    """What is accepted at each precision that is asked for, as rows of text, the header first."""
+    """What is accepted at each requested precision, as rows of text, the header first."""
     own, off_map = facts.get("precision"), facts.get("off_map", {})
     if own is None and not off_map:
         return []
@@ -75,36 +68,29 @@ def rejection_table(facts: Mapping[str, Any]) -> list[list[str]]:
     return rows
 
 
-def draw_reliability(match: Match, truth: GroundTruth | None, tolerance: int) -> dict[str, Picture]:
-    """Shares of right answers over their probability; nothing without probabilities or truth."""
+def draw_reliability(match: Match, truth: GroundTruth | None, tolerance: int) -> Pictures:
+    """The share of right answers over their probability; empty without probabilities or truth."""
     if match.probability is None or truth is None:
         return {}
     probability, right = judged(match, truth, tolerance)
     if not len(right):
         return {}
-    counts, told, good = binned(probability, right, BINS)
+    counts, sums, good = binned(probability, right, BINS)
     figure, (above, below) = canvas(4.2, 2, sharex=True, height_ratios=[3, 1])
     above.plot([0, 1], [0, 1], color=GREY, linewidth=0.8, linestyle=":")
     filled = counts > 0
-    means, shares = told[filled] / counts[filled], good[filled] / counts[filled]
+    means, shares = sums[filled] / counts[filled], good[filled] / counts[filled]
     above.plot(means, shares, color=DARK, linewidth=1)
     sizes = 14 + 120 * (counts[filled] / counts.max()).sqrt()
     above.scatter(means, shares, s=sizes, color=RIGHT, zorder=3)
     above.set(ylabel="share that is right", xlim=(-0.03, 1.03), ylim=(-0.06, 1.06))
     below.bar((torch.arange(BINS) + 0.5) / BINS, counts, width=0.9 / BINS, color=GREY)
-    below.set(xlabel="probability that the map gives", ylabel="queries", yscale="symlog", ylim=(0, None))
-    error = calibration_error(probability, right, BINS)
-    picture = Picture(
-        (figure, (above, below)),
-        "can the probabilities be trusted?",
-        "Answers of like probability, and how many of them are right. On the dotted line a probability is "
-        f"what it says; the expected calibration error is {error:.3f}.",
-    )
-    return {"reliability": picture}
+    below.set(xlabel="probability of being right", ylabel="queries", yscale="symlog", ylim=(0, None))
+    return picture("reliability", (figure, (above, below)), error=calibration_error(probability, right, BINS))
 
 
 def calibration_error(probability: Tensor, right: Tensor, bins: int = 10) -> float:
-    """Expected calibration error: how far probabilities lie from the shares of right answers, on average.
+    """Expected calibration error: the mean distance of probabilities from the shares of right answers.
 
     Shape: probability (n,) and right (n,) bool -> a number from 0 to 1; NaN without answers.
 
@@ -116,12 +102,12 @@ def calibration_error(probability: Tensor, right: Tensor, bins: int = 10) -> flo
     """
     if not len(right):
         return math.nan
-    _, told, good = binned(probability, right, bins)
-    return float((told - good).abs().sum()) / len(right)
+    _, sums, good = binned(probability, right, bins)
+    return float((sums - good).abs().sum()) / len(right)
 
 
 def binned(probability: Tensor, right: Tensor, bins: int) -> Tensor:
-    """In each bin of probability: answers, the sum of their probabilities, right ones; (3,bins)."""
+    """For each bin of probability: answers, the sum of their probabilities, right answers; (3,bins)."""
     probability = probability.double()
     columns = torch.stack([torch.ones_like(probability), probability, right.double()])
     bin_of = (probability * bins).long().clamp(0, bins - 1)

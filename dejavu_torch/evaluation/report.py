@@ -1,4 +1,4 @@
-"""A run's scores as report.json, PNG pictures, one page a person can read, and a table for the terminal."""
+"""The report of a run: report.json, PNG pictures, an HTML page, and a table for the terminal."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 from dejavu_torch.data.output import whole_folder
 from dejavu_torch.evaluation.answers import next_steps, told_line, told_probable
 from dejavu_torch.evaluation.contenders import Contender, colour_of, distinct, sequences_as_json
-from dejavu_torch.evaluation.plots import Picture
+from dejavu_torch.evaluation.plots import Picture, Pictures
 from dejavu_torch.evaluation.prose import sentences, templates
 from dejavu_torch.evaluation.rejection import rejection_table
 from dejavu_torch.recognition.select import PROBABLE
@@ -29,9 +29,9 @@ PICTURES = (
     *("spectrogram", "templates", "features", "activations", "autocorrelogram", "layers"),
     *("spectrum", "components", "posterior", "reliability"),
 )
-LATE = 0.1  # recall at which a curve starts late
-HEADING = 11  # letters of a line of a heading
-SIZES = (1.0, 5.0)  # route bytes per place that stand in the table beside the map's own
+LATE = 0.1  # a curve that starts at a higher recall starts late
+HEADING = 11  # letters in a line of a heading
+SIZES = (1.0, 5.0)  # route bytes per place at which the table also lists the map
 
 _MAIN = {"auc": "AUC", "recall_at_1": "recall@1", "recall_at_100_precision": "R@100P"}
 _MORE = {
@@ -42,12 +42,11 @@ _MORE = {
 
 
 class Report(NamedTuple):
-    """Everything report.json holds.
+    """The content of report.json.
 
-    ours: the scores that are reported, which stand at top level. contenders: entries by key, such as
-    `uncompressed`, that they stand beside; there may be none. facts: the other top-level keys, of which
-    `queries`, `tolerance`, `recall_definition`, `version` and `torch` must be there; the page mentions
-    others, such as `frames` and `seconds_learn`, only where they are.
+    ours: the scores at top level. contenders: the nested entries by key, such as `uncompressed`; may be
+    empty. facts: the other top-level keys. `queries`, `tolerance`, `recall_definition`, `version` and `torch`
+    are required; others, such as `frames` and `seconds_learn`, are optional on the page.
     """
 
     ours: Contender
@@ -61,24 +60,21 @@ class Report(NamedTuple):
         return dict(self.facts) | scores | nested
 
     def shown(self) -> dict[str, Contender]:
-        """The rows of a table by key: ours as `map`, and the others that store something else each."""
+        """The rows of a table by key: ours as `map`, and the distinct others."""
         return {"map": self.ours, **distinct(self.contenders)}
 
     def __repr__(self) -> str:
-        """What was scored, the main scores, and what else there is, in three lines."""
+        """The first sentence of the summary, the main scores, and the other contenders."""
         rows = score_table(self._replace(contenders={}))
         scores = ", ".join(f"{name} {value}" for name, value in zip(*rows[:2], strict=True) if name)
-        beside = f"; beside it {', '.join(self.contenders)}" if self.contenders else ""
+        others = f"; compared with {', '.join(self.contenders)}" if self.contenders else ""
         first = summary(self).partition(". ")[0].rstrip(".")
         line = told_line(self.facts, bool(scores))
-        return "\n".join(filter(None, [first, f"{scores}{beside}", line, "all of report.json: as_json()"]))
+        return "\n".join(filter(None, [first, f"{scores}{others}", line, "all of report.json: as_json()"]))
 
 
 def score_table(report: Report, every: bool = False) -> list[list[str]]:
-    """The scores as rows of text, the header first; no rows where nothing is scored.
-
-    There are bytes only where the number of frames is known.
-    """
+    """The scores as rows of text, the header first, with bytes if the number of frames is known."""
     if not any(one.scores for one in report.shown().values()):
         return []
     frames, columns = report.facts.get("frames"), _MAIN | (_MORE if every else {})
@@ -93,25 +89,22 @@ def score_table(report: Report, every: bool = False) -> list[list[str]]:
                 size = [f"{one.bytes}", f"{one.bytes / frames:.1f}", f"{one.route_bytes / frames:.1f}"]
             row += size if every else size[1:]
         rows.append(row)
-    for size in report.facts.get("storage", {}).get("map", ()):  # behind ours, the largest first
+    for size in report.facts.get("storage", {}).get("map", ()):  # after ours, the largest first
         route, scores = size["route_bytes_per_place"], [size.get(field) for field in columns]
         if frames and any(math.isclose(route, one, rel_tol=0.02) for one in SIZES):
-            whole = route * frames + report.ours.fixed
-            row = ["" if one is None else f"{one:.3f}" for one in scores] + [f"{whole:.0f}"] * every
-            rows.insert(2, [_in_bytes(route), *row, f"{whole / frames:.1f}", f"{route:.1f}"])
+            total = route * frames + report.ours.fixed
+            row = ["" if one is None else f"{one:.3f}" for one in scores] + [f"{total:.0f}"] * every
+            rows.insert(2, [_in_bytes(route), *row, f"{total / frames:.1f}", f"{route:.1f}"])
     return rows
 
 
 def _in_bytes(route: float) -> str:
-    """The name of the run's descriptors coded at another size."""
+    """The name of the map coded at another size."""
     return f"the map in {route:.2g} route byte{'s' * (round(route, 1) != 1)} per place"
 
 
 def sequence_table(report: Report) -> list[list[str]]:
-    """AUC over the number T of queries matched together, and of a filter, as rows of text, the header first.
-
-    No rows where there are only single queries.
-    """
+    """AUC by the number T of queries matched together, and of a filter; empty without sequences."""
     found = {one.name: sequences_as_json(one.by_length) for one in report.shown().values() if one.sequences}
     for size in report.facts.get("storage", {}).get("map", ()):
         if "sequences" in size:
@@ -131,10 +124,7 @@ def is_late(contender: Contender) -> bool:
 
 
 def text_table(rows: list[list[str]]) -> str:
-    """Rows as aligned text: the first column to the left, the others to the right.
-
-    Long headings take several lines.
-    """
+    """Rows as aligned text, the first column to the left, the others to the right, with wrapped headings."""
     if not rows:
         return ""
     headings = [wrap(cell, HEADING, break_long_words=False)[::-1] for cell in rows[0]]
@@ -146,26 +136,26 @@ def text_table(rows: list[list[str]]) -> str:
 
 
 def headline(report: Report) -> str:
-    """What was done and how good it is, in plain words."""
-    return _told(report, "headline")
+    """The main results in plain words."""
+    return _sentences(report, "headline")
 
 
 def summary(report: Report) -> str:
-    """What was scored, in a few sentences: those that the facts allow."""
-    return _told(report, "summary")
+    """The counts, thresholds and times in a few sentences."""
+    return _sentences(report, "summary")
 
 
 def verdict(report: Report) -> str:
     """Whether it worked, in a sentence or two."""
-    return _told(report, "verdict")
+    return _sentences(report, "verdict")
 
 
 def steps(report: Report) -> list[str]:
-    """What to do next, a sentence each."""
-    return [step.strip() for step in _told(report, "next").split("¶") if step.strip()]
+    """What to do next, one sentence each."""
+    return [step.strip() for step in _sentences(report, "next").split("¶") if step.strip()]
 
 
-def _told(report: Report, part: str) -> str:
+def _sentences(report: Report, part: str) -> str:
     facts, scores = report.facts, report.ours.scores
     counts = facts.get("probably_right")
     return sentences(
@@ -185,53 +175,44 @@ def _told(report: Report, part: str) -> str:
 
 
 def steps_after(facts: Mapping[str, Any]) -> str:
-    """What to try next where nothing is scored, but probabilities are known; else ""."""
+    """What to try next if there are probabilities; else ""."""
     if "probably_right" not in facts:
         return ""
     together = bool(facts.get("filter")) or facts.get("sequence", 1) > 1
     strict = facts.get("threshold") is not None or (facts.get("least_probability") or 0) > PROBABLE
-    return "; ".join([*next_steps(together, strict), "--truth scores the answers"])
+    return "; ".join([*next_steps(together, strict), "--truth evaluates the answers"])
 
 
-def as_html(report: Report, pictures: Mapping[str, Picture]) -> str:
-    """The table of scores and two pictures, for a notebook; nothing in it lies in another file."""
+def as_html(report: Report, pictures: Pictures) -> str:
+    """The table of scores and two pictures for a notebook, without references to other files."""
     shown = [name for name in ("pr", "coverage", "pairs") if name in pictures][:2]
     rows = [[html.escape(printable(cell)) for cell in row] for row in score_table(report)]
     table = [f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows]
-    images = [
-        f'<img src="{_embedded(as_png(pictures[name]))}" style="width:25rem" alt="{name}"/>' for name in shown
-    ]
+    style = 'style="width:25rem"'
+    images = [f'<img src="{_embedded(as_png(pictures[name]))}" {style} alt="{name}"/>' for name in shown]
     text = html.escape(printable(summary(report)))
     return f"<table>{''.join(table)}</table><p>{text}</p>{''.join(images)}"
 
 
 def report_folder(path: Path) -> AbstractContextManager[Path]:
-    """`whole_folder` for a report and what lies beside it; pictures of an earlier report are removed.
-
-    Raises:
-        InputError: the folder cannot be made or written in.
-    """
+    """`whole_folder` for a report, without pictures of an earlier one; an InputError if not writable."""
     return whole_folder(path, [f"{name}.png" for name in PICTURES])
 
 
 def write_report(
-    folder: Path,
-    report: Report,
-    pictures: Mapping[str, Picture],
-    title: str,
-    command: str,
-    plan: str | None = None,
+    folder: Path, report: Report, pictures: Pictures, title: str, command: str, plan: str | None = None
 ) -> None:
-    """Write report.json, one PNG for each picture, and index.html with all of it inside."""
+    """Write report.json, a PNG for each picture, and index.html, which contains all of these."""
     facts, shown, embedded = report.facts, report.shown(), {}
     for name, picture in pictures.items():
         data = as_png(picture)
         (folder / f"{name}.png").write_bytes(data)
         embedded[name] = (picture, _embedded(data))
     first = next((name for name in ("pairs", "coverage") if name in embedded), "")
-    coded = [size for size in facts.get("storage", {}).get("map", ()) if "sequences" in size]
+    coded = ["map" for size in facts.get("storage", {}).get("map", ()) if "sequences" in size]
+    sequenced = [*(key for key, one in shown.items() if one.sequences), *coded]
     rows = score_table(report)
-    sizes = ["map"] * max(0, len(rows) - 1 - len(shown))  # rows of our descriptors in other sizes
+    sizes = ["map"] * max(0, len(rows) - 1 - len(shown))  # rows of the map at other sizes
     _write_page(
         folder,
         title=printable(title),
@@ -243,8 +224,7 @@ def write_report(
         rows=rows,
         colours=[colour_of(key) for key in (*sizes, *shown)],
         sequence_rows=sequence_table(report),
-        sequence_colours=[colour_of(key) for key, one in shown.items() if one.sequences]
-        + [colour_of("map")] * len(coded),
+        sequence_colours=[colour_of(key) for key in sequenced],
         rejection_rows=rejection_table(facts.get("rejection", {})),
         every_row=score_table(report, every=True),
         contenders=report.contenders,
@@ -266,7 +246,7 @@ def write_index(
     title: str,
     command: str,
 ) -> None:
-    """Write index.html over several reports, with one table and one picture, and links to their pages."""
+    """Write the index.html of several reports, with one table, one picture, and links to their pages."""
     parts = {"title": printable(title), "notes": notes, "links": pages, "rows": rows}
     pictures = [(picture, _embedded(as_png(picture)))]
     _write_page(folder, **parts, pictures=pictures, made_by=printable(command))
@@ -285,5 +265,5 @@ def _embedded(png: bytes) -> str:
 
 def _write_page(folder: Path, **parts: Any) -> None:
     text = templates(page=True).get_template("report.html.j2").render(parts)
-    # names may hold what is no text
+    # names may hold bytes that are not text
     (folder / "index.html").write_text(text, encoding="utf-8", errors="backslashreplace")

@@ -1,4 +1,4 @@
-"""The paper's experiments on simulated routes, beside the paper's own figures (section V)."""
+"""The paper's experiments (section V) on simulated routes, with the paper's figures."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from dejavu_torch.evaluation.controls import leave_out_match, template_map_of, w
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.paper_tables import PUBLISHED
 from dejavu_torch.evaluation.pictures import paper_pictures
-from dejavu_torch.evaluation.plots import Picture
+from dejavu_torch.evaluation.plots import Picture, picture
 from dejavu_torch.evaluation.report import Report
 from dejavu_torch.evaluation.score_plots import Length, plot_lengths
 from dejavu_torch.maps.template_map import TemplateMapper
@@ -28,15 +28,15 @@ from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.types import InputError, Match, Traverse
 
 LENGTHS = (256, 512, 1024, 2048)
-PATCH = (32, 32)  # pixels: as many rows as the region of ground has in a frame, and some more
-SETTINGS = ("min_period", "strongest", "peaks", "false_alarm", "short")  # of the analysis, but for its chunks
+PATCH = (32, 32)  # pixels: slightly more rows than the region of ground has in a frame
+SETTINGS = ("min_period", "strongest", "peaks", "false_alarm", "short")  # of the analysis, except its chunks
 
 
 def paper_model(reference: Traverse | None = None) -> DejaVu:
-    """The settings of configs/paper.yaml, the paper to the letter.
+    """The settings of configs/paper.yaml, which follow the paper literally.
 
     Args:
-        reference: a traverse whose `corners`, where it has one, gives the velocity (section IV-B).
+        reference: a traverse; if it has `corners`, they give the velocity (section IV-B).
     """
     periods = SpectrogramAnalysis(min_period=8, peaks="bins", false_alarm=None, short="refuse")
     ground = getattr(reference, "corners", None)
@@ -60,19 +60,18 @@ def reproduce(
         dataset: a key of `PUBLISHED`.
         model: settings; None is `paper_model` of the dataset.
         tolerance: places within which one is right, inclusive.
-        seed: of the simulated route. frames: its length, None is the simulator's own.
-        lengths: of chunks, in places, to compare.
+        seed: of the simulated route. frames: its length; None is the simulator's default.
+        lengths: chunk lengths to compare, in places.
         progress: show progress bars on a terminal.
 
     Returns:
-        The comparison of the second traverse, with more entries in its report:
+        The comparison of the second traverse, with additional entries in its report:
 
         - `ideal`, the paper's conditions: the database itself is queried, and every frame is part of its own
-          templates; `ideal_leave_out`, where all frames within the tolerance of the query are left out of
-          every mean;
-        - `comparable` and `known_boundaries`, on a route whose simulator knows its structures, see
+          templates; `ideal_leave_out`, without the frames within the tolerance of the query in any mean;
+        - `comparable` and `known_boundaries`, if the simulator knows the route's structures, see
           `known_boundaries`; the fact `boundaries` has their `BoundaryEffect`;
-        - the facts `published`, `chunk_lengths`, a `Length` each, and `measured_distance` of a train.
+        - the facts `published`, `chunk_lengths` (a `Length` each), and `measured_distance` of a train.
 
     Raises:
         InputError: an unknown dataset, or bad input of any of the stages.
@@ -107,14 +106,12 @@ def reproduce(
         contenders |= {key: contender for key, (contender, _) in boundaries.items()}
         effects = {key: effect._asdict() for key, (_, effect) in boundaries.items()}
         facts["boundaries"] = {"cuts": len(cuts), **effects}
-    pictures = paper_pictures(result.run)
-    return result._replace(
-        report=Report(result.report.ours, contenders, facts), pictures={**pictures, **result.pictures}
-    )
+    report, pictures = Report(result.report.ours, contenders, facts), paper_pictures(result.run)
+    return result._replace(report=report, pictures={**pictures, **result.pictures})
 
 
 def chunk_lengths(result: Comparison, tolerance: int = 5, lengths: Sequence[int] = LENGTHS) -> list[Length]:
-    """Recall and storage of maps whose chunks have other lengths (section VI)."""
+    """Recall and storage of maps with chunks of other lengths (section VI)."""
     mapper, places = _mapper(result.run.model), len(result.run.reference_features)
     if result.run.truth is None or mapper is None:
         return []
@@ -132,19 +129,12 @@ def chunk_lengths(result: Comparison, tolerance: int = 5, lengths: Sequence[int]
 
 def lengths_picture(reports: Mapping[str, Report]) -> Picture:
     """Recall and bytes over the length of the chunks, a line for each dataset."""
-    rows = {
-        name: [Length(**row) for row in report.facts["chunk_lengths"]] for name, report in reports.items()
-    }
-    return Picture(
-        plot_lengths(rows),
-        "how long should a chunk be?",
-        "Recall on the second traverse, and bytes per place, of maps whose chunks have other lengths. The "
-        "paper's is 1024 frames. Dotted: with the printed sum, which favours a last chunk that is shorter.",
-    )
+    lengths = {name: [Length(**row) for row in one.facts["chunk_lengths"]] for name, one in reports.items()}
+    return picture("lengths", plot_lengths(lengths))["lengths"]
 
 
 def measured_distance(resampled: ResampledTraverse) -> float | None:
-    """The distance that the ground shows, as a share of what a simulated train travels; None elsewhere."""
+    """The distance measured on the ground, as a share of a simulated train's true one; None otherwise."""
     span, metres = (getattr(resampled.traverse, name, None) for name in ("ground_span", "distance"))
     if span is None or metres is None:
         return None
@@ -154,7 +144,7 @@ def measured_distance(resampled: ResampledTraverse) -> float | None:
 
 
 def structure_cuts(reference: Traverse) -> list[int]:
-    """Reference frames at which something that repeats starts or stops, where the traverse knows.
+    """Reference frames at which a repeating structure starts or stops; empty if the traverse has none.
 
     A simulated railway has `structures`, (name, period, start, stop) in metres, and `distance`, (N,)
     metres of each frame.
@@ -169,17 +159,14 @@ def structure_cuts(reference: Traverse) -> list[int]:
 
 
 class GivenChunks(SpectrogramAnalysis):
-    """The spectrogram analysis on chunks that are known beforehand.
-
-    Convention: a piece of fewer than two of the shortest periods joins the piece before it.
-    """
+    """The spectrogram analysis on given chunks; one shorter than 2 * min_period joins the one before it."""
 
     def __init__(self, cuts: Sequence[int], **settings: Any) -> None:
         super().__init__(**settings)
         self.cuts = list(cuts)
 
     def chunks(self, places: int) -> list[tuple[int, int]]:
-        """The chunks [start, stop) of a route of so many places."""
+        """The chunks [start, stop) of a route of this many places."""
         shortest = 2 * self.min_period
         if places < shortest:
             raise InputError(f"the route has {places} places; expected at least {shortest}, two periods")
@@ -191,11 +178,7 @@ class GivenChunks(SpectrogramAnalysis):
 
 
 class BoundaryEffect(NamedTuple):
-    """Recall@1 of queries near to where something starts or stops, and of the others.
-
-    near: places within which a query counts as near. queries_near, queries_far: how many there are.
-    recall_at_1_near, recall_at_1_far: None where there are none.
-    """
+    """Recall@1 of the queries within `near` places of a cut, and of the others; None without any."""
 
     near: int
     queries_near: int
@@ -207,12 +190,9 @@ class BoundaryEffect(NamedTuple):
 def boundary_effect(
     match: Match, truth: GroundTruth, cuts: Sequence[int], tolerance: int, near: int = 32
 ) -> BoundaryEffect:
-    """Recall@1 near to the cuts and far from them.
-
-    Shape: match and truth of Q queries.
-    """
+    """Recall@1 near the cuts, places at which a structure starts or stops, and far from them."""
     if not cuts:
-        raise InputError("there are no cuts; expected at least one place at which something starts or stops")
+        raise InputError("there are no cuts; expected at least one place where a structure starts or stops")
     answered = counted(match.index, truth, tolerance) & (truth.positives >= 0).any(1)
     right = is_right(match.index, truth.positives, tolerance)
     distance = (truth.positives[:, :, None] - torch.tensor(list(cuts))).abs().amin(2)
@@ -228,16 +208,10 @@ def boundary_effect(
 def known_boundaries(
     result: Comparison, cuts: Sequence[int], tolerance: int
 ) -> dict[str, tuple[Contender, BoundaryEffect]]:
-    """What it costs that chunks do not end where what repeats starts and stops (section V, underground).
-
-    Raises:
-        InputError: a comparison without ground truth, or with periods of another finder.
-    """
+    """The cost of chunks that do not end where structures start and stop (section V, underground)."""
     mapper, truth = _mapper(result.run.model), result.run.truth
     if truth is None or mapper is None:
-        raise InputError(
-            "known boundaries need a ground truth and SpectrogramAnalysis; this comparison has not both"
-        )
+        raise InputError("the comparison lacks a ground truth or SpectrogramAnalysis; expected both")
     same, given = "the same chunks", "chunks cut where structures start and stop"
     ways = {
         "comparable": (same, mapper.periods),
@@ -254,7 +228,7 @@ def known_boundaries(
 
 
 def _mapper(model: DejaVu) -> TemplateMapper | None:
-    """The model's mapper, where it is one of templates on a spectrogram analysis."""
+    """The model's mapper, if it makes templates from a spectrogram analysis."""
     mapper = model.mapper
     if isinstance(mapper, TemplateMapper) and isinstance(mapper.periods, SpectrogramAnalysis):
         return mapper
@@ -262,16 +236,16 @@ def _mapper(model: DejaVu) -> TemplateMapper | None:
 
 
 def _settings(mapper: TemplateMapper) -> dict[str, Any]:
-    """The settings of a spectrogram analysis, but for its chunks."""
+    """The settings of a spectrogram analysis, except its chunks."""
     return {name: getattr(mapper.periods, name) for name in SETTINGS}
 
 
 def _learned(result: Comparison, mapper: TemplateMapper) -> DejaVu:
-    """The model of a comparison with a map of another mapper."""
+    """The model of a comparison, with a map by another mapper."""
     model = with_mapper(result.run.model, mapper)
     return model.learn_features(result.run.reference_features, result.run.reference)
 
 
 def _localized(model: DejaVu, result: Comparison) -> Match:
-    """At the place of the frame that each match shows, as a ground truth in frames counts."""
+    """The matches of a model, with the places that are scored."""
     return model.localize(result.run.query_features).renumbered(model.map.table.scored)

@@ -1,4 +1,4 @@
-"""Pictures of scores: curves, areas, chunk lengths and running times."""
+"""Pictures of scores: curves, areas, storage, sequences and chunk lengths."""
 
 from __future__ import annotations
 
@@ -10,23 +10,20 @@ from typing import Any, NamedTuple
 
 from dejavu_torch.evaluation.contenders import COLOURS, Contender, colour_of, distinct, sequences_as_json
 from dejavu_torch.evaluation.curves import Scores
-from dejavu_torch.evaluation.plots import LETTERS, LINE, Picture, Plot, canvas, label, picture
+from dejavu_torch.evaluation.plots import LETTERS, LINE, Pictures, Plot, canvas, label, picture
 from dejavu_torch.types import Together
 
 _SHADES = (COLOURS["map"], "#00406b", "#5aa9d6")  # one map on several datasets
-NOTICED = 0.001  # of an area: less is no gain
-SHOWN = (1.0, 2.5, 5.0)  # route bytes per place at which the map is shown as well
-ALIKE = 1.1  # times the bytes: sizes whose lines would lie on each other
-LOWEST, HIGHEST = 0.01, 0.999  # areas, where more and less is drawn as this
+MIN_GAIN = 0.001  # of an area
+SHOWN = (1.0, 2.5, 5.0)  # route bytes per place at which the map is also drawn
+MIN_RATIO = 1.1  # of bytes, between two sizes that are drawn
+LOWEST, HIGHEST = 0.01, 0.999  # limits at which areas are drawn
 _LINES = {"hog": "--", "null": ":"}  # by the first part of a key
 _HATCHES = {"hog": "...", "null": "///"}
 
 
 class Stored(NamedTuple):
-    """What a route is recognised at where it takes so many bytes.
-
-    sequences: as of a `Contender`.
-    """
+    """The scores of a route coded at this size; `sequences` as in a `Contender`."""
 
     route_bytes_per_place: float
     auc: float
@@ -35,12 +32,12 @@ class Stored(NamedTuple):
 
     def as_json(self) -> dict[str, Any]:
         """The entry of report.json."""
-        found = self._asdict() | {"sequences": sequences_as_json(self.sequences)}
-        return {name: value for name, value in found.items() if value != {}}
+        entry = self._asdict() | {"sequences": sequences_as_json(self.sequences)}
+        return {name: value for name, value in entry.items() if value != {}}
 
 
 class Length(NamedTuple):
-    """What a map with chunks of `window` places recognises, and what it stores.
+    """Scores and storage of a map with chunks of `window` places.
 
     recall_at_1_comparable: with scores that are comparable between chunks, `reduction="mean"`.
     """
@@ -59,19 +56,19 @@ def _style(key: str) -> dict[str, Any]:
     return {"color": colour_of(key), "linestyle": line, "linewidth": 2.4 if key == "map" else 1.6}
 
 
-def draw_curves(contenders: Mapping[str, Contender], tolerance: str) -> dict[str, Picture]:
-    """Precision over recall (figures 8 to 10 of the paper) and, of several curves, the areas below them."""
+def draw_curves(contenders: Mapping[str, Contender], tolerance: str) -> Pictures:
+    """Precision over recall (figures 8 to 10 of the paper) and, for several curves, the areas under them."""
     shown = [
         (key, label(one.name), one.curve, one.scores.auc)
         for key, one in distinct(contenders).items()
-        if one.curve and one.scores and key != "leave_out"  # which has other queries
+        if one.curve and one.scores and key != "leave_out"  # its queries are others
     ]
     if not shown:
         return {}
     figure, axis = canvas(3.4 + 1.1 * LINE * sum(len(wrap(name, LETTERS - 8)) for _, name, *_ in shown))
     for key, name, curve, _ in reversed(shown):  # the first on top
-        silent = " (reports nothing)" if len(curve.recall) == 0 else ""
-        axis.plot(curve.recall, curve.precision, label=fill(name + silent, LETTERS - 8), **_style(key))
+        name += " (reports nothing)" * (len(curve.recall) == 0)
+        axis.plot(curve.recall, curve.precision, label=fill(name, LETTERS - 8), **_style(key))
     axis.set(xlim=(0, 1.01), ylim=(0, 1.02), xlabel="recall (of all queries)", ylabel="precision")
     axis.set_title(f"right within {tolerance}", fontsize=10)
     axis.grid(alpha=0.25)
@@ -93,7 +90,7 @@ def draw_curves(contenders: Mapping[str, Contender], tolerance: str) -> dict[str
 
 
 def plot_lengths(datasets: Mapping[str, Sequence[Length]]) -> Plot:
-    """Recall and storage over the length of the chunks (section VI)."""
+    """Recall and storage over the chunk length (section VI)."""
     figure, (above, below) = canvas(4.6, 2, sharex=True)
     for number, (name, rows) in enumerate(datasets.items()):
         colour, mark = _SHADES[number % len(_SHADES)], "osD^v"[number % 5]
@@ -118,11 +115,11 @@ def plot_lengths(datasets: Mapping[str, Sequence[Length]]) -> Plot:
 
 def draw_storage(
     contenders: Mapping[str, Contender], storage: Mapping[str, Sequence[Stored]], tolerance: str
-) -> dict[str, Picture]:
-    """Areas over bytes; nothing where there are none."""
+) -> Pictures:
+    """Areas over bytes; empty without any."""
     names = {
         "map": "this map",
-        "null": "null: the same in shuffled order",
+        "null": "null: the same, shuffled",
         "interpolated": "keyframes in int8, interpolated",
     }
     curves = {key: points for key, points in storage.items() if points}
@@ -157,11 +154,10 @@ def draw_storage(
 
 def draw_sequences(
     contenders: Mapping[str, Contender], coded: Sequence[Stored], places: int, tolerance: str
-) -> dict[str, Picture]:
-    """Areas over the number of queries matched together, and of a filter behind; nothing where single ones
-    are.
+) -> Pictures:
+    """Areas over the number of queries matched together, and of a filter; empty without T > 1.
 
-    The map is drawn at some of the sizes that it is coded at as well, unless it has about that size itself.
+    The map is also drawn at some of its other sizes, if they differ enough.
     """
     lines = {key: one for key, one in distinct(contenders).items() if one.sequences}
     if not lines:
@@ -174,9 +170,10 @@ def draw_sequences(
         for budget in SHOWN if coded[0].sequences else ():
             nearest = min(coded, key=lambda size: abs(size.route_bytes_per_place - budget))
             size = nearest.route_bytes_per_place
-            if all(max(size, other) > ALIKE * min(size, other) for other in sizes):
+            if all(max(size, other) > MIN_RATIO * min(size, other) for other in sizes):
                 mark = {"marker": "osD^"[len(sizes)], "markerfacecolor": "white", "linewidth": 1.0}
-                drawn.insert(len(sizes), (f"the same in {size:.3g} bytes", nearest.sequences, style | mark))
+                name = f"the map in {size:.3g} byte{'s' * (f'{size:.3g}' != '1')}"
+                drawn.insert(len(sizes), (name, nearest.sequences, style | mark))
                 sizes.append(size)
     figure, axis = canvas(3.6 + 1.1 * LINE * sum(len(wrap(name, LETTERS - 8)) for name, *_ in drawn))
     lengths = sorted({T for _, found, _ in drawn for T in found if T != "filter"})
@@ -196,10 +193,10 @@ def draw_sequences(
 
 
 def equally_good(ours: Sequence[Stored], others: Sequence[Stored]) -> list[tuple[float, float]]:
-    """Bytes of ours, and those at which the others reach the same area, where they do.
+    """Pairs of our bytes and the bytes at which the others reach the same area, if they do.
 
-    Convention: between two of their points the area grows with the logarithm of the bytes. Ours counts where
-    it is better, by more than .001, than all that takes less.
+    Convention: between two points of the others the area grows with the logarithm of the bytes. A point of
+    ours is skipped unless it is better, by more than .001, than all smaller ones.
 
     Example:
         >>> others = Stored(4, 0.5, 0.5), Stored(16, 0.9, 0.9)
@@ -207,27 +204,27 @@ def equally_good(ours: Sequence[Stored], others: Sequence[Stored]) -> list[tuple
         >>> ours, round(theirs, 6)
         (1, 8.0)
     """
-    found, best = [], -1.0
+    pairs, best = [], -1.0
     for one in ours:
-        if one.auc <= best + NOTICED:
+        if one.auc <= best + MIN_GAIN:
             continue
         best = one.auc
         for low, high in pairwise(others):
             if low.auc <= one.auc <= high.auc and low.auc < high.auc:
                 share = (one.auc - low.auc) / (high.auc - low.auc)
                 sizes = low.route_bytes_per_place, high.route_bytes_per_place
-                found.append((one.route_bytes_per_place, sizes[0] * (sizes[1] / sizes[0]) ** share))
+                pairs.append((one.route_bytes_per_place, sizes[0] * (sizes[1] / sizes[0]) ** share))
                 break
-    return found
+    return pairs
 
 
 def drawn_areas(areas: Sequence[float]) -> list[float]:
-    """Areas that `area_axis` has room for: those beyond its ends lie there."""
+    """Areas clipped to the range of `area_axis`."""
     return [min(max(area, LOWEST), HIGHEST) for area in areas]
 
 
 def area_axis(axis: Any) -> None:
-    """A logarithmic axis of 1 - area towards 1, and of the area towards 0."""
+    """Make the y axis a logit axis of areas: logarithmic towards 0 and towards 1."""
     axis.set_yscale("logit")
     levels = [LOWEST, 0.1, 0.5, 0.9, 0.99, HIGHEST]
     axis.set_yticks(levels, [f"{level:g}" for level in levels])

@@ -1,4 +1,4 @@
-"""What a route is recognised at, over the bytes that it may take: the map, its null, and keyframes."""
+"""Scores over route bytes: the map, its null control, and keyframes."""
 
 from __future__ import annotations
 
@@ -27,19 +27,13 @@ BUDGETS = (1.0, 2.5, 5.0, 10.0, 20.0)  # route bytes per place
 def coded_at_sizes(
     run: Localization, budgets: Sequence[float] = BUDGETS, seed: int = 0, progress: bool = False
 ) -> dict[str, list[Stored]]:
-    """The run's descriptors coded anew at several budgets, each evaluated with the run's queries.
-
-    Raises:
-        InputError: a map of another kind, or no ground truth.
-    """
-    run = run._replace(matching=SINGLE) if run.sequence is None else run  # no filter for each size
+    """Code the descriptors of a spectral map at several budgets, and evaluate each with the run's queries."""
+    run = run._replace(matching=SINGLE) if run.sequence is None else run  # without a filter for each size
     route = run.model.map
     if not isinstance(route, SpectralMap) or run.truth is None:
         truth = "no" if run.truth is None else "a"
-        raise InputError(
-            f"a storage curve got a map of kind {route.kind!r} and {truth} ground truth; expected a spectral "
-            "map and a ground truth"
-        )
+        seen = f"a storage curve got a map of kind {route.kind!r} and {truth} ground truth"
+        raise InputError(f"{seen}; expected a spectral map and a ground truth")
     features = run.reference_features
     order, mixed = shuffled(features, seed)
     kinds = {
@@ -53,17 +47,17 @@ def coded_at_sizes(
         for answers, size in kinds[key](budget):
             answers = answers.renumbered(route.table.scored)
             scores = evaluate(answers, run.truth, run.tolerance)
-            beside = evaluate_each(answers.sequences, run.truth, run.tolerance)
-            found[key].append(Stored(size / route.places, scores.auc, scores.recall_at_1, beside))
+            sequences = evaluate_each(answers.sequences, run.truth, run.tolerance)
+            found[key].append(Stored(size / route.places, scores.auc, scores.recall_at_1, sequences))
     return found
 
 
 def noise_over_map(route: SpectralMap, features: Tensor, seed: int = 0) -> float:
-    """Bytes of noise that is as smooth as the route, coded in the map's steps, over those of the map.
+    """Bytes of noise as smooth as the route, coded in the map's steps, divided by those of the map.
 
-    The noise is Gaussian with the spectrum of each number of the descriptor, its energy averaged over half
-    octaves: nothing in it repeats. What the map takes less than this is the most that it can owe to
-    repetition, and all else it owes to smoothness; a trend, or a stretch quieter than others, saves too.
+    The noise is Gaussian with the spectrum of each descriptor dimension, averaged over half octaves, so that
+    nothing in it repeats. The difference is an upper bound of what the map saves by repetition: a trend, or a
+    segment with less energy than others, saves bytes too. All other savings come from smoothness.
     """
     lines = spectrum((features.float() - route.means[0].float()).T, route.transform)
     band = (2 * torch.arange(1, lines.shape[1] + 1, device=lines.device).log2()).long()
@@ -86,7 +80,7 @@ def _coded(
     order: Tensor | None = None,
     resolution: float = 0.0,
 ) -> Iterator[tuple[Match, int]]:
-    """What is found on a map of about so many bytes, and its bytes; nothing where it cannot be met."""
+    """The matches on a map of about this budget, and its bytes; empty if no map can meet it."""
     mapper = SpectralMapper(budget, None, route.chunk, route.transform, route.metric, resolution)
     model = with_mapper(run.model, mapper)
     try:
@@ -98,7 +92,7 @@ def _coded(
 
 
 def _keyframes(run: Localization, route: SpectralMap, budget: float) -> Iterator[tuple[Match, int]]:
-    """What is found among interpolated keyframes of at most so many bytes, and their bytes."""
+    """The matches among interpolated keyframes of at most this budget, and their bytes."""
     between, _, keys = interpolated(as_int8(run.reference_features), budget * route.places)
     size = keys * route.dimension
     if size <= budget * route.places:

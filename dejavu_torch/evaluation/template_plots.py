@@ -1,4 +1,4 @@
-"""Pictures of a template map: its periods, the features of its layers, and how they answer a query."""
+"""Pictures of a template map: its periods, the features of its layers, and its answer to a query."""
 
 from __future__ import annotations
 
@@ -13,24 +13,10 @@ from matplotlib.colors import PowerNorm
 from torch import Tensor
 from torch.nn.functional import max_pool1d
 
+from dejavu_torch.evaluation import plots
 from dejavu_torch.evaluation.activation import activation_rates, layer_distances
 from dejavu_torch.evaluation.localization import Localization, frame_at
 from dejavu_torch.evaluation.map_plots import BLUE, plot_answers
-from dejavu_torch.evaluation.plots import (
-    BOX,
-    DARK,
-    GREY,
-    LABELLED,
-    LAYERS,
-    LINE,
-    PLACE,
-    WIDTH,
-    Picture,
-    canvas,
-    period_axis,
-    picture,
-    show_cells,
-)
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.maps.template_map import TemplateMap
 from dejavu_torch.model import DejaVu
@@ -39,14 +25,14 @@ from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.resize import resize_frames
 from dejavu_torch.types import FrequencyLayer, Plan, Traverse
 
-CANDIDATES = 16  # features of a layer from which the one to show is chosen
-SHOWN = 12  # layers of a chunk
-DOTS = 2000  # along a picture, at least; a longer line is drawn as the range that it covers
-ROWS, CYCLES, MARKED = 64, 100, 12  # templates, cycles and multiples of a period drawn at most
+CANDIDATES = 16  # features of a layer from which one is chosen to be shown
+SHOWN = 12  # layers of a chunk, at most
+DOTS = 2000  # along a picture, at least; a longer line is drawn as a band from its minimum to its maximum
+ROWS, CYCLES, MARKED = 64, 100, 12  # templates, cycles and multiples of a period drawn, at most
 
 
-def draw_template_map(run: Localization, route: TemplateMap) -> dict[str, Picture]:
-    """Every picture of a template map; those of layers are left out where it has none."""
+def draw_template_map(run: Localization, route: TemplateMap) -> plots.Pictures:
+    """All pictures of a template map; without layers only the first."""
     plan, pictures = route.plan, draw_chunks(route.plan, run.borders, run.unit)
     shown = shown_chunk(plan)
     if not shown:
@@ -58,8 +44,8 @@ def draw_template_map(run: Localization, route: TemplateMap) -> dict[str, Pictur
     return pictures | draw_features(run, layers) | draw_activations(run, route, shown)
 
 
-def draw_paper(run: Localization, route: TemplateMap) -> dict[str, Picture]:
-    """The autocorrelogram of a feature, and the layers of its chunk; nothing for a map without layers."""
+def draw_paper(run: Localization, route: TemplateMap) -> plots.Pictures:
+    """The autocorrelogram of a feature, and the layers of its chunk; empty for a map without layers."""
     shown = shown_chunk(route.plan)
     if not shown:
         return {}
@@ -73,7 +59,7 @@ def draw_paper(run: Localization, route: TemplateMap) -> dict[str, Picture]:
 
 
 def layers_by_chunk(plan: Plan) -> dict[tuple[int, int], list[int]]:
-    """Positions of the layers of each chunk, those of most features first."""
+    """Indices of the layers of each chunk, those with the most features first."""
     chunks = defaultdict(list)
     for j in sorted(range(len(plan)), key=lambda j: -len(plan[j].features)):
         chunks[plan[j].start, plan[j].stop].append(j)
@@ -81,19 +67,14 @@ def layers_by_chunk(plan: Plan) -> dict[tuple[int, int], list[int]]:
 
 
 def shown_chunk(plan: Plan) -> list[int]:
-    """Positions of the layers of the chunk that pictures show, those of most features first.
-
-    The chunk is the longest that has two layers, else the longest; of equals the first.
-    """
+    """Indices of the layers of the first longest chunk with two layers, else of the first longest chunk."""
     chunks = layers_by_chunk(plan)
-    best = max(
-        chunks, key=lambda edges: (len(chunks[edges]) > 1, edges[1] - edges[0], -edges[0]), default=None
-    )
-    return [] if best is None else chunks[best]
+    order = sorted(chunks, key=lambda edges: (len(chunks[edges]) > 1, edges[1] - edges[0], -edges[0]))
+    return chunks[order[-1]] if order else []
 
 
 def feature_templates(route: TemplateMap, j: int) -> Tensor:
-    """Templates of one layer in the units of the features, (P,F): trained weights divided out."""
+    """Templates of one layer in the units of the features, (P,F), without trained weights."""
     templates: Tensor = route.blocks()[j].detach().cpu()
     if not len(route.weights):
         return templates
@@ -101,11 +82,9 @@ def feature_templates(route: TemplateMap, j: int) -> Tensor:
 
 
 def best_explained(values: Tensor, layer: FrequencyLayer, templates: Tensor) -> int:
-    """Position in a layer of the feature of which the templates explain the largest share of the variance.
+    """Index in a layer of the feature whose variance the templates explain best: (N,D), (P,F) -> 0..F-1.
 
-    Only the 16 features whose templates vary most are candidates.
-
-    Shape: values (N,D), templates (P,F) -> 0..F-1.
+    Only the 16 features whose templates vary most are considered.
     """
     candidates = templates.var(0, correction=0).argsort(descending=True, stable=True)[:CANDIDATES]
     columns = torch.tensor(layer.features)[candidates].to(values.device)
@@ -115,14 +94,14 @@ def best_explained(values: Tensor, layer: FrequencyLayer, templates: Tensor) -> 
     return int(candidates[share.nan_to_num(-1, neginf=-1).argmax()])
 
 
-def draw_chunks(plan: Plan, borders: Tensor, unit: str) -> dict[str, Picture]:
-    """Chunks along the route and the periods found in each; the wider a bar, the more features."""
-    figure, axis = canvas(3.6)
-    axis.set(xlim=(0, int(borders[-1])), xlabel=PLACE, ylabel=f"period ({unit})")
+def draw_chunks(plan: Plan, borders: Tensor, unit: str) -> plots.Pictures:
+    """The chunks of the route and the periods found in each; the wider a bar, the more features."""
+    figure, axis = plots.canvas(3.6)
+    axis.set(xlim=(0, int(borders[-1])), xlabel=plots.PLACE, ylabel=f"period ({unit})")
     if not plan:
         axis.set(yticks=[])
-        axis.text(0.5, 0.5, "this route does not repeat: no layers", ha="center", transform=axis.transAxes)
-        return picture("chunks", (figure, axis))
+        axis.text(0.5, 0.5, "no layers: nothing repeats", ha="center", transform=axis.transAxes)
+        return plots.picture("chunks", (figure, axis))
     most = max(len(layer.features) for layer in plan)
     chunks = layers_by_chunk(plan)
     for chunk, members in chunks.items():
@@ -131,77 +110,66 @@ def draw_chunks(plan: Plan, borders: Tensor, unit: str) -> dict[str, Picture]:
             share = len(plan[j].features) / most
             style = {"linewidth": 0.6 + 7 * share, "alpha": 0.35 + 0.65 * share}
             axis.hlines(float(plan[j].period), first, last, color=BLUE, **style)
-        for j, along in zip(members if len(chunks) <= LABELLED else (), (0.3, 0.7), strict=False):
+        for j, along in zip(members if len(chunks) <= plots.LABELLED else (), (0.3, 0.7), strict=False):
             where = first + along * (last - first), float(plan[j].period)
-            text = axis.text(*where, f"{where[1]:.4g}", fontsize=9, ha="center", bbox=BOX)
+            text = axis.text(*where, f"{where[1]:.4g}", fontsize=9, ha="center", bbox=plots.BOX)
             text.set_va("center_baseline")
     for edge in {edge for chunk in chunks for edge in chunk}:
-        axis.axvline(int(borders[edge]), color=GREY, linewidth=0.8, linestyle=":")
+        axis.axvline(int(borders[edge]), color=plots.GREY, linewidth=0.8, linestyle=":")
     periods = [float(layer.period) for layer in plan]
-    period_axis(axis, min(periods) / 1.2, max(periods) * 1.2, unit)
+    plots.period_axis(axis, min(periods) / 1.2, max(periods) * 1.2, unit)
     axis.set_title(f"widest bar: {most} features", fontsize=10, loc="left")
-    return picture("chunks", (figure, axis))
+    return plots.picture("chunks", (figure, axis))
 
 
-def draw_layers(layers: Sequence[FrequencyLayer], borders: Tensor, unit: str) -> dict[str, Picture]:
-    """Layers of one chunk and their phases along it (figure 2 of the paper).
-
-    Convention: one row a layer, those of most features, by period; the colour is the phase, so that a
-    column of colours is what names a place.
-    """
+def draw_layers(layers: Sequence[FrequencyLayer], borders: Tensor, unit: str) -> plots.Pictures:
+    """Layers of one chunk, at most those with the most features, and their phases (figure 2 of the paper)."""
     shown = sorted(sorted(layers, key=lambda layer: -len(layer.features))[:SHOWN], key=lambda p: p.period)
     start, stop = shown[0].start, shown[0].stop
-    figure, axis = canvas(0.24 * len(shown) + 1.5)
+    figure, axis = plots.canvas(0.24 * len(shown) + 1.5)
     phases = torch.stack([layer.place_phases / layer.phases for layer in shown])
     x, y = borders[start : stop + 1] - 0.5, torch.arange(len(shown) + 1) - 0.5
-    image = show_cells(axis, x, y, phases, cmap="twilight", vmin=0, vmax=1)
+    image = axis.pcolorfast(x.numpy(), y.numpy(), phases.numpy(), cmap="twilight", vmin=0, vmax=1)
     axis.invert_yaxis()
     axis.set_yticks(range(len(shown)), [f"{float(layer.period):.4g}" for layer in shown])
-    axis.set(xlabel=PLACE, ylabel=f"period ({unit})")
+    axis.set(xlabel=plots.PLACE, ylabel=f"period ({unit})")
     axis.set_title(f"phase in {len(shown)} of {len(layers)} layers", loc="left", fontsize=10)
     figure.colorbar(image, ax=axis, label="phase / period", pad=0.01, aspect=20)
-    return picture("layers", (figure, axis))
+    return plots.picture("layers", (figure, axis))
 
 
-def draw_autocorrelogram(
-    values: Tensor, periods: Sequence[float], feature: int, unit: str
-) -> dict[str, Picture]:
-    """How alike a feature (N,) is to itself some places later (figure 1 (c) of the paper).
-
-    Convention: the biased autocorrelation of the feature minus its mean, 1 at lag 0.
-    """
-    figure, axis = canvas(3)
+def draw_autocorrelogram(values: Tensor, periods: Sequence[float], feature: int, unit: str) -> plots.Pictures:
+    """The biased autocorrelation of a feature (N,) minus its mean (figure 1 (c) of the paper)."""
+    figure, axis = plots.canvas(3)
     spectrum = torch.fft.rfft(values.double() - values.double().mean(), n=2 * len(values)).abs().square()
     correlation = torch.fft.irfft(spectrum)[: len(values)]
-    axis.plot(correlation / correlation[0].clamp(min=1e-30), color=DARK, linewidth=1)
-    for period, colour in zip(periods, LAYERS, strict=False):
+    axis.plot(correlation / correlation[0].clamp(min=1e-30), color=plots.DARK, linewidth=1)
+    for period, colour in zip(periods, plots.LAYERS, strict=False):
         lags = [k * period for k in range(1, MARKED) if k * period < len(values)]
         axis.vlines(lags, -1, 1, color=colour, linewidth=0.9, linestyle=":", label=f"multiples of {period:g}")
     axis.set(xlim=(0, len(values)), ylim=(-1, 1.02), xlabel=f"lag ({unit})", ylabel="autocorrelation")
-    axis.set_title(f"feature {feature} against itself", loc="left", fontsize=10)
+    axis.set_title(f"feature {feature}", loc="left", fontsize=10)
     if periods:
         axis.legend(loc="upper right", ncols=2, frameon=False, fontsize=9)
-    return picture("autocorrelogram", (figure, axis))
+    return plots.picture("autocorrelogram", (figure, axis))
 
 
-def draw_spectrogram(run: Localization, plan: Plan, feature: int) -> dict[str, Picture]:
-    """One feature through time, and its spectrogram, a column a chunk (figure 3 of the paper).
+def draw_spectrogram(run: Localization, plan: Plan, feature: int) -> plots.Pictures:
+    """One feature along the route and its spectrogram, a column per chunk (figure 3 of the paper).
 
-    Nothing where the periods are not those of a spectrogram analysis.
-
-    Convention: where chunks overlap, each column ends where the next begins.
+    Empty for other period finders. If chunks overlap, each column ends at the start of the next.
     """
     analysis, borders = getattr(run.model.mapper, "periods", None), run.borders
     if not isinstance(analysis, SpectrogramAnalysis):
         return {}
     values = run.reference_features[:, feature : feature + 1].cpu()
     spectra = analysis(values)
-    figure, axes = canvas(4.4, 2, sharex=True, height_ratios=(1, 1.7))
+    figure, axes = plots.canvas(4.4, 2, sharex=True, height_ratios=(1, 1.7))
     above, below = axes
     step = max(1, len(values) // DOTS)
     low, high = (sign * max_pool1d(sign * values.T, step, ceil_mode=True)[0] for sign in (-1, 1))
-    above.fill_between(borders[:-1:step], low, high, color=DARK, linewidth=0.4)
-    above.set_title(f"feature {feature} through time", loc="left", fontsize=10)
+    above.fill_between(borders[:-1:step], low, high, color=plots.DARK, linewidth=0.4)
+    above.set_title(f"feature {feature} along the route", loc="left", fontsize=10)
     above.set(ylabel="value")
     shares = [(power[2:] / power[1:].sum()).nan_to_num() for _, _, power in spectra]
     norm = PowerNorm(0.5, 0, 100 * max(1e-6, *(float(share.max()) for share in shares)))
@@ -212,34 +180,34 @@ def draw_spectrogram(run: Localization, plan: Plan, feature: int) -> dict[str, P
         between = (stop - start) / (torch.arange(len(share) + 1) + 1.5)  # two bins
         mesh = below.pcolormesh([left, right], between.numpy(), share.numpy() * 100, norm=norm, cmap="Blues")
         for axis in axes:
-            axis.axvline(left, color=GREY, linewidth=0.8, linestyle=":")
+            axis.axvline(left, color=plots.GREY, linewidth=0.8, linestyle=":")
         for layer in plan:
             if (layer.start, layer.stop) != (start, stop) or feature not in layer.features:
                 continue
             at = (left + right) / 2, float(layer.period)
-            size = 11 if len(spectra) <= LABELLED else 3
-            below.plot(*at, "o", color=LAYERS[0], markersize=size, markerfacecolor="none")
-            if len(spectra) <= LABELLED:
-                style = {"textcoords": "offset points", "va": "center", "fontsize": 9, "bbox": BOX}
+            size = 11 if len(spectra) <= plots.LABELLED else 3
+            below.plot(*at, "o", color=plots.LAYERS[0], markersize=size, markerfacecolor="none")
+            if len(spectra) <= plots.LABELLED:
+                style = {"textcoords": "offset points", "va": "center", "fontsize": 9, "bbox": plots.BOX}
                 below.annotate(f"{at[1]:.4g}", at, (10, 0), **style)
-    figure.colorbar(mesh, ax=below, label="% of its power", pad=0.01, aspect=30)
+    figure.colorbar(mesh, ax=below, label="% of the feature's power", pad=0.01, aspect=30)
     longest = max((stop - start) / 1.5 for start, stop, _ in spectra)
-    period_axis(below, analysis.min_period, longest, run.unit)
-    below.set(xlim=(0, int(borders[-1])), xlabel=PLACE)
+    plots.period_axis(below, analysis.min_period, longest, run.unit)
+    below.set(xlim=(0, int(borders[-1])), xlabel=plots.PLACE)
     below.set_title("power at each period; circles: kept", loc="left", fontsize=10)
-    return picture("spectrogram", (figure, axes))
+    return plots.picture("spectrogram", (figure, axes))
 
 
 def draw_templates(
     run: Localization, layer: FrequencyLayer, templates: Tensor, chosen: int
-) -> dict[str, Picture]:
-    """The places of equal phase averaged into the templates (P,F) of a layer (figure 4 of the paper).
+) -> plots.Pictures:
+    """Places of equal phase, averaged into the templates (P,F) of a layer (figure 4 of the paper).
 
-    Convention: of more than 100 cycles every k-th is drawn. Of more than 64 features those are drawn that
-        vary most from phase to phase; rows are ordered by where in the cycle they are high, each from
-        its lowest (white) to its highest (dark).
+    Convention: of more than 100 cycles every k-th is drawn; of more than 64 features, those that vary most
+        from phase to phase. Rows are sorted by the phase of their maximum, and each is scaled from its
+        minimum (white) to its maximum (dark).
     """
-    figure, (above, below) = canvas(4.8, 2, sharex=True, height_ratios=(1, 1.4))
+    figure, (above, below) = plots.canvas(4.8, 2, sharex=True, height_ratios=(1, 1.4))
     period, feature = float(layer.period), layer.features[chosen]
     values = run.reference_features[layer.start : layer.stop, feature].cpu()
     places = torch.arange(layer.start, layer.stop)
@@ -247,8 +215,8 @@ def draw_templates(
     within = places - cycle.double() * period
     cycles = cycle.unique()
     for one in cycles[:: -(-len(cycles) // CYCLES)]:
-        above.plot(within[cycle == one], values[cycle == one], color=GREY, linewidth=0.6, alpha=0.6)
-    # phase k holds the places that lie from k to k + 1 phases into their cycle
+        above.plot(within[cycle == one], values[cycle == one], color=plots.GREY, linewidth=0.6, alpha=0.6)
+    # phase k covers the places from k to k + 1 phases into their cycle
     phase = (torch.arange(layer.phases) + 0.5) * period / layer.phases - 0.5
     above.plot(phase, templates[:, chosen], color=BLUE, linewidth=2.2)
     thick = "the trained template" if run.model.trained else "their mean"
@@ -262,23 +230,20 @@ def draw_templates(
     image = (image - low) / (high - low).clamp(min=torch.finfo(image.dtype).tiny)
     extent = (-0.5, period - 0.5, len(rows) - 0.5, -0.5)
     below.imshow(image.numpy(), aspect="auto", extent=extent, cmap="Blues", interpolation="nearest")
-    of = f"{len(layer.features)} features"
-    shown = of if len(rows) == len(layer.features) else f"{len(rows)} of {of}"
+    shown = f"{len(rows)} of " * (len(rows) < len(layer.features)) + f"{len(layer.features)} features"
     below.set_title(f"templates of {shown}; dark: highest", loc="left", fontsize=10)
     mark = (rows == chosen).nonzero().flatten().tolist()
     below.set_yticks(mark, [str(feature)] * len(mark))
     below.set(xlabel=f"phase, of a period of {period:.4g} ({run.unit})", ylabel="feature")
     below.set_xlim(-0.5, period - 0.5)
-    return picture("templates", (figure, (above, below)), trained=run.model.trained)
+    return plots.picture("templates", (figure, (above, below)), trained=run.model.trained)
 
 
-def draw_features(run: Localization, layers: Sequence[FrequencyLayer]) -> dict[str, Picture]:
-    """HOG features that take part in a layer, on a frame of the route (figures 15 and 16 of the paper).
+def draw_features(run: Localization, layers: Sequence[FrequencyLayer]) -> plots.Pictures:
+    """The HOG features of a layer, on a frame of the route (figures 15 and 16); empty for other features.
 
-    Nothing for other features than our HOG's.
-
-    Convention: each is drawn as the edge it responds to, across its gradient; the stronger the line, the
-        more of the overlapping blocks have this cell and orientation in the layer.
+    Each is drawn as the edge it responds to. The stronger the line, the more of the overlapping blocks have
+    this cell and orientation in the layer.
     """
     model, hog = run.model, run.model.features
     if type(hog) is not HOG or len(run.reference.frame_shape) != 3:
@@ -288,14 +253,14 @@ def draw_features(run: Localization, layers: Sequence[FrequencyLayer]) -> dict[s
     if grey.min() < 0 or grey.max() > 1:
         grey = (grey - grey.min()) / (grey.max() - grey.min())
     height, width = grey.shape
-    beside = width <= 1.6 * height and width <= 12 * hog.cell
-    rows, columns = (1, len(layers)) if beside else (len(layers), 1)
-    wide = 0.97 * WIDTH / columns
-    tall = min(2 * WIDTH, wide * height / width) + 2 * LINE
-    figure, axes = canvas(tall * rows, rows, columns, squeeze=False)
+    side_by_side = width <= min(1.6 * height, 12 * hog.cell)
+    rows, columns = (1, len(layers)) if side_by_side else (len(layers), 1)
+    wide = 0.97 * plots.WIDTH / columns
+    tall = min(2 * plots.WIDTH, wide * height / width) + 2 * plots.LINE
+    figure, axes = plots.canvas(tall * rows, rows, columns, squeeze=False)
     points = 72 * wide * hog.cell / width  # a cell's side
-    for axis, layer, colour in zip(axes.flat, layers, LAYERS, strict=False):
-        axis.imshow((0.35 + 0.65 * grey).numpy(), cmap="gray", vmin=0, vmax=1)  # pale: lines stand out
+    for axis, layer, colour in zip(axes.flat, layers, plots.LAYERS, strict=False):
+        axis.imshow((0.35 + 0.65 * grey).numpy(), cmap="gray", vmin=0, vmax=1)  # pale, below the lines
         layout = hog.orientations, hog.cell, hog.block
         edges, count = edges_seen(torch.tensor(layer.features), (height, width), *layout)
         strength = count / count.max()
@@ -304,7 +269,7 @@ def draw_features(run: Localization, layers: Sequence[FrequencyLayer]) -> dict[s
         axis.add_collection(lines)
         axis.set_axis_off()
         axis.set_title(f"period {float(layer.period):.4g},\n{len(layer.features)} features", fontsize=10)
-    return picture("features", (figure, axes), frame=int(run.borders[middle]))
+    return plots.picture("features", (figure, axes), frame=int(run.borders[middle]))
 
 
 def as_hog_sees(model: DejaVu, frame: Tensor) -> Tensor:
@@ -319,11 +284,11 @@ def edges_seen(
 ) -> tuple[Tensor, Tensor]:
     """The edges that HOG features respond to, as line segments, and how many of the features share each.
 
-    Shape: (F,) int64 -> (E,2,2) end points (x, y) in pixels, where (0, 0) is the middle of the first pixel;
-        (E,) int64, in how many (overlapping) blocks the features have this cell and orientation.
+    Shape: (F,) int64 -> (E,2,2) end points (x, y) in pixels, with (0, 0) in the middle of the first pixel;
+        (E,) int64, the number of (overlapping) blocks in which the features have this cell and orientation.
 
-    Convention: an edge lies across its gradient, through the middle of its cell. Bin o holds gradients of
-        about (o + 1/2) * 180 / orientations degrees.
+    Convention: an edge is perpendicular to its gradient, through the middle of its cell. Bin o holds
+        gradients of about (o + 1/2) * 180 / orientations degrees.
     """
     rows, columns = (max(0, pixels // cell - block + 1) for pixels in size)
     shape = (rows, columns, block, block, orientations)
@@ -336,11 +301,8 @@ def edges_seen(
     return torch.stack([middle - along, middle + along], 1), count
 
 
-def draw_activations(run: Localization, route: TemplateMap, chunk: Sequence[int]) -> dict[str, Picture]:
-    """Scores of one query over a chunk: two layers of it, and all fused (figure 17 of the paper).
-
-    Nothing where the chunk has one layer.
-    """
+def draw_activations(run: Localization, route: TemplateMap, chunk: list[int]) -> plots.Pictures:
+    """Scores of one query over a chunk, by two of its layers and by all fused (figure 17 of the paper)."""
     if len(chunk) < 2:
         return {}
     plan, chosen = route.plan, chunk[:2]
@@ -359,21 +321,17 @@ def draw_activations(run: Localization, route: TemplateMap, chunk: Sequence[int]
         titles = [f"{title}:\n{rate.describe()}" for title, rate in zip(titles, rates, strict=True)]
         *alone, fused = (rate._asdict() for rate in rates)
         numbers = {"start": start, "stop": stop, "layers": alone, "fused": fused}
-    curves = list(zip(titles, scores, (*LAYERS, BLUE), strict=True))
+    curves = list(zip(titles, scores, (*plots.LAYERS, BLUE), strict=True))
     strip = slit_scan(source_of(run.reference), int(run.borders[start]), int(run.borders[stop]))
     plot = plot_answers(run, query, (start, stop), places, curves, strip)
     facts = {"layers": len(chunk), "within": f"{run.tolerance} {run.unit}", "rates": numbers}
-    return picture("activations", plot, numbers, **facts)
+    return plots.picture("activations", plot, numbers, **facts)
 
 
 def slit_scan(traverse: Traverse, start: int, stop: int) -> Tensor | None:
-    """The middle image column of each of the frames [start, stop), side by side: (C,H,stop - start).
-
-    None where the traverse holds features.
-    """
+    """The middle column of each of the frames [start, stop): (C,H,stop - start); None for ready features."""
     if len(traverse.frame_shape) == 1:
         return None
-    columns = [  # a view would keep the whole frames
-        batch[..., batch.shape[-1] // 2].clone() for batch in traverse.between(start, stop)
-    ]
+    # clones, as a view would keep the whole frames
+    columns = [batch[..., batch.shape[-1] // 2].clone() for batch in traverse.between(start, stop)]
     return torch.cat(columns).permute(1, 2, 0).float() if columns else None

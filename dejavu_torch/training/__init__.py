@@ -1,1 +1,1 @@
-"""Feature learning: losses, task, data, metrics."""
+"""Feature learning: losses, stages, task, data and metrics."""

@@ -1,4 +1,4 @@
-"""Batches of frames with their right places, from any traverse."""
+"""Batches of frames and their right places, from any traverse."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, r
 from dejavu_torch.resize import resize_frames
 from dejavu_torch.types import InputError, Traverse
 
-READ_AT_ONCE = 64  # frames
-FEW = 300  # frames, below which a network learns less than a map has untrained
-FEWEST = 2  # stretches that are held out
+READ_BATCH = 64  # frames
+MIN_FRAMES = 300  # with fewer, a trained network is usually worse than an untrained map
+MIN_SEGMENTS = 2  # that are held out
 
 
 class Batch(NamedTuple):
-    """frames: (B,C,H,W) or features (B,D). truth: their right places; rows of nothing known are -1."""
+    """frames: (B,C,H,W) or features (B,D). truth: their right places; a row of -1 if unknown."""
 
     frames: Tensor
     truth: GroundTruth
 
 
 class StoredFrames(Dataset[Batch]):
-    """Frames (n,C,H,W) uint8, which may lie in temporary files (see `concatenate`), or features (n,D) float,
-    of one or several traverses, with the right places of all of them."""
+    """Frames (n,C,H,W) uint8, possibly in temporary files (see `concatenate`), or features (n,D) float, of
+    one or several traverses, with their right places."""
 
     def __init__(self, parts: list[Tensor], truth: GroundTruth) -> None:
         self.parts = parts
@@ -58,15 +58,15 @@ class StoredFrames(Dataset[Batch]):
     def __getitem__(self, index: list[int]) -> Batch:
         frames, first = torch.tensor(index), 0
         chosen = self.values.new_empty(len(frames), *self.values.shape[1:])
-        for part in self.parts:  # which may lie in files: never joined
+        for part in self.parts:  # not joined, as they may lie in files
             here = (frames >= first) & (frames < first + len(part))
             chosen[here] = part[frames[here] - first]
             first += len(part)
         return Batch(as_frames(chosen), GroundTruth(*(part[index] for part in self.truth)))
 
 
-class InOrder(DistributedSampler[list[int]]):  # as Lightning leaves it alone
-    """All frames once, in batches; of several processes each takes a stretch, and none is repeated."""
+class InOrder(DistributedSampler[list[int]]):  # a class that Lightning does not replace
+    """All frames once, in batches; each process gets a contiguous part, without repeated frames."""
 
     def __init__(self, count: int, batch_size: int, process: int = 0, processes: int = 1) -> None:
         super().__init__(cast(Any, range(count)), processes, process, shuffle=False)
@@ -81,67 +81,67 @@ class InOrder(DistributedSampler[list[int]]):  # as Lightning leaves it alone
 
 
 class Clips(DistributedSampler[list[int]]):
-    """Each frame about once an epoch, in clips of consecutive frames from all over the route. No clip crosses
-    from one run to the next; each process takes its part of a batch."""
+    """Each frame about once per epoch, in clips of consecutive frames in random order. No clip crosses from
+    one run to the next; each process gets its part of a batch."""
 
     def __init__(
         self, runs: list[range], batch_size: int, clip: int, process: int = 0, processes: int = 1
     ) -> None:
         super().__init__(cast(Any, range(sum(map(len, runs)))), processes, process)
         self.runs, self.clip = runs, clip
-        self.every = sum(len(run) // clip for run in runs)
-        self.clips = min(batch_size // clip, self.every) // processes  # of a process's part of a batch
+        self.total = sum(len(run) // clip for run in runs)
+        self.clips = min(batch_size // clip, self.total) // processes  # of a process's part of a batch
         if not self.clips:
-            seen = f"there are {self.every} clips of {clip} frames and {processes} processes"
+            seen = f"there are {self.total} clips of {clip} frames and {processes} processes"
             raise InputError(f"{seen}; expected one for each")
 
     def __len__(self) -> int:
-        return self.every // (self.clips * self.num_replicas)
+        return self.total // (self.clips * self.num_replicas)
 
     def __iter__(self) -> Iterator[list[int]]:
         starts = []
         for run in self.runs:
-            left_over = int(torch.randint(len(run) % self.clip + 1, ()))
-            starts.append(run.start + left_over + torch.arange(len(run) // self.clip) * self.clip)
-        order = torch.cat(starts)[torch.randperm(self.every)]
+            offset = int(torch.randint(len(run) % self.clip + 1, ()))
+            starts.append(run.start + offset + torch.arange(len(run) // self.clip) * self.clip)
+        order = torch.cat(starts)[torch.randperm(self.total)]
         frames = order[:, None] + torch.arange(self.clip)
-        batches = frames.split(self.clips * self.num_replicas)[: len(self)]  # an incomplete one is left out
+        batches = frames.split(self.clips * self.num_replicas)[: len(self)]  # complete ones only
         return iter([batch.split(self.clips)[self.rank].flatten().tolist() for batch in batches])
 
 
 class RouteData(LightningDataModule):
-    """A reference traverse to train on, and further ones to train on, to validate and to test with.
+    """A reference traverse to train on, and optional others to train on, validate and test with.
 
     Args:
-        source: the reference, whose frames are the places of the map: what `open_source` reads, a Traverse,
-            or a tensor of frames or features (see `ArrayTraverse`). A list of several routes, or a folder of
-            nothing but folders, trains one descriptor for all of them: their places are numbered one route
-            after the other, and nothing crosses from one to the next.
-        second: another traverse of the same route to train on as well: its frames are positives of the
-            places they show. Of several routes it is a list as long, None for those without.
-        validation: a traverse to validate on during training. None: the reference itself under augmentation,
-            the same each time; its figures say what is learned, not how another traverse fares.
-        query: the traverse that `test` localizes, and that judges the map at the end of `fit` without a
+        source: the reference, whose frames are the places of the map: a source of `open_source`, a Traverse,
+            or a tensor of frames or features (see `ArrayTraverse`). A list of several routes, or a folder
+            that contains only folders, trains one descriptor for all routes: their places are numbered one
+            route after the other, and no clip or tolerance crosses from one to the next.
+        second: another traverse of the same route to train on: its frames are positives of the places they
+            show. For several routes, a list of the same length, with None for routes without.
+        validation: a traverse to validate on during training. None: the reference under a fixed augmentation;
+            its figures show what is learned, not the accuracy on another traverse.
+        query: the traverse that `test` localizes. `fit` evaluates the final map on it if there is no
             validation.
-        second_truth, validation_truth, truth: the places of these three, as --truth of `dejavu compare`; None
-            of a second traverse as long as the reference also means frame i is place i.
+        second_truth, validation_truth, truth: the places of these three, as --truth of `dejavu compare`. For
+            a second traverse as long as the reference, None also means that frame i is place i.
         tolerance: places within which one is right, inclusive.
         batch_size: frames of a batch.
         clip: consecutive frames in a batch, which get the same augmentation; 1 draws each frame by itself.
-        resize: (height, width) in pixels that frames are stored in; None is what the backbone resizes them to
-            if that is smaller, or several routes are of several sizes, and their own size otherwise.
+        resize: (height, width) in pixels of the stored frames. None is the size to which the backbone resizes
+            them if it is smaller or several routes differ in size, else their own size.
         augmentation: of the training frames; None is `Augmentation` with its defaults.
         velocity: makes places and queries even steps along the ground, as in `DejaVu`.
-        held_out: share of the reference's frames that training never sees, in evenly spaced stretches of 20,
-            by which `MapExport` calibrates and judges the map at the end; at most 0.5, 0 is none. Nor is
-            anything held out for templates, of a route of fewer than 300 frames, of several routes, of ready
-            features, or where there is a validation.
+        held_out: share of the reference's frames that training never sees, in evenly spaced segments of 20,
+            on which `MapExport` calibrates and evaluates the final map; at most 0.5, 0 is none. There are no
+            segments for templates, routes of fewer than 300 frames, several routes, ready features, or with
+            a validation.
 
-    Convention: frames are kept as bytes; beyond `concatenate`'s share of memory they lie in a file.
+    Convention: frames are stored as bytes; beyond `concatenate`'s share of memory they lie in a file.
 
     Raises:
         InputError: no traverse, one that cannot be read, no longer than the tolerance, without known places,
-            or of frames of another size than the reference's; several routes with a validation or a query.
+            or with frames of another size than the reference's; several routes with a validation or a query.
 
     Example:
         >>> data = RouteData([torch.rand(20, 3, 8, 8), torch.rand(30, 3, 8, 8)], tolerance=2)
@@ -179,23 +179,21 @@ class RouteData(LightningDataModule):
         self.listed = {"source": [*routes] if isinstance(routes, (list, tuple)) else [routes]}
         if not self.listed["source"]:
             raise InputError("source is an empty list; expected at least one traverse")
-        self.listed["second"] = self._one_each("second", second)
-        self.listed["validation"] = self._one_each("validation", validation)
-        self.listed["query"] = self._one_each("query", query)
+        for name, given in (("second", second), ("validation", validation), ("query", query)):
+            self.listed[name] = self._one_each(name, given)
         self.truths = {
             "second": self._one_each("second_truth", second_truth),
             "validation": self._one_each("validation_truth", validation_truth),
             "query": self._one_each("truth", truth),
         }
         for name, one in ((name, one) for name, every in self.listed.items() for one in every):
-            missing = one is None and name != "source"
-            if not missing and not isinstance(one, (str, Path, Traverse, Tensor)):
+            if not isinstance(one, (str, Path, Traverse, Tensor)) and (one is not None or name == "source"):
                 seen = f"{name} is of type {type(one).__name__}"
                 raise InputError(f"{seen}; expected a path, a Traverse, or a tensor of frames or features")
         paths = [str(one) for one in self.listed["source"] if isinstance(one, (str, Path))]
         for one in (one for one in paths if paths.count(one) > 1):
             raise InputError(f"{one} is given twice; expected each route once, other traverses as second")
-        # as it was given where there is one route
+        # without the list if there is one route
         self.sources = {
             name: given if len(given) > 1 and any(one is not None for one in given) else given[0]
             for name, given in self.listed.items()
@@ -204,20 +202,20 @@ class RouteData(LightningDataModule):
         self.resize = None if resize is None else (int(resize[0]), int(resize[1]))
         self.augmentation = Augmentation() if augmentation is None else augmentation
         self.velocity, self.held_out = velocity, held_out
-        self.routes: list[Traverse] = []  # at even steps, where there is `velocity`
+        self.routes: list[Traverse] = []  # at even steps if `velocity` is given
         self.sets: dict[str, StoredFrames] = {}
-        self._wanted: tuple[int, int] | None = None  # size of the stored frames, where it makes them smaller
+        self._smaller: tuple[int, int] | None = None  # size of the stored frames, if smaller than their own
 
     def _one_each(self, name: str, given: Any) -> list[Any]:
-        """What is given for each of the routes."""
+        """The given value for each of the routes."""
         count = len(self.listed["source"])
         each = list(given) if isinstance(given, (list, tuple)) else [given] * (count if given is None else 1)
         if count > 1 and name in ("validation", "query") and any(one is not None for one in each):
-            seen = f"{name} is given, and there are {count} routes, which make no map"
+            seen = f"{name} is given, but there are {count} routes, for which no map is made"
             raise InputError(f"{seen}; expected none, and `dejavu compare A B --descriptor FILE` for a route")
         if len(each) != count:
-            seen = f"{name} is of {len(each)}, the routes are {count}"
-            raise InputError(f"{seen}; expected one of each route, null for those without")
+            seen = f"{name} lists {len(each)}, and there are {count} routes"
+            raise InputError(f"{seen}; expected one for each route, null for routes without")
         return each
 
     @property
@@ -227,7 +225,7 @@ class RouteData(LightningDataModule):
 
     @property
     def route_name(self) -> str:
-        """Of the routes, for messages."""
+        """The name of the routes, for messages."""
         return self.reference.name + f" and {len(self.routes) - 1} more" * (len(self.routes) > 1)
 
     @property
@@ -236,34 +234,35 @@ class RouteData(LightningDataModule):
         return [len(part) for part in self.sets["reference"].parts]
 
     def apart(self, places: Tensor) -> Tensor:
-        """Places numbered so that those of two routes are further apart than the tolerance; -1 stays -1."""
+        """Places renumbered with a gap of the tolerance between routes; -1 stays -1."""
         starts = torch.tensor(self.lengths, device=places.device).cumsum(0)[:-1]
         return places + self.tolerance * torch.bucketize(places, starts, right=True)
 
     @property
     def held(self) -> list[int]:
-        """The first places of the stretches that training never sees."""
+        """The first places of the held-out segments, which training never sees."""
         frames = self.sets["reference"].values
-        # the templates of a place that is never seen would not be found
+        # not for templates: unseen places would not be found
         one_map = len(self.routes) == 1 and frames.ndim == 4 and self._of_task("made", True)
-        if not one_map or not self.held_out or len(frames) < FEW or self.sources["validation"] is not None:
+        enough = len(frames) >= MIN_FRAMES and self.sources["validation"] is None
+        if not (one_map and self.held_out and enough):
             return []
-        count = max(FEWEST, round(self.held_out * len(frames) / STRETCH))
+        count = max(MIN_SEGMENTS, round(self.held_out * len(frames) / STRETCH))
         return [(2 * i + 1) * len(frames) // (2 * count) - STRETCH // 2 for i in range(count)]
 
     def _of_task(self, name: str, default: Any = None) -> Any:
-        """What the task in training says; the default without one."""
+        """An attribute of the task in training; the default without one."""
         return default if self.trainer is None else getattr(self.trainer.lightning_module, name, default)
 
     def setup(self, stage: str) -> None:
-        """Read the reference, and what the stage needs beside it."""
+        """Read the reference and the other traverses that the stage needs."""
         if len(self.listed["source"]) > 1 and not self._of_task("made", True):
-            seen = f"there are {len(self.listed['source'])} routes, and templates are of one"
+            seen = f"there are {len(self.listed['source'])} routes, but templates can be trained on one only"
             raise InputError(f"{seen}; expected one, or model.mapper SpectralMapper, to train a descriptor")
-        wanted = self._of_task("frame_size") if self.resize is None else self.resize
-        if wanted != self._wanted:
+        smaller = self._of_task("frame_size") if self.resize is None else self.resize
+        if smaller != self._smaller:
             self.sets.clear()
-            self._wanted = wanted
+            self._smaller = smaller
         if "reference" not in self.sets:
             opened = [self._open(source) for source in self.listed["source"]]
             self.routes = [resampled(route, self.velocity, self.batch_size) for route in opened]
@@ -271,30 +270,30 @@ class RouteData(LightningDataModule):
             places = torch.arange(sum(map(len, parts)))
             self.sets["reference"] = StoredFrames(parts, as_ground_truth(places[:, None]))
         if self._of_task("made"):
-            self._read("second")  # its map is made anew, whatever the stage
+            self._read("second")  # every stage makes the map, whose whitening needs it
         needed = {"fit": ("second", "validation"), "validate": ("validation",), "test": ("query",)}
         for name in needed.get(stage, ()):
             self._read(name)
         if stage == "fit":
-            self.unseen()  # what it refuses at the end is refused before the training
+            self.unseen()  # so that its errors come before the training
         if stage == "test" and "query" not in self.sets:
             raise InputError("there is nothing to test on; expected data.query, a second traverse")
 
     @property
     def _size(self) -> tuple[int, int] | None:
-        """(height, width) of stored frames; None is their own."""
+        """(height, width) of stored frames; None is their own size."""
         shape = self.reference.frame_shape
         for route in self.routes[1:]:
             other = route.frame_shape
-            if len(other) != len(shape) or other[0] != shape[0] or (other != shape and not self._wanted):
-                raise _other_frames(route.name, other, shape)
+            if len(other) != len(shape) or other[0] != shape[0] or (other != shape and not self._smaller):
+                raise _shape_error(route.name, other, shape)
             if other != shape:
-                return self._wanted
-        smaller = self._wanted and len(shape) == 3 and math.prod(self._wanted) < math.prod(shape[1:])
-        return self._wanted if smaller or self.resize is not None else None
+                return self._smaller
+        shrinks = self._smaller and len(shape) == 3 and math.prod(self._smaller) < math.prod(shape[1:])
+        return self._smaller if shrinks or self.resize is not None else None
 
     def unseen(self) -> tuple[Traverse, GroundTruth] | None:
-        """The traverse to validate on, else the one to test on, and its places; None without either."""
+        """The validation traverse, else the query traverse, and its places; None without either."""
         for name in ("validation", "query"):
             if self.sources[name] is not None:
                 self._read(name)
@@ -302,20 +301,20 @@ class RouteData(LightningDataModule):
         return None
 
     def _open(self, source: Any, shape: tuple[int, ...] | None = None) -> Traverse:
-        """At the size that `DejaVu.fit` of the task's model gives; as it is where `resize` gives one."""
+        """A traverse, at the size of `DejaVu.fit` of the task's model unless `resize` is given."""
         traverse = as_traverse(source) if isinstance(source, (Traverse, Tensor)) else open_source(source)
         model = self._of_task("dejavu")
         return traverse if model is None or self.resize is not None else model.fit(traverse, shape)
 
     def _opened(self, name: str, i: int = 0) -> Traverse:
-        """Another traverse of route i, at its steps."""
+        """Another traverse of route i, resampled with the steps of the route."""
         route = self.routes[i]
         step = route.step if isinstance(route, ResampledTraverse) else None
         traverse = self._open(self.listed[name][i], route.frame_shape)
         return resampled(traverse, self.velocity, self.batch_size, step)
 
     def _stored(self, traverse: Traverse) -> Tensor:
-        """See `store`; refused if every answer would be right."""
+        """The frames of a traverse, see `store`; one so short that every answer is right is refused."""
         values = store(traverse, self._size)
         if len(values) <= max(1, self.tolerance):
             seen = f"{traverse.name} has {len(values)} frame{'s' * (len(values) != 1)}"
@@ -323,7 +322,7 @@ class RouteData(LightningDataModule):
         return values
 
     def _read(self, name: str) -> None:
-        """Another traverse of each route, as if of one after the other, if it is given and not read yet."""
+        """Read another traverse of each route, in the order of the routes, if given and not read yet."""
         given = [i for i, source in enumerate(self.listed[name]) if source is not None]
         if not given or name in self.sets:
             return
@@ -332,7 +331,7 @@ class RouteData(LightningDataModule):
         if len(self.routes) > 1:
             known = [one.positives.masked_fill(~one.judged[:, None], -1) for one in truths]
             starts = [sum(self.lengths[:i]) for i in given]
-            truth = _joined([p.where(p < 0, p + start) for p, start in zip(known, starts, strict=True)])
+            truth = _concatenated([p.where(p < 0, p + start) for p, start in zip(known, starts, strict=True)])
         self.sets[name] = StoredFrames([*parts], truth)
 
     def _read_one(self, name: str, i: int) -> tuple[Tensor, GroundTruth]:
@@ -341,10 +340,10 @@ class RouteData(LightningDataModule):
         traverse = self._opened(name, i)
         values = self._stored(traverse)
         if values.shape[1:] != reference.shape[1:]:
-            raise _other_frames(traverse.name, tuple(values.shape[1:]), tuple(reference.shape[1:]))
-        named = name == "second"  # as another traverse of the same places
+            raise _shape_error(traverse.name, tuple(values.shape[1:]), tuple(reference.shape[1:]))
+        aligned = name == "second"  # by definition of the same places
         counts = len(reference), len(values)
-        known = ground_truth_of(self.truths[name][i], route, traverse, *counts, aligned=named)
+        known = ground_truth_of(self.truths[name][i], route, traverse, *counts, aligned=aligned)
         if known is None:
             option = "data.truth" if name == "query" else f"data.{name}_truth"
             seen = f"no truth for {traverse.name}: {len(values)} frames, {len(reference)} places"
@@ -354,7 +353,7 @@ class RouteData(LightningDataModule):
         return values, known
 
     def train_dataloader(self) -> DataLoader[Batch]:
-        """Frames of the reference and of the second traverse, as they are stored; this process's part."""
+        """Stored frames of the reference and of the second traverse; this process's part."""
         return self.training_batches(*self._processes)
 
     @property
@@ -363,18 +362,18 @@ class RouteData(LightningDataModule):
         return (0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size)
 
     def training_batches(self, process: int = 0, processes: int = 1) -> DataLoader[Batch]:
-        """Batches of all processes of the training; their parts for one of so many."""
+        """Batches of the training; of each, the part of one of so many processes."""
         sets = [self.sets[name] for name in ("reference", "second") if name in self.sets]
         parts = [part for one in sets for part in one.parts]
-        frames = StoredFrames(parts, _joined([one.truth.positives for one in sets]))
+        frames = StoredFrames(parts, _concatenated([one.truth.positives for one in sets]))
         held = torch.tensor(self.held, dtype=torch.int64)[:, None] + torch.arange(STRETCH)
         kept = ~torch.isin(frames.truth.positives, held).any(1)
         each = torch.arange(len(frames)).split([len(part) for part in parts])
         runs = [run for part in each for run in runs_of(part[kept[part]])]
         longest = max(map(len, runs))
         if longest < self.clip:
-            seen = f"clip is {self.clip} and the longest stretch that is trained on has {longest} frames"
-            raise InputError(f"{seen} (data.held_out is {self.held_out:g}); expected fewer")
+            seen = f"clip is {self.clip} and the longest segment to train on has {longest} frames"
+            raise InputError(f"{seen} (data.held_out is {self.held_out:g}); expected a shorter clip")
         batch_size = self.batch_size * self._processes[1]
         return _loader(frames, Clips(runs, batch_size, self.clip, process, processes))
 
@@ -391,7 +390,7 @@ class RouteData(LightningDataModule):
         return _loader(frames, InOrder(len(frames), self.batch_size, *self._processes))
 
     def augmented(self, frames: Tensor, clip: int) -> Tensor:
-        """Frames (B,C,H,W), clip after clip, as on another day; features (B,D) as they are."""
+        """Augmented frames (B,C,H,W), clip after clip; features (B,D) unchanged."""
         if frames.ndim != 4 or not self.augmentation.acts:
             return frames
         self.augmentation.train()
@@ -400,7 +399,7 @@ class RouteData(LightningDataModule):
         return augmented.flatten(0, 1)
 
     def validated(self, batch: Batch) -> Tensor:
-        """The frames of a validation batch: the reference itself is augmented, in the same way each time."""
+        """The frames of a validation batch; the reference itself gets the same augmentation each time."""
         if "validation" in self.sets:
             return batch.frames
         with torch.random.fork_rng():
@@ -409,19 +408,19 @@ class RouteData(LightningDataModule):
 
 
 def store(traverse: Traverse, resize: tuple[int, int] | None = None) -> Tensor:
-    """All frames of a traverse as bytes: (N,C,H,W) uint8; ready features as they are, (N,D)."""
+    """All frames of a traverse as bytes, (N,C,H,W) uint8; ready features unchanged, (N,D)."""
     shape: tuple[int, ...] = ()
 
     def rows() -> Iterator[Tensor]:
         nonlocal shape
-        for batch in traverse.batches(READ_AT_ONCE):
+        for batch in traverse.batches(READ_BATCH):
             if batch.ndim == 4 and resize is not None:
                 needed = 4 * len(batch) * batch.shape[1] * math.prod(resize)
                 check_room(needed, f"{traverse.name} in frames of {resize[0]} x {resize[1]}")
                 batch = resize_frames(batch, resize)
             if shape and tuple(batch.shape[1:]) != shape:
                 seen = f"{traverse.name} holds frames of {shape} and of {tuple(batch.shape[1:])}"
-                raise InputError(f"{seen}; expected one size, as data.resize makes")
+                raise InputError(f"{seen}; expected one size, as with data.resize")
             shape = tuple(batch.shape[1:])
             if not batch.isfinite().all():
                 raise InputError(f"{traverse.name} holds NaN or infinite values; expected finite numbers")
@@ -432,23 +431,23 @@ def store(traverse: Traverse, resize: tuple[int, int] | None = None) -> Tensor:
 
 
 def as_frames(values: Tensor) -> Tensor:
-    """Bytes as frames in [0, 1]; features as they are."""
+    """Bytes as frames in [0, 1]; features unchanged."""
     return values.float() / 255 if values.dtype == torch.uint8 else values
 
 
-def _joined(positives: list[Tensor]) -> GroundTruth:
+def _concatenated(positives: list[Tensor]) -> GroundTruth:
     """The truth of several traverses, one after the other."""
     width = max(part.shape[1] for part in positives)
     pad = torch.nn.functional.pad
     return as_ground_truth(torch.cat([pad(part, (0, width - part.shape[1]), value=-1) for part in positives]))
 
 
-def _other_frames(name: str, seen: tuple[int, ...], reference: tuple[int, ...]) -> InputError:
-    told = f"{name} has frames of {seen}, the reference of {reference}"
-    return InputError(f"{told}; expected the same channels, and one size, as data.resize makes")
+def _shape_error(name: str, shape: tuple[int, ...], reference: tuple[int, ...]) -> InputError:
+    seen = f"{name} has frames of {shape}, the reference of {reference}"
+    return InputError(f"{seen}; expected the same channels and one size, as with data.resize")
 
 
 def _loader(frames: StoredFrames, batches: Iterable[list[int]]) -> DataLoader[Batch]:
-    # the sampler yields whole batches of indices, so that frames are read many at a time; a generator of its
-    # own, so that a validation takes none of training's random numbers
+    # the sampler yields batches of indices, so that many frames are read at a time; the generator keeps a
+    # validation from using up random numbers of the training
     return DataLoader(frames, sampler=batches, batch_size=None, generator=torch.Generator())

@@ -1,4 +1,4 @@
-"""What runs beside a training: progress, checkpoints, and at the end the map and what it is worth."""
+"""The callbacks of a training: progress, checkpoints, and at the end the map and its scores."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import math
 import sys
 import time
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import pytorch_lightning as pl
 from pytorch_lightning.callbacks import Callback, Checkpoint, ModelCheckpoint, ProgressBar
@@ -26,27 +26,25 @@ from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.localizer import SINGLE
-from dejavu_torch.training.datamodule import FEW, RouteData
+from dejavu_torch.training.datamodule import MIN_FRAMES, RouteData
 from dejavu_torch.training.task import PlaceRecognitionTask, load_weights
 from dejavu_torch.types import InputError, Match, Traverse
 
 DESCRIPTOR = "descriptor.safetensors"  # of several routes
 TRAINED, HOG, UNTRAINED = "the trained map", "HOG of all frames", "the untrained map"
-LINES, APART = 10, 60.0  # lines of a training without a terminal, and seconds between two at most
+LINES, INTERVAL = 10, 60.0  # lines of progress without a terminal, and seconds between two at most
 CPU_FLAGS = Path("/proc/cpuinfo")
-FAST = {"avx512_bf16", "amx_bf16", "bf16"}  # the last one of ARM
+BF16_FLAGS = {"avx512_bf16", "amx_bf16", "bf16"}  # the last one on ARM
 
 log = logging.getLogger("dejavu_torch")
 
 
 class MapExport(Callback):
-    """Writes the map when training ends or is interrupted: of the best checkpoint if one is watched for, else
-    of the last step.
+    """Writes the map when training ends or is interrupted, from the best checkpoint if one is monitored, else
+    from the last step. For several routes it writes their descriptor to `descriptor.safetensors`.
 
-    Of several routes it is their descriptor, without a map, in `descriptor.safetensors`.
-
-    When training has ended, `scores` are what the map is worth on the traverse to validate or to test on,
-    else on stretches that training never saw, see `beside_untrained`; they are logged too.
+    After training, `scores` are those of the map on the validation or query traverse, else on held-out
+    segments, see `compare_with_untrained`; they are logged too.
 
     Args:
         name: of the map file, in the trainer's default_root_dir.
@@ -59,50 +57,46 @@ class MapExport(Callback):
         self.scores: dict[str, Scores] = {}
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Note the step that a checkpoint brought."""
+        """Note the first step, which a checkpoint may set."""
         self.began, self.written, self.scores = trainer.global_step, None, {}
 
     def on_fit_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Load the best weights, and write."""
+        """Load the best weights and write the map."""
         if not isinstance(pl_module, PlaceRecognitionTask) or not trainer.is_global_zero:
             return
         step = trainer.global_step
         if not step:
-            log.warning("no step was taken: no map is written")
+            log.warning("no training step was made: no map is written")
             return
         if self.began in (None, step):
-            log.warning("nothing was trained: step %d is reached; max_steps counts from the start", step)
-        watch = [
-            one for one in trainer.checkpoint_callbacks if isinstance(one, ModelCheckpoint) and one.monitor
-        ]
-        best = next((one.best_model_path for one in watch if one.best_model_path), "")
+            log.warning("nothing was trained: step %d is already reached; max_steps counts from step 0", step)
+        callbacks = (one for one in trainer.checkpoint_callbacks if isinstance(one, ModelCheckpoint))
+        monitored = [one for one in callbacks if one.monitor]
+        best = next((one.best_model_path for one in monitored if one.best_model_path), "")
         if best and Path(best).is_file():
             load_weights(pl_module, best)
-        elif watch:
-            seen = f"{best} is gone" if best else f"{watch[0].monitor} was never measured"
-            log.warning("%s: the map is of the last step", seen)
+        elif monitored:
+            seen = f"{best} is gone" if best else f"{monitored[0].monitor} was never measured"
+            log.warning("%s: the map is from the last step", seen)
         data = pl_module.data
         self.write(pl_module, Path(trainer.default_root_dir), data)
         if self.written is None or not self.written[1].map.places:
             return
         unseen = data.unseen() or held_frames(self.written[1], data, pl_module.held)
         if unseen is not None:
-            self.scores = beside_untrained(self.written[1], data.reference, *unseen, data.tolerance)
+            self.scores = compare_with_untrained(self.written[1], data.reference, *unseen, data.tolerance)
             figures = {f"unseen/auc_of_{n.replace(' ', '_')}": one.auc for n, one in self.scores.items()}
             for logger in trainer.loggers:
                 logger.log_metrics(figures, step)
 
-    def on_exception(
-        self, trainer: pl.Trainer, pl_module: pl.LightningModule, exception: BaseException
-    ) -> None:
+    def on_exception(self, trainer: pl.Trainer, pl_module: Any, exception: BaseException) -> None:
         """Write the map of the last step if the user interrupts."""
         interrupted = isinstance(exception, KeyboardInterrupt) and trainer.state.fn == "fit"
         if interrupted and trainer.global_step and self.written is None:
-            self.write(cast(PlaceRecognitionTask, pl_module), Path(trainer.default_root_dir))
+            self.write(pl_module, Path(trainer.default_root_dir))
 
     def write(self, task: PlaceRecognitionTask, folder: Path, data: RouteData | None = None) -> None:
-        """Write the task's map, calibrated by what training has not seen of the data if it is given; a
-        warning if there is none yet."""
+        """Write the task's map, calibrated with unseen data if `data` is given; warn if there is none yet."""
         try:
             model = task.deployed()
         except InputError as error:
@@ -110,7 +104,7 @@ class MapExport(Callback):
             return
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / (self.name if model.map.places else DESCRIPTOR)
-        model.save(path)  # whatever becomes of its calibration
+        model.save(path)  # before the calibration, which may fail
         self.written = (path, model)
         if data is not None and model.map.places:
             calibrate(model, data, task.held)
@@ -120,8 +114,7 @@ class MapExport(Callback):
 def held_frames(
     model: DejaVu, data: RouteData, starts: list[int], shape: tuple[int, ...] | None = None
 ) -> tuple[Traverse, GroundTruth] | None:
-    """The stretches that begin at `starts`, in frames of `shape`, as they may look on another visit, and
-    their places; None without any."""
+    """The held-out segments that begin at `starts`, augmented, in frames of `shape`, and their places."""
     if not starts:
         return None
     strengths = STRENGTHS if model.whitening is None else model.whitening.strengths
@@ -131,7 +124,7 @@ def held_frames(
 
 
 def calibrate(model: DejaVu, data: RouteData, starts: list[int]) -> None:
-    """By the traverse to validate on, else by stretches that training never saw; else not at all."""
+    """Calibrate with the validation traverse, else with held-out segments; without either, warn."""
     validated = data.sources["validation"] is not None
     unseen = data.unseen() if validated else held_frames(model, data, starts, model.frame_shape)
     if unseen is not None:
@@ -142,10 +135,10 @@ def calibrate(model: DejaVu, data: RouteData, starts: list[int]) -> None:
         except InputError as error:
             log.warning("the map is not calibrated: %s", error)
     elif data.held:
-        seen = "the map is not calibrated: the training has seen what data.held_out %g leaves out"
+        seen = "the map is not calibrated: the earlier training has seen the segments of data.held_out %g"
         log.warning(seen, data.held_out)
-    elif isinstance(model.mapper, TemplateMapper) and model.map.places >= FEW:
-        log.warning("the map is not calibrated: of templates nothing is held out; data.validation would")
+    elif isinstance(model.mapper, TemplateMapper) and model.map.places >= MIN_FRAMES:
+        log.warning("the map is not calibrated: templates have no held-out segments; give data.validation")
 
 
 class LastCheckpoint(Checkpoint):
@@ -159,20 +152,18 @@ class LastCheckpoint(Checkpoint):
         self.every, self.saved = every, 0
 
     def on_train_batch_end(self, trainer: pl.Trainer, *_: Any) -> None:
-        """Save when it is time to."""
+        """Save every `every` steps."""
         if trainer.global_step % self.every == 0:
             self._save(trainer)
 
-    def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Save the last step."""
-        self._save(trainer)
-
-    def on_exception(
-        self, trainer: pl.Trainer, pl_module: pl.LightningModule, exception: BaseException
-    ) -> None:
+    def on_exception(self, trainer: pl.Trainer, pl_module: Any, exception: BaseException) -> None:
         """Save the last step if the user interrupts."""
         if isinstance(exception, KeyboardInterrupt):
             self._save(trainer)
+
+    def on_train_end(self, trainer: pl.Trainer, pl_module: Any) -> None:
+        """Save the last step."""
+        self._save(trainer)
 
     def _save(self, trainer: pl.Trainer) -> None:
         if trainer.state.fn == "fit" and trainer.global_step not in (0, self.saved):
@@ -180,19 +171,14 @@ class LastCheckpoint(Checkpoint):
             self.saved = trainer.global_step
 
 
-def beside_untrained(
+def compare_with_untrained(
     model: DejaVu, reference: Traverse, query: Traverse, truth: GroundTruth, tolerance: int
 ) -> dict[str, Scores]:
-    """Scores of a trained map, of HOG of all frames, and of the untrained map: that of `DejaVu()`, by the
-    model's own mapper, unless it is of templates, in as many route bytes. What cannot be made of these frames
-    is left out, with a warning.
+    """Scores by name of a trained map, of HOG of all frames, and of an untrained map; empty without truth.
 
-    Args:
-        model: with its map, on any device. reference, query: resampled where the model is.
-        truth: the places of the queries. tolerance: places within which one is right.
-
-    Returns:
-        By name, the trained map first; nothing where no query has a known place.
+    The untrained map is that of `DejaVu()` with the model's own mapper (unless it makes templates), in as
+    many route bytes. If it cannot be made of these frames, there is a warning. The traverses are resampled
+    if the model is.
     """
     query = _of_shape(query, reference.frame_shape)
     found = {TRAINED: _match(model, query)}
@@ -200,7 +186,7 @@ def beside_untrained(
     found |= {HOG: hog["hog"].found} if hog else {}
     mapper = None if isinstance(model.mapper, TemplateMapper) else copy.deepcopy(model.mapper)
     if isinstance(mapper, SpectralMapper) and mapper.route_bytes_per_place is None:
-        # another descriptor takes other bytes
+        # the same step would give other bytes for another descriptor
         mapper.route_bytes_per_place = model.map.summary().route_bytes / model.map.places
         mapper.step = mapper.hold = None
     try:
@@ -225,49 +211,48 @@ def _match(model: DejaVu, query: Traverse) -> Match:
 
 
 class StepBar(ProgressBar):
-    """Shows steps of all, the loss and the time left on stderr."""
+    """Shows the steps, the loss and the remaining time on stderr."""
 
     def __init__(self) -> None:
         super().__init__()
         self.shown = True
         self.bar: tqdm[Any] | None = None
-        self.total = self.began = self.told = 0
-        self.since = self.told_at = 0.0
+        self.total = self.began = self.last_step = 0
+        self.since = self.last_time = 0.0
 
     def disable(self) -> None:
-        """See Lightning's, as is the next."""
         self.shown = False
 
     def enable(self) -> None:
         self.shown = True
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Begin at the step that a checkpoint brought."""
+        """Begin at the current step, which a checkpoint may set."""
         self.total, self.began = int(trainer.estimated_stepping_batches), trainer.global_step
-        self.told, self.since = self.began, time.monotonic()
-        self.told_at = self.since
+        self.last_step = self.began
+        self.last_time = self.since = time.monotonic()
         if self.shown and sys.stderr.isatty():
             given = {"total": self.total, "initial": self.began, "unit": " steps", "file": sys.stderr}
             self.bar = tqdm(desc="training", **given)
 
     def on_train_batch_end(self, trainer: pl.Trainer, *_: Any) -> None:
-        """Tell when it is time to."""
+        """Update the bar, or print a line if one is due."""
         step, now = trainer.global_step, time.monotonic()
         if self.bar is not None:
             self.bar.update(step - self.bar.n)
-            if now - self.told_at > 1:
-                self.told_at = now
+            if now - self.last_time > 1:
+                self.last_time = now
                 self.bar.set_postfix_str(_loss(trainer), refresh=False)
             return
-        due = (step - self.told) * LINES >= self.total or now - self.told_at >= APART
-        if self.shown and (due or step == self.total) and step > self.told:
-            self.told, self.told_at = step, now
+        due = (step - self.last_step) * LINES >= self.total or now - self.last_time >= INTERVAL
+        if self.shown and (due or step == self.total) and step > self.last_step:
+            self.last_step, self.last_time = step, now
             left = tqdm.format_interval((now - self.since) * (self.total - step) / (step - self.began))
             line = f"dejavu: training: step {step} of {self.total}, {_loss(trainer)}, {left} left"
             tqdm.write(line, file=sys.stderr)
 
     def teardown(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
-        """Leave the bar as it stands."""
+        """Close the bar."""
         if self.bar is not None:
             self.bar.close()
             self.bar = None
@@ -278,10 +263,7 @@ def _loss(trainer: pl.Trainer) -> str:
 
 
 def has_bf16() -> bool:
-    """Whether the processor multiplies numbers of 16 bits (bfloat16) itself; elsewhere they are slower.
-
-    Known on Linux; False elsewhere.
-    """
+    """Whether the processor has bfloat16 instructions, without which it is slow; False except on Linux."""
     text = CPU_FLAGS.read_text(encoding="utf-8", errors="replace") if CPU_FLAGS.is_file() else ""
     lines = (line for line in text.splitlines() if line.lower().startswith(("flags", "features")))
-    return bool(FAST & set(next(lines, "").split()))
+    return bool(BF16_FLAGS & set(next(lines, "").split()))

@@ -1,4 +1,4 @@
-"""Losses of places, phases and bits, float32 at least, 0 if nothing counts; and those of a blind guess."""
+"""Losses of places, phases and bits (float32 at least, 0 without any target), and their values by chance."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from dejavu_torch.training.processes import mean_of_all
 from dejavu_torch.types import InputError, Plan
 
 STEP = 0.5  # of the lines' RMS, at the start
-PER_OCTAVE = 2  # bands of frequency that have a width of their own
-LEAST = 1e-24  # of the lines' mean square: the root of 0 has no gradient
-LAST, BELOW = 100, 0.98  # steps, and the share of chance, or of what was before, that is less than it
+PER_OCTAVE = 2  # frequency bands with a width each
+MIN_ENERGY = 1e-24  # of the lines' mean square: the root of 0 has no gradient
+LAST, BELOW = 100, 0.98  # steps; a loss below this share of chance, or of the loss before, is lower
 
 
 class PlaceLoss(NamedTuple):
-    """loss: scalar. left_out: queries without a right place that is covered, which the mean leaves out."""
+    """loss: scalar. left_out: number of queries without a covered right place, which the mean excludes."""
 
     loss: Tensor
     left_out: int
@@ -44,9 +44,9 @@ def place_cross_entropy(
     """Mean over queries of -log sum_{i right} p_i, where p = softmax(-S / T) over all places (S of eq. 4).
 
     Args:
-        scores: S, lower is better, +inf where no layer covers the place: p = 0 there.
+        scores: S, lower is better, +inf at places that no layer covers (p = 0).
         places: the right places of each query, -1 as padding.
-        tolerance: places within so many of a right one, inclusive, are right as well.
+        tolerance: places within this distance of a right one, inclusive, are also right.
         temperature: T > 0, in units of the scores; may carry gradients.
 
     Shape: (Q,N), (Q,R) int64 -> PlaceLoss.
@@ -65,7 +65,7 @@ def place_cross_entropy(
     if tolerance < 0 or outside:
         seen = f"the tolerance is {tolerance} and places outside the route are {outside[:3]}"
         raise InputError(f"{seen}; expected at least 0, and places in 0..{n - 1} or -1")
-    # +1 where a right stretch begins, -1 after its end: no Q x N x R
+    # +1 at the start of each range of right places, -1 after its end: avoids Q x N x R
     known = (places >= 0).int()
     steps = known.new_zeros(queries, n + 1)
     steps.scatter_add_(1, (places - tolerance).clamp(min=0), known)
@@ -81,14 +81,14 @@ def _check_places(places: Tensor, scores: Tensor) -> None:
 
 
 def _surprise(scores: Tensor, right: Tensor, temperature: Tensor | float) -> Tensor:
-    """-log of the softmax's share of what is right, for the rows that have it. (Q,K), (Q,K) -> (counted,)."""
+    """-log of the probability of the right columns, for rows with any. (Q,K), (Q,K) bool -> (rows,)."""
     smallest = torch.as_tensor(temperature).min().item()
     if not smallest > 0:
         raise InputError(f"the temperature is {smallest}; expected a number above 0")
     covered = ~scores.isposinf()
     right = right & covered
     kept = right.any(1)
-    # +inf is taken out before the division: inf times a gradient of 0 is NaN
+    # +inf is replaced before the division: inf times a gradient of 0 is NaN
     scores = scores.to(torch.promote_types(scores.dtype, torch.float32)).masked_fill(~covered, 0)
     logits = (-scores / temperature).masked_fill(~covered, -math.inf)[kept]
     return logits.logsumexp(1) - logits.masked_fill(~right[kept], -math.inf).logsumexp(1)
@@ -100,12 +100,12 @@ def phase_cross_entropy(
     """Mean over layers and queries of -log sum_{k right} p_k, p = softmax(-d / T) over the layer's phases.
 
     Args:
-        distances: d of each layer, as `phase_distances` gives them.
+        distances: d of each layer, from `phase_distances`.
         places, temperature: see `place_cross_entropy`; T in units of the distances.
 
     Shape: L tensors (Q,P), (Q,R) int64 -> scalar.
 
-    Convention: a query counts once for each layer that covers a right place of it, all with equal weight.
+    Convention: a query has one term for each layer that covers a right place of it, all with equal weight.
 
     Raises:
         InputError: no layers, shapes that do not fit the plan, a temperature <= 0.
@@ -133,12 +133,12 @@ def laplace_bits(levels: Tensor, widths: Tensor) -> Tensor:
     """Bits of each level under a Laplace distribution around 0: -log2 of its mass within half a step.
 
     Args:
-        levels: in steps, whole numbers or between them, as noise makes them.
+        levels: in steps; with noise they are not whole numbers.
         widths: b of the densities exp(-|x| / b) / 2b, in steps, above 0; broadcast with the levels.
 
     Shape: (...), (...) -> (...).
 
-    Convention: finite, with gradients, however far a level lies out.
+    Convention: finite, with finite gradients, for any level.
 
     Source: Ballé, Laparra and Simoncelli, End-to-end optimized image compression, ICLR 2017.
 
@@ -158,7 +158,7 @@ class Objective:
     """A weighted sum of the two losses.
 
     Args:
-        place, phase: how much each counts; 0 leaves it out.
+        place, phase: the weights; 0 omits a loss.
 
     Raises:
         InputError: a weight below 0, or none above 0.
@@ -169,8 +169,8 @@ class Objective:
 
     def __post_init__(self) -> None:
         if not (min(self.place, self.phase) >= 0 and 0 < self.place + self.phase < math.inf):
-            seen = f"the losses count place={self.place}, phase={self.phase}"
-            raise InputError(f"{seen}; expected 0 or more, one above 0")
+            seen = f"the weights of the losses are place={self.place}, phase={self.phase}"
+            raise InputError(f"{seen}; expected 0 or more, at least one above 0")
 
     def __call__(
         self,
@@ -182,10 +182,10 @@ class Objective:
         tolerance: int,
     ) -> Losses:
         """The losses of distances by eq. 3, (B,P) of each layer, and scores by `log_posterior`, (B,N)."""
-        found = place_cross_entropy(scores, places, tolerance, 1.0)  # the scores have their temperature
+        found = place_cross_entropy(scores, places, tolerance, 1.0)  # the scores include the temperature
         parts, total = {"place": found.loss}, self.place * found.loss
         if self.phase:
-            if route.reduction == "mean":  # in the units of the scores
+            if route.reduction == "mean":  # to the units of the scores
                 distances = [
                     distance / weight_per_feature(route.metric, len(layer.features))
                     for distance, layer in zip(distances, route.plan, strict=True)
@@ -196,14 +196,14 @@ class Objective:
 
 
 class Coded(NamedTuple):
-    """proxies: (W,K), whose length means nothing. bits: scalar, what their lines take in all."""
+    """proxies: (W,K), of any length. bits: scalar, of all their lines."""
 
     proxies: Tensor
     bits: Tensor
 
 
 def bands_of(lines: int, transform: Transform = "dft") -> Tensor:
-    """The band of frequencies of each line of a spectrum, half an octave wide; 0 is the mean alone.
+    """The frequency band of each line of a spectrum, half an octave wide; band 0 is the mean only.
 
     Shape: -> (lines,) int64.
 
@@ -219,25 +219,25 @@ def bands_of(lines: int, transform: Transform = "dft") -> Tensor:
 def coded_proxies(
     lines: Tensor, log_step: Tensor, log_widths: Tensor, transform: Transform = "dft", noise: bool = True
 ) -> Coded:
-    """A proxy for each stretch of a route, rebuilt from the quantised lines of their spectra over the route.
+    """Decode a proxy for each segment of a route from the quantised lines of their spectra along the route.
 
-    A network whose descriptors follow the proxies learns features of few frequencies, as a `SpectralMap` of
-    few bytes holds them.
+    A network whose descriptors follow the proxies learns features of few frequencies, which a `SpectralMap`
+    codes in few bytes.
 
     Args:
-        lines: of any RMS, see `spectrum`; W stretches, at least 2.
-        log_step: of the step that they are coded in, beside an RMS of 1.
-        log_widths: of the Laplace distribution of the levels, in steps, for each band (`bands_of`) and
-            feature, in this order.
+        lines: of any RMS, see `spectrum`; W segments, at least 2.
+        log_step: log of the quantisation step, relative to the RMS.
+        log_widths: log of the widths of the Laplace distribution of the levels, in steps, for each band
+            (`bands_of`) and feature, in this order.
         transform: of the lines.
-        noise: whether the bits are those of levels with uniform noise in place of the rounding error.
+        noise: compute the bits of levels with uniform noise instead of the rounding error.
 
     Shape: (W,K), scalar, (bands * K,) -> Coded.
 
-    Convention: rounding is that of the map (`quantise`), whose gradient passes straight through.
+    Convention: rounding is that of the map (`quantise`), with a straight-through gradient.
 
     Source: Ballé, Laparra and Simoncelli, ICLR 2017, for the bits; Minnen and Singh, ICIP 2020, for noise in
-        the bits and rounding in what is rebuilt.
+        the bits and rounding in the decoded values.
 
     Raises:
         InputError: shapes that do not fit.
@@ -249,14 +249,14 @@ def coded_proxies(
         (torch.Size([40, 8]), True)
     """
     if lines.ndim != 2 or len(lines) < 2 or not lines.shape[1]:
-        raise InputError(f"the lines are {tuple(lines.shape)}; expected (W,K), at least 2 stretches")
+        raise InputError(f"the lines are {tuple(lines.shape)}; expected (W,K), at least 2 segments")
     band = bands_of(len(lines), transform).to(lines.device)
     expected = (int(band.max()) + 1) * lines.shape[1]
     if tuple(log_widths.shape) != (expected,):
         raise InputError(f"the widths are {tuple(log_widths.shape)}; expected ({expected},)")
-    wanted = lines / lines.square().mean().clamp(min=LEAST).sqrt() / log_step.exp()
-    levels = wanted + (quantise(wanted.detach(), 1.0) - wanted).detach()
-    noisy = wanted + torch.rand(wanted.shape, dtype=wanted.dtype).to(wanted) - 0.5 if noise else wanted
+    scaled = lines / lines.square().mean().clamp(min=MIN_ENERGY).sqrt() / log_step.exp()
+    levels = scaled + (quantise(scaled.detach(), 1.0) - scaled).detach()
+    noisy = scaled + torch.rand(scaled.shape, dtype=scaled.dtype).to(scaled) - 0.5 if noise else scaled
     widths = log_widths.exp().unflatten(0, (-1, lines.shape[1]))[band]
     return Coded(from_spectrum(levels.T, transform).T, laplace_bits(noisy, widths).sum())
 
@@ -266,7 +266,7 @@ class NothingLearned(InputError):
 
 
 def place_chance(places: int, tolerance: int) -> float:
-    """The least `place_cross_entropy` of one answer to all queries of a route, log(N / (2 tolerance + 1)).
+    """The minimum of `place_cross_entropy` with the same answer to all queries, log(N / (2 tolerance + 1)).
 
     Example:
         >>> round(place_chance(2697, 5), 2)
@@ -276,7 +276,7 @@ def place_chance(places: int, tolerance: int) -> float:
 
 
 def phase_chance(plan: Plan) -> float:
-    """The least `phase_cross_entropy` likewise: the mean entropy of a layer's phases along the route."""
+    """The same minimum of `phase_cross_entropy`: the mean entropy of a layer's phases along the route."""
     entropies = []
     for layer in plan:
         share = torch.bincount(layer.phase(torch.arange(layer.start, layer.stop))).double()
@@ -286,14 +286,14 @@ def phase_chance(plan: Plan) -> float:
 
 
 class LastLosses(deque[Mapping[str, Tensor]]):
-    """The losses of the last `LAST` steps of a stage, after its warm-up; those of a step by name."""
+    """The losses, by name, of the last `LAST` steps of a stage after its warm-up."""
 
     def __init__(self) -> None:
         super().__init__(maxlen=LAST)
         self.learned = False
 
     def check(self, chance: Mapping[str, float]) -> None:
-        """Refuse losses that tell places apart if none is below chance or still falls; not before `LAST`."""
+        """Raise `NothingLearned` if, after `LAST` steps, no loss is below chance and none is falling."""
         if len(self) < LAST or not chance:
             return
         losses = {name: torch.stack([parts[name] for parts in self]) for name in chance}

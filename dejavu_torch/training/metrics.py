@@ -1,4 +1,4 @@
-"""Place recognition as a metric of torchmetrics: `evaluate` over all the batches of an epoch."""
+"""`evaluate` over all batches of an epoch, as a metric of torchmetrics."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from dejavu_torch.types import InputError, Match
 
 
 class PlaceRecognition(Metric):
-    """What `evaluate` says of all queries of an epoch, whatever the batches and processes (section IV-C).
+    """The scores of `evaluate` over all queries of an epoch, in any batches and processes (section IV-C).
 
     Args:
         tolerance: in the unit of the places (frames, or evenly spaced places), inclusive.
@@ -23,9 +23,9 @@ class PlaceRecognition(Metric):
     Shape: update(match of (Q,), truth (Q,R) int64 with -1 as padding, or a `GroundTruth`); R may differ from
         batch to batch. compute() -> float64 scalars, the fields of `Scores` by name.
 
-    Convention: a query that `evaluate` leaves out (not judged, or reporting an ignored place) is left out
-        here. Where none is left, before the first update for example, every figure is NaN: nothing was
-        measured. Three numbers are kept of each query, on the device of the metric.
+    Convention: queries that `evaluate` excludes (not judged, or reporting an ignored place) are excluded
+        here. Without any query, for example before the first update, every figure is NaN. The state is three
+        numbers per query, on the device of the metric.
 
     Raises:
         InputError: in update, a negative tolerance, a NaN score, or a truth that does not fit the matches.
@@ -49,8 +49,8 @@ class PlaceRecognition(Metric):
     def __init__(self, tolerance: int, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         self.tolerance = tolerance
-        # of one dimension, so that batches and processes join whatever their R; and float64, which is then
-        # also what a process that saw no query gives
+        # one-dimensional, so that batches and processes can be joined for any R; float64, so that a process
+        # without queries gives it too
         self.set_dtype(torch.float64)
         self.add_state("rows", [], dist_reduce_fx="cat")
 
@@ -63,7 +63,7 @@ class PlaceRecognition(Metric):
         truth = GroundTruth(*(part.cpu() for part in as_ground_truth(truth)))
         good, answerable = is_right(index, truth.positives, self.tolerance), (truth.positives >= 0).any(1)
         kept = counted(index, truth, self.tolerance)
-        # the same queries in a world of two places: what is reported is place 0, and it or place 1 is right
+        # the same queries on a map of two places: the reported place is 0, and the right one is 0 or 1
         rows = torch.stack(
             [score, (index >= 0).double() - 1, torch.where(answerable, (~good).double(), -1)], 1
         )

@@ -1,8 +1,8 @@
-"""What the processes of one training share: a batch, its gradients and running statistics.
+"""A training by several processes, which share a batch, its gradients and running statistics.
 
-Losses and gradients are those of one process with the whole batch; only batch normalisation is by each part.
-All processes draw the same random numbers, but for augmentation and network: so each makes what is of the
-whole route, such as a whitening or a map, alike, without being sent it.
+Losses and gradients equal those of one process with the whole batch; only batch normalisation is per part.
+All processes draw the same random numbers, except for augmentation and network. So each computes the same
+whitening and the same map of the whole route, and none has to be sent.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from dejavu_torch.types import InputError
 
 
 def processes() -> int:
-    """How many there are."""
+    """The number of processes."""
     return distributed.get_world_size() if distributed.is_available() and distributed.is_initialized() else 1
 
 
 def process() -> int:
-    """The number of this one, from 0."""
+    """The rank of this process, from 0."""
     return distributed.get_rank() if processes() > 1 else 0
 
 
 def mean_of_all(values: Tensor) -> Tensor:
-    """The sum of a process's values over how many a process has on average: the mean over processes of such
-    figures, and of their gradients, is the mean over all values. (n,) -> scalar, 0 if there are none."""
+    """The sum of this process's values divided by the mean number of values per process: its mean over the
+    processes, also of the gradients, is the mean over all values. (n,) -> scalar, 0 without any."""
     count = averaged(torch.tensor(float(len(values)), device=values.device))
     return values.sum() / count.clamp(min=1 / processes())
 
@@ -46,7 +46,7 @@ def averaged(values: Tensor) -> Tensor:
 
 
 def average_gradients(optimizers: Iterable[Optimizer], module: nn.Module) -> None:
-    """Replace each gradient that any process has, and the running statistics of a module, by the mean."""
+    """Replace each gradient that any process has, and the running statistics of a module, by their mean."""
     if processes() == 1:
         return
     groups = [group for optimizer in optimizers for group in optimizer.param_groups]
@@ -54,28 +54,27 @@ def average_gradients(optimizers: Iterable[Optimizer], module: nn.Module) -> Non
     without = averaged(torch.tensor([float(parameter.grad is None) for parameter in trained]).to(trained[0]))
     for parameter, share in zip(trained, without.tolist(), strict=True):
         if share < 1:
-            parameter.grad = averaged(
-                torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
-            )
+            own = torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
+            parameter.grad = averaged(own)
     for buffer in module.buffers():
         if buffer.is_floating_point():
             buffer.copy_(averaged(buffer))
 
 
 def own_part(values: Tensor) -> Tensor:
-    """This process's rows of values that all have alike."""
+    """This process's rows of values that are the same in all processes."""
     return values.tensor_split(processes())[process()]
 
 
 def noise_like(values: Tensor) -> Tensor:
-    """Normal noise on the rows of this process, drawn for those of all, of the CPU's random numbers."""
+    """Normal noise for the rows of this process, from CPU random numbers drawn for the rows of all."""
     shape = (processes() * len(values), *values.shape[1:])
     return own_part(torch.randn(shape, dtype=values.dtype)).to(values.device)
 
 
 @contextmanager
 def own_random(step: int) -> Iterator[None]:
-    """Random numbers of this process alone, others at each step; those of all go on as if none were drawn."""
+    """Random numbers of this process alone, different at each step; the common state is restored after."""
     if processes() == 1:
         yield
         return
@@ -85,10 +84,10 @@ def own_random(step: int) -> Iterator[None]:
 
 
 def share(task: pl.LightningModule, trainer: pl.Trainer) -> None:
-    """Make the processes of a trainer begin alike; a strategy other than DDP is an InputError.
+    """Make the processes of a trainer begin with the same state; a strategy other than DDP is an InputError.
 
-    A training makes new parameters as it goes, which a model that DDP has wrapped would not know: the
-    strategy only starts the processes, and the task averages its gradients by `average_gradients`.
+    A training creates parameters, which a model wrapped by DDP would not know. So the strategy only starts
+    the processes, and the task averages its gradients by `average_gradients`.
     """
     if trainer.world_size == 1:
         return

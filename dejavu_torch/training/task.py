@@ -1,4 +1,4 @@
-"""Training the whole method end to end: the backbone, and with it the map, or the descriptors of the map."""
+"""Training the whole method: the backbone together with a template map, or the descriptors of another map."""
 
 from __future__ import annotations
 
@@ -31,65 +31,65 @@ from dejavu_torch.model_file import check_types, opened
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.training.checkpoint import EXPECTED, CheckpointFiles, read_checkpoint, taking_over
-from dejavu_torch.training.datamodule import FEW, Batch
+from dejavu_torch.training.datamodule import MIN_FRAMES, Batch
 from dejavu_torch.training.losses import LastLosses, Objective
 from dejavu_torch.training.metrics import PlaceRecognition
 from dejavu_torch.training.processes import average_gradients, averaged, share
-from dejavu_torch.training.stages import CodeStage, DescriptorStage, RateStage, Stage, stages_of, whitens
+from dejavu_torch.training.stages import CodeStage, DescriptorStage, RateStage, Stage, stages_of, unwhitened
 from dejavu_torch.training.trainee import Trainee, coded
 from dejavu_torch.types import InputError, Training
 
 log = logging.getLogger("dejavu_torch")
 
 TEMPERATURE = 0.03  # of `log_posterior` at the start
-DESCRIPTOR = 0.4  # of the steps of a training whose descriptor gets a code
-MAP, WHITENING = "dejavu.map.", "dejavu.whitening."  # names of tensors in a checkpoint begin so
+DESCRIPTOR = 0.4  # share of the steps for a descriptor that gets a code
+MAP, WHITENING = "dejavu.map.", "dejavu.whitening."  # prefixes of tensor names in a checkpoint
 
 
 class PlaceRecognitionTask(Trainee):
-    """A `DejaVu` model in training: its features learn to repeat with the periods of its layers.
+    """A `DejaVu` model in training, whose features learn to repeat with the periods of its layers.
 
-    The templates of the map start as the phase means of the untrained features (eq. 1) and then are
-    parameters. Periods never get a gradient: they are imposed, or found anew every few epochs. Of an
-    `Embedding` with a hidden layer the descriptor is trained first, then its code, see `stages_of`.
+    The templates of the map start as the phase means of the untrained features (eq. 1) and are trained.
+    Periods get no gradient: they are imposed, or found again every few epochs. For an `Embedding` with a
+    hidden layer the descriptor is trained first, then its code, see `stages_of`.
 
     Any other map, such as a spectral one, is not trained: all steps train the descriptor, without the code of
-    an `Embedding`, and the map is made of it in closed form.
+    an `Embedding`, and the map is made from it in closed form.
 
     Args:
         backbone: nn.Module (B,C,H,W) -> (B,D); None is `SmallCNN()`.
-        mapper: makes the map; its temperature is where that of templates starts, 0.03 if it is None. None is
-            `TemplateMapper(ImposedPeriods())`.
-        whitening: of the descriptor, if the map is made of it. It learns from views under the training's
+        mapper: makes the map; None is `TemplateMapper(ImposedPeriods())`. The trained temperature starts at
+            the mapper's, or at 0.03 if that is None.
+        whitening: of the descriptor, for maps made from it. It learns from views under the training's
             augmentation and of the second traverse; its `strengths` are not used. None and "none" are as in
-            `DejaVu`, but None is "none" with a `rate`: whitening would mix the features.
+            `DejaVu`, but with a `rate` None is "none", since whitening would mix the features.
         preprocess: as in `DejaVu`.
-        feature_weights: learn a weight of each feature, at least 0; of templates, as the next and
-            `refresh` and `losses`.
+        feature_weights: learn a weight of at least 0 for each feature; for template maps only, as are
+            `descriptor`, `refresh` and `losses`.
         descriptor: share of the steps in which an `Embedding` with a hidden layer learns its descriptor.
-        start: a map file of the same backbone, whose weights to start from.
-        freeze: beginnings of names of parameters that stay as they are, with their running statistics; "" is
-            all of the backbone.
-        batch_norm: "train" lets BatchNorm follow the batches; "frozen" keeps its running statistics, as
-            pretrained networks and few frames want.
-        refresh: epochs after which layers are found anew and templates restart as phase means; 0 never.
-        losses: which losses count, and how much.
-        rate: weight of a bit per place of the map beside the cross-entropy of the place, in nats; of maps
-            made of the descriptor, which then consists of few frequencies, see `coded_proxies`.
+        start: a map file of the same backbone with the weights to start from.
+        freeze: prefixes of names of parameters that are not trained and keep their running statistics; "" is
+            the whole backbone.
+        batch_norm: "train" lets BatchNorm follow the batches; "frozen" keeps its running statistics, which
+            is better for pretrained networks and few frames.
+        refresh: epochs after which layers are found again and templates restart as phase means; 0 never.
+        losses: the weights of the losses.
+        rate: weight of a bit per place of the map relative to the cross-entropy of the place, in nats. For
+            maps made from the descriptor, which then has few frequencies, see `coded_proxies`.
         lr: highest learning rate of AdamW; it rises over the first tenth of a stage's steps and falls to 0.
-        weight_decay: of weights that are multiplied with something, not of biases, templates and the like.
-        batch_size: frames in memory at a time if features are made without gradients.
-        weight_bits: of each weight of the backbone in the map file, 8 or 32, as of `DejaVu`. Training and
-            checkpoints have 32; a map that is made of a descriptor, validation and test see rounded ones.
+        weight_decay: of matrices and kernels only, not of biases or templates.
+        batch_size: frames in memory at a time when features are computed without gradients.
+        weight_bits: of each weight of the backbone in the map file, 8 or 32, as in `DejaVu`. Training and
+            checkpoints use 32; maps made from a descriptor, validation and test use the rounded weights.
 
-    Convention: `EarlyStopping`, a `ModelCheckpoint` with `monitor`, and validation begin with the last stage:
-        figures of two stages do not compare.
+    Convention: `EarlyStopping`, a `ModelCheckpoint` with `monitor`, and validation begin with the last stage,
+        since figures of two stages are not comparable.
 
     Raises:
-        InputError: settings out of range; a backbone that gives no (B,D); a loss that is not finite; a
-            checkpoint of other settings.
-        NothingLearned: an InputError; the mean loss of 100 steps after the rise of the learning rate, or of
-            the last 100 of a stage, is that of a guess.
+        InputError: settings out of range; a backbone that does not give (B,D); a loss that is not finite; a
+            checkpoint with other settings.
+        NothingLearned: an InputError; the mean loss over 100 steps after the rise of the learning rate, or
+            over the last 100 of a stage, is at chance.
     """
 
     def __init__(
@@ -116,7 +116,7 @@ class PlaceRecognitionTask(Trainee):
         made = not isinstance(mapper, TemplateMapper)
         learned = isinstance(whitening, Whitening)
         strengths = whitening.strengths if isinstance(whitening, Whitening) else STRENGTHS
-        none = f"none: it does nothing for the map of a {type(mapper).__name__}"
+        none = f"none, since it has no effect on the map of a {type(mapper).__name__}"
         for name, value, fits, expected in (
             ("lr", lr, lr > 0, "a number above 0"),
             ("weight_decay", weight_decay, weight_decay >= 0, "0 or more"),
@@ -149,43 +149,41 @@ class PlaceRecognitionTask(Trainee):
         self.losses = Objective() if losses is None else losses
         self.refresh, self.lr, self.weight_decay = refresh, lr, weight_decay
         self.stages = nn.ModuleList(stages_of(backbone, descriptor, made, rate))
-        self.index, self.began = 0, 0  # the stage, and the step at which it began
+        self.index, self.began = 0, 0  # the stage, and its first step
         self.last = LastLosses()  # of the stage
-        self.metric = PlaceRecognition(0)  # `setup` gives it the tolerance
-        # of the training that a checkpoint comes from
+        self.metric = PlaceRecognition(0)  # `setup` sets the tolerance
+        # from a checkpoint
         self.steps = 0
-        self.resumed = False  # whether it is being taken over
-        self.held_before: list[int] | None = None  # stretches
-        self.routes: list[Any] | None = None  # that are not compared with the data's yet
+        self.resumed = False  # until the first step or validation
+        self.held_before: list[int] | None = None  # its held-out segments
+        self.routes: list[Any] | None = None  # until they are compared with the data's
         self._callbacks: list[pl.Callback] = []
 
     @property
     def stage(self) -> Stage:
-        """The stage that runs."""
+        """The current stage."""
         return cast(Stage, self.stages[self.index])
 
     @property
     def in_last_stage(self) -> bool:
-        """Whether this is the stage that trains the map, or the descriptors of the map."""
+        """Whether this stage trains the map, or the descriptors from which it is made."""
         return self.index == len(self.stages) - 1
 
     @property
     def frame_size(self) -> tuple[int, int] | None:
-        """(height, width) to which the backbone resizes frames, so that they may be stored in it; None if it
-        does not, or a contrast is evened before, at the frames' own size."""
+        """(height, width) to which the backbone resizes frames, at which they can be stored; None if it does
+        not, or if contrast normalisation needs the frames' own size."""
         return None if self.dejavu.preprocess.contrast else getattr(self.features, "resize", None)
 
     @property
     def held(self) -> list[int]:
-        """The first places of the stretches that no step has seen, nor one of the checkpoint's training."""
+        """The first places of the segments that neither this training nor that of a checkpoint has seen."""
         before = self.held_before
         return [start for start in self.data.held if before is None or start in before]
 
     def setup(self, stage: str) -> None:
-        """Get ready for a route; the first map is made later, if no checkpoint brings one.
-
-        Convention: checkpoints are `CheckpointFiles`, unless the trainer was given another plugin for them.
-        """
+        """Prepare for a route, with `CheckpointFiles` unless the trainer has another plugin for checkpoints.
+        The first map is made later, unless it comes from a checkpoint."""
         if type(self.trainer.strategy.checkpoint_io) is TorchCheckpointIO:
             self.trainer.strategy.checkpoint_io = CheckpointFiles()
         data, model, frames = self.data, self.dejavu, self.data.sets["reference"]
@@ -196,25 +194,25 @@ class PlaceRecognitionTask(Trainee):
         self.metric = PlaceRecognition(data.tolerance)
         model.velocity = data.velocity
         self._check_routes()
-        if stage == "fit" and sum(data.lengths) < FEW:
+        if stage == "fit" and sum(data.lengths) < MIN_FRAMES:
             self._say_few()
         if ready and self.made:
             kind = type(model.mapper).__name__
-            seen = f"{data.reference.name} holds ready features, and the map of a {kind} is not trained"
+            seen = f"{data.reference.name} holds ready features, but the map of a {kind} is not trained"
             raise InputError(f"{seen}; expected frames, or `dejavu learn`")
         if isinstance(self.stage, RateStage) and len(data.routes) > 1:
-            seen = f"model.rate is {self.stage.rate} and there are {len(data.routes)} routes"
-            raise InputError(f"{seen}: its bits are of the map of one; expected model.rate 0, or one route")
-        whitened = model.whitening if self.made else whitens(model.features)
+            seen = f"model.rate is {self.stage.rate}, for the bits of one map, and there are "
+            raise InputError(f"{seen}{len(data.routes)} routes; expected model.rate 0, or one route")
+        whitened = model.whitening if self.made else unwhitened(model.features)
         if whitened is not None and not data.augmentation.acts and data.sources["second"] is None:
-            seen = "data.augmentation changes nothing, which leaves nothing to whiten by"
+            seen = "data.augmentation changes nothing, so the whitening has nothing to learn from"
             other = ", or model.whitening none" * self.made
-            raise InputError(f"{seen}; expected one that does, or data.second{other}")
+            raise InputError(f"{seen}; expected an augmentation, or data.second{other}")
         if ready and list(model.features.parameters()):
-            log.warning("these are ready features: the backbone is left out")
-            model.features, self.frozen = HOG(), set()  # has nothing to store
+            log.warning("the source holds ready features: the backbone is not used")
+            model.features, self.frozen = HOG(), set()  # has no weights to store
             self.stages, self.index = nn.ModuleList([CodeStage()]), 0
-        # a further training describes its own frames
+        # another training computes these again
         self.began, self.views, self._descriptors, self.last = 0, None, None, LastLosses()
 
     def _say_few(self) -> None:
@@ -222,13 +220,13 @@ class PlaceRecognitionTask(Trainee):
         source = data.sources["source"]
         alone = data.sources["validation"] is None and len(data.routes) == 1
         log.warning(
-            "%s has %d frames, below %d: the untrained map that `dejavu learn` makes is likely better%s",
-            *(source if isinstance(source, (str, Path)) else data.route_name, sum(data.lengths), FEW),
+            "%s has %d frames, fewer than %d: the untrained map of `dejavu learn` is likely better%s",
+            *(source if isinstance(source, (str, Path)) else data.route_name, sum(data.lengths), MIN_FRAMES),
             ", and the trained map is not calibrated without data.validation" * alone,
         )
 
     def forward(self, frames: Tensor) -> Tensor:
-        """Scores of all places, the very ones that the exported map gives. (B,C,H,W) or (B,D) -> (B,N)."""
+        """Scores of all places, equal to those of the exported map. (B,C,H,W) or (B,D) -> (B,N)."""
         with in_bits(self.features, self.weight_bits):
             features = features_of(frames, self.dejavu.describe, "the batch")
         if self.made:
@@ -236,11 +234,7 @@ class PlaceRecognitionTask(Trainee):
         return self.scores(self.route.distances(features))
 
     def deployed(self) -> DejaVu:
-        """The trained model by itself, whose `save` writes the map file.
-
-        Raises:
-            InputError: a training that has not reached its last stage.
-        """
+        """The trained model, whose `save` writes the map file; an InputError before the last stage."""
         self.require_map()
         if self.made and not self.map.places:
             self.relearn()
@@ -255,12 +249,12 @@ class PlaceRecognitionTask(Trainee):
             route.temperature = mapper.temperature = float(self.log_temperature.detach().exp())
             mapper.trainable = False
         steps = 0 if self._trainer is None else self.trainer.global_step
-        seed = os.environ.get("PL_GLOBAL_SEED")  # where seed_everything keeps it
+        seed = os.environ.get("PL_GLOBAL_SEED")  # set by seed_everything
         model.trained = Training(steps or self.steps, int(seed) if seed else None)
         return model
 
     def require_map(self) -> None:
-        """Refuse a training that is in a stage without a map."""
+        """Refuse a stage without a map."""
         if not self.in_last_stage:
             stage = f"stage {self.index + 1} of {len(self.stages)}, {type(self.stage).__name__}"
             raise InputError(f"the training is in {stage}, which has no map yet; expected the last stage")
@@ -268,9 +262,8 @@ class PlaceRecognitionTask(Trainee):
     # training
 
     def configure_optimizers(self) -> Any:
-        """Begin the stage, or the next if it has no steps: AdamW of its parameters, whose learning rate
-        rises over the first tenth of its steps, then falls along a cosine to 0. Only what is multiplied with
-        something decays: matrices and kernels."""
+        """Begin the stage, or the next one if it has no steps: AdamW, with a learning rate that rises over
+        the first tenth of the steps, then falls along a cosine to 0. Only matrices and kernels decay."""
         if not math.isfinite(float(self.trainer.estimated_stepping_batches)):
             raise InputError("the training has no end; expected trainer.max_steps or trainer.max_epochs")
         if self.stop() <= self.began and not self.in_last_stage:
@@ -292,14 +285,14 @@ class PlaceRecognitionTask(Trainee):
         return {"optimizer": optimizer, "lr_scheduler": schedule}
 
     def stop(self) -> int:
-        """The step that ends the stage."""
+        """The step at which the stage ends."""
         steps = int(self.trainer.estimated_stepping_batches)
         if self.in_last_stage:
             return steps
         return min(self.began + round(cast(DescriptorStage, self.stage).share * steps), steps - 1)
 
     def _rise(self) -> int:
-        """Steps of the stage in which the learning rate rises."""
+        """Number of steps in which the learning rate rises."""
         return max(1, round((self.stop() - self.began) / 10))
 
     def _advance(self, step: int) -> None:
@@ -309,29 +302,31 @@ class PlaceRecognitionTask(Trainee):
         self.index, self.began, self.last = self.index + 1, step, LastLosses()
 
     def _check_learned(self) -> None:
+        """Refuse a training that learned nothing."""
         self.last.check(self.stage.chance(self))
 
+    on_train_end = _check_learned
+
     def on_fit_start(self) -> None:
-        """Callbacks that watch a figure wait for the last stage."""
+        """Remove callbacks that monitor a figure until the last stage."""
         self._callbacks = self.trainer.callbacks  # type: ignore[attr-defined]
         if not self.in_last_stage:
-            self.trainer.callbacks = [  # type: ignore[attr-defined]
-                callback for callback in self._callbacks if getattr(callback, "monitor", None) is None
-            ]
+            others = [one for one in self._callbacks if getattr(one, "monitor", None) is None]
+            self.trainer.callbacks = others  # type: ignore[attr-defined]
 
     def teardown(self, stage: str) -> None:
-        """Give the trainer back its callbacks."""
+        """Restore the callbacks of the trainer."""
         if self._callbacks:
             self.trainer.callbacks, self._callbacks = self._callbacks, []  # type: ignore[attr-defined]
 
     def on_train_start(self) -> None:
         """Refuse a checkpoint whose loops are at another step than its weights."""
         if self.resumed and self.global_step != self.steps:
-            seen = f"the checkpoint is of step {self.steps}, its loops are at {self.global_step}"
+            seen = f"the checkpoint is of step {self.steps}, but its loops are at {self.global_step}"
             raise InputError(f"{seen}; {EXPECTED}")
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
-        """Drop a map of the features before; begin the next stage if the steps of this one are over."""
+        """Drop the map of the previous features; begin the next stage after the last step of this one."""
         if self.made and self.map.places:
             self.dejavu.load_state_dict(self._unmade(), strict=False)
         if not self.in_last_stage and self.global_step >= self.stop():
@@ -341,13 +336,13 @@ class PlaceRecognitionTask(Trainee):
                 self.trainer.callbacks = self._callbacks
 
     def on_train_epoch_start(self) -> None:
-        """Find the layers anew when it is time to."""
+        """Find the layers again every `refresh` epochs."""
         due = self.refresh and self.current_epoch and self.current_epoch % self.refresh == 0
         if due and self.in_last_stage:
             before = self.route
             self.relearn()
             optimizer, new = self.trainer.optimizers[0], dict(self.route.named_parameters())
-            for name, old in before.named_parameters():  # nothing is remembered of it
+            for name, old in before.named_parameters():  # replaced, without optimizer state
                 for group in optimizer.param_groups:
                     group["params"] = [new[name] if one is old else one for one in group["params"]]
                 optimizer.state.pop(old, None)
@@ -370,21 +365,17 @@ class PlaceRecognitionTask(Trainee):
         return total
 
     def on_train_batch_end(self, *_: Any) -> None:
-        """Give up a training that learns nothing, as soon as that can be told."""
-        self.resumed = False  # its optimizer's state has made a step
+        """Stop a training that learns nothing, as soon as that is known."""
+        self.resumed = False  # the optimizer accepted the checkpoint's state
         if not self.last.learned:
             self._check_learned()
 
-    def on_train_end(self) -> None:
-        """The same at the end."""
-        self._check_learned()
-
     def on_after_backward(self) -> None:
-        """The gradients of all processes, before their scaling and clipping."""
+        """Average the gradients of all processes, before scaling and clipping."""
         average_gradients(self.trainer.optimizers, self.features)
 
     def train(self, mode: bool = True) -> PlaceRecognitionTask:
-        """As nn.Module's, but what is frozen keeps its running statistics."""
+        """As in nn.Module, but frozen modules keep their running statistics."""
         super().train(mode)
         for name in self.frozen:
             self.features.get_submodule(name).eval()
@@ -393,16 +384,16 @@ class PlaceRecognitionTask(Trainee):
     # validation and test
 
     def on_validation_epoch_start(self) -> None:
-        """A map of the present features, if there is none yet."""
+        """Make the map of the current features, if there is none yet."""
         self.resumed = False
         if self.trainer.state.fn != "fit":
             self.require_map()
         if self.in_last_stage and not self.map.places:
-            with torch.inference_mode(False):  # its parameters may be trained later
+            with torch.inference_mode(False):  # since its parameters may be trained later
                 self.relearn()
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
-        """Localize a batch, in the number type of the exported map whatever the training's."""
+        """Localize a batch, in the precision of the exported map."""
         if self.in_last_stage:
             frames = batch.frames if self.trainer.testing else self.data.validated(batch)
             with torch.autocast(self.device.type, enabled=False):
@@ -412,7 +403,7 @@ class PlaceRecognitionTask(Trainee):
             self.metric.update(match._replace(index=index), truth)
 
     def on_validation_epoch_end(self) -> None:
-        """Log what `evaluate` says; the reference itself, under augmentation, is no validation traverse."""
+        """Log the scores of `evaluate`; those on the augmented reference get a suffix."""
         if self.in_last_stage:
             figures = self.metric.compute()
             self.metric.reset()
@@ -431,20 +422,20 @@ class PlaceRecognitionTask(Trainee):
         cls, checkpoint_path: str | Path, *, weights_only: bool = True, **settings: Any
     ) -> PlaceRecognitionTask:
         """A task with the weights of a checkpoint and the constructor's `settings`, as in the training.
-        Unlike Lightning's own, it imports nothing that the file names; `weights_only` is always true."""
+        Unlike Lightning's method, it imports no class named in the file; `weights_only` is always true."""
         task = cls(**settings)
         load_weights(task, checkpoint_path)
         return task
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Keep the stage, and what is trained; a map that is made is made anew."""
+        """Add the stage, the trained parameters and the routes; a map in closed form is not stored."""
         checkpoint |= {"stages": self._stages(), "stage": self.index, "began": self.began}
         checkpoint |= {"trained": self._trained(), "routes": self._routes(), "held": self.held}
         if self.made:
             checkpoint["state_dict"] |= {f"dejavu.{name}": value for name, value in self._unmade().items()}
 
     def _unmade(self) -> dict[str, Any]:
-        """The state of a model that has learned no map and no whitening."""
+        """The state of a model without a map and without a learned whitening."""
         whitening = None if self.dejavu.whitening is None else Whitening()
         return DejaVu(nn.Identity(), whitening or "none", self.dejavu.mapper).state_dict()
 
@@ -456,16 +447,16 @@ class PlaceRecognitionTask(Trainee):
         return sorted(name for name, parameter in self.named_parameters() if id(parameter) in trained)
 
     def _routes(self) -> list[Any]:
-        """Names and lengths of several routes; nothing of one, which may be read from elsewhere."""
+        """Names and lengths of several routes; empty for one, whose path may change."""
         named = [[route.name, n] for route, n in zip(self.data.routes, self.data.lengths, strict=True)]
         return named if len(named) > 1 else []
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuse what is not of these settings and this route; layers that were found are taken over."""
+        """Refuse a checkpoint of other settings or another route; take over its layers."""
         if checkpoint["stages"] != self._stages():
             seen = f"the checkpoint is of the stages {checkpoint['stages']}"
             raise InputError(f"{seen}; expected one of {self._stages()}")
-        own = {name for name, _ in self.named_parameters()}  # buffers of a backbone may hold what they like
+        own = {name for name, _ in self.named_parameters()}  # buffers of a backbone may hold any value
         for name, value in checkpoint["state_dict"].items():
             checked = name in own or name.startswith((MAP, WHITENING))
             if checked and isinstance(value, Tensor) and not value.isfinite().all():
@@ -473,7 +464,7 @@ class PlaceRecognitionTask(Trainee):
         if self._trainer is not None:
             self.resumed = True
             if self.trainer.state.fn != "fit":
-                checkpoint.pop("loops", None)  # nothing goes on
+                checkpoint.pop("loops", None)  # no training continues
         self.routes, self.held_before = checkpoint["routes"], checkpoint["held"]
         if not self.made:
             self._take_templates(checkpoint["state_dict"])
@@ -481,7 +472,7 @@ class PlaceRecognitionTask(Trainee):
         self.index, self.began = checkpoint["stage"], checkpoint["began"]
         self.steps = checkpoint["global_step"]
         if other := sorted(set(self._trained()) ^ set(checkpoint["trained"])):
-            seen = f"{', '.join(other[:3])}: trained in the checkpoint or in this run, not in both"
+            seen = f"{', '.join(other[:3])}: trained in either the checkpoint or this run, but not in both"
             raise InputError(f"{seen}; expected a checkpoint of the same settings")
 
     def _take_templates(self, state: dict[str, Any]) -> None:
@@ -495,28 +486,28 @@ class PlaceRecognitionTask(Trainee):
                     ", ".join(f"{layer.phases} in {layer.period}" for layer in plan) or "no"
                     for plan in (route.plan, imposed)
                 )
-                seen = f"the checkpoint has layers of {held} frames, this run imposes {wanted}"
+                seen = f"the checkpoint has layers of {held} frames, but this run imposes {wanted}"
                 raise InputError(f"{seen}; expected the same periods")
         route.trainable(True, self.feature_weights)
         self.dejavu.map = route.to(self.device)
 
     def _check_routes(self) -> None:
-        """Refuse a map, or a checkpoint, of other routes than the data's, once there are data."""
+        """Refuse a map or a checkpoint of other routes than the data's, if there are data."""
         if self._trainer is None:
             return
         places, count = self.map.places, len(self.data.sets["reference"])
         if places not in (0, count):
-            seen = f"the map is of {places} places, {self.data.reference.name} has {count}"
-            raise InputError(f"{seen}; expected the route that it was made of")
+            seen = f"the map has {places} places, {self.data.reference.name} has {count}"
+            raise InputError(f"{seen}; expected the route that the map was made of")
         if self.routes not in (None, self._routes()):
             seen = f"the checkpoint was trained on {self.routes or 'one route'!s:.300}"
-            seen = f"{seen}, the data is {self.data.route_name}"
-            raise InputError(f"{seen}; expected the same routes in the same order")
+            expected = "expected the same routes in the same order"
+            raise InputError(f"{seen}, the data is {self.data.route_name}; {expected}")
         self.routes = None
 
 
 def load_weights(task: PlaceRecognitionTask, path: str | Path) -> None:
-    """Give a task what a checkpoint of it holds."""
+    """Load a checkpoint into its task."""
     checkpoint = read_checkpoint(path)
     with taking_over(path):
         task.on_load_checkpoint(checkpoint)
@@ -525,7 +516,7 @@ def load_weights(task: PlaceRecognitionTask, path: str | Path) -> None:
 
 
 def start_from(backbone: nn.Module, path: str | Path) -> None:
-    """Give a backbone the weights of a map file, without the code of a whitened descriptor, of its route."""
+    """Load the weights of a map file into a backbone, except the code of a whitened descriptor."""
     prefix = "features."
     with opened(Path(path)) as (tensors, header):
         stored = unpacked(tensors, prefix)
@@ -548,13 +539,13 @@ def start_from(backbone: nn.Module, path: str | Path) -> None:
 def freeze_parts(
     backbone: nn.Module, prefixes: Sequence[str], batch_norm: Literal["train", "frozen"]
 ) -> set[str]:
-    """Take the gradient from parameters; return the names of modules whose running statistics stay."""
+    """Freeze parameters; return the names of the modules that keep their running statistics."""
     named = dict(backbone.named_parameters())
     for prefix in prefixes:
         chosen = [p for name, p in named.items() if name.startswith(prefix)]
         if not chosen:
             known = ", ".join(sorted({name.partition(".")[0] for name in named}))
-            seen = f"freeze names {prefix!r}, which no parameter of {type(backbone).__name__} begins with"
+            seen = f"freeze has {prefix!r}, but no parameter of {type(backbone).__name__} begins with it"
             raise InputError(f"{seen}; expected one of {known or 'none, it has none'}")
         for parameter in chosen:
             parameter.requires_grad_(False)

@@ -1,4 +1,4 @@
-"""A model in training: how it describes the frames of its route, and the map of them."""
+"""A model in training: its descriptors of the route's frames, and their map."""
 
 from __future__ import annotations
 
@@ -24,31 +24,31 @@ from dejavu_torch.training.datamodule import RouteData, StoredFrames
 from dejavu_torch.training.losses import Objective
 from dejavu_torch.types import InputError
 
-WIDE = 1e6  # step of a map without lines, beside descriptors of about 1
+WIDE = 1e6  # step of a map without lines, for descriptors of about 1
 
 log = logging.getLogger("dejavu_torch")
 
 
 class Trainee(pl.LightningModule):
-    """A `DejaVu` model and the route that it is trained on. Its map is of templates, which are trained, or of
-    another kind, which is made of the descriptors in closed form (`made`)."""
+    """A `DejaVu` model and the route that it is trained on. The templates of its map are trained; any other
+    map is made from the descriptors in closed form (`made`)."""
 
     log_temperature: nn.Parameter
     losses: Objective
-    frozen: set[str]  # modules of the features whose running statistics stay
-    gives_way = False  # whether bytes per place that a short route cannot meet are raised
+    frozen: set[str]  # modules of the features that keep their running statistics
+    gives_way = False  # whether to raise bytes per place that a short route cannot meet
 
     def __init__(self, dejavu: DejaVu, made: bool, feature_weights: bool, weight_bits: int) -> None:
         super().__init__()
         self.dejavu, self.made = dejavu, made
         self.feature_weights, self.weight_bits = feature_weights, weight_bits
-        self._descriptors: Tensor | None = None  # of the reference, once they stay as they are
-        # what a code is learned from: descriptors of augmented frames, (n,K), and their places, (n,R)
+        self._descriptors: Tensor | None = None  # of the reference, once they are fixed
+        # to learn a code from: descriptors of augmented frames, (n,K), and their places, (n,R)
         self.views: tuple[Tensor, Tensor] | None = None
 
     @property
     def data(self) -> RouteData:
-        """The data module that the trainer runs with."""
+        """The trainer's data module."""
         data = getattr(self._trainer, "datamodule", None)
         if not isinstance(data, RouteData):
             raise InputError(f"the trainer's data module is {type(data).__name__}; expected RouteData")
@@ -56,22 +56,22 @@ class Trainee(pl.LightningModule):
 
     @property
     def map(self) -> PlaceMap:
-        """The map of the present features; empty until it is made."""
+        """The map of the current features; empty until it is made."""
         return self.dejavu.map
 
     @property
     def route(self) -> TemplateMap:
-        """The map in training."""
+        """The template map in training."""
         return cast(TemplateMap, self.dejavu.map)
 
     @property
     def features(self) -> nn.Module:
-        """What is trained to describe frames."""
+        """The features in training."""
         return self.dejavu.features
 
     @property
     def network(self) -> nn.Module:
-        """What makes the descriptor: the features, or their network if a code follows."""
+        """The module that makes the descriptor: the features, or their network if a code follows."""
         embedding = coded(self.features)
         return self.features if embedding is None else embedding.network
 
@@ -83,13 +83,13 @@ class Trainee(pl.LightningModule):
         return embedding.describe(self.dejavu.preprocess(frames))
 
     def scores(self, distances: Sequence[Tensor]) -> Tensor:
-        """Eq. 4 of the map with the temperature that is trained: L tensors (B,P) -> (B,N)."""
+        """Eq. 4 of the map with the trained temperature: L tensors (B,P) -> (B,N)."""
         return log_posterior(self.route.combine(distances), self.log_temperature.exp())
 
     # the reference, described
 
     def descriptors(self) -> Tensor:
-        """Descriptors of the reference, (N,K), of a network that is trained no more: made once."""
+        """Descriptors of the reference, (N,K), by a network that is fixed by now; computed once."""
         if self._descriptors is None:
             with in_mode(self.features, False):
                 self._descriptors = self.of_reference(self.described)
@@ -99,8 +99,8 @@ class Trainee(pl.LightningModule):
     def of_reference(
         self, make: Callable[[Tensor], Tensor], given: Tensor | None = None, shuffled: bool = False
     ) -> Tensor:
-        """What `make` gives for batches of the stored frames, or of what is given of each, (N,D); NaN is
-        refused. Shuffled batches are drawn from all over the route, for running statistics."""
+        """`make` applied to batches of the stored frames, or of the rows of `given`, (N,D); NaN is refused.
+        Shuffled batches come from all over the route, for running statistics."""
         frames = self.data.sets["reference"]
         count = len(frames)
         order = torch.randperm(count) if shuffled else torch.arange(count)
@@ -112,25 +112,25 @@ class Trainee(pl.LightningModule):
         features = torch.cat(made)
         features = features[order.argsort().to(features.device)]
         if not features.isfinite().all():
-            seen = f"{type(self.features).__name__} makes NaN or infinite features of {self.data.route_name}"
+            seen = f"{type(self.features).__name__} gives NaN or infinite features for {self.data.route_name}"
             raise InputError(f"{seen}; expected finite numbers")
         return features
 
-    def described(self, frames: Tensor, describe: Callable[[Tensor], Tensor] | None = None) -> Tensor:
-        """Descriptors of stored frames; a backbone that does not take them is refused."""
+    def described(self, frames: Tensor) -> Tensor:
+        """Descriptors of stored frames; a backbone that fails on them is refused."""
         try:
-            return features_of(frames.to(self.device), describe or self.describe, "the batch")
+            return features_of(frames.to(self.device), self.describe, "the batch")
         except RuntimeError as error:
-            seen = f"{type(self.features).__name__} does not take frames {tuple(frames.shape[1:])}"
+            seen = f"{type(self.features).__name__} does not accept frames {tuple(frames.shape[1:])}"
             raise InputError(f"{seen}: {one_line(error)[:200]}") from error
 
     @torch.no_grad()
-    def views_of(self, rounds: int, most: int) -> Iterator[tuple[Tensor, Tensor]]:
-        """Batches of descriptors of augmented training frames, (B,K), and their known places, (B,R); at most
-        `most` in all after the first round."""
+    def views_of(self, rounds: int, limit: int) -> Iterator[tuple[Tensor, Tensor]]:
+        """Batches of descriptors of augmented training frames, (B,K), and their known places, (B,R); after
+        the first round at most `limit` in all."""
         loader = self.data.training_batches()
         frames = len(cast(StoredFrames, loader.dataset))
-        rounds = min(rounds, most // frames) if self.data.augmentation.acts else 1
+        rounds = min(rounds, limit // frames) if self.data.augmentation.acts else 1
         with in_mode(self.features, False):
             for _ in range(max(1, rounds)):
                 for batch in loader:
@@ -143,7 +143,7 @@ class Trainee(pl.LightningModule):
     # the map
 
     def relearn(self) -> None:
-        """The map anew from the present features of the reference (section III-A)."""
+        """Make the map from the current features of the reference (section III-A)."""
         if self.made:
             self._make_map()
         else:
@@ -155,7 +155,7 @@ class Trainee(pl.LightningModule):
     def _learn_templates(self) -> None:
         first, weights = not self.route.places, self.route.weights
         embedding = coded(self.features)
-        with in_mode(self, first):  # the first are made in training mode: running statistics are gathered
+        with in_mode(self, first):  # the first in training mode, to collect running statistics
             if embedding is None:
                 features = self.of_reference(self.described, shuffled=first)
             else:
@@ -166,15 +166,11 @@ class Trainee(pl.LightningModule):
             raise InputError(f"nothing repeats in the features of {name}; expected imposed periods")
         self.route.trainable(True, self.feature_weights, weights)
 
+    @torch.no_grad()
     def _make_map(self) -> None:
-        """In closed form, of the rounded network, and with no random number of the training."""
+        """In closed form from the rounded network, without using up random numbers of the training."""
         model, whitening = self.dejavu, self.dejavu.whitening
-        with (
-            in_bits(self.features, self.weight_bits),
-            torch.random.fork_rng(),
-            torch.no_grad(),
-            in_mode(model, False),
-        ):
+        with in_bits(self.features, self.weight_bits), torch.random.fork_rng(), in_mode(model, False):
             features = self.of_reference(self.described)
             if self.gives_way:
                 self.check_budget(*features.shape)
@@ -187,22 +183,22 @@ class Trainee(pl.LightningModule):
             model.learn_features(model.whitened(features), alone)
 
     def check_budget(self, places: int, dimension: int) -> None:
-        """Refuse a map of too few bytes; those that nobody asked for give way."""
+        """Refuse a map of too few bytes; if the user did not choose them, raise them instead."""
         mapper: Any = self.dejavu.mapper
         whitening = self.dejavu.whitening
-        numbers = dimension if whitening is None else whitening.kept(places, dimension, True)
-        descriptors = torch.randn(places, numbers, generator=torch.Generator().manual_seed(0))
+        kept = dimension if whitening is None else whitening.kept(places, dimension, True)
+        descriptors = torch.randn(places, kept, generator=torch.Generator().manual_seed(0))
         if whitening is None:
-            descriptors += 1  # a mean that takes bytes
+            descriptors += 1  # a mean, which needs bytes
         wanted = getattr(mapper, "route_bytes_per_place", None)
-        gives_way, self.gives_way = self.gives_way, False  # it is settled
+        gives_way, self.gives_way = self.gives_way, False  # only once
         try:
             mapper(descriptors)
         except InputError:
             if not gives_way or wanted is None:
                 raise
             empty = SpectralMapper(None, step=WIDE, chunk=mapper.chunk)(descriptors)
-            more = min(wanted + empty.summary().route_bytes / places, 4 * numbers)
+            more = min(wanted + empty.summary().route_bytes / places, 4 * kept)
             mapper.route_bytes_per_place = math.ceil(100 * more) / 100
             mapper(descriptors)
             log.warning(

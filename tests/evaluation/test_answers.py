@@ -83,7 +83,7 @@ def test_no_line_no_offset(places: Tensor) -> None:
 def test_few_answers_or_few_frames_show_no_line() -> None:
     assert line_of(torch.arange(9), torch.arange(9), within=5) is None
     assert line_of(torch.arange(12), torch.arange(12), within=5) is None  # any order would be near it
-    assert line_of(torch.arange(40), torch.arange(40), within=5, fewest=41) is None
+    assert line_of(torch.arange(40), torch.arange(40), within=5, min_answers=41) is None
 
 
 @pytest.mark.parametrize(

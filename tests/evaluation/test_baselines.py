@@ -62,7 +62,7 @@ def test_distances_in_parts_change_nothing(monkeypatch: pytest.MonkeyPatch) -> N
         whole = nearest_frames(reference, query, k, matching=Matching(sequence))
         for numbers in (1, 20, 45):
             with monkeypatch.context() as patch:
-                patch.setattr("dejavu_torch.evaluation.baselines.DISTANCES_AT_ONCE", numbers)
+                patch.setattr("dejavu_torch.evaluation.baselines.BLOCK_DISTANCES", numbers)
                 parts = nearest_frames(reference, query, k, matching=Matching(sequence))
             assert all(torch.equal(x, y) for x, y in zip(parts, whole, strict=True))
 

@@ -120,7 +120,7 @@ def test_the_null_of_a_trained_map_has_the_templates_of_shuffled_frames(trained:
 
 @pytest.mark.parametrize(("kind", "frames"), [(ArrayTraverse, 239), (Unknown, 241)])
 def test_another_reference_than_the_map_s_is_refused(trained: DejaVu, frames: int, kind: Any) -> None:
-    with refused(f"gives {frames} places", "holds 240", "expected the reference that it was made of"):
+    with refused(f"has {frames} places", "the map has 240", "expected the reference"):
         compare(kind(route(0, frames)), kind(route(1)), "0", model=trained)
 
 
@@ -270,7 +270,7 @@ def test_many_queries_in_order_are_filtered_if_that_is_asked_for(monkeypatch: py
     found = []
     monkeypatch.setattr("dejavu_torch.evaluation.compare.draw_pictures", lambda *_: {})
     for most in (900, 899):
-        monkeypatch.setattr("dejavu_torch.evaluation.compare.UNASKED", most)
+        monkeypatch.setattr("dejavu_torch.evaluation.compare.MAX_FILTERED", most)
         found.append([bool(compare(*pair, ordered=ordered).run.matching.beside) for ordered in (None, True)])
     assert found == [[True, True], [False, True]]
 

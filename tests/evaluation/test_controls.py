@@ -266,5 +266,5 @@ def test_what_leaving_out_does_not_fit_is_refused() -> None:
         with refused(f"leave-out got width {width}", "expected width >= 0 and (40, 3)"):
             leave_out_match(model, given, width)
     model.trained = Training(10, None)
-    with refused("trained templates", "was not trained"):
+    with refused("trained templates", "an untrained map"):
         leave_out_match(model, features)

@@ -222,7 +222,7 @@ def test_queries_that_are_not_counted_are_as_if_never_asked(
             kept.append(i)
     if not kept:
         for judging in (evaluate, curve_of, count_queries):
-            with refused(f"of {len(rows)} queries", "none is left", "expected"):
+            with refused(f"of {len(rows)} queries", "none can be judged", "expected"):
                 judging(match, truth, tolerance)
         return
     rest, right = Match(*(column[kept] for column in match)), truth.positives[kept]
@@ -241,7 +241,7 @@ def test_queries_that_are_not_counted_are_as_if_never_asked(
 def test_a_soft_place_within_the_tolerance_of_a_right_one_is_right() -> None:
     truth = GroundTruth(torch.tensor([[10]]), torch.tensor([True]), torch.tensor([[12]]))
     assert evaluate(match_of([12]), truth, 2).recall_at_1 == 1.0
-    with refused("none is left"):
+    with refused("none can be judged"):
         evaluate(match_of([12]), truth, 1)
 
 

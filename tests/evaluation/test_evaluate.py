@@ -161,7 +161,7 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
     only = written(tmp_path, HEADER + "0,7,0.5,1\n", "one.csv")
     soft = np.ones((9, 1), dtype=bool)
     np.savez(tmp_path / "gt.npz", GThard=np.eye(9, 1, dtype=bool), GTsoft=soft)
-    with refused("none is left to judge"):
+    with refused("none can be judged"):
         evaluate_file(only, str(tmp_path / "gt.npz"))
 
 

@@ -56,7 +56,7 @@ def test_the_lines_that_are_marked_are_those_of_the_map(chunk: int) -> None:
         assert axis.lines[2].get_ydata() == [1, 1]
         assert axis.lines[1].get_color() == COLOURS["map"]
     assert {"period (frames)", "size of a line (steps)", "kept", "coded as 0", "step"} <= set(texts(figure))
-    assert ("of the chunk of frames 0 to 150" in picture.caption) == (chunk == 150)
+    assert ("in the chunk of frames 0 to 150" in picture.caption) == (chunk == 150)
 
 
 def test_a_map_without_lines_has_no_such_pictures() -> None:

@@ -92,7 +92,7 @@ def test_rows_show_frames_side_by_side_under_their_titles() -> None:
 
 
 def test_scores_are_scaled_and_the_best_of_each_block_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dejavu_torch.evaluation.match_plots.SCORES_AT_ONCE", 200)
+    monkeypatch.setattr("dejavu_torch.evaluation.match_plots.BLOCK_SCORES", 200)
     scores, asked = torch.rand(30, 50), []
 
     def of(numbers: Tensor) -> Tensor:
@@ -105,7 +105,7 @@ def test_scores_are_scaled_and_the_best_of_each_block_is_shown(monkeypatch: pyte
     for column, block in enumerate(scaled(scores)[::2].split(3, 1)):
         assert torch.allclose(image(picture.plot[1].flat[0])[:, column], block.amin(1))
     assert (sum(asked), max(asked)) == (15, 4)
-    told = "Drawn: 15 of the queries; of 3 neighbouring places the one that fits best."
+    told = "Shown: 15 of 30 queries; the best of every 3 neighbouring places."
     assert picture.caption.endswith(told)
 
 
@@ -167,7 +167,7 @@ def test_what_a_sequence_adds_up_may_reach_off_the_map_and_before_the_first_quer
 def test_a_posterior_is_pooled_as_it_comes_and_shows_some_right_places(
     monkeypatch: pytest.MonkeyPatch, largest_tensor: type
 ) -> None:
-    monkeypatch.setattr("dejavu_torch.evaluation.match_plots.SCORES_AT_ONCE", 450)
+    monkeypatch.setattr("dejavu_torch.evaluation.match_plots.BLOCK_SCORES", 450)
     scores, model = torch.rand(130, 75), PlaceFilter()
     with torch.no_grad():
         posterior = model.posterior(scores)
@@ -178,7 +178,7 @@ def test_a_posterior_is_pooled_as_it_comes_and_shows_some_right_places(
     with largest_tensor() as seen:
         picture = draw_posterior(run, cells=40)["posterior"]
     assert seen.numel <= 38 * 33  # queries by places of the image
-    assert "the most probable of 4 queries and 2 places" in picture.caption
+    assert "the highest probability among 4 queries and 2 places" in picture.caption
     figure, (axis, below) = picture.plot
     for row, some in zip(image(axis), posterior[:, :-1].split(4), strict=True):
         for value, places in zip(row, some.split(2, 1), strict=True):

@@ -130,7 +130,7 @@ def test_the_pairs_are_the_frames_that_were_matched(run: Localization) -> None:
         assert torch.allclose(torch.tensor(axis.images[0].get_array())[..., 0], source[number, 0])
     for asked, reported in zip(numbers[::3], numbers[1::3], strict=True):
         assert int(run.match.index[asked]) == reported
-    assert "All are accepted" in pairs.caption
+    assert "All answers are accepted" in pairs.caption
     strict = run._replace(match=run.match._replace(accepted=run.match.accepted & False))
     assert "best match of those that are rejected" in draw_pictures(strict, {})["pairs"].caption
 
@@ -148,7 +148,7 @@ def test_a_sequence_shows_what_it_adds_up_and_a_filter_its_posterior(run: Locali
     assert "Circles" in pictures["posterior"].caption
     run = sequenced(run, SequenceMatcher(5))
     run.match.index[58:63] = -1  # the example is the nearest to the middle that is reported
-    assert "frame 57 and the place reported for it, the 5 cells" in draw_pictures(run, {})["scores"].caption
+    assert "frame 57 and its reported place, the 5 cells" in draw_pictures(run, {})["scores"].caption
     run.match.index.fill_(-1)
     assert "cells" not in draw_pictures(run, {})["scores"].caption
 

@@ -58,7 +58,7 @@ def test_a_curve_that_starts_late_has_a_star_and_the_star_is_explained(equal: bo
     one = report()._replace(ours=ours)
     assert ours.starts == equal / 10
     assert score_table(one)[1][1].endswith("*") == late
-    assert ("*: this curve starts at a recall above 0.1" in summary(one)) == late
+    assert ("this curve starts at a recall above 0.1" in summary(one)) == late
     assert one.as_json()["curve_starts_at_recall"] == ours.starts
 
 
@@ -144,9 +144,9 @@ def test_the_summary_tells_what_was_scored() -> None:
     assert summary(report(facts)) == (
         "20 queries; right within 3 places of the truth (place = query). 40 frames of the reference and 30 "
         "of the query were resampled to even steps of 2.5 pixels of ground. 15 of the queries are in the "
-        "truth. 2 report a place that counts neither as right nor as wrong. Of 13 scored 9 are accepted, 8 "
-        "correctly. Here --threshold 0.25 would accept right places only. Learning took 1.2 s, localizing "
-        "2.0 s."
+        "truth. 2 queries report an ignored place, which is neither right nor wrong. 9 of 13 scored answers "
+        "are accepted; 8 of these are right. On these queries --threshold 0.25 accepts right places only. "
+        "Learning took 1.2 s, localizing 2.0 s."
     )
     assert summary(report()) == "20 queries; right within 3 frames."
 
@@ -154,10 +154,10 @@ def test_the_summary_tells_what_was_scored() -> None:
 def test_the_page_begins_with_plain_words() -> None:
     baseline = Contender("all frames", SCORES._replace(recall_at_1=0.9), 64000, 1)
     assert headline(report({"frames": 32}, uncompressed=baseline)).replace("\xa0", " ") == (
-        "20 queries were looked up on a map of 32 places: 75.0 % were found in their right place (recall@1). "
-        "Sorted by score, the answers have an area under the precision-recall curve (AUC) of 0.500; 1 is "
-        "perfect. The map takes 125 bytes per place. The features as they are would take 2000 and find "
-        "90.0 %."
+        "20 queries were localized on a map of 32 places: 75.0 % were matched to their right place "
+        "(recall@1). Sorted by score, the answers have an area under the precision-recall curve (AUC) of "
+        "0.500; 1 is perfect. The map takes 125 bytes per place. Storing the features uncompressed would "
+        "take 2000 bytes per place and find 90.0 %."
     )
     some = headline(report({"with_answer": 16})).replace("\xa0", " ")
     assert "Of the 16 that have a right place, 75.0 %" in some  # recall is of those, not of all 20
@@ -212,7 +212,7 @@ def test_the_next_step_is_a_filter_or_more_bytes_if_these_find_more() -> None:
     floats = Contender("all frames", SCORES._replace(recall_at_1=0.9), 64000, 1)
     one = report({"kind": "spectral"}, uncompressed=floats)._replace(ours=ours)
     found = " ".join(steps(one)).replace("\xa0", " ")
-    assert "87.5 % are found" in found
+    assert "87.5 % of these queries are found" in found
     assert "--mapper.hold .95" in found
 
 

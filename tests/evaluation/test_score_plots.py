@@ -74,7 +74,7 @@ def test_the_storage_picture_shows_the_points_and_what_the_null_takes() -> None:
     assert lines["all of them"].get_ydata() == [0.9, 0.9]
     assert axis.get_xscale() == "log"
     assert {"route bytes per place", "right within 2 frames"} <= set(texts(figure))
-    assert "null takes 4 times the bytes" in picture.caption
+    assert "null control needs 4 times the bytes" in picture.caption
     assert picture.numbers["null_over_map"] == [4.0]
     assert picture.numbers["map"][0] == {"route_bytes_per_place": 1, "auc": 0.5, "recall_at_1": 0.5}
     assert draw_storage({}, {}, "2 frames") == draw_storage({}, {"map": []}, "2 frames") == {}
@@ -97,7 +97,7 @@ def test_the_areas_of_sequences_of_all_contenders_and_of_the_map_at_other_sizes(
     figure, axis = draw_sequences(contenders, coded, 100, "2 frames")["sequences"].plot
     lines = {line.get_label(): line for line in axis.lines}
     # 5 route bytes per place are its own; 2.5 are nearest to 0.97, which are there already
-    names = ["this map, 5 route bytes per place", "the same in 0.97 bytes", "HOG, every frame"]
+    names = ["this map, 5 route bytes per place", "the map in 0.97 bytes", "HOG, every frame"]
     assert list(lines) == names[::-1]  # the first on top
     assert [list(line.get_xdata()) for line in axis.lines] == [[1, 5, 11]] * 3
     assert list(lines[names[0]].get_ydata()) == [0.5, 0.7, 0.9]

@@ -86,7 +86,7 @@ def test_spectrogram_is_darkest_at_the_period(hop: int | None) -> None:
     assert starts == [start for start, _, _ in analysis(values)]
     kept = [line.get_ydata() for line in below.lines if line.get_marker() == "o"]
     assert kept == [[32]]
-    assert "feature 0 through time" in texts(figure)
+    assert "feature 0 along the route" in texts(figure)
 
 
 def test_spectrogram_of_a_constant_feature_and_of_a_long_one() -> None:

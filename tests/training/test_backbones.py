@@ -129,7 +129,7 @@ def test_ready_features_leave_a_backbone_out(tmp_path: Path, caplog: pytest.LogC
     running.fit(task, data_of(features))
     model = DejaVu.load(tmp_path / "map.safetensors")  # by itself
     running.validate(task, data_of(features), verbose=False)
-    assert warned(caplog) == ["these are ready features: the backbone is left out"]
+    assert warned(caplog) == ["the source holds ready features: the backbone is not used"]
     assert "backbone" not in model.summary().fixed
     assert model.summary().map_bytes < sum(p.nbytes for p in backbone().parameters())
     torch.testing.assert_close(model(features[:3]), task(features[:3]))
@@ -157,12 +157,12 @@ class Wrong(nn.Module):
     [
         (Wrong("3d"), ("Wrong made (40, 8, 1)", "expected features (40, D)")),
         (Wrong("half"), ("Wrong made (20, 8)", "expected features (40, D)")),
-        (Wrong("nan"), ("Wrong makes NaN", "the array")),
+        (Wrong("nan"), ("Wrong gives NaN", "the array")),
         (Wrong("late"), ("the loss is nan at step 2", "place nan", "expected a finite number")),
         (SmallCNN(8, 3, (16, 16), (4,)), ("got frames (40, 1, 16, 16)",)),
         (
             nn.Sequential(nn.Conv2d(3, 2, 3), nn.Flatten()),
-            ("Sequential does not take frames (1, 16, 16)", "3 channels"),
+            ("Sequential does not accept frames (1, 16, 16)", "3 channels"),
         ),
     ],
     ids=["3d", "half", "nan", "late", "CNN's channels", "channels"],

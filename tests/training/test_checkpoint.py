@@ -158,9 +158,9 @@ def test_a_resumed_run_finds_layers_anew_when_it_is_time_to(tmp_path: Path) -> N
         ("templates 3", {"feature_weights": True}, FRAMES, ["dejavu.map.weights", "not in both"]),
         ("templates 3", {"freeze": ["linear"]}, FRAMES, ["dejavu.features.linear.bias, dejavu"]),
         ("templates 3", {"backbone": coded()}, FRAMES, ["['CodeStage']", "['DescriptorStage', 'CodeStage']"]),
-        ("templates 3", {}, 30, ["the map is of 40 places", "the array has 30"]),
+        ("templates 3", {}, 30, ["the map has 40 places", "the array has 30"]),
         ("spectral 4", {"mapper": mapper()}, FRAMES, ["['DescriptorStage']", "'CodeStage'"]),
-        ("spectral 4", {}, 30, ["40 stretches of 1 frames", "the array has 30", "the route"]),
+        ("spectral 4", {}, 30, ["40 segments of 1 frames", "the array has 30", "the route"]),
         ("spectral 4", {"freeze": ["network.linear"]}, FRAMES, ["network.linear.bias", "not in both"]),
     ],
     ids=str,
@@ -191,7 +191,7 @@ def test_a_task_is_not_fitted_to_a_second_route(tmp_path: Path) -> None:
     task = new_task()
     model = fit(tmp_path, task, data_of())
     for stage in ("fit", "validate"):
-        with refused("the map is of 40 places", "the array has 30", "expected the route that it was made of"):
+        with refused("the map has 40 places", "the array has 30", "expected the route"):
             getattr(trainer(tmp_path), stage)(task, data_of(footage()[:30]))
     # the same route once more goes on from its map
     templates = task.route.templates.detach().clone()

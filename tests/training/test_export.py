@@ -56,16 +56,16 @@ def test_what_leaves_no_map_or_another_than_expected_warns(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     trainer(tmp_path, limit_train_batches=0).fit(new_task(), data_of())
-    assert warned(caplog) == ["no step was taken: no map is written"]
+    assert warned(caplog) == ["no training step was made: no map is written"]
     assert not (tmp_path / "map.safetensors").exists()
     caplog.clear()
     best, task = ModelCheckpoint(tmp_path, monitor="val/auc_augmented", mode="max"), new_task()
     trainer(tmp_path, best, Tidy(), LastCheckpoint()).fit(task, data_of())
-    assert warned(caplog) == [f"{best.best_model_path} is gone: the map is of the last step"]
+    assert warned(caplog) == [f"{best.best_model_path} is gone: the map is from the last step"]
     caplog.clear()
     trainer(tmp_path).fit(new_task(), data_of(), ckpt_path=tmp_path / "checkpoints" / "last.ckpt")
     (line,) = warned(caplog)
-    assert line.startswith("nothing was trained: step 4 is reached")
+    assert line.startswith("nothing was trained: step 4 is already reached")
     assert torch.equal(DejaVu.load(tmp_path / "map.safetensors").map.templates, task.route.templates)
 
 

@@ -19,7 +19,7 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.features.views import STRETCH, Views
 from dejavu_torch.training import export
-from dejavu_torch.training.export import UNTRAINED, LastCheckpoint, beside_untrained
+from dejavu_torch.training.export import UNTRAINED, LastCheckpoint, compare_with_untrained
 from dejavu_torch.types import Match
 
 FRAMES = 320
@@ -52,7 +52,7 @@ def calibrations(monkeypatch: pytest.MonkeyPatch) -> list[set[int]]:
         seen.append(set(views.places.tolist()))
 
     monkeypatch.setattr(DejaVu, "calibrate", taken)
-    monkeypatch.setattr("dejavu_torch.training.export.beside_untrained", lambda *_: {})
+    monkeypatch.setattr("dejavu_torch.training.export.compare_with_untrained", lambda *_: {})
     return seen
 
 
@@ -157,7 +157,7 @@ def test_the_untrained_map_is_of_frames_of_the_queries_size(
     reference, query = (ArrayTraverse(footage(noise, 24, 176)) for noise in (0.0, 0.1))
     model = DejaVu(backbone(), mapper=SpectralMapper(6.0), preprocess=Preprocess(size=size))
     model.learn(ArrayTraverse(footage(0.0, 24, 32)))
-    scores = beside_untrained(model, reference, query, as_ground_truth(torch.arange(24)[:, None]), 2)
+    scores = compare_with_untrained(model, reference, query, as_ground_truth(torch.arange(24)[:, None]), 2)
     assert UNTRAINED in scores
     assert len([line for line in warned(caplog) if "resized to" in line]) == (size is not None)
 
@@ -176,7 +176,7 @@ def test_the_untrained_map_takes_as_many_bytes(
         return match(model, query)
 
     monkeypatch.setattr(export, "_match", noted)
-    beside_untrained(model, reference, query, as_ground_truth(torch.arange(24)[:, None]), 2)
+    compare_with_untrained(model, reference, query, as_ground_truth(torch.arange(24)[:, None]), 2)
     assert sizes[1] == pytest.approx(sizes[0], rel=0.02)
 
 
@@ -186,7 +186,7 @@ def test_the_untrained_map_takes_as_many_bytes(
 def test_a_short_route_is_told_before_the_training(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     trainer(tmp_path, **SHORT).fit(new_task(), data_of())
     (line,) = warned(caplog)
-    assert all(fact in line for fact in ("40 frames, below 300", "dejavu learn", "data.validation"))
+    assert all(fact in line for fact in ("40 frames, fewer than 300", "dejavu learn", "data.validation"))
     assert DejaVu.load(tmp_path / "map.safetensors").calibration is None
 
 

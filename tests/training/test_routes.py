@@ -18,7 +18,7 @@ from dejavu_torch import DejaVu, RouteData, SpectralMapper, open_source
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.source import routes_of
 from dejavu_torch.features.embedding import to_length
-from dejavu_torch.training.stages import DescriptorStage, alike
+from dejavu_torch.training.stages import DescriptorStage, similar_span
 from dejavu_torch.training.task import PlaceRecognitionTask
 
 LENGTHS = [40, 31, 23]
@@ -67,7 +67,7 @@ def test_neither_stretches_nor_the_tolerance_cross_from_one_route_to_the_next(tm
     stage = task.stage
     assert isinstance(stage, DescriptorStage)
     stage.begin(task)
-    every = alike(data.sets["reference"], data.lengths, 3)
+    every = similar_span(data.sets["reference"], data.lengths, 3)
     assert every == 2  # shorter than the tolerance
     places = [(route, i) for route, length in enumerate(LENGTHS) for i in range(length)]
     stretches = list(dict.fromkeys((route, i // every) for route, i in places))
@@ -192,11 +192,11 @@ POOLED = nn.Sequential(nn.AdaptiveAvgPool2d(4), nn.Flatten(), nn.Linear(16, 8))
         ([], {}, {}, ("source is an empty list", "at least one traverse")),
         (["a", None], {}, {}, ("source is of type NoneType", "a path")),
         (["sim:aerial", "sim:aerial"], {}, {}, ("sim:aerial is given twice",)),
-        (None, {"second": routes()[0]}, {}, ("second is of 1, the routes are 3", "null")),
-        (None, {"second_truth": "3"}, {}, ("second_truth is of 1, the routes are 3",)),
+        (None, {"second": routes()[0]}, {}, ("second lists 1, and there are 3 routes", "null")),
+        (None, {"second_truth": "3"}, {}, ("second_truth lists 1, and there are 3 routes",)),
         (None, {"query": [routes()[0]] * 3}, {}, ("query is given", "3 routes", "--descriptor")),
         (routes((16, 20, 16))[:2], {}, {"backbone": POOLED}, ("1 has frames of (1, 20, 20)", "data.resize")),
-        (None, {}, {"rate": 1.0}, ("model.rate is 1.0 and there are 3 routes", "model.rate 0")),
+        (None, {}, {"rate": 1.0}, ("model.rate is 1.0", "3 routes", "model.rate 0")),
         (None, {}, {"mapper": None}, ("3 routes", "SpectralMapper")),
     ],
     ids=["empty", "none", "twice", "one second", "one truth", "query", "sizes", "rate", "templates"],

@@ -179,7 +179,7 @@ def test_a_map_of_either_kind_gives_its_network_to_start_from(tmp_path: Path) ->
         ({"rate": math.nan}, ("rate is nan", "0 or more")),
         ({"weight_bits": 4}, ("weight_bits is 4", "8, 32")),
         ({"mapper": nn.Identity()}, ("mapper is a Identity", "expected a Mapper")),
-        ({"mapper": mapper(), "rate": 1.0}, ("rate is 1.0", "nothing for the map of a TemplateMapper")),
+        ({"mapper": mapper(), "rate": 1.0}, ("rate is 1.0", "no effect on the map of a TemplateMapper")),
         ({"mapper": mapper(), "whitening": Whitening()}, ("whitening", "TemplateMapper")),
         ({"feature_weights": True}, ("feature_weights", "SpectralMapper")),
         ({"descriptor": 0.5}, ("descriptor", "SpectralMapper")),
@@ -198,8 +198,8 @@ def test_settings_that_do_not_fit_are_refused(settings: dict[str, Any], facts: t
 @pytest.mark.parametrize(
     ("settings", "frames", "facts"),
     [
-        ({"backbone": coded(network=HOG())}, None, ("can be trained", "dejavu learn")),
-        ({"freeze": [""]}, None, ("can be trained", "dejavu learn")),
+        ({"backbone": coded(network=HOG())}, None, ("nothing to train", "dejavu learn")),
+        ({"freeze": [""]}, None, ("nothing to train", "dejavu learn")),
         ({}, torch.eye(FRAMES), ("ready features", "SpectralMapper is not trained", "dejavu learn")),
         ({"mapper": SpectralMapper(0.1)}, None, ("route_bytes_per_place is 0.1",)),
     ],

@@ -32,7 +32,7 @@ from dejavu_torch import HOG, DejaVu, SpectralMapper
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.training.datamodule import StoredFrames
-from dejavu_torch.training.stages import CodeStage, DescriptorStage, alike
+from dejavu_torch.training.stages import CodeStage, DescriptorStage, similar_span
 from dejavu_torch.training.task import PlaceRecognitionTask
 
 ALL = [DescriptorStage, CodeStage]
@@ -195,25 +195,25 @@ def slid(step: int, count: int = 200, noise: float = 0.0, seed: int = 0) -> Tens
 @pytest.mark.parametrize(("step", "noise", "expected"), [(1, 0.0, 5), (1, 0.1, 5), (80, 0.0, 1)])
 def test_a_stretch_is_as_long_as_frames_stay_alike(step: int, noise: float, expected: int) -> None:
     frames = slid(step, noise=noise)
-    assert alike(stored(frames), [200], 5) == expected
-    assert alike(stored(frames), [200], 1) == alike(stored(frames), [200], 0) == 1  # the tolerance at most
+    assert similar_span(stored(frames), [200], 5) == expected
+    assert [similar_span(stored(frames), [200], most) for most in (1, 0)] == [1, 1]  # the tolerance at most
     stop = torch.cat([frames[:100], frames[100:101].expand(60, -1, -1, -1), frames[100:]])
-    assert alike(stored(stop), [260], 5) == expected
+    assert similar_span(stored(stop), [260], 5) == expected
 
 
 def test_what_a_route_always_shows_is_no_likeness() -> None:
     below, other = torch.rand(2, 1, 32, 64, generator=torch.Generator().manual_seed(1))
     routes = [slid(80, 60, seed=seed) for seed in (2, 3)]
     routes[0][:, :, 32:], routes[1][:, :, 32:] = below, other
-    assert alike(stored(*routes), [60, 60], 5) == 1
-    assert alike(stored(slid(1)[:60], *routes), [60, 60, 60], 5) == 1  # not the first route alone
+    assert similar_span(stored(*routes), [60, 60], 5) == 1
+    assert similar_span(stored(slid(1)[:60], *routes), [60, 60, 60], 5) == 1  # not the first route alone
 
 
 def test_frames_too_small_for_hog_have_stretches_of_the_tolerance() -> None:
     small = StoredFrames(
         [torch.zeros(9, 1, 4, 4, dtype=torch.uint8)], as_ground_truth(torch.arange(9)[:, None])
     )
-    assert alike(small, [9], 5) == 5
+    assert similar_span(small, [9], 5) == 5
 
 
 def test_places_are_right_within_a_stretch(
@@ -226,8 +226,8 @@ def test_places_are_right_within_a_stretch(
     assert (task.stage.tolerance(task), task.metric.tolerance) == (1, 5)
     assert task.stage.chance(task) == {"descriptor": pytest.approx(math.log(200 / 3))}
     # one that is resumed keeps its stretches
-    monkeypatch.setattr("dejavu_torch.training.stages.alike", lambda *_: pytest.fail("looked again"))
+    monkeypatch.setattr("dejavu_torch.training.stages.similar_span", lambda *_: pytest.fail("looked again"))
     task.stage.begin(task)
     assert int(task.stage.every) == 1
-    (line,) = [line for line in warned(caplog) if "alike" in line]
+    (line,) = [line for line in warned(caplog) if "stay similar" in line]
     assert all(fact in line for fact in ("for 1, fewer than data.tolerance 5", "dejavu learn"))
