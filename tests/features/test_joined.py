@@ -348,7 +348,7 @@ def test_a_network_of_a_function_beside_hog(folder: Path, capsys: pytest.Capture
         (("[HOG, zoo.nothing]",), "--features.members: module 'zoo' has no attribute 'nothing'"),
         (("[HOG, {",), "--features is '[HOG, {'; expected a list of classes"),
         (("[2020-13-45]",), "--features is '[2020-13-45]'; expected a list of classes"),
-        (("[HOG, PatchPixels]", "--whitening.groups", "[1764, 10]"), "groups of 1764 + 10 numbers"),
+        (("[HOG, PatchPixels]", "--whitening.groups", "[1764, 10]"), "groups of 1764 + 10 dimensions"),
         (("HOG", "--whitening.groups", "[]"), "the groups are []"),
     ],
 )

@@ -22,7 +22,7 @@ MUTANTS = [
     Mutant(
         "With a temperature a query that no place covers scores +inf everywhere.",
         "dejavu_torch/maps/template_map.py",
-        "return -logits.log_softmax(1).masked_fill(closed, -math.inf)",
+        "return -logits.log_softmax(1).masked_fill(uncovered, -math.inf)",
         "return -logits.log_softmax(1)",
         ("tests/maps/test_scores.py::-k temperature or log_posterior",),
     ),
@@ -130,7 +130,7 @@ MUTANTS = [
     Mutant(
         "A map file that is damaged in any bit is refused.",
         "dejavu_torch/maps/file.py",
-        "if seen.get(part) != sums.get(part)",
+        "if found.get(part) != sums.get(part)",
         "if (part in seen) != (part in sums)",
         ("tests/maps/test_file.py::-k any_flipped",),
     ),

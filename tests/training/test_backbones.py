@@ -162,7 +162,7 @@ class Wrong(nn.Module):
         (SmallCNN(8, 3, (16, 16), (4,)), ("got frames (40, 1, 16, 16)",)),
         (
             nn.Sequential(nn.Conv2d(3, 2, 3), nn.Flatten()),
-            ("Sequential does not take frames (1, 16, 16)", "3 channels"),
+            ("Sequential fails on frames (1, 16, 16)", "3 channels"),
         ),
     ],
     ids=["3d", "half", "nan", "late", "CNN's channels", "channels"],
