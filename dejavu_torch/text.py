@@ -15,10 +15,7 @@ Step = TypeVar("Step")
 
 def printable(text: object) -> str:
     """The text as one line: characters neither printable nor a space, such as line breaks, are escaped."""
-    return "".join(
-        c if c.isprintable() or category(c) == "Zs" else c.encode("unicode_escape").decode()
-        for c in str(text)
-    )
+    return "".join(c if c.isprintable() or category(c) == "Zs" else ascii(c)[1:-1] for c in str(text))
 
 
 def one_line(text: object) -> str:

@@ -180,8 +180,7 @@ class Match(_Columns):
         index: (Q,) int64, the place found, -1 if no place has a finite score; (Q,k) candidates, best first.
         score: float, lower is better, +inf without a place. accepted: bool, see `DejaVu.acceptance`.
         probability: float64, of being right, NaN for all but the first candidate; None without calibration.
-        sequences: for each T, matches (Q,) by sequences of T queries, or by a filter. Neither this nor
-            `probability` is in the tuple.
+        sequences: by T, matches (Q,) of sequences or a filter. The tuple lacks this and `probability`.
     """
 
     probability: Tensor | None = None
@@ -236,11 +235,8 @@ class SequenceModel(nn.Module, ABC):
 
     @abstractmethod
     def step(self, scores: Tensor, state: Tensor, firsts: Sequence[int] = (0,)) -> tuple[Tensor, Tensor]:
-        """Scores (B,N) of the next B queries, and the state -> scores (B,N) and the next state.
-
-        Args:
-            firsts: the first place of each route of the map.
-        """
+        """Scores (B,N) of the next B queries, the state, and the first place of each route -> scores (B,N),
+        the next state."""
 
     @abstractmethod
     def check(self, queries: int | None, places: int) -> None:

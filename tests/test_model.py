@@ -270,7 +270,7 @@ def test_a_frame_that_is_not_finite_is_named() -> None:
     for make, bad in ((waves, torch.nan), (pictures, torch.inf)):
         values = make()
         values[41].view(-1)[1] = bad
-        with refused("frame 41", "NaN", "expected finite"):
+        with refused("frame 41", "NaN", "expected none"):
             wave_model(batch_size=8).learn(values)
         model = wave_model(batch_size=8).learn(make())
         with refused("frame 41", "NaN"):

@@ -42,15 +42,14 @@ class Augmentation(nn.Module):
         blur: largest sigma of a Gaussian, pixels, at most 20; the kernel reaches as many pixels, rounded.
         occlusion: fraction of the frame that a rectangle of another clip covers, sides 1:3 to 3:1, at most 1.
         noise: standard deviation of Gaussian noise, at most 1.
-        perspective: degrees, at most 45, about the vertical and the horizontal axis: the frame is a tilted
-            plane, with its longer side as its distance and as the focal length.
+        perspective: degrees, at most 45, about both axes; distance and focal length are the longer side.
 
     Shape: frames (B,C,H,W) or clips (B,T,C,H,W), float32 in [0, 1] -> the same.
 
-    Convention: changes follow in this order. Rotation, shift, scale and perspective happen together to 90 %
-        of clips, and repeat the border; gamma, occlusion and noise to 70 %, illumination and blur to 50 %.
-        All frames of a clip get the same change, except noise; a single clip is covered with black. Random
-        numbers come from torch's generators. No gradient passes. Eval mode returns the input itself.
+    Convention: changes follow in this order. Rotation, shift, scale and perspective, together, change 90 %
+        of clips and repeat the border; gamma, occlusion and noise 70 %, illumination and blur 50 %. Frames of
+        a clip share all but the noise; a single clip is covered with black. No gradient passes. Random
+        numbers are from torch's generators. Eval mode returns the input itself.
 
     Raises:
         InputError: a strength out of range; forward: frames of another shape or dtype, or too small to blur.

@@ -95,8 +95,7 @@ class SmallCNN(nn.Module):
 
     def forward(self, frames: Tensor) -> Tensor:
         if frames.ndim != 4 or frames.shape[1] != self.channels:
-            expected = f"(B,{self.channels},H,W), as channels={self.channels}"
-            raise InputError(f"SmallCNN got frames {tuple(frames.shape)}; expected {expected}")
+            raise InputError(f"SmallCNN got {tuple(frames.shape)}; expected frames (B,{self.channels},H,W)")
         frames = resize_frames(frames, self.resize).to(self.linear.weight.dtype)
         if self.cell:
             frames = local_contrast(frames, self.cell)

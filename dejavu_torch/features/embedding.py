@@ -84,8 +84,7 @@ class Embedding(nn.Module):
 
     Args:
         network: frames (B,channels,h,w) -> feature maps (B,K,h',w'), tokens (B,T,K), which are averaged, or
-            vectors (B,K), such as `kornia.feature.HardNet()` with 1 channel of 32 x 32. Of several outputs
-            the first vectors are used.
+            vectors (B,K), such as `kornia.feature.HardNet()` with 1 channel; of several, the first vectors.
         dimension: D, number of features; None returns the pooled output itself.
         channels: of the network's input, 3 or 1; grey frames are repeated, colours become luminance.
         resize: (height, width) in pixels to resize frames to, antialiased.
@@ -94,15 +93,14 @@ class Embedding(nn.Module):
         hidden: width of the hidden layer of a `Coder`, which replaces the linear layer; 0 has none.
         noise, kept: of the `Coder`.
         layer: name of the submodule, as in `named_modules`, at which the network ends, see `up_to`.
-        mean, std: of the frames in [0, 1], per channel or one number for all, to normalise the network's
-            input; (.485, .456, .406) and (.229, .224, .225) for most networks trained on ImageNet.
+        mean, std: to normalise frames in [0, 1], per channel or one for all; (.485, .456, .406) and
+            (.229, .224, .225) for most networks trained on ImageNet.
         output: index of the output to use, if the network returns a tuple, list or dict.
 
     Shape: (B,C,H,W) float in [0, 1], C of 1 or 3 -> (B,D).
 
     Raises:
-        InputError: settings out of range, or a layer, output or frame size that the network does not have;
-            forward: frames neither grey nor RGB.
+        InputError: settings out of range or not of this network; forward: frames neither grey nor RGB.
 
     Example:
         >>> blocks = nn.Sequential(nn.Conv2d(3, 4, 3), nn.Conv2d(4, 9, 3))
@@ -138,11 +136,8 @@ class Embedding(nn.Module):
         self.hidden, self.noise, self.kept = hidden, noise, kept
         self.layer, self.mean, self.std, self.output = layer, mean, std, output
         if not fits or not 1 <= grid <= WIDEST or channels not in (1, 3) or min(cell, hidden) < 0:
-            expected = (
-                f"1 or 3 channels, cell and hidden 0 or more, a grid of 1 to {WIDEST}, dimension at least"
-            )
-            expected += " 1, or none and hidden 0"
-            raise InputError(f"Embedding got {self.extra_repr()}; expected {expected}")
+            expected = "channels 1 or 3, cell, hidden 0 or more, dimension at least 1, or none and hidden 0"
+            raise InputError(f"Embedding got {self.extra_repr()}; expected {expected}, grid 1 to {WIDEST}")
         # not persistent: the settings hold the same
         self.register_buffer("offset", _per_channel("mean", mean, channels, 0.0), persistent=False)
         self.register_buffer("factor", 1 / _per_channel("std", std, channels, 1.0), persistent=False)

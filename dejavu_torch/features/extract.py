@@ -40,8 +40,7 @@ def feature_batches(
         traverse: frames (B,C,H,W), or ready features (B,D), which pass unchanged.
         module: (B,C,H,W) -> (B,D). It runs in eval mode; the modes of its parts are restored.
         batch_size: frames in memory at a time, fewer if they are large; at least 256 ready features.
-        progress: label of a progress bar on stderr, or of occasional lines if that is no terminal. Copies
-            of one frame count once.
+        progress: label of a progress bar on stderr, or of lines if it is no terminal; copies count once.
         on_first: called with the first batch and its features.
 
     Raises:
@@ -120,7 +119,7 @@ def warn_of_bright(frames: Tensor, name: str) -> bool:
 
 
 def check_alone(module: nn.Module, frames: Tensor, features: Tensor, name: str) -> None:
-    """Refuse a network whose features of a frame depend on its batch by more than 1e-3 or rounding."""
+    """Refuse a network in eval mode whose features of a frame depend on its batch beyond 1e-3 or rounding."""
     if frames.ndim != 4 or len(frames) < 2:
         return
     device = features.device.type

@@ -24,9 +24,8 @@ class HOG(nn.Module):
         cell: side of a square cell, pixels. Pixels beyond the last whole cell only enter gradients.
         block: side of a square block, cells. Blocks overlap: they move by one cell.
         resize: (height, width) in pixels to resize to first, antialiased; None keeps the size.
-        bins: "hard": a pixel votes for the bin of its orientation, as in skimage. "linear", for training:
-            it shares its vote between the two nearest bin centres, (k + 0.5) * 180 / orientations degrees,
-            cyclic over 180, so that gradients reach the orientation.
+        bins: "hard": a pixel votes for one bin, as in skimage. "linear": it shares its vote between the two
+            nearest bin centres, (k + 0.5) * 180 / orientations, cyclic, which gives orientation a gradient.
 
     Shape: (B,C,H,W) -> (B,D) with D = (ny - block + 1) * (nx - block + 1) * block**2 * orientations,
         ny = H // cell, nx = W // cell; ordered as in skimage.
@@ -87,8 +86,7 @@ def hog(
         >>> hog(torch.rand(5, 1, 64, 64)).shape
         torch.Size([5, 1764])
     """
-    features: Tensor = HOG(orientations, cell, block, resize, bins)(frames)
-    return features
+    return HOG(orientations, cell, block, resize, bins).forward(frames)
 
 
 def gradients(frames: Tensor) -> tuple[Tensor, Tensor]:
@@ -106,24 +104,22 @@ def gradients(frames: Tensor) -> tuple[Tensor, Tensor]:
     return row, column
 
 
-def cell_histograms(
-    rows: Tensor, columns: Tensor, orientations: int, cell: int, bins: Bins = "hard"
-) -> Tensor:
+def cell_histograms(dy: Tensor, dx: Tensor, orientations: int, cell: int, bins: Bins = "hard") -> Tensor:
     """Mean gradient magnitude per cell and bin: two of (B,H,W) -> (B, H // cell, W // cell, orientations)."""
-    batch, height, width = rows.shape
+    batch, height, width = dy.shape
     ny, nx = height // cell, width // cell
-    rows, columns = rows[:, : ny * cell, : nx * cell], columns[:, : ny * cell, : nx * cell]
-    energy = rows.square() + columns.square()
+    dy, dx = dy[:, : ny * cell, : nx * cell], dx[:, : ny * cell, : nx * cell]
+    energy = dy.square() + dx.square()
     # sqrt has no gradient at 0: flat pixels are masked before and after it, which makes their gradient 0
     flat = energy == 0
     magnitude = energy.masked_fill(flat, 1).sqrt().masked_fill(flat, 0)
     if bins == "linear":
         # atan2 has no gradient at 0 or if the square underflows; such a pixel has no vote to share
-        columns = columns.masked_fill(energy < torch.finfo(energy.dtype).tiny, 1)
+        dx = dx.masked_fill(energy < torch.finfo(energy.dtype).tiny, 1)
     else:  # detach, since torch.export cannot save no_grad
-        rows, columns = rows.detach(), columns.detach()
+        dy, dx = dy.detach(), dx.detach()
     # in degrees, the bin edges 45, 90 and 135 are exact in float32 too
-    position = torch.rad2deg(torch.atan2(rows, columns)).remainder(180) / (180 / orientations)
+    position = torch.rad2deg(torch.atan2(dy, dx)).remainder(180) / (180 / orientations)
     if bins == "hard":  # rounding may reach the end of the circle; the magnitude passes NaN on
         shares = [(position.long().masked_fill_(~(position < orientations), 0), magnitude)]
     else:
@@ -134,7 +130,7 @@ def cell_histograms(
             (lower.remainder(orientations), magnitude * (1 - upper_share)),
             ((lower + 1).remainder_(orientations), magnitude * upper_share),
         ]
-    y, x = (torch.arange(n * cell, device=rows.device).div(cell, rounding_mode="floor") for n in (ny, nx))
+    y, x = (torch.arange(n * cell, device=dy.device).div(cell, rounding_mode="floor") for n in (ny, nx))
     first = (y[:, None] * nx + x) * orientations
     votes = magnitude.new_zeros(batch, ny * nx * orientations)
     for slot, share in shares:

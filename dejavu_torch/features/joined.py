@@ -17,8 +17,7 @@ class Joined(nn.Module):
 
     Args:
         members: modules (B,C,H,W) -> (B,D_i); all see the same frames.
-        shares: of each member, above 0 and at most 1, None is 1 each: whitening reduces its dimensions, and
-            its squared length, by this factor.
+        shares: factor in (0, 1] on the whitened dimensions and the squared length of each; None is 1.
 
     Attributes:
         groups: number of features of each member, for the last frames; whitening treats each by itself.
@@ -43,8 +42,7 @@ class Joined(nn.Module):
             seen = ", ".join(type(one).__name__ for one in modules) or "none"
             raise InputError(f"the members of the features are {seen}; expected modules, at least one")
         if shares is not None and not (len(shares) == len(modules) and all(0 < one <= 1 for one in shares)):
-            seen = f"the shares of {len(modules)} members of the features are {shares}"
-            raise InputError(f"{seen}; expected a number above 0 and at most 1 for each")
+            raise InputError(f"shares of {len(modules)} members are {shares}; expected (0, 1] for each")
         self.members, self.shares = nn.ModuleList(modules), shares
         self.groups: tuple[int, ...] | None = None
 

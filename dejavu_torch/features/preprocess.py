@@ -79,9 +79,8 @@ def normalise_patches(frames: Tensor, patch: int = 9) -> Tensor:
     """Subtracts the mean, and divides by the standard deviation, of the patch around each pixel, per channel
     (Milford and Wyeth, SeqSLAM, ICRA 2012, with adjacent patches).
 
-    Convention: patches end at the border of the frame. The standard deviation is the population's, and at
-        least 1/255, so that noise in a flat sky is not amplified; above that, a gain or an offset of
-        brightness changes nothing. Gradients are finite everywhere.
+    Convention: patches end at the border. The standard deviation is the population's, at least 1/255, to not
+        amplify noise in a flat sky; above that, gain and offset cancel. Gradients are finite everywhere.
     """
     height, width = frames.shape[-2:]
     if min(height, width) < patch:
@@ -127,16 +126,14 @@ class Preprocess(nn.Module):
             "R-B", in upper or lower case; None keeps the frames' channels.
         contrast: "patch", "clahe", or None, which keeps it.
         patch: side of the square patch for "patch", pixels, odd, at least 3.
-        clip_limit: for "clahe": limit of each bin of a tile's histogram, as a multiple of a flat histogram's
-            bins, but never below 1 pixel; 0 is no limit.
+        clip_limit: for "clahe": limit of histogram bins, relative to a flat one, at least 1 pixel; 0 is none.
         grid: (rows, columns) of tiles for "clahe"; they need not divide the frame.
-        size: pixels to which `DejaVu.fit` (not `forward`) reduces the longer side of a traverse's frames, but
-            not below the features' own `resize`; None keeps the frames' size.
+        size: pixels of the longer side to which `DejaVu.fit` reduces frames, but not below the features' own
+            `resize`; None keeps their size.
 
     Shape: (B,C,H,W) -> (B,1,H,W), or (B,C,H,W) if `channel` is None.
 
-    Convention: without channel and contrast any input is returned as it is. "clahe" maps a difference of
-        channels d in [-1, 1] to (d + 1) / 2 first.
+    Convention: without channel and contrast any input passes unchanged. "clahe" maps a difference to [0, 1].
 
     Raises:
         InputError: settings out of range; forward: frames that do not fit them.

@@ -47,8 +47,7 @@ def _traced_calls() -> OrderedDict[str, Any]:
 def up_to(network: nn.Module, layer: str, frames: Tensor) -> nn.Module:
     """A copy of a network that `run` ends at a layer, the name of a submodule, the first time that it runs.
 
-    The copy omits modules that have not started by then, unless that changes its output for `frames`. The
-    names of the others stay.
+    The copy omits modules that have not started by then, unless that changes its output for `frames`.
     """
     name, names = type(network).__name__, [one for one, _ in network.named_modules() if one]
     if layer not in names:

@@ -28,8 +28,7 @@ class Views(NamedTuple):
 
 
 class AugmentedTraverse(Traverse):
-    """Augmented copies of frames of a traverse: block by block, one copy of each frame, then the next copies.
-    They are the same for any batch size.
+    """Augmented copies of frames, the same for any batch size: each block of frames `copies` times.
 
     Args:
         traverse: frames (B,C,H,W). runs: the frames, increasing. block: most frames augmented together.
@@ -86,7 +85,6 @@ class AugmentedTraverse(Traverse):
 
     @property
     def frame_shape(self) -> tuple[int, ...]:
-        """See `Traverse`."""
         return self.traverse.frame_shape
 
 

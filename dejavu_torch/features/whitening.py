@@ -44,10 +44,9 @@ def learned_whitening(
 ) -> tuple[Tensor, Tensor]:
     """The projection to directions that distinguish places but change little between two views of one.
 
-    With d = (view - place) / 2, m = (view + place) / 2, C = E[d d^T], B = Cov[m] and
-    W = (1 - a) C + a tr(C) / K I, the columns of P are the `kept` directions with the largest
-    p^T B p / p^T W p, scaled to p^T W p = 1 (Mikolajczyk and Matas, ICCV 2007). The shrinkage a is above 0
-    and at most 1; None is `oracle_shrinkage`, at least 0.03.
+    With d = (view - place) / 2, m = (view + place) / 2, C = E[d d^T], B = Cov[m], shrinkage a in (0, 1] (None
+    is `oracle_shrinkage`, at least 0.03) and W = (1 - a) C + a tr(C) / K I, P has the `kept` directions with
+    the largest p^T B p / p^T W p, scaled to p^T W p = 1 (Mikolajczyk and Matas, ICCV 2007).
 
     Shape: (n,K), (n,K) -> mean (K,), P (K,kept), float32.
     """
@@ -96,11 +95,10 @@ class Whitening(nn.Module):
         strengths: arguments of `Augmentation`, instead of `STRENGTHS`.
         seed: of the copies.
         bits: of each number of the projection: 4 (two to a byte), 8 or 16.
-        power: applied to the absolute value of each dimension, above 0 and at most 1. Below 1 large values
-            have less weight, such as those that a new object in the frame causes.
-        groups: D_1, D_2, .., if descriptors are concatenated. Each part is whitened by itself and scaled to
-            length 1; the K dimensions that best keep their inner products follow, levelled a little so that
-            few do not dominate. None is the groups of `Joined` features, or one group.
+        power: of each dimension's absolute value, above 0 and at most 1, to lower peaks, as of new objects.
+        groups: D_1, D_2, .. of concatenated descriptors, each whitened by itself and scaled to length 1; then
+            follow the K dimensions that best keep their inner products, the largest lowered a little. None
+            is the groups of `Joined` features, or one group.
         group_numbers: dimensions of each group, at most its rank; None is chosen like `numbers`.
 
     Shape: (B,D) -> (B,K).
@@ -109,8 +107,8 @@ class Whitening(nn.Module):
         constant, the root mean square of these. Before `learn` descriptors pass unchanged.
 
     Raises:
-        InputError: settings out of range; learn: descriptors that do not vary, views that equal their places,
-            more `numbers` than the rank, groups that do not add up to D; forward: another dimension.
+        InputError: settings out of range; learn: constant descriptors, views equal to places, `numbers` above
+            the rank, groups that do not add up to D; forward: another dimension.
 
     Example:
         >>> route, whitening = torch.randn(400, 16), Whitening(numbers=4)
@@ -244,7 +242,7 @@ class Whitening(nn.Module):
         Args:
             places: (N,D), the descriptors of the route; they may be in a file.
             views: batches of descriptors (B,D) and the places (B,) that they show, if any.
-            groups, shares: of the features, see `Joined`, if the constructor's groups are None.
+            groups, shares: see `Joined`, if the constructor's groups are None.
         """
         groups, shares = (groups, shares) if self.groups is None else (self.groups, None)
         sizes = [places.shape[1]] if groups is None else [*groups]

@@ -155,8 +155,8 @@ def _run(levels: Ints, packed: bytearray, reads: bool = False) -> tuple[Ints, in
     if kernel is _code:  # lists, whose elements Python reads faster
         state, counts = state.tolist(), counts.tolist()
     sums, before = np.zeros((RING, columns + 1), np.int32), np.zeros((2, columns), np.int32)
-    filled, row, step = _filled(levels), 0, max(1, CODED_LEVELS // columns)
-    coding = reads, state, counts, sums, _logarithms()
+    end, row, step = _filled(levels), 0, max(1, CODED_LEVELS // columns)
+    coder = reads, state, counts, sums, _logarithms()
     for start in range(0, rows, step):
         some = levels[start : start + step]
         if reads:
@@ -165,9 +165,7 @@ def _run(levels: Ints, packed: bytearray, reads: bool = False) -> tuple[Ints, in
             bits = 2 * max(int(some.max()), -int(some.min())).bit_length() + 2  # of a level, and a row
             packed.extend(bytes(max(0, int(state[2]) + BIT_BYTES * bits * some.size - len(packed))))
         block = np.concatenate([before, some], dtype=np.int32)
-        row = kernel(
-            block, start, filled, packed if kernel is _code else np.frombuffer(packed, np.uint8), coding
-        )
+        row = kernel(block, start, end, packed if kernel is _code else np.frombuffer(packed, np.uint8), coder)
         before = block[-2:]
         if reads:
             levels = levels if _fits(block) else levels.astype(np.int32, copy=False)

@@ -16,8 +16,7 @@ def compiled(
 ) -> Callable[..., Any] | None:
     """The function, and its `calls`, compiled for one signature or loaded from numba's cache.
 
-    None, and a log line that `what` happens instead, if numba is missing, disabled or broken. `options` are
-    those of `njit`.
+    None, and a log line that `what` happens instead, if numba is missing, disabled or broken.
     """
     options |= {"nogil": True, "error_model": "numpy"}
     try:

@@ -66,8 +66,7 @@ def phase_distances(query: Tensor, templates: Tensor, metric: Metric = "l1") -> 
 def compiled_l1(query: Tensor, templates: Tensor) -> Tensor | None:
     """L1 distances by the compiled loop: (Q,F), (P,F) -> (Q,P); None if torch has to compute them.
 
-    That is for gradients and tracing (vmap, torch.compile, export), on other devices and dtypes, for few
-    templates, and without numba.
+    That is for gradients, tracing, vmap, other devices and dtypes, few templates, and without numba.
 
     Convention: all pairs are summed in the same order: distances of a query do not depend on its batch, and
         equal templates have equal distances, bit for bit.

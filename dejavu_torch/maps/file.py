@@ -46,26 +46,21 @@ def digests(**values: Any) -> dict[str, str]:
 
 def map_size(tensors: Mapping[str, Tensor], header: dict[str, Any]) -> int:
     """Bytes of the file that `write_map` writes."""
-    return len(safetensors.torch.save(*_sealed(tensors, header)))
+    return len(safetensors.torch.save(*_seal(tensors, header)))
 
 
 def write_map(path: Path, tensors: Mapping[str, Tensor], header: dict[str, Any]) -> None:
-    """Write the file completely or, with an InputError, not at all; equal contents give equal bytes.
-
-    Args:
-        tensors: names begin with a part of the model and a dot. header: JSON values.
-    """
+    """Write the file completely or, with an InputError, not at all; equal contents give equal bytes. Names of
+    tensors begin with a part of the model and a dot; the header is JSON."""
     with whole_file(path) as temporary:
         try:
-            plain, metadata = _sealed(tensors, header)
+            plain, metadata = _seal(tensors, header)
             safetensors.torch.save_file(plain, temporary, metadata)
         except (SafetensorError, ValueError) as error:
             raise InputError(f"{path} was not written: {error}") from error
 
 
-def _sealed(
-    tensors: Mapping[str, Tensor], header: dict[str, Any]
-) -> tuple[dict[str, Tensor], dict[str, str]]:
+def _seal(tensors: Mapping[str, Tensor], header: dict[str, Any]) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Tensors with memory of their own, as safetensors needs, and metadata: one entry, for a fixed order."""
     layout = torch.contiguous_format
     plain = {name: one.detach().cpu().clone(memory_format=layout) for name, one in tensors.items()}

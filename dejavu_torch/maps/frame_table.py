@@ -23,8 +23,7 @@ class Route(NamedTuple):
 class FrameTable(NamedTuple):
     """The frame and route of each place of a map; for the fields see `PlaceMap`.
 
-    Convention: tensors of places and frames are int64 of any shape, numbered through all routes. -1 means
-        none, and stays -1.
+    Convention: places and frames are int64 of any shape, numbered through all routes. -1, for none, stays.
     """
 
     places: int

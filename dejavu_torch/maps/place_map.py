@@ -15,6 +15,7 @@ from dejavu_torch.maps.frame_table import FrameTable, Route
 from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.types import InputError
 
+ScoreBlocks = Iterator[tuple[int, Tensor]]  # the first place of each block, and its scores (Q,n)
 EXTRA = "_extra_state"  # torch's key for the result of `get_extra_state`
 
 
@@ -77,10 +78,8 @@ class PlaceMap(nn.Module, ABC):
         if queries.ndim != 2 or queries.shape[1] != self.dimension:
             raise InputError(f"the queries are {tuple(queries.shape)}; the map expects (Q, {self.dimension})")
 
-    def score_blocks(
-        self, queries: Tensor, start: int = 0, stop: int | None = None
-    ) -> Iterator[tuple[int, Tensor]]:
-        """The columns [start, stop) of `scores`, block by block: the first place and (Q,n) scores of each."""
+    def score_blocks(self, queries: Tensor, start: int = 0, stop: int | None = None) -> ScoreBlocks:
+        """The columns [start, stop) of `scores`, block by block."""
         yield start, self.scores(queries)[:, start:stop]
 
     @property
@@ -89,7 +88,7 @@ class PlaceMap(nn.Module, ABC):
         return self.places
 
     def lowest(self, queries: Tensor) -> tuple[Tensor, Tensor] | None:
-        """The lowest score and its first place, -1 if none is finite, (Q,) each; None if not faster."""
+        """The lowest score and its first place, -1 if none is finite, (Q,), no gradient; None if not faster."""
         return None
 
     @property
@@ -98,11 +97,9 @@ class PlaceMap(nn.Module, ABC):
         return FrameTable(self.places, self.positions, self.routes)
 
     def frame_of(self, places: Tensor) -> Tensor:
-        """The reference frame that each place shows, see `FrameTable`."""
         return self.table.frame_of(places)
 
     def place_of(self, frames: Tensor) -> Tensor:
-        """The place nearest to each reference frame, see `FrameTable`."""
         return self.table.place_of(frames)
 
     @property

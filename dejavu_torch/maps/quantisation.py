@@ -35,14 +35,12 @@ def quantise(lines: Tensor, step: Tensor | float, width: Tensor | None = None) -
     return levels if width is None else levels * (lines.abs() >= (1 - ROUNDING) * step * width)
 
 
-def dead_zone(
-    lines: Tensor, lengths: Sequence[int], resolution: float, transform: Transform
-) -> Tensor | None:
-    """Factor on the dead zone of each of (N,K) lines in chunks of these lengths: 1 + (resolution / P)^2 for a
+def dead_zone(lines: Tensor, sizes: Sequence[int], resolution: float, transform: Transform) -> Tensor | None:
+    """Factor on the dead zone of each of (N,K) lines in chunks of these sizes: 1 + (resolution / P)^2 for a
     line of period P, (N,1); None if that is 1 for all."""
     if not resolution:
         return None
-    inverse = torch.cat([half_cycles(torch.arange(n), transform) / (2 * n) for n in lengths]).to(lines)
+    inverse = torch.cat([half_cycles(torch.arange(n), transform) / (2 * n) for n in sizes]).to(lines)
     return (1 + (resolution * inverse).square())[:, None]
 
 
@@ -51,8 +49,7 @@ class RouteLines:
 
     Args:
         lengths: places of each chunk. transform, resolution: see `spectrum`, `dead_zone`.
-        mean: (K,) to subtract; None is the route's, in bfloat16 as a map stores it, or 0 if it is so small
-            that it is cheaper as line 0.
+        mean: (K,) to subtract; None is the route's in bfloat16, or 0 if it is small and cheaper as line 0.
 
     Shape: features (N,K), float of any kind.
     """
@@ -88,7 +85,6 @@ class RouteLines:
 
     @property
     def mean_bytes(self) -> int:
-        """Bytes of the mean in a file."""
         return self.mean.nbytes if bool(self.mean.any()) else 0
 
     def even(self) -> RouteLines:
@@ -104,7 +100,6 @@ class RouteLines:
             yield torch.cat([one.to(torch.int8 if one.abs().max() <= 127 else torch.int32) for one in parts])
 
     def coded_bytes(self, step: float) -> int:
-        """Bytes of the coded lines with this step."""
         return sum(map(coded_bytes, self.levels(step)))
 
     def error(self, step: float) -> float:
@@ -114,11 +109,11 @@ class RouteLines:
 
     def step_of(self, room: float) -> float:
         """The smallest step with which the lines fit into `room` bytes; approximate for a long route."""
-        return self._steps_around(self.coded_bytes, room, CLOSE if self.lines.numel() > BLOCK else 1.0)[1]
+        return self._bisect(self.coded_bytes, room, CLOSE if self.lines.numel() > BLOCK else 1.0)[1]
 
     def step_that_holds(self, share: float) -> float:
         """The largest step with which the lines hold a share of the variance, or the finest step."""
-        return self._steps_around(self.held, math.nextafter(share, 0))[0]
+        return self._bisect(self.held, math.nextafter(share, 0))[0]
 
     def held(self, step: float) -> float:
         """The share of the variance that the lines hold with this step."""
@@ -146,9 +141,7 @@ class RouteLines:
             width = None if self.width is None else self.width[rows]
             yield self.lines[rows], quantise(self.lines[rows], step, width)
 
-    def _steps_around(
-        self, value: Callable[[float], float], most: float, close: float = 1.0
-    ) -> tuple[float, float]:
+    def _bisect(self, value: Callable[[float], float], most: float, near: float = 1.0) -> tuple[float, float]:
         """The largest step with a value above `most`, or the finest, and the smallest with another value, by
         bisection of their logarithm; values decrease."""
         finest = self.scale / FINEST
@@ -157,7 +150,7 @@ class RouteLines:
             middle = (low + high) / 2
             found = value(math.exp(middle))
             low, high = (low, middle) if found <= most else (middle, high)
-            if close * most <= found < most:
+            if near * most <= found < most:
                 break
         if low == math.log(finest):
             return finest, finest if value(finest) <= most else math.exp(high)

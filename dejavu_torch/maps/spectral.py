@@ -29,29 +29,24 @@ class SpectralMapper(Mapper):
     """Codes descriptors along the route: the spectrum of each dimension over a chunk, all with one step.
 
     Args:
-        route_bytes_per_place: bytes that grow with the route, for each place; the step is the smallest whose
-            coded lines fit. Positions of frames are included, unless they leave less than half for the lines:
-            then they come on top, with a warning. None: `step` or `hold` decides.
+        route_bytes_per_place: bytes that grow with the route; the step is the smallest that fits. Positions
+            of frames are included, unless they need over half: then they come on top, with a warning.
         step: the step itself, in units of the descriptor.
         chunk: places of a chunk. Shorter chunks cost more bytes; a shorter route is one chunk.
         transform, metric: of the maps, see `SpectralMap`.
         resolution: places; the dead zone of a line of period P is 1 + (resolution / P)^2 times as wide.
-            For video with many frames per place that a user distinguishes, 8 makes a better map than 0; if
-            every frame is another place, a worse one.
-        hold: share of the descriptors' variance that the lines hold: 1 - sum of squared errors / sum of
-            squared differences from the mean. The step is the largest that holds it; then `resolution`
-            removes further lines. None, without bytes and step, is .85, or more if lines of 5 bytes per place
-            hold more, since few features distinguish places by small differences.
+            For video with many frames per place, 8 makes a better map than 0; with few, a worse one.
+        hold: share of the descriptors' variance that the lines hold before `resolution` removes any: 1 -
+            squared errors / squared differences from the mean. The step is the largest that holds it. None,
+            without bytes and step, is .85, or more if 5 bytes per place hold more, as with few features.
 
     Shape: descriptors (N,K) -> SpectralMap of N places.
 
-    Convention: the written route is at most 2 % below the budget and never above it, unless steps so fine
-        that they change no score take less. Without `resolution` a map holds at least `hold`, unless even
-        such steps hold less; for a long route its sample decides.
+    Convention: the written route takes 98 to 100 % of the budget, or less if the finest useful step needs
+        less. Without `resolution` a map holds `hold`, or what that step holds; samples stand for long routes.
 
     Raises:
-        InputError: settings out of range; forward: fewer than two places, descriptors that are not finite or
-            all the same, or a budget that cannot be met.
+        InputError: settings out of range; forward: no two different finite descriptors, too few bytes.
 
     Example:
         >>> wave = torch.sin(torch.arange(500.0)[:, None] * torch.tensor([0.1, 0.23, 0.37]))
@@ -89,10 +84,7 @@ class SpectralMapper(Mapper):
 
     @classmethod
     def of_equal_size(cls, route: SpectralMap) -> SpectralMapper:
-        """A mapper for other routes with a map's settings and bytes per place.
-
-        All lines have the same dead zone: fast changes are noise only on a smooth route.
-        """
+        """A mapper with a map's settings and bytes per place, but no `resolution`, for routes of any kind."""
         size = (route.summary().route_bytes - route.positions.nbytes) / route.places
         return cls(size, None, route.chunk, route.transform, route.metric)
 
@@ -113,16 +105,10 @@ class SpectralMapper(Mapper):
     @torch.no_grad()
     def fit(self, sample: Tensor, stretch: int, share: float = 1.0) -> SpectralMap:
         """A map without places: mean and step for the chunks of a route, from sampled stretches (n,K) of it.
-
-        Args:
-            share: of the route's places that are in the sample, which is charged this share of the mean.
-        """
+        The sample pays for a `share` of the mean, its part of the route's places."""
         return self._fitted(sample, stretch, share)[0]
 
-    def empty(self) -> SpectralMap:
-        return self._map()
-
-    def _map(self, means: Tensor | None = None, step: float = 0.0) -> SpectralMap:
+    def empty(self, means: Tensor | None = None, step: float = 0.0) -> SpectralMap:
         return SpectralMap(means, self.metric, self.transform, self.chunk, self.resolution, step)
 
     def with_overhead(self, overhead: int) -> SpectralMapper:
@@ -150,7 +136,7 @@ class SpectralMapper(Mapper):
                 left = f"what route_bytes_per_place={budget:g} leaves for them and the lines"
                 log.warning(f"{seen}, over half of {left}: they come on top of it")
         step = float(torch.tensor(self._fitting_step(lines, fixed)))  # float32, as in the file
-        route = self._map(lines.mean[None], step)
+        route = self.empty(lines.mean[None], step)
         even = lines.even()  # lines that `resolution` removes do not count as missing
         if self.share is None and even.held(step) < HALF:
             route.needed = (fixed + lines.coded_bytes(even.step_that_holds(HELD))) / places

@@ -18,7 +18,7 @@ from torch import Tensor
 from dejavu_torch.maps.codec import Stream, decode
 from dejavu_torch.maps.file import checked
 from dejavu_torch.maps.frame_table import Route
-from dejavu_torch.maps.place_map import PlaceMap, require
+from dejavu_torch.maps.place_map import PlaceMap, ScoreBlocks, require
 from dejavu_torch.maps.spectrum import Transform, from_slots, half_cycles, slots
 from dejavu_torch.maps.summary import ChunkSummary, MapSummary
 from dejavu_torch.types import InputError
@@ -80,8 +80,8 @@ class SpectralMap(PlaceMap):
     """A list of coded chunks: the quantised spectrum of descriptors along time, scored without decoding it.
 
     A phase mean repeated along a chunk (eq. 1) is the descriptor's projection onto the harmonics of 1 / tau.
-    This map keeps all lines of the spectrum that are worth their bytes: transform coding with one step for
-    all lines, which is reverse water-filling (Cover and Thomas, section 10.3.3).
+    This map keeps all lines that are worth their bytes: transform coding with one step for all lines, which
+    is reverse water-filling (Cover and Thomas, section 10.3.3).
 
     Buffers, the tensors of a file:
         lengths: (G,) int64, places of each chunk. steps: (G,) float32, of each chunk.
@@ -93,9 +93,8 @@ class SpectralMap(PlaceMap):
         norms: (N,) float32, of the coded descriptors; tiny ones are 0 (`MIN_NORM`).
 
     Attributes:
-        chunks: the places [start, stop) of each. needed: bytes per place that would hold .85 of the variance
-            of a learned route, if its bytes or its step hold less than half, else None.
-        energy, error: sums over the chunks that were added, not loaded; see `Chunk`.
+        chunks: the places [start, stop) of each. energy, error: see `Chunk`, summed over added chunks.
+        needed: bytes per place to hold .85 of the variance, if the map was learned and holds less than half.
 
     Args:
         means: as above; None makes a map that can load any state.
@@ -323,8 +322,8 @@ class SpectralMap(PlaceMap):
     def products(self, queries: Tensor, chunks: range) -> Tensor:
         """Inner products with all descriptors of G chunks of equal length W: (Q,K) -> (Q,W G).
 
-        They are the inverse transform, which is linear, of the products with the lines: O(lines + W log W)
-        per query instead of O(W K). No autocast.
+        The inverse transform is linear, so it follows the products with lines: O(lines + W log W) per query
+        instead of O(W K). No autocast.
         """
         parts = [queries]
         if not torch.compiler.is_compiling():  # fewer queries at a time stay in the cache
@@ -369,12 +368,9 @@ class SpectralMap(PlaceMap):
         return first, bisect.bisect_left(self.chunks, stop, key=lambda chunk: chunk[0])
 
     def scores(self, queries: Tensor) -> Tensor:
-        """Scores of all places: (Q,K) -> (Q,N)."""
         return torch.cat([scores for _, scores in self.score_blocks(queries)], 1)
 
-    def score_blocks(
-        self, queries: Tensor, start: int = 0, stop: int | None = None
-    ) -> Iterator[tuple[int, Tensor]]:
+    def score_blocks(self, queries: Tensor, start: int = 0, stop: int | None = None) -> ScoreBlocks:
         """See `PlaceMap`: blocks of consecutive chunks that fit into the processor's cache."""
         stop = self.places if stop is None else stop
         self.check_queries(queries)
@@ -431,19 +427,16 @@ class SpectralMap(PlaceMap):
         fits = means.shape in (shape, (0, self.dimension)) and bool(means.isfinite().all())
         require(not self.places or fits, f"means {tuple(means.shape)}; expected {shape} finite numbers")
         if self.routes:
-            self._check_routes()
+            names, places, frames = zip(*self.routes, strict=True)
+            fits = len({*names}) == len(names) and all(names)
+            require(fits, f"names {', '.join(names)}; expected {len(names)} different ones")
+            ends = {*accumulate(lengths)}
+            fits = min(places) > 0 and sum(places) == self.places and ends.issuperset(accumulate(places))
+            whole = f"whole chunks, {self.places} places in all"
+            require(fits, f"routes of {[*places]!s:.100} places; expected {whole}")
+            fits = sum(frames) == self.table.frames
+            require(fits, f"routes of {[*frames]!s:.100} frames; expected {self.table.frames} in all")
         super().check()
-
-    def _check_routes(self) -> None:
-        names, places, frames = zip(*self.routes, strict=True)
-        fits = len({*names}) == len(names) and all(names)
-        require(fits, f"names {', '.join(names)}; expected a different one for each of {len(names)} routes")
-        ends = {*accumulate(self.lengths.tolist())}
-        fits = min(places) > 0 and sum(places) == self.places and ends.issuperset(accumulate(places))
-        expected = f"whole chunks, {self.places} places in all"
-        require(fits, f"routes of {[*places]!s:.100} places; expected {expected}")
-        fits = sum(frames) == self.table.frames
-        require(fits, f"routes of {[*frames]!s:.100} frames; expected {self.table.frames} in all")
 
     def loaded(self) -> None:
         """Decode the chunks of a file, and restore omitted means of 0."""

@@ -19,9 +19,8 @@ def spectrum(series: Tensor, transform: Transform = "dft") -> Tensor:
 
     Args:
         series: float; gradients pass.
-        transform: "dft": line 0 is the mean, lines 2k - 1 and 2k are the cosine and the sine of k cycles; of
-            an even W the last line is the cosine of W / 2 cycles. "dct" (DCT-II): line r is the cosine of r
-            half cycles.
+        transform: "dft": line 0 is the mean, lines 2k - 1 and 2k are the cosine and the sine of k cycles (at
+            W / 2 cycles only the cosine). "dct" (DCT-II): line r is the cosine of r half cycles.
 
     Shape: (...,W) -> (...,W).
 
@@ -50,24 +49,20 @@ def from_spectrum(lines: Tensor, transform: Transform = "dft") -> Tensor:
     return from_slots(slotted * factor, count, transform)
 
 
-def slots(
-    count: int, transform: Transform, dtype: torch.dtype, device: torch.device
-) -> tuple[Tensor, Tensor]:
-    """For `from_slots`: the slot of each of W lines, (W,) int64, and the factor of each of S slots, (S,), 0
+def slots(n: int, transform: Transform, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """For `from_slots`: the slot of each of n lines, (n,) int64, and the factor of each of S slots, (S,), 0
     without a line. Both are cached: do not change them."""
     if torch.compiler.is_compiling() or type(torch.empty(0)) is not Tensor:  # a mode of fake tensors
-        return _slots(count, transform, dtype, device)
+        return _slots(n, transform, dtype, device)
     with torch.inference_mode(False):  # cached tensors are also used with gradients
-        return _cached_slots(count, transform, dtype, device)
+        return _cached_slots(n, transform, dtype, device)
 
 
-def _slots(
-    count: int, transform: Transform, dtype: torch.dtype, device: torch.device
-) -> tuple[Tensor, Tensor]:
-    slot, size = torch.arange(count, device=device), count
+def _slots(n: int, transform: Transform, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    slot, size = torch.arange(n, device=device), n
     if transform == "dft":  # pairs of a cosine and a sine; the mean has no sine
-        slot, size = slot + (slot > 0), 2 * (count // 2) + 2
-    scale = 1 / _scale(torch.empty(count, dtype=dtype, device=device), transform)
+        slot, size = slot + (slot > 0), 2 * (n // 2) + 2
+    scale = 1 / _scale(torch.empty(n, dtype=dtype, device=device), transform)
     return slot, scale.new_zeros(size).index_copy(0, slot, scale)
 
 

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from dejavu_torch.maps.distance import Metric, phase_distances
 from dejavu_torch.maps.file import checked
 from dejavu_torch.maps.layer_search import lowest
-from dejavu_torch.maps.place_map import Mapper, PlaceMap, require
+from dejavu_torch.maps.place_map import Mapper, PlaceMap, ScoreBlocks, require
 from dejavu_torch.maps.summary import ChunkSummary, MapSummary
 from dejavu_torch.maps.templates import PhaseTemplates, check_plan
 from dejavu_torch.periods.finder import PeriodFinder
@@ -45,8 +45,7 @@ def weight_per_feature(metric: Metric, features: int) -> float:
 def log_posterior(scores: Tensor, temperature: float | Tensor) -> Tensor:
     """Negative log posterior of each place in nats, -log softmax(-S / T): (Q,N) -> (Q,N), lower is better.
 
-    It makes the scores of different queries comparable, since it ignores what raises S at all places. A score
-    of +inf stays +inf.
+    Scores of different queries become comparable: a shift of S at all places cancels. +inf stays +inf.
 
     Example:
         >>> log_posterior(torch.tensor([[0.0, 0.0, torch.inf]]), 0.1).tolist()
@@ -72,8 +71,8 @@ class TemplateMap(PlaceMap):
         plan, templates: the layers, and a tensor (P,F) for each, from `PhaseTemplates`.
         places, dimension: N, and D features per frame.
         metric: distance of eq. 3, see `phase_distances`.
-        reduction: "sum" is eq. 4 as printed. "mean" divides it by the number of features in the sum (l2: the
-            sum of their roots, cosine: the number of layers), so that places of any coverage are comparable.
+        reduction: "sum" is eq. 4 as printed; "mean" divides it by the features in the sum (l2: their roots,
+            cosine: the layers), to compare places of any coverage.
         temperature: T, makes scores the `log_posterior`; None leaves S unchanged.
         weights: see above; None for 1.
 
@@ -232,9 +231,7 @@ class TemplateMap(PlaceMap):
         scores = self._sums(queries, 0, self.places)
         return scores if self.temperature is None else log_posterior(scores, self.temperature)
 
-    def score_blocks(
-        self, queries: Tensor, start: int = 0, stop: int | None = None
-    ) -> Iterator[tuple[int, Tensor]]:
+    def score_blocks(self, queries: Tensor, start: int = 0, stop: int | None = None) -> ScoreBlocks:
         """See `PlaceMap`: one block, from the layers that cover these places."""
         if self.temperature is not None:  # the softmax needs all places
             yield start, self.scores(queries)[:, start:stop]
@@ -269,11 +266,8 @@ class TemplateMap(PlaceMap):
         return score, torch.where(score.isfinite(), start + place, -1)
 
     def trainable(self, templates: bool = True, weights: bool = False, start: Tensor | None = None) -> None:
-        """Turn the templates, the weights, or both, into parameters, until `freeze`.
-
-        Args:
-            start: (D,) initial weights if the map has none; None or (0,) is 1 for every feature.
-        """
+        """Turn the templates, the weights, or both, into parameters, until `freeze`; `start`: (D,) initial
+        weights if the map has none, None or (0,) for 1."""
         self.freeze()
         if weights and not len(self.weights):
             own = self.templates.new_ones(self.dimension)
@@ -368,8 +362,7 @@ class TemplateMapper(Mapper):
 
     def forward(self, features: Tensor) -> TemplateMap:
         if self.periods is None:  # from a map file
-            seen = "the map's period finder is not of this package"
-            raise InputError(f"{seen}; expected a mapper with it to learn anew")
+            raise InputError("the map's period finder is not of this package; learn anew by a mapper with it")
         plan = self.periods.plan(features)
         return self._map(plan, self.templates(features, plan), *features.shape).to(features.device)
 

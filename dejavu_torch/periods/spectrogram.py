@@ -112,19 +112,17 @@ class SpectrogramAnalysis(PeriodFinder):
 
     Args:
         window: places per chunk and spectrum. hop: places between the starts of chunks; None is `window`.
-        min_period: shortest period, in places. The longest is half the window: bins 0 and 1 hold the mean and
-            slow drift.
+        min_period: shortest period, in places; the longest is half the window, above mean and drift.
         strongest: number of frequencies that a feature keeps.
         peaks: "local" ranks local maxima of the spectrum, "bins" all its bins (the paper).
-        false_alarm: probability that white noise gives a chunk any layers (`noise_share`). Smooth footage
-            passes whether or not it repeats. None: every chunk gets layers (the paper).
+        false_alarm: probability that white noise gives a chunk layers (`noise_share`); smooth footage passes
+            whether or not it repeats. None: every chunk gets layers (the paper).
         short: for a route shorter than the window: "shrink" the window with a warning, or "refuse".
 
     Shape: features (N,D) -> tuple of G spectra, one per chunk.
 
-    Convention: Hann window, not centred. The places after the last whole window form a shorter chunk, which
-        is dropped if it is shorter than two shortest periods. A feature that is constant in a chunk has no
-        power there. A chunk too short to pass `false_alarm` is logged.
+    Convention: Hann window, not centred. Places after the last whole window are a shorter chunk, or dropped
+        if fewer than 2 * min_period. Constant features have no power. Chunks too short to pass are logged.
 
     Raises:
         InputError: an argument out of range; features that are not finite floats (N,D); a route too short.

@@ -27,12 +27,10 @@ def common_period(periods: Sequence[Fraction | int]) -> Fraction:
 def support_of(periods: Sequence[int], places: int) -> tuple[int, int]:
     """Code distance and torus distance of integer periods >= 1 over a route of at least 3 places.
 
-    Any two places differ in at least as many layers as the code distance d, which corrects (d - 1) // 2 wrong
-    layers. The torus distance is the minimum, over differences D > 1 of places, of the sum over layers of
-    min(D mod tau, tau - D mod tau).
+    Two places differ in at least d layers, the code distance, which corrects (d - 1) // 2 wrong layers. The
+    torus distance is the minimum over D > 1 of the sum over layers of min(D mod tau, tau - D mod tau).
 
-    Source: R. W. Watson and C. W. Hastings, Self-checked computation using residue arithmetic, Proc. IEEE
-        54 (1966).
+    Source: Watson and Hastings, Self-checked computation using residue arithmetic, Proc. IEEE 54 (1966).
 
     Example:
         >>> support_of([4, 5, 7], 100)

@@ -114,8 +114,8 @@ def test_grey_pixels_are_those_of_grey_frames() -> None:
         (lambda: both()(torch.rand(2, 7)), ("Joined got (2, 7)", "float frames")),
         (lambda: PatchPixels(channel="mauve"), ("'mauve'", "'grey'")),
         (lambda: Joined([HOG(), Means()], [1.0]), ("shares of 2 members", "[1.0]", "for each")),
-        (lambda: Joined([HOG(), Means()], [1, 0]), ("[1, 0]", "above 0")),
-        (lambda: Joined([HOG(), Means()], [1, 1.5]), ("[1, 1.5]", "at most 1")),
+        (lambda: Joined([HOG(), Means()], [1, 0]), ("[1, 0]", "(0, 1]")),
+        (lambda: Joined([HOG(), Means()], [1, 1.5]), ("[1, 1.5]", "(0, 1]")),
     ],
 )
 def test_what_is_refused(call: Callable[[], Any], facts: tuple[str, ...]) -> None:

@@ -129,7 +129,7 @@ def test_a_stream_of_anything_is_refused(packed: bytes, rows: int, columns: int)
 def test_a_claim_of_nothing_or_beyond_the_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     stream = encode(levels())
     for rows, columns in ((0, 5), (5, -1), (10**10, 10**4)):
-        with refused(f"claims {rows} x {columns}", "at least one", "memory"):
+        with refused(f"claims {rows} x {columns}", "1 or more", "memory"):
             decode(stream, rows, columns)
     monkeypatch.setattr(codec, "free_memory", lambda: math.inf)
     assert decode(stream, 200, 7).shape == (200, 7)
@@ -143,7 +143,7 @@ def test_a_claim_of_endless_zeros_is_refused_before_they_are_decoded(monkeypatch
     sparse = torch.zeros(10**4, 16, dtype=torch.int8)
     assert torch.equal(decode(encode(sparse), 10**4, 16), sparse)
     sparse[-1, -1] = 1
-    with refused("nearly all 0", "more bytes per place"):  # nothing is written that is not read
+    with refused("nearly all 0", "more bytes"):  # nothing is written that is not read
         encode(sparse)
 
 

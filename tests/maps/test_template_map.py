@@ -87,7 +87,7 @@ def test_buffers_that_do_not_fit_together_are_refused(
 
 
 def test_templates_of_another_shape_are_refused() -> None:
-    with refused("98 phases and 2 features got templates (2, 98); expected (98, 2)"):
+    with refused("templates of a layer are (2, 98)", "(P,F) = (98, 2)"):
         TemplateMap(PLAN[:1], [torch.zeros(2, 98)], PLACES, DIMENSION)
 
 

@@ -102,8 +102,8 @@ MUTANTS = [
     Mutant(
         "The lines hold at least the share that is asked for.",
         "dejavu_torch/maps/quantisation.py",
-        "self._steps_around(self.held, math.nextafter(share, 0))[0]",
-        "self._steps_around(self.held, math.nextafter(share, 0))[1]",
+        "self._bisect(self.held, math.nextafter(share, 0))[0]",
+        "self._bisect(self.held, math.nextafter(share, 0))[1]",
         ("tests/maps/test_spectral.py::test_the_lines_hold_the_share_that_is_asked_for",),
     ),
     Mutant(
