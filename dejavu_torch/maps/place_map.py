@@ -88,7 +88,8 @@ class PlaceMap(nn.Module, ABC):
         return self.places
 
     def lowest(self, queries: Tensor) -> tuple[Tensor, Tensor] | None:
-        """The lowest score and its first place, -1 if none is finite, (Q,), no gradient; None if not faster."""
+        """The lowest score of each query and its first place, (Q,) each, -1 if none is finite; without
+        gradient. None if this is not faster than all scores."""
         return None
 
     @property

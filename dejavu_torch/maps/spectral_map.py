@@ -322,8 +322,7 @@ class SpectralMap(PlaceMap):
     def products(self, queries: Tensor, chunks: range) -> Tensor:
         """Inner products with all descriptors of G chunks of equal length W: (Q,K) -> (Q,W G).
 
-        The inverse transform is linear, so it follows the products with lines: O(lines + W log W) per query
-        instead of O(W K). No autocast.
+        Inverse transforms of products with the lines: O(lines + W log W) per query, not O(W K). No autocast.
         """
         parts = [queries]
         if not torch.compiler.is_compiling():  # fewer queries at a time stay in the cache

@@ -159,10 +159,10 @@ class Wrong(nn.Module):
         (Wrong("half"), ("Wrong made (20, 8)", "expected features (40, D)")),
         (Wrong("nan"), ("Wrong makes NaN", "the array")),
         (Wrong("late"), ("the loss is nan at step 2", "place nan", "expected a finite number")),
-        (SmallCNN(8, 3, (16, 16), (4,)), ("got frames (40, 1, 16, 16)",)),
+        (SmallCNN(8, 3, (16, 16), (4,)), ("got (40, 1, 16, 16)",)),
         (
             nn.Sequential(nn.Conv2d(3, 2, 3), nn.Flatten()),
-            ("Sequential fails on frames (1, 16, 16)", "3 channels"),
+            ("Sequential does not take frames (1, 16, 16)", "3 channels"),
         ),
     ],
     ids=["3d", "half", "nan", "late", "CNN's channels", "channels"],
