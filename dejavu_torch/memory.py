@@ -1,4 +1,4 @@
-"""How much memory there is, and what lies in temporary files instead."""
+"""Free memory, and tensors in temporary files."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from torch import Tensor
 
 from dejavu_torch.types import InputError
 
-GROUPS = Path("/sys/fs/cgroup")  # the limits of containers, jobs and services
-OWN = Path("/proc/self/cgroup")  # which of them the process is in
-CACHES = ("inactive_file", "active_file", "slab_reclaimable")  # given back if memory is short
-IN_MEMORY = 2**29  # bytes of features, before they spill
-BLOCK = 2**26  # bytes: so large a tensor goes back to the system once it is freed, a batch may not
+CGROUPS = Path("/sys/fs/cgroup")  # the limits of containers, jobs and services
+OWN_CGROUP = Path("/proc/self/cgroup")  # which of them the process is in
+RECLAIMABLE = ("inactive_file", "active_file", "slab_reclaimable")
+IN_MEMORY = 2**29  # bytes of features that are kept in memory
+BLOCK_BYTES = 2**26  # a tensor this large returns to the system when it is freed, a batch may not
 
 
 def free_memory() -> float:
-    """Bytes the process can still get: what the system has and its limits allow; inf if nothing says."""
-    return min(_of_system(), _of_container(), _of_process())
+    """Bytes that the process can still allocate within the system and its limits; inf if unknown."""
+    return min(_free_in_system(), _free_in_cgroups(), _free_in_process())
 
 
 def check_room(needed: float, what: str) -> None:
-    """Refuse what takes more bytes than are free; the message begins with `what` it is.
+    """Refuse what needs more bytes than are free; the message begins with `what`.
 
     Example:
         >>> check_room(10**6, "a strip of 1000 x 1000 pixels")
@@ -43,7 +43,7 @@ def _size(number: float) -> str:
     return f"{number / 1e9:.3g} GB" if number >= 1e9 else f"{max(number, 0) / 1e6:.3g} MB"
 
 
-def _of_system() -> float:
+def _free_in_system() -> float:
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
         return next(1024.0 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
@@ -52,26 +52,26 @@ def _of_system() -> float:
         return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")) if known else math.inf
 
 
-def _of_container() -> float:
-    """What is left to the control group of the process, and to each that contains it."""
+def _free_in_cgroups() -> float:
+    """The least that the control group of the process, and every group around it, have left."""
     try:
-        own = next(line[3:] for line in OWN.read_text().splitlines() if line.startswith("0::"))
+        own = next(line[3:] for line in OWN_CGROUP.read_text().splitlines() if line.startswith("0::"))
     except (OSError, StopIteration):
         own = "/"
-    inside = GROUPS / own.lstrip("/")
-    return min(_of_group(group) for group in (inside, *inside.parents) if group.is_relative_to(GROUPS))
+    inside = CGROUPS / own.lstrip("/")
+    return min(_free_in(group) for group in (inside, *inside.parents) if group.is_relative_to(CGROUPS))
 
 
-def _of_group(group: Path) -> float:
+def _free_in(group: Path) -> float:
     try:
         limit, used = (float((group / f"memory.{name}").read_text()) for name in ("max", "current"))
         stat = dict(map(str.split, (group / "memory.stat").read_text().splitlines()))
-        return limit - used + sum(float(stat.get(name, 0)) for name in CACHES)
-    except (OSError, ValueError):  # none, or "max"
+        return limit - used + sum(float(stat.get(name, 0)) for name in RECLAIMABLE)
+    except (OSError, ValueError):  # no such files, or a limit of "max"
         return math.inf
 
 
-def _of_process() -> float:
+def _free_in_process() -> float:
     try:
         import resource
 
@@ -87,15 +87,12 @@ def _spilling(what: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise InputError(
-            f"{what} do not fit into a temporary file: {error.strerror}; "
-            "expected room there, or TMPDIR set to a folder with room"
-        ) from error
+        seen = f"{what} do not fit into a temporary file: {error.strerror}"
+        raise InputError(f"{seen}; expected room there, or TMPDIR set to a folder with room") from error
 
 
 def empty(rows: int, columns: int, device: torch.device, in_memory: int = IN_MEMORY) -> Tensor:
-    """(rows,columns) float32, not set; on the CPU, one of over `in_memory` bytes lies in a temporary file
-    without a name. InputError if there is no room for it."""
+    """Uninitialised float32; on the CPU, more than `in_memory` bytes are in an unnamed temporary file."""
     size = 4 * rows * columns
     if device.type != "cpu" or size <= in_memory:
         return torch.empty(rows, columns, device=device)
@@ -106,20 +103,20 @@ def empty(rows: int, columns: int, device: torch.device, in_memory: int = IN_MEM
 
 
 def concatenate(batches: Iterable[Tensor], in_memory: int = IN_MEMORY, half: bool = False) -> Tensor:
-    """Batches (B,D) of one number type as one tensor (N,D), which may be larger than the memory.
+    """Batches (B,D) of one dtype as one tensor (N,D), which may be larger than the memory.
 
     Args:
-        in_memory: about how many bytes to keep in memory. More spill to a temporary file without a name,
-            which the tensor then maps, on the CPU: rows are read when they are used.
+        in_memory: about how many bytes to keep in memory. More spill to an unnamed temporary file, which
+            the tensor then maps, on the CPU: rows are read when they are used.
         half: whether the file holds float16.
 
     Raises:
-        InputError: batches of different D or number type, none at all, or no room for the file.
+        InputError: batches of different D or dtype, none at all, or no room for the file.
     """
     parts: list[Tensor] = []
     file: IO[bytes] | None = None
     rows, held = 0, 0
-    for block in _blocks(batches, min(BLOCK, in_memory)):
+    for block in _blocks(batches, min(BLOCK_BYTES, in_memory)):
         parts.append(block)
         rows, held = rows + len(block), held + block.nbytes
         if held > in_memory:
@@ -135,22 +132,21 @@ def concatenate(batches: Iterable[Tensor], in_memory: int = IN_MEMORY, half: boo
             room.copy_(parts.pop(0))
         return whole
     _spilled(parts, file, half)
-    kind = np.float16 if half else block.cpu().numpy().dtype
+    dtype = np.float16 if half else block.cpu().numpy().dtype
     # copy on write: the tensor may be written to, the file never is
-    return torch.from_numpy(np.memmap(file, kind, "c", shape=(rows, block.shape[1])))
+    return torch.from_numpy(np.memmap(file, dtype, "c", shape=(rows, block.shape[1])))
 
 
 def _blocks(batches: Iterable[Tensor], most: int) -> Iterator[Tensor]:
-    """Batches joined to blocks of just over `most` bytes."""
+    """Batches concatenated to blocks of just over `most` bytes."""
     loose: list[Tensor] = []
     kind, rows, held = None, 0, 0
     for batch in batches:
-        seen = batch.shape[1], batch.dtype
+        dimension, dtype = seen = batch.shape[1], batch.dtype
         kind = kind or seen
         if seen != kind:
-            raise InputError(
-                f"features {rows}.. are {seen[0]} of {seen[1]}; expected {kind[0]} of {kind[1]} as before"
-            )
+            before = f"{kind[0]} of {kind[1]} as before"
+            raise InputError(f"features {rows}.. are {dimension} of {dtype}; expected {before}")
         rows, held = rows + len(batch), held + batch.nbytes
         loose.append(batch)
         if held > most:
@@ -161,9 +157,9 @@ def _blocks(batches: Iterable[Tensor], most: int) -> Iterator[Tensor]:
 
 
 def _spilled(parts: list[Tensor], file: IO[bytes] | None, half: bool) -> IO[bytes]:
-    """The file, a new one if there is none, with the parts at its end."""
+    """The parts appended to the file, or to a new one if there is none."""
     with _spilling("the features"):
-        file = tempfile.TemporaryFile() if file is None else file  # noqa: SIM115, it goes with the tensor
+        file = tempfile.TemporaryFile() if file is None else file  # noqa: SIM115, the tensor keeps it open
         for part in parts:
             file.write((part.half() if half else part).cpu().contiguous().numpy().data)
         file.flush()

@@ -1,4 +1,4 @@
-"""How frames are resized, in every room: what is described, stored and drawn is the same."""
+"""The one way to resize frames: what is described, stored and drawn is the same."""
 
 from __future__ import annotations
 
@@ -9,43 +9,37 @@ from torch.nn.functional import interpolate
 
 from dejavu_torch.types import InputError
 
-MOST_PIXELS = 2**26  # of a frame: files and options can name any number
-STRETCHED = 1.05  # change of the aspect ratio that counts
+Size = tuple[int, int]  # height and width, pixels
+MOST_PIXELS = 2**26  # of a frame, since files and options can ask for any number
+STRETCHED = 1.05  # ratio of aspect ratios above which frames count as stretched
 
 
-def check_size(size: tuple[int, int], least: int, what: str) -> tuple[int, int]:
+def check_size(size: Size, least: int, what: str) -> Size:
     """(height, width) as a tuple, refused below `least` pixels each; the message begins with `what`."""
     if len(size) != 2 or min(size) < least or math.prod(size) > MOST_PIXELS:
-        raise InputError(
-            f"{what}={tuple(size)}; expected (height, width) in pixels, at least {least} each "
-            f"and {MOST_PIXELS} in all"
-        )
-    return int(size[0]), int(size[1])  # a map gives a list
+        expected = f"(height, width) in pixels, at least {least} each, at most {MOST_PIXELS} in all"
+        raise InputError(f"{what}={tuple(size)}; expected {expected}")
+    return int(size[0]), int(size[1])  # a map file holds a list
 
 
-def resize_frames(frames: Tensor, size: tuple[int, int] | None) -> Tensor:
-    """Frames (B,C,H,W) of another size (height, width), antialiased: bilinear, over areas if they shrink.
-
-    None, and the size that the frames have, change nothing.
-    """
+def resize_frames(frames: Tensor, size: Size | None) -> Tensor:
+    """Frames (B,C,H,W) resized to (height, width), bilinear and antialiased; None keeps their size."""
     if size is None or tuple(frames.shape[-2:]) == tuple(size):
         return frames
     return interpolate(frames, (size[0], size[1]), mode="bilinear", antialias=True)
 
 
-def is_stretched(own: tuple[int, int], size: tuple[int, int]) -> bool:
-    """Whether another size (height, width) changes the aspect ratio of frames by over 5 %."""
+def is_stretched(own: Size, size: Size) -> bool:
+    """Whether resizing from `own` (height, width) to `size` changes the aspect ratio by over 5 %."""
     ratio = own[0] * size[1] / (own[1] * size[0])
     return not 1 / STRETCHED < ratio < STRETCHED
 
 
-def reduced_size(
-    own: tuple[int, int], longest: int | None, least: tuple[int, int] | None = None
-) -> tuple[int, int]:
-    """The size (height, width) of frames whose longer side is to have at most `longest` pixels.
+def reduced_size(own: Size, longest: int | None, least: Size | None = None) -> Size:
+    """The size (height, width) to reduce frames to, with at most `longest` pixels on the longer side.
 
     Args:
-        own: their size. longest: None keeps it. least: of each side, such as what a network needs.
+        own: their size. longest: None keeps it. least: minimum of each side, such as a network's input.
 
     Example:
         >>> reduced_size((540, 960), 160), reduced_size((540, 960), 160, (224, 224))

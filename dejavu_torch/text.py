@@ -1,4 +1,4 @@
-"""Text as part of messages: from elsewhere, such as the names of files, and of settings."""
+"""Text in messages: of unknown origin, such as file names, and of settings; progress bars."""
 
 from __future__ import annotations
 
@@ -14,15 +14,12 @@ Step = TypeVar("Step")
 
 
 def printable(text: object) -> str:
-    """A text of one line: what is neither printable nor a space, as a line break, is escaped."""
-    return "".join(
-        c if c.isprintable() or category(c) == "Zs" else c.encode("unicode_escape").decode()
-        for c in str(text)
-    )
+    """The text as one line: characters neither printable nor a space, such as line breaks, are escaped."""
+    return "".join(c if c.isprintable() or category(c) == "Zs" else ascii(c)[1:-1] for c in str(text))
 
 
 def one_line(text: object) -> str:
-    """A text without line breaks, each run of blanks one space."""
+    """The text without line breaks; every run of blanks becomes one space."""
     return " ".join(str(text).split())
 
 
@@ -33,7 +30,7 @@ def settings_of(module: nn.Module, *hidden: str) -> str:
 
 
 def bar(steps: Sequence[Step], text: str | None) -> Iterable[Step]:
-    """The steps of a long work, with a progress bar on stderr if that is a terminal; no text is no bar."""
+    """The steps of a long task, with a progress bar on stderr if it is a terminal; None shows no bar."""
     from tqdm import tqdm
 
     shown: Iterable[Step] = tqdm(steps, text, disable=None if text else True, leave=False)

@@ -1,4 +1,4 @@
-"""The data that crosses a room boundary, and its validation. Nothing here computes."""
+"""The types that the folders of the package exchange, and their validation."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from torch import Tensor, nn
 
 from dejavu_torch.text import printable
 
-BATCH_NUMBERS = 2**26  # in the frames of a batch, of which there is at least one: 256 MB
-AT_ONCE = 64  # frames read at a time by default
-FRAME_NUMBERS = 2**28  # in one frame: 1 GB
+BATCH_NUMBERS = 2**26  # values in a batch of more than one frame: 256 MB
+BATCH_SIZE = 64  # frames read at a time by default
+FRAME_NUMBERS = 2**28  # values in one frame: 1 GB
 LONGEST_MESSAGE = 2000  # characters
 
-Together = int | Literal["filter"]  # T queries in a sequence, or all before by a filter
+Together = int | Literal["filter"]  # T queries in a sequence, or all so far in a filter
 
 
 class InputError(ValueError):
-    """Bad input. Its message is one line, printable and not too long: what was seen and what was expected."""
+    """Bad input. The message is one printable line of limited length: what was seen and what was expected."""
 
     def __init__(self, message: object) -> None:
         text = printable(message)
@@ -37,17 +37,17 @@ class InputError(ValueError):
 class Traverse(ABC):
     """Frames along a route, in order, read in batches: never all of them in memory.
 
-    It can be iterated any number of times and yields the same values each time, whatever the batch size.
+    It can be iterated any number of times, and yields the same values for any batch size.
     """
 
-    name: str = "traverse"  # in messages, a path or a `sim:` address
-    length: int | None = None  # number of frames N, None if only reading to the end can tell
+    name: str = "traverse"  # in messages: a path or a `sim:` address
+    length: int | None = None  # number of frames N, None if it is only known after reading to the end
     place: Tensor | None = None  # (N,) float64, the true position of each frame in reference frames
-    # how the frames were cut out of one long image, and which of all such cuts they are: alike, same places
+    # how the frames were cut from one long image, and which of these cuts they are; equal: the same places
     cut: tuple[tuple[int, ...], range] | None = None
-    seeks: bool = False  # whether `between` reads nothing before the first frame asked for
-    sized: bool = False  # whether the size of the frames was asked for, as by `width=` of a video
-    ordered: bool = False  # whether frames are known to follow one another along the route, as in a video
+    seeks: bool = False  # whether `between` can skip earlier frames without reading them
+    sized: bool = False  # whether the user asked for a frame size, as with `width=` of a video
+    ordered: bool = False  # whether the frames are known to be consecutive, as in a video
 
     @abstractmethod
     def batches(self, size: int) -> Iterator[Tensor]:
@@ -57,7 +57,7 @@ class Traverse(ABC):
         """
 
     def between(self, start: int, stop: int) -> Iterator[Tensor]:
-        """The frames [start, stop), as `batches` gives them; those before may be read as well."""
+        """The frames [start, stop), as `batches` yields them; earlier frames may be read as well."""
         seen = 0
         for batch in self.batches(self.batch_size()):
             if seen >= stop:
@@ -68,11 +68,11 @@ class Traverse(ABC):
             seen += len(batch)
 
     def select(self, frames: range, size: int) -> Iterator[Tensor]:
-        """The frames of an increasing range, `size` at a time; a traverse may end before it does.
+        """The frames of an increasing range, `size` at a time; the traverse may end first.
 
         Only the last batch is smaller: random numbers drawn per batch must not depend on how frames are read.
         """
-        offset = 0  # of the next frame of the range
+        offset = 0  # of the next selected frame in the next part
         held: list[Tensor] = []
         for part in self.between(frames.start, frames.stop):
             held.append(part[offset :: frames.step])
@@ -92,7 +92,7 @@ class Traverse(ABC):
         raise InputError(f"{self.name} holds no frames; expected at least one")
 
     def frame_name(self, i: int) -> str:
-        """Name of frame i in its source, such as a file name or the time in a video; "" for none."""
+        """Name of frame i in its source, such as a file name or the time in a video; "" if it has none."""
         return ""
 
     def frame_time(self, i: int) -> float:
@@ -100,25 +100,25 @@ class Traverse(ABC):
         return math.nan
 
     def identity(self) -> str:
-        """Distinguishes these frames from others, as far as the way they are asked for does."""
+        """Identifies the source and its options; no frame is read."""
         return f"{self.name} {self.length}"
 
     def state(self, start: int, stop: int) -> str:
-        """Changes with the frames [start, stop), as far as can be known unread, such as by times of files."""
+        """Changes if the frames [start, stop) change, as far as file times and the like show it."""
         return ""
 
     def count(self) -> int:
-        """Number of frames, read through if the traverse does not know its length."""
+        """Number of frames; reads all of them if the length is not known."""
         return sum(map(len, self.batches(self.batch_size()))) if self.length is None else self.length
 
-    def batch_size(self, most: int = AT_ONCE) -> int:
+    def batch_size(self, most: int = BATCH_SIZE) -> int:
         """How many frames to read at a time: `most`, or fewer if they are large; refuses too large ones."""
         shape = self.frame_shape
-        numbers = math.prod(shape)
-        if numbers > FRAME_NUMBERS:
+        values = math.prod(shape)
+        if values > FRAME_NUMBERS:
             seen = f"{self.name} has frames of {' x '.join(map(str, shape))} numbers"
-            raise InputError(f"{seen}; expected at most {FRAME_NUMBERS}, as ?width=640 makes of images")
-        return max(1, min(most, BATCH_NUMBERS // max(1, numbers)))
+            raise InputError(f"{seen}; expected at most {FRAME_NUMBERS}, for images by ?width=640")
+        return max(1, min(most, BATCH_NUMBERS // max(1, values)))
 
 
 @dataclass(frozen=True)
@@ -127,9 +127,9 @@ class FrequencyLayer:
 
     Args:
         period: tau, in places; any positive rational, for example 93 or Fraction(195, 2).
-        phases: P, the number of templates per feature. The paper's case is phases = period.
+        phases: P, the number of templates per feature; in the paper, phases = period.
         start, stop: the chunk [start, stop) in places.
-        features: the indices of the features that take part, increasing.
+        features: indices of the features that repeat, increasing.
 
     Convention: phase(i) = floor((i mod period) * phases / period) counts from absolute place 0.
     """
@@ -151,9 +151,7 @@ class FrequencyLayer:
         if max(self.stop * b, a * self.phases) >= 2**63:
             raise InputError(f"{seen} up to {self.stop}; expected numbers whose products are below 2^63")
         if not self.features or not all(i < j for i, j in pairwise((-1, *self.features))):
-            raise InputError(
-                "a layer's feature indices must be non-empty, non-negative and strictly increasing"
-            )
+            raise InputError(f"layer features {self.features!s:.60}; expected 1 or more, increasing from 0")
 
     def phase(self, places: Tensor) -> Tensor:
         """Phase of each place, in exact integer arithmetic. (n,) int64 -> (n,) int64 in 0..P-1."""
@@ -176,14 +174,13 @@ class _Columns(NamedTuple):
 
 
 class Match(_Columns):
-    """Where each query was found (eq. 5) and whether to believe it (eq. 6): index, score, accepted.
+    """Where each query was found (eq. 5) and whether the answer is accepted (eq. 6): index, score, accepted.
 
     Attributes:
         index: (Q,) int64, the place found, -1 if no place has a finite score; (Q,k) candidates, best first.
-        score: float, lower is better, +inf where nothing covers. accepted: bool, see `DejaVu.acceptance`.
-        probability: float64, of being right, if the map is calibrated, else None; NaN for all but the first
-            candidate; outside the tuple.
-        sequences: by T, matches (Q,) by sequences of T queries, or by a filter; outside the tuple.
+        score: float, lower is better, +inf without a place. accepted: bool, see `DejaVu.acceptance`.
+        probability: float64, of being right, NaN for all but the first candidate; None without calibration.
+        sequences: by T, matches (Q,) of sequences or a filter. The tuple lacks this and `probability`.
     """
 
     probability: Tensor | None = None
@@ -197,12 +194,12 @@ class Match(_Columns):
         return match
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Match:
-        """The same change of every column; `sequences` stay."""
+        """The same change in every column, but not in `sequences`."""
         probability = None if self.probability is None else change(self.probability)
         return Match(*map(change, self))._replace(probability=probability, sequences=self.sequences)
 
     def renumbered(self, place: Callable[[Tensor], Tensor]) -> Match:
-        """Places by other numbers, in `sequences` too; -1 must stay."""
+        """The match with `place` applied to its places, in `sequences` too; it must keep -1."""
         sequences = {T: match.renumbered(place) for T, match in self.sequences.items()}
         return self._replace(index=place(self.index), sequences=sequences)
 
@@ -225,30 +222,26 @@ class Training(NamedTuple):
 
 
 class SequenceModel(nn.Module, ABC):
-    """Scores of places from consecutive queries, not from one: what `sequence` of `DejaVu.localize` takes.
+    """Combines the scores of consecutive queries: the `sequence` argument of `DejaVu.localize`.
 
-    Convention: causal; the score of a query is for the place of that query. Memory does not grow with the
-    queries.
+    Convention: causal; each score is for the place of its own query. Memory does not grow with the queries.
     """
 
-    likely: float | None = None  # a score below it is more likely right than not, where scores say that
+    likely: float | None = None  # a score below it is more likely right than wrong; None if scores do not say
 
     @abstractmethod
     def start(self, places: int, fixed: bool = False) -> Tensor:
-        """The state before the first query; `fixed`: of the shape that it keeps, as in an exported graph."""
+        """The state before the first query; `fixed`: in its final shape, as an exported graph needs it."""
 
     @abstractmethod
     def step(self, scores: Tensor, state: Tensor, firsts: Sequence[int] = (0,)) -> tuple[Tensor, Tensor]:
-        """Scores (B,N) of the next queries, one or more, and the state -> scores (B,N) and the next state.
-
-        Args:
-            firsts: the first place of each route of the map.
-        """
+        """Scores (B,N) of the next B queries, the state, and the first place of each route -> scores (B,N),
+        the next state."""
 
     @abstractmethod
     def check(self, queries: int | None, places: int) -> None:
-        """Refuse, or warn of, a number of places or of queries, if known, that it makes no sense for."""
+        """Refuse, or warn of, a number of places or (if known) of queries for which it makes no sense."""
 
     def threshold_of(self, threshold: float | None) -> float | None:
-        """What a score has to be below to be accepted, if it is `threshold` for single queries."""
+        """The acceptance threshold for its scores, given the one for single queries."""
         return threshold

@@ -26,7 +26,7 @@ from dejavu_torch.memory import concatenate
 def test_whatever_the_memory_the_rows_are_the_same(rows: int, batch: int, block: int, in_memory: int) -> None:
     features = torch.randn(rows, 3)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(memory, "BLOCK", block)
+        patch.setattr(memory, "BLOCK_BYTES", block)
         assert torch.equal(concatenate(features.split(batch)), features)
         assert torch.equal(concatenate(features.split(batch), in_memory), features)
 

@@ -20,8 +20,8 @@ def test_what_does_not_fit_is_refused_with_both_numbers(monkeypatch: pytest.Monk
 
 def test_the_limits_of_the_groups_around_a_job_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     own, inside = tmp_path / "own", tmp_path / "slurm" / "job" / "step"
-    monkeypatch.setattr(memory, "GROUPS", tmp_path)
-    monkeypatch.setattr(memory, "OWN", own)
+    monkeypatch.setattr(memory, "CGROUPS", tmp_path)
+    monkeypatch.setattr(memory, "OWN_CGROUP", own)
     own.write_text("4:memory:/elsewhere\n0::/slurm/job/step\n")
     inside.mkdir(parents=True)
     assert 2**20 < free_memory() < 2**60

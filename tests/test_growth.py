@@ -449,7 +449,7 @@ def test_a_state_that_does_not_fit_leaves_a_merged_map_as_it_was() -> None:
             {"routes": [extra["routes"][0], extra["routes"][1] | {"frames": 131}]},
             ("routes of [100, 131] frames", "expected 230"),
         ),
-        ({"routes": ["a", "b"]}, ("routes[0] is of 'a'", "name, places, frames")),
+        ({"routes": ["a", "b"]}, ("routes[0] holds 'a'", "name, places, frames")),
     ):
         with refused(*words):
             merged.map.load_state_dict(good | {"_extra_state": extra | change})

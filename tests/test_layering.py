@@ -21,7 +21,7 @@ ARROWS = {
     "data": "text types memory resize",
     "features": "text types resize",
     "periods": "text types memory",
-    "maps": "types memory data periods",
+    "maps": "types text memory data periods",
     "recognition": "text types data maps",
     "motion": "text types memory data",
     "learning": "types memory data features maps recognition motion",

@@ -270,7 +270,7 @@ def test_a_frame_that_is_not_finite_is_named() -> None:
     for make, bad in ((waves, torch.nan), (pictures, torch.inf)):
         values = make()
         values[41].view(-1)[1] = bad
-        with refused("frame 41", "NaN", "expected finite"):
+        with refused("frame 41", "NaN", "expected none"):
             wave_model(batch_size=8).learn(values)
         model = wave_model(batch_size=8).learn(make())
         with refused("frame 41", "NaN"):
@@ -318,7 +318,7 @@ def test_frames_keep_their_size_where_it_was_asked_for(tmp_path: Path) -> None:
     assert DejaVu(preprocess=Preprocess(size=None)).fit(open_source(images)).frame_shape == (1, 200, 400)
     assert DejaVu(preprocess=Preprocess(size=50)).fit(open_source(images)).frame_shape == (1, 25, 50)
     for size in (0, 1.5):
-        with refused("size is", "at least 1"):
+        with refused("size=", "at least 1"):
             Preprocess(size=size)  # type: ignore[arg-type]
 
 

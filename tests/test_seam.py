@@ -180,7 +180,7 @@ def test_a_loaded_map_says_that_its_period_finder_is_missing(
     values = torch.rand(60, 4)
     DejaVu(mapper=TemplateMapper(Foreign())).learn(values).save(tmp_path / "m.safetensors")
     model = DejaVu.load(tmp_path / "m.safetensors")
-    with refused("periods is not of this package", "learn anew"):
+    with refused("period finder is not of this package", "learn anew"):
         model.learn(values)
     report = compare(ArrayTraverse(values, "a"), ArrayTraverse(values + 0.01, "b"), "0", model).report
     assert "null" not in report.contenders

@@ -1,4 +1,4 @@
-"""What another day does to a frame, for learning features that are robust to it."""
+"""Augmentation of frames by changes of light, lens and view between days."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from dejavu_torch.types import InputError
 
-# the largest strength of each kind; two numbers where the argument is a pair
+# the largest strength of each change; two numbers if the argument is a pair
 LARGEST: dict[str, tuple[float, ...]] = {
     "colour": (1, 1),
     "rotation": (180,),
@@ -22,36 +22,34 @@ LARGEST: dict[str, tuple[float, ...]] = {
     "occlusion": (1,),
     "noise": (1,),
 }
-# the chance that a clip gets each kind
+# the probability that a clip gets each change
 WARPED, DEVELOPED, LIT, BLURRED, OCCLUDED, NOISY = 0.9, 0.7, 0.5, 0.5, 0.7, 0.7
-LARGE_BLUR = 4  # pixels, from which on kornia filters rows and columns faster than squares
+LARGE_BLUR = 4  # pixels; above this, separable filters of kornia are faster than square ones
 NO_BLUR = 1e-3  # sigma of a kernel that changes nothing
 
 
 class Augmentation(nn.Module):
-    """Light, lens and view of another day, drawn anew for every clip, up to the strength of each change.
+    """Random changes of light, lens and view, drawn for every clip, up to the strength of each change.
 
     Args:
         colour: per channel, (gain, offset), at most 1: x * (1 +- gain) +- offset.
-        rotation: degrees, in the plane of the frame.
+        rotation: degrees, in the plane of the frame, at most 180.
         shift: (horizontal, vertical), fractions of the width and of the height, at most 1.
         scale: fraction, 1 +- scale, at most 0.9.
-        exposure: all channels alike, (gain, offset), at most 1: (x +- offset) * (1 +- gain), clamped each
-            time.
+        exposure: for all channels, (gain, offset), at most 1: (x +- offset) * (1 +- gain), clamped twice.
         gamma: x ** g with g from 1 / (1 + gamma) to 1 + gamma, at most 10.
-        illumination: added or subtracted at one side, falling evenly to 0 at the opposite side; at most 1.
-        blur: sigma of a Gaussian, pixels, at most 20, cut off at the nearest whole number of pixels.
-        occlusion: fraction of the frame that a rectangle of another clip covers, sides 1:3 to 3:1.
+        illumination: added or subtracted at one side, falling linearly to 0 at the opposite side; at most 1.
+        blur: largest sigma of a Gaussian, pixels, at most 20; the kernel reaches as many pixels, rounded.
+        occlusion: fraction of the frame that a rectangle of another clip covers, sides 1:3 to 3:1, at most 1.
         noise: standard deviation of Gaussian noise, at most 1.
-        perspective: degrees, at most 45, about the vertical and the horizontal axis: the frame as a plane, at
-            a distance of its longer side, which is the focal length too, seen from another side.
+        perspective: degrees, at most 45, about both axes; distance and focal length are the longer side.
 
     Shape: frames (B,C,H,W) or clips (B,T,C,H,W), float32 in [0, 1] -> the same.
 
-    Convention: they act in this order; rotation, shift, scale and perspective together on 9 clips of 10, and
-        repeat the border; gamma, occlusion and noise on 7, illumination and blur on 5 of 10. All frames of a
-        clip change alike, but for the noise; a clip alone is covered with black. Random numbers come from
-        torch's generators. No gradient passes. In eval mode the input itself comes back.
+    Convention: changes follow in this order. Rotation, shift, scale and perspective, together, change 90 %
+        of clips and repeat the border; gamma, occlusion and noise 70 %, illumination and blur 50 %. Frames of
+        a clip share all but the noise; a single clip is covered with black. No gradient passes. Random
+        numbers are from torch's generators. Eval mode returns the input itself.
 
     Raises:
         InputError: a strength out of range; forward: frames of another shape or dtype, or too small to blur.
@@ -93,7 +91,7 @@ class Augmentation(nn.Module):
         return any(max(strength) > 0 for strength in self.strengths.values())
 
     def stronger(self, factor: float) -> Augmentation:
-        """The same with every strength times a factor, as far as it may go."""
+        """The augmentation with every strength times a factor, up to the largest allowed."""
         other = Augmentation()
         for name, most in LARGEST.items():
             scaled = (factor * one for one in self.strengths[name])
@@ -106,16 +104,14 @@ class Augmentation(nn.Module):
             return frames
         (blur,), (noise,) = self.strengths["blur"], self.strengths["noise"]
         radius = max(1, round(blur)) if blur else 0
-        shape, kind = tuple(frames.shape), frames.dtype
-        if len(shape) not in (4, 5) or kind != torch.float32 or min(shape) < 1 or min(shape[-2:]) <= radius:
-            raise InputError(
-                f"the frames are {shape} {kind}; expected some, float32 (B,C,H,W) or clips (B,T,C,H,W), of "
-                f"more than {radius} pixels a side to blur"
-            )
+        shape, dtype = tuple(frames.shape), frames.dtype
+        if len(shape) not in (4, 5) or dtype != torch.float32 or min(shape) < 1 or min(shape[-2:]) <= radius:
+            expected = "at least one, float32 (B,C,H,W) or clips (B,T,C,H,W), of more than"
+            raise InputError(f"the frames are {shape} {dtype}; expected {expected} {radius} pixels a side")
         clips = frames if frames.ndim == 5 else frames[:, None]
         gain, offset = self.strengths["colour"]
         draw = torch.rand(2, len(clips), 1, clips.shape[2], 1, 1, device=clips.device) * 2 - 1
-        clips = (clips * (1 + gain * draw[0]) + offset * draw[1]).clamp_(0, 1)  # a copy: all else is in place
+        clips = (clips * (1 + gain * draw[0]) + offset * draw[1]).clamp_(0, 1)  # a copy, to change in place
         clips = self._lit(self._warped(clips))
         clips = self._occluded(_blurred(clips, blur, radius) if blur else clips)
         if noise:
@@ -153,7 +149,7 @@ class Augmentation(nn.Module):
         if gamma:
             power = _uniform(clips, 1 / (1 + gamma), 1 + gamma)
             power = torch.where(_happens(clips, DEVELOPED), power, 1)
-            clips = clips.log_().mul_(power).exp_()  # faster than pow, and 0 of 0
+            clips = clips.log_().mul_(power).exp_()  # faster than pow; 0 stays 0
         if slope:
             height, width = clips.shape[-2:]
             x = torch.linspace(0, 1, width, device=clips.device)
@@ -165,7 +161,7 @@ class Augmentation(nn.Module):
         return clips
 
     def _occluded(self, clips: Tensor) -> Tensor:
-        """A rectangle of each clip taken from the one before."""
+        """A rectangle of each clip is replaced by that of the clip before."""
         (most,) = self.strengths["occlusion"]
         if not most:
             return clips
@@ -189,7 +185,7 @@ class Augmentation(nn.Module):
 
 
 def _uniform(clips: Tensor, low: float, high: float) -> Tensor:
-    """A number for each clip, (B,1,1,1,1)."""
+    """A random number for each clip, (B,1,1,1,1)."""
     return low + (high - low) * torch.rand(len(clips), 1, 1, 1, 1, device=clips.device)
 
 
@@ -198,9 +194,9 @@ def _happens(clips: Tensor, chance: float) -> Tensor:
 
 
 def _homography(angle: Tensor, zoom: Tensor, shift: Tensor, tilt: Tensor) -> Tensor:
-    """(B,3,3): from points of a warped frame to their source, in units of the longer side from its middle.
+    """(B,3,3), from points of a warped frame to their source: relative to the centre, in longer sides.
 
-    angle, zoom: (B,). shift, tilt: (2,B), the latter about the vertical and the horizontal axis.
+    angle, zoom: (B,). shift: (2,B). tilt: (2,B), about the vertical and the horizontal axis.
     """
     one, zero = torch.ones_like(angle), torch.zeros_like(angle)
     cos, sin = angle.cos() / zoom, angle.sin() / zoom

@@ -1,4 +1,4 @@
-"""A small CNN that can be trained to repeat: the learned counterpart of HOG."""
+"""A small CNN to train on a route: the learned counterpart of HOG."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from dejavu_torch.resize import check_size, resize_frames
 from dejavu_torch.text import settings_of
 from dejavu_torch.types import InputError
 
-FLAT = 2 / 255  # contrast below which nothing is blown up
+FLAT = 2 / 255  # contrast below which nothing is amplified
 
 
 def local_contrast(frames: Tensor, cell: int = 8) -> Tensor:
-    """Each pixel (B,C,H,W) minus the mean around it, divided by the contrast around it, mean about 0.
+    """Each pixel (B,C,H,W) minus the mean around it, divided by the contrast around it.
 
-    Mean and contrast are those of square cells, of `cell` pixels a side, interpolated between the cells'
-    centres, which is faster than a window at every pixel (`normalise_patches`). All channels share the
-    contrast. A gain or an offset of brightness changes almost nothing; contrast below 2/255 is not amplified.
+    Both are computed in cells of `cell` x `cell` pixels, the contrast over all channels, and interpolated,
+    which is faster than a window at every pixel (`normalise_patches`). A gain or an offset of brightness
+    changes almost nothing; contrast below 2/255 is not amplified.
     """
     height, width = frames.shape[-2:]
     grid = (-(-height // cell), -(-width // cell))
@@ -33,13 +33,13 @@ def local_contrast(frames: Tensor, cell: int = 8) -> Tensor:
 
 
 class SmallCNN(nn.Module):
-    """Local contrast, strided convolutions, and one linear layer, which keeps where things are. Features are
-    standardised by their running mean and deviation over the training frames, to share one scale.
+    """Local contrast, strided convolutions, and a linear layer, which sees where things are. Features are
+    standardised by their running mean and variance over the training frames.
 
     Args:
         dimension: D, number of features.
-        channels: of the frames; None is 3, until a training or loaded weights have others.
-        resize: (height, width) in pixels that frames are resized to, antialiased.
+        channels: of the frames; None is 3, or as training frames or loaded weights have.
+        resize: (height, width) in pixels to resize frames to, antialiased.
         widths: channels after each convolution; each halves height and width.
         squeeze: channels before the linear layer.
         cell: of `local_contrast`, pixels; 0 leaves the contrast unchanged.
@@ -63,27 +63,23 @@ class SmallCNN(nn.Module):
         self.resize = check_size(resize, 1, "SmallCNN got resize")
         self.follows, self.channels = channels is None, 3 if channels is None else channels
         self.dimension, self.squeeze, self.cell = dimension, squeeze, cell
-        self.widths = tuple(int(width) for width in widths)  # a map gives a list
+        self.widths = tuple(int(width) for width in widths)  # a map file holds a list
         if not widths or min(dimension, self.channels, squeeze, *widths) < 1 or cell < 0:
             raise InputError(f"SmallCNN got {settings_of(self)}; expected at least 1 each, cell 0 or more")
         layers: list[nn.Module] = []
         height, width = self.resize
         for before, after in zip((self.channels, *self.widths), self.widths, strict=False):
             side = 3 if layers else 5
-            layers += [
-                nn.Conv2d(before, after, side, stride=2, padding=side // 2, bias=False),
-                nn.BatchNorm2d(after),
-                nn.ReLU(inplace=True),
-            ]
+            convolution = nn.Conv2d(before, after, side, stride=2, padding=side // 2, bias=False)
+            layers += [convolution, nn.BatchNorm2d(after), nn.ReLU(inplace=True)]
             height, width = -(-height // 2), -(-width // 2)
-        self.convolutions = nn.Sequential(
-            *layers, nn.Conv2d(self.widths[-1], squeeze, 1), nn.ReLU(inplace=True)
-        )
+        layers += [nn.Conv2d(self.widths[-1], squeeze, 1), nn.ReLU(inplace=True)]
+        self.convolutions = nn.Sequential(*layers)
         self.linear = nn.Linear(squeeze * height * width, dimension)
         self.standardise = nn.BatchNorm1d(dimension, affine=False, momentum=0.02)
 
     def follow(self, channels: int) -> None:
-        """Accept frames of so many channels if None was given: the first layer begins anew."""
+        """Adapt to this number of channels if none was given, with a new first layer."""
         if self.follows and channels != self.channels:
             self.channels = channels
             first = nn.Conv2d(channels, self.widths[0], 5, stride=2, padding=2, bias=False)
@@ -99,10 +95,7 @@ class SmallCNN(nn.Module):
 
     def forward(self, frames: Tensor) -> Tensor:
         if frames.ndim != 4 or frames.shape[1] != self.channels:
-            raise InputError(
-                f"SmallCNN got frames {tuple(frames.shape)}; expected (B,{self.channels},H,W), "
-                f"as channels={self.channels} says"
-            )
+            raise InputError(f"SmallCNN got {tuple(frames.shape)}; expected frames (B,{self.channels},H,W)")
         frames = resize_frames(frames, self.resize).to(self.linear.weight.dtype)
         if self.cell:
             frames = local_contrast(frames, self.cell)

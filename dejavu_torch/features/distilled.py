@@ -1,4 +1,4 @@
-"""What the first blocks of an ImageNet network see, from a network that is small enough for the package."""
+"""A small network that imitates the first blocks of an ImageNet network; its weights are in the package."""
 
 from __future__ import annotations
 
@@ -16,30 +16,29 @@ from dejavu_torch.resize import resize_frames
 from dejavu_torch.text import settings_of
 from dejavu_torch.types import InputError
 
-SIZE = (96, 96)  # pixels of the frames that it was trained on
+SIZE = (96, 96)  # pixels of its training frames
 STRIDES = (2, 2, 2, 1, 1)  # of its convolutions
-WIDEST = 12  # cells along a side of its maps
+WIDEST = 12  # cells along a side of its feature maps
 WEIGHTS = {"lite0": Path(__file__).with_name("lite0.safetensors")}
 
 
 class Distilled(nn.Module):
-    """Textures and colours, where HOG has edges, as the first blocks of an ImageNet network see them.
+    """Textures and colours, to complement the edges of HOG, from a network of 65 kB.
 
-    Convolutions that were trained on drawn images to give what the first four blocks of EfficientNet-Lite0
-    (Tan and Le, ICML 2019) give after training on ImageNet, averaged over a grid.
+    Convolutions, averaged over a grid. They were trained on drawn images to reproduce the output of the first
+    four blocks of EfficientNet-Lite0 (Tan and Le, ICML 2019) trained on ImageNet.
 
     Args:
         grid: cells along each side of the frame, at most 12.
-        weights: "lite0", so far the only ones, which `python -m benchmarks distil` makes. They come with the
-            package, 8 bits each; a map file holds their checksum alone, and no training changes them.
+        weights: "lite0", the only choice so far, made by `python -m benchmarks distil`. They are part of the
+            package, in 8 bits each, and fixed: a map file holds only their checksum.
 
     Shape: (B,C,H,W) float in [0, 1] -> (B, 40 x grid^2).
 
-    Convention: frames are resized to 96 x 96; those of 2, or of more than 3, channels are averaged to grey.
+    Convention: frames are resized to 96 x 96, and averaged to grey unless they have 1 or 3 channels.
 
     Raises:
-        InputError: settings out of range; forward: frames that are not (B,C,H,W) float; load_state_dict: the
-            checksum of other weights.
+        InputError: settings out of range; forward: not (B,C,H,W) float; load_state_dict: another checksum.
 
     Example:
         >>> import torch
@@ -68,19 +67,17 @@ class Distilled(nn.Module):
     def _load_from_state_dict(self, state: dict[str, Any], prefix: str, *args: Any) -> None:
         stored = state.get(f"{prefix}checksum")
         if stored is not None and not torch.equal(stored.cpu(), self.checksum.cpu()):
-            raise InputError(
-                f"it was learned with other weights {self.weights} of Distilled than this version has; "
-                "expected the version that learned it, or a map learned anew"
-            )
+            seen = f"it was learned with other weights {self.weights} of Distilled than this version has"
+            raise InputError(f"{seen}; expected the version that learned it, or a map learned anew")
         super()._load_from_state_dict(state, prefix, *args)
 
     extra_repr = settings_of
 
 
 def loaded(path: Path) -> dict[str, Tensor]:
-    """The weights (O,I,k,k) and biases (O,) of a file of whole numbers and scales, and a checksum."""
+    """The weights (O,I,k,k) and biases (O,) of a file of integers and scales, and a checksum."""
     stored, layers = load_file(path), {}
-    # of the order of all whole numbers, too; in place of a hash, which is no tensor
+    # sensitive to order, as a hash is, but a tensor
     sums = [stored[f"{i}.weight"].flatten().long().cumsum(0).sum() for i in range(len(STRIDES))]
     layers["checksum"] = torch.stack(sums)
     for i in range(len(STRIDES)):
@@ -90,11 +87,11 @@ def loaded(path: Path) -> dict[str, Tensor]:
 
 
 def distilled_maps(frames: Tensor, layers: Mapping[str, Tensor]) -> Tensor:
-    """Grey or RGB frames in [0, 1] through the convolutions: (B,C,96,96) -> (B,40,12,12)."""
+    """Feature maps of grey or RGB frames in [0, 1]: (B,C,96,96) -> (B,40,12,12)."""
     values = 2 * frames - 1
     for i, stride in enumerate(STRIDES):
         weight, bias = (layers[f"{name}{i}"].to(values) for name in ("weight", "bias"))
-        if not i and values.shape[1] == 1:  # as three equal channels
+        if not i and values.shape[1] == 1:  # the result for three equal channels
             weight = weight.sum(1, keepdim=True)
         values = conv2d(values.relu() if i else values, weight, bias, stride, weight.shape[-1] // 2)
     return values

@@ -1,4 +1,4 @@
-"""Any network as a backbone: its descriptor, and the whitening and the code after it."""
+"""Any network as a backbone: its descriptor, with whitening and a code."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ SHOWN = 4  # shapes in a message
 class Coder(nn.Module):
     """Whitens a descriptor (B,K) and maps it, by one hidden layer, to the code (B,D) of its place.
 
-    That code is arbitrary: training adds noise to the whitened descriptor, for the days that it does not see.
+    Training adds noise to the whitened descriptor, so that the code is robust to changes it has not seen.
 
     Args:
-        inputs: K, of a descriptor. dimension: D, of the code, not standardised yet.
+        inputs: K, of a descriptor. dimension: D, of the code, before standardisation.
         hidden: width of the hidden layer.
-        noise: its standard deviation beside components of about 1, in training mode.
-        kept: number of components that whitening keeps; fewer if K is smaller.
+        noise: standard deviation of the noise in training mode; components are about 1.
+        kept: number of components after whitening, at most K.
 
-    Convention: components are the first dimensions of the descriptor until `whiten`. They are scaled to
-        length sqrt(components) before the noise, and after it.
+    Convention: until `whiten`, components are the first dimensions of the descriptor. They are scaled to
+        length sqrt(components) before and after the noise.
     """
 
     mean: Tensor
@@ -44,17 +44,15 @@ class Coder(nn.Module):
     ) -> None:
         super().__init__()
         if min(inputs, dimension, hidden, kept) < 1 or not 0 <= noise < math.inf:
-            raise InputError(
-                f"Coder got inputs={inputs}, dimension={dimension}, hidden={hidden}, kept={kept}, "
-                f"noise={noise}; expected at least 1 each, the noise 0 or more"
-            )
+            seen = f"{inputs=}, {dimension=}, {hidden=}, {kept=}, {noise=}"
+            raise InputError(f"Coder got {seen}; expected at least 1 each, the noise 0 or more")
         self.noise = noise
         kept = min(kept, inputs)
         self.register_buffer("mean", torch.zeros(inputs))
         self.register_buffer("projection", torch.eye(inputs, kept))
         self.register_buffer("whitened", torch.tensor(False))
         norm = nn.BatchNorm1d(hidden)
-        # the scale of the units does not matter; with a small one AdamW reaches their thresholds sooner
+        # the scale does not change the function; AdamW reaches the units' thresholds sooner if it is small
         nn.init.constant_(norm.weight, 0.1)
         first, last = nn.Linear(kept, hidden, bias=False), nn.Linear(hidden, dimension)
         self.layers = nn.Sequential(first, norm, nn.ReLU(inplace=True), last)
@@ -67,7 +65,7 @@ class Coder(nn.Module):
         self.whitened.fill_(True)
 
     def forward(self, descriptors: Tensor) -> Tensor:
-        # bf16 is too coarse for the small differences that whitening enlarges
+        # bf16 is too coarse for the small differences that whitening amplifies
         with torch.autocast(descriptors.device.type, enabled=False):
             components = to_length((descriptors.to(self.mean.dtype) - self.mean) @ self.projection)
             if self.training and self.noise:
@@ -85,26 +83,24 @@ class Embedding(nn.Module):
     """The output of a network, pooled to a coarse grid and projected to D standardised features.
 
     Args:
-        network: frames (B,channels,h,w) -> maps (B,K,h',w'), tokens (B,T,K), which are averaged, or vectors
-            (B,K), such as `kornia.feature.HardNet()` with 1 channel of 32 x 32. Of several outputs the first
-            vectors count.
-        dimension: D, number of features; None gives the pooled output itself.
+        network: frames (B,channels,h,w) -> feature maps (B,K,h',w'), tokens (B,T,K), which are averaged, or
+            vectors (B,K), such as `kornia.feature.HardNet()` with 1 channel; of several, the first vectors.
+        dimension: D, number of features; None returns the pooled output itself.
         channels: of the network's input, 3 or 1; grey frames are repeated, colours become luminance.
-        resize: (height, width) in pixels that frames are resized to, antialiased.
-        grid: cells along each side that maps are averaged over.
+        resize: (height, width) in pixels to resize frames to, antialiased.
+        grid: cells along each side over which feature maps are averaged.
         cell: of `local_contrast` before the network, pixels; 0 leaves the contrast unchanged.
         hidden: width of the hidden layer of a `Coder`, which replaces the linear layer; 0 has none.
         noise, kept: of the `Coder`.
-        layer: name of the submodule, as in `named_modules`, that the network ends at, see `up_to`.
-        mean, std: of each channel, or one number for all, subtracted from the frames in [0, 1] and divided
-            out last; (.485, .456, .406) and (.229, .224, .225) for most that ImageNet trained.
-        output: index of the member of a tuple, list or dict that counts instead.
+        layer: name of the submodule, as in `named_modules`, at which the network ends, see `up_to`.
+        mean, std: to normalise frames in [0, 1], per channel or one for all; (.485, .456, .406) and
+            (.229, .224, .225) for most networks trained on ImageNet.
+        output: index of the output to use, if the network returns a tuple, list or dict.
 
     Shape: (B,C,H,W) float in [0, 1], C of 1 or 3 -> (B,D).
 
     Raises:
-        InputError: settings out of range, a network that cannot take such frames, or has no such layer or
-            output; forward: frames neither grey nor RGB.
+        InputError: settings out of range or not of this network; forward: frames neither grey nor RGB.
 
     Example:
         >>> blocks = nn.Sequential(nn.Conv2d(3, 4, 3), nn.Conv2d(4, 9, 3))
@@ -140,13 +136,11 @@ class Embedding(nn.Module):
         self.hidden, self.noise, self.kept = hidden, noise, kept
         self.layer, self.mean, self.std, self.output = layer, mean, std, output
         if not fits or not 1 <= grid <= WIDEST or channels not in (1, 3) or min(cell, hidden) < 0:
-            raise InputError(
-                f"Embedding got {self.extra_repr()}; expected 1 or 3 channels, cell and hidden of 0 or more "
-                f"(with no dimension hidden 0), a grid of 1 to {WIDEST}, a dimension of at least 1"
-            )
-        # the settings say the same
-        self.register_buffer("offset", _of_channels("mean", mean, channels, 0.0), persistent=False)
-        self.register_buffer("factor", 1 / _of_channels("std", std, channels, 1.0), persistent=False)
+            expected = "channels 1 or 3, cell, hidden 0 or more, dimension at least 1, or none and hidden 0"
+            raise InputError(f"Embedding got {self.extra_repr()}; expected {expected}, grid 1 to {WIDEST}")
+        # not persistent: the settings hold the same
+        self.register_buffer("offset", _per_channel("mean", mean, channels, 0.0), persistent=False)
+        self.register_buffer("factor", 1 / _per_channel("std", std, channels, 1.0), persistent=False)
         size = (1, channels, *self.resize)
         frame = torch.linspace(0, 1, math.prod(size)).view(size)
         try:
@@ -156,38 +150,33 @@ class Embedding(nn.Module):
         except InputError:
             raise
         except Exception as error:  # a network may raise anything
-            raise InputError(
-                f"{type(network).__name__} does not take frames {size}: {one_line(error)}"
-            ) from error
+            raise InputError(f"{type(network).__name__} fails on frames {size}: {one_line(error)}") from error
         self.linear: nn.Module = nn.Identity()
         self.standardise: nn.Module = nn.Identity()
         if dimension is not None:
-            coded = (inputs, dimension, hidden, noise, kept)
-            self.linear = Coder(*coded) if hidden else nn.Linear(inputs, dimension)
+            sizes = (inputs, dimension, hidden, noise, kept)
+            self.linear = Coder(*sizes) if hidden else nn.Linear(inputs, dimension)
             self.standardise = nn.BatchNorm1d(dimension, affine=False, momentum=0.02)
 
-    def _pooled(self, made: object) -> Tensor:
-        """What the network made, one row per frame."""
+    def _pooled(self, output: object) -> Tensor:
+        """The output of the network, one row per frame."""
         name = type(self.network).__name__
         if self.output is not None:
-            members = members_of(made)
+            members = members_of(output)
             if not -len(members) <= self.output < len(members):
-                seen = f"output is {self.output}, but {name} made {len(members)}"
-                raise InputError(f"{seen}; expected one of them")
-            made = members[self.output]
-        tensors = tensors_in(made)
+                raise InputError(f"output is {self.output}; {name} made {len(members)}, expected one of them")
+            output = members[self.output]
+        tensors = tensors_in(output)
         chosen = tensors if len(tensors) == 1 else [tensor for tensor in tensors if tensor.ndim == 2]
         if chosen and chosen[0].ndim in (2, 3):
             return chosen[0].mean(1) if chosen[0].ndim == 3 else chosen[0]
         if chosen and chosen[0].ndim == 4:
             return nn.functional.adaptive_avg_pool2d(chosen[0], self.grid).flatten(1)
-        seen = ", ".join(str(tuple(tensor.shape)) for tensor in tensors[:SHOWN]) or type(made).__name__
+        seen = ", ".join(str(tuple(tensor.shape)) for tensor in tensors[:SHOWN]) or type(output).__name__
         if len(tensors) > 1:
             seen = f"{len(tensors)} tensors, {seen}{', ..' * (len(tensors) > SHOWN)}, none of them vectors"
-        raise InputError(
-            f"{name} made {seen}; expected maps (B,K,h,w) or vectors (B,K), or output, the index of one, or "
-            "layer, where the network is to end"
-        )
+        expected = "maps (B,K,h,w), vectors (B,K), output=INDEX of one of several, or layer=NAME of a layer"
+        raise InputError(f"{name} made {seen}; expected {expected}")
 
     @property
     def coder(self) -> Coder | None:
@@ -195,7 +184,7 @@ class Embedding(nn.Module):
         return self.linear if isinstance(self.linear, Coder) else None
 
     def without_code(self) -> Embedding:
-        """An Embedding of the same network that gives the descriptor itself."""
+        """An Embedding with the same network that returns the descriptor itself."""
         settings = {name: getattr(self, name) for name in ("layer", "mean", "std", "output")}
         return Embedding(self.network, None, self.channels, self.resize, self.grid, self.cell, **settings)
 
@@ -226,14 +215,13 @@ class Embedding(nn.Module):
         return settings_of(self, "network")
 
 
-def _of_channels(name: str, given: float | list[float] | None, channels: int, default: float) -> Tensor:
-    """(channels,1,1), from a number for each channel or one for all."""
+def _per_channel(name: str, given: float | list[float] | None, channels: int, default: float) -> Tensor:
+    """(channels,1,1), from a number per channel or one for all."""
     numbers = [*given] if isinstance(given, (list, tuple)) else [default if given is None else given]
-    # numbers that float32 holds, and their inverse
+    # in the range of float32, as are inverses
     least, most = (-1e38, 1e38) if name == "mean" else (1e-37, 1e37)
     if len(numbers) not in (1, channels) or not all(least <= number <= most for number in numbers):
-        raise InputError(
-            f"Embedding got {name}={f'{given}':.80}; expected a number for each of {channels} channels, or "
-            f"one for all{', above 0' if name == 'std' else ''}"
-        )
+        expected = f"a number for each of {channels} channels, or one for all"
+        expected += ", above 0" * (name == "std")
+        raise InputError(f"Embedding got {name}={f'{given}':.80}; expected {expected}")
     return torch.tensor(numbers).float().expand(channels).clone().view(channels, 1, 1)

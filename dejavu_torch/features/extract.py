@@ -18,12 +18,12 @@ from dejavu_torch.types import InputError, Traverse
 
 log = logging.getLogger("dejavu_torch")
 
-BRIGHTEST = 1.5  # of a frame in [0, 1], whatever was done to it
-APART = 1e-3  # of its length: by how much the features of a frame may differ alone and among others
-ULPS = 4  # and of the coarsest numbers
-TF32 = 2**-10  # what it rounds by
-READY = 256  # ready features at a time at least: a search takes longer for each of fewer
-FIRST, EVERY = 30.0, 60.0  # seconds before the first line of progress, and from one to the next
+BRIGHTEST = 1.5  # frames should be in [0, 1]; preprocessing may exceed it a little
+BATCH_TOLERANCE = 1e-3  # of their length: how much features may differ between a frame alone and in a batch
+BATCH_ULPS = 4  # of the coarsest dtype: the same tolerance, if it is larger
+TF32 = 2**-10  # the rounding of this format
+READY = 256  # ready features at a time, at least: a search takes longer per query for fewer
+FIRST_LINE, LINE_EVERY = 30.0, 60.0  # seconds until the first line of progress, and between lines
 
 
 def feature_batches(
@@ -39,9 +39,8 @@ def feature_batches(
     Args:
         traverse: frames (B,C,H,W), or ready features (B,D), which pass unchanged.
         module: (B,C,H,W) -> (B,D). It runs in eval mode; the modes of its parts are restored.
-        batch_size: frames in memory at a time; fewer if they are large, and of ready features at least 256.
-        progress: what to call this work on stderr: a bar on a terminal, else a line now and then. Copies of
-            one frame count once.
+        batch_size: frames in memory at a time, fewer if they are large; at least 256 ready features.
+        progress: label of a progress bar on stderr, or of lines if it is no terminal; copies count once.
         on_first: called with the first batch and its features.
 
     Raises:
@@ -54,15 +53,13 @@ def feature_batches(
         for batch in traverse.batches(traverse.batch_size(size)):
             with torch.no_grad():
                 features = features_of(batch.to(device), module, traverse.name).detach()
-            if features.dtype in (torch.float16, torch.bfloat16):  # too coarse to add up and to transform
+            if features.dtype in (torch.float16, torch.bfloat16):  # too coarse for sums and transforms
                 features = features.float()
             bad = ~features.isfinite().all(1)
             if bad.any():
-                first = done + int(bad.nonzero()[0])
-                first = int(getattr(traverse, "frame", range(first + 1))[first])  # of the source
-                raise InputError(
-                    f"{traverse.name}: frame {first} gives NaN or infinite features; expected finite numbers"
-                )
+                i = done + int(bad.nonzero()[0])
+                i = int(getattr(traverse, "frame", range(i + 1))[i])  # of the source
+                raise InputError(f"{traverse.name}: frame {i} has NaN or infinite features; expected none")
             if on_first is not None and done == 0:
                 on_first(batch, features)
             update((done + len(features)) // copies - done // copies)
@@ -74,20 +71,20 @@ def feature_batches(
 
 @contextmanager
 def _progress(text: str | None, total: int | None) -> Iterator[Callable[[int], object]]:
-    """A function to call with how many more frames are done, which shows it on stderr; None shows nothing."""
+    """A function to call with the number of frames newly done, which shows progress unless `text` is None."""
     if text is not None and sys.stderr.isatty():
         with tqdm(total=total, desc=text, unit="frame", leave=False) as bar:
             yield bar.update
         return
     began, done = time.monotonic(), 0
-    due = began + FIRST
+    due = began + FIRST_LINE
 
     def update(more: int) -> None:
         nonlocal done, due
         done, now = done + more, time.monotonic()
         if text is None or now < due or not done:
             return
-        due = now + EVERY
+        due = now + LINE_EVERY
         of = f" of {total}" if total else ""
         left = f", {max(0, total - done) * (now - began) / done:.0f} s left" if total else ""
         tqdm.write(f"dejavu: {text}: {done}{of} frames{left}", file=sys.stderr)
@@ -96,7 +93,7 @@ def _progress(text: str | None, total: int | None) -> Iterator[Callable[[int], o
 
 
 def features_of(batch: Tensor, describe: Callable[[Tensor], Tensor], name: str = "the input") -> Tensor:
-    """Features of one batch: (B,C,H,W) frames are described, (B,D) features stay unchanged."""
+    """Features of one batch: frames (B,C,H,W) are described, features (B,D) pass unchanged."""
     if isinstance(batch, Tensor) and batch.ndim == 2 and batch.is_floating_point():
         return batch
     check_frames(batch, f"{name} is", " or float features (B,D)")
@@ -107,14 +104,13 @@ def features_of(batch: Tensor, describe: Callable[[Tensor], Tensor], name: str =
         owner = describe[-1] if isinstance(describe, nn.Sequential) else describe
         owner = getattr(owner, "__self__", owner)  # of a method
         owner = getattr(owner, "features", owner)
-        raise InputError(
-            f"{type(owner).__name__} made {made} of {tuple(batch.shape)}; expected features ({len(batch)}, D)"
-        )
+        seen = f"{type(owner).__name__} made {made} of {tuple(batch.shape)}"
+        raise InputError(f"{seen}; expected features ({len(batch)}, D)")
     return features
 
 
 def warn_of_bright(frames: Tensor, name: str) -> bool:
-    """Whether frames (B,C,H,W) exceed [0, 1] by far, and then a line; ready features (B,D) may be any."""
+    """Whether frames (B,C,H,W) exceed [0, 1] by far, with a warning; ready features (B,D) never do."""
     most = float(frames.detach().amax()) if frames.ndim == 4 and len(frames) else 0.0
     if most > BRIGHTEST:
         seen = f"{name} has frames with values up to {most:.4g}"
@@ -123,29 +119,27 @@ def warn_of_bright(frames: Tensor, name: str) -> bool:
 
 
 def check_alone(module: nn.Module, frames: Tensor, features: Tensor, name: str) -> None:
-    """Refuse a network, in eval mode, whose features of a frame depend on the other frames of the batch: by
-    over 1e-3 of their length, or what its numbers round by."""
+    """Refuse a network in eval mode whose features of a frame depend on its batch beyond 1e-3 or rounding."""
     if frames.ndim != 4 or len(frames) < 2:
         return
     device = features.device.type
     with torch.no_grad():
         alone = features_of(frames[:1].to(features.device), module, name).to(features)
-    apart = float((alone[0] - features[0]).norm() / features[0].norm().clamp(min=1e-12))
-    kinds = {one.dtype for one in module.parameters() if one.is_floating_point()}
+    difference = float((alone[0] - features[0]).norm() / features[0].norm().clamp(min=1e-12))
+    dtypes = {one.dtype for one in module.parameters() if one.is_floating_point()}
     if torch.is_autocast_enabled(device):
-        kinds.add(torch.get_autocast_dtype(device))
+        dtypes.add(torch.get_autocast_dtype(device))
     # a GPU may use TF32 in one batch and not in another
-    coarsest = max([0.0 if device == "cpu" else TF32, *(torch.finfo(kind).eps for kind in kinds)])
-    if apart > max(APART, ULPS * coarsest):
-        raise InputError(
-            f"frame 0 of {name} has other features alone than in a batch with {len(frames) - 1} others, by "
-            f"{apart:.2g} of their length; expected --batch_size 1, where every frame is alone"
-        )
+    coarsest = max([0.0 if device == "cpu" else TF32, *(torch.finfo(dtype).eps for dtype in dtypes)])
+    if difference > max(BATCH_TOLERANCE, BATCH_ULPS * coarsest):
+        seen = f"frame 0 of {name} has other features alone than in a batch with {len(frames) - 1} others"
+        expected = "--batch_size 1, where every frame is alone"
+        raise InputError(f"{seen}, by {difference:.2g} of their length; expected {expected}")
 
 
 @contextmanager
 def in_mode(module: nn.Module, training: bool) -> Iterator[None]:
-    """The module in training or eval mode; afterwards every part is in its own mode again."""
+    """The module in training or eval mode; afterwards every part has its own mode again."""
     modes = [(part, part.training) for part in module.modules()]
     module.train(training)
     try:

@@ -21,18 +21,17 @@ class HOG(nn.Module):
 
     Args:
         orientations: unsigned orientation bins in [0, 180) degrees.
-        cell: side of a square cell, pixels. Pixels beyond the last whole cell only feed gradients.
+        cell: side of a square cell, pixels. Pixels beyond the last whole cell only enter gradients.
         block: side of a square block, cells. Blocks overlap: they move by one cell.
         resize: (height, width) in pixels to resize to first, antialiased; None keeps the size.
-        bins: "hard": a pixel votes for the bin of its orientation, as in skimage. "linear", the trainable
-            form, in which the orientation carries gradient: it shares its vote between the two nearest bin
-            centres, (k + 0.5) * 180 / orientations degrees, cyclic over 180.
+        bins: "hard": a pixel votes for one bin, as in skimage. "linear": it shares its vote between the two
+            nearest bin centres, (k + 0.5) * 180 / orientations, cyclic, which gives orientation a gradient.
 
     Shape: (B,C,H,W) -> (B,D) with D = (ny - block + 1) * (nx - block + 1) * block**2 * orientations,
         ny = H // cell, nx = W // cell; ordered as in skimage.
 
-    Convention: each pixel of a colour image has the gradient of its strongest channel. Blocks are normalised
-        by L2-Hys. Gradients with respect to the frames are finite everywhere.
+    Convention: each pixel has the gradient of its strongest channel. Blocks are normalised by L2-Hys.
+        Gradients with respect to the frames are finite everywhere.
 
     Raises:
         InputError: settings out of range; forward: not (B,C,H,W) float, or smaller than one block.
@@ -52,24 +51,20 @@ class HOG(nn.Module):
         self.bins: Bins = bins
         least, most = min(orientations, cell, block), MOST_ORIENTATIONS
         if least < 1 or orientations > most or bins not in get_args(Bins):
-            raise InputError(
-                f"HOG got {settings_of(self)}; expected at least 1 each, at most {most} orientations, bins "
-                "'hard' or 'linear'"
-            )
+            expected = f"at least 1 each, at most {most} orientations, bins 'hard' or 'linear'"
+            raise InputError(f"HOG got {settings_of(self)}; expected {expected}")
 
     def forward(self, frames: Tensor) -> Tensor:
         check_frames(frames, "HOG got")
         height, width = frames.shape[-2:] if self.resize is None else self.resize
         least = self.cell * self.block
         if min(height, width) < least:
-            raise InputError(
-                f"HOG got frames of {height} x {width} pixels; expected at least one block, {least} x {least}"
-            )
+            raise InputError(f"HOG got frames of {height} x {width}; expected one block, {least} x {least}")
         return in_parts(self._describe, frames)
 
     def _describe(self, frames: Tensor) -> Tensor:
-        slopes = gradients(resize_frames(frames, self.resize))
-        histograms = cell_histograms(*slopes, self.orientations, self.cell, self.bins)
+        rows, columns = gradients(resize_frames(frames, self.resize))
+        histograms = cell_histograms(rows, columns, self.orientations, self.cell, self.bins)
         blocks = histograms.unfold(1, self.block, 1).unfold(2, self.block, 1)  # (B,by,bx,O,block,block)
         blocks = _unit(blocks.permute(0, 1, 2, 4, 5, 3).flatten(3)).clamp(max=0.2)
         return _unit(blocks).flatten(1)
@@ -91,13 +86,11 @@ def hog(
         >>> hog(torch.rand(5, 1, 64, 64)).shape
         torch.Size([5, 1764])
     """
-    features: Tensor = HOG(orientations, cell, block, resize, bins)(frames)
-    return features
+    return HOG(orientations, cell, block, resize, bins).forward(frames)
 
 
 def gradients(frames: Tensor) -> tuple[Tensor, Tensor]:
-    """Differences f(x + 1) - f(x - 1) down the rows and along the columns, 0 at the border, of the strongest
-    channel: (B,C,H,W) -> two of (B,H,W)."""
+    """f(x + 1) - f(x - 1) of rows and columns, 0 at borders, in the strongest channel, two (B,H,W)."""
     rows, columns = torch.zeros_like(frames), torch.zeros_like(frames)
     rows[:, :, 1:-1] = frames[:, :, 2:] - frames[:, :, :-2]
     columns[..., 1:-1] = frames[..., 2:] - frames[..., :-2]
@@ -111,25 +104,23 @@ def gradients(frames: Tensor) -> tuple[Tensor, Tensor]:
     return row, column
 
 
-def cell_histograms(
-    rows: Tensor, columns: Tensor, orientations: int, cell: int, bins: Bins = "hard"
-) -> Tensor:
+def cell_histograms(dy: Tensor, dx: Tensor, orientations: int, cell: int, bins: Bins = "hard") -> Tensor:
     """Mean gradient magnitude per cell and bin: two of (B,H,W) -> (B, H // cell, W // cell, orientations)."""
-    batch, height, width = rows.shape
+    batch, height, width = dy.shape
     ny, nx = height // cell, width // cell
-    rows, columns = rows[:, : ny * cell, : nx * cell], columns[:, : ny * cell, : nx * cell]
-    energy = rows.square() + columns.square()
-    # sqrt has no gradient at 0: a flat pixel is masked on both sides of it, and its gradient is 0
+    dy, dx = dy[:, : ny * cell, : nx * cell], dx[:, : ny * cell, : nx * cell]
+    energy = dy.square() + dx.square()
+    # sqrt has no gradient at 0: flat pixels are masked before and after it, which makes their gradient 0
     flat = energy == 0
     magnitude = energy.masked_fill(flat, 1).sqrt().masked_fill(flat, 0)
     if bins == "linear":
-        # atan2 has no gradient at 0, or where the square underflows: such a pixel has no vote to share
-        columns = columns.masked_fill(energy < torch.finfo(energy.dtype).tiny, 1)
-    else:  # detached, not under no_grad, which torch.export cannot save
-        rows, columns = rows.detach(), columns.detach()
-    # in degrees 45, 90 and 135 are exact, also in float32: they lie on bin edges
-    position = torch.rad2deg(torch.atan2(rows, columns)).remainder(180) / (180 / orientations)
-    if bins == "hard":  # rounding may reach the end of the circle; NaN stays NaN in the magnitude
+        # atan2 has no gradient at 0 or if the square underflows; such a pixel has no vote to share
+        dx = dx.masked_fill(energy < torch.finfo(energy.dtype).tiny, 1)
+    else:  # detach, since torch.export cannot save no_grad
+        dy, dx = dy.detach(), dx.detach()
+    # in degrees, the bin edges 45, 90 and 135 are exact in float32 too
+    position = torch.rad2deg(torch.atan2(dy, dx)).remainder(180) / (180 / orientations)
+    if bins == "hard":  # rounding may reach the end of the circle; the magnitude passes NaN on
         shares = [(position.long().masked_fill_(~(position < orientations), 0), magnitude)]
     else:
         position = position - 0.5
@@ -139,7 +130,7 @@ def cell_histograms(
             (lower.remainder(orientations), magnitude * (1 - upper_share)),
             ((lower + 1).remainder_(orientations), magnitude * upper_share),
         ]
-    y, x = (torch.arange(n * cell, device=rows.device).div(cell, rounding_mode="floor") for n in (ny, nx))
+    y, x = (torch.arange(n * cell, device=dy.device).div(cell, rounding_mode="floor") for n in (ny, nx))
     first = (y[:, None] * nx + x) * orientations
     votes = magnitude.new_zeros(batch, ny * nx * orientations)
     for slot, share in shares:

@@ -1,4 +1,4 @@
-"""Short names of networks of torch.hub that describe places, and the `Embedding` that each stands for."""
+"""Short names for place recognition networks of torch.hub, and the `Embedding` that each stands for."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ PREFIX = "hub:"
 def embedding(
     repository: str, entry: str, resize: tuple[int, int] = (322, 322), output: int | None = None, **own: Any
 ) -> dict[str, Any]:
-    """`class_path` and `init_args` of an `Embedding` of torch.hub.load(repository, entry, **own), for
-    frames of the size that the network was evaluated with, normalised as ImageNet's are."""
+    """Settings of an `Embedding` of a torch.hub network, with the frame size of the network's evaluation."""
     call = {"repo_or_dir": repository, "model": entry, "trust_repo": True, **own}
     settings: dict[str, Any] = {"dimension": None, "resize": [*resize], "output": output}
     settings |= {"mean": [0.485, 0.456, 0.406], "std": [0.229, 0.224, 0.225]}
@@ -39,9 +38,9 @@ NETWORKS = {
 
 
 def known(name: str) -> dict[str, Any]:
-    """What a short name such as `hub:megaloc` stands for."""
-    found = NETWORKS.get(name.removeprefix(PREFIX))
-    if found is None:
+    """The settings of a short name such as `hub:megaloc`."""
+    settings = NETWORKS.get(name.removeprefix(PREFIX))
+    if settings is None:
         names = ", ".join(f"{PREFIX}{one}" for one in NETWORKS)
-        raise InputError(f"{name} is no short name of a network; expected one of {names}")
-    return found
+        raise InputError(f"{name} is not the short name of a network; expected one of {names}")
+    return settings

@@ -1,4 +1,4 @@
-"""Features of several modules side by side."""
+"""Concatenated features of several modules."""
 
 from __future__ import annotations
 
@@ -13,21 +13,19 @@ from dejavu_torch.types import InputError
 
 
 class Joined(nn.Module):
-    """Features of several modules side by side, such as HOG and the descriptor of a network.
+    """Concatenated features of several modules, such as HOG and the descriptor of a network.
 
     Args:
-        members: modules (B,C,H,W) -> (B,D_i), any whatsoever; all see the same frames.
-        shares: of each, above 0 and at most 1, None is 1 each: the part of the numbers of a whole member that
-            whitening keeps of it, and its squared length beside theirs.
+        members: modules (B,C,H,W) -> (B,D_i); all see the same frames.
+        shares: factor in (0, 1] on the whitened dimensions and the squared length of each; None is 1.
 
     Attributes:
-        groups: features of each member, of the frames seen last; the whitening learned from them takes these.
+        groups: number of features of each member, for the last frames; whitening treats each by itself.
 
     Shape: (B,C,H,W) -> (B, D_1 + D_2 + ..).
 
     Raises:
-        InputError: no members, some that are no modules, or shares that do not fit them; forward: a member
-            that makes something else.
+        InputError: no members, or not modules; shares that do not fit; forward: a member's other output.
 
     Example:
         >>> from dejavu_torch.features.hog import HOG
@@ -44,21 +42,19 @@ class Joined(nn.Module):
             seen = ", ".join(type(one).__name__ for one in modules) or "none"
             raise InputError(f"the members of the features are {seen}; expected modules, at least one")
         if shares is not None and not (len(shares) == len(modules) and all(0 < one <= 1 for one in shares)):
-            seen = f"the shares of {len(modules)} members of the features are {shares}"
-            raise InputError(f"{seen}; expected a number above 0 and at most 1 for each")
+            raise InputError(f"shares of {len(modules)} members are {shares}; expected (0, 1] for each")
         self.members, self.shares = nn.ModuleList(modules), shares
         self.groups: tuple[int, ...] | None = None
 
     def forward(self, frames: Tensor) -> Tensor:
         check_frames(frames, "Joined got")
         made = [features_of(frames, member) for member in self.members]
-        if not torch.compiler.is_compiling():  # a graph changes nothing but its outputs
+        if not torch.compiler.is_compiling():  # a graph has no side effects
             self.groups = tuple(one.shape[1] for one in made)
         return torch.cat(made, 1)
 
 
 def groups_of(features: nn.Module) -> tuple[tuple[int, ...] | None, list[float] | None]:
-    """The `groups` and `shares` of features, or of the last part of a pipeline; None of features that are not
-    joined."""
+    """The `groups` and `shares` of `Joined` features, or of the last module of a pipeline; else None."""
     last = features[-1] if isinstance(features, nn.Sequential) and len(features) else features
     return (last.groups, last.shares) if isinstance(last, Joined) else (None, None)

@@ -11,25 +11,24 @@ from dejavu_torch.types import InputError
 
 
 class PatchPixels(nn.Module):
-    """Pixels of frames made small, each patch with mean 0 and standard deviation 1, which is at least 1/255
-    (Milford and Wyeth, SeqSLAM, ICRA 2012).
+    """Pixels of small frames; each patch is normalised to mean 0 and standard deviation 1, but standard
+    deviations below 1/255 count as 1/255 (Milford and Wyeth, SeqSLAM, ICRA 2012).
 
     Args:
-        size: (height, width) in pixels; smaller frames keep theirs, cut to whole patches.
-        patch: side in pixels of the square patches, which lie side by side.
-        channel: that alone, as of `Preprocess`, such as "grey", of frames of 2 or more than 3 channels their
-            mean; None takes all that the frames have.
+        size: (height, width) in pixels; smaller frames keep their size, reduced to whole patches.
+        patch: side of the square patches in pixels.
+        channel: see `Preprocess`, None is all; for "grey", 2 or more than 3 channels are averaged.
 
     Shape: (B,C,H,W) -> (B, C x height x width).
 
     Raises:
-        InputError: a size smaller than a patch; forward: frames that are not (B,C,H,W) float, or as small.
+        InputError: a size smaller than a patch; forward: not (B,C,H,W) float, or smaller than a patch.
     """
 
     def __init__(self, size: tuple[int, int] = (32, 64), patch: int = 8, channel: str | None = None) -> None:
         super().__init__()
         if patch < 2:
-            raise InputError(f"patches of {patch} pixels; expected at least 2")
+            raise InputError(f"PatchPixels got patches of {patch} pixels; expected at least 2")
         self.size, self.patch = check_size(size, patch, "PatchPixels got size"), patch
         self.channel = None if channel is None else channel_name(channel)
 
@@ -37,9 +36,8 @@ class PatchPixels(nn.Module):
         check_frames(frames, "PatchPixels got")
         side, (height, width) = self.patch, frames.shape[-2:]
         if min(height, width) < side:
-            raise InputError(
-                f"frames of {height} x {width} pixels; expected at least one patch, {side} x {side}"
-            )
+            seen = f"PatchPixels got frames of {height} x {width} pixels"
+            raise InputError(f"{seen}; expected at least one patch, {side} x {side}")
         if self.channel == "grey" and frames.shape[1] not in (1, 3):
             frames = frames.mean(1, keepdim=True)
         elif self.channel is not None:

@@ -1,4 +1,4 @@
-"""A network up to one of its layers: what comes after it is neither computed nor kept."""
+"""A network up to one of its layers: later layers are neither computed nor stored."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ SHOWN = 12  # names of layers in a message
 
 
 class Reached(Exception):
-    """Ends a forward pass at a layer, whose output it carries."""
+    """Ends a forward pass at a layer, whose output is the argument."""
 
 
 def run(network: nn.Module, frames: Tensor) -> object:
-    """The output of a network, or of the layer that `up_to` ends it at."""
+    """The output of a network, or of the layer at which `up_to` ends it."""
     calls = _traced_calls()
-    begun = len(calls)
+    depth = len(calls)
     try:
         output: object = network(frames)
     except Reached as reached:
         output = reached.args[0]
-        while len(calls) > begun:
+        while len(calls) > depth:
             calls.popitem()
     return output
 
 
 def _traced_calls() -> OrderedDict[str, Any]:
-    """The calls of modules that torch.export is in, which its tracer does not leave by an exception."""
+    """The stack of module calls of torch.export, which its tracer does not unwind after an exception."""
     if torch.compiler.is_exporting() and not torch.compiler.is_dynamo_compiling():
         from torch.fx.experimental.proxy_tensor import get_proxy_mode
 
@@ -45,10 +45,9 @@ def _traced_calls() -> OrderedDict[str, Any]:
 
 
 def up_to(network: nn.Module, layer: str, frames: Tensor) -> nn.Module:
-    """A copy of a network that `run` ends at a layer, the name of a submodule; the first of its runs counts.
+    """A copy of a network that `run` ends at a layer, the name of a submodule, the first time that it runs.
 
-    Modules that have not run when the layer is done are left out of the copy, unless it gives something else
-    without them on `frames`. The names of the others stay.
+    The copy omits modules that have not started by then, unless that changes its output for `frames`.
     """
     name, names = type(network).__name__, [one for one, _ in network.named_modules() if one]
     if layer not in names:
@@ -61,22 +60,22 @@ def up_to(network: nn.Module, layer: str, frames: Tensor) -> nn.Module:
         raise InputError(f"{name} cannot be copied to end at {layer}: {error}") from error
     last = ended.get_submodule(layer)
     last.register_forward_hook(_end)
-    begun: set[nn.Module] = set()
-    done: set[nn.Module] = set()
+    started: set[nn.Module] = set()
+    finished: set[nn.Module] = set()
     with (
-        register_module_forward_pre_hook(lambda module, *_: begun.add(module)),
-        register_module_forward_hook(lambda module, *_: done.add(module)),  # called ahead of `_end`
+        register_module_forward_pre_hook(lambda module, *_: started.add(module)),
+        register_module_forward_hook(lambda module, *_: finished.add(module)),  # runs before `_end`
     ):
-        expected = _tried(ended, frames)
-    if last not in begun:
+        expected = _outputs(ended, frames)
+    if last not in started:
         raise InputError(f"{name} does not run its layer {layer} as a module; expected another layer")
     smaller = copy.deepcopy(ended)
-    _leave_out(ended, smaller, begun, done)
+    _omit(ended, smaller, started, finished)
     try:
-        pairs = zip(_tried(smaller, frames), expected, strict=True)
-        # a map's network is first made without numbers
+        pairs = zip(_outputs(smaller, frames), expected, strict=True)
+        # the network of a map file has meta tensors at first
         same = all(a.shape == b.shape and (a.is_meta or torch.allclose(a, b, 1e-4, 1e-5)) for a, b in pairs)
-    except Exception:  # a network may look at any of its parts
+    except Exception:  # a network may access any of its parts
         same = False
     return smaller if same else ended
 
@@ -85,31 +84,31 @@ def _end(layer: nn.Module, given: Any, output: object) -> None:
     raise Reached(output)
 
 
-def _tried(network: nn.Module, frames: Tensor) -> list[Tensor]:
+def _outputs(network: nn.Module, frames: Tensor) -> list[Tensor]:
     with torch.no_grad(), in_mode(network, False):
         return tensors_in(run(network, frames))
 
 
-def _leave_out(whole: nn.Module, smaller: nn.Module, begun: set[nn.Module], done: set[nn.Module]) -> None:
-    """Replace by nothing, in a copy of a module, the parts with weights that have not begun."""
+def _omit(whole: nn.Module, smaller: nn.Module, started: set[nn.Module], finished: set[nn.Module]) -> None:
+    """Replace, in a copy of a module, the parts with weights that have not started by nn.Identity."""
     for name, part in whole.named_children():
-        if part in done:  # it may use parts without running them
+        if part in finished:  # it may use parts without running them
             continue
-        if not begun.isdisjoint(part.modules()):
-            _leave_out(part, smaller.get_submodule(name), begun, done)
+        if not started.isdisjoint(part.modules()):
+            _omit(part, smaller.get_submodule(name), started, finished)
         elif part.state_dict():
             setattr(smaller, name, nn.Identity())
 
 
-def members_of(made: object) -> list[object]:
-    """The members of a tuple, list or dict; anything else is the only one."""
-    if isinstance(made, dict):
-        return [*made.values()]
-    return [*made] if isinstance(made, (tuple, list)) else [made]
+def members_of(output: object) -> list[object]:
+    """The members of a tuple, list or dict; anything else is its only member."""
+    if isinstance(output, dict):
+        return [*output.values()]
+    return [*output] if isinstance(output, (tuple, list)) else [output]
 
 
-def tensors_in(made: object) -> list[Tensor]:
-    """The tensors in what a network made, in order."""
-    if isinstance(made, (tuple, list, dict)):
-        return [tensor for member in members_of(made) for tensor in tensors_in(member)]
-    return [made] if isinstance(made, Tensor) else []
+def tensors_in(output: object) -> list[Tensor]:
+    """The tensors in the output of a network, in order."""
+    if isinstance(output, (tuple, list, dict)):
+        return [tensor for member in members_of(output) for tensor in tensors_in(member)]
+    return [output] if isinstance(output, Tensor) else []

@@ -1,4 +1,4 @@
-"""Further views of the places of a route, from which whitening learns what changes between two visits."""
+"""Augmented views of the places of a route, for whitening and calibration."""
 
 from __future__ import annotations
 
@@ -12,27 +12,26 @@ from torch import Tensor
 from dejavu_torch.features.augmentation import LARGEST, Augmentation
 from dejavu_torch.types import InputError, Traverse
 
-BLOCK = 64  # frames augmented at once
-STRETCH, EVERY = 20, 10  # frames of a segment, and which of the segments are used
-STRONGER = 1.5  # than for a whitening, which has seen the frames themselves
+BLOCK = 64  # frames augmented together
+STRETCH, EVERY = 20, 10  # frames of a segment; every 10th segment is used
+STRONGER = 1.5  # factor on the strengths for whitening, which has seen the frames themselves
 FEWEST, MOST = 600, 1200  # frames of all segments together
-TIMES = 2  # frames of all segments over the frames of a short route, at most
-LEAST, SCORES = 240, 2**27  # frames of a long route at least, and scores of them all at all of its places
+MAX_COPIES = 2  # frames of all segments, relative to the frames of a short route
+LEAST, SCORES = 240, 2**27  # frames of a long route at least; their scores at all places at most
 
 
 class Views(NamedTuple):
-    """Frames of places of the reference: (n,) int64, the place that each shows; -1 for none, to skip it."""
+    """Frames, and (n,) int64 the place of the reference that each shows, -1 for a frame to skip."""
 
     traverse: Traverse
     places: Tensor
 
 
 class AugmentedTraverse(Traverse):
-    """Augmented copies of frames of a traverse: one of each frame of a block, another of each, and so on; the
-    same whatever the batch size.
+    """Augmented copies of frames, the same for any batch size: each block of frames `copies` times.
 
     Args:
-        traverse: frames (B,C,H,W). runs: the frames, increasing. block: frames augmented at once, at most.
+        traverse: frames (B,C,H,W). runs: the frames, increasing. block: most frames augmented together.
         copies: of each frame. strengths: arguments of `Augmentation`. factor: to multiply them by.
 
     Raises:
@@ -73,7 +72,7 @@ class AugmentedTraverse(Traverse):
                 yield from copies.split(size)
 
     def _blocks(self) -> Iterator[Tensor]:
-        """The frames of each block; a traverse that does not seek is read once."""
+        """The frames of each block; a traverse that cannot seek is read only once."""
         if self.traverse.seeks or len(self.runs) == 1:
             for run in self.runs:
                 yield from self.traverse.select(run, self.block)
@@ -86,15 +85,13 @@ class AugmentedTraverse(Traverse):
 
     @property
     def frame_shape(self) -> tuple[int, ...]:
-        """See `Traverse`."""
         return self.traverse.frame_shape
 
 
 def augmented_route(
     traverse: Traverse, frames: int, copies: int, most: int, strengths: Mapping[str, Any], seed: int = 0
 ) -> tuple[Views, str]:
-    """Augmented copies of the N `frames` of a traverse, at most `most` in all, drawn evenly if there would be
-    more; and how often which frames are looked at, in words."""
+    """At most `most` augmented copies of N `frames`, evenly drawn, and a phrase for the log about them."""
     shown = range(0, frames, max(1, -(-frames * copies // most)))
     views = AugmentedTraverse(traverse, [shown], traverse.batch_size(BLOCK), copies, strengths, seed)
     each = "each frame" if shown.step == 1 else f"{len(shown)} of the frames"
@@ -108,19 +105,19 @@ def augmented_segments(
     places: int | None = None,
     starts: Sequence[int] | None = None,
 ) -> AugmentedTraverse:
-    """Segments of a traverse, each frame as it may look on another visit, by which a map is calibrated.
+    """Augmented segments of a traverse, as another visit may show them, to calibrate a map.
 
-    Every 10th segment of 20 frames, shorter ones of a short traverse; several times if that is little, and
-    fewer of a long one: 1200 frames of one of 10^5, down to 240 of longer ones.
+    Every 10th segment of 20 frames, or of fewer in a short traverse. Short traverses are used several times,
+    long ones in part: 1200 frames of 10^5, down to 240 of more.
 
     Args:
-        frames: of the traverse, N. strengths: of `Augmentation`; changes are 1.5 times as strong.
-        places: of the map, among which they are searched; None is N.
-        starts: of segments of 20 frames, increasing, in place of every 10th.
+        frames: N, of the traverse. strengths: of `Augmentation`; changes are 1.5 times as strong.
+        places: of the map to search; None is N.
+        starts: of segments of 20 frames, increasing, instead of every 10th segment.
     """
     length = min(STRETCH, max(1, frames // EVERY)) if starts is None else STRETCH
     starts = range(0, frames - length + 1, EVERY * length) if starts is None else starts
     most = min(MOST, max(LEAST, SCORES // (places or frames)))
     runs = [range(one, one + length) for one in starts[:: max(1, -(-len(starts) * length // most))]]
-    copies = max(1, -(-min(FEWEST, TIMES * frames, most) // (len(runs) * length)))
+    copies = max(1, -(-min(FEWEST, MAX_COPIES * frames, most) // (len(runs) * length)))
     return AugmentedTraverse(traverse, runs, length, copies, strengths, factor=STRONGER)

@@ -1,4 +1,4 @@
-"""Learned whitening: the directions of a descriptor that tell places apart and change little on one place."""
+"""Learned whitening: directions of a descriptor that distinguish places but change little at one place."""
 
 from __future__ import annotations
 
@@ -17,37 +17,36 @@ from dejavu_torch.types import InputError
 log = logging.getLogger("dejavu_torch")
 
 ROWS = 1024  # in double precision at a time
-SAMPLED = 4096  # rows that principal components are found in
-DIMENSIONS = 128  # unless said otherwise
-WIDEST = 256  # dimensions without whitening
-PLACES_PER_DIMENSION = 2  # a short route does not fill as many dimensions
-COMPONENTS = 400  # that whitening works on
-VIEWS = 4  # of a frame, on a long route
-VIEWS_PER_COMPONENT = 30  # on any: as 4 views of each of 3000 frames
-ENOUGH = 12  # views of a frame: more cost time and change nothing
+SAMPLED = 4096  # rows in which principal components are found
+DIMENSIONS = 128  # by default
+WIDEST = 256  # default dimensions without views
+PLACES_PER_DIMENSION = 2  # on a short route, at least
+COMPONENTS = 400  # principal components that are whitened, by default
+VIEWS = 4  # of a frame, at least
+VIEWS_PER_COMPONENT = 30  # at least: as 4 views of each of 3000 frames
+MAX_VIEWS = 12  # of a frame: more take time and change nothing
 SHRINKAGE = 0.03  # at least
-SPARE = 32  # further directions of the randomised subspace, which make it accurate
+SPARE = 32  # further directions of the randomised subspace, for accuracy
 ROUNDS = 3  # of its iteration
-STRENGTHS: Mapping[str, Any] = {  # of augmented copies: those of `Augmentation`
+STRENGTHS: Mapping[str, Any] = {  # defaults of `Augmentation`
     name: [*strength] if len(strength) > 1 else strength[0]
     for name, strength in Augmentation().strengths.items()
     if max(strength)
 }
-LEVELLING = 0.25  # power of their root mean square that joined numbers are divided by
-LEAST = 1e-12  # absolute value that a power is applied to: keeps gradients finite
-ROUNDING = 1e-7  # of the largest variance: below it there is none
-_Components: TypeAlias = tuple[Tensor, Tensor, Tensor, int]  # mean, basis, variances, how many to keep
+LEVELLING = 0.25  # joined dimensions are divided by this power of their root mean square
+LEAST = 1e-12  # absolute value to which a power is applied, for finite gradients
+ROUNDING = 1e-7  # of the largest variance: smaller ones count as 0
+_Components: TypeAlias = tuple[Tensor, Tensor, Tensor, int]  # mean, basis, variances, dimensions to keep
 
 
 def learned_whitening(
     views: Tensor, places: Tensor, kept: int, shrinkage: float | None = 0.5
 ) -> tuple[Tensor, Tensor]:
-    """The projection to what tells places apart and changes little between two views of one place.
+    """The projection to directions that distinguish places but change little between two views of one.
 
-    With d = (view - place) / 2, m = (view + place) / 2, C = E[d d^T], B = Cov[m] and
-    W = (1 - a) C + a tr(C) / K I, the columns of P are the `kept` directions with the largest
-    p^T B p / p^T W p, scaled to p^T W p = 1 (Mikolajczyk and Matas, ICCV 2007). The shrinkage a is above 0
-    and at most 1; None is `oracle_shrinkage`, and at least 0.03.
+    With d = (view - place) / 2, m = (view + place) / 2, C = E[d d^T], B = Cov[m], shrinkage a in (0, 1] (None
+    is `oracle_shrinkage`, at least 0.03) and W = (1 - a) C + a tr(C) / K I, P has the `kept` directions with
+    the largest p^T B p / p^T W p, scaled to p^T W p = 1 (Mikolajczyk and Matas, ICCV 2007).
 
     Shape: (n,K), (n,K) -> mean (K,), P (K,kept), float32.
     """
@@ -61,11 +60,8 @@ def learned_whitening(
         mean += middle.sum(0) / n
     scale, size = within.diagonal().mean(), second.diagonal().mean()
     if not scale.isfinite() or not scale > 1e-10 * size:
-        raise InputError(
-            f"the descriptors of {n} views differ from those of their places by {scale.item():.2g} in the "
-            "mean square; expected a finite number, and more than rounding: an augmentation, or a second "
-            "traverse"
-        )
+        seen = f"the mean square difference of {n} views from their places is {scale.item():.2g}"
+        raise InputError(f"{seen}; expected a finite one above rounding: augmentation or a second traverse")
     if shrinkage is None:
         shrinkage = max(SHRINKAGE, oracle_shrinkage(within, n))
     within = (1 - shrinkage) * within
@@ -77,7 +73,7 @@ def learned_whitening(
 
 
 def oracle_shrinkage(covariance: Tensor, samples: int) -> float:
-    """How much of a covariance (K,K) of Gaussian samples to replace by a multiple of the identity, 0 to 1
+    """The share of a covariance (K,K) of Gaussian samples to replace by a multiple of the identity, 0 to 1
     (Chen, Wiesel, Eldar and Hero, IEEE Transactions on Signal Processing 58, 2010, eq. 23)."""
     size, trace = len(covariance), float(covariance.trace())
     square = float(covariance.square().sum())
@@ -87,36 +83,32 @@ def oracle_shrinkage(covariance: Tensor, samples: int) -> float:
 
 
 class Whitening(nn.Module):
-    """A descriptor of few dimensions, which tells places apart and changes little with light and view: for
-    one route, principal components, then `learned_whitening` by views of its places, which are augmented
-    copies of its frames, or frames of a second traverse.
+    """Reduces descriptors to few dimensions that distinguish the places of a route but change little with
+    light and view: principal components, then `learned_whitening` by augmented frames or a second traverse.
 
     Args:
-        numbers: K, at most the rank. None is 128, on a short route half of its places; without views 256.
+        numbers: K, at most the rank. None is 128, but at most half the places; without views 256.
         components: principal components that are whitened, at least K.
-        shrinkage: of `learned_whitening`. None is 0.03, and more if there are few views.
-        views: augmented copies of each frame. None is 4, up to 12 on a short route: 30 for each component.
+        shrinkage: of `learned_whitening`. None is 0.03, or more if there are few views.
+        views: augmented copies of each frame. None is 4, on a short route up to 12: 30 per component.
         most_views: copies in all; frames are drawn evenly if there would be more.
-        strengths: arguments of `Augmentation`, in place of those of `STRENGTHS`.
+        strengths: arguments of `Augmentation`, instead of `STRENGTHS`.
         seed: of the copies.
-        bits: of each number of the projection: 4, two to a byte, 8 or 16.
-        power: of the absolute value of each whitened number, above 0 and at most 1. Below 1 large ones, such
-            as those of something new in the frame, count for less.
-        groups: D_1, D_2, .. of a descriptor whose members lie side by side. Each is whitened by itself, to
-            length 1, and these are reduced to the K numbers that keep most of their products. Of these the
-            large ones are lowered a little, or a few of them would decide what is alike. None is what the
-            features tell (`Joined`); of those that tell nothing the descriptor is whitened as a whole.
-        group_numbers: that are kept of each member, its rank at most; None is as many as of a descriptor.
+        bits: of each number of the projection: 4 (two to a byte), 8 or 16.
+        power: of each dimension's absolute value, above 0 and at most 1, to lower peaks, as of new objects.
+        groups: D_1, D_2, .. of concatenated descriptors, each whitened by itself and scaled to length 1; then
+            follow the K dimensions that best keep their inner products, the largest lowered a little. None
+            is the groups of `Joined` features, or one group.
+        group_numbers: dimensions of each group, at most its rank; None is chosen like `numbers`.
 
     Shape: (B,D) -> (B,K).
 
-    Convention: descriptors have length 1. Without views they are the principal components, with their
-        variances, and a constant number, the root mean square of these. Before `learn` descriptors pass.
+    Convention: descriptors have length 1. Without views they are the principal components, not scaled, and a
+        constant, the root mean square of these. Before `learn` descriptors pass unchanged.
 
     Raises:
-        InputError: settings out of range; learn: descriptors that do not vary, views that equal their places,
-            more `numbers` than the rank, groups of other than D numbers; forward: descriptors of another
-            dimension.
+        InputError: settings out of range; learn: constant descriptors, views equal to places, `numbers` above
+            the rank, groups that do not add up to D; forward: another dimension.
 
     Example:
         >>> route, whitening = torch.randn(400, 16), Whitening(numbers=4)
@@ -154,20 +146,18 @@ class Whitening(nn.Module):
         shares = power, 1 if shrinkage is None else shrinkage
         counts = 1 <= min(kept) <= max(kept) <= components and (views or 0) >= 0 and most_views >= 1
         if not counts or bits not in (4, 8, 16) or not all(0 < share <= 1 for share in shares):
-            raise InputError(
-                f"Whitening got {settings_of(self, 'strengths', 'seed')}; expected numbers of at least 1 and "
-                "at most components, 0 views or more, at least 1 in all, a shrinkage and a power above 0 "
-                "and at most 1, bits of 4, 8, 16"
-            )
+            expected = "1 <= numbers <= components, views >= 0, most_views >= 1, shrinkage and power above 0 "
+            expected += "and at most 1, bits of 4, 8 or 16"
+            raise InputError(f"Whitening got {settings_of(self, 'strengths', 'seed')}; expected {expected}")
         if groups is not None and min(groups, default=0) < 1:
-            raise InputError(f"the groups are {self.groups}; expected numbers of each member, at least 1")
+            raise InputError(f"the groups are {self.groups}; expected a dimension of at least 1 for each")
         self.strengths = {**STRENGTHS, **(strengths or {})}
-        self.fixed = False  # learned elsewhere: it serves this route unchanged
+        self.fixed = False  # whether it comes from elsewhere and is not learned again
         self.register_buffer("projection", torch.zeros(0, 0, dtype=torch.int8))  # (D,K), see `take`
         self.register_buffer("scale", torch.zeros(0))  # (K,)
-        self.register_buffer("offset", torch.zeros(0))  # (K,), of the mean
-        self.register_buffer("length", torch.zeros(0))  # (1,), the constant number, or (0,)
-        self.members = nn.ModuleList()  # a whitening of each group; the projection is then of theirs together
+        self.register_buffer("offset", torch.zeros(0))  # (K,), the projected mean
+        self.register_buffer("length", torch.zeros(0))  # (1,), the constant dimension, or (0,)
+        self.members = nn.ModuleList()  # a whitening per group, whose outputs the projection joins
 
     @property
     def whole(self) -> Tensor:
@@ -179,16 +169,16 @@ class Whitening(nn.Module):
 
     @property
     def parts(self) -> list[Whitening]:
-        """All that project: this one, and those of its groups."""
+        """This whitening, and those of its groups."""
         return [self, *(member for member in self.members if isinstance(member, Whitening))]
 
     def unpacked(self) -> list[Tensor]:
-        """`whole` of all `parts` as float32, by columns, for a fast `forward` of single descriptors."""
+        """`whole` of all `parts` as float32, column-major, for a fast `forward` of single descriptors."""
         return [part.whole.T.float().contiguous().T for part in self.parts]
 
     @property
     def sizes(self) -> list[int]:
-        """Numbers of each member of the descriptors that are whitened, once there is a projection."""
+        """Dimension of each group of the input, once there is a projection."""
         return [len(member.projection) for member in self.parts[1:]] or [len(self.projection)]
 
     @property
@@ -198,27 +188,27 @@ class Whitening(nn.Module):
 
     @property
     def dimension(self) -> int:
-        """Of a whitened descriptor, once there is a projection."""
+        """Of the output, once there is a projection."""
         return len(self.scale) + len(self.length)
 
     def forward(self, descriptors: Tensor, unpacked: Sequence[Tensor] | None = None) -> Tensor:
-        """Descriptors (B,D) -> (B,K); `unpacked`: the result of that method, if it is kept."""
+        """Descriptors (B,D) -> (B,K); `unpacked`: a stored result of that method."""
         if not self.learned:
             return descriptors
         shape, sizes = tuple(descriptors.shape), self.sizes
         if shape[1:] != (sum(sizes),):
             raise InputError(f"the whitening got descriptors {shape}; expected (B, {sum(sizes)})")
-        # bf16 is too coarse for the small differences that whitening enlarges
+        # bf16 is too coarse for the small differences that whitening amplifies
         with torch.autocast(descriptors.device.type, enabled=False):
             exact = descriptors.to(torch.promote_types(descriptors.dtype, torch.float32))
             wholes = [part.whole for part in self.parts] if unpacked is None else unpacked
             if len(self.members):
                 each = zip(self.parts[1:], exact.split(sizes, 1), wholes[1:], strict=True)
-                exact = torch.cat([member._projected(own, whole) for member, own, whole in each], 1)
-            return self._projected(exact, wholes[0])
+                exact = torch.cat([member._project(own, whole) for member, own, whole in each], 1)
+            return self._project(exact, wholes[0])
 
-    def _projected(self, exact: Tensor, whole: Tensor) -> Tensor:
-        """Rows (B,D) by the own projection, to length 1; whole: (D,K)."""
+    def _project(self, exact: Tensor, whole: Tensor) -> Tensor:
+        """Projects rows (B,D) by `whole` (D,K), without the members, to length 1."""
         whitened = (exact @ whole.to(exact)) * self.scale.to(exact) - self.offset.to(exact)
         if len(self.length):
             whitened = torch.cat([whitened, self.length.to(whitened).expand(whitened.shape[0], 1)], 1)
@@ -227,14 +217,14 @@ class Whitening(nn.Module):
         return nn.functional.normalize(whitened, dim=1)
 
     def copies(self, frames: int, features: int) -> int:
-        """Augmented copies of each frame, by the numbers of frames and features."""
+        """Number of augmented copies of each frame of a route."""
         if self.views is not None:
             return self.views
         components = min(frames, features, self.components)
-        return min(ENOUGH, max(VIEWS, math.ceil(VIEWS_PER_COMPONENT * components / frames)))
+        return min(MAX_VIEWS, max(VIEWS, math.ceil(VIEWS_PER_COMPONENT * components / frames)))
 
     def kept(self, places: int, features: int, views: bool) -> int:
-        """Dimensions that are kept, unless the rank of the route is lower."""
+        """Dimensions to keep, unless the rank of the route is lower."""
         if self.numbers is not None:
             return self.numbers
         return min(DIMENSIONS, features, max(1, places // PLACES_PER_DIMENSION)) if views else WIDEST
@@ -250,29 +240,29 @@ class Whitening(nn.Module):
         """Find the projection for one route.
 
         Args:
-            places: (N,D), the descriptors of the route; they may lie in a file.
-            views: batches of descriptors (B,D) and the places (B,) that they show; None has no views.
-            groups, shares: of the features, see `Joined`, if the constructor's groups are None.
+            places: (N,D), the descriptors of the route; they may be in a file.
+            views: batches of descriptors (B,D) and the places (B,) that they show, if any.
+            groups, shares: see `Joined`, if the constructor's groups are None.
         """
         groups, shares = (groups, shares) if self.groups is None else (self.groups, None)
         sizes = [places.shape[1]] if groups is None else [*groups]
         if sum(sizes) != places.shape[1]:
-            seen = f"groups of {' + '.join(map(str, sizes))} numbers, and descriptors {tuple(places.shape)}"
+            seen = f"groups of {' + '.join(map(str, sizes))} dimensions, descriptors {tuple(places.shape)}"
             raise InputError(f"{seen}; expected (N, {sum(sizes)})")
         members = [self] if groups is None else [self._member() for _ in sizes]
-        begun = []
+        found = []
         shares = [1.0] * len(members) if groups is None or shares is None else shares
         for member, own, share in zip(members, places.split(sizes, 1), shares, strict=True):
             kept = self.kept(len(places), own.shape[1], views is not None)
             if groups is not None:
                 kept = math.ceil(share * (self.group_numbers or kept))
-            begun.append(member._components(own, kept, kept if views is None else self.components))
+            found.append(member._components(own, kept, kept if views is None else self.components))
         if views is None:
-            for member, (mean, basis, variances, _) in zip(members, begun, strict=True):
+            for member, (mean, basis, variances, _) in zip(members, found, strict=True):
                 member.take(mean, basis, variances.mean().sqrt())
         else:
-            pairs = _of_views(places, views, begun)
-            for member, (mean, basis, _, kept), (shown, own) in zip(members, begun, pairs, strict=True):
+            pairs = _projected_views(places, views, found)
+            for member, (mean, basis, _, kept), (shown, own) in zip(members, found, pairs, strict=True):
                 centre, projection = learned_whitening(shown, own, kept, self.shrinkage)
                 member.take(mean + basis @ centre, basis @ projection, None)
         if groups is not None:
@@ -281,13 +271,12 @@ class Whitening(nn.Module):
             each = zip(weights, members, some, strict=True)
             joined = torch.cat([weight * member(own) for weight, member, own in each], 1)
             kept = self.kept(len(places), joined.shape[1], views is not None)
-            # about zero, not their mean: the products of all pairs are kept, which cosines are made of
+            # about zero, not the mean, to keep the inner products of all pairs, as cosines need
             mean, basis, squares, _ = self._components(joined, kept, kept, centre=False)
             if views is not None:
                 basis = basis / (squares / squares.mean()) ** (LEVELLING / 2)
-            sizes = [len(member.scale) + len(member.length) for member in members]
-            scaled = torch.cat([w * part for w, part in zip(weights, basis.split(sizes), strict=True)])
-            self.take(mean, scaled, None)
+            parts = zip(weights, basis.split([member.dimension for member in members]), strict=True)
+            self.take(mean, torch.cat([weight * part for weight, part in parts]), None)
         self.members = nn.ModuleList([] if groups is None else members)
 
     def _member(self) -> Whitening:
@@ -295,21 +284,21 @@ class Whitening(nn.Module):
         return Whitening(bits=self.bits, power=self.power, seed=self.seed).to(self.scale.device)
 
     def _components(self, places: Tensor, kept: int, count: int, centre: bool = True) -> _Components:
-        """`principal_components` up to the rank, and how many numbers are kept of those that are wanted."""
-        found = principal_components(places, count, self.seed, centre)
-        # many descriptors lie in a file, wherever the model is
-        mean, basis, variances = (one.to(self.scale.device) for one in found)
+        """`principal_components` up to the rank, and how many dimensions to keep, `kept` at most."""
+        # the descriptors of a long route are in a file, wherever the model is
+        found = (one.to(self.scale.device) for one in principal_components(places, count, self.seed, centre))
+        mean, basis, variances = found
         rank = int((variances > ROUNDING * variances[0]).sum())
         if kept > rank and self.numbers is not None:
             raise InputError(f"numbers is {kept}, but the descriptors of this route have rank {rank}")
         if rank < kept < count:
-            log.warning("the descriptors of this route have rank %d: as many numbers, not %d", rank, kept)
+            log.warning("the descriptors of this route have rank %d: as many dimensions, not %d", rank, kept)
         return mean, basis[:, :rank], variances[:rank], min(kept, rank)
 
     def take(self, mean: Tensor, projection: Tensor, length: Tensor | None) -> None:
-        """Set mean (D,), projection (D,K), rounded to `bits`, and the constant number, if any.
+        """Set mean (D,), projection (D,K), rounded to `bits`, and the constant dimension, if any.
 
-        Of 4 bits two numbers are a byte, the first half of the columns the lower ones.
+        With 4 bits two numbers share a byte; the first half of the columns are the low bits.
         """
         self.scale = projection.abs().amax(0) / (2 ** (self.bits - 1) - 1)
         whole = (projection / self.scale).round()
@@ -322,22 +311,21 @@ class Whitening(nn.Module):
 
     def _load_from_state_dict(self, state: dict[str, Any], prefix: str, *args: Any) -> None:
         inner = f"{prefix}members."
-        made = {name.removeprefix(inner).partition(".")[0] for name in state if name.startswith(inner)}
-        self.members = nn.ModuleList(self._member() for _ in made)  # torch loads them next
+        inside = {name.removeprefix(inner): one for name, one in state.items() if name.startswith(inner)}
+        groups = {name.partition(".")[0] for name in inside}
+        self.members = nn.ModuleList(self._member() for _ in groups)  # torch loads them next
         buffers = {name: state.get(prefix + name, own) for name, own in self.named_buffers(recurse=False)}
-        kind, seen = buffers["projection"].dtype, [tuple(one.shape) for one in buffers.values()]
-        width = tuple((count + 1) // 2 if kind == torch.uint8 else count for count in seen[1])
+        dtype, seen = buffers["projection"].dtype, [tuple(one.shape) for one in buffers.values()]
+        width = tuple((count + 1) // 2 if dtype == torch.uint8 else count for count in seen[1])
         fits = len(seen[0]) == 2 and seen[0][1:] == width and seen[2] == seen[1] and seen[3] in ((0,), (1,))
-        counted = [name for name in state if name.startswith(inner) and name.endswith((".scale", ".length"))]
-        numbers = sum(state[name].numel() for name in counted)
-        fits = fits and (not made or numbers == seen[0][0])
+        joined = sum(one.numel() for name, one in inside.items() if name.endswith((".scale", ".length")))
+        fits = fits and (not groups or joined == seen[0][0])
         finite = all(bool(stored.isfinite().all()) for stored in buffers.values())
-        told = f"; D is {numbers}, of its {len(made)} groups" if made else ""
-        if not fits or not finite or kind not in (torch.uint8, torch.int8, torch.int16):
-            raise InputError(
-                f"the whitening has a projection, scale, offset and length of {seen}; expected finite (D,K), "
-                f"two numbers to a byte in uint8, (K,), (K,), and one number or none{told}"
-            )
+        if not fits or not finite or dtype not in (torch.uint8, torch.int8, torch.int16):
+            expected = "finite (D,K), two numbers to a byte in uint8, (K,), (K,), and one number or none"
+            expected += f"; D is {joined}, of its {len(groups)} groups" if groups else ""
+            sizes = f"the whitening has a projection, scale, offset and length of {seen}"
+            raise InputError(f"{sizes}; expected {expected}")
         for name, stored in buffers.items():
             setattr(self, name, torch.empty_like(stored, device=self.scale.device))
         super()._load_from_state_dict(state, prefix, *args)
@@ -346,33 +334,32 @@ class Whitening(nn.Module):
         return settings_of(self, *(["strengths"] if self.strengths == STRENGTHS else []))
 
 
-def _of_views(
-    places: Tensor, views: Iterable[tuple[Tensor, Tensor]], begun: Sequence[_Components]
+def _projected_views(
+    places: Tensor, views: Iterable[tuple[Tensor, Tensor]], found: Sequence[_Components]
 ) -> list[Tensor]:
-    """Components (2,n,C) of views, which may be made as they come, and of their places, of each group."""
-    sizes, pairs = [len(mean) for mean, *_ in begun], [list[Tensor]() for _ in begun]
+    """Components (2,n,C) of views, which are read batch by batch, and of their places, for each group."""
+    sizes, pairs = [len(mean) for mean, *_ in found], [list[Tensor]() for _ in found]
     for view, place in views:
         if view.shape[1] != places.shape[1]:
-            seen = f"the views have {view.shape[1]} features"
-            raise InputError(f"{seen}; expected {places.shape[1]} as in the route")
+            raise InputError(f"views have {view.shape[1]} features; expected {places.shape[1]}, the route's")
         both = (rows.split(sizes, 1) for rows in (view, places[place.to(places.device)]))
-        for held, (mean, basis, *_), *parts in zip(pairs, begun, *both, strict=True):
+        for held, (mean, basis, *_), *parts in zip(pairs, found, *both, strict=True):
             held.append(torch.stack([(part.to(mean) - mean) @ basis for part in parts]))
     if not pairs[0]:
-        raise InputError("there are no views to whiten with; expected some, or None for none")
+        raise InputError("there are no views for whitening; expected at least one batch, or None")
     return [torch.cat(held, 1) for held in pairs]
 
 
 def principal_components(
     rows: Tensor, count: int, seed: int = 0, centre: bool = True
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The directions in which SAMPLED of the descriptors, drawn evenly, vary most, by subspace iteration
-    (Halko, Martinsson and Tropp, SIAM Review 53, 2011, algorithm 4.4), faster than `torch.svd_lowrank`.
+    """Principal components of SAMPLED evenly drawn descriptors, by subspace iteration (Halko, Martinsson and
+    Tropp, SIAM Review 53, 2011, algorithm 4.4), which is faster than `torch.svd_lowrank`.
 
     Args:
-        centre: vary about their mean; else about zero, and the mean is 0.
+        centre: subtract the mean; else it is 0.
 
-    Shape: (N,D) -> mean (D,), basis (D,C), variances (C,), the largest first; C is `count` at most.
+    Shape: (N,D) -> mean (D,), basis (D,C), variances (C,), the largest first; C is at most `count`.
     """
     if rows.ndim != 2 or len(rows) < 2:
         raise InputError(f"the descriptors are {tuple(rows.shape)}; expected (N,D), N at least 2")
@@ -388,5 +375,5 @@ def principal_components(
     variances, turn = torch.linalg.eigh(inside.T @ inside / len(sample))
     variances, turn = variances.flip(0)[:count], turn.flip(1)[:, :count]
     if not variances[0] > ROUNDING * sample.square().mean():
-        raise InputError(f"the {len(rows)} descriptors are all alike; expected a route that changes")
+        raise InputError(f"the {len(rows)} descriptors are all the same; expected a route that changes")
     return mean, basis @ turn.to(basis), variances.float()

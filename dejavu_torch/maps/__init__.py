@@ -1,1 +1,1 @@
-"""Plan + features -> compressed map."""
+"""Descriptors -> compressed maps, which score queries."""

@@ -1,10 +1,10 @@
 """The entropy coder of a spectral map: integer levels to bytes by adaptive arithmetic coding, and back.
 
-Each row begins with a bit that is 1 if all further levels are 0. A level is the number of bits of its
-magnitude in unary, its sign, and the bits below the leading one. The probability of a bit follows how often
-it was 1 in its context: for the unary bits, the magnitudes in this column and its neighbours over the rows
-before, and in all columns over the last few rows; for a sign, the sign two rows before, which is the line of
-the same kind, cosine or sine. All arithmetic is in integers, so that every machine decodes the same levels.
+Each row begins with a bit that is 1 if all further levels are 0. A level is coded as the bit length of its
+magnitude in unary, its sign, and the bits below the leading one. Each bit has an adaptive probability in its
+context: for the unary bits, earlier magnitudes in this column and its neighbours, and recent ones in all
+columns; for a sign, the sign two rows before, whose line has the same kind, cosine or sine. All arithmetic is
+in integers, so that every machine decodes the same levels.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ from dejavu_torch.types import InputError
 
 Ints = NDArray[np.integer[Any]]
 
-LEVELS_PER_BYTE, LEVELS_AT_LEAST = 2**13, 2**22  # most levels of a stream
-LEVEL, COLUMN = 4, 2**13  # bytes to decode a level, and a column
-MOST = 15  # larger magnitudes count as this one in the sums of a context
-REACH, RING = 128, 256  # rows that a context looks back at most, and whose sums are kept
+LEVELS_PER_BYTE, LEVELS_AT_LEAST = 2**13, 2**22  # maximum levels of a stream, per byte and of a short one
+LEVEL_BYTES, COLUMN_BYTES = 4, 2**13  # memory to decode a level, and a column
+MAX_MAGNITUDE = 15  # in the sums of a context; larger ones are clipped
+REACH, RING = 128, 256  # rows that a context looks back at most, and rows whose sums are kept
 LENGTH_MAX = 31  # bits of a magnitude
 NEAR = 34  # contexts by the magnitudes near a level
 END, SIGN, BITS, LENGTH = 0, 1, 4, 4 + 32 * 32  # the first context of each kind of bit
 CONTEXTS = LENGTH + 32 * NEAR
-FIRST = (2, 1)  # initial counts of 0s and 1s in a context; each bit adds 2
-BLOCK, COUNTED = 2**13, 2**16  # levels that are coded, and counted, at a time
-BIT = 5  # bytes of a bit at most
-SPAN, BYTE = 56, 48  # bits of the interval at first, and at least
-LEAST = 1 << BYTE
-WORTH_COMPILING = 2**19  # levels that Python codes in the time that numba loads
+PRIOR = (2, 1)  # initial counts of 0s and 1s in a context; each bit adds 2
+CODED_LEVELS, COUNTED_LEVELS = 2**13, 2**16  # per block
+BIT_BYTES = 5  # at most
+SPAN, MIN_SPAN = 56, 48  # bits of the interval: initial and minimal
+LEAST = 1 << MIN_SPAN
+WORTH_COMPILING = 2**19  # levels that Python codes in the time that numba takes to load
 
 
 class Stream(NamedTuple):
@@ -54,76 +54,70 @@ def encode(levels: Tensor) -> Stream:
 
     Shape: (W,K) int8 or int32 -> (n,) uint8.
     """
-    whole = _numbers(levels)
+    numbers = _integers(levels)
     packed = bytearray()
-    _, row, (low, _, size) = _run(whole, packed)
+    _, row, (low, _, size) = _run(numbers, packed)
     packed[size:] = bytes(1)
-    _put(int(low) + LEAST - 1, size, packed)  # in the interval, its further bytes 0
-    _check_size(row, whole.shape[1], len(packed))
-    return Stream(torch.frombuffer(packed, dtype=torch.uint8), _checksum(whole))
+    _put(int(low) + LEAST - 1, size, packed)  # the first byte of a number in the interval; the others are 0
+    _check_size(row, numbers.shape[1], len(packed))
+    return Stream(torch.frombuffer(packed, dtype=torch.uint8), _checksum(numbers))
 
 
 def coded_bytes(levels: Tensor) -> int:
-    """The size of `encode`'s stream, or a byte more, without coding: (W,K) int8 or int32."""
-    whole = _numbers(levels)
-    filled, width = _filled(whole), whole.shape[1]
-    counts, rows = np.zeros((CONTEXTS, 2)), max(2, COUNTED // width)
-    counts[END] = filled, filled < len(whole)
+    """The size of the stream of `encode`, or a byte more, without coding: (W,K) int8 or int32."""
+    numbers = _integers(levels)
+    filled, width = _filled(numbers), numbers.shape[1]
+    counts, rows = np.zeros((CONTEXTS, 2)), max(2, COUNTED_LEVELS // width)
+    counts[END] = filled, filled < len(numbers)
     sums, signs = np.zeros((rows + RING, width + 1), np.int32), np.zeros((2, width), np.int64)
     for start in range(0, filled, rows):
-        block = whole[start : min(start + rows, filled)].astype(np.int64)
-        here = np.arange(start, start + len(block))
-        ahead, totals = (here + 1) % len(sums), np.minimum(np.abs(block), MOST).cumsum(0)
-        sums[ahead, :-1] = sums[start % len(sums), :-1] + totals
-        sums[ahead, -1] = sums[ahead, :-1].sum(1)
-        near = _near(sums, here, _logarithms())
+        block = numbers[start : min(start + rows, filled)].astype(np.int64)
+        row = np.arange(start, start + len(block))
+        after, totals = (row + 1) % len(sums), np.minimum(np.abs(block), MAX_MAGNITUDE).cumsum(0)
+        sums[after, :-1] = sums[start % len(sums), :-1] + totals
+        sums[after, -1] = sums[after, :-1].sum(1)
+        near = _near(sums, row, _logarithms())
         signs = np.concatenate([signs[-2:], np.sign(block)])
         _count(counts, np.abs(block), signs[2:], signs[:-2], near)
-    prior = torch.tensor(FIRST, dtype=torch.float64) / 2
-    after = torch.from_numpy(counts) + prior
+    prior = torch.tensor(PRIOR, dtype=torch.float64) / 2
+    total = torch.from_numpy(counts) + prior
     # the probability of all bits of a context, in any order, is a quotient of gamma functions
-    nats = after.sum(1).lgamma() - after.lgamma().sum(1) + prior.lgamma().sum() - prior.sum().lgamma()
+    nats = total.sum(1).lgamma() - total.lgamma().sum(1) + prior.lgamma().sum() - prior.sum().lgamma()
     return int(float(nats.sum()) / math.log(256) + 1.01)
 
 
 def decode(stream: Stream, rows: int, columns: int) -> Tensor:
-    """The levels of a stream, (W,K) int8, or int32 if some need it.
+    """The levels of a stream, (W,K) int8, or int32 if necessary.
 
     Raises:
-        InputError: a truncated or altered stream, one of another size, or more than the memory holds.
+        InputError: a truncated or altered stream, another size, or more levels than fit into memory.
     """
-    if min(rows, columns) < 1 or (rows * LEVEL + COLUMN) * columns > free_memory():
-        raise InputError(
-            f"the map claims {rows} x {columns} levels; expected at least one, and what fits into the memory"
-        )
+    if min(rows, columns) < 1 or (rows * LEVEL_BYTES + COLUMN_BYTES) * columns > free_memory():
+        raise InputError(f"the map claims {rows} x {columns} levels; expected 1 or more, within free memory")
     packed = stream.bytes.numpy().tobytes()
     padded = bytearray(packed + bytes(SPAN // 8 - 1))
     levels, _, state = _run(np.zeros((rows, columns), np.int8), padded, reads=True)
     left, checksum = max(0, len(padded) - int(state[2])), _checksum(levels)
     if left or checksum != stream.checksum:
-        raise InputError(
-            f"the coded lines are truncated or altered: {len(packed)} bytes, {left} of them left over, give "
-            f"levels of checksum {checksum}; expected {levels.size} levels of {stream.checksum}"
-        )
+        seen = f"{len(packed)} bytes, {left} of them unused, decode to levels of checksum {checksum}"
+        expected = f"expected {levels.size} levels of {stream.checksum}"
+        raise InputError(f"the coded lines are truncated or altered: {seen}; {expected}")
     return torch.from_numpy(levels)
 
 
 def _check_size(rows: int, columns: int, size: int) -> None:
-    """Refuse a stream of `size` bytes for so many rows up to the last that is not 0: slow to decode."""
+    """Refuse a stream of few bytes for many rows up to the last that is not 0: it is slow to decode."""
     if rows * columns > LEVELS_AT_LEAST + LEVELS_PER_BYTE * size:
-        raise InputError(
-            f"{rows} x {columns} levels in {size} bytes are next to nothing but zeros; "
-            "expected more bytes per place"
-        )
+        raise InputError(f"{rows} x {columns} levels in {size} bytes are nearly all 0; expected more bytes")
 
 
-def _numbers(levels: Tensor) -> Ints:
+def _integers(levels: Tensor) -> Ints:
     numbers: Ints = levels.detach().cpu().contiguous().numpy()
     return numbers.astype(np.int8) if _fits(numbers) else numbers
 
 
 def _fits(levels: Ints) -> bool:
-    """Whether int8 holds the levels."""
+    """Whether the levels fit into int8."""
     return levels.dtype == np.int8 or bool(levels.min() >= -128 and levels.max() <= 127)
 
 
@@ -142,10 +136,9 @@ def _count(counts: Any, size: Ints, sign: Ints, before: Ints, near: Ints) -> Non
     ends = np.bincount((length * NEAR + near).ravel(), minlength=32 * NEAR).reshape(32, NEAR)
     more = ends[::-1].cumsum(0)[::-1] - ends
     counts[LENGTH:] += np.stack([ends, more], 2).reshape(-1, 2)
-    counts[LENGTH + LENGTH_MAX * NEAR :, 0] = 0  # no bit follows the longest
+    counts[LENGTH + LENGTH_MAX * NEAR :, 0] = 0  # the longest has no final bit
     for minus in (0, 1):
-        there = sign == 1 - 2 * minus
-        counts[SIGN : SIGN + 3, minus] += np.bincount(1 + before[there], minlength=3)
+        counts[SIGN : SIGN + 3, minus] += np.bincount(1 + before[sign == 1 - 2 * minus], minlength=3)
     for bits in range(2, 1 + int(length.max())):
         large = size[length == bits]
         ones = (large[:, None] >> np.arange(bits - 1) & 1).sum(0)
@@ -154,27 +147,25 @@ def _count(counts: Any, size: Ints, sign: Ints, before: Ints, near: Ints) -> Non
 
 
 def _run(levels: Ints, packed: bytearray, reads: bool = False) -> tuple[Ints, int, Any]:
-    """Write levels to bytes, or read as many; the levels, the row where coding ended, `_code`'s state."""
+    """Write levels to bytes, or read them -> levels, the row at which coding ended, the state of `_code`."""
     rows, columns = levels.shape
     kernel, begin = _kernel(levels.size), SPAN // 8 if reads else 0
     state: Any = np.array([int.from_bytes(packed[:begin], "big"), 1 << SPAN, begin])
-    counts: Any = np.tile(FIRST, CONTEXTS)
+    counts: Any = np.tile(PRIOR, CONTEXTS)
     if kernel is _code:  # lists, whose elements Python reads faster
         state, counts = state.tolist(), counts.tolist()
     sums, before = np.zeros((RING, columns + 1), np.int32), np.zeros((2, columns), np.int32)
-    filled, row, step = _filled(levels), 0, max(1, BLOCK // columns)
+    end, row, step = _filled(levels), 0, max(1, CODED_LEVELS // columns)
+    coder = reads, state, counts, sums, _logarithms()
     for start in range(0, rows, step):
         some = levels[start : start + step]
         if reads:
             _check_size(start, columns, len(packed))
         else:
             bits = 2 * max(int(some.max()), -int(some.min())).bit_length() + 2  # of a level, and a row
-            packed.extend(bytes(max(0, int(state[2]) + BIT * bits * some.size - len(packed))))
+            packed.extend(bytes(max(0, int(state[2]) + BIT_BYTES * bits * some.size - len(packed))))
         block = np.concatenate([before, some], dtype=np.int32)
-        coding = reads, state, counts, sums, _logarithms()
-        row = kernel(
-            block, start, filled, packed if kernel is _code else np.frombuffer(packed, np.uint8), coding
-        )
+        row = kernel(block, start, end, packed if kernel is _code else np.frombuffer(packed, np.uint8), coder)
         before = block[-2:]
         if reads:
             levels = levels if _fits(block) else levels.astype(np.int32, copy=False)
@@ -184,13 +175,13 @@ def _run(levels: Ints, packed: bytearray, reads: bool = False) -> tuple[Ints, in
     return levels, row, state
 
 
-# The functions from here to `_near` run as they are, on lists, and compiled by numba, on arrays.
+# The functions from here to `_near` run in Python, on lists, or compiled by numba, on arrays.
 
 
 def _code(block: Any, start: int, filled: int, packed: Any, coding: Any) -> int:
-    """Code the rows of a block, behind the two before row `start`; the row from which on all are 0."""
+    """Code the rows of a block, which follow the two rows before `start`; the row from which all are 0."""
     reads, state, counts, sums, logarithms = coding
-    # the lower end of the interval, or the value read less that, its width, the position in `packed`
+    # the lower end of the interval, or its distance from the value read; its width; the position in `packed`
     low, span, at = state[0], state[1], state[2]
     for r in range(2, len(block)):
         row = start + r - 2
@@ -212,13 +203,12 @@ def _code(block: Any, start: int, filled: int, packed: Any, coding: Any) -> int:
                 minus, low, span, at = _bit(context, int(level < 0), reads, low, span, at, counts, packed)
                 value, context = 1, BITS + 32 * length
                 for n in range(length - 2, -1, -1):
-                    bit, low, span, at = _bit(
-                        context + n, size >> n & 1, reads, low, span, at, counts, packed
-                    )
+                    bit = size >> n & 1
+                    bit, low, span, at = _bit(context + n, bit, reads, low, span, at, counts, packed)
                     value = 2 * value + bit
                 block[r, f] = -value if minus else value
         now, after = sums[row % RING], sums[(row + 1) % RING]
-        after[:-1] = now[:-1] + np.minimum(np.abs(block[r]), MOST)
+        after[:-1] = now[:-1] + np.minimum(np.abs(block[r]), MAX_MAGNITUDE)
         after[-1] = after[:-1].sum()
     else:
         row = start + len(block) - 2
@@ -229,7 +219,7 @@ def _code(block: Any, start: int, filled: int, packed: Any, coding: Any) -> int:
 def _bit(
     context: int, bit: int, reads: bool, low: int, span: int, at: int, counts: Any, packed: Any
 ) -> tuple[int, int, int, int]:
-    """Code a bit in its context; the bit, and the interval and position after it."""
+    """Code a bit in its context -> the bit, and the interval and position after it."""
     zero, one = counts[2 * context], counts[2 * context + 1]
     part = span // (zero + one) * zero
     if reads:
@@ -248,8 +238,8 @@ def _bit(
 
 
 def _put(low: int, at: int, packed: Any) -> int:
-    """Write the first byte of the interval's lower end, and carry into the bytes before it."""
-    byte = low >> BYTE
+    """Write the first byte of the interval's lower end, with a carry into the bytes before it."""
+    byte = low >> MIN_SPAN
     if byte > 255:
         last = at - 1
         while packed[last] == 255:
@@ -261,13 +251,13 @@ def _put(low: int, at: int, packed: Any) -> int:
 
 
 def _near(sums: Any, rows: Any, logarithms: Any) -> Any:
-    """The contexts (R,K), 0 to `NEAR`, by what sums (over R,K+1) of all rows before gained lately."""
+    """The contexts (R,K), 0 to `NEAR`, by the recent growth of `sums` (.., K+1) over all earlier rows."""
     now, columns = sums[rows % len(sums)], sums.shape[1] - 1
     far = np.minimum(np.minimum(np.maximum(rows // 2, 16), REACH), rows)
     close = np.minimum(np.minimum(np.maximum(rows // 16, 2), 8), rows)
     recent = (now[:, -1] - sums[(rows - close) % len(sums)][:, -1]).astype(np.int64)
     mean = (recent << 10) // (np.maximum(close, 1) * columns)
-    # the mean magnitude over the last rows, in 256ths, with more weight on the last two
+    # the mean magnitude over recent rows, in 256ths, with more weight on the last two
     column = ((now - sums[(rows - far) % len(sums)]) << 8) // np.maximum(far, 1).reshape(-1, 1)
     column = column + ((now - sums[(rows - np.minimum(rows, 2)) % len(sums)]) << 4)
     wide = 2 * column[:, :-1]
@@ -284,11 +274,11 @@ def _logarithms() -> Ints:
     return np.array([0, *((n**8).bit_length() - 1 for n in range(1, 2**14 + 1))])
 
 
-_coded = 0  # levels, by this process
+_coded = 0  # levels, in this process
 
 
 def _kernel(levels: int) -> Callable[..., int]:
-    """What codes so many more levels."""
+    """The function that codes this number of further levels."""
     global _coded
     _coded += levels
     return (_compiled() if _coded >= WORTH_COMPILING else None) or _code

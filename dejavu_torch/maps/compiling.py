@@ -6,16 +6,17 @@ import logging
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from dejavu_torch.text import one_line
+
 log = logging.getLogger("dejavu_torch")
 
 
 def compiled(
     function: Callable[..., Any], signature: str, what: str, calls: Sequence[Any] = (), **options: Any
 ) -> Callable[..., Any] | None:
-    """The function, and what it calls, compiled for one signature or loaded from numba's cache.
+    """The function, and its `calls`, compiled for one signature or loaded from numba's cache.
 
-    None, with a line in the log that says `what` is done without, if numba is missing, disabled or broken;
-    `options` are those of `njit`.
+    None, and a log line that `what` happens instead, if numba is missing, disabled or broken.
     """
     options |= {"nogil": True, "error_model": "numpy"}
     try:
@@ -26,11 +27,11 @@ def compiled(
             register_jitable(one)
         try:
             kernel: Callable[..., Any] = numba.njit(signature, cache=True, **options)(function)
-        except Exception:  # there may be no folder for the cache
+        except Exception:  # the cache may have no folder
             kernel = numba.njit(signature, cache=False, **options)(function)
         if kernel is function:
             raise RuntimeError("NUMBA_DISABLE_JIT is set")
         return kernel
-    except Exception as error:  # a broken compiler must not break what works without one
-        log.info("%s, not by numba: %s", what, " ".join(str(error).split()))
+    except Exception as error:  # a broken compiler must not break what works without it
+        log.info("%s, not by numba: %s", what, one_line(error))
         return None

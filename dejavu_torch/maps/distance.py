@@ -1,4 +1,4 @@
-"""Distance of a query to every phase of a layer (section III-B, eq. 3); L1 by a loop that numba compiles."""
+"""Distance of a query to every phase of a layer (section III-B, eq. 3); L1 by a loop compiled by numba."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ Metric = Literal["l1", "l2", "cosine"]
 Floats = NDArray[np.float32]
 
 WORTH_COMPILING = 2**14  # P x F above which the loop is faster than torch even for one query
-QUERIES_AT_ONCE = 64  # they stay in cache while the templates stream by
-TASK = 2**23  # |a - b| for one thread at a time, about half a millisecond
+QUERIES_AT_ONCE = 64  # they stay in the cache while templates are read
+TASK = 2**23  # terms |a - b| per task of a thread, about half a millisecond
 
 
 def phase_distances(query: Tensor, templates: Tensor, metric: Metric = "l1") -> Tensor:
@@ -36,8 +36,8 @@ def phase_distances(query: Tensor, templates: Tensor, metric: Metric = "l1") -> 
 
     Shape: (Q,F), (P,F) -> (Q,P).
 
-    Convention: in float32 at least, whatever the autocast, without a tensor Q x P x F. On the CPU "l1"
-        without gradients runs in a compiled loop if numba is installed.
+    Convention: at least float32, under any autocast, without a tensor Q x P x F. On the CPU "l1" without
+        gradients runs in a compiled loop if numba is installed.
 
     Raises:
         InputError: tensors that are not (Q,F) and (P,F), or an unknown metric.
@@ -49,9 +49,8 @@ def phase_distances(query: Tensor, templates: Tensor, metric: Metric = "l1") -> 
     if metric not in get_args(Metric):
         raise InputError(f"metric {metric!r} is unknown; expected {', '.join(get_args(Metric))}")
     if query.ndim != 2 or templates.ndim != 2 or query.shape[1] != templates.shape[1]:
-        raise InputError(
-            f"phase_distances got {tuple(query.shape)} and {tuple(templates.shape)}; expected (Q,F) and (P,F)"
-        )
+        seen = f"phase_distances got {tuple(query.shape)} and {tuple(templates.shape)}"
+        raise InputError(f"{seen}; expected (Q,F) and (P,F)")
     dtype = torch.promote_types(torch.promote_types(query.dtype, templates.dtype), torch.float32)
     query, templates = query.to(dtype), templates.to(dtype)
     with torch.autocast(query.device.type, enabled=False):
@@ -67,11 +66,10 @@ def phase_distances(query: Tensor, templates: Tensor, metric: Metric = "l1") -> 
 def compiled_l1(query: Tensor, templates: Tensor) -> Tensor | None:
     """L1 distances by the compiled loop: (Q,F), (P,F) -> (Q,P); None if torch has to compute them.
 
-    That is for gradients and whatever else follows or traces operations (vmap, torch.compile, export), on
-    other devices and dtypes, for few templates, and without numba.
+    That is for gradients, tracing, vmap, other devices and dtypes, few templates, and without numba.
 
-    Convention: a pair is summed in one order wherever it stands: a query alone has the distances, to the bit,
-        that it has in a batch, and equal templates have equal distances.
+    Convention: all pairs are summed in the same order: distances of a query do not depend on its batch, and
+        equal templates have equal distances, bit for bit.
     """
     if templates.numel() < WORTH_COMPILING:
         return None
@@ -90,14 +88,14 @@ def compiled_l1(query: Tensor, templates: Tensor) -> Tensor | None:
     if threads < 2:
         for task in tasks:
             kernel(*task)
-    else:  # new threads, so that a fork, or calls from several threads, do no harm
+    else:  # new threads, safe with forks and calls from several threads
         with ThreadPoolExecutor(threads) as pool:
             list(pool.map(lambda task: kernel(*task), tasks))
     return torch.from_numpy(out)
 
 
 def _floats(tensor: Tensor) -> Floats | None:
-    """The numbers of a float32 tensor on the CPU, or None if its operations are followed or traced."""
+    """The data of a float32 tensor on the CPU, or None if autograd or a tracer records its operations."""
     if (
         torch.compiler.is_compiling()
         or torch.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
@@ -111,19 +109,19 @@ def _floats(tensor: Tensor) -> Floats | None:
     try:
         floats: Floats = tensor.detach().contiguous().numpy()
         return floats
-    except (RuntimeError, TypeError):  # tensors of vmap have no memory, sparse ones no rows
+    except (RuntimeError, TypeError):  # tensors of vmap have no memory, sparse tensors no rows
         return None
 
 
 @cache
 def _compiled() -> Callable[[Floats, Floats, Floats], None] | None:
     signature = "void(float32[:,::1], float32[:,::1], float32[:,:])"
-    fastmath = {"reassoc", "nsz", "contract"}  # but not "nnan" and "ninf": NaN and infinity have to arrive
+    fastmath = {"reassoc", "nsz", "contract"}  # not "nnan" and "ninf", which lose NaN and infinity
     return compiled(_distances, signature, "L1 distances by torch", fastmath=fastmath)
 
 
 def _distances(query: Floats, templates: Floats, out: Floats) -> None:
-    """Four templates at a time; the last block repeats the last, so that all sums are in one order."""
+    """Four templates at a time; the last block repeats its last one, so that all sums have the same order."""
     last = len(templates) - 1
     for a in range(0, len(templates), 4):
         b, c, d = min(a + 1, last), min(a + 2, last), min(a + 3, last)
@@ -139,5 +137,5 @@ def _distances(query: Floats, templates: Floats, out: Floats) -> None:
 
 
 def l1_backend() -> Literal["numba", "torch"]:
-    """What computes large L1 distances on the CPU without gradients; the first call compiles the loop."""
+    """The library for large L1 distances on the CPU without gradients; the first call compiles the loop."""
     return "torch" if _compiled() is None else "numba"

@@ -1,4 +1,4 @@
-"""A map file: one safetensors archive of tensors, a JSON header, and digests of both. No pickle, no code."""
+"""A map file: a safetensors archive of tensors, a JSON header, and digests of both. No pickle, no code."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ FORMAT = 11
 NAME = "dejavu_torch-map"
 ZIP = b"PK\x03\x04"  # the first bytes of a checkpoint
 EXPECTED = "a map file, as DejaVu.save writes"
-HEADER = "header"  # the digest that is of no tensor
+HEADER = "header"  # key of the header and of its digest
 SHOWN = 60  # characters of a value in a message
 
 
@@ -46,27 +46,22 @@ def digests(**values: Any) -> dict[str, str]:
 
 def map_size(tensors: Mapping[str, Tensor], header: dict[str, Any]) -> int:
     """Bytes of the file that `write_map` writes."""
-    return len(safetensors.torch.save(*_sealed(tensors, header)))
+    return len(safetensors.torch.save(*_seal(tensors, header)))
 
 
 def write_map(path: Path, tensors: Mapping[str, Tensor], header: dict[str, Any]) -> None:
-    """Write the file whole or, with an InputError, not at all; the same contents give the same bytes.
-
-    Args:
-        tensors: by names that begin with a part of the model and a dot. header: JSON values.
-    """
+    """Write the file completely or, with an InputError, not at all; equal contents give equal bytes. Names of
+    tensors begin with a part of the model and a dot; the header is JSON."""
     with whole_file(path) as temporary:
         try:
-            plain, metadata = _sealed(tensors, header)
+            plain, metadata = _seal(tensors, header)
             safetensors.torch.save_file(plain, temporary, metadata)
         except (SafetensorError, ValueError) as error:
             raise InputError(f"{path} was not written: {error}") from error
 
 
-def _sealed(
-    tensors: Mapping[str, Tensor], header: dict[str, Any]
-) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Tensors with memory of their own, as safetensors needs, and one entry of metadata: it mixes several."""
+def _seal(tensors: Mapping[str, Tensor], header: dict[str, Any]) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Tensors with memory of their own, as safetensors needs, and metadata: one entry, for a fixed order."""
     layout = torch.contiguous_format
     plain = {name: one.detach().cpu().clone(memory_format=layout) for name, one in tensors.items()}
     sealed = {"version": FORMAT, "checksums": checksums(plain, header), HEADER: header}
@@ -83,8 +78,7 @@ def _finite(text: str) -> float:
 
 
 def read_map(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """What `write_map` wrote; an InputError if the file is missing, truncated, foreign, damaged or of another
-    format."""
+    """What `write_map` wrote; an InputError if it is missing, truncated, damaged or not of this format."""
     check_regular(path, EXPECTED)
     try:
         with path.open("rb") as file:
@@ -94,41 +88,40 @@ def read_map(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         with safe_open(path, framework="pt") as archive:
             metadata = archive.metadata() or {}
             if NAME not in metadata:
-                problem = f"{path} is no map of dejavu_torch, or an old one"
-                raise InputError(f"{problem}; expected {EXPECTED}; of an old one, learn the route anew")
+                seen = f"{path} is not a map of dejavu_torch, or an old one"
+                raise InputError(f"{seen}; expected {EXPECTED}; if it is old, learn the route anew")
             sealed = json.loads(metadata[NAME], parse_constant=_finite, parse_float=_finite)
             version = sealed["version"]
             if version != FORMAT:
                 newer = isinstance(version, int) and version > FORMAT
                 cure = "a newer dejavu_torch is needed" if newer else "learn the route anew"
-                problem = f"{path} has map format {version!r:.40}; this version reads {FORMAT}"
-                raise InputError(f"{problem}: {cure}")
+                raise InputError(f"{path} has map format {version!r:.40}; expected {FORMAT}; {cure}")
             tensors = {name: archive.get_tensor(name) for name in archive.keys()}  # noqa: SIM118
         header, sums = sealed[HEADER], dict(sealed["checksums"] or {})
-        seen = checksums(tensors, header)
+        found = checksums(tensors, header)
     except InputError:
         raise
     except (SafetensorError, OSError, KeyError, TypeError, ValueError, RecursionError) as error:
-        raise InputError(f"{path} is truncated or no map file ({error}); expected a whole one") from error
-    damaged = sorted(part for part in {*seen, *sums} if seen.get(part) != sums.get(part))
+        raise InputError(f"{path} is truncated or not a map file ({error}); expected a whole one") from error
+    damaged = sorted(part for part in {*found, *sums} if found.get(part) != sums.get(part))
     if damaged:
         raise InputError(f"{path} is damaged: its {' and '.join(damaged)}; expected it as it was written")
     return tensors, header
 
 
 def part_of(tensors: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
-    """The tensors of one part of a file, by their own names."""
+    """The tensors of one part of a file, without the part in their names."""
     prefix = f"{part}."
     return {name.removeprefix(prefix): one for name, one in tensors.items() if name.startswith(prefix)}
 
 
 def checked(value: Any, kind: Any, where: str) -> Any:
-    """A JSON value, if it is of a type; else an InputError. Numbers are finite, whole ones below 2^53.
+    """A JSON value if it has a type, else an InputError. Numbers must be finite, integers below 2^53.
 
     Args:
         kind: int, float, str, bool, None, Any, a Literal, a union, a sequence or mapping of these, or a
-            NamedTuple, for a mapping with exactly its fields. A module is a mapping.
-        where: names the value in messages.
+            NamedTuple, for a mapping with exactly its fields; any other type means a mapping.
+        where: name of the value in messages.
 
     Example:
         >>> checked("4", int | None, "block")
@@ -145,12 +138,10 @@ def checked(value: Any, kind: Any, where: str) -> Any:
     elif origin in (tuple, list, Sequence) and isinstance(value, list | tuple):
         kinds = inner if origin is tuple and ... not in inner else inner[:1] * len(value)
         if len(kinds) == len(value):
-            pairs = enumerate(zip(value, kinds, strict=True))
-            items = [checked(one, of, f"{where}[{i}]") for i, (one, of) in pairs]
+            items = [checked(value[i], kinds[i], f"{where}[{i}]") for i in range(len(value))]
             return items if origin is list else tuple(items)
     elif origin in (dict, Mapping) and isinstance(value, dict):
-        kind = inner[1] if inner else Any
-        return {name: checked(one, kind, f"{where}.{name}") for name, one in value.items()}
+        return checked_fields(value, dict.fromkeys(value, inner[1] if inner else Any), where)
     elif _fits(value, origin, inner):
         return value
     limit = ", finite and below 2^53" if isinstance(value, int | float) else ""
@@ -158,7 +149,7 @@ def checked(value: Any, kind: Any, where: str) -> Any:
 
 
 def _fits(value: Any, origin: Any, inner: tuple[Any, ...]) -> bool:
-    """Whether a value is of a type other than a union, a sequence or a NamedTuple."""
+    """Whether a value has a type other than a union, a sequence or a NamedTuple."""
     if type(value) in (int, float) and not abs(value) < (LARGEST if type(value) is int else math.inf):
         return False
     if origin is Literal:
@@ -169,8 +160,8 @@ def _fits(value: Any, origin: Any, inner: tuple[Any, ...]) -> bool:
 
 
 def checked_fields(value: Any, kinds: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """A mapping with exactly these keys, whose values are `checked` by these types."""
+    """A mapping with exactly these keys, its values `checked` by these types."""
     if not isinstance(value, dict) or value.keys() != kinds.keys():
         seen = ", ".join(sorted(map(str, value))) if isinstance(value, dict) else repr(value)
-        raise InputError(f"{where} is of {seen[:SHOWN] or 'nothing'}; expected {', '.join(kinds)}")
+        raise InputError(f"{where} holds {seen[:SHOWN] or 'nothing'}; expected {', '.join(kinds)}")
     return {name: checked(value[name], kind, f"{where}.{name}") for name, kind in kinds.items()}

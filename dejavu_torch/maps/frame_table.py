@@ -1,4 +1,4 @@
-"""Places, frames of the reference and routes: which belong together."""
+"""The correspondence of places, reference frames and routes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dejavu_torch.types import InputError
 
 
 class Route(NamedTuple):
-    """A route of a map that has several: its name, and how many places and frames."""
+    """One of several routes of a map: its name and its numbers of places and frames."""
 
     name: str
     places: int
@@ -21,10 +21,9 @@ class Route(NamedTuple):
 
 
 class FrameTable(NamedTuple):
-    """Which frames the places of a map show, and on which route; its columns are those of `PlaceMap`.
+    """The frame and route of each place of a map; for the fields see `PlaceMap`.
 
-    Convention: tensors of places and frames are int64 of any shape, and count through all routes. -1, no
-        place or frame, stays -1.
+    Convention: places and frames are int64 of any shape, numbered through all routes. -1, for none, stays.
     """
 
     places: int
@@ -33,12 +32,12 @@ class FrameTable(NamedTuple):
 
     @property
     def frames(self) -> int:
-        """F, of the reference."""
+        """F, number of frames of the reference."""
         return len(self.positions) or self.places
 
     @property
     def steps(self) -> Tensor:
-        """(F,) of each frame, through all routes; of several in double, as float32 would lose places."""
+        """(F,) step of each frame, through all routes; for several in double, since float32 loses places."""
         if len(self.routes) < 2 or not len(self.positions):
             return self.positions
         parts = self.positions.double().clamp(min=0).split([route.frames for route in self.routes])
@@ -47,7 +46,7 @@ class FrameTable(NamedTuple):
 
     @property
     def borders(self) -> Tensor:
-        """(N+1,) int64, the frame with which each place begins, and the number of frames."""
+        """(N+1,) int64, the first frame of each place, then the number of frames."""
         return borders(self.steps) if len(self.positions) else torch.arange(self.places + 1)
 
     def frame_of(self, places: Tensor) -> Tensor:
@@ -55,22 +54,21 @@ class FrameTable(NamedTuple):
         return look_up(shown_frames(self.steps), places) if len(self.positions) else places
 
     def place_of(self, frames: Tensor) -> Tensor:
-        """The place nearest to each frame, -1 for one before the first place; no other frames than F."""
+        """The place nearest to each frame below F, -1 for a frame before the first place."""
         if frames.numel() and int(frames.max()) >= self.frames:
-            seen = f"frame {int(frames.max())} of the reference"
-            raise InputError(f"{seen}; expected frames from 0 to {self.frames - 1}")
+            raise InputError(f"reference frame {int(frames.max())}; expected frames 0 to {self.frames - 1}")
         return place_of(self.steps, frames) if len(self.positions) else frames
 
     def scored(self, places: Tensor) -> Tensor:
-        """Of the places that show one frame, the nearest to it, which a ground truth in frames means."""
+        """For each place, the nearest one to the frame it shows, as in a ground truth of frames."""
         return self.place_of(self.frame_of(places))
 
     def route_of(self, places: Tensor) -> Tensor:
-        """The number of the route that each place is on."""
+        """The index of the route of each place."""
         ends = torch.tensor([route.places for route in self.routes], device=places.device).cumsum(0)
         return torch.where(places >= 0, torch.searchsorted(ends, places.contiguous(), right=True), -1)
 
     def own_frame_of(self, places: Tensor) -> Tensor:
-        """As `frame_of`, with frames counted on their own route."""
+        """As `frame_of`, with frames numbered on their own route."""
         starts = torch.tensor([0, *(route.frames for route in self.routes)], device=places.device).cumsum(0)
         return torch.where(places >= 0, self.frame_of(places) - look_up(starts, self.route_of(places)), -1)

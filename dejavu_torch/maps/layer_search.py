@@ -8,18 +8,17 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-AHEAD = 2**12  # places that are compared together to find the first of equal ones
+AHEAD = 2**12  # places compared at a time to find the first of equal scores
 
 
 @torch.no_grad()
 def lowest(one: Tensor, other: Tensor, places: int, divisor: float = 1.0) -> tuple[Tensor, Tensor]:
-    """The lowest score of two layers and the first place that has it, bit for bit as a scan finds them.
+    """The lowest score of two layers and its first place, bit for bit as a scan of all places finds them.
 
-    The score of place i is (one[i mod tau1] + other[i mod tau2]) / divisor. Among the places r, r + tau1,
-    r + 2 tau1, ... the longer layer has one distance, and those of the shorter one are a window that slides
-    along a circle of its residues: O(tau1 + tau2) for any number of places, which is at least the longer tau.
-    Rounded sums are equal more often than their terms are, so the first of equal scores is sought among all r
-    that reach the lowest.
+    The score of place i is (one[i mod tau1] + other[i mod tau2]) / divisor, for at least the longer tau
+    places. At the places r, r + tau1, r + 2 tau1, ... the longer layer has a single distance, and the shorter
+    one a window of a circle of its residues, whose minimum slides along: O(tau1 + tau2) for any number of
+    places. Since rounding makes more sums equal, the first place is searched among all r with the lowest.
 
     Shape: (Q,tau1), (Q,tau2) -> (Q,), (Q,) int64; `places` if no score is finite.
 
@@ -32,7 +31,7 @@ def lowest(one: Tensor, other: Tensor, places: int, divisor: float = 1.0) -> tup
     end = min(places, math.lcm(outer, inner))
     circle = inner // math.gcd(outer, inner)
     order, position = _circles(outer, inner, long.device)
-    times, more = divmod(end, outer)  # the first `more` r have one place more
+    times, more = divmod(end, outer)  # the first `more` r have another place
     windows = sliding_minimum(short.index_select(1, order).unflatten(1, (-1, circle)), times)
     least = windows.flatten(1).index_select(1, position)
     last = (torch.arange(more, device=long.device) + times * outer) % inner
@@ -56,7 +55,7 @@ def lowest(one: Tensor, other: Tensor, places: int, divisor: float = 1.0) -> tup
 
 @lru_cache(maxsize=16)
 def _circles(outer: int, inner: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Residues modulo `inner` in the order in which steps of `outer` visit them, and where each r begins."""
+    """Residues modulo `inner` in the order in which steps of `outer` visit them, and the start of each r."""
     circles = math.gcd(outer, inner)
     starts, steps = torch.arange(circles), torch.arange(inner // circles)
     order = ((starts[:, None] + steps * outer) % inner).flatten()
@@ -65,8 +64,8 @@ def _circles(outer: int, inner: int, device: torch.device) -> tuple[Tensor, Tens
 
 
 def sliding_minimum(values: Tensor, width: int) -> Tensor:
-    """The lowest of each value and the width - 1 after it, around the circle of the last dimension, in O(n):
-    every window is the end of one block of `width` values and the beginning of the next.
+    """The minimum of each value and the next width - 1, in a circle along the last dimension, in O(n): every
+    window is the end of one block of `width` values and the start of the next.
 
     Source: M. van Herk, A fast algorithm for local minimum and maximum filters on rectangular and octagonal
         kernels, Pattern Recognition Letters 13 (1992).

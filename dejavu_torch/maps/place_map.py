@@ -1,4 +1,4 @@
-"""What every kind of map offers, and what makes one from descriptors."""
+"""The interfaces of maps and of mappers, which make them from descriptors."""
 
 from __future__ import annotations
 
@@ -15,31 +15,32 @@ from dejavu_torch.maps.frame_table import FrameTable, Route
 from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.types import InputError
 
-EXTRA = "_extra_state"  # where torch keeps what `get_extra_state` gives
+ScoreBlocks = Iterator[tuple[int, Tensor]]  # the first place of each block, and its scores (Q,n)
+EXTRA = "_extra_state"  # torch's key for the result of `get_extra_state`
 
 
 def require(fits: bool, seen: str) -> None:
-    """Refuse, by an InputError, buffers that do not fit together: what was seen, and what was expected."""
+    """Refuse a map whose buffers are inconsistent; the message says what was seen and what was expected."""
     if not fits:
         raise InputError(f"the map does not fit together: {seen}")
 
 
 class PlaceMap(nn.Module, ABC):
-    """A route in a form that scores. A new kind of map subclasses it; a `Mapper` makes it from descriptors.
+    """A route that scores queries. A new kind of map subclasses it; a `Mapper` makes it from descriptors.
 
     Attributes:
-        kind: a name of the kind, stored with the map.
-        state: type of what `get_extra_state` gives, by which a file is checked: a NamedTuple of its entries.
+        kind: name of the kind, stored with the map.
+        state: NamedTuple of the entries of `get_extra_state`, to check a file.
         places, dimension: N, and D features per frame.
         positions: (F,) float32, even steps of each reference frame from the first place of its route, if
             resampled (section IV-B); (0,) if place i is reference frame i.
-        visits: (V,2) int32, runs of places and how many visits they are the mean of; (0,2) if all are of one.
-        routes: of a merged map, in order, else (). Places and frames count through all of them.
+        visits: (V,2) int32, runs of places and the number of visits that they average; (0,2) if all are 1.
+        routes: of a merged map, in order, else (). Places and frames are numbered through all of them.
 
-    Shape: queries (Q,D) -> scores (Q,N), lower is better, +inf where nothing covers a place.
+    Shape: queries (Q,D) -> scores (Q,N), lower is better, +inf for a place that nothing covers.
 
     Convention: everything that changes a score is in `state_dict`, settings included; a state of another kind
-        or of other settings is refused. Loading takes the shapes of what is loaded.
+        or of other settings is refused. Buffers get the shapes of the loaded state.
     """
 
     kind: ClassVar[str]
@@ -60,68 +61,63 @@ class PlaceMap(nn.Module, ABC):
 
     @abstractmethod
     def settings(self) -> dict[str, Any]:
-        """What a state must share with the map that loads it, such as the metric, as JSON values."""
+        """Settings that a loaded state must have too, such as the metric, as JSON values."""
 
     @abstractmethod
     def summary(self) -> MapSummary:
-        """What the map can tell apart, and its bytes by part."""
+        """Capacity of the map, and its bytes by part."""
 
     def loaded(self) -> None:
-        """Called when a state was loaded: derive what follows from the buffers."""
+        """Called after a state was loaded, to derive attributes from the buffers."""
 
     def forward(self, queries: Tensor) -> Tensor:
         return self.scores(queries)
 
     def check_queries(self, queries: Tensor) -> None:
-        """Refuse, by an InputError, queries that are not (Q,D)."""
+        """Refuse queries that are not (Q,D)."""
         if queries.ndim != 2 or queries.shape[1] != self.dimension:
-            seen = f"the query features are {tuple(queries.shape)}"
-            raise InputError(f"{seen}; the map expects (Q, {self.dimension})")
+            raise InputError(f"the queries are {tuple(queries.shape)}; the map expects (Q, {self.dimension})")
 
-    def score_blocks(
-        self, queries: Tensor, start: int = 0, stop: int | None = None
-    ) -> Iterator[tuple[int, Tensor]]:
-        """The columns [start, stop) of `scores`, block by block: its first place, and (Q,n) scores."""
+    def score_blocks(self, queries: Tensor, start: int = 0, stop: int | None = None) -> ScoreBlocks:
+        """The columns [start, stop) of `scores`, block by block."""
         yield start, self.scores(queries)[:, start:stop]
 
     @property
     def block_places(self) -> int:
-        """Numbers that the largest block of `score_blocks` holds for a query, about."""
+        """About how many numbers the largest block of `score_blocks` needs per query."""
         return self.places
 
     def lowest(self, queries: Tensor) -> tuple[Tensor, Tensor] | None:
-        """The lowest score of each query (Q,) and the first place that has it (Q,), -1 if none is finite;
-        without gradient. None if that takes as long as all scores."""
+        """The lowest score of each query and its first place, (Q,) each, -1 if none is finite; without
+        gradient. None if this is not faster than all scores."""
         return None
 
     @property
     def table(self) -> FrameTable:
-        """Which frames and routes the places show."""
+        """The frame and route of each place."""
         return FrameTable(self.places, self.positions, self.routes)
 
     def frame_of(self, places: Tensor) -> Tensor:
-        """The reference frame that each place shows, see `FrameTable`."""
         return self.table.frame_of(places)
 
     def place_of(self, frames: Tensor) -> Tensor:
-        """The place nearest to each reference frame, see `FrameTable`."""
         return self.table.place_of(frames)
 
     @property
     def visit_counts(self) -> Tensor:
-        """(N,) int64, how many visits each place is the mean of."""
+        """(N,) int64, number of visits that each place averages."""
         if not len(self.visits):
             return torch.ones(self.places, dtype=torch.int64, device=self.visits.device)
         runs, counts = self.visits.long().unbind(1)
         return counts.repeat_interleave(runs)
 
     def count_visits(self, counts: Tensor) -> None:
-        """Keep how many visits each place is the mean of, (N,) int64."""
+        """Set the number of visits that each place averages, (N,) int64."""
         values, runs = counts.unique_consecutive(return_counts=True)
         self.visits = torch.stack([runs, values], 1).int()[: 0 if (values == 1).all() else None]
 
     def check(self) -> None:
-        """`require` that buffers fit together; a subclass begins with its own."""
+        """`require` that the buffers are consistent; a subclass checks its own first."""
         positions, visits = self.positions, self.visits
         fits = positions.ndim == 1 and positions.is_floating_point() and bool(positions.isfinite().all())
         require(fits, f"positions {tuple(positions.shape)} {positions.dtype}; expected finite floats (F,)")
@@ -135,11 +131,11 @@ class PlaceMap(nn.Module, ABC):
             require(seen == self.places, f"positions of {seen} places; expected {self.places}")
 
     def get_extra_state(self) -> dict[str, Any]:
-        """What the state holds beside the tensors."""
+        """The state besides the tensors."""
         return {"kind": self.kind, "places": self.places, "dimension": self.dimension, **self.settings()}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Take over what `get_extra_state` gave; another kind or other settings are an InputError."""
+        """Restore the result of `get_extra_state`; another kind or other settings are an InputError."""
         if not isinstance(state, dict):
             raise InputError(f"the map's state is a {type(state).__name__}; expected its kind and settings")
         for name, value in {"kind": self.kind, **self.settings()}.items():
@@ -147,51 +143,50 @@ class PlaceMap(nn.Module, ABC):
                 raise InputError(f"the map's {name} is {state.get(name)!r}; expected {value!r}")
         sizes = state.get("places"), state.get("dimension")
         if not all(type(size) is int and 0 <= size < LARGEST for size in sizes):
-            seen = f"the map has {sizes[0]!r} places of {sizes[1]!r} features"
-            raise InputError(f"{seen}; expected whole numbers")
+            raise InputError(f"the map's places and dimension are {sizes!r}; expected integers from 0")
         self.places, self.dimension = state["places"], state["dimension"]
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        if not any(name.startswith(prefix) for name in state_dict):  # of other parts of a model
+        if not any(name.startswith(prefix) for name in state_dict):  # the state of other parts of a model
             super()._load_from_state_dict(state_dict, prefix, *args)
             return
         before = self.__dict__ | {"_buffers": {**self._buffers}, "_parameters": {**self._parameters}}
         try:
-            if prefix + EXTRA in state_dict:  # before any tensor is touched
+            if prefix + EXTRA in state_dict:  # before any tensor changes
                 self.set_extra_state(state_dict[prefix + EXTRA])
             for name, own in [*self.named_buffers(recurse=False), *self.named_parameters(recurse=False)]:
-                trained = isinstance(own, nn.Parameter)  # one that holds something keeps its shape
+                trained = isinstance(own, nn.Parameter)  # keeps its shape unless it is empty
                 if prefix + name in state_dict and not (trained and own.numel()):
                     new = torch.empty_like(state_dict[prefix + name], device=own.device)
                     setattr(self, name, nn.Parameter(new) if trained else new)
             super()._load_from_state_dict(state_dict, prefix, *args)
             self.check()
             self.loaded()
-        except InputError:  # a state that is refused leaves the map as it was
+        except InputError:  # a refused state leaves the map as it was
             self.__dict__.clear()
             self.__dict__.update(before)
             raise
 
     def packed(self) -> dict[str, Tensor]:
-        """The tensors of a file: those of the state, without visits if all places are of one."""
-        left_out = {EXTRA} if len(self.visits) else {EXTRA, "visits"}
-        return {name: value for name, value in self.state_dict().items() if name not in left_out}
+        """The tensors of a file: the state's, without visits if every place has one."""
+        omitted = {EXTRA} if len(self.visits) else {EXTRA, "visits"}
+        return {name: value for name, value in self.state_dict().items() if name not in omitted}
 
     def load_packed(self, tensors: dict[str, Tensor], extra: dict[str, Any]) -> None:
-        """Load what `packed` and `get_extra_state` gave; other tensors are an InputError."""
+        """Load the results of `packed` and `get_extra_state`; other tensors are an InputError."""
         own = self.state_dict().keys() - {EXTRA}
         if not own - {"visits"} <= tensors.keys() <= own:
             seen = f"it holds {', '.join(sorted(tensors)) or 'nothing'}"
             raise InputError(f"{seen} of a map; expected {', '.join(sorted(own))}")
-        once = {"visits": self.visits[:0]} if "visits" in own else {}
-        self.load_state_dict({**once, **tensors, EXTRA: extra})
+        default = {"visits": self.visits[:0]} if "visits" in own else {}
+        self.load_state_dict({**default, **tensors, EXTRA: extra})
 
 
 class Mapper(nn.Module, ABC):
     """Makes a map of N places from descriptors (N,D). Subclass it, and `PlaceMap`, for another kind of map.
 
     Attributes:
-        kind: of its maps, the name that they store.
+        kind: see `PlaceMap`.
         whitens: whether it expects whitened descriptors by default.
     """
 
@@ -207,5 +202,5 @@ class Mapper(nn.Module, ABC):
         """A map without places, which can load any map of this mapper."""
 
     def with_overhead(self, overhead: int) -> Mapper:
-        """The mapper that leaves room in its budget, if any, for what else grows with the places."""
+        """A mapper whose budget, if it has one, includes this many other bytes that grow with the places."""
         return self

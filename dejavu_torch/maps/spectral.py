@@ -1,4 +1,4 @@
-"""The mapper of spectral maps: it finds the step that fits a budget, and codes the lines in it."""
+"""The mapper of spectral maps: it finds the quantisation step for a budget, and codes the lines."""
 
 from __future__ import annotations
 
@@ -14,44 +14,39 @@ from dejavu_torch.maps.place_map import Mapper
 from dejavu_torch.maps.quantisation import RouteLines
 from dejavu_torch.maps.spectral_map import CHUNK_BYTES, Chunk, SpectralMap, SpectralMetric
 from dejavu_torch.maps.spectrum import Transform
+from dejavu_torch.text import settings_of
 from dejavu_torch.types import InputError
 
 log = logging.getLogger("dejavu_torch")
 
-ROWS = 2**14  # of descriptors, checked at a time
-HALF = 0.5  # of the variance: a map that holds less says which bytes would hold `HELD`
-HELD = 0.85  # of the variance by default: such maps find nearly what their descriptors find
-LINE_BYTES = 5.0  # per place: what lines by default take at least, if they hold more in it
+ROWS = 2**14  # descriptors checked at a time
+HALF = 0.5  # share of the variance; a map that holds less reports the bytes that would hold `HELD`
+HELD = 0.85  # default share of the variance: such maps are nearly as accurate as their descriptors
+LINE_BYTES = 5.0  # per place: lines take as many by default, if they then hold more
 
 
 class SpectralMapper(Mapper):
-    """Codes descriptors along the route: the spectrum of each dimension over a chunk, in steps of one size.
+    """Codes descriptors along the route: the spectrum of each dimension over a chunk, all with one step.
 
     Args:
-        route_bytes_per_place: bytes of the map for each place, without those that do not grow with the route;
-            the step is the smallest whose coded lines fit. Positions of frames count, but come on top, with a
-            warning, if they would leave the lines less than half. None leaves the step to `step` or `hold`.
-        step: the step itself, in units of the descriptor, in place of the bytes.
-        chunk: places of a chunk. Shorter chunks cost more bytes; a route no longer than one has one.
+        route_bytes_per_place: bytes that grow with the route; the step is the smallest that fits. Positions
+            of frames are included, unless they need over half: then they come on top, with a warning.
+        step: the step itself, in units of the descriptor.
+        chunk: places of a chunk. Shorter chunks cost more bytes; a shorter route is one chunk.
         transform, metric: of the maps, see `SpectralMap`.
-        resolution: places; 0 codes all lines alike. The dead zone of a line of period P is
-            1 + (resolution / P)^2 times as wide. For video with many frames for each place that a user tells
-            apart 8 makes a better map; if every frame is another place it makes a worse one.
-        hold: in place of the bytes, the share of the descriptors' variance that the lines hold: 1 - the sum
-            of squares of what is missing / that of the differences from the mean. The step is the largest
-            that holds it; `resolution` then leaves out lines that count in it. None, without bytes and step,
-            is .85, and more if lines of 5 bytes per place hold it: few features tell places apart by small
-            differences.
+        resolution: places; the dead zone of a line of period P is 1 + (resolution / P)^2 times as wide.
+            For video with many frames per place, 8 makes a better map than 0; with few, a worse one.
+        hold: share of the descriptors' variance that the lines hold before `resolution` removes any: 1 -
+            squared errors / squared differences from the mean. The step is the largest that holds it. None,
+            without bytes and step, is .85, or more if 5 bytes per place hold more, as with few features.
 
     Shape: descriptors (N,K) -> SpectralMap of N places.
 
-    Convention: the written route is within 2 % of the budget and not above it, unless steps so fine that they
-        change no score take less. Without `resolution` the share that a map holds is at least `hold`, unless
-        even such steps hold less; that of a long route is as its sample tells.
+    Convention: the written route takes 98 to 100 % of the budget, or less if the finest useful step needs
+        less. Without `resolution` a map holds `hold`, or what that step holds; samples stand for long routes.
 
     Raises:
-        InputError: settings out of range; forward: fewer than two places, descriptors that are not finite or
-            all alike, or a budget that cannot be met.
+        InputError: settings out of range; forward: no two different finite descriptors, too few bytes.
 
     Example:
         >>> wave = torch.sin(torch.arange(500.0)[:, None] * torch.tensor([0.1, 0.23, 0.37]))
@@ -77,7 +72,7 @@ class SpectralMapper(Mapper):
         given = {name: value for name, value in every.items() if value is not None}
         if len(given) > 1:
             seen = " and ".join(f"{name} is {value}" for name, value in given.items())
-            raise InputError(f"{seen}; expected one of them, None for the rest")
+            raise InputError(f"{seen}; expected one of them, None for the others")
         for name, value in given.items():
             if not 0 < value < (1 if name == "hold" else math.inf):
                 share = " and below 1, such as 0.85" if name == "hold" else ""
@@ -89,16 +84,13 @@ class SpectralMapper(Mapper):
 
     @classmethod
     def of_equal_size(cls, route: SpectralMap) -> SpectralMapper:
-        """Makes maps of other routes with a map's settings, that take as many bytes a place.
-
-        All lines count alike: what is fast is noise in a smooth route, but not in one that is not.
-        """
+        """A mapper with a map's settings and bytes per place, but no `resolution`, for routes of any kind."""
         size = (route.summary().route_bytes - route.positions.nbytes) / route.places
         return cls(size, None, route.chunk, route.transform, route.metric)
 
     @property
     def share(self) -> float | None:
-        """Of the variance that maps hold, by default or more; None where bytes or a step decide."""
+        """The share of the variance that maps hold at least; None if bytes or a step decide."""
         given = self.route_bytes_per_place is not None or self.step is not None
         return None if given else self.hold or HELD
 
@@ -112,17 +104,11 @@ class SpectralMapper(Mapper):
 
     @torch.no_grad()
     def fit(self, sample: Tensor, stretch: int, share: float = 1.0) -> SpectralMap:
-        """A map without places: mean and step for chunks of a route, from descriptors (n,K) of stretches.
-
-        Args:
-            share: of the route's places that are in the sample, which pays for as much of the mean.
-        """
+        """A map without places: mean and step for the chunks of a route, from sampled stretches (n,K) of it.
+        The sample pays for a `share` of the mean, its part of the route's places."""
         return self._fitted(sample, stretch, share)[0]
 
-    def empty(self) -> SpectralMap:
-        return self._map()
-
-    def _map(self, means: Tensor | None = None, step: float = 0.0) -> SpectralMap:
+    def empty(self, means: Tensor | None = None, step: float = 0.0) -> SpectralMap:
         return SpectralMap(means, self.metric, self.transform, self.chunk, self.resolution, step)
 
     def with_overhead(self, overhead: int) -> SpectralMapper:
@@ -130,53 +116,48 @@ class SpectralMapper(Mapper):
         other.overhead = overhead
         return other
 
-    def extra_repr(self) -> str:
-        names = ("route_bytes_per_place", "step", "chunk", "transform", "metric", "resolution", "hold")
-        return ", ".join(f"{name}={getattr(self, name)!r}" for name in names)
+    extra_repr = settings_of
 
     def _fitted(self, features: Tensor, chunk: int, share: float = 1.0) -> tuple[SpectralMap, RouteLines]:
-        """The map without places, and the lines to code in its step."""
+        """The map without places, and the lines to code with its step."""
         check_descriptors(features)
         places = len(features)
         lengths = [min(chunk, places - start) for start in range(0, places, chunk)]
         lines = RouteLines(features, lengths, self.transform, self.resolution)
         if not lines.scale > 1e-6 * float(lines.mean.float().square().mean().sqrt()):
-            raise InputError(f"the {places} descriptors are all alike; expected a route that changes")
+            raise InputError(f"the {places} descriptors are all the same; expected a route that changes")
         fixed = round(share * lines.mean_bytes) + CHUNK_BYTES * len(lines.chunks)
         budget = self.route_bytes_per_place
         if budget is not None:
             if self.overhead <= max(0, budget * places - fixed) / 2:
                 fixed += self.overhead
             else:
-                log.warning(
-                    "positions of frames take %.3g bytes per place, over half of what "
-                    "route_bytes_per_place=%g leaves for them and the lines: they come on top of it",
-                    *(self.overhead / places, budget),
-                )
-        step = float(torch.tensor(self._fitting_step(lines, fixed)))  # as the file holds it
-        route = self._map(lines.mean[None], step)
-        even = lines.even()  # what `resolution` leaves out is not missed
+                seen = f"positions of frames take {self.overhead / places:.3g} bytes per place"
+                left = f"what route_bytes_per_place={budget:g} leaves for them and the lines"
+                log.warning(f"{seen}, over half of {left}: they come on top of it")
+        step = float(torch.tensor(self._fitting_step(lines, fixed)))  # float32, as in the file
+        route = self.empty(lines.mean[None], step)
+        even = lines.even()  # lines that `resolution` removes do not count as missing
         if self.share is None and even.held(step) < HALF:
             route.needed = (fixed + lines.coded_bytes(even.step_that_holds(HELD))) / places
         return route, lines
 
     def _fitting_step(self, lines: RouteLines, fixed: int) -> float:
-        """The smallest step whose coded lines fit into the budget, to 2 %, or the mapper's own step."""
+        """The smallest step whose coded lines fit into the budget, or the step that `step` or `hold` says."""
         if self.step is not None:
             return self.step
         if self.route_bytes_per_place is None:
             step = lines.even().step_that_holds(self.hold or HELD)
             room = 0 if self.hold else LINE_BYTES * len(lines.lines)
             return lines.step_of(room) if lines.coded_bytes(step) < room else step
-        places, numbers = lines.lines.shape
+        places, dimension = lines.lines.shape
         budget, least = self.route_bytes_per_place, (fixed + lines.coded_bytes(lines.coarsest)) / places
-        most = math.floor(least) + 4 * numbers  # all numbers as floats
+        most = math.floor(least) + 4 * dimension  # all numbers as floats
         if not least < budget <= most:
-            works = math.ceil(least + min(5, 2 * numbers))
-            raise InputError(
-                f"route_bytes_per_place is {budget:g}; expected more than {least:.3g}, which a mean, "
-                f"chunks and positions take, such as {works}, and at most {most}, with all numbers as floats"
-            )
+            example = math.ceil(least + min(5, 2 * dimension))
+            expected = f"more than {least:.3g} for mean, chunks and positions, such as {example}"
+            expected += f", and at most {most}, with all numbers as floats"
+            raise InputError(f"route_bytes_per_place is {budget:g}; expected {expected}")
         return lines.step_of(budget * places - fixed)
 
 
@@ -184,7 +165,7 @@ class SpectralMapper(Mapper):
 def code_chunk(
     descriptors: Tensor, mean: Tensor, step: float, transform: Transform = "dft", resolution: float = 0.0
 ) -> Chunk:
-    """The lines of one chunk, coded: what `SpectralMap.extend` adds, here or on any machine.
+    """The coded lines of one chunk, for `SpectralMap.extend`; the same on any machine.
 
     Args:
         mean: (K,) of the route's descriptors. step: of the lines. transform, resolution: of the map.
@@ -201,7 +182,7 @@ def code_chunk(
 
 
 def check_descriptors(features: Tensor, dimension: int | None = None) -> None:
-    """Refuse descriptors that make no route, or with a dimension, no chunk of one."""
+    """Refuse what is not a route of descriptors or, with a dimension, a chunk of one."""
     least, expected = (2, "K") if dimension is None else (1, dimension)
     fits = features.ndim == 2 and len(features) >= least and dimension in (None, features.shape[1])
     if not fits or not features.numel() or not features.is_floating_point():

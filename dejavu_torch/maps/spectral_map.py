@@ -1,4 +1,4 @@
-"""The spectral map: the strongest lines of every feature's spectrum along the route, and nothing else."""
+"""The spectral map: the strongest lines of every feature's spectrum along the route."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from torch import Tensor
 from dejavu_torch.maps.codec import Stream, decode
 from dejavu_torch.maps.file import checked
 from dejavu_torch.maps.frame_table import Route
-from dejavu_torch.maps.place_map import PlaceMap, require
+from dejavu_torch.maps.place_map import PlaceMap, ScoreBlocks, require
 from dejavu_torch.maps.spectrum import Transform, from_slots, half_cycles, slots
 from dejavu_torch.maps.summary import ChunkSummary, MapSummary
 from dejavu_torch.types import InputError
 
 SpectralMetric = Literal["cosine", "l2"]
-MIN_NORM = 1e-6  # of the RMS norm in a chunk, or the mean's: a shorter descriptor has no direction
-STRONGEST = 10  # periods that a summary names
-LARGEST = 2**31 - 1  # places of a map, and its coefficients: what int32 holds
-BLOCK = 2**19  # numbers computed at a time: they stay in the processor's cache
-LONG = 2**22  # numbers of a long chunk that are computed at a time
-TOGETHER = 16  # queries at least that are multiplied with lines at a time
-COPIES = 4  # numbers held for a place and a query: line, transform, score, is it best
+MIN_NORM = 1e-6  # of the RMS norm in a chunk, or of the mean's norm: shorter descriptors count as 0
+STRONGEST = 10  # periods in a summary
+LARGEST = 2**31 - 1  # places of a map, or its coefficients, for int32
+BLOCK = 2**19  # numbers computed at a time, to stay in the processor's cache
+LONG = 2**22  # numbers of a long chunk computed at a time
+TOGETHER = 16  # queries multiplied with lines at a time, at least
+COPIES = 4  # numbers per place and query: line, transform, score, comparison with the best
 FILE = {  # dtype and dimensions of the tensors of a file
     "lengths": (torch.int64, 1),
     "steps": (torch.float32, 1),
@@ -39,13 +39,13 @@ FILE = {  # dtype and dimensions of the tensors of a file
     "means": (torch.bfloat16, 2),
     "visits": (torch.int32, 2),
 }
-CHUNK_BYTES = 8 + 4 + 8 + 8  # of a chunk's length, step, stream length and checksum in the file
+CHUNK_BYTES = 8 + 4 + 8 + 8  # a chunk's length, step, stream length and checksum in a file
 
 
 class Chunk(NamedTuple):
-    """All that a file holds of some places.
+    """Consecutive places as a file stores them.
 
-    energy, error: the sums of squares of all lines and of what the levels miss; 0 if not known.
+    energy, error: the sums of squares of all lines and of the quantisation errors; 0 if not known.
     """
 
     places: int
@@ -56,7 +56,7 @@ class Chunk(NamedTuple):
 
 
 class SpectralState(NamedTuple):
-    """What `SpectralMap.get_extra_state` gives; see its arguments."""
+    """The result of `SpectralMap.get_extra_state`; see its arguments."""
 
     kind: Literal["spectral"]
     places: int
@@ -69,7 +69,7 @@ class SpectralState(NamedTuple):
 
 
 class Lines(NamedTuple):
-    """Coefficients other than 0: the number of the line, the feature, and the value; (L,) each."""
+    """Nonzero coefficients: the index of the line, the feature, and the value; (L,) each."""
 
     line: Tensor
     feature: Tensor
@@ -79,38 +79,34 @@ class Lines(NamedTuple):
 class SpectralMap(PlaceMap):
     """A list of coded chunks: the quantised spectrum of descriptors along time, scored without decoding it.
 
-    A phase mean repeated along a chunk (eq. 1) is the descriptor's projection onto the harmonics of 1 / tau;
-    this map keeps whichever lines of the spectrum are worth their bytes: transform coding with one step for
-    all lines, which is reverse water-filling (Cover and Thomas, section 10.3.3).
+    A phase mean repeated along a chunk (eq. 1) is the descriptor's projection onto the harmonics of 1 / tau.
+    This map keeps all lines that are worth their bytes: transform coding with one step for all lines, which
+    is reverse water-filling (Cover and Thomas, section 10.3.3).
 
     Buffers, the tensors of a file:
         lengths: (G,) int64, places of each chunk. steps: (G,) float32, of each chunk.
         streams, stream_table: coded levels; bytes and checksum of each chunk.
-        means: (R,K) bfloat16, of the descriptors of each route, small ones 0: the lines code the difference.
-    Buffers that follow from these:
-        counts, feature, level: coefficients of each of N lines; of each of L coefficients the feature,
-            ascending within a line, and the value in steps; in the smallest types that hold them.
-        norms: (N,) float32, of the descriptors that the map holds; 0 for next to none (`MIN_NORM`).
+        means: (R,K) bfloat16, subtracted from the descriptors of each route; small means are 0.
+    Buffers derived from these:
+        counts, feature, level: number of coefficients of each of N lines; for each of L coefficients its
+            feature, ascending within a line, and its value in steps; in the smallest dtypes possible.
+        norms: (N,) float32, of the coded descriptors; tiny ones are 0 (`MIN_NORM`).
 
     Attributes:
-        chunks: the places [start, stop) of each. needed: bytes per place that would hold .85 of the variance
-            of a learned route, if its bytes or its step hold less than half, else None.
-        energy, error: sums over the chunks that were added, not loaded; see `Chunk`.
+        chunks: the places [start, stop) of each. energy, error: see `Chunk`, summed over added chunks.
+        needed: bytes per place to hold .85 of the variance, if the map was learned and holds less than half.
 
     Args:
         means: as above; None makes a map that can load any state.
-        metric: "cosine": 1 - the cosine of the angle between query and coded descriptor. "l2": the square
-            of their distance.
+        metric: "cosine": 1 - cosine of query and coded descriptor. "l2": their squared distance.
         transform: see `spectrum`. chunk, resolution: see `SpectralMapper`. step: of the first chunk.
 
     Shape: scores: descriptors (Q,K) -> (Q,N), lower is better.
 
-    Convention: a place of norm 0 has cosine 0 with every query, and no gradient; so has a query of length 0.
-        Gradients reach the queries.
+    Convention: norm 0, of a place or a query, means cosine 0 and no gradient. Gradients reach the queries.
 
     Raises:
-        InputError: settings out of range, buffers that do not fit together; scores: descriptors of another
-            dimension.
+        InputError: settings out of range, inconsistent buffers; scores: another dimension.
     """
 
     kind = "spectral"
@@ -155,24 +151,24 @@ class SpectralMap(PlaceMap):
             self.to(means.device)
 
     def _clear(self) -> None:
-        """Forget the chunks, and what was decoded of them."""
+        """Remove all chunks and their decoded lines."""
         for name in ("lengths", "steps", "stream_table", "streams", "visits"):
             setattr(self, name, getattr(self, name)[:0])
-        self.counts = self.lengths.to(_type_for(self.dimension))
-        self.feature = self.lengths.to(_type_for(self.dimension - 1))
+        self.counts = self.lengths.to(_dtype_for(self.dimension))
+        self.feature = self.lengths.to(_dtype_for(self.dimension - 1))
         self.level, self.norms = self.lengths.to(torch.int8), self.lengths.float()
         self.chunks: list[tuple[int, int]] = []
-        self._bounds = [0]  # in the coefficients, of the chunks
+        self._bounds = [0]  # of each chunk's coefficients
         self.places, self.energy, self.error = 0, 0.0, 0.0
 
     def extend(self, chunks: Iterable[Chunk], levels: Iterable[Tensor] | None = None) -> None:
-        """Add the places of coded chunks; the others stay as they are, to the bit.
+        """Add the places of coded chunks; the scores of the others do not change.
 
         Args:
             levels: (W,K) of each chunk, if they are known; else the streams are decoded.
 
         Raises:
-            InputError: a stream that is altered, or more places than a map has.
+            InputError: an altered stream, or too many places.
         """
         chunks = [*chunks]
         if not chunks:
@@ -180,17 +176,13 @@ class SpectralMap(PlaceMap):
         places, device = [one.places for one in chunks], self.means.device
         if levels is None:
             with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-                parts = [
-                    *pool.map(lambda one: _nonzero(decode(one.stream, one.places, self.dimension)), chunks)
-                ]
+                parts = [*pool.map(lambda c: _nonzero(decode(c.stream, c.places, self.dimension)), chunks)]
         else:
             parts = [_nonzero(one) for one in levels]
         sizes = self.places + sum(places), self._bounds[-1] + sum(len(level) for *_, level in parts)
         if max(sizes) > LARGEST:
-            raise InputError(
-                f"the map has {sizes[0]} places and {sizes[1]} coefficients; expected at most {LARGEST} of "
-                "each: make several maps"
-            )
+            seen = f"the map has {sizes[0]} places and {sizes[1]} coefficients"
+            raise InputError(f"{seen}; expected at most {LARGEST} of each: make several maps")
 
         def append(name: str, *more: Tensor) -> None:
             setattr(self, name, torch.cat([getattr(self, name), *(one.to(device) for one in more)]))
@@ -225,25 +217,24 @@ class SpectralMap(PlaceMap):
 
     @property
     def held(self) -> float | None:
-        """The share of the variance that the lines hold, of chunks that were not loaded; None for none."""
+        """The share of the variance that the lines hold, over added chunks; None if there are none."""
         return 1 - self.error / self.energy if self.energy else None
 
     def coded(self) -> list[Chunk]:
-        """The chunks as a file holds them: what `extend` takes."""
+        """The chunks as a file stores them, for `extend`."""
         sizes, checksums = self.stream_table.T.tolist()
         streams = map(Stream, self.streams.cpu().split(sizes), checksums)
         return [*map(Chunk, self.lengths.tolist(), self.steps.tolist(), streams)]
 
     def of_chunks(self, chunks: Iterable[Chunk]) -> SpectralMap:
-        """A map of other chunks with the mean and settings of this one, on its device."""
+        """A map of other chunks with this map's mean, settings and device."""
         made = SpectralMap(self.means, **self.settings())
         made.extend(chunks)
         return made
 
     @classmethod
     def merged(cls, parts: Sequence[SpectralMap], names: Sequence[str]) -> SpectralMap:
-        """The map of several routes of one dimension, metric and transform, each with its own mean and steps;
-        `growth.merge` checks that."""
+        """The map of several routes, each with its own mean and steps; `growth.merge` checks the routes."""
         made = cls(torch.cat([part.means for part in parts]), **parts[0].settings())
         sizes = ((part.places, part.table.frames) for part in parts)
         made.routes = tuple(Route(name, *size) for name, size in zip(names, sizes, strict=True))
@@ -254,11 +245,7 @@ class SpectralMap(PlaceMap):
         return made
 
     def part(self, name: str) -> SpectralMap:
-        """The map of one route by itself.
-
-        Raises:
-            InputError: there is no such route.
-        """
+        """The map of one route alone; an InputError if there is no such route."""
         names = [one.name for one in self.routes]
         if name not in names:
             raise InputError(f"there is no route {name!r}; expected one of {', '.join(names)}")
@@ -272,7 +259,7 @@ class SpectralMap(PlaceMap):
         return made
 
     def between(self, first: int, last: int) -> SpectralMap:
-        """The chunks [first, last) as a map, whose places score as in this one."""
+        """A map of the chunks [first, last), with the same scores."""
         routes = self._routes_of(range(first, last))
         own, counts = routes.unique_consecutive(return_counts=True)
         made = SpectralMap(self.means[own], **self.settings())
@@ -284,7 +271,7 @@ class SpectralMap(PlaceMap):
 
     @property
     def step(self) -> float:
-        """Of the last chunk, and of those to come."""
+        """Of the last chunk, and of the next."""
         return float(self.steps[-1]) if len(self.steps) else self._step
 
     def lines(self, chunk: int) -> Lines:
@@ -295,7 +282,7 @@ class SpectralMap(PlaceMap):
         return Lines(line, self.feature[some].long(), level * self.steps[chunk])
 
     def decode(self, chunk: int) -> Tensor:
-        """The descriptors of a chunk as the map holds them, (W,K) float32."""
+        """The coded descriptors of a chunk, (W,K) float32."""
         return torch.cat([*self._features(chunk)]).T
 
     def _features(self, chunk: int) -> Iterator[Tensor]:
@@ -306,8 +293,7 @@ class SpectralMap(PlaceMap):
             yield self.products(some, range(chunk, chunk + 1))
 
     def samples(self, chunk: int, count: int) -> Tensor:
-        """Descriptors at so many even positions of a chunk, low-passed: the inverse transform of as many
-        lines, -> (M,K)."""
+        """Low-passed descriptors at M = `count` even positions of a chunk, from the first M lines: (M,K)."""
         (start, stop), (line, feature, value) = self.chunks[chunk], self.lines(chunk)
         slot, factor = slots(stop - start, self.transform, value.dtype, value.device)
         size = len(slots(count, self.transform, value.dtype, value.device)[1])
@@ -322,9 +308,9 @@ class SpectralMap(PlaceMap):
         return from_slots(low, count, self.transform).T * math.sqrt(count / (stop - start))
 
     def sampled(self, chunk: int, count: int) -> Tensor:
-        """The places in a chunk that are nearest to so many even positions, (M,) int64."""
+        """The places in a chunk nearest to M = `count` even positions, (M,) int64."""
         start, stop = self.chunks[chunk]
-        half = 0.5 if self.transform == "dct" else 0.0  # its places are in the middle of a step
+        half = 0.5 if self.transform == "dct" else 0.0  # DCT places are in the middle of a step
         at = (torch.arange(count, device=self.norms.device) + half) * ((stop - start) / count) - half
         return at.round().long().clamp(max=stop - start - 1)
 
@@ -334,13 +320,12 @@ class SpectralMap(PlaceMap):
         return torch.where(norms > 0, 1 / norms, 0)
 
     def products(self, queries: Tensor, chunks: range) -> Tensor:
-        """Inner products with all descriptors of equally long chunks: (Q,K) -> (Q,W G).
+        """Inner products with all descriptors of G chunks of equal length W: (Q,K) -> (Q,W G).
 
-        The inverse transform is linear, so they are the inverse transform of the products with the lines:
-        O(lines + W log W) for a query instead of O(W K). No autocast.
+        Inverse transforms of products with the lines: O(lines + W log W) per query, not O(W K). No autocast.
         """
         parts = [queries]
-        if not torch.compiler.is_compiling():  # what is held for the others stays in the cache
+        if not torch.compiler.is_compiling():  # fewer queries at a time stay in the cache
             places = self.chunks[chunks.stop - 1][1] - self.chunks[chunks.start][0]
             parts = [*queries.split(max(TOGETHER, BLOCK // places))]
         with torch.autocast(queries.device.type, enabled=False):
@@ -364,7 +349,7 @@ class SpectralMap(PlaceMap):
         return from_slots(lines, length, self.transform).flatten(1)
 
     def _runs(self, first: int, last: int, rows: int) -> Iterator[range]:
-        """Consecutive chunks of equal length, as many as have `BLOCK` numbers in so many rows."""
+        """Consecutive chunks of equal length, with at most `BLOCK` numbers in this many rows."""
         while first < last:
             start, stop = self.chunks[first]
             most = min(last, first + max(1, BLOCK // (rows * (stop - start))))
@@ -375,20 +360,17 @@ class SpectralMap(PlaceMap):
             first = end
 
     def _span(self, start: int, stop: int) -> tuple[int, int]:
-        """The chunks [first, last) that hold the places [start, stop)."""
-        if (start, stop) == (0, self.places):  # torch.compile does not follow bisect
+        """The chunks [first, last) that contain the places [start, stop)."""
+        if (start, stop) == (0, self.places):  # torch.compile does not support bisect
             return 0, len(self.chunks)
         first = bisect.bisect_right(self.chunks, start, key=lambda chunk: chunk[1])
         return first, bisect.bisect_left(self.chunks, stop, key=lambda chunk: chunk[0])
 
     def scores(self, queries: Tensor) -> Tensor:
-        """Scores of all places: (Q,K) -> (Q,N)."""
         return torch.cat([scores for _, scores in self.score_blocks(queries)], 1)
 
-    def score_blocks(
-        self, queries: Tensor, start: int = 0, stop: int | None = None
-    ) -> Iterator[tuple[int, Tensor]]:
-        """See `PlaceMap`: of consecutive chunks, as many as the processor's cache has room for."""
+    def score_blocks(self, queries: Tensor, start: int = 0, stop: int | None = None) -> ScoreBlocks:
+        """See `PlaceMap`: blocks of consecutive chunks that fit into the processor's cache."""
         stop = self.places if stop is None else stop
         self.check_queries(queries)
         queries = queries.to(torch.promote_types(queries.dtype, torch.float32))
@@ -396,7 +378,7 @@ class SpectralMap(PlaceMap):
         if self.metric == "cosine":
             queries = queries / torch.where(length > 0, length, 1)
         rows = self.dimension
-        if not torch.compiler.is_compiling():  # a program has the same blocks for any number of queries
+        if not torch.compiler.is_compiling():  # a compiled program has the same blocks for any Q
             rows = max(1, queries.shape[0] + len(self.level) // max(1, self.places))
         for run in self._runs(*self._span(start, stop), rows):
             begin, end = self.chunks[run.start][0], self.chunks[run.stop - 1][1]
@@ -416,7 +398,6 @@ class SpectralMap(PlaceMap):
         return max(COPIES * longest, BLOCK // max(1, self.dimension))
 
     def settings(self) -> dict[str, Any]:
-        """See `PlaceMap`: what a map is made with."""
         return {name: getattr(self, name) for name in ("metric", "transform", "chunk", "resolution")}
 
     def get_extra_state(self) -> dict[str, Any]:
@@ -436,33 +417,28 @@ class SpectralMap(PlaceMap):
         require(fits, f"chunks of {lengths!s:.100} places; expected {self.places} in all")
         fits = len(steps) == len(lengths) and bool(((steps > 0) & steps.isfinite()).all())
         require(fits, f"steps {steps.tolist()!s:.100}; expected {len(lengths)} finite numbers above 0")
-        shape = tuple(self.stream_table.shape)
-        fits = shape == (len(lengths), 2)
-        require(fits, f"a stream table {shape} for {len(lengths)} chunks; expected a row each")
+        shape, expected = tuple(self.stream_table.shape), (len(lengths), 2)
+        require(shape == expected, f"a stream table {shape}; expected {expected}, a row for each chunk")
         sizes, size = self.stream_table[:, 0].tolist(), len(self.streams)
         fits = min(sizes, default=0) >= 0 and sum(sizes) == size
         require(fits, f"the coded lines are {size} bytes; the table claims {sizes!s:.100}")
         shape = max(1, len(self.routes)), self.dimension
         fits = means.shape in (shape, (0, self.dimension)) and bool(means.isfinite().all())
-        fits = not self.places or fits
-        require(fits, f"means {tuple(means.shape)}; expected {shape} finite numbers")
+        require(not self.places or fits, f"means {tuple(means.shape)}; expected {shape} finite numbers")
         if self.routes:
-            self._check_routes()
+            names, places, frames = zip(*self.routes, strict=True)
+            fits = len({*names}) == len(names) and all(names)
+            require(fits, f"names {', '.join(names)}; expected {len(names)} different ones")
+            ends = {*accumulate(lengths)}
+            fits = min(places) > 0 and sum(places) == self.places and ends.issuperset(accumulate(places))
+            whole = f"whole chunks, {self.places} places in all"
+            require(fits, f"routes of {[*places]!s:.100} places; expected {whole}")
+            fits = sum(frames) == self.table.frames
+            require(fits, f"routes of {[*frames]!s:.100} frames; expected {self.table.frames} in all")
         super().check()
 
-    def _check_routes(self) -> None:
-        names, places, frames = zip(*self.routes, strict=True)
-        fits = len({*names}) == len(names) and all(names)
-        require(fits, f"names {', '.join(names)}; expected another one for each of {len(names)} routes")
-        ends = {*accumulate(self.lengths.tolist())}
-        fits = min(places) > 0 and sum(places) == self.places and ends.issuperset(accumulate(places))
-        told = f"expected whole chunks, {self.places} places in all"
-        require(fits, f"routes of {[*places]!s:.100} places; {told}")
-        fits = sum(frames) == self.table.frames
-        require(fits, f"routes of {[*frames]!s:.100} frames; expected {self.table.frames} in all")
-
     def loaded(self) -> None:
-        """Decode the chunks of a file, and give its routes the means 0 that it leaves out."""
+        """Decode the chunks of a file, and restore omitted means of 0."""
         chunks, visits = self.coded(), self.visits
         if self.dimension and not len(self.means):
             self.means = self.means.new_zeros(max(1, len(self.routes)), self.dimension)
@@ -471,12 +447,11 @@ class SpectralMap(PlaceMap):
         self.visits = visits
 
     def packed(self) -> dict[str, Tensor]:
-        """See `PlaceMap`; means that are all 0 are left out."""
+        """See `PlaceMap`; means that are all 0 are omitted."""
         packed = super().packed()
         return packed if bool(self.means.any()) else packed | {"means": self.means[:0]}
 
     def summary(self) -> MapSummary:
-        """See `MapSummary`; the parts are those of the route."""
         chunks = [ChunkSummary(start, stop, self._periods(g)) for g, (start, stop) in enumerate(self.chunks)]
         packed = self.packed() if self.places else {}
         names = {"streams": "lines", "means": "mean", "positions": "positions", "visits": "visits"}
@@ -487,7 +462,7 @@ class SpectralMap(PlaceMap):
         return MapSummary(self.kind, self.places, covered, 0, 0, tuple(chunks), route, {}, len(self.level))
 
     def _periods(self, chunk: int) -> tuple[Fraction, ...]:
-        """The periods of the strongest lines, sorted; cosine and sine of one frequency count together."""
+        """The periods of the strongest lines, sorted, with the cosine and sine of each frequency together."""
         line, _, value = self.lines(chunk)
         start, stop = self.chunks[chunk]
         energy = value.new_zeros(stop - start + 1)
@@ -504,15 +479,13 @@ class SpectralMap(PlaceMap):
 
 
 def sparse_products(queries: Tensor, counts: Tensor, feature: Tensor, level: Tensor) -> Tensor:
-    """Products of queries with rows that are mostly 0.
+    """Products of queries with sparse rows: (Q,K) -> (Q,S).
 
     Args:
-        counts: (S,) of each row, how many numbers are not 0. feature, level: (L,) of these, column and value.
+        counts: (S,) nonzero numbers of each row. feature, level: (L,) column and value of each of these.
 
-    Shape: (Q,K) -> (Q,S).
-
-    Convention: by a CSR product on a CPU with MKL, made for the call, since it neither compiles nor exports;
-        elsewhere, and of tensors that are traced, by `scatter_add`. No autocast.
+    Convention: a CSR product on a CPU with MKL, whose matrix is made here since it neither compiles nor
+        exports; elsewhere, and for traced tensors, `scatter_add`. No autocast.
     """
     plain = type(queries) is Tensor and queries.device.type == "cpu"
     if plain and not torch.compiler.is_compiling() and _has_csr():
@@ -520,7 +493,7 @@ def sparse_products(queries: Tensor, counts: Tensor, feature: Tensor, level: Ten
         shape = (len(counts), queries.shape[1])
         rows = torch.sparse_csr_tensor(crow, feature.int(), level.to(queries), shape, check_invariants=False)
         with torch.autocast("cpu", enabled=False):
-            if len(queries) == 1:  # half the time of a product with a matrix
+            if len(queries) == 1:  # takes half the time of a matrix product
                 return (rows @ queries[0])[None]
             products: Tensor = rows @ queries.T
         return products.T.contiguous()
@@ -532,7 +505,7 @@ def sparse_products(queries: Tensor, counts: Tensor, feature: Tensor, level: Ten
 
 @cache
 def _has_csr() -> bool:
-    """Whether torch multiplies CSR tensors by MKL; its warning that they are in beta is shown once, here."""
+    """Whether torch multiplies CSR tensors by MKL. Its warning that they are in beta is raised once, here."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         torch.eye(2).to_sparse_csr()
@@ -540,7 +513,7 @@ def _has_csr() -> bool:
 
 
 def _rows(counts: Tensor, total: int) -> Tensor:
-    """The row of each of so many numbers, (L,) int64; `total` is known, and need not be read off a device."""
+    """The row of each number, (L,) int64; passing L as `total` avoids reading it from the device."""
     rows = torch.arange(counts.shape[0], device=counts.device)
     return rows.repeat_interleave(counts.int(), output_size=total)
 
@@ -549,9 +522,9 @@ def _nonzero(levels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """counts (W,), feature (L,) and level (L,) of levels (W,K)."""
     width, parts = levels.shape[1], []
     for rows in levels.split(max(1, BLOCK // width)):
-        there = rows != 0
-        counts = there.sum(1).to(_type_for(width))
-        parts.append((counts, there.nonzero()[:, 1].to(_type_for(width - 1)), rows[there]))
+        nonzero = rows != 0
+        counts = nonzero.sum(1).to(_dtype_for(width))
+        parts.append((counts, nonzero.nonzero()[:, 1].to(_dtype_for(width - 1)), rows[nonzero]))
     counts, feature, level = (torch.cat(column) for column in zip(*parts, strict=True))
     if level.dtype != torch.int8:
         largest = int(level.abs().max()) if len(level) else 0
@@ -559,5 +532,5 @@ def _nonzero(levels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return counts, feature, level
 
 
-def _type_for(number: int) -> torch.dtype:
+def _dtype_for(number: int) -> torch.dtype:
     return torch.uint8 if number < 2**8 else torch.int16 if number < 2**15 else torch.int32

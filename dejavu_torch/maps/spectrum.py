@@ -1,4 +1,4 @@
-"""Orthonormal real transforms along time: which frequencies a series is made of, a line for each."""
+"""Orthonormal real transforms along time; the coefficients are called lines."""
 
 from __future__ import annotations
 
@@ -8,20 +8,19 @@ from functools import lru_cache
 from typing import Literal, TypeVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 Transform = Literal["dft", "dct"]
 N = TypeVar("N", int, Tensor)
 
 
 def spectrum(series: Tensor, transform: Transform = "dft") -> Tensor:
-    """The lines of W numbers in time; there are W of them.
+    """The W lines of a series of W numbers.
 
     Args:
         series: float; gradients pass.
-        transform: "dft": line 0 is the mean, lines 2k - 1 and 2k are the cosine and the sine of k cycles; of
-            an even W the last line is the cosine of W / 2 cycles. "dct" (DCT-II): line r is the cosine of r
-            half cycles.
+        transform: "dft": line 0 is the mean, lines 2k - 1 and 2k are the cosine and the sine of k cycles (at
+            W / 2 cycles only the cosine). "dct" (DCT-II): line r is the cosine of r half cycles.
 
     Shape: (...,W) -> (...,W).
 
@@ -38,48 +37,42 @@ def spectrum(series: Tensor, transform: Transform = "dft") -> Tensor:
         cosine, sine = _quarter_steps(series)
         return (halves.real * cosine + halves.imag * sine) * _scale(series, transform)
     parts = torch.view_as_real(torch.fft.rfft(series, norm="ortho")).flatten(-2)
-    lines = torch.cat([parts[..., :1], parts[..., 2 : count + 1]], -1)  # the mean has no sine; nor have W / 2
+    lines = torch.cat([parts[..., :1], parts[..., 2 : count + 1]], -1)  # 0 and W / 2 cycles have no sine
     return lines * _scale(series, transform)
 
 
 def from_spectrum(lines: Tensor, transform: Transform = "dft") -> Tensor:
-    """The series that has these lines: the inverse of `spectrum`. (...,W) -> (...,W)"""
+    """The inverse of `spectrum`: (...,W) -> (...,W)."""
     count = lines.shape[-1]
     slot, factor = slots(count, transform, lines.dtype, lines.device)
     slotted = lines.new_zeros(*lines.shape[:-1], len(factor)).index_copy(-1, slot, lines)
     return from_slots(slotted * factor, count, transform)
 
 
-def slots(
-    count: int, transform: Transform, dtype: torch.dtype, device: torch.device
-) -> tuple[Tensor, Tensor]:
-    """The slot in which `from_slots` expects each of W lines, (W,) int64, and the factor that it expects on
-    each of the S slots, (S,); slots without a line are 0. Both may be shared: they are not to be changed."""
-    if torch.compiler.is_compiling() or type(torch.empty(0)) is not Tensor:  # of a mode that fakes tensors
-        return _slots(count, transform, dtype, device)
-    with torch.inference_mode(False):  # what is kept serves gradients too
-        return _kept_slots(count, transform, dtype, device)
+def slots(n: int, transform: Transform, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """For `from_slots`: the slot of each of n lines, (n,) int64, and the factor of each of S slots, (S,), 0
+    without a line. Both are cached: do not change them."""
+    if torch.compiler.is_compiling() or type(torch.empty(0)) is not Tensor:  # a mode of fake tensors
+        return _slots(n, transform, dtype, device)
+    with torch.inference_mode(False):  # cached tensors are also used with gradients
+        return _cached_slots(n, transform, dtype, device)
 
 
-def _slots(
-    count: int, transform: Transform, dtype: torch.dtype, device: torch.device
-) -> tuple[Tensor, Tensor]:
-    slot, size = torch.arange(count, device=device), count
+def _slots(n: int, transform: Transform, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    slot, size = torch.arange(n, device=device), n
     if transform == "dft":  # pairs of a cosine and a sine; the mean has no sine
-        slot, size = slot + (slot > 0), 2 * (count // 2) + 2
-    scale = 1 / _scale(torch.empty(count, dtype=dtype, device=device), transform)
+        slot, size = slot + (slot > 0), 2 * (n // 2) + 2
+    scale = 1 / _scale(torch.empty(n, dtype=dtype, device=device), transform)
     return slot, scale.new_zeros(size).index_copy(0, slot, scale)
 
 
-_kept_slots = lru_cache(32)(_slots)  # making them takes longer than the transform of a single query
+_cached_slots = lru_cache(32)(_slots)  # computing them takes longer than the transform of a single query
 
 
 def from_slots(slotted: Tensor, count: int, transform: Transform) -> Tensor:
-    """The series of so many numbers whose lines are in their `slots`: (...,S) -> (...,W)."""
+    """The series of W = `count` numbers from lines in their `slots`: (...,S) -> (...,W)."""
     if transform == "dct":
-        cosine, sine = _quarter_steps(slotted)
-        nothing = torch.zeros_like(slotted[..., :1])
-        parts = [torch.cat([slotted * factor, nothing], -1) for factor in (cosine, sine)]
+        parts = [nn.functional.pad(slotted * factor, (0, 1)) for factor in _quarter_steps(slotted)]
         mirrored: Tensor = torch.fft.irfft(torch.complex(*parts), n=2 * count, norm="ortho")
         return mirrored[..., :count]
     pairs = torch.view_as_complex(slotted.unflatten(-1, (-1, 2)))
@@ -88,17 +81,17 @@ def from_slots(slotted: Tensor, count: int, transform: Transform) -> Tensor:
 
 
 def half_cycles(line: N, transform: Transform) -> N:
-    """The half cycles of a line over the series."""
+    """Number of half cycles of a line over the series."""
     return line if transform == "dct" else (line + 1) // 2 * 2
 
 
 def period_of(line: int, count: int, transform: Transform = "dft") -> Fraction:
-    """The period of a line above 0, in steps of a series of `count`: W / k of k cycles."""
+    """The period of a line above 0, in steps of a series of W = `count`: W / k for k cycles."""
     return Fraction(2 * count, half_cycles(line, transform))
 
 
 def _scale(values: Tensor, transform: str) -> Tensor:
-    """What makes torch's transform orthonormal, (W,)."""
+    """The factors that make torch's transform orthonormal, (W,)."""
     count = values.shape[-1]
     scale = torch.ones(count, dtype=values.dtype, device=values.device)
     if transform == "dct":
@@ -109,7 +102,7 @@ def _scale(values: Tensor, transform: str) -> Tensor:
 
 
 def _quarter_steps(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Cosine and sine of pi r / 2W, (W,): places lie half a step from where the mirrored series begins."""
+    """Cosine and sine of pi r / 2W, (W,): the mirrored series starts half a step before the first place."""
     count = values.shape[-1]
     angles = torch.arange(count, dtype=torch.float64, device=values.device) * (math.pi / (2 * count))
     return angles.cos().to(values.dtype), angles.sin().to(values.dtype)

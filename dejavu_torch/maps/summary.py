@@ -10,15 +10,14 @@ from typing import NamedTuple
 from dejavu_torch.periods.support import common_period
 
 LAYERS_SHOWN = 6
-CHUNKS_SHOWN = 12  # of a summary in lines
-LARGE = 10**9  # a common period beyond it is no figure that a person compares
+CHUNKS_SHOWN = 12
+LARGE = 10**9  # common periods from here on are not shown
 
 
 class ChunkSummary(NamedTuple):
-    """One chunk [start, stop), and what repeats in it.
+    """One chunk [start, stop): periods of its layers, or of the ten strongest lines of a spectral map.
 
-    periods: of its layers, or of the ten strongest lines of a spectral map. features: number of features of
-    each layer; () in a spectral map.
+    features: number of features of each layer; () in a spectral map.
     """
 
     start: int
@@ -28,7 +27,7 @@ class ChunkSummary(NamedTuple):
 
     @property
     def common_period(self) -> Fraction:
-        """The least common multiple of the layers' periods, in places: the capacity; 0 without layers."""
+        """The least common multiple of the layers' periods, in places: the capacity. 0 without layers."""
         return common_period(self.periods) if self.features else Fraction(0)
 
     def __str__(self) -> str:
@@ -47,13 +46,13 @@ class ChunkSummary(NamedTuple):
 
 @dataclass(frozen=True, repr=False)
 class MapSummary:
-    """Capacity and storage of a map; prints as a few lines for a person.
+    """Capacity and storage of a map; `repr` is a readable text of a few lines.
 
     Attributes:
-        covered: places that at least one layer covers, or that have a descriptor. templates: sum of phases.
+        covered: places that at least one layer covers, or with a descriptor. templates: sum of phases.
         template_numbers: sum of phases x features. lines: of a spectral map.
-        route: bytes of the map by part, such as the templates.
-        fixed: other bytes by part, such as the backbone; of these only the names grow with the route.
+        route: bytes by part that grow with the route, such as the templates.
+        fixed: other bytes by part, such as the backbone; only the names among them grow with the route.
     """
 
     kind: str
@@ -68,12 +67,10 @@ class MapSummary:
 
     @property
     def fixed_bytes(self) -> int:
-        """Sum of `fixed`."""
         return sum(self.fixed.values())
 
     @property
     def route_bytes(self) -> int:
-        """Sum of `route`."""
         return sum(self.route.values())
 
     @property
@@ -83,11 +80,10 @@ class MapSummary:
 
     @property
     def bytes_per_place(self) -> float:
-        """`map_bytes` over the number of places."""
         return self.map_bytes / max(self.places, 1)
 
     def with_parts(self, fixed: Mapping[str, int]) -> MapSummary:
-        """The summary with further fixed parts, without those of 0 bytes."""
+        """The summary with further fixed parts, unless they have 0 bytes."""
         return replace(self, fixed={**self.fixed, **{name: size for name, size in fixed.items() if size}})
 
     def __repr__(self) -> str:

@@ -1,4 +1,4 @@
-"""The paper's kind of map: layers of phase templates and the scores they give (section III, eq. 3, eq. 4)."""
+"""The paper's kind of map: layers of phase templates, and their scores (section III, eq. 3, eq. 4)."""
 
 from __future__ import annotations
 
@@ -16,46 +16,46 @@ from torch import Tensor, nn
 from dejavu_torch.maps.distance import Metric, phase_distances
 from dejavu_torch.maps.file import checked
 from dejavu_torch.maps.layer_search import lowest
-from dejavu_torch.maps.place_map import Mapper, PlaceMap, require
+from dejavu_torch.maps.place_map import Mapper, PlaceMap, ScoreBlocks, require
 from dejavu_torch.maps.summary import ChunkSummary, MapSummary
 from dejavu_torch.maps.templates import PhaseTemplates, check_plan
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
+from dejavu_torch.text import settings_of
 from dejavu_torch.types import FrequencyLayer, InputError, Plan
 
 Reduction = Literal["mean", "sum"]
-MAX_PLACES = 2**26  # in all layers: no tensor of a file is as long as the route, a few bytes can claim any
-PHASE_COST = 8  # of a phase of two layers that are searched, in places that are scored in the same time
-SEARCH_COST = 2**15  # of any search, in the same unit
+MAX_PLACES = 2**26  # in all layers, since a file of a few bytes can claim any number
+PHASE_COST = 8  # time per phase to search two layers, in units of the time to score a place
+SEARCH_COST = 2**15  # time of any search, in the same unit
 
 
 def segments(plan: Plan, places: int) -> Iterator[tuple[int, int, tuple[int, ...]]]:
-    """Places [start, stop) that the same layers cover, and these, L of eq. 4, as positions in the plan."""
+    """Places [start, stop) that the same layers cover, and the indices of these layers, L of eq. 4."""
     cuts = sorted({0, places, *(layer.start for layer in plan), *(layer.stop for layer in plan)})
     for start, stop in pairwise(cuts):
         yield start, stop, tuple(j for j, layer in enumerate(plan) if layer.start <= start < layer.stop)
 
 
 def weight_per_feature(metric: Metric, features: int) -> float:
-    """What a layer's distance grows with: its features for l1, their root for l2, nothing for cosine."""
+    """How a layer's distance grows with its features: linearly for l1, by the root for l2, not for cosine."""
     return {"l1": features, "l2": math.sqrt(features), "cosine": 1.0}[metric]
 
 
 def log_posterior(scores: Tensor, temperature: float | Tensor) -> Tensor:
-    """How unlikely each place is, in nats: -log softmax(-S / T) over places; (Q,N) -> (Q,N), lower is better.
+    """Negative log posterior of each place in nats, -log softmax(-S / T): (Q,N) -> (Q,N), lower is better.
 
-    It makes the scores of different queries comparable: what no template explains raises S at all places, and
-    this not at all. A place that scores +inf stays +inf.
+    Scores of different queries become comparable: a shift of S at all places cancels. +inf stays +inf.
 
     Example:
         >>> log_posterior(torch.tensor([[0.0, 0.0, torch.inf]]), 0.1).tolist()
         [[0.6931471824645996, 0.6931471824645996, inf]]
     """
-    closed = scores.isinf()
-    reachable = ~closed.all(1, keepdim=True)
-    # +inf must not meet T: its gradient would be NaN
-    logits = (-scores.masked_fill(closed, 0) / temperature).masked_fill(closed & reachable, -math.inf)
-    return -logits.log_softmax(1).masked_fill(closed, -math.inf)
+    uncovered = scores.isinf()
+    reachable = ~uncovered.all(1, keepdim=True)
+    # +inf / T would have a gradient of NaN
+    logits = (-scores.masked_fill(uncovered, 0) / temperature).masked_fill(uncovered & reachable, -math.inf)
+    return -logits.log_softmax(1).masked_fill(uncovered, -math.inf)
 
 
 class TemplateMap(PlaceMap):
@@ -63,26 +63,26 @@ class TemplateMap(PlaceMap):
 
     Buffers, the tensors of a file:
         layers: (L,5) int64, period numerator, period denominator, phases, start, stop.
-        feature_ptr, feature_index: (L+1,) int64, where each layer's features begin in (sum F,) int32.
+        feature_ptr, feature_index: (L+1,) int64, the start of each layer's features in (sum F,) int32.
         templates: (sum P x F,) float, row-major (P,F) blocks in the order of the layers.
         weights: (D,) float, the factor of each feature's difference in eq. 3; (0,) for 1.
 
     Args:
-        plan, templates: the layers, and a tensor (P,F) for each, as `PhaseTemplates` gives them.
+        plan, templates: the layers, and a tensor (P,F) for each, from `PhaseTemplates`.
         places, dimension: N, and D features per frame.
         metric: distance of eq. 3, see `phase_distances`.
-        reduction: "sum" is eq. 4 as printed. "mean" divides it by the number of features summed over (l2:
-            their roots, cosine: the layers), so that places are comparable whatever covers them.
-        temperature: T of `log_posterior`, which scores then are, in their units; None leaves S as it is.
+        reduction: "sum" is eq. 4 as printed; "mean" divides it by the features in the sum (l2: their roots,
+            cosine: the layers), to compare places of any coverage.
+        temperature: T, makes scores the `log_posterior`; None leaves S unchanged.
         weights: see above; None for 1.
 
     Shape: scores: query features (Q,D) -> (Q,N), lower is better, uncovered +inf.
 
-    Convention: L in eq. 4 is the set of layers whose chunk holds i. Templates are means of `weighted`
+    Convention: L in eq. 4 is the set of layers whose chunk contains i. Templates are means of `weighted`
         features: |w H - w mu| = w |H - mu|. Gradients reach the queries and the templates.
 
     Raises:
-        InputError: arguments that do not fit together or are unknown; scores: features of another dimension.
+        InputError: unknown or inconsistent arguments; scores: features of another dimension.
 
     Example:
         >>> plan = (FrequencyLayer(2, 2, 0, 3, (0,)),)
@@ -98,7 +98,7 @@ class TemplateMap(PlaceMap):
     feature_index: Tensor
     templates: Tensor
     weights: Tensor
-    lap_phases: Tensor  # of each layer at its first places, until they repeat
+    lap_phases: Tensor  # for each layer, the phases of its first places, until they repeat
 
     def __init__(
         self,
@@ -118,8 +118,7 @@ class TemplateMap(PlaceMap):
         for layer, block in zip(plan, templates, strict=True):
             shape = layer.phases, len(layer.features)
             if block.shape != shape:
-                seen = f"a layer of {shape[0]} phases and {shape[1]} features"
-                raise InputError(f"{seen} got templates {tuple(block.shape)}; expected {shape}")
+                raise InputError(f"templates of a layer are {tuple(block.shape)}; expected (P,F) = {shape}")
         rows = [(*layer.period.as_integer_ratio(), layer.phases, layer.start, layer.stop) for layer in plan]
         index = [feature for layer in plan for feature in layer.features]
         pointer = [0, *accumulate(len(layer.features) for layer in plan)]
@@ -146,7 +145,7 @@ class TemplateMap(PlaceMap):
         if max(self.places, covered) > MAX_PLACES:
             seen = f"a map of {self.places} places, {covered} in all layers"
             raise InputError(f"{seen}; expected at most {MAX_PLACES}")
-        # phases repeat after as many places as the numerator of the period
+        # the numerator of the period is the number of places after which phases repeat
         self.laps = [min(layer.period.numerator, layer.stop - layer.start) for layer in self.plan]
         pairs = zip(self.plan, self.laps, strict=True)
         phases = [layer.phase(torch.arange(layer.start, layer.start + lap)) for layer, lap in pairs]
@@ -196,11 +195,11 @@ class TemplateMap(PlaceMap):
         return list(self.feature_index.split([len(layer.features) for layer in self.plan]))
 
     def weighted(self, features: Tensor) -> Tensor:
-        """Features times `weights`, as templates are made and compared with them: (n,D) -> (n,D)."""
+        """Features times `weights`, for templates and for queries: (n,D) -> (n,D)."""
         return features * self.weights if len(self.weights) else features
 
     def distances(self, queries: Tensor, layers: Sequence[int] | None = None) -> list[Tensor]:
-        """Eq. 3 for every layer, or for some by their positions in the plan: (Q,D) -> L tensors (Q,P)."""
+        """Eq. 3 for every layer, or for some by their indices in the plan: (Q,D) -> L tensors (Q,P)."""
         self.check_queries(queries)
         queries, features, blocks = self.weighted(queries), self.layer_features(), self.blocks()
         return [
@@ -209,20 +208,19 @@ class TemplateMap(PlaceMap):
         ]
 
     def divisor(self, layers: Sequence[int]) -> float:
-        """What the sum of the distances of these layers is divided by in S."""
+        """The number by which S divides the sum of the distances of these layers."""
         if self.reduction == "sum":
             return 1.0
         return sum(weight_per_feature(self.metric, len(self.plan[j].features)) for j in layers)
 
     def combine(self, distances: Sequence[Tensor], start: int = 0, stop: int | None = None) -> Tensor:
-        """S of the places [start, stop) from the phase distances of each layer (eq. 4): L tensors (Q,P) ->
-        (Q,stop - start). A place that no layer covers scores +inf."""
+        """S of the places [start, stop) (eq. 4), +inf if uncovered: L tensors (Q,P) -> (Q,stop - start)."""
         stop = self.places if stop is None else stop
         laps, parts = self.lap_phases.split(self.laps), []
         for begin, end, layers in self.segments:
             first, count = max(start, begin), min(stop, end) - max(start, begin)
             if count > 0 and layers:
-                rows = [_along(distances[j], laps[j], first - self.plan[j].start, count) for j in layers]
+                rows = [_at_places(distances[j], laps[j], first - self.plan[j].start, count) for j in layers]
                 parts.append(reduce(torch.add, rows) / self.divisor(layers))
             elif count > 0:
                 parts.append(torch.full_like(distances[0][:, :1], math.inf).expand(-1, count))
@@ -233,11 +231,9 @@ class TemplateMap(PlaceMap):
         scores = self._sums(queries, 0, self.places)
         return scores if self.temperature is None else log_posterior(scores, self.temperature)
 
-    def score_blocks(
-        self, queries: Tensor, start: int = 0, stop: int | None = None
-    ) -> Iterator[tuple[int, Tensor]]:
+    def score_blocks(self, queries: Tensor, start: int = 0, stop: int | None = None) -> ScoreBlocks:
         """See `PlaceMap`: one block, from the layers that cover these places."""
-        if self.temperature is not None:  # a softmax is over all places
+        if self.temperature is not None:  # the softmax needs all places
             yield start, self.scores(queries)[:, start:stop]
         else:
             yield start, self._sums(queries, start, self.places if stop is None else stop)
@@ -248,17 +244,16 @@ class TemplateMap(PlaceMap):
         if not found:
             dtype = torch.promote_types(queries.dtype, torch.float32)
             return queries.new_full((queries.shape[0], stop - start), math.inf, dtype=dtype)
-        distances = [found.get(j, found[members[0]]) for j in range(len(self.plan))]  # no other row is read
+        distances = [found.get(j, found[members[0]]) for j in range(len(self.plan))]  # others are not read
         return self.combine(distances, start, stop)
 
     @property
     def block_places(self) -> int:
-        """See `PlaceMap`: a number for each place in each layer of a segment."""
         return self.places * max([1, *(len(layers) for _, _, layers in self.segments)])
 
     @torch.no_grad()
     def lowest(self, queries: Tensor) -> tuple[Tensor, Tensor] | None:
-        """See `PlaceMap`: from two layers that cover the same places, unless these are few."""
+        """See `PlaceMap`: for two layers that cover the same places, if there are many."""
         chunks = {(layer.start, layer.stop) for layer in self.plan}
         if self.temperature is not None or len(self.plan) != 2 or len(chunks) != 1:
             return None
@@ -271,11 +266,8 @@ class TemplateMap(PlaceMap):
         return score, torch.where(score.isfinite(), start + place, -1)
 
     def trainable(self, templates: bool = True, weights: bool = False, start: Tensor | None = None) -> None:
-        """Make parameters of the templates, of the weights, or of both, until `freeze`.
-
-        Args:
-            start: (D,) the weights to begin with if the map has none; None or (0,) is 1 for every feature.
-        """
+        """Turn the templates, the weights, or both, into parameters, until `freeze`; `start`: (D,) initial
+        weights if the map has none, None or (0,) for 1."""
         self.freeze()
         if weights and not len(self.weights):
             own = self.templates.new_ones(self.dimension)
@@ -289,7 +281,7 @@ class TemplateMap(PlaceMap):
                 setattr(self, name, nn.Parameter(getattr(self, name).detach().clone()))
 
     def freeze(self) -> None:
-        """Make buffers of what was trained; no weight is left below 0, since |w H - mu| = |-w H + mu|."""
+        """Turn parameters into buffers; negative weights change sign, since |w H - mu| = |-w H + mu|."""
         for name, parameter in list(self.named_parameters()):
             delattr(self, name)
             self.register_buffer(name, parameter.detach().clone())
@@ -321,7 +313,7 @@ class TemplateMap(PlaceMap):
         return f"{sizes}, template_numbers={self.templates.numel()}, metric={self.metric!r}"
 
 
-def _along(distances: Tensor, lap: Tensor, first: int, count: int) -> Tensor:
+def _at_places(distances: Tensor, lap: Tensor, first: int, count: int) -> Tensor:
     """Distances of a layer at `count` of its places, whose phases repeat after a lap: (Q,P) -> (Q,count)."""
     first %= len(lap)
     if first + count <= len(lap):
@@ -331,17 +323,17 @@ def _along(distances: Tensor, lap: Tensor, first: int, count: int) -> Tensor:
 
 
 class TemplateMapper(Mapper):
-    """The paper's mapper (section III-A): layers of what repeats, and a template for each of their phases.
+    """The paper's mapper (section III-A): layers of features that repeat, and a template for each phase.
 
     Args:
         periods: finds the layers, without gradient; None is `SpectrogramAnalysis` with its defaults.
         metric, reduction, temperature: of the maps, see `TemplateMap`.
-        trainable: make the templates nn.Parameters, to be fine-tuned, instead of buffers.
+        trainable: whether templates are nn.Parameters, to fine-tune, instead of buffers.
 
     Shape: features (N,D) -> TemplateMap of N places; if nothing repeats, all places score +inf.
 
     Raises:
-        InputError: see `TemplateMap`, and what `periods` refuses.
+        InputError: see `TemplateMap` and `periods`.
 
     Example:
         >>> wave = torch.arange(64)[:, None] % torch.tensor([8.0, 9.0])  # two features that repeat
@@ -360,20 +352,17 @@ class TemplateMapper(Mapper):
         trainable: bool = False,
     ) -> None:
         super().__init__()
-        if periods is not None and not isinstance(periods, PeriodFinder):
-            seen = f"periods is a {type(periods).__name__}"
-            raise InputError(f"{seen}; expected a PeriodFinder such as SpectrogramAnalysis")
+        if not isinstance(periods, PeriodFinder | None):
+            raise InputError(f"periods is a {type(periods).__name__}; expected a PeriodFinder")
         self.trainable = trainable
         self.periods: PeriodFinder | None = SpectrogramAnalysis() if periods is None else periods
         self.metric, self.reduction, self.temperature = metric, reduction, temperature
         self.templates = PhaseTemplates()
-        self.empty()  # refuses what a map would
+        self.empty()  # checks the settings
 
     def forward(self, features: Tensor) -> TemplateMap:
-        if self.periods is None:  # of a map file
-            raise InputError(
-                "what found the map's periods is not of this package; expected a mapper with it to learn anew"
-            )
+        if self.periods is None:  # from a map file
+            raise InputError("the map's period finder is not of this package; learn anew by a mapper with it")
         plan = self.periods.plan(features)
         return self._map(plan, self.templates(features, plan), *features.shape).to(features.device)
 
@@ -388,4 +377,4 @@ class TemplateMapper(Mapper):
         return route
 
     def extra_repr(self) -> str:
-        return f"metric={self.metric!r}, reduction={self.reduction!r}, temperature={self.temperature}"
+        return settings_of(self, "periods", "trainable")

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from dejavu_torch.types import FrequencyLayer, InputError
 
-MASK_NUMBERS = 2**22  # of a mask that is held at a time
+MASK_NUMBERS = 2**22  # values of a mask that are held at a time
 
 
 def phase_mask(
@@ -24,15 +24,14 @@ def phase_mask(
     """The masks M(i, tau, k) of one period, all phases at once (eq. 2).
 
     Args:
-        frames: how many, counted from 0, or (n,) int64 the frames themselves.
-        period: tau, frames; whole or rational.
-        phases: P; None is the paper's case, one phase per frame of a whole period.
-        start, stop: the chunk [start, stop), outside of which M is 0; a stop of None has no end.
+        frames: their number, from 0, or (n,) int64 the frames themselves.
+        period: tau, in frames; an integer or rational.
+        phases: P; None is the paper's case, one phase per frame of an integer period.
+        start, stop: the chunk [start, stop), outside of which M is 0; None has no end.
 
-    Shape: -> (P,n), 1 where frame i of the chunk has phase k, else 0.
+    Shape: -> (P,n), 1 if frame i of the chunk has phase k, else 0.
 
-    Convention: phases count 0..P-1 from absolute frame 0; if they are as many as frames of the period, M is 1
-        where mod(i - k, tau) = 0.
+    Convention: phases count 0..P-1 from absolute frame 0; with P = tau, M is 1 if mod(i - k, tau) = 0.
 
     Raises:
         InputError: a fractional period without `phases`, or a chunk that ends after a number of frames.
@@ -47,9 +46,7 @@ def phase_mask(
         raise InputError(f"phase_mask got period {period} and no phases; expected phases for a fraction")
     if isinstance(frames, int):
         if stop is not None and stop > frames:
-            raise InputError(
-                f"phase_mask got the chunk [{start}, {stop}); expected it inside {frames} frames"
-            )
+            raise InputError(f"phase_mask got chunk [{start}, {stop}); expected it inside {frames} frames")
         frames = torch.arange(frames)
     inside = frames >= start if stop is None else (frames >= start) & (frames < stop)
     phases = period.numerator if phases is None else phases
@@ -63,7 +60,7 @@ class PhaseTemplates(nn.Module):
 
     Shape: features (N,D), plan of L layers -> tuple of L tensors (P,F).
 
-    Convention: the mean runs over the layer's own chunk. A phase without frames gets 0, which nothing reads.
+    Convention: the mean is over the layer's own chunk. A phase without frames gets 0, which is never read.
         Gradients reach the features. A layer beyond the N frames or the D features is an InputError.
 
     Example:
@@ -83,10 +80,8 @@ def check_plan(plan: Sequence[FrequencyLayer], places: int, dimension: int) -> N
     """Refuse, by an InputError, a layer that reaches beyond the places or the features."""
     for layer in plan:
         if layer.stop > places or layer.features[-1] >= dimension:
-            raise InputError(
-                f"a layer covers [{layer.start}, {layer.stop}) and feature {layer.features[-1]}; "
-                f"expected it inside {places} places of {dimension} features"
-            )
+            seen = f"a layer covers [{layer.start}, {layer.stop}) and feature {layer.features[-1]}"
+            raise InputError(f"{seen}; expected it inside {places} places of {dimension} features")
 
 
 def _means(features: Tensor, layer: FrequencyLayer) -> Tensor:

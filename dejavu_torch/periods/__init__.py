@@ -1,1 +1,1 @@
-"""Features -> which of them repeat, where, and how often."""
+"""Features -> the periods with which they repeat."""

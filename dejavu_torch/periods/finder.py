@@ -1,4 +1,4 @@
-"""What every way to find periods offers."""
+"""The interface of period finders."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from dejavu_torch.types import Plan
 
 
 class PeriodFinder(nn.Module, ABC):
-    """Finds which features repeat, where and how often. Subclass it to bring your own.
+    """Finds which features repeat, where and how often. Subclass it to add another.
 
-    A map file names finders of this package only: a map learned with your own loads without it.
+    A map file names only finders of this package: a map learned with your own loads without it.
     """
 
     @abstractmethod

@@ -14,7 +14,7 @@ from dejavu_torch.periods.support import supportive_periods
 from dejavu_torch.text import settings_of
 from dejavu_torch.types import FrequencyLayer, InputError, Plan
 
-LONGEST = 2**24  # bins of a period, and places of a bin: their products fit whole numbers of 64 bits
+LONGEST = 2**24  # bins in a period, and places in a bin, so that products fit into int64
 
 log = logging.getLogger("dejavu_torch")
 
@@ -24,17 +24,17 @@ class ImposedPeriods(PeriodFinder):
 
     Args:
         periods: P of each layer, distinct, >= 2, in bins; None chooses `supportive_periods` for the route.
-        bin: places that share a phase, >= 1; the tolerance is a sensible size.
-        stagger: bins of different layers drift past each other, to tell apart places that share a bin: the
-            periods are P * bin places and, in turn, a tenth of a bin more and less.
+        bin: places that share a phase, >= 1; the tolerance is a good choice.
+        stagger: shift the bins of different layers, to distinguish the places within a bin: the periods
+            are P * bin places, alternately plus and minus a tenth of a bin.
 
     Shape: features (N,D), N >= 2 -> plan of L layers, each of P phases over 0..N and all D features.
 
-    Convention: the last bin may be short. Periods that cannot tell the bins of the route apart are allowed
-        and logged; one period of as many phases as bins is a classifier of places.
+    Convention: the last bin may be short. Periods too few to distinguish the bins of the route are allowed,
+        with a warning. One period of as many phases as bins is a classifier of places.
 
     Raises:
-        InputError: periods or a bin out of range, features of another shape.
+        InputError: periods or bin out of range, features of another shape.
 
     Example:
         >>> [layer.phases for layer in ImposedPeriods(bin=5).plan(Tensor(2700, 8))]
@@ -47,28 +47,23 @@ class ImposedPeriods(PeriodFinder):
             least = "2 places to stagger" if stagger else "1 place"
             raise InputError(f"imposed periods got bin={bin}; expected at least {least}, at most {LONGEST}")
         if periods is not None:
-            whole = all(isinstance(period, int) and 2 <= period <= LONGEST for period in periods)
-            if not whole or not periods or len(periods) > len(set(periods)):
-                raise InputError(
-                    f"imposed periods are {periods}; expected distinct whole numbers >= 2, <= {LONGEST}"
-                )
+            fits = all(isinstance(period, int) and 2 <= period <= LONGEST for period in periods)
+            if not fits or not periods or len(periods) > len(set(periods)):
+                expected = f"distinct integers from 2 to {LONGEST}"
+                raise InputError(f"imposed periods are {periods}; expected {expected}")
         self.periods = None if periods is None else list(periods)
         self.bin, self.stagger = bin, stagger
 
     def plan(self, features: Tensor) -> Plan:
         if features.ndim != 2 or len(features) < 2 or features.shape[1] < 1:
-            seen = f"imposed periods got features {tuple(features.shape)}"
-            raise InputError(f"{seen}; expected (N,D) with N >= 2, D >= 1")
+            raise InputError(f"imposed periods got {tuple(features.shape)}; expected (N,D), N >= 2, D >= 1")
         places, dimension = features.shape
         bins = -(-places // self.bin)
         periods = self.periods or supportive_periods(bins)
         check_room(4 * sum(periods) * dimension, f"a template for each of {sum(periods)} imposed phases")
-        distinct = math.lcm(*periods)
-        if distinct < bins:
-            log.warning(
-                f"periods {tuple(periods)} tell {distinct} bins apart; the route has {bins}, "
-                f"so places {distinct * self.bin} apart look alike"
-            )
+        if (distinct := math.lcm(*periods)) < bins:
+            seen = f"periods {tuple(periods)} distinguish {distinct} bins; the route has {bins}"
+            log.warning(f"{seen}, so places {distinct * self.bin} apart look the same")
         drift = Fraction(self.bin, 10) if self.stagger and len(periods) > 1 else Fraction(0)
         return tuple(
             FrequencyLayer(period * self.bin + (-1) ** j * drift, period, 0, places, tuple(range(dimension)))

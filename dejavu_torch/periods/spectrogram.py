@@ -1,4 +1,4 @@
-"""The spectrogram of each feature through time and the periods read off it (section III-A)."""
+"""The spectrogram of each feature over time, and the periods found in it (section III-A)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from dejavu_torch.text import settings_of
 from dejavu_torch.types import FrequencyLayer, InputError, Plan
 
 torchaudio: Any
-try:  # its compiled library refuses a torch of another build
+try:  # its compiled library fails to load with another build of torch
     import torchaudio.functional  # type: ignore[no-redef]
 except (ImportError, OSError, RuntimeError):
     torchaudio = None
@@ -23,8 +23,8 @@ BACKEND = "torchaudio" if torchaudio else "torch.stft"  # of the spectrogram
 
 log = logging.getLogger("dejavu_torch")
 
-NUMBERS_AT_ONCE = 2**22  # of a chunk's features, so that memory does not grow with their number
-HANN_PEAK = 2 / 3  # share of its power that a pure wave holds in its own bin under a Hann window
+NUMBERS_AT_ONCE = 2**22  # values of a chunk, so that memory does not grow with the number of features
+HANN_PEAK = 2 / 3  # share of its power that a pure wave has in its own bin under a Hann window
 
 Bin = TypeVar("Bin", int, Tensor)
 
@@ -42,7 +42,7 @@ def chunk_power(chunk: Tensor) -> Tensor:
     if not chunk.isfinite().all():
         raise InputError("spectrogram got features that are not finite; expected finite numbers")
     centred = chunk - chunk.mean(0)
-    # rounding leaves a constant feature a trace of power: zero it, or noise would name its period
+    # rounding leaves a constant feature some power, in which noise would choose a period: set it to zero
     constant = centred.abs().amax(0) <= 8 * torch.finfo(chunk.dtype).eps * chunk.abs().amax(0)
     waves = centred.masked_fill(constant, 0.0).T
     n, window = len(chunk), torch.hann_window(len(chunk), dtype=chunk.dtype, device=chunk.device)
@@ -58,10 +58,9 @@ def strongest_bins(power: Tensor, count: int, last: int, peaks: Literal["bins", 
     """The `count` strongest bins of each feature among bins 2..last with power, strongest first.
 
     Args:
-        peaks: "bins" ranks all bins; "local" only local maxima, so that the leakage of a peak into the next
-            bin is no second period.
+        peaks: "bins" ranks all bins, "local" only local maxima, so that leakage adds no second period.
 
-    Shape: (K,D) -> (count,D) int64, -1 if a feature has no more such bins; of equal bins the lower one wins.
+    Shape: (K,D) -> (count,D) int64, -1 if a feature has fewer such bins; among equal bins the lower one wins.
     """
     candidates = torch.zeros_like(power, dtype=torch.bool)
     candidates[2 : last + 1] = power[2 : last + 1] > 0
@@ -75,7 +74,7 @@ def strongest_bins(power: Tensor, count: int, last: int, peaks: Literal["bins", 
 
 
 def bin_period(length: int, k: Bin) -> Bin:
-    """Period of bin k of a spectrum over `length` places, in whole places: round(length / k), halves up.
+    """Period of bin k of a spectrum over `length` places, to the nearest place: length / k, halves up.
 
     Example:
         >>> bin_period(1024, 11), bin_period(1024, 6)  # the paper's two periods
@@ -85,8 +84,7 @@ def bin_period(length: int, k: Bin) -> Bin:
 
 
 def layers_of(bins: Tensor, start: int, stop: int) -> list[FrequencyLayer]:
-    """Layers of the chunk [start, stop) by the strongest bins (count,D) of each feature, -1 for none: by
-    increasing period, features of equal `bin_period` share one."""
+    """Layers of a chunk [start, stop), one per `bin_period` of the strongest bins (count,D), -1 for none."""
     rank, feature = (bins > 0).nonzero(as_tuple=True)
     period = bin_period(stop - start, bins[rank, feature])
     return [
@@ -96,9 +94,9 @@ def layers_of(bins: Tensor, start: int, stop: int) -> list[FrequencyLayer]:
 
 
 def noise_share(bins: int, features: int, false_alarm: float) -> float:
-    """The share of its power that white noise in any of the features has in one bin, with this probability.
+    """The share of its power that white noise exceeds in one bin of any feature with this probability.
 
-    Fisher's test, P(largest of K shares > g) <= K (1 - g)^(K - 1), and Bonferroni's bound over D features.
+    Fisher's test, P(largest of K shares > g) <= K (1 - g)^(K - 1), with Bonferroni's bound over D features.
 
     Source: R. A. Fisher, Tests of significance in harmonic analysis, Proc. R. Soc. A 125 (1929).
 
@@ -110,28 +108,24 @@ def noise_share(bins: int, features: int, false_alarm: float) -> float:
 
 
 class SpectrogramAnalysis(PeriodFinder):
-    """Which features repeat, where and how often, by the spectrogram of each (section III-A).
+    """Finds periods in the spectrogram of each feature (section III-A).
 
     Args:
-        window: places per spectrum, the length of a chunk. hop: places from one chunk to the next; None is
-            `window`.
-        min_period: shortest period, in places. The longest is half the window, bin 2: bins 0 and 1 hold mean
-            and slow drift.
-        strongest: how many frequencies a feature keeps.
+        window: places per chunk and spectrum. hop: places between the starts of chunks; None is `window`.
+        min_period: shortest period, in places; the longest is half the window, above mean and drift.
+        strongest: number of frequencies that a feature keeps.
         peaks: "local" ranks local maxima of the spectrum, "bins" all its bins (the paper).
-        false_alarm: probability that white noise gives a chunk layers at all (`noise_share`). Smooth footage
-            passes, whether it repeats or not. None: every chunk gets layers (the paper).
-        short: for a route shorter than the window: "shrink" the window and log that, or "refuse".
+        false_alarm: probability that white noise gives a chunk layers (`noise_share`); smooth footage passes
+            whether or not it repeats. None: every chunk gets layers (the paper).
+        short: for a route shorter than the window: "shrink" the window with a warning, or "refuse".
 
-    Shape: features (N,D) -> tuple of G spectra, one for each chunk.
+    Shape: features (N,D) -> tuple of G spectra, one per chunk.
 
-    Convention: Hann window, not centred. The places after the last whole window are a shorter chunk, left out
-        if they are fewer than two of the shortest periods. A feature that is constant in a chunk has no power
-        there. A chunk too short to pass `false_alarm` is logged.
+    Convention: Hann window, not centred. Places after the last whole window are a shorter chunk, or dropped
+        if fewer than 2 * min_period. Constant features have no power. Chunks too short to pass are logged.
 
     Raises:
-        InputError: an argument out of range; features that are not finite floats (N,D); a route that is too
-            short.
+        InputError: an argument out of range; features that are not finite floats (N,D); a route too short.
 
     Example:
         >>> wave = torch.sin(torch.arange(256) * 2 * torch.pi / 32)[:, None]
@@ -167,16 +161,13 @@ class SpectrogramAnalysis(PeriodFinder):
         self._logged: set[str] = set()
 
     def chunks(self, places: int) -> list[tuple[int, int]]:
-        """The chunks [start, stop) of a route of so many places."""
-        shortest = 2 * self.min_period
+        """The chunks [start, stop) of a route."""
+        shortest, seen = 2 * self.min_period, f"the route has {places} place{'s' * (places != 1)}"
         if places < shortest:
-            seen = f"the route has {places} place{'s' * (places != 1)}"
             raise InputError(f"{seen}; expected at least {shortest}, two periods of {self.min_period}")
         if places < self.window and self.short == "refuse":
-            raise InputError(
-                f"the route has {places} places; expected at least {self.window}, the window, "
-                "or a shorter window, or one that shrinks (--mapper.periods.short shrink)"
-            )
+            cure = "the window, or a shorter window, or --mapper.periods.short shrink"
+            raise InputError(f"{seen}; expected at least {self.window}, {cure}")
         window = min(self.window, places)
         hop = min(self.hop or window, window)
         chunks = [(start, start + window) for start in range(0, places - window + 1, hop)]
@@ -192,17 +183,16 @@ class SpectrogramAnalysis(PeriodFinder):
     def plan(self, features: Tensor) -> Plan:
         """See `PeriodFinder`; by chunk and then by period."""
         layers: list[FrequencyLayer] = []
-        chunks = self._chunks_of(features)
+        chunks, alarm = self._chunks_of(features), self.false_alarm
         if len(features) < self.window:
             self._warn_once(f"window shrunk from {self.window} to {len(features)} places, the whole route")
         for start, stop in chunks:
             parts = features[start:stop].split(max(1, NUMBERS_AT_ONCE // (stop - start)), 1)
             bins, share = (torch.cat(found, -1) for found in zip(*map(self._strongest, parts), strict=True))
-            alarm = self.false_alarm
             least = 0.0 if alarm is None else noise_share((stop - start) // 2, len(share), alarm)
             if least > HANN_PEAK:
-                places = f"places {start}-{stop - 1}"
-                self._warn_once(f"{places}: too few to tell a period from noise; no layers here")
+                seen = f"places {start}-{stop - 1}: too few to distinguish a period from noise"
+                self._warn_once(f"{seen}; no layers here")
             if alarm is None or (share > least).any():
                 layers += layers_of(bins, start, stop)
         return tuple(layers)
@@ -216,10 +206,8 @@ class SpectrogramAnalysis(PeriodFinder):
 
     def _strongest(self, chunk: Tensor) -> tuple[Tensor, Tensor]:
         """The strongest bins of each feature (count,D), and the largest share of its power in one (D,)."""
-        power = chunk_power(chunk)
-        bins = strongest_bins(
-            power, min(self.strongest, len(power)), len(chunk) // self.min_period, self.peaks
-        )
+        power, last = chunk_power(chunk), len(chunk) // self.min_period
+        bins = strongest_bins(power, min(self.strongest, len(power)), last, self.peaks)
         share = power.gather(0, bins.clamp(min=0)) / power[1:].sum(0)
         return bins, share.where(bins > 0, 0.0).amax(0)
 

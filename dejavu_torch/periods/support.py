@@ -1,4 +1,4 @@
-"""How many places a set of periods can tell apart: the mutual support of frequencies."""
+"""How many places a set of periods can distinguish: the mutual support of frequencies."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from itertools import count
 
 import numpy as np
 
-SMALLEST = 4  # period: a layer of 2 or 3 phases hardly tells places from noise
-CORRECTS = 1  # wrong layers that supportive periods survive
+MIN_PERIOD = 4  # with 2 or 3 phases a layer hardly stands out from noise
+CORRECTS = 1  # wrong layers that supportive periods tolerate
 
 
 def common_period(periods: Sequence[Fraction | int]) -> Fraction:
-    """Least common multiple of one or more periods: the number of places they can tell apart.
+    """Least common multiple of one or more periods: the number of places they can distinguish.
 
     Example:
         >>> common_period([93, 171]), common_period([Fraction(195, 2), 171])  # 93 and 171 share a factor 3
@@ -25,14 +25,12 @@ def common_period(periods: Sequence[Fraction | int]) -> Fraction:
 
 
 def support_of(periods: Sequence[int], places: int) -> tuple[int, int]:
-    """How whole periods >= 1 support each other over a route of at least 3 places: two distances.
+    """Code distance and torus distance of integer periods >= 1 over a route of at least 3 places.
 
-    The code distance d is in how many layers any two places differ at least; (d - 1) // 2 wrong layers are
-    survived. The torus distance is the least sum over layers of min(D mod tau, tau - D mod tau), D > 1 places
-    apart.
+    Two places differ in at least d layers, the code distance, which corrects (d - 1) // 2 wrong layers. The
+    torus distance is the minimum over D > 1 of the sum over layers of min(D mod tau, tau - D mod tau).
 
-    Source: R. W. Watson and C. W. Hastings, Self-checked computation using residue arithmetic, Proc. IEEE
-        54 (1966).
+    Source: Watson and Hastings, Self-checked computation using residue arithmetic, Proc. IEEE 54 (1966).
 
     Example:
         >>> support_of([4, 5, 7], 100)
@@ -40,15 +38,15 @@ def support_of(periods: Sequence[int], places: int) -> tuple[int, int]:
     """
     tau = np.array(periods)[:, None]
     phase = np.arange(1, places) % tau  # of every difference D
-    around = np.minimum(phase, tau - phase).sum(0)
-    return int((phase != 0).sum(0).min()), int(around[1:].min())
+    torus = np.minimum(phase, tau - phase).sum(0)
+    return int((phase != 0).sum(0).min()), int(torus[1:].min())
 
 
 def supportive_periods(places: int) -> tuple[int, ...]:
-    """Distinct whole periods >= 4, increasing, that tell the places apart, also with one layer wrong.
+    """Distinct integer periods >= 4, increasing, that distinguish the places even with one layer wrong.
 
-    Convention: the pairwise co-prime set of the fewest templates; of several the one of the largest code
-        distance, then of the largest torus distance, then of the longest shortest period.
+    Convention: the pairwise co-prime set with the fewest templates; among several, the one with the largest
+        code distance, then the largest torus distance, then the longest shortest period.
 
     Example:
         >>> supportive_periods(540)
@@ -56,16 +54,16 @@ def supportive_periods(places: int) -> tuple[int, ...]:
     """
 
     def suffices(chosen: tuple[int, ...]) -> bool:
-        """Whether any but 2 * CORRECTS of them, at worst the smallest, tell the places apart."""
+        """Whether the smallest, all but 2 * CORRECTS of them, distinguish the places."""
         core = len(chosen) - 2 * CORRECTS
         return core > 0 and math.prod(chosen[:core]) >= places
 
-    totals = ([*filter(suffices, _co_prime_sets(total, SMALLEST))] for total in count(SMALLEST))
+    totals = ([*filter(suffices, _co_prime_sets(total, MIN_PERIOD))] for total in count(MIN_PERIOD))
     return max(next(filter(None, totals)), key=lambda chosen: (support_of(chosen, max(places, 3)), chosen))
 
 
 def _co_prime_sets(total: int, smallest: int, chosen: tuple[int, ...] = ()) -> Iterator[tuple[int, ...]]:
-    """Rising pairwise co-prime sets that begin with those chosen and go on with some of this total."""
+    """Increasing pairwise co-prime sets: the chosen periods, then others that add up to `total`."""
     if not total:
         yield chosen
     for period in (*range(smallest, (total + 1) // 2), total):  # the last one, or one that leaves a larger

@@ -146,14 +146,14 @@ def test_mean_and_deviation_are_taken_out_last() -> None:
     torch.testing.assert_close(net(frames), expected)
 
 
-NO_MAPS = "expected maps (B,K,h,w) or vectors (B,K)"
+NO_MAPS = "expected maps (B,K,h,w), vectors (B,K)"
 
 
 @pytest.mark.parametrize(
     ("make", "output", "facts"),
     [
-        (lambda: nn.Conv2d(1, 4, 3), None, ("Conv2d does not take frames", "(1, 3, 96, 96)", "channels")),
-        (Picky, None, ("Picky does not take frames", "frames of 96 are not what I want")),
+        (lambda: nn.Conv2d(1, 4, 3), None, ("Conv2d fails on frames", "(1, 3, 96, 96)", "channels")),
+        (Picky, None, ("Picky fails on frames", "frames of 96 are not what I want")),
         (lambda: Maker(lambda f: f[..., None]), None, ("Maker made (1, 3, 96, 96, 1)", NO_MAPS)),
         (lambda: Maker(lambda f: f.mean()), None, ("Maker made ()", NO_MAPS)),
         (lambda: Maker(lambda f: []), None, ("Maker made list", NO_MAPS)),
@@ -184,7 +184,7 @@ def test_networks_that_do_not_fit_are_refused(
         (lambda: plain()(torch.rand(2, 2, 8, 8)), ("(2, 2, 8, 8)", "(B,1,H,W) or (B,3,H,W)")),
         (lambda: plain()(torch.rand(3, 8, 8)), ("(3, 8, 8)", "(B,1,H,W) or (B,3,H,W)")),
         (lambda: plain(dimension=0), ("dimension=0", "at least 1")),
-        (lambda: plain(dimension=None, hidden=6), ("hidden=6", "no dimension")),
+        (lambda: plain(dimension=None, hidden=6), ("hidden=6", "or none and hidden 0")),
         (lambda: plain(channels=2), ("channels=2", "1 or 3")),
         (lambda: plain(resize=(0, 8)), ("resize=(0, 8)", "expected")),
         (lambda: plain(resize=(8, 8, 8)), ("resize=(8, 8, 8)", "expected")),

@@ -114,8 +114,8 @@ def test_grey_pixels_are_those_of_grey_frames() -> None:
         (lambda: both()(torch.rand(2, 7)), ("Joined got (2, 7)", "float frames")),
         (lambda: PatchPixels(channel="mauve"), ("'mauve'", "'grey'")),
         (lambda: Joined([HOG(), Means()], [1.0]), ("shares of 2 members", "[1.0]", "for each")),
-        (lambda: Joined([HOG(), Means()], [1, 0]), ("[1, 0]", "above 0")),
-        (lambda: Joined([HOG(), Means()], [1, 1.5]), ("[1, 1.5]", "at most 1")),
+        (lambda: Joined([HOG(), Means()], [1, 0]), ("[1, 0]", "(0, 1]")),
+        (lambda: Joined([HOG(), Means()], [1, 1.5]), ("[1, 1.5]", "(0, 1]")),
     ],
 )
 def test_what_is_refused(call: Callable[[], Any], facts: tuple[str, ...]) -> None:
@@ -348,7 +348,7 @@ def test_a_network_of_a_function_beside_hog(folder: Path, capsys: pytest.Capture
         (("[HOG, zoo.nothing]",), "--features.members: module 'zoo' has no attribute 'nothing'"),
         (("[HOG, {",), "--features is '[HOG, {'; expected a list of classes"),
         (("[2020-13-45]",), "--features is '[2020-13-45]'; expected a list of classes"),
-        (("[HOG, PatchPixels]", "--whitening.groups", "[1764, 10]"), "groups of 1764 + 10 numbers"),
+        (("[HOG, PatchPixels]", "--whitening.groups", "[1764, 10]"), "groups of 1764 + 10 dimensions"),
         (("HOG", "--whitening.groups", "[]"), "the groups are []"),
     ],
 )

@@ -42,7 +42,7 @@ def test_how_many_rows_are_coded_at_a_time_changes_nothing(monkeypatch: pytest.M
     own = levels()
     whole = encode(own), coded_bytes(own)
     for block in (1, 7 * 16, 7 * 200):
-        monkeypatch.setattr(codec, "BLOCK", block)
+        monkeypatch.setattr(codec, "CODED_LEVELS", block)
         assert torch.equal(encode(own).bytes, whole[0].bytes)
         assert coded_bytes(own) == whole[1]
         assert torch.equal(decode(whole[0], 200, 7), own.to(torch.int8))
@@ -129,7 +129,7 @@ def test_a_stream_of_anything_is_refused(packed: bytes, rows: int, columns: int)
 def test_a_claim_of_nothing_or_beyond_the_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     stream = encode(levels())
     for rows, columns in ((0, 5), (5, -1), (10**10, 10**4)):
-        with refused(f"claims {rows} x {columns}", "at least one", "memory"):
+        with refused(f"claims {rows} x {columns}", "1 or more", "memory"):
             decode(stream, rows, columns)
     monkeypatch.setattr(codec, "free_memory", lambda: math.inf)
     assert decode(stream, 200, 7).shape == (200, 7)
@@ -138,12 +138,12 @@ def test_a_claim_of_nothing_or_beyond_the_memory_is_refused(monkeypatch: pytest.
 def test_a_claim_of_endless_zeros_is_refused_before_they_are_decoded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(codec, "LEVELS_AT_LEAST", 2**12)
     zeros = Stream(torch.zeros(3, dtype=torch.uint8), 0)
-    with refused("next to nothing but zeros"):
+    with refused("nearly all 0"):
         decode(zeros, 10**5, 128)
     sparse = torch.zeros(10**4, 16, dtype=torch.int8)
     assert torch.equal(decode(encode(sparse), 10**4, 16), sparse)
     sparse[-1, -1] = 1
-    with refused("next to nothing but zeros", "more bytes per place"):  # nothing is written that is not read
+    with refused("nearly all 0", "more bytes"):  # nothing is written that is not read
         encode(sparse)
 
 

@@ -189,11 +189,11 @@ def with_sealed(path: Path, **changes: Any) -> None:
     [
         (lambda path: path.unlink(), ["not there"]),
         (lambda path: [path.unlink(), path.mkdir()], ["is a folder", "map file"]),
-        (lambda path: path.write_bytes(bytes(500)), ["no map file"]),
+        (lambda path: path.write_bytes(bytes(500)), ["not a map file"]),
         (lambda path: torch.save({"state_dict": {}}, path), ["is a checkpoint", "dejavu train export"]),
-        (lambda path: with_metadata(path, None), ["no map of dejavu_torch"]),
+        (lambda path: with_metadata(path, None), ["not a map of dejavu_torch"]),
         (lambda path: with_metadata(path, {"format": NAME}), ["an old one", "learn the route anew"]),
-        (lambda path: with_sealed(path, version=5), ["format 5", f"reads {FORMAT}", "learn the route anew"]),
+        (lambda path: with_sealed(path, version=5), [f"format 5; expected {FORMAT}", "learn the route anew"]),
         (lambda path: with_sealed(path, version=FORMAT + 1), [f"format {FORMAT + 1}", "newer"]),
         *(
             (lambda path, sums=sums: with_sealed(path, checksums=sums), ["is damaged"])
@@ -257,7 +257,7 @@ CRAFTED_LINES: list[tuple[dict[str, Any], dict[str, Any], list[str]]] = [
     ({"map.lengths": [-64]}, {}, ["[-64] places"]),
     ({"map.lengths": torch.tensor([64.0])}, {}, ["lengths (1,) torch.float32"]),
     ({"map.stream_table": [[-1, 0]]}, {}, ["the table claims [-1]"]),
-    ({"map.stream_table": torch.zeros(0, 2, dtype=torch.int64)}, {}, ["(0, 2) for 1 chunks"]),
+    ({"map.stream_table": torch.zeros(0, 2, dtype=torch.int64)}, {}, ["table (0, 2); expected (1, 2)"]),
     ({"map.steps": torch.tensor([3e38])}, {}, ["not finite"]),
     ({"map.steps": torch.tensor([float("nan")])}, {}, ["finite numbers above 0"]),
 ]

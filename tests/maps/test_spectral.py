@@ -330,7 +330,7 @@ def test_settings_out_of_range_are_refused(settings: dict[str, Any], words: tupl
         (torch.rand(4), ("(4,)", "(N, K)")),
         (torch.rand(4, 0), ("(4, 0)", "(N, K)")),
         (torch.ones(9, 4, dtype=torch.int64), ("int64", "floats")),
-        (torch.ones(9, 4), ("9 descriptors", "all alike")),
+        (torch.ones(9, 4), ("9 descriptors", "all the same")),
         (torch.full((9, 4), math.nan), ("NaN",)),
     ],
 )

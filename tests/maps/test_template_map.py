@@ -53,7 +53,7 @@ def test_convention_1_places_count_from_0_and_chunks_are_half_open() -> None:
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [
-        ("_extra_state", lambda s: {**s, "places": -1}, "-1 places of 4 features; expected whole numbers"),
+        ("_extra_state", lambda s: {**s, "places": -1}, "(-1, 4); expected integers"),
         ("_extra_state", lambda s: {**s, "places": 200}, "expected it inside 200 places"),
         ("_extra_state", lambda s: {**s, "dimension": 3}, "expected it inside 300 places of 3 features"),
         ("_extra_state", lambda s: {**s, "kind": "spectral"}, "kind is 'spectral'; expected 'templates'"),
@@ -71,7 +71,7 @@ def test_convention_1_places_count_from_0_and_chunks_are_half_open() -> None:
         ("positions", lambda t: torch.arange(299.0), "positions of 299 places; expected 300"),
         ("positions", lambda t: torch.arange(300), "positions (300,) torch.int64; expected finite"),
         ("feature_ptr", lambda t: t[[0, 2, 1, 3]], "feature_ptr does not rise"),
-        ("feature_index", lambda t: t.flip(0), "feature indices must be"),
+        ("feature_index", lambda t: t.flip(0), "layer features (3, 1); expected 1 or more, increasing"),
         ("feature_index", lambda t: t + 1, "feature 4; expected it inside"),
         ("templates", lambda t: t * torch.nan, "templates that are not finite"),
         ("weights", lambda t: torch.ones(3), "weights (3,); expected (4,) or (0,)"),
@@ -87,7 +87,7 @@ def test_buffers_that_do_not_fit_together_are_refused(
 
 
 def test_templates_of_another_shape_are_refused() -> None:
-    with refused("98 phases and 2 features got templates (2, 98); expected (98, 2)"):
+    with refused("templates of a layer are (2, 98)", "(P,F) = (98, 2)"):
         TemplateMap(PLAN[:1], [torch.zeros(2, 98)], PLACES, DIMENSION)
 
 

@@ -63,8 +63,8 @@ MUTANTS = [
         "With a resolution, cosine and sine of one frequency of the DFT have the same dead zone, by "
         "their period.",
         "dejavu_torch/maps/quantisation.py",
-        "half_cycles(torch.arange(n), transform) / (2 * n) for n in lengths",
-        "torch.arange(n) // 2 * 2 / (2 * n) for n in lengths",
+        "half_cycles(torch.arange(n), transform) / (2 * n) for n in sizes",
+        "torch.arange(n) // 2 * 2 / (2 * n) for n in sizes",
         ("tests/test_behaviour.py::test_cosine_and_sine_have_the_same_dead_zone",),
     ),
     Mutant(
@@ -106,7 +106,7 @@ MUTANTS = [
     Mutant(
         "The bytes of a summary add up to the size of the map's file, its header included.",
         "dejavu_torch/maps/file.py",
-        "return len(safetensors.torch.save(*_sealed(tensors, header)))",
+        "return len(safetensors.torch.save(*_seal(tensors, header)))",
         "return sum(tensor.nbytes for tensor in tensors.values())",
         ("tests/maps/test_file.py::test_one_file_of_the_size_the_map_claims",),
     ),

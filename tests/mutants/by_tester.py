@@ -22,7 +22,7 @@ MUTANTS = [
     Mutant(
         "With a temperature a query that no place covers scores +inf everywhere.",
         "dejavu_torch/maps/template_map.py",
-        "return -logits.log_softmax(1).masked_fill(closed, -math.inf)",
+        "return -logits.log_softmax(1).masked_fill(uncovered, -math.inf)",
         "return -logits.log_softmax(1)",
         ("tests/maps/test_scores.py::-k temperature or log_posterior",),
     ),
@@ -102,8 +102,8 @@ MUTANTS = [
     Mutant(
         "The lines hold at least the share that is asked for.",
         "dejavu_torch/maps/quantisation.py",
-        "self._steps_around(self.held, math.nextafter(share, 0))[0]",
-        "self._steps_around(self.held, math.nextafter(share, 0))[1]",
+        "self._bisect(self.held, math.nextafter(share, 0))[0]",
+        "self._bisect(self.held, math.nextafter(share, 0))[1]",
         ("tests/maps/test_spectral.py::test_the_lines_hold_the_share_that_is_asked_for",),
     ),
     Mutant(
@@ -130,7 +130,7 @@ MUTANTS = [
     Mutant(
         "A map file that is damaged in any bit is refused.",
         "dejavu_torch/maps/file.py",
-        "if seen.get(part) != sums.get(part)",
+        "if found.get(part) != sums.get(part)",
         "if (part in seen) != (part in sums)",
         ("tests/maps/test_file.py::-k any_flipped",),
     ),

@@ -157,7 +157,7 @@ def test_convention_3_the_paper_refuses_a_long_window() -> None:
 def test_a_chunk_too_short_to_tell_says_so(caplog: pytest.LogCaptureFixture) -> None:
     features = wave(24, 2)[:, None].repeat(1, 500)
     assert SpectrogramAnalysis(24).plan(features) == ()
-    assert "places 0-23: too few to tell" in caplog.text
+    assert "places 0-23: too few to distinguish" in caplog.text
     assert SpectrogramAnalysis(24, false_alarm=None).plan(features) != ()
 
 

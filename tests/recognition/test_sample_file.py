@@ -121,7 +121,7 @@ def a_map(file: Path, model: DejaVu) -> None:
     [
         (cut, "truncated"),
         (damage, "damaged: its fine"),
-        (text, "no map file"),
+        (text, "not a map file"),
         (a_map, "a map or another file of this package"),
     ],
 )

@@ -159,7 +159,7 @@ class Wrong(nn.Module):
         (Wrong("half"), ("Wrong made (20, 8)", "expected features (40, D)")),
         (Wrong("nan"), ("Wrong gives NaN", "the array")),
         (Wrong("late"), ("the loss is nan at step 2", "place nan", "expected a finite number")),
-        (SmallCNN(8, 3, (16, 16), (4,)), ("got frames (40, 1, 16, 16)",)),
+        (SmallCNN(8, 3, (16, 16), (4,)), ("got (40, 1, 16, 16)",)),
         (
             nn.Sequential(nn.Conv2d(3, 2, 3), nn.Flatten()),
             ("Sequential does not accept frames (1, 16, 16)", "3 channels"),
