@@ -258,7 +258,7 @@ def test_files_are_written_whatever_becomes_of_what_is_printed(folder: Path) -> 
     ("words", "status", "said"),
     [
         ("| grep -q usage:", 0, ""),
-        ("> /dev/full", 2, "dejavu: what was printed is not whole: No space left on device\n"),
+        ("> /dev/full", 2, "dejavu: the printed output is incomplete: No space left on device\n"),
         ("dance 2>&-", 2, ""),
         ("''", 2, "dejavu: '' is no command; expected one of"),
     ],
