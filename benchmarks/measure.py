@@ -17,6 +17,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -286,6 +287,7 @@ def write_bench(out: Path, rows: Sequence[Row], picture: Plot | None = None, **f
             picture[0].savefig(folder / "bench.png")
 
 
+@cache
 def commit() -> str | None:
     """The commit of this clone."""
     command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"]

@@ -1,33 +1,33 @@
 """Scalable place recognition from repeating features, as differentiable PyTorch modules.
 
 The method of Jacobson, Scheirer and Milford, "Déjà vu: Scalable Place Recognition Using Mutually
-Supportive Feature Frequencies" (IROS 2017). Where each part of the paper lives:
+Supportive Feature Frequencies" (IROS 2017). From the paper's sections to the code:
 
     III    the whole method                      DejaVu              model
     III-A  spectrogram, two strongest periods    SpectrogramAnalysis periods.spectrogram
-    III-A  layers of features of like period     FrequencyLayer      types, periods.spectrogram
+    III-A  layers of features with one period    FrequencyLayer      types, periods.spectrogram
     eq. 2  phase masks M(i, tau, k)              phase_mask          maps.templates
     eq. 1  templates mu(H, tau, k)               PhaseTemplates      maps.templates
-           the map they make                     TemplateMapper      maps.template_map
+           their map                             TemplateMapper      maps.template_map
     eq. 3  distance to every phase of a layer    phase_distances     maps.distance
     eq. 4  scores S(i) of all places             TemplateMap         maps.template_map
            any kind of map                       PlaceMap            maps.place_map
-           (ours) their generalisation           SpectralMapper      maps.spectral
+           (ours) generalisation of templates    SpectralMapper      maps.spectral
     eq. 5  best place, eq. 6 acceptance          best_match          recognition.select
     IV-A   HOG features                          HOG, hog            features.hog
-    IV-A   window slid along an aerial image     SlidingWindow       data.strip
+    IV-A   sliding window on an aerial image     SlidingWindow       data.strip
     IV-B   velocity from the ground              GroundOdometry      motion.odometry, motion.resampling
     IV-A   (ours) channel, local contrast        Preprocess          features.preprocess
-           (ours) few numbers, that tell places  Whitening           features.whitening
+           (ours) few, distinctive dimensions    Whitening           features.whitening
     IV-C   precision, recall, area               pr_curve, evaluate  evaluation.curves
-    V      (ours) beside baselines and nulls     compare             evaluation.compare
-    VI     (ours) several queries one by one     SequenceMatcher     recognition.sequence
-    VI     (ours) probabilities on the way        PlaceFilter         recognition.filter
-    VI     (ours) frames as they come            LiveLocalizer       live.localizer
+    V      (ours) with baselines and nulls       compare             evaluation.compare
+    VI     (ours) several consecutive queries    SequenceMatcher     recognition.sequence
+    VI     (ours) probabilities along the way    PlaceFilter         recognition.filter
+    VI     (ours) frames from a camera           LiveLocalizer       live.localizer
     VI     (ours) features trained to repeat     PlaceRecognitionTask training.task
            frames to train on                    RouteData           training.datamodule
            any backbone                          Embedding           features.embedding
-           periods imposed instead of found      ImposedPeriods      periods.imposed
+           imposed instead of found periods      ImposedPeriods      periods.imposed
 """
 
 from __future__ import annotations
@@ -64,20 +64,12 @@ if TYPE_CHECKING:
     from dejavu_torch.recognition.sequence import SequenceMatcher as SequenceMatcher
     from dejavu_torch.training.datamodule import RouteData as RouteData
     from dejavu_torch.training.task import PlaceRecognitionTask as PlaceRecognitionTask
-    from dejavu_torch.types import (
-        FrequencyLayer as FrequencyLayer,
-    )
-    from dejavu_torch.types import (
-        InputError as InputError,
-    )
-    from dejavu_torch.types import (
-        Match as Match,
-    )
-    from dejavu_torch.types import (
-        Traverse as Traverse,
-    )
+    from dejavu_torch.types import FrequencyLayer as FrequencyLayer
+    from dejavu_torch.types import InputError as InputError
+    from dejavu_torch.types import Match as Match
+    from dejavu_torch.types import Traverse as Traverse
 
-# where each name lives: a room is imported when one of its names is first asked for
+# the module of each name, imported on first use
 _NAMES = {
     "data.source": "open_source",
     "evaluation.compare": "compare",

@@ -1,4 +1,4 @@
-"""Chunks of a route coded, and parts of a map searched, by the workers of a Ray cluster."""
+"""Coding the chunks of a route, and searching parts of a map, on a Ray cluster."""
 
 from __future__ import annotations
 
@@ -28,30 +28,29 @@ from dejavu_torch.learning import ChunkCoder
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.maps.spectral_map import Chunk, SpectralMap
 from dejavu_torch.recognition.coarse import coarse_search
-from dejavu_torch.recognition.search import Best, Search, Wanted, lowest_needed, search
+from dejavu_torch.recognition.search import Best, Search, Wanted, num_needed, search
 from dejavu_torch.text import one_line
 from dejavu_torch.types import InputError, Traverse
 
 AUTO = "auto"
 RETRIES = 3  # of a task whose worker died
-AHEAD = 2  # tasks for each processor that are submitted at a time
-TASK = 1024  # places at least, whose chunks one task makes
+AHEAD = 2  # submitted tasks per worker
+TASK = 1024  # minimum number of places per task
 QUIET = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}  # no telemetry, no advice
 
 
 class Cluster:
-    """Workers that run tasks: those of a Ray cluster, or of one that is started on this machine.
+    """The workers of a Ray cluster, or of one started on this machine.
 
     Args:
-        address: "auto" starts one worker for each processor of this machine; else that of a cluster, such as
-            `10.0.0.1:6379`, or `ray://10.0.0.1:10001` from outside it.
+        address: "auto" starts one worker for each processor of this machine; otherwise the address of a
+            cluster, such as `10.0.0.1:6379`, or `ray://10.0.0.1:10001` from outside it.
 
-    Convention: what a task needs goes to the workers by value, code of the user included; this package has
-        to be installed there. Relative paths count from this process's folder, where a worker has one of
-        that name.
+    Convention: workers receive all that a task needs by value, including the user's code; this package has to
+        be installed there. Relative paths are relative to this process's folder, if a worker has it.
 
     Raises:
-        InputError: Ray is not installed, or no cluster at that address.
+        InputError: Ray is not installed, or there is no cluster at that address.
     """
 
     def __init__(self, address: str = AUTO) -> None:
@@ -60,17 +59,13 @@ class Cluster:
         logging.getLogger("ray").setLevel(logging.ERROR)
         quiet = {"log_to_driver": False, "logging_level": logging.ERROR, "configure_logging": False}
         handlers = {number: signal.getsignal(number) for number in SIGNALS}
+        local = {"address": "local", "num_cpus": _processors(), "include_dashboard": False}
         try:
-            if address == AUTO:
-                self.ray.init(num_cpus=_processors(), include_dashboard=False, address="local", **quiet)
-            else:
-                self.ray.init(address=address, **quiet)
+            self.ray.init(**(local if address == AUTO else {"address": address}), **quiet)
         except Exception as error:  # of any type
-            raise InputError(
-                f"no Ray cluster at {address}: {one_line(error)[:200]}; expected `auto`, or the address that "
-                "`ray start --head` printed"
-            ) from error
-        finally:  # Ray takes them
+            seen = f"no Ray cluster at {address}: {one_line(error)[:200]}"
+            raise InputError(f"{seen}; expected `auto`, or the address from `ray start --head`") from error
+        finally:  # Ray replaces them
             for number, handler in handlers.items():
                 signal.signal(number, handler)
         self.workers = max(1, int(self.ray.cluster_resources().get("CPU", 1)))
@@ -84,13 +79,8 @@ class Cluster:
     def code(
         self, coder: ChunkCoder, traverse: Traverse, tasks: Sequence[range]
     ) -> Iterator[tuple[range, list[Chunk], str]]:
-        """Code chunks of a traverse: each task, the numbers of some, with its chunks, as tasks are finished.
-
-        A task whose worker dies is run again, `RETRIES` times.
-
-        Returns:
-            A task, its chunks, and what ended it before the last, if anything did, else "".
-        """
+        """Code chunks of a traverse, in tasks that are ranges of chunks. Yields each finished task with its
+        chunks and the error that ended it early, or "". The task of a dead worker runs again."""
         remote = self.ray.remote(num_cpus=1, max_retries=RETRIES)(_code)
         with _by_value(self.ray, (coder, traverse)):
             sent = [self.ray.put((coder, traverse))]
@@ -102,21 +92,20 @@ class Cluster:
                     running[remote.remote(sent, task, os.getcwd())] = task
                 done, _ = self.ray.wait(list(running))
                 for one in done:
-                    yield running.pop(one), *self._chunks(one)
+                    yield running.pop(one), *self._result(one)
         finally:
             for one in running:
                 with suppress(Exception):
                     self.ray.cancel(one, force=True)
 
-    def _chunks(self, reference: Any) -> tuple[list[Chunk], str]:
+    def _result(self, reference: Any) -> tuple[list[Chunk], str]:
         try:
-            results: tuple[list[Chunk], str] = self.ray.get(reference)
-            return results
-        except self.ray.exceptions.RayTaskError:  # an error of ours
+            return self.ray.get(reference)  # type: ignore[no-any-return]
+        except self.ray.exceptions.RayTaskError:  # raised by our code
             raise
         except self.ray.exceptions.RayError as error:
             seen = f"its worker died, {RETRIES + 1} times ({one_line(error)[:100]})"
-            return [], f": {seen}; expected workers that live, and memory for them"
+            return [], f": {seen}; expected workers that stay alive, with enough memory"
 
 
 def code_on(
@@ -127,34 +116,31 @@ def code_on(
     progress: str | None = None,
     together: int = 0,
 ) -> Iterator[Chunk]:
-    """As `ChunkCoder.chunks`, by a cluster: the same bytes in the same order.
+    """As `ChunkCoder.chunks`, on a cluster: the same bytes in the same order.
 
-    A traverse that cannot seek is read from its beginning by every worker, so that its chunks are divided
-    into few tasks.
+    Every worker reads a traverse that cannot seek from its beginning, so its chunks form few tasks.
 
     Args:
         together: chunks of a task; 0 is those of `TASK` places.
 
     Raises:
-        InputError: chunks that came to nothing; all before them have been yielded.
+        InputError: a chunk failed; all chunks before it have been yielded.
     """
     together = together or max(1, TASK // coder.chunk)
     if not traverse.seeks:
         together = max(together, -(-len(wanted) // cluster.workers))
     tasks = [wanted[i : i + together] for i in range(0, len(wanted), together)]
-    total = len(range(*coder.span(wanted)))
+    total, disable = len(range(*coder.span(wanted))), None if progress else True
     done: dict[int, Chunk] = {}
     failed: dict[int, str] = {}
     following = wanted.start
-    with tqdm(
-        total=total, desc=progress, unit="frame", disable=None if progress else True, leave=False
-    ) as bar:
-        for task, made, failure in cluster.code(coder, traverse, tasks):
-            done |= zip(task, made, strict=False)
-            bar.update(sum(chunk.places for chunk in made))
+    with tqdm(total=total, desc=progress, unit="frame", disable=disable, leave=False) as bar:
+        for task, chunks, failure in cluster.code(coder, traverse, tasks):
+            done |= zip(task, chunks, strict=False)
+            bar.update(sum(chunk.places for chunk in chunks))
             if failure:
-                start, stop = coder.span(task[len(made) :])
-                failed[task[len(made)]] = f"frames {start} to {stop - 1}{failure}"
+                start, stop = coder.span(task[len(chunks) :])
+                failed[task[len(chunks)]] = f"frames {start} to {stop - 1}{failure}"
             while following in done:
                 yield done.pop(following)
                 following += 1
@@ -163,30 +149,28 @@ def code_on(
 
 
 class ClusterSearch:
-    """As `search`, consecutive chunks of a spectral map being scored by one worker each.
+    """As `search`, with each worker scoring consecutive chunks of a spectral map.
 
     Args:
-        cluster: its workers hold the chunks; one that dies is started again.
-        method: of each worker on its part. memory: bytes that this may take on all of them together.
+        cluster: its workers hold the chunks; a worker that dies is started again.
+        method: of each worker on its part. memory: bytes for the samples of all workers together.
 
     Shape: queries (Q,K), wanted -> (Q,n) scores and places; see `Wanted`.
 
-    Convention: places are those of a search here, scores up to rounding, which depends on the processor.
+    Convention: places equal those of a search in this process; scores may differ by the processor's rounding.
 
     Raises:
-        InputError: a map of another kind; a worker that does not come back.
+        InputError: a map of another kind; a worker that cannot be restarted.
     """
 
     def __init__(
         self, cluster: Cluster, route: PlaceMap, method: Search = "auto", memory: int | None = None
     ) -> None:
         if not isinstance(route, SpectralMap):
-            raise InputError(
-                f"a map of kind {route.kind!r} is not divided among workers; expected a spectral one"
-            )
+            raise InputError(f"a map of kind {route.kind!r} cannot be divided; expected a spectral one")
         actor = cluster.ray.remote(num_cpus=1, max_restarts=RETRIES, max_task_retries=RETRIES)(_Searcher)
         self.cluster, self.actors = cluster, []
-        self.parts: list[Any] = []  # held for actors that are started again
+        self.parts: list[Any] = []  # kept for restarted actors
         starts, workers = [start for start, _ in route.chunks], cluster.workers
         bounds = [bisect_left(starts, worker * route.places / workers) for worker in range(workers)]
         for first, stop in pairwise([*bounds, len(starts)]):
@@ -197,21 +181,21 @@ class ClusterSearch:
 
     @torch.no_grad()
     def __call__(self, queries: Tensor, wanted: Wanted) -> Best:
-        """Scores and places in which the wanted candidates are."""
+        """Scores and places that include the wanted candidates."""
         try:
             answers = self.cluster.ray.get(
                 [actor.search.remote(queries.cpu().numpy(), wanted) for actor in self.actors]
             )
         except self.cluster.ray.exceptions.RayError as error:
             seen = f"a worker died with its part of the map ({one_line(error)[:100]})"
-            raise InputError(f"{seen}; expected workers that live, and memory for it") from error
-        found = [(torch.from_numpy(score.copy()), torch.from_numpy(place.copy())) for score, place in answers]
-        score, place = (torch.cat(column, 1) for column in zip(*found, strict=True))
+            raise InputError(f"{seen}; expected workers that stay alive, with enough memory") from error
+        columns = zip(*answers, strict=True)
+        score, place = (torch.cat([torch.from_numpy(one.copy()) for one in column], 1) for column in columns)
         return score, place
 
 
 class _Searcher:
-    """Holds a part of a map, whose first place is that one of the whole."""
+    """Searches a part of a map, which begins at place `first`."""
 
     def __init__(self, part: SpectralMap, first: int, method: Search, memory: int | None) -> None:
         torch.set_num_threads(1)
@@ -219,42 +203,37 @@ class _Searcher:
         self.find = None if method == "scan" else coarse_search(part, memory, method == "exact")
 
     def search(self, queries: Any, wanted: Wanted) -> tuple[Any, Any]:
-        """Scores and places in which the wanted candidates of the part are, as arrays."""
-        own = torch.from_numpy(queries.copy())
+        """Scores and places that include the wanted candidates of the part, as arrays."""
+        tensor = torch.from_numpy(queries.copy())
         if self.find is None:
-            score, place = search(self.part, own, lowest_needed(wanted, self.part.places), scan=True)
+            score, place = search(self.part, tensor, num_needed(wanted, self.part.places), scan=True)
         else:
-            score, place = self.find(own, wanted)
+            score, place = self.find(tensor, wanted)
         return score.numpy(), torch.where(score.isfinite(), place + self.first, place).numpy()
 
 
 def check_installed() -> Any:
-    """Ray, or a line that it is not there.
-
-    Raises:
-        InputError: it is not installed.
-    """
+    """The module `ray`; InputError if it is not installed."""
     try:
         return importlib.import_module("ray")
     except ImportError as error:
-        raise InputError(
-            f"Ray is not there ({one_line(error)}); expected it: pip install 'dejavu_torch[cluster]'"
-        ) from error
+        seen = f"Ray cannot be imported ({one_line(error)})"
+        raise InputError(f"{seen}; expected it: pip install 'dejavu_torch[cluster]'") from error
 
 
 def _processors() -> int:
-    """Processors that this process may use; not all systems tell."""
+    """Processors that this process may use, or all of them if the system does not say."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @lru_cache(1)
 def _received(reference: Any) -> Any:
-    """What this worker process was sent last: coder and traverse are unpacked once, not for each task."""
+    """Coder and traverse, unpacked once by each worker process instead of for each task."""
     return check_installed().get(reference)
 
 
 def _code(sent: list[Any], task: range, folder: str) -> tuple[list[Chunk], str]:
-    """The chunks of a task, in a worker, and what ended it early, else ""."""
+    """In a worker: the chunks of a task, and the error that ended it early, or ""."""
     with suppress(OSError):
         os.chdir(folder)
     coder, traverse = _received(sent[0])
@@ -270,7 +249,7 @@ def _code(sent: list[Any], task: range, folder: str) -> tuple[list[Chunk], str]:
 
 @contextmanager
 def _by_value(ray: Any, values: Iterable[object]) -> Iterator[None]:
-    """In the block, classes of the user's own files are sent as code: workers do not have these files."""
+    """Sends classes from the user's own files as code, since workers do not have these files."""
     own = {module.__name__: module for value in values for module in _modules_of(value)}
     for module in own.values():
         ray.cloudpickle.register_pickle_by_value(module)
@@ -282,7 +261,7 @@ def _by_value(ray: Any, values: Iterable[object]) -> Iterator[None]:
 
 
 def _modules_of(value: object) -> Iterator[ModuleType]:
-    """The modules of the user's own files that the classes of a value, and of its parts, come from."""
+    """The modules from the user's own files that define the classes of a value and its parts."""
     if isinstance(value, tuple | list):
         for one in value:
             yield from _modules_of(one)

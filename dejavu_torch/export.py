@@ -1,4 +1,4 @@
-"""A map and all that is ahead of it as one ONNX file, which runs without torch and without this package."""
+"""Export of frames -> scores as one ONNX file, which runs without torch and without this package."""
 
 from __future__ import annotations
 
@@ -31,75 +31,62 @@ from dejavu_torch.types import InputError, SequenceModel
 from dejavu_torch.version import __version__
 
 OPSET = 18
-METADATA = "dejavu_torch"  # the key of the file's metadata whose value is a JSON mapping
-MOST_BYTES = 2**31 - 2**24  # of the constants: protobuf writes files below 2 GB
-TOLERANCE = 1e-3  # of the file's scores beside torch's, relative above 1
-MOST_SIZE = 2**16  # frames of a batch, pixels of a side
-TRIED = 3  # frames that the file is tried on before it is kept
-LONGEST = 200  # characters of what torch says
+METADATA = "dejavu_torch"  # key in the file's metadata, with a JSON mapping as value
+MAX_BYTES = 2**31 - 2**24  # of the constants: protobuf files are smaller than 2 GB
+TOLERANCE = 1e-3  # maximum difference to torch's scores, relative above 1
+MAX_SIZE = 2**16  # frames of a batch, pixels of a side
+TRIED = 3  # frames that the file is tested on
+MAX_REASON = 200  # characters of an error of torch
 
 
 class Exported(NamedTuple):
-    """What was written.
+    """The result of an export."""
 
-    facts: the file's metadata. bytes: of the file. difference: the largest to torch's scores, relative above
-    1, on frames of noise.
-    """
-
-    facts: dict[str, Any]
+    facts: dict[str, Any]  # the file's metadata
     bytes: int
-    difference: float
+    difference: float  # the largest to torch's scores, relative above 1, on frames of noise
 
 
-class Rebuilt(nn.Module):
-    """The scores of a spectral map from its descriptors as constants: what `SpectralMap.scores` gives.
-
-    Shape: (Q,K) -> (Q,N).
-    """
+class Decoded(nn.Module):
+    """`SpectralMap.scores` with the decoded descriptors as constants, (Q,K) -> (Q,N)."""
 
     descriptors: Tensor
     norms: Tensor
-    per_norm: Tensor
+    inverse_norms: Tensor
 
     def __init__(self, route: SpectralMap) -> None:
         super().__init__()
         self.metric = route.metric
-        rebuilt = torch.cat([route.decode(g) for g in range(len(route.chunks))])
-        self.register_buffer("descriptors", rebuilt.T.contiguous())
+        decoded = torch.cat([route.decode(g) for g in range(len(route.chunks))])
+        self.register_buffer("descriptors", decoded.T.contiguous())
         self.register_buffer("norms", route.norms)
-        self.register_buffer("per_norm", route.inverse_norms())
+        self.register_buffer("inverse_norms", route.inverse_norms())
 
     def forward(self, queries: Tensor) -> Tensor:
         length: Tensor = torch.linalg.vector_norm(queries, dim=1, keepdim=True)
         if self.metric == "cosine":
             queries = queries / torch.where(length > 0, length, 1)
-            return 1 - queries @ self.descriptors * self.per_norm
+            return 1 - queries @ self.descriptors * self.inverse_norms
         products = queries @ self.descriptors
         return (length.square() - 2 * products + self.norms.square()).clamp(min=0)
 
 
 class Resized(nn.Module):
-    """Frames at the size of the map's: (B,C,any,any) -> (B,C,H,W)."""
+    """Resizes frames to the size of the map's: (B,C,any,any) -> (B,C,H,W)."""
 
     def __init__(self, size: tuple[int, int]) -> None:
         super().__init__()
         self.size = size
 
     def forward(self, frames: Tensor) -> Tensor:
-        # also where they have that size, which changes nothing: a graph does not branch
+        # even at that size, where it changes nothing, since a graph cannot branch
         return nn.functional.interpolate(frames, self.size, mode="bilinear", antialias=True)
 
 
 class Graph(nn.Module):
-    """A model as what is exported: frames (B,C,H,W), or features (B,D), -> scores (B,N).
+    """The exported form of a model: frames (B,C,H,W), or features (B,D), -> scores (B,N).
 
     With a sequence: one frame (1,C,H,W) and the state before it -> scores (1,N) and the next state.
-
-    Args:
-        sequence: None takes each frame by itself.
-
-    Attributes:
-        parts: what a frame goes through, by name, in order.
     """
 
     def __init__(self, model: DejaVu, sequence: SequenceModel | None = None) -> None:
@@ -113,10 +100,10 @@ class Graph(nn.Module):
         if model.whitening is not None and model.whitening.learned:
             whitening = copy.deepcopy(model.whitening)
             for part in whitening.parts:
-                part.projection = part.whole  # not two numbers to a byte
+                part.projection = part.whole  # not two values per byte
             parts["whitening"] = whitening
-        parts["map"] = Rebuilt(model.map) if isinstance(model.map, SpectralMap) else model.map
-        self.parts = nn.ModuleDict(parts)
+        parts["map"] = Decoded(model.map) if isinstance(model.map, SpectralMap) else model.map
+        self.parts = nn.ModuleDict(parts)  # the stages in order
         self.sequence = sequence
 
     def forward(self, frames: Tensor, state: Tensor | None = None) -> Tensor | tuple[Tensor, Tensor]:
@@ -129,55 +116,49 @@ def export_onnx(model: DejaVu, path: str | Path, sequence: SequenceModel | None 
     """Write preprocessing, features, whitening, map and scores as one ONNX file, opset 18.
 
     Args:
-        model: with a map. A spectral map is rebuilt: the file holds the descriptors of all places, float32.
-        path: of the file, written whole or not at all, and only if onnxruntime gives torch's scores with it.
-        sequence: a `SequenceMatcher` or a `PlaceFilter`: the file then takes one frame at a time and the
-            state before it, and gives the next state; see `SequenceModel.step`.
+        model: with a map. A spectral map is decoded: the file holds the float32 descriptors of all places.
+        path: of the file, which is written only if onnxruntime reproduces torch's scores.
+        sequence: a `SequenceMatcher` or a `PlaceFilter`. The file then maps one frame and the state before it
+            to scores and the next state, see `SequenceModel.step`.
 
-    Shape: `frames` (B,C,H,W) float32 in [0, 1] -> `scores` (B,N), for any B, H and W: frames of another size
-        than the map's are resized to it. On a map of ready features the input is `features` (B,D). With a
-        sequence `frames` (1,C,H,W), `state` -> `scores` (1,N), `next_state`.
+    Shape: `frames` (B,C,H,W) float32 in [0, 1] -> `scores` (B,N), for any B, H and W: frames are resized to
+        the size of the map's. For a map of ready features the input is `features` (B,D). With a sequence
+        `frames` (1,C,H,W), `state` -> `scores` (1,N), `next_state`.
 
-    Convention: the metadata's entry "dejavu_torch" is JSON: the names and shapes of inputs and outputs, the
-        places, the threshold where there is one, of single frames the calibration where there is one, the
-        step between places of a resampled map, and with a sequence the number that fills its first state.
-        Places are those of the map. Frames are not checked: NaN gives NaN.
+    Convention: the metadata's entry "dejavu_torch" is JSON: names and shapes of inputs and outputs, the
+        number of places, and if there is one, the threshold, the calibration for single frames, the step
+        between places of a resampled map, and the number that fills the first state of a sequence. Places
+        are those of the map. Frames are not checked: NaN gives NaN.
 
     Raises:
-        InputError: no map, a part that cannot be exported, or whose exported scores are others, onnx or
+        InputError: no map, a part that cannot be exported, different scores of the exported model, onnx or
             onnxruntime missing, more than 2 GB, or a file that cannot be written.
     """
     path = Path(path)
     check_output_file(path)
-    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # onnxruntime's: it is for its user to switch on
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # of onnxruntime, unless the user has set it
     for name in ("onnx", "onnxscript", "onnxruntime"):
         try:
             import_module(name)
         except ImportError as error:
-            raise InputError(
-                f"an export needs {name}, which cannot be imported ({one_line(error)}); "
-                "expected it to be there: pip install 'dejavu_torch[export]'"
-            ) from error
+            seen = f"an export needs {name}, which cannot be imported ({one_line(error)})"
+            raise InputError(f"{seen}; expected it: pip install 'dejavu_torch[export]'") from error
     model.require_map()
     if model.map.routes:
         routes = ", ".join(route.name for route in model.map.routes)
         raise InputError(f"the map has the routes {routes}; expected to export the map of each")
     if model.frame_shape is None:
-        raise InputError(
-            "the map does not know what frames it was learned from; expected one learned from a source"
-        )
+        raise InputError("the map does not know its frames; expected a map learned from a source")
     if sequence is not None:
         sequence.check(None, model.map.places)
     size = 4 * model.map.places * model.map.dimension if isinstance(model.map, SpectralMap) else 0
-    if size > MOST_BYTES:
-        raise InputError(
-            f"{model.map.places} places of {model.map.dimension} numbers take {size / 1e9:.1f} GB; an ONNX "
-            f"file holds {MOST_BYTES / 1e9:.1f} GB"
-        )
+    if size > MAX_BYTES:
+        seen = f"{model.map.places} places of {model.map.dimension} dimensions need {size / 1e9:.1f} GB"
+        raise InputError(f"{seen}; expected at most {MAX_BYTES / 1e9:.1f} GB in an ONNX file")
     device = model.map.positions.device
     graph = Graph(model, sequence)
     noise = torch.rand(TRIED, *model.frame_shape, generator=torch.Generator().manual_seed(0)).to(device)
-    noise[1:, ..., : noise.shape[-1] // 2], noise[2:] = 0, 0  # what is flat, too
+    noise[1:, ..., : noise.shape[-1] // 2], noise[2:] = 0, 0  # half a flat frame, a flat frame
     facts = _facts(model, sequence)
     with torch.no_grad(), in_mode(graph, False), _quiet():
         inputs: tuple[Tensor, ...] = (noise[:2],)
@@ -189,24 +170,18 @@ def export_onnx(model: DejaVu, path: str | Path, sequence: SequenceModel | None 
             free |= {2: "height", 3: "width"} if noise.ndim == 4 else {}
             written = _serialised(_program(graph, inputs, names, free), facts)
             difference = _difference(written, graph, noise, facts)
-        except Exception as error:  # of torch, onnx or onnxruntime, each of which has many
+        except Exception as error:  # of any type, from torch, onnx or onnxruntime
             raise _refusal(graph, noise, error) from error
     if not difference <= TOLERANCE:
-        raise InputError(
-            f"the exported scores differ from torch's by {difference:.2g} on noise; expected at most "
-            f"{TOLERANCE:g}: a part does other work in ONNX"
-        )
+        seen = f"the exported scores differ from torch's by {difference:.2g} on noise"
+        raise InputError(f"{seen}; expected at most {TOLERANCE:g}: a part behaves differently in ONNX")
     with whole_file(path) as temporary:
         temporary.write_bytes(written)
     return Exported(facts, len(written), difference)
 
 
 def session_of(file: str | bytes, threads: int = 0) -> Any:
-    """An onnxruntime session on the CPU.
-
-    Args:
-        file: path, or contents. threads: 0 is as many as onnxruntime takes.
-    """
+    """An onnxruntime session on the CPU for a file, by path or contents; 0 threads is its default."""
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
@@ -215,46 +190,40 @@ def session_of(file: str | bytes, threads: int = 0) -> Any:
 
 
 def run_session(session: Any, frames: Tensor) -> Tensor:
-    """Scores of frames, or of features, by a session: (B,C,H,W) -> (B,N); with a sequence one by one."""
+    """Scores of frames, or of features, from a session: (B,C,H,W) -> (B,N); one by one with a sequence."""
     facts = json.loads(session.get_modelmeta().custom_metadata_map[METADATA])
     name, *states = facts["inputs"]
-    given = frames.cpu().numpy()
+    arrays = frames.cpu().numpy()
     if not states:
-        return torch.from_numpy(session.run(None, {name: given})[0])
+        return torch.from_numpy(session.run(None, {name: arrays})[0])
     state = np.full(facts["inputs"]["state"], float(facts["first_state"]), np.float32)
-    found = []
-    for frame in given:
+    rows = []
+    for frame in arrays:
         scores, state = session.run(None, {name: frame[None], "state": state})
-        found.append(torch.from_numpy(scores))
-    return torch.cat(found)
+        rows.append(torch.from_numpy(scores))
+    return torch.cat(rows)
 
 
 def _facts(model: DejaVu, sequence: SequenceModel | None) -> dict[str, Any]:
-    """The metadata; dimensions that are free have a name."""
+    """The metadata; free dimensions have a name."""
     shape, places = list(model.frame_shape or ()), model.map.places
-    name, taken = ("frames", [*shape[:1], "height", "width"]) if len(shape) == 3 else ("features", shape)
-    facts: dict[str, Any] = {"version": __version__, "opset": OPSET, "places": places}
-    facts |= {
-        "frame_shape": shape,
-        "inputs": {name: ["batch", *taken]},
-        "outputs": {"scores": ["batch", places]},
-    }
-    if sequence is not None:
-        first = sequence.start(places, fixed=True)
-        facts["inputs"] = {name: [1, *taken], "state": list(first.shape)}
-        facts["outputs"] = {"scores": [1, places], "next_state": list(first.shape)}
-        facts |= {
-            "first_state": "nan" if isinstance(sequence, SequenceMatcher) else "0",
-            "sequence": str(sequence),
-        }
-    platt = model.matching(None).platt if sequence is None else None
-    if platt is not None:  # of `confidence_of`
-        facts["calibration"] = {**platt._asdict(), "margin": MARGIN, "tolerance": TOLERANCE_OF_MARGIN}
-        precision = model.acceptance().precision
-        facts |= {} if precision is None else {"precision": precision}
-    threshold = model.threshold if sequence is None else sequence.threshold_of(model.threshold)
-    if threshold is None and sequence is not None:
-        threshold = sequence.likely  # of sequences the file has no calibration
+    name, sizes = ("frames", [*shape[:1], "height", "width"]) if len(shape) == 3 else ("features", shape)
+    facts: dict[str, Any] = {"version": __version__, "opset": OPSET, "places": places, "frame_shape": shape}
+    if sequence is None:
+        facts |= {"inputs": {name: ["batch", *sizes]}, "outputs": {"scores": ["batch", places]}}
+        threshold, platt = model.threshold, model.matching(None).platt
+        if platt is not None:  # for `confidence_of`
+            facts["calibration"] = {**platt._asdict(), "margin": MARGIN, "tolerance": TOLERANCE_OF_MARGIN}
+            precision = model.acceptance().precision
+            facts |= {} if precision is None else {"precision": precision}
+    else:
+        state = list(sequence.start(places, fixed=True).shape)
+        facts["inputs"] = {name: [1, *sizes], "state": state}
+        facts["outputs"] = {"scores": [1, places], "next_state": state}
+        facts["first_state"] = "nan" if isinstance(sequence, SequenceMatcher) else "0"
+        facts["sequence"] = str(sequence)
+        threshold = sequence.threshold_of(model.threshold)
+        threshold = sequence.likely if threshold is None else threshold  # without a calibration
     facts |= {} if threshold is None else {"threshold": threshold}
     return facts | ({} if model.step is None else {"step": model.step})
 
@@ -262,9 +231,9 @@ def _facts(model: DejaVu, sequence: SequenceModel | None) -> dict[str, Any]:
 def _program(
     graph: nn.Module, inputs: tuple[Tensor, ...], names: tuple[list[str], list[str]], free: dict[int, str]
 ) -> Any:
-    """What `torch.onnx.export` makes of a module; `free` names the sizes of the first input that may vary."""
-    # not within torch.onnx.export, which would try other ways, some for one batch size only
-    sizes = {axis: torch.export.Dim(name, min=1, max=MOST_SIZE) for axis, name in free.items()}
+    """The ONNX program of a module; `free` names the variable dimensions of the first input."""
+    # exported here, since torch.onnx.export would fall back to ways that fix the batch size
+    sizes = {axis: torch.export.Dim(name, min=1, max=MAX_SIZE) for axis, name in free.items()}
     shapes = (sizes or None, *[None] * (len(inputs) - 1))
     program = torch.export.export(graph, inputs, dynamic_shapes=shapes)
     return torch.onnx.export(
@@ -272,7 +241,7 @@ def _program(
         dynamo=True,
         dynamic_shapes=shapes,  # for their names
         verbose=False,
-        optimize=False,  # it leaves out the addition of less than 1e-8, as ahead of a root that divides
+        optimize=False,  # it would remove additions below 1e-8, such as those before a root in a divisor
         opset_version=OPSET,
         input_names=names[0],
         output_names=names[1],
@@ -281,29 +250,27 @@ def _program(
 
 
 def _translations() -> dict[Callable[..., Any], Callable[..., Any]]:
-    """What torch has no ONNX for."""
+    """ONNX for operations that torch cannot translate."""
     import onnx_ir as ir
     from onnxscript import opset18
 
     op: Any = opset18
 
     def hypot(self: Any, other: Any) -> Any:
-        # in double precision, as exact as torch's: which of two channels is the stronger must not change
-        squares = [
-            op.Mul(one, one) for one in (op.Cast(side, to=ir.DataType.DOUBLE) for side in (self, other))
-        ]
-        return op.Cast(op.Sqrt(op.Add(*squares)), to=self.dtype)
+        # in double precision, as exact as torch: the choice of the stronger channel must not change
+        sides = [op.Cast(side, to=ir.DataType.DOUBLE) for side in (self, other)]
+        return op.Cast(op.Sqrt(op.Add(*(op.Mul(side, side) for side in sides))), to=self.dtype)
 
     def cdist(x1: Any, x2: Any, p: float = 2.0, compute_mode: int | None = None) -> Any:
-        # row by row: nothing of Q x P x F is built
+        # row by row, which builds no tensor of Q x P x F
         if p not in (1.0, 2.0):
-            raise NotImplementedError(f"cdist of p={p}")
+            raise NotImplementedError(f"cdist with p={p}")
         row = ir.Value(name="row", shape=ir.Shape(x1.shape[1:]), type=ir.TensorType(x1.dtype))
-        change = ir.node("Sub", [x2, row])
+        difference = ir.node("Sub", [x2, row])
         axes = ir.node("Constant", [], {"value_ints": [1]})
-        sums = ir.node(f"ReduceL{p:.0f}", [change.outputs[0], axes.outputs[0]], {"keepdims": 0})
+        sums = ir.node(f"ReduceL{p:.0f}", [difference.outputs[0], axes.outputs[0]], {"keepdims": 0})
         sums.outputs[0].type, sums.outputs[0].shape = row.type, ir.Shape(x2.shape[:1])
-        body = ir.Graph([row], sums.outputs, nodes=[change, axes, sums], name="distances")
+        body = ir.Graph([row], sums.outputs, nodes=[difference, axes, sums], name="distances")
         return op.Scan(x1, body=body, num_scan_inputs=1)
 
     aten = torch.ops.aten
@@ -311,7 +278,7 @@ def _translations() -> dict[Callable[..., Any], Callable[..., Any]]:
 
 
 def _serialised(program: Any, facts: dict[str, Any]) -> bytes:
-    """The file's contents: without the places in our source that torch notes at every node."""
+    """The file's contents, without the source locations that torch adds to every node."""
     import onnx_ir as ir
     from onnxscript import optimizer
 
@@ -329,7 +296,7 @@ def _serialised(program: Any, facts: dict[str, Any]) -> bytes:
 
 
 def _difference(written: bytes, graph: Graph, frames: Tensor, facts: dict[str, Any]) -> float:
-    """How far onnxruntime's scores are from torch's at most, relative above 1."""
+    """The largest difference of onnxruntime's scores to torch's, relative above 1."""
     if graph.sequence is None:
         expected = graph(frames)
     else:
@@ -339,13 +306,13 @@ def _difference(written: bytes, graph: Graph, frames: Tensor, facts: dict[str, A
             rows.append(scores)
         expected = torch.cat(rows)
     expected = expected.cpu()
-    found = run_session(session_of(written), frames)
-    apart = (found - expected).abs() / expected.abs().clamp(min=1)
-    return float(torch.where(found == expected, 0, apart.nan_to_num(math.inf)).max())
+    scores = run_session(session_of(written), frames)
+    difference = (scores - expected).abs() / expected.abs().clamp(min=1)
+    return float(torch.where(scores == expected, 0, difference.nan_to_num(math.inf)).max())
 
 
 def _refusal(graph: Graph, frames: Tensor, error: Exception) -> InputError:
-    """The first part that cannot be exported by itself, and why."""
+    """The error of the first part that cannot be exported by itself."""
     for name, part in graph.parts.items():
         try:
             after = part(frames)
@@ -357,16 +324,16 @@ def _refusal(graph: Graph, frames: Tensor, error: Exception) -> InputError:
 
 
 def _reason(error: BaseException) -> str:
-    """The first line of what an exception came from."""
+    """The first line of an exception's original cause."""
     while error.__cause__ is not None:
         error = error.__cause__
     text = str(error).strip() or type(error).__name__
-    return one_line(text.splitlines()[0])[:LONGEST]
+    return one_line(text.splitlines()[0])[:MAX_REASON]
 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Without what torch and onnxscript print and log of their own work."""
+    """Suppresses what torch and onnxscript print and log."""
     before = logging.root.manager.disable
     logging.disable(logging.CRITICAL)
     try:

@@ -1,4 +1,4 @@
-"""How a map is learned: fitted on a sample of the route, then extended chunk by chunk (section III-A)."""
+"""Learning a map: fit on a sample of the route, then extend chunk by chunk (section III-A)."""
 
 from __future__ import annotations
 
@@ -38,42 +38,38 @@ from dejavu_torch.types import InputError, Traverse
 
 log = logging.getLogger("dejavu_torch")
 
-SAMPLE = 10_000  # frames that a route is fitted on; a route that has no more is its own sample
-STRETCHES = 4  # of a sample, at least
+SAMPLE = 10_000  # frames that a longer route is fitted on
+MIN_SEGMENTS = 4  # of a sample
 ROWS = 4096  # descriptors on the device at a time
-FEW = IN_MEMORY // 4  # bytes of descriptors kept in memory
-OFF = 0.02  # deviation from the bytes per place, or the share, asked for that is logged
-LONGEST_SEGMENT = 512  # queries that a filter follows in a calibration
-SEGMENT_SCORES = 2**22  # of the queries of a segment at all places
-CALIBRATION_SCORES = 2**30  # of all frames of a calibration at all places
-SAVED = 60  # seconds from one writing of a partial map to the next
+DESCRIPTOR_MEMORY = IN_MEMORY // 4  # bytes of descriptors kept in memory
+LOGGED_DEVIATION = 0.02  # from the bytes per place, or the share, that the user set
+MAX_SEGMENT = 512  # consecutive queries in a calibration
+SEGMENT_SCORES = 2**22  # maximum, queries of a segment x places
+CALIBRATION_SCORES = 2**30  # maximum, frames of a calibration x places
+SAVE_INTERVAL = 60  # seconds between two versions of a partial map
 
-OnFirst = Callable[[Tensor, Tensor], None]  # of the first batch of frames, and its features
+OnFirst = Callable[[Tensor, Tensor], None]  # receives the first batch of frames and its features
 
 
 class Describer(NamedTuple):
-    """How a model describes frames: all that a process needs for it.
+    """Describes frames; all that a worker process needs for it."""
 
-    pipeline: (B,C,H,W) -> (B,D), preprocess and features. whitening: (B,D) -> (B,K), None for none.
-    batch_size: frames at a time. device: of the model. warned: (traverse, line) that were logged already.
-    """
-
-    pipeline: nn.Module
-    whitening: Whitening | None
+    pipeline: nn.Module  # (B,C,H,W) -> (B,D), preprocess and features
+    whitening: Whitening | None  # (B,D) -> (B,K)
     batch_size: int
     device: torch.device
-    warned: set[tuple[str, str]]
+    warned: set[tuple[str, str]]  # (traverse, line) of warnings that were logged
 
     def features(
         self, traverse: Traverse, progress: str | None = None, on_first: OnFirst | None = None
     ) -> Iterator[Tensor]:
-        """Features of a traverse in batches (B,D), without gradients; see `feature_batches`."""
+        """Batches (B,D) of features, without gradients; see `feature_batches`."""
         return feature_batches(traverse, self.pipeline, self.batch_size, self.device, progress, on_first)
 
     def descriptors(
         self, traverse: Traverse, progress: str | None = None, on_first: OnFirst | None = None
     ) -> Iterator[Tensor]:
-        """Descriptors of a traverse in batches (B,K), without gradients."""
+        """Batches (B,K) of descriptors, without gradients."""
         return map(self.whitened, self.features(traverse, progress, on_first))
 
     def whitened(self, features: Tensor) -> Tensor:
@@ -81,13 +77,13 @@ class Describer(NamedTuple):
         return features if self.whitening is None else self.whitening(features)
 
     def require_learning(self, name: str) -> None:
-        """Refuse a second traverse, by its name, that no whitening learns from."""
+        """Refuse a second traverse of this name if no whitening learns from it."""
         if self.whitening is None or self.whitening.fixed:
             seen = "there is no whitening" if self.whitening is None else "the whitening is another map's"
-            raise InputError(f"{seen} to learn from {name}; expected one that is learned")
+            raise InputError(f"{seen} to learn from {name}; expected a whitening that is learned")
 
     def warn_of_bright(self, frames: Tensor, name: str) -> None:
-        """Once for each traverse, see `warn_of_bright`."""
+        """`warn_of_bright`, once for each traverse."""
         if (name, "bright") not in self.warned and warn_of_bright(frames, name):
             self.warned.add((name, "bright"))
 
@@ -101,9 +97,10 @@ class Describer(NamedTuple):
         """Descriptors (N,K) of a reference; the whitening is learned from it first, unless it is fixed.
 
         Args:
-            second: see `DejaVu.learn`. spectral: for a spectral map whitening learns from a sample if the
-                features exceed the memory, and many descriptors lie in a temporary file, as float16 if they
-                are whitened, which is finer than any step.
+            second: see `DejaVu.learn`.
+            spectral: for a spectral map, whitening learns from a sample if the features exceed the memory,
+                and many descriptors are kept in a temporary file, as float16 if they are whitened, which is
+                finer than any step.
         """
         learns = self.whitening is not None and not self.whitening.fixed
         if second is not None:
@@ -121,11 +118,11 @@ class Describer(NamedTuple):
             features = concatenate(self.features(traverse, progress, check_first))
             self._learn_whitening(features, traverse, second, progress)
             return concatenate(self.whitened(part.to(self.device)) for part in features.split(ROWS))
-        batches = self.descriptors(traverse, progress, check_first)
-        return concatenate(batches, FEW, self.whitening is not None) if spectral else concatenate(batches)
+        storage = (DESCRIPTOR_MEMORY, self.whitening is not None) if spectral else ()
+        return concatenate(self.descriptors(traverse, progress, check_first), *storage)
 
     def _exceeds_memory(self, traverse: Traverse) -> bool:
-        """Whether the float32 features of a traverse of over `SAMPLE` frames are too many to keep."""
+        """Whether the float32 features of a traverse longer than `SAMPLE` exceed the memory."""
         frames = traverse.count()
         return frames > SAMPLE and 4 * frames * self.count_features(traverse) > IN_MEMORY
 
@@ -135,30 +132,28 @@ class Describer(NamedTuple):
         whitening = self.whitening
         assert whitening is not None
         if len(features) < 2 and not is_ready(traverse):
-            raise InputError(f"{traverse.name} has 1 frame; expected at least 2, as of a traverse")
-        looks = "" if second is None else f"by {second.traverse.name}"
+            raise InputError(f"{traverse.name} has 1 frame; expected at least 2")
+        source = "" if second is None else f"by {second.traverse.name}"
         if second is None and not is_ready(traverse) and whitening.views != 0:
             copies = whitening.copies(*features.shape)
             settings = copies, whitening.most_views, whitening.strengths, whitening.seed
-            second, looks = augmented_route(traverse, len(features), *settings)
+            second, source = augmented_route(traverse, len(features), *settings)
         groups = (None, None) if is_ready(traverse) else groups_of(self.pipeline)
         if second is None:
             whitening.learn(features, None, *groups)
         else:
-            batches = self.features(second.traverse, progress and f"learning what changes: {looks}")
+            batches = self.features(second.traverse, progress and f"learning what changes: {source}")
             whitening.learn(features, _with_places(batches, second.places.to(self.device)), *groups)
         whitening.to(self.device)
 
     def visits(self, views: Views, progress: str | None = None) -> tuple[Tensor, Tensor]:
-        """Descriptors (n,K) of the frames that show a place, and these places (n,)."""
+        """Descriptors (n,K) of the frames with a known place, and these places (n,)."""
         rows = concatenate(self.descriptors(views.traverse, progress and "averaging"))
         if len(rows) != len(views.places):
-            seen = (
-                f"{views.traverse.name} gives descriptors {tuple(rows.shape)} of {len(views.places)} places"
-            )
+            seen = f"{views.traverse.name} gives {len(rows)} descriptors for {len(views.places)} places"
             raise InputError(f"{seen}; expected one for each")
-        shown = views.places.to(rows.device) >= 0
-        return rows[shown], views.places[shown.to(views.places.device)]
+        known = views.places.to(rows.device) >= 0
+        return rows[known], views.places[known.to(views.places.device)]
 
     def averaged(self, rows: Tensor, visits: Views, progress: str | None = None) -> Tensor:
         """Descriptors (N,K) of places, averaged with those of visits to them."""
@@ -167,67 +162,60 @@ class Describer(NamedTuple):
         return with_visits(rows.float(), torch.ones(len(rows)), *self.visits(visits, progress))
 
     def seekable(self, views: Views, progress: str | None = None) -> Views:
-        """Views of a traverse that seeks: as they are, or the features of all, which may lie in a file."""
+        """Views whose traverse `seeks`: the same, or their features, kept in a file if they are many."""
         if views.traverse.seeks:
             return views
         features = concatenate(self.features(views.traverse, progress and "averaging"))
         return Views(ArrayTraverse(features.cpu(), views.traverse.name), views.places)
 
     def check_sizes(self, reference: Traverse, query: Traverse) -> int:
-        """How many features a frame gives; refuse, before the long work, traverses that do not give as many.
-
-        Raises:
-            InputError: naming both.
-        """
+        """The number of features per frame; refuses traverses in which it differs, before any long work."""
         counts = [self.count_features(traverse) for traverse in (reference, query)]
         if counts[0] != counts[1]:
             seen = " and ".join(
-                f"{traverse.name} gives {count} features a frame of "
+                f"{traverse.name} gives {count} features per frame of "
                 f"{' x '.join(map(str, traverse.frame_shape))}"
                 for traverse, count in zip((reference, query), counts, strict=True)
             )
-            raise InputError(f"{seen}; expected as many, as frames of one size give")
+            raise InputError(f"{seen}; expected the same number, from frames of the same size")
         return counts[0]
 
     def count_features(self, traverse: Traverse) -> int:
-        """D, of the first frame."""
+        """D, from the first frame."""
         return next(self._replace(batch_size=1).features(traverse)).shape[1]
 
 
 class Sample(NamedTuple):
-    """Evenly spaced stretches of a route; whole chunks of it, if these are short enough.
+    """Evenly spaced segments of a route: whole chunks, if these are short enough."""
 
-    frame: (n,) int64, the frames. stretch: frames of each stretch.
-    """
-
-    frame: Tensor
-    stretch: int
+    frame: Tensor  # (n,) int64
+    segment: int  # frames of each segment
 
     @classmethod
     def of(cls, frames: int, chunk: int) -> Sample:
-        """The sample of a route of over `SAMPLE` frames that is coded in chunks of `chunk`.
+        """The sample of a route longer than `SAMPLE`, coded in chunks of `chunk` places.
 
         Example:
             >>> sample = Sample.of(100_000, chunk=1000)
             >>> len(sample.frame), sample.frame[::1000].tolist()
             (10000, [0, 11000, 22000, 33000, 44000, 55000, 66000, 77000, 88000, 99000])
         """
-        stretch = min(chunk, SAMPLE // STRETCHES)
-        count, last = SAMPLE // stretch, frames // stretch - 1
-        starts = torch.arange(count) * last // (count - 1) * stretch
-        return cls((starts[:, None] + torch.arange(stretch)).flatten(), stretch)
+        segment = min(chunk, SAMPLE // MIN_SEGMENTS)
+        count, last = SAMPLE // segment, frames // segment - 1
+        starts = torch.arange(count) * last // (count - 1) * segment
+        return cls((starts[:, None] + torch.arange(segment)).flatten(), segment)
 
     def views(self, second: Views) -> Views:
-        """What a second traverse shows of the sample; one that shows nothing of it is refused."""
-        found = shown_of(second, self.frame)
-        if not len(found.places):
+        """The views of the sample in a second traverse; InputError if there are none."""
+        views = views_of(second, self.frame)
+        if not len(views.places):
             seen = f"{second.traverse.name} shows none of the {len(self.frame)} frames that are learned from"
-            raise InputError(f"{seen}, in stretches of {self.stretch} all along the route; expected some")
-        return found
+            raise InputError(f"{seen}, in segments of {self.segment} along the route; expected some")
+        return views
 
 
-def shown_of(views: Views, frames: Tensor) -> Views:
-    """What a traverse shows of some frames of a route (n,), increasing, with places that count in these."""
+def views_of(views: Views, frames: Tensor) -> Views:
+    """The views of some frames (n,) of a route, increasing; their places are indices into these frames."""
     places = views.places.cpu()
     at = torch.searchsorted(frames, places).clamp(max=len(frames) - 1)
     shown = (frames[at] == places).nonzero().flatten()
@@ -235,27 +223,23 @@ def shown_of(views: Views, frames: Tensor) -> Views:
 
 
 class ChunkCoder(NamedTuple):
-    """Codes chunks of frames, once whitening, mean and step are known: here, in a process, on a machine.
+    """Codes chunks with known whitening, mean and step, in this process or elsewhere.
 
-    describer: of the model. frames: N, of the route. chunk: places of a chunk. code: descriptors (W,K) of a
-    chunk -> Chunk. visits: frames of a traverse that `seeks`, averaged with those of the places that they
-    show; None averages nothing.
-
-    Convention: no batch spans two chunks, so that what precedes a chunk changes nothing in it. Matrix
-        products round differently by the number of threads: the work is done `in_one_thread`.
+    Convention: the bytes of a chunk do not depend on where it is coded. No batch spans two chunks, and
+        the work is done `in_one_thread`, as the rounding of matrix products depends on the threads.
     """
 
     describer: Describer
-    frames: int
-    chunk: int
-    code: Callable[[Tensor], Chunk]
-    visits: Views | None = None
+    frames: int  # N, of the route
+    chunk: int  # places of a chunk
+    code: Callable[[Tensor], Chunk]  # descriptors (W,K) of a chunk -> Chunk
+    visits: Views | None = None  # frames of a traverse that `seeks`, to average with those of their places
 
     @classmethod
     def like(
         cls, route: SpectralMap, describer: Describer, frames: int, visits: Views | None = None
     ) -> ChunkCoder:
-        """For so many frames of a map's route, or of places to append to it."""
+        """A coder for the frames of a map's route, or for frames to append to it."""
         settings = {"transform": route.transform, "resolution": route.resolution}
         code = partial(code_chunk, mean=route.means[-1], step=route.step, **settings)  # type: ignore[arg-type]
         return cls(describer, frames, route.chunk, code, visits)
@@ -266,16 +250,12 @@ class ChunkCoder(NamedTuple):
         return -(-self.frames // self.chunk)
 
     def span(self, chunks: range) -> tuple[int, int]:
-        """The frames [start, stop) of consecutive chunks."""
+        """The frames [start, stop) of a range of chunks."""
         return chunks.start * self.chunk, min(chunks.stop * self.chunk, self.frames)
 
     @torch.no_grad()
     def chunks(self, traverse: Traverse, wanted: range, progress: str | None = None) -> Iterator[Chunk]:
-        """The chunks of these numbers in order; memory holds one.
-
-        Raises:
-            InputError: frames that cannot be read, or as `feature_batches` and `code_chunk`.
-        """
+        """Code a range of chunks, one at a time; InputError as from `feature_batches` and `code_chunk`."""
         start, stop = self.span(wanted)
         part = _ByChunks(traverse, start, stop, self.chunk)
         held: list[Tensor] = []
@@ -287,16 +267,15 @@ class ChunkCoder(NamedTuple):
                 if done % self.chunk == 0 or done == stop:
                     rows, held = torch.cat(held), []
                     if self.visits is not None:
-                        shown = shown_of(self.visits, torch.arange(done - len(rows), done))
-                        rows = self.describer.averaged(rows, shown)
+                        visits = views_of(self.visits, torch.arange(done - len(rows), done))
+                        rows = self.describer.averaged(rows, visits)
                     yield self.code(rows)
         if done < stop:
-            seen = f"{traverse.name} ended at frame {done}"
-            raise InputError(f"{seen}; expected {self.frames} frames, as it had before")
+            raise InputError(f"{traverse.name} ended at frame {done}; expected its {self.frames} frames")
 
 
 class _ByChunks(Traverse):
-    """The frames [start, stop) of a traverse, in batches as large as may be that do not span two chunks."""
+    """The frames [start, stop) of a traverse, in batches that do not span two chunks."""
 
     length: int
 
@@ -307,7 +286,7 @@ class _ByChunks(Traverse):
 
     def batches(self, size: int) -> Iterator[Tensor]:
         span = range(self.start, self.start + self.length)
-        # frames that cannot be read are then read with no chunk but their own
+        # an unreadable frame then stops only its own chunk
         step = self.chunk if self.traverse.seeks else self.length
         parts = (self.traverse.select(span[i : i + step], size) for i in range(0, self.length, step))
         frames, done = chain.from_iterable(chain.from_iterable(parts)), 0
@@ -324,13 +303,13 @@ class _ByChunks(Traverse):
         return self.traverse.frame_shape
 
 
-#: the chunks of a traverse with these numbers, in order: here, or by the workers of a cluster
+#: codes a range of a traverse's chunks, in order: in this process, or on a cluster
 Code = Callable[[ChunkCoder, Traverse, range, str | None], Iterator[Chunk]]
 
 
 @contextmanager
 def in_one_thread() -> Iterator[None]:
-    """In the block torch computes in one thread, so that the number of cores changes no bit of a product."""
+    """Makes torch compute in one thread, so that products do not depend on the number of cores."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -340,13 +319,13 @@ def in_one_thread() -> Iterator[None]:
 
 
 class Checkpoint:
-    """The partial map of a long run, `FILE.part`, from which the same command continues after a kill.
+    """The partial map of a long run, `FILE.part`, with which the same command resumes after a kill.
 
     Args:
         path: of the map.
 
-    Convention: a run is the same if digests of everything that makes the chunks are. Of the source only the
-        files of finished chunks must be unchanged: one that cannot be read may be replaced.
+    Convention: two runs are the same if the digests of everything that affects the chunks are equal. Only the
+        source files of finished chunks have to be unchanged: an unreadable file may be replaced.
     """
 
     def __init__(self, path: Path) -> None:
@@ -358,13 +337,13 @@ class Checkpoint:
     def open(
         self, key: Mapping[str, str], traverse: Traverse, route: SpectralMap, whitening: Whitening | None
     ) -> bool:
-        """Load what the run of this key has finished of a traverse; False if nothing.
+        """Load the finished part of the run with this key; False if there is none.
 
         Args:
-            route: the map before the traverse, and `whitening`, to load into.
+            route, whitening: to load into; `route` has the places that precede the traverse.
 
         Raises:
-            InputError: the file is of a run with another key, or of none, or finished frames were changed.
+            InputError: not a partial map, one of another run, or finished frames that were changed.
         """
         self.key, self.opened = key, True
         if not self.path.exists():
@@ -373,7 +352,7 @@ class Checkpoint:
             tensors, header = read_map(self.path)
             known, state = header["run"], header["state"]
         except (InputError, KeyError) as error:
-            raise InputError(f"{self.path} is no partial map; expected none to be there") from error
+            raise InputError(f"{self.path} is not a partial map; expected no file there") from error
         if known != key:
             other = [name for name in {**key, **known} if key.get(name) != known.get(name)]
             self._refuse(f": its {', '.join(other)} {'differs' if len(other) == 1 else 'differ'}")
@@ -386,21 +365,18 @@ class Checkpoint:
         return True
 
     def check_unused(self) -> None:
-        """Refuse a run without checkpoints if there is the partial map of another."""
+        """Refuse the partial map of another run, before a run without checkpoints."""
         if self.path.exists():
             self._refuse()
 
     @property
     def due(self) -> bool:
-        """Whether the partial map was last written over `SAVED` seconds ago."""
-        return monotonic() - self.written > SAVED
+        """Whether the partial map was last written over `SAVE_INTERVAL` seconds ago."""
+        return monotonic() - self.written > SAVE_INTERVAL
 
     def save(self, route: SpectralMap, whitening: Whitening | None, traverse: Traverse, places: int) -> None:
-        """Write the partial map, which holds so many places of a traverse.
-
-        Raises:
-            InputError: the system refuses it; what was there before stays.
-        """
+        """Write the partial map, with the first `places` places of a traverse. InputError if this fails; an
+        earlier file then stays."""
         tensors = {f"map.{name}": tensor for name, tensor in route.packed().items()}
         if whitening is not None:
             tensors |= {f"whitening.{name}": tensor for name, tensor in whitening.state_dict().items()}
@@ -416,11 +392,11 @@ class Checkpoint:
 
     def _refuse(self, why: str = "") -> NoReturn:
         seen = f"{self.path} has finished chunks of another run{why}"
-        raise InputError(f"{seen}; expected the command that began it, or the file removed")
+        raise InputError(f"{seen}; expected the command that started it, or the file removed")
 
 
 def is_long(traverse: Traverse, chunk: int) -> bool:
-    """Whether a route, coded in chunks of so many places, is learned from a sample and chunk by chunk."""
+    """Whether a route with chunks of this many places is learned from a sample, chunk by chunk."""
     return traverse.count() > max(SAMPLE, chunk)
 
 
@@ -433,15 +409,15 @@ def fit(
     visits: Views | None = None,
     progress: str | None = None,
 ) -> SpectralMap:
-    """A map without places: whitening, mean and step of a traverse of over `SAMPLE` frames, by its sample."""
+    """A map without places, but with whitening, mean and step from the sample of a long traverse."""
     frames = traverse.count()
     sample = Sample.of(frames, mapper.chunk)
     own = second and sample.views(second)
     rows = describer.reference(Selection(traverse, sample.frame), own, progress and "sampling")
     if visits is not None:
-        rows = describer.averaged(rows, shown_of(visits, sample.frame))
-    share = len(rows) / frames  # of what the file holds once, the sample pays its share alone
-    fitted = mapper.with_overhead(round(share * mapper.overhead)).fit(rows, sample.stretch, share)
+        rows = describer.averaged(rows, views_of(visits, sample.frame))
+    share = len(rows) / frames  # of the fixed bytes, charged to the sample
+    fitted = mapper.with_overhead(round(share * mapper.overhead)).fit(rows, sample.segment, share)
     return fitted.to(describer.device)
 
 
@@ -455,14 +431,14 @@ def append_places(
     checkpoint: Checkpoint | None = None,
     code: Code = ChunkCoder.chunks,
 ) -> None:
-    """Add the places of a traverse to a map, as coded chunks; the partial map is kept once a minute.
+    """Append the places of a traverse to a map, as coded chunks; the partial map is saved once a minute.
 
     Args:
-        start: places of the map that precede the traverse; those behind them are there already, as after a
-            kill, and are not made again.
+        start: places of the map that precede the traverse. Places after these are finished, as after a kill,
+            and are not coded again.
 
     Raises:
-        InputError: frames that cannot be read, or a full disk; what is finished is kept.
+        InputError: frames that cannot be read, or a full disk; finished chunks are kept.
     """
     coder = ChunkCoder.like(
         route, describer, traverse.count(), visits and describer.seekable(visits, progress)
@@ -472,7 +448,7 @@ def append_places(
 
     def add() -> None:
         if held:
-            chunks, held[:] = [*held], []  # if this is interrupted, they are not added again
+            chunks, held[:] = [*held], []  # an interruption must not add them twice
             route.extend(chunks)
             if checkpoint is not None:
                 checkpoint.save(route, describer.whitening, traverse, route.places - start)
@@ -480,14 +456,14 @@ def append_places(
     try:
         for chunk in code(coder, traverse, missing, progress) if missing else ():
             held.append(chunk)
-            # short chunks together, since the map grows by copies
+            # several chunks at a time, since each extension copies the map
             if sum(one.places for one in held) >= SAMPLE or (checkpoint is not None and checkpoint.due):
                 add()
         add()
-    except BaseException as error:  # also if the user interrupts it
+    except BaseException as error:  # includes an interruption by the user
         if checkpoint is None:
             raise
-        with suppress(InputError):  # as on a full disk
+        with suppress(InputError):  # a full disk
             add()
         if not checkpoint.kept or not isinstance(error, InputError):
             raise
@@ -497,38 +473,36 @@ def append_places(
 
 @torch.no_grad()
 def learn_descriptors(mapper: Mapper, descriptors: Tensor) -> PlaceMap:
-    """The map that a mapper makes from descriptors (N,K); one of other sizes is refused."""
+    """The map of descriptors (N,K); a map of other sizes is refused."""
     route: PlaceMap = mapper(descriptors)
     if (route.places, route.dimension) != tuple(descriptors.shape):
-        raise InputError(
-            f"{type(mapper).__name__} made a map of {route.places} places of {route.dimension} "
-            f"features from features {tuple(descriptors.shape)}; expected as many"
-        )
+        seen = f"{type(mapper).__name__} made a map of {route.places} places and {route.dimension} features"
+        raise InputError(f"{seen} from features {tuple(descriptors.shape)}; expected the same numbers")
     return route
 
 
 def log_reached(route: SpectralMap, mapper: SpectralMapper) -> None:
-    """The bytes of a long route, and the variance that it holds, if the sample promised others."""
+    """Warn if the bytes of a long route, or the variance that it holds, differ from what was set."""
     hold, held = mapper.share, route.held or 0
-    more = mapper.hold is None and held > (hold or 0)  # as 5 bytes per place hold
-    if hold is not None and not mapper.resolution and abs(held - hold) > OFF and not more:
-        seen = "hold is %g, and the lines hold %.3g of the variance: their step is of %d of %d places"
+    more = mapper.hold is None and held > (hold or 0)  # the default may hold more
+    if hold is not None and not mapper.resolution and abs(held - hold) > LOGGED_DEVIATION and not more:
+        seen = "hold is %g, but the lines hold %.3g of the variance: the step is fitted on %d of %d places"
         log.warning(seen, *(hold, held, SAMPLE, route.places))
     wanted, places, summary = mapper.route_bytes_per_place, route.places, route.summary()
     if wanted is None or summary.route_bytes - summary.route["lines"] >= wanted * places:
         return
     overhead = mapper.overhead if 2 * mapper.overhead <= wanted * places else 0
     reached = (summary.route_bytes + overhead) / places
-    if abs(reached / wanted - 1) > OFF:
+    if abs(reached / wanted - 1) > LOGGED_DEVIATION:
         log.warning(
-            "route_bytes_per_place is %g, and the route takes %.3g, for %.0f %% of its variance: its step is "
-            "of %d of its %d places",
+            "route_bytes_per_place is %g, but the route takes %.3g, for %.0f %% of its variance: the step is "
+            "fitted on %d of its %d places",
             *(wanted, reached, 100 * held, SAMPLE, places),
         )
 
 
 def with_visits(means: Tensor, counts: Tensor, rows: Tensor, places: Tensor) -> Tensor:
-    """Means (N,K) of so many visits (N,) each, and of further ones (n,K) to places (n,) as well."""
+    """Means (N,K) of `counts` (N,) visits each, updated with further descriptors (n,K) of places (n,)."""
     before = counts.to(means)[:, None]
     more = places.bincount(minlength=len(means)).to(means)[:, None]
     sums = (means * before).index_add(0, places.to(means.device), rows.to(means))
@@ -536,11 +510,10 @@ def with_visits(means: Tensor, counts: Tensor, rows: Tensor, places: Tensor) -> 
 
 
 def observation_counts(visits: Views, places: int) -> Tensor:
-    """How many frames of visits show each of so many places, (N,); a place beyond these is refused."""
+    """The number of frames that show each of N places, (N,); a place beyond them is refused."""
     shown = visits.places[visits.places >= 0].cpu()
     if len(shown) and int(shown.max()) >= places:
-        seen = f"{visits.traverse.name} shows place {int(shown.max())}"
-        raise InputError(f"{seen}; expected one of {places}")
+        raise InputError(f"{visits.traverse.name} shows place {int(shown.max())}; expected one of {places}")
     return shown.bincount(minlength=places)
 
 
@@ -550,12 +523,12 @@ def is_ready(traverse: Traverse | None) -> bool:
 
 
 def positions_of(traverse: Traverse | None) -> Tensor:
-    """(F,) how many even steps each frame of a resampled traverse lies from the first place; else (0,)."""
+    """(F,) even steps from the first place to each frame of a resampled traverse; otherwise (0,)."""
     return traverse.positions if isinstance(traverse, ResampledTraverse) else torch.zeros(0)
 
 
 def _with_places(batches: Iterator[Tensor], places: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-    """Batches of features, each with the places (B,) that they show; those that show none left out."""
+    """Batches of features with their places (B,), without frames that show none."""
     done = 0
     for batch in batches:
         shown = places[done : done + len(batch)]
@@ -571,10 +544,10 @@ def calibration_of(
     places: Tensor | None = None,
     progress: str | None = None,
 ) -> Calibration:
-    """How probably answers of a map are right, by their confidence; see `DejaVu.calibrate`."""
+    """See `DejaVu.calibrate`."""
     if views is None:
         if reference is None:
-            raise InputError("neither a reference nor views to calibrate by; expected one of them")
+            raise InputError("no reference and no views to calibrate by; expected one of them")
         strengths = STRENGTHS if describer.whitening is None else describer.whitening.strengths
         places = torch.arange(route.places) if places is None else places
         segments = augmented_segments(reference, len(places), strengths, route.places)
@@ -584,12 +557,12 @@ def calibration_of(
     if isinstance(views.traverse, AugmentedTraverse):
         length = views.traverse.block
     else:
-        length = max(STRETCH, min(LONGEST_SEGMENT, SEGMENT_SCORES // route.places))
+        length = max(STRETCH, min(MAX_SEGMENT, SEGMENT_SCORES // route.places))
         views = _segments_of(views, length, max(LEAST, CALIBRATION_SCORES // route.places))
     name, descriptors = views.traverse.name, concatenate(describer.descriptors(views.traverse, progress))
     if len(descriptors) != len(views.places):
         seen = f"{name} has {len(descriptors)} frames and {len(views.places)} places"
-        raise InputError(f"{seen}; expected as many")
+        raise InputError(f"{seen}; expected the same number")
     parts = zip(descriptors.split(length), views.places.split(length), strict=True)
     try:
         return calibrated(route, parts, another)
@@ -597,9 +570,9 @@ def calibration_of(
         raise InputError(f"calibrating by {name}: {error}") from error
 
 
-def _segments_of(views: Views, length: int, most: int) -> Views:
-    """Evenly spaced segments of views, about `most` frames in all."""
-    count, wanted = len(views.places) // length, max(1, most // length)
+def _segments_of(views: Views, length: int, frames: int) -> Views:
+    """Evenly spaced segments of views, with about `frames` frames in total."""
+    count, wanted = len(views.places) // length, max(1, frames // length)
     if count <= wanted:
         return views
     starts = torch.arange(wanted) * (count - 1) // max(1, wanted - 1) * length

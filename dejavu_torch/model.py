@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.parameter import is_lazy
 
+from dejavu_torch import learning, model_file
 from dejavu_torch.data.arrays import as_traverse
 from dejavu_torch.data.fitted import at_size, resize_like, size_like
 from dejavu_torch.data.names import names_of
@@ -24,37 +25,12 @@ from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import Views
 from dejavu_torch.features.whitening import WIDEST, Whitening
-from dejavu_torch.learning import (
-    Checkpoint,
-    ChunkCoder,
-    Code,
-    Describer,
-    append_places,
-    calibration_of,
-    fit,
-    is_long,
-    is_ready,
-    learn_descriptors,
-    log_reached,
-    observation_counts,
-    positions_of,
-)
 from dejavu_torch.maps.file import checked_fields
 from dejavu_torch.maps.place_map import Mapper, PlaceMap
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.maps.weights import BITS, round_weights
 from dejavu_torch.memory import concatenate
-from dejavu_torch.model_file import (
-    CLASSES,
-    STATE,
-    model_state,
-    read_model,
-    run_key,
-    set_state,
-    summary_of,
-    write_model,
-)
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse, resampled, source_of
 from dejavu_torch.recognition.calibration import Calibration
@@ -65,46 +41,38 @@ from dejavu_torch.recognition.search import SCORES_AT_ONCE, Find, Search, check_
 from dejavu_torch.recognition.select import HIGHEST, PROBABLE, Acceptance, check_candidates
 from dejavu_torch.resize import reduced_size
 from dejavu_torch.text import bar
-from dejavu_torch.types import (
-    BATCH_NUMBERS,
-    InputError,
-    Match,
-    SequenceModel,
-    Training,
-    Traverse,
-)
+from dejavu_torch.types import BATCH_NUMBERS, InputError, Match, SequenceModel, Training, Traverse
 
 log = logging.getLogger("dejavu_torch")
 
-MANY_FEATURES = 50_000  # per frame: worth a word
+MANY_FEATURES = 50_000  # per frame: more are warned of
 
 
 class DejaVu(nn.Module):
     """Learn a compressed map of a route from what repeats along it, and find places on it (section III).
 
     Args:
-        features: any nn.Module (B,C,H,W) -> (B,D); None is `default_features`: HOG and the network of the
-            package side by side, HOG alone without whitening.
-        whitening: reduces features to few numbers, learned anew with each map unless it is `fixed`; None is
-            Whitening for a SpectralMapper and "none" for templates; "none" keeps the features, though a
-            SpectralMapper gets the principal components of ready ones of over 256 numbers.
+        features: any nn.Module (B,C,H,W) -> (B,D); None is `default_features`.
+        whitening: reduces features to few dimensions, learned with each map unless it is `fixed`; None is
+            Whitening for a SpectralMapper and "none" for templates. "none" keeps the features, except that a
+            SpectralMapper reduces ready features of over 256 dimensions to principal components.
         mapper: makes the map from the descriptors of a traverse; None is SpectralMapper with its defaults.
         threshold: accept a match if its score is below; infinity accepts every finite score.
-        precision: accept a match instead if it is at least as probably right, above 0 and below 1; the map
-            has to be calibrated. See `acceptance` for neither.
+        precision: instead, accept a match if its probability is at least this, in (0, 1); the map has to be
+            calibrated. See `acceptance` for the default.
         batch_size: frames in memory at a time.
         preprocess: size, colour and contrast of the frames; None is Preprocess with its defaults, which
             reduces the longer side to 160 pixels and changes nothing else.
-        velocity: measures how the ground moves: places and queries are even steps along it (section IV-B);
-            None uses the frames as they are.
-        weight_bits: of each weight of the features in the file; 8 rounds them in place, with a scale for each
-            output channel.
+        velocity: measures the motion of the ground, so that places and queries are even steps along it
+            (section IV-B); None uses the frames as they are.
+        weight_bits: of each weight of the features in the file; 8 rounds the weights in place, with a scale
+            for each output channel.
 
     Shape: forward: frames (Q,C,H,W) or features (Q,D) -> scores (Q,N), lower is better.
 
-    Convention: a match counts places; `map.frame_of` gives the reference frame that a place shows. `forward`
-        is a fixed run of tensor operations without host synchronisation: it goes through `torch.export` with
-        a dynamic batch and through `torch.compile(fullgraph=True)`.
+    Convention: a match counts places; `map.frame_of` gives the reference frame of a place. `forward` is a
+        fixed sequence of tensor operations without host synchronisation: it supports `torch.export` with a
+        dynamic batch and `torch.compile(fullgraph=True)`.
 
     Example:
         >>> from dejavu_torch import SpectrogramAnalysis, TemplateMapper
@@ -132,8 +100,7 @@ class DejaVu(nn.Module):
         if whitening not in (None, "none") and not isinstance(whitening, Whitening):
             raise InputError(f"the whitening is {whitening!r}; expected a Whitening, 'none' or None")
         if mapper is not None and not isinstance(mapper, Mapper):
-            seen = f"the mapper is a {type(mapper).__name__}"
-            raise InputError(f"{seen}; expected a Mapper such as TemplateMapper")
+            raise InputError(f"the mapper is a {type(mapper).__name__}; expected a Mapper or None")
         if not isinstance(batch_size, int) or batch_size < 1:
             raise InputError(f"batch_size is {batch_size}; expected a whole number of at least 1")
         if threshold is not None and not threshold > -math.inf:
@@ -142,25 +109,23 @@ class DejaVu(nn.Module):
             raise InputError(f"weight_bits is {weight_bits!r}; expected one of {', '.join(map(str, BITS))}")
         check_precision(precision)
         if precision is not None and threshold is not None:
-            raise InputError(f"a threshold, {threshold}, and a precision, {precision}; expected one of them")
+            raise InputError(f"threshold is {threshold} and precision is {precision}; expected one of them")
         self.preprocess = Preprocess() if preprocess is None else preprocess
         self.mapper = SpectralMapper() if mapper is None else mapper
         whitens = (whitening is None and self.mapper.whitens) or isinstance(whitening, Whitening)
         self.features = default_features(whitens) if features is None else features
-        for module in self.features.modules():  # no file can be loaded into expanded ones
+        for module in self.features.modules():  # a file cannot be loaded into expanded buffers
             for name, buffer in module.named_buffers(recurse=False):
                 if not is_lazy(buffer):
                     setattr(module, name, buffer.contiguous())
         if weight_bits == 8 and not round_weights(self.features):
-            raise InputError(
-                f"weight_bits is 8, but {type(self.features).__name__} has no float32 weights of 2 or more "
-                "dimensions (of lazy layers: yet); expected 32"
-            )
+            seen = f"weight_bits is 8, but {type(self.features).__name__} has no float32 weights of 2 or more"
+            raise InputError(f"{seen} dimensions (lazy layers: not yet); expected 32")
         self.weight_bits = weight_bits
         if whitening is None and whitens:
             whitening = Whitening()
         self.whitening = whitening if isinstance(whitening, Whitening) else None
-        self._whitens = self.whitening is not None  # if not, wide features get their own
+        self._whitens = self.whitening is not None  # if not, wide features are whitened nevertheless
         self.threshold = None if threshold is None else float(min(threshold, HIGHEST))
         self.precision = precision
         self.batch_size = batch_size
@@ -168,19 +133,18 @@ class DejaVu(nn.Module):
         self.map: PlaceMap = self.mapper.empty()
         self.step: float | None = None  # pixels of ground from one place of the map to the next
         self.frame_shape: tuple[int, ...] | None = None  # of the reference, or (D,) of ready features
-        self.frame_names: list[str] = []  # of the reference's frames; empty if they have none
+        self.frame_names: list[str] = []  # of the reference; empty if it has none
         self.trained: Training | None = None
         self.calibration: Calibration | None = None
-        self.search: Search = "auto"  # how single queries are searched for, see `localize`
-        self.search_memory: int | None = None  # bytes of its samples; None follows the places
-        self.search_file: Path | str | None = None  # keeps its samples for other processes
-        self.find: Find | None = None  # in its place, as a cluster does
-        # the samples, and what they are of
-        self._coarse: tuple[tuple[Any, ...], CoarseSearch | None] = (), None
-        self._warned: set[tuple[str, str]] = set()  # traverse and line of warnings that are logged once
+        self.search: Search = "auto"  # for single queries, see `localize`
+        self.search_memory: int | None = None  # bytes of the samples, see `coarse.plan`
+        self.search_file: Path | str | None = None  # keeps the samples for other processes
+        self.find: Find | None = None  # replaces the search, such as by a cluster
+        self._coarse: tuple[tuple[Any, ...], CoarseSearch | None] = (), None  # a search and its key
+        self._warned: set[tuple[str, str]] = set()  # (traverse, line) of warnings that were logged
 
     def settings(self) -> dict[str, Any]:
-        """The constructor's arguments as they are now: `DejaVu(**model.settings())` has no map."""
+        """The constructor's arguments now: `DejaVu(**model.settings())` is the same model without a map."""
         own = {name: getattr(self, name) for name in inspect.signature(DejaVu).parameters}
         return own | {"whitening": self.whitening or "none"}
 
@@ -189,132 +153,125 @@ class DejaVu(nn.Module):
         traverse: Traverse | Tensor,
         progress: bool = False,
         second: Views | None = None,
-        checkpoint: Checkpoint | None = None,
-        code: Code = ChunkCoder.chunks,
+        checkpoint: learning.Checkpoint | None = None,
+        code: learning.Code = learning.ChunkCoder.chunks,
         visits: Views | None = None,
     ) -> DejaVu:
         """Section III-A: features, what repeats in them, and the map.
 
         Args:
             traverse: the reference, a Traverse or a tensor: frames (N,C,H,W) or features (N,D).
-            second: another traverse of the same places, from which whitening learns what changes between two
-                visits, in place of augmented copies; `growth.second_traverse` makes it.
-            progress: show a progress bar on a terminal, elsewhere a line a minute, on stderr.
-            checkpoint: keeps the partial map of a long route, from which learning continues after a kill; it
-                is the caller's to remove.
-            code: what codes the chunks of a long route: this process, or a cluster.
+            second: another traverse of the same places, from which whitening learns what changes between
+                visits, instead of from augmented copies; see `growth.second_traverse`.
+            progress: show a progress bar on a terminal, elsewhere a line per minute, on stderr.
+            checkpoint: keeps the partial map of a long route, so that learning can resume after a kill; the
+                caller removes it.
+            code: codes the chunks of a long route: in this process, or on a cluster.
             visits: see `growth.learn_mean`.
 
         Returns:
-            self, in eval mode, with the map in `self.map`. If nothing repeats in a route, its template map
+            self, in eval mode, with the map in `self.map`. If nothing repeats along the route, a template map
             has no layers, and every place scores +inf.
 
-        Convention: memory holds the descriptors (N,K) and a few copies of them; of a route of over `SAMPLE`
-            frames, and over one chunk, a spectral map learns whitening, mean and step from a sample, see
-            `learning.Sample`, and memory holds a chunk, the sample and the map.
+        Convention: the descriptors (N,K) and a few copies of them are in memory. On a route longer than
+            `SAMPLE` frames and one chunk, a spectral map learns whitening, mean and step from a sample, see
+            `learning.Sample`, and only a chunk, the sample and the map are in memory.
 
         Raises:
             InputError: no frames, too few, NaN, or mixed sizes; features that depend on other frames. The
-                model is left as it was.
+                model stays unchanged.
         """
         traverse = self.resample(as_traverse(traverse), progress=progress)
         describer, text = self._describer_of(traverse), "learning" if progress else None
-        mapper = self.mapper.with_overhead(positions_of(traverse).nbytes)
+        mapper = self.mapper.with_overhead(learning.positions_of(traverse).nbytes)
         route: PlaceMap
         counts: Tensor | None = None
         if visits is not None:
             describer.check_sizes(traverse, visits.traverse)
-            counts = observation_counts(visits, traverse.count())
-        if isinstance(mapper, SpectralMapper) and is_long(traverse, mapper.chunk):
+            counts = learning.observation_counts(visits, traverse.count())
+        if isinstance(mapper, SpectralMapper) and learning.is_long(traverse, mapper.chunk):
             route = mapper.empty().to(describer.device)
             resumed = checkpoint is not None and checkpoint.open(
-                run_key(self, traverse, second, visits), traverse, route, describer.whitening
+                model_file.run_key(self, traverse, second, visits), traverse, route, describer.whitening
             )
             if not resumed:
-                route = fit(mapper, describer, traverse, second, visits, text)
-            append_places(route, describer, traverse, 0, visits, text, checkpoint, code)
-            log_reached(route, mapper)
+                route = learning.fit(mapper, describer, traverse, second, visits, text)
+            learning.append_places(route, describer, traverse, 0, visits, text, checkpoint, code)
+            learning.log_reached(route, mapper)
         else:
             if checkpoint is not None:
                 checkpoint.check_unused()
             rows = describer.reference(traverse, second, text, isinstance(mapper, SpectralMapper))
             if visits is not None:
                 rows = describer.averaged(rows, visits, text)
-            route = learn_descriptors(mapper, rows)
+            route = learning.learn_descriptors(mapper, rows)
         if counts is not None:
             route.count_visits(1 + counts)
-        self._keep(describer.whitening)
-        return self._take(route, traverse)
+        self._keep_whitening(describer.whitening)
+        return self._keep_map(route, traverse)
 
     def learn_features(self, features: Tensor, traverse: Traverse | None = None) -> DejaVu:
-        """As `learn`, from descriptors that are there already.
+        """As `learn`, from ready descriptors.
 
         Args:
             features: (N,K) float, whitened if the model whitens.
-            traverse: what they come from, if known: then the map knows which frames to expect, and which
-                frame each place of resampled ones shows.
+            traverse: their source, if known: it tells the map which frames to expect, and the frame of each
+                resampled place.
         """
-        mapper = self.mapper.with_overhead(positions_of(traverse).nbytes)
-        return self._take(learn_descriptors(mapper, features), traverse)
+        mapper = self.mapper.with_overhead(learning.positions_of(traverse).nbytes)
+        return self._keep_map(learning.learn_descriptors(mapper, features), traverse)
 
     def describe_reference(
         self, traverse: Traverse, second: Views | None = None, progress: str | None = None
     ) -> Tensor:
-        """Descriptors (N,K) of the reference, the whitening learned from it: what `learn_features` takes.
+        """Descriptors (N,K) of the reference for `learn_features`; the whitening is learned from it.
 
         Args:
-            second: see `learn`. progress: text of a progress bar on a terminal; None shows nothing.
-
-        Raises:
-            InputError: as `learn`, or a second traverse that no whitening learns from.
+            second: see `learn`; InputError if no whitening learns from it.
+            progress: text of a progress bar on a terminal; None shows none.
         """
         describer = self._describer_of(traverse)
-        found = describer.reference(traverse, second, progress, isinstance(self.mapper, SpectralMapper))
-        self._keep(describer.whitening)
-        return found
+        rows = describer.reference(traverse, second, progress, isinstance(self.mapper, SpectralMapper))
+        self._keep_whitening(describer.whitening)
+        return rows
 
     @property
-    def describer(self) -> Describer:
-        """How the model describes frames now."""
-        pixels = math.prod(own_size(self.features) or (1,))  # fewer frames at a time if these become large
+    def describer(self) -> learning.Describer:
+        """Describes frames with the model's present settings."""
+        pixels = math.prod(own_size(self.features) or (1,))  # larger frames, smaller batches
         batch = max(1, min(self.batch_size, BATCH_NUMBERS // (3 * pixels)))
         pipeline = nn.Sequential(self.preprocess, self.features)
-        return Describer(pipeline, self.whitening, batch, self.map.positions.device, self._warned)
+        return learning.Describer(pipeline, self.whitening, batch, self.map.positions.device, self._warned)
 
-    def _describer_of(self, traverse: Traverse) -> Describer:
-        """As `describer`, to learn from a traverse, with a whitening of its own unless it is fixed.
-
-        Ready features too wide for a spectral map become principal components without whitening, too.
-        """
+    def _describer_of(self, traverse: Traverse) -> learning.Describer:
+        """As `describer`, for learning from a traverse: with a copy of a whitening that is not fixed, or with
+        principal components of ready features that are too wide for a spectral map."""
         whitening = self.whitening if self._whitens else None
         if whitening is not None and not whitening.fixed:
             whitening = copy.deepcopy(whitening)
-        wide = is_ready(traverse) and traverse.frame_shape[0] > WIDEST
+        wide = learning.is_ready(traverse) and traverse.frame_shape[0] > WIDEST
         if whitening is None and wide and isinstance(self.mapper, SpectralMapper):
             whitening = Whitening(views=0).to(self.map.positions.device)
         return self.describer._replace(whitening=whitening)
 
-    def _keep(self, learned: Whitening | None) -> None:
+    def _keep_whitening(self, learned: Whitening | None) -> None:
         if self._whitens and self.whitening is not None and learned is not None:
-            self.whitening.load_state_dict(learned.state_dict())  # it may be the user's, too
+            self.whitening.load_state_dict(learned.state_dict())  # the caller may hold the module too
         else:
             self.whitening = learned
 
     def take_whitening(self, other: DejaVu) -> None:
-        """Describe as another model does: its preprocess, features and whitening, which stays as it is.
-
-        Raises:
-            InputError: the other has no whitening.
-        """
+        """Use the preprocess, features and whitening of another model; the whitening becomes fixed. Raises
+        InputError if there is none."""
         if other.whitening is None or not other.whitening.learned:
-            raise InputError("its map was learned without whitening; expected one that was learned with it")
+            raise InputError("its map was learned without whitening; expected one learned with whitening")
         self.take_descriptor(other)
         self.whitening, self._whitens = other.whitening, True
         self.whitening.fixed = True
 
     def take_descriptor(self, other: DejaVu) -> None:
-        """Use the preprocess and features of another model, such as one trained on many routes; whitening is
-        learned anew.
+        """Use the preprocess and features of another model, such as one trained on many routes, but not its
+        whitening.
 
         Example:
             >>> base = DejaVu(features=HOG(cell=16))
@@ -333,54 +290,48 @@ class DejaVu(nn.Module):
         progress: bool = False,
         shape: tuple[int, ...] | None = None,
     ) -> Traverse:
-        """A traverse in the form that the model learns or localizes: `fit`, then `resampled` by `velocity`.
-
-        Args:
-            step, shape: for queries those of the map, `self.step` and `self.frame_shape`; None for a
-                reference.
-        """
+        """A traverse as the model learns or localizes it: `fit`, then `resampled` by `velocity`. For queries,
+        `step` and `shape` are `self.step` and `self.frame_shape`; for a reference, None."""
         return resampled(self.fit(traverse, shape), self.velocity, self.batch_size, step, progress)
 
     def fit(self, traverse: Traverse, shape: tuple[int, ...] | None = None) -> Traverse:
-        """Frames at the size of the map's, or of `preprocess.size`; images and videos are decoded at it.
+        """Frames at the size of the map's, or at `preprocess.size`; images and videos are decoded at it.
 
         Args:
-            shape: (C,H,W) of the map's frames, or of the reference's; frames of another aspect ratio, by over
-                5 %, stay as they are. None is a reference: the longer side is reduced to `preprocess.size`,
-                but not below the features' own `resize`, or a block of HOG, and not if the source asks for a
+            shape: (C,H,W) of the map's or the reference's frames; frames whose aspect ratio differs by over
+                5 % stay unchanged. None is a reference: the longer side is reduced to `preprocess.size`, but
+                not below the features' own `resize` or a block of HOG, and not if the source specifies a
                 size, such as `clip.mp4?width=320`.
 
         Returns:
-            The traverse itself if its frames, or ready features, have that size.
+            The traverse itself if it has that size, or ready features.
         """
         own = traverse.frame_shape[1:]
         if len(own) != 2 or isinstance(traverse, ResampledTraverse):
             return traverse
         if shape is None:
             longest = None if traverse.sized else self.preprocess.size
-            least = own_size(self.features, block=True)
-            size, why = reduced_size(own, longest, least), "see preprocess.size"
+            size, why = reduced_size(own, longest, own_size(self.features, block=True)), "see preprocess.size"
         else:
             size, why = size_like(own, shape), "the size of the map's frames"
         if size == own:
             return traverse
-        line = f"frames of {own[0]} x {own[1]} pixels are brought to {size[0]} x {size[1]}, {why}"
+        line = f"frames of {own[0]} x {own[1]} pixels are resized to {size[0]} x {size[1]}, {why}"
         if (traverse.name, line) not in self._warned:
             log.warning("%s: %s", traverse.name, line)
             self._warned.add((traverse.name, line))
         return at_size(traverse, size)
 
-    def _take(self, route: PlaceMap, traverse: Traverse | None) -> DejaVu:
-        """The map that was learned from a traverse, in eval mode."""
+    def _keep_map(self, route: PlaceMap, traverse: Traverse | None) -> DejaVu:
+        """Keep the map learned from a traverse; returns self in eval mode."""
         shape = () if traverse is None else traverse.frame_shape
         if len(shape) == 3 and route.dimension > MANY_FEATURES:
-            log.warning(
-                "each frame gives %d features; smaller frames make a smaller and faster map", route.dimension
-            )
+            line = "each frame gives %d features; smaller frames make a smaller and faster map"
+            log.warning(line, route.dimension)
         if len(shape) == 1 and (self.preprocess.channel or self.preprocess.contrast):
-            log.warning("these are ready features: channel and contrast are left as they are")
-        device, positions = self.map.positions.device, positions_of(traverse)
-        route = route.to(device)  # many descriptors lie in a file, on the CPU
+            log.warning("these are ready features: channel and contrast have no effect")
+        device, positions = self.map.positions.device, learning.positions_of(traverse)
+        route = route.to(device)  # many descriptors are in a file, on the CPU
         if len(positions):
             route.positions = positions.to(device)
             route.check()
@@ -391,7 +342,7 @@ class DejaVu(nn.Module):
         return self.replace_map(route)
 
     def replace_map(self, route: PlaceMap) -> DejaVu:
-        """Another map of the same frames, without what was known of the one before; in eval mode."""
+        """Set another map of the same frames, without calibration; returns self in eval mode."""
         self.map, self.find, self.calibration = route, None, None
         return self.eval()
 
@@ -402,16 +353,15 @@ class DejaVu(nn.Module):
         places: Tensor | None = None,
         progress: bool = False,
     ) -> DejaVu:
-        """Learn how probably answers are right by their confidence, for `Match.probability`.
+        """Learn the probability that an answer is right from its confidence, for `Match.probability`.
 
         Args:
-            reference: the traverse that the map was learned from. Every 10th segment of 20 of its frames is
-                localized in changed light and view: `Augmentation` of 1.5 times the strengths of the
-                whitening, which has learned from the plain ones.
-            views: frames of another traverse of the same places instead, or other segments of the reference;
-                those that show no place are left out, and very many are sampled.
-            places: (n,) int64, which place each frame of the reference shows, -1 for none; None is frame i at
-                place i.
+            reference: the traverse that the map was learned from. Every 10th segment of 20 frames is
+                localized in changed light and view: `Augmentation` with 1.5 times the whitening's strengths.
+            views: instead, frames of another traverse of the same places, or other segments of the reference.
+                Frames without a place are ignored, and very many frames are sampled.
+            places: (n,) int64, the place of each frame of the reference, -1 for none; None is place i for
+                frame i.
             progress: see `learn`.
 
         Returns:
@@ -433,16 +383,16 @@ class DejaVu(nn.Module):
         if reference is not None and views is None:
             own = self.fit(as_traverse(reference), self.frame_shape or ())
         text = "calibrating" if progress else None
-        self.calibration = calibration_of(self.describer, self.map, own, views, places, text)
+        self.calibration = learning.calibration_of(self.describer, self.map, own, views, places, text)
         return self
 
     def describe(self, frames: Tensor) -> Tensor:
-        """Features of frames: preprocess, then features. (B,C,H,W) -> (B,D)"""
+        """Preprocess, then features: (B,C,H,W) -> (B,D)."""
         features: Tensor = self.features(self.preprocess(frames))
         return features
 
     def whitened(self, features: Tensor) -> Tensor:
-        """Descriptors of features, (B,D) -> (B,K); the features themselves without whitening."""
+        """Features (B,D) -> descriptors (B,K); without whitening they are the same."""
         return self.describer.whitened(features)
 
     def forward(self, queries: Tensor) -> Tensor:
@@ -464,20 +414,20 @@ class DejaVu(nn.Module):
         """Section III-C: the best place of each query and whether it is accepted (eq. 5, eq. 6).
 
         Args:
-            queries: a Traverse or a tensor: frames (Q,C,H,W) or features (Q,D). For a map of even steps they
-                are resampled likewise, see `resample`.
-            progress: text of a progress bar on a terminal; None is no bar.
-            sequence: scores consecutive queries together, as `SequenceMatcher` and `PlaceFilter` do; None
-                matches each by itself.
-            search: of single queries: "coarse" scores the places near the best samples of a long spectral
-                map, "exact" rules out all others, "scan" scores all; "auto" is coarse if that is faster. None
-                is `self.search`.
+            queries: a Traverse or a tensor: frames (Q,C,H,W) or features (Q,D). They are resampled like the
+                map's frames, see `resample`.
+            progress: text of a progress bar on a terminal; None shows none.
+            sequence: scores consecutive queries together, such as a `SequenceMatcher` or a `PlaceFilter`;
+                None matches each query by itself.
+            search: for single queries: "coarse" scores the places near the best samples of a long spectral
+                map, "exact" also excludes all others by bounds, "scan" scores all places, "auto" is coarse if
+                that is faster. None is `self.search`.
 
         Shape: -> Match of (Q,) on the CPU.
 
         Raises:
             InputError: no map, no frames, NaN, or features of another dimension than the map's; a
-                `self.search_file` that is of another map, or where no samples are searched.
+                `self.search_file` of another map, or for a search without samples.
         """
         return Match.joined(self.matches(queries, progress, sequence, search))
 
@@ -488,11 +438,11 @@ class DejaVu(nn.Module):
         order: Tensor | None = None,
         progress: str | None = None,
     ) -> Match:
-        """As `localize`, of descriptors (Q,K) as the map's own are: whitened if the model whitens.
+        """As `localize`, for descriptors (Q,K), whitened if the model whitens.
 
         Args:
-            matching: or the sequence of `localize`. order: (N,) which frame each place of a shuffled map is;
-                the match then counts frames. progress: text of a progress bar on a terminal; None is no bar.
+            matching: a Matching, or the sequence of `localize`. progress: see `localize`.
+            order: (N,) the frame of each place of a shuffled map; the match then counts frames.
         """
         matching = matching if isinstance(matching, Matching) else self.matching(matching)
         localizer = self.localizer(matching)
@@ -505,7 +455,7 @@ class DejaVu(nn.Module):
             return Match.joined(matcher.match(part[:, place.to(part.device)]) for part in scores)
 
     def localizer(self, matching: Matching) -> Localizer:
-        """What matches descriptors on the map, a batch of consecutive queries after the other."""
+        """A matcher of descriptors, for consecutive batches of queries."""
         self.require_map()
         check_search(matching.search)
         sequence, coarse = matching.sequence, None
@@ -521,12 +471,11 @@ class DejaVu(nn.Module):
         return Localizer(self.map, matching, coarse, coarse.approximate)
 
     def _coarse_search(self, exact: bool) -> CoarseSearch | None:
-        """Samples of the map as it is, made when they are first needed; None where it is scanned."""
-        norms = getattr(self.map, "norms", None)  # another tensor if the map is another
+        """The coarse search of the present map, made on first use; None if the map has to be scanned."""
+        norms = getattr(self.map, "norms", None)  # identifies the map
         known, found = self._coarse
-        how = self.search_memory, exact
-        if not known or known[0] is not norms or known[1:] != (self.search_file, *how):
-            file = self.search_file
+        file, how = self.search_file, (self.search_memory, exact)
+        if not known or known[0] is not norms or known[1:] != (file, *how):
             found = coarse_search(self.map, *how) if file is None else kept_search(Path(file), self.map, *how)
             self._coarse = (norms, file, *how), found
         return found
@@ -566,11 +515,11 @@ class DejaVu(nn.Module):
         sequence: SequenceModel | None = None,
         search: Search | None = None,
     ) -> Match:
-        """The k best places of each query, no two of them near each other; the first is `localize`'s.
+        """The k best places of each query; the first is that of `localize`.
 
         Args:
             queries, sequence, search: see `localize`.
-            k: how many, from 1 to the number of places.
+            k: from 1 to the number of places.
             apart: suppression radius in places, at least 0: any two candidates of a query differ by more.
 
         Shape: -> Match of (Q,k) on the CPU.
@@ -586,25 +535,21 @@ class DejaVu(nn.Module):
         return Match.joined(self.matches(queries, None, sequence, search, k, apart))
 
     def matching(self, sequence: SequenceModel | None = None, search: Search | None = None) -> Matching:
-        """How queries are matched, with probabilities if the map is calibrated for it.
-
-        Raises:
-            InputError: a precision, but the map is not calibrated for this way of matching.
-        """
+        """How queries are matched, with probabilities if the map is calibrated for it. Raises InputError if a
+        precision lacks this calibration."""
         platt = self.calibration and self.calibration.of(sequence)
         if self.precision is not None and platt is None:
-            other = "calibrated for single queries and for a filter that always searches"
-            seen = f"the map is {other if self.calibration else 'not calibrated'}"
-            problem = f"the precision is {self.precision}, but {seen}"
-            raise InputError(f"{problem}; expected a threshold in its place")
+            only = "calibrated for single queries and for a filter with search_every 1 only"
+            seen = f"the precision is {self.precision}, but the map is "
+            raise InputError(f"{seen}{only if self.calibration else 'not calibrated'}; expected a threshold")
         return Matching(sequence, rule=self.acceptance(sequence), platt=platt, search=search or self.search)
 
     def acceptance(self, sequence: SequenceModel | None = None) -> Acceptance:
-        """Which answers are accepted, of single queries or of a sequence (convention 4).
+        """Which answers are accepted, for single queries or for a sequence (convention 4).
 
-        By the threshold or precision that was given, or that the map's file has. Else with a probability of
-        at least .5, if the map is calibrated for this way of matching. Else those that a filter holds for
-        more likely than not, and otherwise every finite score.
+        In this order: by the threshold or precision of the user or of the map's file; with a probability of
+        at least .5, if the map is calibrated for this way of matching; with a filter's own probability above
+        .5; every finite score.
         """
         threshold = self.threshold if sequence is None else sequence.threshold_of(self.threshold)
         if threshold is not None or self.precision is not None:
@@ -614,27 +559,26 @@ class DejaVu(nn.Module):
         return Acceptance(None if sequence is None else sequence.likely, given=False)
 
     def extract_all(self, traverse: Traverse, progress: str | None = None) -> Tensor:
-        """Descriptors of a whole traverse, (N,K); many of them lie in a temporary file, see `concatenate`."""
+        """Descriptors (N,K) of a whole traverse; many are kept in a temporary file, see `concatenate`."""
         return concatenate(self.describer.descriptors(traverse, progress))
 
     @property
     def features_per_frame(self) -> int:
-        """D, that the map was learned from."""
+        """D, the number of features per frame that the map was learned from."""
         learned = self.whitening is not None and self.whitening.learned
         return sum(self.whitening.sizes) if learned and self.whitening else self.map.dimension
 
     def check_queries(self, shape: tuple[int, ...], dimension: int, name: str) -> None:
-        """Refuse queries that do not fit the map, and warn of frames of another size that do.
+        """Refuse queries that do not fit the map, and warn if their frames have another size.
 
         Args:
-            shape: of one query, (C,H,W) or (D,). dimension: D, how many features it gives.
-            name: of the queries, for the message.
+            shape: of one query, (C,H,W) or (D,). dimension: D, its features. name: for the message.
         """
         reference, expected = self.frame_shape, self.features_per_frame
         if reference is None or len(shape) != 3:
             return
         if len(reference) == 1:
-            seen = f"{name} holds frames, but the map was learned from ready features"
+            seen = f"{name} has frames, but the map was learned from ready features"
             raise InputError(f"{seen}; expected features (Q, {expected})")
         own, other = (" x ".join(map(str, one)) for one in (shape, reference))
         if dimension != expected:
@@ -644,20 +588,20 @@ class DejaVu(nn.Module):
             log.warning("%s has frames of %s, the map was learned from %s", name, own, other)
 
     def frame_name(self, frame: int) -> str:
-        """The name of a reference frame, such as its file's; empty where it has none."""
+        """The name of a reference frame, such as its file name; empty if it has none."""
         return self.frame_names[frame] if self.frame_names else ""
 
     def save(self, path: str | Path) -> None:
-        """Write the map, or a trained descriptor without one, with the weights of the features, as one
+        """Write the map, or a trained descriptor without a map, and the weights of the features as one
         safetensors file.
 
         Raises:
-            InputError: nothing learnt yet, weights that were changed since they were rounded, or the file
+            InputError: nothing learned yet, weights that changed after they were rounded, or a file that
                 cannot be written.
         """
         if self.trained is None:
             self.require_map()
-        write_model(Path(path), self)
+        model_file.write_model(Path(path), self)
 
     @classmethod
     def load(cls, path: str | Path, features: nn.Module | None = None) -> DejaVu:
@@ -665,62 +609,53 @@ class DejaVu(nn.Module):
 
         Args:
             features: the module that made the map's features, needed if it is not of this package; its
-                weights come from the file.
+                weights are read from the file.
 
         Raises:
-            InputError: missing, truncated, foreign or newer file, or other features than the map's.
+            InputError: a missing, truncated, foreign or newer file, or other features than the map's.
         """
-        return read_model(cls, Path(path), features).eval()
+        return model_file.read_model(cls, Path(path), features).eval()
 
     def summary(self) -> MapSummary:
-        """What the map can tell apart, and the bytes of its file by part."""
-        return summary_of(self)
+        """The resolution of the map, and the bytes of its file by part."""
+        return model_file.summary_of(self)
 
     def get_extra_state(self) -> dict[str, Any]:
-        """What the state_dict holds beside the tensors and the map's own state."""
-        return model_state(self)
+        """The state apart from tensors and the map's own state."""
+        return model_file.model_state(self)
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Take over what `get_extra_state` gave.
-
-        Raises:
-            InputError: a state of other entries, or of other types.
-        """
-        set_state(self, checked_fields(state, STATE, "the model's state"))
+        """Restore the result of `get_extra_state`; InputError if its entries or types differ."""
+        model_file.set_state(self, checked_fields(state, model_file.STATE, "the model's state"))
 
     def require_map(self, purpose: str = "") -> None:
-        """Refuse a model without a map, which is needed for a purpose: " to append to"."""
+        """Refuse a model without a map; `purpose` is for the message, such as " to append to"."""
         if not self.map.places:
             if self.trained is None:
                 raise InputError(f"there is no map yet{purpose}; expected learn(...) or load(...) first")
             seen = f"this is a descriptor without a map{purpose}"
-            raise InputError(f"{seen}; expected learn(...) of a route with it first")
+            raise InputError(f"{seen}; expected learn(...) with it first")
 
 
 def default_features(whitens: bool = True) -> nn.Module:
-    """The features of a model that names none: HOG and a small network side by side, which whitening joins;
-    HOG alone, as the paper has it, if nothing does."""
+    """HOG and the package's network side by side; without whitening HOG alone, as in the paper."""
     return Joined([HOG(), Distilled()]) if whitens else HOG()
 
 
 def own_size(features: nn.Module, block: bool = False) -> tuple[int, int] | None:
-    """The size (height, width) that features resize frames to, if a class of this package does; the largest
-    of joined ones. With `block` a block of HOG is one, too."""
+    """The size (height, width) to which features of this package resize frames, the largest of joined ones;
+    None if they do not. With `block`, also the size of a block of HOG."""
     if isinstance(features, Joined):
-        found = [own_size(member, block) for member in features.members]
-        sizes = [one for one in found if one is not None]
+        sizes = [one for one in (own_size(member, block) for member in features.members) if one is not None]
         return (max(height for height, _ in sizes), max(width for _, width in sizes)) if sizes else None
-    size: tuple[int, int] | None = getattr(features, "resize", None) if type(features) in CLASSES else None
+    known = type(features) in model_file.CLASSES
+    size: tuple[int, int] | None = getattr(features, "resize", None) if known else None
     if size is None and block and type(features) is HOG:
         size = (features.cell * features.block,) * 2
     return size
 
 
 def check_precision(precision: float | None) -> None:
-    """Refuse a precision that no answers can be asked for.
-
-    Raises:
-        InputError: not above 0 and below 1.
-    """
+    """Refuse a precision outside (0, 1)."""
     if precision is not None and not 0 < precision < 1:
         raise InputError(f"the precision is {precision}; expected a share above 0 and below 1, such as .99")

@@ -1,7 +1,7 @@
-"""How a model is written to a map file and read: its parts as recipes, its weights and its map.
+"""Writes a model to a map file and reads it: recipes of its parts, weights and map.
 
 A recipe is the name of a class and its constructor arguments. Only classes in `REGISTRY` are built from a
-file; any other module has to be given by the caller. Nothing is imported by name.
+file; the caller has to give any other module. Nothing is imported by name.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ from dejavu_torch.types import FRAME_NUMBERS, InputError, Training, Traverse
 from dejavu_torch.version import __version__
 
 M = TypeVar("M", bound=nn.Module)
-MOST_PARTS = 16  # of a recipe
-NO_MAP = "a descriptor without a map; expected a map, as `dejavu learn SOURCE --descriptor FILE` makes of it"
+MAX_PARTS = 16  # of a recipe
+NO_MAP = "a descriptor without a map; expected a map, as from `dejavu learn SOURCE --descriptor FILE`"
 
 # the classes that a map file may name
 CLASSES: tuple[type[nn.Module], ...] = (
@@ -76,13 +76,13 @@ REGISTRY = {cls.__name__: cls for cls in CLASSES}
 
 
 class Recipe(NamedTuple):
-    """How to build a module: the name of its class and its constructor arguments."""
+    """The name of a module's class and its constructor arguments."""
 
     class_path: str
     init_args: dict[str, Any]
 
 
-# the header of a map file: the parts and settings of a model, its state, and that of its map
+# the header of a map file: a model's parts, settings and state, and the state of its map
 PARTS: dict[str, tuple[type[nn.Module], Any]] = {
     "preprocess": (Preprocess, Recipe),
     "features": (nn.Module, Recipe),
@@ -102,7 +102,7 @@ HEADER = {name: kind for name, (_, kind) in PARTS.items()} | SETTINGS | STATE | 
 
 
 def recipe_of(module: nn.Module) -> Recipe:
-    """Recipe of a module, without arguments if it is not of this package."""
+    """The recipe of a module, without arguments if its class is not in `REGISTRY`."""
     cls = type(module)
     if REGISTRY.get(cls.__name__) is not cls:
         return Recipe(f"{cls.__module__}.{cls.__qualname__}", {})
@@ -112,7 +112,7 @@ def recipe_of(module: nn.Module) -> Recipe:
             arguments[name] = [recipe_of(one)._asdict() for one in value]
         elif isinstance(value, nn.Module):
             arguments[name] = recipe_of(value)._asdict()
-    return Recipe(cls.__name__, json.loads(json.dumps(arguments)))  # equal to that read from a file
+    return Recipe(cls.__name__, json.loads(json.dumps(arguments)))  # compares equal to one from a file
 
 
 def recipes_of(model: Any) -> dict[str, Any]:
@@ -122,13 +122,13 @@ def recipes_of(model: Any) -> dict[str, Any]:
 
 
 def with_parts(recipe: Recipe) -> list[Recipe]:
-    """A recipe, and those of all its parts."""
+    """A recipe and all recipes nested in it."""
     parts = (part for parts in _parts(recipe).values() for part in parts)
     return [recipe, *(inner for part in parts for inner in with_parts(part))]
 
 
 def _parts(recipe: Recipe) -> dict[str, list[Recipe]]:
-    """The recipes among the arguments, by name; several of an argument that is a list of them."""
+    """The arguments that are recipes, or lists of them, by name."""
     named = {name: one if isinstance(one, list) else [one] for name, one in recipe.init_args.items()}
     return {
         name: checked(ones, list[Recipe], name)
@@ -138,47 +138,43 @@ def _parts(recipe: Recipe) -> dict[str, list[Recipe]]:
 
 
 def difference(stored: Recipe, given: Recipe) -> str:
-    """Where two recipes differ, in words."""
+    """How two recipes differ, in words."""
     if stored.class_path != given.class_path:
         return f"{stored.class_path}; got {given.class_path}"
     names = [name for name, value in stored.init_args.items() if given.init_args.get(name) != value]
-    known, seen = (
-        ", ".join(f"{name}={one.init_args.get(name)}" for name in names) for one in (stored, given)
-    )
-    return f"{stored.class_path} of {known}; got {seen}"
+    values = [", ".join(f"{name}={one.init_args.get(name)}" for name in names) for one in (stored, given)]
+    return f"{stored.class_path} with {'; got '.join(values)}"
 
 
 def build(recipe: Recipe, kind: type[M], given: nn.Module | None = None) -> M:
-    """A module of base class `kind` by its recipe; `given` is taken where the recipe is its own."""
+    """A module of base class `kind` from its recipe; `given` if it has the same recipe."""
     name = recipe.class_path
     if isinstance(given, kind) and recipe_of(given) == recipe:
         return given
     if name not in REGISTRY:
-        raise InputError(
-            f"the map's features come from {name}, which only the caller can load; expected it as "
-            "`features`, with the arguments it was made with"
-        )
+        seen = f"the map's features are of class {name}, which only the caller can load"
+        raise InputError(f"{seen}; expected it as `features`, with its original arguments")
     cls = REGISTRY[name]
     if not issubclass(cls, kind):
-        raise InputError(f"the map names {name}, which is no {kind.__name__}")
+        raise InputError(f"the map names {name}; expected a {kind.__name__}")
     hints = get_type_hints(cls.__init__)
-    kinds = {  # an argument that is newer than the file has its default
+    kinds = {  # an argument that is newer than the file gets its default
         key: hints[key]
         for key, parameter in inspect.signature(cls).parameters.items()
         if key in recipe.init_args or parameter.default is parameter.empty
     }
     arguments = checked_fields(recipe.init_args, kinds, f"the map's {name}")
     count = len(with_parts(recipe))
-    if count > MOST_PARTS:
-        raise InputError(f"the map's {name} is made of {count} parts; expected at most {MOST_PARTS}")
+    if count > MAX_PARTS:
+        raise InputError(f"the map's {name} has {count} parts; expected at most {MAX_PARTS}")
     for key, parts in _parts(recipe).items():
-        # only learning needs what found the periods: without a finder of this package the mapper has none
+        # only learning needs the period finder: a foreign one is omitted
         foreign = key == "periods" and parts[0].class_path not in REGISTRY
-        made = [None if foreign else build(part, nn.Module, given) for part in parts]
-        if given is not None and sum(one is given for one in made) > 1:
+        built = [None if foreign else build(part, nn.Module, given) for part in parts]
+        if given is not None and sum(one is given for one in built) > 1:
             seen = f"several members of the features are {recipe_of(given).class_path}"
             raise InputError(f"{seen}, and one was given; expected all members, as a list")
-        arguments[key] = made if isinstance(arguments[key], list) else made[0]
+        arguments[key] = built if isinstance(arguments[key], list) else built[0]
     module: Any = cls(**arguments)
     if "periods" in arguments:
         module.periods = arguments["periods"]
@@ -186,7 +182,7 @@ def build(recipe: Recipe, kind: type[M], given: nn.Module | None = None) -> M:
 
 
 def weights_of(model: Any, part: str) -> dict[str, Tensor]:
-    """The tensors that a file holds of a part of a model, such as "features"."""
+    """The tensors of a part of a model, such as "features", as stored in a file."""
     module = getattr(model, part)
     state = {} if module is None else module.state_dict()
     weights = packed(module) if part == "features" and model.weight_bits == 8 else state
@@ -194,17 +190,17 @@ def weights_of(model: Any, part: str) -> dict[str, Tensor]:
 
 
 def model_state(model: Any) -> dict[str, Any]:
-    """What a model's state holds beside tensors and the map's own state, as JSON takes it."""
+    """A model's state apart from tensors and the map's own state, as JSON values."""
     names = encode_names(model.frame_names) if model.frame_names else None
-    return {name: _plain(names if name == "names" else getattr(model, name)) for name in STATE}
+    return {name: _json(names if name == "names" else getattr(model, name)) for name in STATE}
 
 
-def _plain(value: Any) -> Any:
-    return {key: _plain(one) for key, one in value._asdict().items()} if hasattr(value, "_asdict") else value
+def _json(value: Any) -> Any:
+    return {key: _json(one) for key, one in value._asdict().items()} if hasattr(value, "_asdict") else value
 
 
 def set_state(model: Any, state: Mapping[str, Any], frames: int | None = None) -> None:
-    """Give a model what `model_state` returned, its types checked."""
+    """Restore the result of `model_state`, whose types are checked."""
     for name in STATE.keys() - {"names"}:
         setattr(model, name, state[name])
     names = state["names"]
@@ -221,7 +217,7 @@ def contents(model: Any) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 
 def summary_of(model: Any) -> MapSummary:
-    """What a model's map can tell apart, and the bytes of its file by part."""
+    """The resolution of a model's map, and the bytes of its file by part."""
     tensors, header = contents(model)
     fixed = {
         name: sum(tensor.nbytes for tensor in weights_of(model, part).values())
@@ -237,7 +233,7 @@ def write_model(path: Path, model: Any) -> None:
     """See `DejaVu.save`."""
     _check_rounded(model)
     tensors, header = contents(model)
-    checked_fields(header, HEADER, "the model")  # what is written can be read
+    checked_fields(header, HEADER, "the model")  # as reading will
     checked(header["map"], model.map.state, "the map")
     write_map(path, tensors, header)
 
@@ -246,13 +242,13 @@ def read_model(make: Callable[..., M], path: Path, features: nn.Module | None) -
     """See `DejaVu.load`; `make` is `DejaVu`."""
     with opened(path) as (tensors, header):
         if features is not None and (given := recipe_of(features)) != (whole := header["features"]):
-            # a part of them is given for what only the caller can load, not as features of its own
+            # a part is enough if only the caller can load it
             foreign = any(part.class_path not in REGISTRY for part in with_parts(given))
             if not (foreign and given in with_parts(whole)):
                 raise InputError(f"it was learned with {difference(whole, given)}")
         weights = unpacked(tensors, "features.")
         if features is None:
-            with torch.device("meta"):  # a claim of large layers allocates nothing
+            with torch.device("meta"):  # large layers in a bad header allocate nothing
                 probe = nn.ModuleDict({"features": _part(header, "features", None)})
                 own = {name: one for name, one in weights.items() if name.startswith("features.")}
                 probe.load_state_dict(own, assign=True)
@@ -265,7 +261,7 @@ def read_model(make: Callable[..., M], path: Path, features: nn.Module | None) -
         loaded = model.load_state_dict(rest, strict=False)
         missing = [name for name in loaded.missing_keys if name.startswith(("features.", "whitening."))]
         if missing or loaded.unexpected_keys:
-            raise InputError(f"it does not fit: missing {missing}, not expected {loaded.unexpected_keys}")
+            raise InputError(f"it does not fit: missing {missing}, unexpected {loaded.unexpected_keys}")
         model.weight_bits = 8 if len(weights) < len(tensors) else 32
         _check_rounded(model)
         set_state(model, header, model.map.table.frames)
@@ -274,11 +270,7 @@ def read_model(make: Callable[..., M], path: Path, features: nn.Module | None) -
 
 
 def read_place_map(path: Path) -> PlaceMap:
-    """The map of a file alone, without what made its features.
-
-    Raises:
-        InputError: as `DejaVu.load`.
-    """
+    """The map of a file without its feature modules; InputError as in `DejaVu.load`."""
     with opened(path) as (tensors, header):
         route: PlaceMap = _part(header, "mapper", None).empty()
         if header["map"].get("places") == 0:
@@ -289,7 +281,7 @@ def read_place_map(path: Path) -> PlaceMap:
 
 @contextmanager
 def opened(path: Path) -> Iterator[tuple[dict[str, Tensor], dict[str, Any]]]:
-    """Tensors and header of a map file; what is refused of them within the block names the file."""
+    """Tensors and header of a map file; errors within the block are raised with the file's name."""
     tensors, values = read_map(path)
     try:
         header = checked_fields(values, HEADER, "its header")
@@ -300,7 +292,7 @@ def opened(path: Path) -> Iterator[tuple[dict[str, Tensor], dict[str, Any]]]:
         yield tensors, header
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    except (RuntimeError, RecursionError) as error:  # tensors that torch does not load, or endless nesting
+    except (RuntimeError, RecursionError) as error:  # torch cannot load tensors, or the nesting is too deep
         raise InputError(f"{path} does not fit its modules: {one_line(error)}") from error
 
 
@@ -310,7 +302,7 @@ def _part(header: Mapping[str, Any], name: str, features: nn.Module | None) -> A
 
 
 def _fill(route: PlaceMap, tensors: Mapping[str, Tensor], state: dict[str, Any]) -> None:
-    """Give an empty map what a file holds of it; nothing if there is only a descriptor."""
+    """Fill an empty map from a file; it stays empty if the file has only a descriptor."""
     checked(state, route.state, "its map")
     own = part_of(tensors, "map")
     if own or state.get("places"):
@@ -320,33 +312,31 @@ def _fill(route: PlaceMap, tensors: Mapping[str, Tensor], state: dict[str, Any])
 
 
 def check_types(tensors: Mapping[str, Tensor], features: nn.Module) -> None:
-    """Refuse whole numbers for weights that are none, such as those of 8 bits without their scales."""
+    """Refuse integers for float weights, such as 8-bit weights without their scales."""
     for name, own in features.state_dict().items():
         stored = tensors.get(f"features.{name}")
         is_float = isinstance(own, Tensor) and own.dtype.is_floating_point
         if is_float and stored is not None and not stored.dtype.is_floating_point:
             kind = str(stored.dtype).removeprefix("torch.")
-            raise InputError(f"it does not fit: features.{name} is of {kind}; expected float numbers")
+            raise InputError(f"it does not fit: features.{name} is {kind}; expected a float type")
 
 
 def _check_rounded(model: Any) -> None:
     if model.weight_bits == 8 and not is_rounded(model.features):
-        raise InputError(
-            f"weights of {type(model.features).__name__} are not rounded to 8 bits; expected all of them, "
-            "and none changed since: a DejaVu that is made of them with weight_bits=8"
-        )
+        seen = f"weights of {type(model.features).__name__} are not rounded to 8 bits, or changed since then"
+        raise InputError(f"{seen}; expected a DejaVu constructed from them with weight_bits=8")
 
 
 def _check(model: Any) -> None:
-    """Refuse parts of a model that do not fit together."""
+    """Refuse inconsistent parts of a model."""
     positions, step, shape, whitening = model.map.positions, model.step, model.frame_shape, model.whitening
     resampled = model.velocity is not None and step is not None and step > 0
     if (len(positions) > 0) != resampled or (step is not None) != resampled:
         raise InputError(f"it has step {step} and {len(positions)} frame positions")
     if whitening is not None and whitening.learned:
-        made, expected = whitening.dimension, model.map.dimension
-        if made != (expected or made):
-            raise InputError(f"its whitening makes {made} numbers; expected the map's {expected}")
+        found, expected = whitening.dimension, model.map.dimension
+        if found != (expected or found):
+            raise InputError(f"its whitening makes {found} dimensions; expected the map's {expected}")
     if shape is not None and (len(shape) not in (1, 3) or min(shape) < 1 or math.prod(shape) > FRAME_NUMBERS):
         raise InputError(f"its frames are {shape}; expected (C,H,W) or (D,)")
 
@@ -354,15 +344,14 @@ def _check(model: Any) -> None:
 def run_key(
     model: Any, traverse: Traverse, second: Views | None = None, visits: Views | None = None
 ) -> dict[str, str]:
-    """What the chunks of a traverse are made of, as digests: see `learning.Checkpoint`."""
+    """Digests of everything that affects the chunks of a traverse, see `learning.Checkpoint`."""
     header = recipes_of(model)
     header["code"] = sorted(filter(None, map(_code_of, {type(one) for one in model.modules()})))
     header |= {"batch_size": model.describer.batch_size, "sample": SAMPLE}
     header |= {"version": __version__, "torch": torch.__version__, "device": model.describer.device.type}
     fixed = model.whitening is not None and model.whitening.fixed
-    sums = checksums(
-        weights_of(model, "features") | (weights_of(model, "whitening") if fixed else {}), header
-    )
+    weights = weights_of(model, "features") | (weights_of(model, "whitening") if fixed else {})
+    sums = checksums(weights, header)
     sources = {
         name: views
         and [views.traverse.identity(), views.traverse.state(0, len(views.places)), views.places.tolist()]
@@ -373,7 +362,7 @@ def run_key(
 
 
 def _code_of(cls: type[nn.Module]) -> str:
-    """The source of a class of the user's own; "" if there is none, or if a version identifies it."""
+    """The source of a user's class; "" if there is none, or for a class that a version identifies."""
     if cls.__module__.partition(".")[0] in ("dejavu_torch", "torch"):
         return ""
     try:

@@ -15,6 +15,7 @@ version = release = __version__
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.viewcode", "pages"]
 html_theme = "furo"
 html_title = "dejavu_torch"
+html_static_path, html_css_files = ["_static"], ["site.css"]
 html_copy_source = False
 
 myst_heading_anchors = 6  # as GitHub makes them

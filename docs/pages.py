@@ -22,21 +22,26 @@ NOTEBOOKS = DOCS / "notebooks"  # copies, as Sphinx reads one folder
 TEXTS = (r"Convention(?: \d+)?", "Environment", "Returns", "Shape", "Source")  # sections without entries
 SECTION = re.compile(rf"^(Args|Attributes|Buffers[\w ,]*|Example|Raises|{'|'.join(TEXTS)}):(?: (.*))?$", re.M)
 MARKUP = re.compile(r"(`[^`]*`|\*[\w'][^*\n]*[\w']\*)|[|*\\]|(?<=\w)_(?!\w)")  # what stays; what is escaped
-WIDTH = "100"  # characters of a line of help
+WIDTH = "88"  # characters of a line of help, as many as the page shows
 
 
-def help_of(line: str) -> str:
-    """What a command line such as `dejavu learn --help` prints."""
+def help_of(lines: str) -> str:
+    """What command lines such as `dejavu learn --help` print, each command under its own heading."""
     from benchmarks.__main__ import run
     from dejavu_torch.cli import run_command
 
-    words = shlex.split(line)
-    program, words = (run_command, words[1:]) if words[0] == "dejavu" else (run, words[3:])
-    printed = io.StringIO()
     os.environ["COLUMNS"] = WIDTH
-    with redirect_stdout(printed), suppress(SystemExit):
-        program(words)
-    return f"```text\n{printed.getvalue().strip()}\n```"
+    shown = []
+    for line in lines.splitlines():
+        words = shlex.split(line)
+        program, words = (run_command, words[1:]) if words[0] == "dejavu" else (run, words[3:])
+        printed = io.StringIO()
+        with redirect_stdout(printed), suppress(SystemExit):
+            program(words)
+        shown += [f"## {line.removesuffix(' --help')}"] if words[-1] == "--help" else []
+        text = printed.getvalue().strip().replace(" \b", "")  # jsonargparse takes a blank back
+        shown.append(f"```text\n{text}\n```")
+    return "\n\n".join(shown)
 
 
 @cache
@@ -120,9 +125,10 @@ def write(app: Any, docname: str, source: list[str]) -> None:
             target = NOTEBOOKS / target.name
         return f"]({os.path.relpath(target, page.parent)}{anchor})" if target.is_file() else found[0]
 
-    text = re.sub(
-        r"^```\{(help|api)\}\n(.*)\n```$", lambda found: GENERATED[found[1]](found[2]), source[0], flags=re.M
-    )
+    def generated(found: re.Match[str]) -> str:
+        return GENERATED[found[1]](found[2])
+
+    text = re.sub(r"^```\{(help|api)\}\n(.*?)\n```$", generated, source[0], flags=re.M | re.S)
     source[0] = re.sub(r"\]\(([\w./-]+)(#[^)\s]*)?\)", link, text)
 
 

@@ -17,6 +17,10 @@ from PIL import Image
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from dejavu_torch.data.simulate.route import SimulatedRoute
+from dejavu_torch.features import distilled
+from dejavu_torch.resize import resize_frames
+
 collect_ignore = ["mutants"]  # it has no tests, and runs them
 
 # commands and notebooks run in processes of their own, beside each other
@@ -46,7 +50,12 @@ FEW_VIEWS = {
     *("test_cli_growth", "test_faults", "test_readme", "test_memory_bench", "test_scale", "test_demo"),
     *("test_cli_networks", "test_pretrained", "test_cli_rejection", "test_onnx_export", "test_reproduce"),
     *("test_routes", "test_spectral_training", "test_trainings", "test_compare"),
+    *("test_cli_live", "test_cli_hub", "test_cli_streaming", "test_configs", "test_joined", "test_cluster"),
+    *("test_storage_bench", "test_train_command", "test_held_out", "test_devices", "test_free_memory"),
+    "test_spectral_model",
 }
+DRAWN = ("test_simulate", "test_golden", "test_frame_range", "test_source")  # what simulated routes draw
+MOST_HELD = 40_000_000  # numbers of frames
 PIXELS = FEW_VIEWS - {"test_demo", "test_compare"} | {"test_real_routes"}
 
 
@@ -77,8 +86,8 @@ def _one_thread() -> None:
 @pytest.fixture(scope="module", autouse=True)
 def _short_work(request: pytest.FixtureRequest) -> Iterator[None]:
     """Where whole commands run again and again, their pictures are drawn but written as one pixel each, and
-    whitening and calibration learn from few copies of frames: both take most of their time, and what a
-    picture looks like, and how many copies there are, is tested elsewhere."""
+    whitening and calibration learn from few copies of frames, which the network sees small: these take most
+    of their time, and what a picture looks like, and how many copies there are, is tested elsewhere."""
     with pytest.MonkeyPatch.context() as patch:
         if request.path.stem in PIXELS:
             one = io.BytesIO()
@@ -88,7 +97,23 @@ def _short_work(request: pytest.FixtureRequest) -> Iterator[None]:
             patch.setattr("dejavu_torch.features.whitening.VIEWS", 1)
             patch.setattr("dejavu_torch.features.whitening.VIEWS_PER_COMPONENT", 1)
             patch.setattr("dejavu_torch.features.views.FEWEST", 100)
+            patch.setattr(distilled, "resize_frames", lambda frames, size: resize_frames(frames, (48, 48)))
+        if not request.path.stem.startswith(DRAWN):
+            patch.setattr(SimulatedRoute, "read", read_once)
         yield
+
+
+held: dict[tuple[str, int], Tensor] = {}  # frames by route and number
+
+
+def read_once(route: SimulatedRoute, frames: range) -> Tensor:
+    """Frames of a simulated route: drawing them took most of the time of many a test."""
+    if sum(map(Tensor.numel, held.values())) > MOST_HELD:
+        held.clear()
+    if new := [i for i in frames if (route.name, i) not in held]:
+        drawn = route._frames(torch.tensor(new))
+        held.update(zip([(route.name, i) for i in new], drawn, strict=True))
+    return torch.stack([held[route.name, i] for i in frames])
 
 
 @pytest.fixture(autouse=True)

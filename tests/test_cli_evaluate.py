@@ -141,7 +141,7 @@ def test_options_that_do_nothing_for_ready_features_are_told(
     run("learn", *arguments)
     assert "ready features" not in caplog.text
     run("learn", *arguments, "--preprocess.channel", "R-B")
-    assert "these are ready features: channel and contrast are left as they are" in caplog.text
+    assert "these are ready features: channel and contrast have no effect" in caplog.text
 
 
 @pytest.mark.parametrize("name", [b"a\nb", b"a\x1b[2Jb", b"\xff\xfe"])

@@ -197,7 +197,7 @@ def test_a_visit_is_averaged_into_a_map_that_is_there(
         ("merge first.safetensors --map m.safetensors", ["first.safetensors", "at least two"]),
         ("merge first.safetensors ./first.safetensors --map m.safetensors", ["the same file"]),
         ("merge first.safetensors f.safetensors --map m.safetensors", ["first", "f cannot be merged"]),
-        ("merge first.safetensors f.safetensors --map f.safetensors", ["f.safetensors is what is read"]),
+        ("merge first.safetensors f.safetensors --map f.safetensors", ["f.safetensors is an input"]),
         ("compare a.npy a.npy --map both.safetensors --out e", ["both.safetensors has", "first, other"]),
         ("export both.safetensors --onnx both.onnx", ["routes first, other"]),
         (f"live both.safetensors {ROUTE} --page 0 --reference {ROUTE}", ["--reference", "2 routes"]),

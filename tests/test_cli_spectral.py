@@ -19,9 +19,10 @@ from command_line import TEMPLATES, fails, frames, report_of, run
 from dejavu_torch import DejaVu, SequenceMatcher, SpectralMapper, open_source
 from dejavu_torch.cli.commands import run_learn
 from dejavu_torch.cli.parser import parse
-from dejavu_torch.features import views
+from dejavu_torch.features import distilled, views
 from dejavu_torch.maps.file import read_map
 from dejavu_torch.recognition import coarse
+from dejavu_torch.resize import resize_frames
 
 ROUTE = "sim:aerial?frames=96"
 SECOND = "sim:aerial?frames=96&traverse=1"
@@ -58,7 +59,7 @@ def same_maps(first: Path, second: Path) -> bool:
 def test_searches_of_localize(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(coarse, "FEWEST", 0)  # as a long map is searched
+    monkeypatch.setattr(coarse, "MIN_PLACES", 0)  # as a long map is searched
     path, out = tmp_path / "m.safetensors", tmp_path / "m.csv"
     run("learn", ROUTE, "--map", path, "--mapper.chunk", "32", "--features", "HOG")
     found = []
@@ -75,7 +76,7 @@ def test_searches_of_localize(
     kept = tmp_path / "route.samples"
     (tmp_path / "link").symlink_to(tmp_path)
     for new in (kept, tmp_path / "link" / kept.name):  # before it is there
-        assert "what is read" in fails(capsys, "localize", path, SECOND, "--search_file", kept, "--out", new)
+        assert "is an input" in fails(capsys, "localize", path, SECOND, "--search_file", kept, "--out", new)
     assert not kept.exists()
     for _ in range(2):  # written, read
         run("localize", path, SECOND, "--search_file", kept, "--out", out)
@@ -89,8 +90,8 @@ def test_searches_of_localize(
     ):
         assert said in fails(capsys, "localize", path, SECOND, "--search_file", kept, *words, "--out", out)
     assert scored in fails(capsys, "live", path, SECOND, "--search_file", kept)
-    assert "what is read" in fails(capsys, "localize", path, SECOND, "--search_file", kept, "--out", kept)
-    assert "no whole file" in fails(capsys, "localize", path, SECOND, "--search_file", path, "--out", out)
+    assert "is an input" in fails(capsys, "localize", path, SECOND, "--search_file", kept, "--out", kept)
+    assert "complete file" in fails(capsys, "localize", path, SECOND, "--search_file", path, "--out", out)
     capsys.readouterr()
     run("live", path, f"{SECOND}&stop=3", "--sequence", "1", "--search_file", kept)
     assert [json.loads(line)["place"] for line in capsys.readouterr().out.splitlines()] == [
@@ -108,7 +109,8 @@ def places(path: Path) -> list[str]:
         return [row["place"] for row in csv.DictReader(file)]
 
 
-def test_two_processes_write_the_same_bytes(tmp_path: Path) -> None:
+def test_two_processes_write_the_same_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(distilled, "resize_frames", resize_frames)  # as it is there
     kinds = {"spectral": ("--whitening.views", "2"), "templates": TEMPLATES}
     words = {name: ["learn", ROUTE, *kind, "--map"] for name, kind in kinds.items()}
     there = [[*line, f"{tmp_path}/{name}.there.safetensors"] for name, line in words.items()]

@@ -48,7 +48,7 @@ def test_a_killed_run_goes_on_where_it_was(
 ) -> None:
     out, part = tmp_path / "route.safetensors", tmp_path / "route.safetensors.part"
     words = ["learn", str(route), "--map", str(out), *CHUNKED]
-    program = "import sys; from dejavu_torch import learning; learning.SAVED = 0; "
+    program = "import sys; from dejavu_torch import learning; learning.SAVE_INTERVAL = 0; "
     program += f"from dejavu_torch.cli import main; main({words!r})"
     process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.DEVNULL)
     stop = time.monotonic() + 120

@@ -165,7 +165,7 @@ def test_a_config_that_is_none_is_refused_ahead_of_the_loader(
 
 def test_a_config_is_a_regular_file(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "fifo")
-    with refused("fifo is no regular file"):
+    with refused("fifo is not a regular file"):
         parse("learn", run_learn, ["x", "--map", "y", "--config", str(tmp_path / "fifo")])
     for name in (str(tmp_path), "a\0b", "a" * 5000, ""):
         with refused("--config"):

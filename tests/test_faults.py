@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import random
 import resource
@@ -20,6 +21,7 @@ import pytest
 from command_line import fails, frames, run, write_images
 
 from dejavu_torch import DejaVu
+from dejavu_torch.cli import main
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="limits, mounts and signals of Linux")
 DEJAVU = (sys.executable, "-m", "dejavu_torch.cli")
@@ -66,6 +68,26 @@ def in_hand(process: subprocess.Popen[bytes]) -> bool:
     lines = Path(f"/proc/{process.pid}/status").read_text().splitlines()
     (caught,) = (int(line.split()[1], 16) for line in lines if line.startswith("SigCgt"))
     return bool(caught >> (signal.SIGTERM - 1) & 1)
+
+
+def forked(work: Callable[[], None]) -> int:
+    """The number of a process that does this: torch takes seconds to import in one that is started."""
+    child = os.fork()
+    if child:
+        return child
+    try:
+        work()
+    except SystemExit as stop:
+        sys.stderr.flush()
+        os._exit(stop.code)  # type: ignore[arg-type]
+    except BaseException:
+        os._exit(1)
+    os._exit(0)
+
+
+def ended(work: Callable[[], None]) -> int:
+    """The status of a process that has done this."""
+    return os.waitstatus_to_exitcode(os.waitpid(forked(work), 0)[1])
 
 
 def names_in(folder: Path) -> set[str]:
@@ -214,44 +236,42 @@ def test_an_interrupt_that_was_turned_into_another_exception_is_one() -> None:
 # standard streams
 
 
-LATE = """
-import os, sys
-from dejavu_torch.cli import commands, main, parser, process  # and torch, once for all that are forked
+def opened(number: int) -> io.TextIOWrapper | None:
+    """A standard stream as Python opens it."""
+    try:
+        os.fstat(number)
+    except OSError:
+        return None
+    return open(number, "w" if number else "r", closefd=False)
 
-def opened(number, mode):
-    try: os.fstat(number)
-    except OSError: return None
-    return open(number, mode, closefd=False)
 
-for redirected in sys.argv[1:]:
-    read, write = os.pipe()
-    if not os.fork():  # a command with its streams as a shell opens them, and Python upon them
+@pytest.mark.parametrize(("redirected", "status"), [("left", 0), ("closed", 0), ("full", 2)])
+def test_files_are_written_whatever_becomes_of_what_is_printed(
+    redirected: str, status: int, folder: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Where who reads has left, as `head` does, where streams are closed, and where a disk is full."""
+
+    def command() -> None:
+        os.chdir(folder)
+        read, write = os.pipe()
         os.close(read)
-        if redirected == "closed": [os.close(number) for number in range(3)]
-        elif redirected == "full": os.dup2(os.open("/dev/full", os.O_WRONLY), 1)
-        else: os.dup2(write, 1)
+        if redirected == "closed":
+            os.closerange(0, 3)
+        else:
+            os.dup2(os.open("/dev/full", os.O_WRONLY) if redirected == "full" else write, 1)
         os.close(write)
         for number, name in enumerate(("stdin", "stdout", "stderr")):
-            stream = opened(number, "w" if number else "r")
-            setattr(sys, name, stream); setattr(sys, f"__{name}__", stream)
-        sys.argv[1:] = ["learn", "a.npy", "--map", f"{redirected}.safetensors", "--whitening.views", "1"]
+            stream = opened(number)
+            setattr(sys, name, stream)
+            setattr(sys, f"__{name}__", stream)
+        sys.argv[1:] = ["localize", "map.safetensors", "b.npy", "--out", "m.csv"]
         main()
-        sys.exit()
-    os.close(write); os.close(read)
-    print(redirected, os.waitstatus_to_exitcode(os.wait()[1]), flush=True)
-"""
 
-
-def test_files_are_written_whatever_becomes_of_what_is_printed(folder: Path) -> None:
-    """Where who reads has left, as `head` does, where streams are closed, and where a disk is full."""
-    words = [sys.executable, "-c", LATE, "left", "closed", "full"]
-    done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
-    assert done.stdout.splitlines() == ["left 0", "closed 0", "full 2"]
-    assert (done.stderr.count("\n"), done.stderr.count("No space left on device")) == (1, 1)
-    for name in ("left", "closed", "full"):
-        path = folder / f"{name}.safetensors"
-        assert path.read_bytes()[8:9] == b"{"  # and nothing that was printed
-        assert DejaVu.load(path).map.places == 64
+    assert ended(command) == status
+    said = "dejavu: what was printed is not whole: No space left on device\n"
+    assert capfd.readouterr().err == said * (redirected == "full")
+    text = (folder / "m.csv").read_text()  # and nothing that was printed
+    assert (text[:12], text.count("\n")) == ("query,place,", 65)
 
 
 @pytest.mark.parametrize(
@@ -350,7 +370,7 @@ def test_an_output_that_is_what_is_read_is_refused_and_stays(
     (folder / "report" / "matches.csv").write_text("query,place\n0,0\n")
     shutil.copy("report/matches.csv", "m.csv")
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    assert "is what is read; expected another" in fails(capsys, *words.split())
+    assert "is an input; expected another" in fails(capsys, *words.split())
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
 
@@ -368,12 +388,15 @@ def test_a_report_may_lie_beside_what_it_is_of(folder: Path, monkeypatch: pytest
 
 
 def mounted(folder: Path, options: str, *commands: str) -> list[str]:
-    """The lines that commands say behind one another with a small disk at `disk`, by themselves."""
+    """The lines that commands say behind one another with a small disk at `disk`, by themselves, and one that
+    can only be read at `sealed`."""
     probe = ["unshare", "-rm", "mount", "-t", "tmpfs", "none", "/mnt"]
     if subprocess.run(probe, capture_output=True).returncode:
         pytest.skip("nothing can be mounted here")
     (folder / "disk").mkdir()
-    script = "; ".join([f"mount -t tmpfs -o {options} none disk", *commands])
+    (folder / "sealed").mkdir()
+    mounts = f"mount -t tmpfs -o {options} none disk", "mount -t tmpfs -o ro none sealed"
+    script = "; ".join([*mounts, *commands])
     done = subprocess.run(
         ["unshare", "-rm", "bash", "-c", script], cwd=folder, capture_output=True, text=True
     )
@@ -393,13 +416,16 @@ def commands_of_one_process(*lines: str) -> str:
     return shlex.join([sys.executable, "-c", code, *lines])
 
 
-def test_a_full_disk_is_one_line_and_leaves_what_was_there(folder: Path) -> None:
+def test_a_disk_that_is_full_or_sealed_is_one_line_and_leaves_what_was_there(folder: Path) -> None:
+    """A sealed one is told ahead of the work."""
     plain = " ".join(PLAIN)
     words = commands_of_one_process(
         f"compare a.npy b.npy {plain} --truth 0 --out disk/old",
         "!dd if=/dev/zero of=disk/full bs=1k count=64 status=none 2> /dev/null",
         f"learn a.npy {plain} --map disk/map.safetensors",
         "learn b.npy --append disk/map.safetensors",
+        "learn sim:aerial?frames=1000000 --map sealed/map.safetensors",
+        "compare a.npy b.npy --out sealed/report",
     )
     found = mounted(
         folder,
@@ -410,47 +436,29 @@ def test_a_full_disk_is_one_line_and_leaves_what_was_there(folder: Path) -> None
         "find disk -mindepth 1 | sort; cat disk/old/*; cmp map.safetensors disk/map.safetensors",
     )
     said = [line for line in found if line.startswith("dejavu: ")]
-    assert [line.rpartition(": ")[2][:13] for line in said] == ["No space left"] * 3
+    assert [line.rpartition(": ")[2][:13] for line in said[:3]] == ["No space left"] * 3
+    assert ["no permission" in line for line in said[3:]] == [True] * 2
     assert [line for line in found if line not in said] == [
-        *["status 2"] * 3,
+        *["status 2"] * 5,
         *("disk/full", "disk/map.safetensors", "disk/old", "disk/old/matches.csv", "disk/old/pr.png"),
         *("old", "old"),
     ]
 
 
-def test_a_place_to_read_only_is_told_ahead_of_the_work(folder: Path) -> None:
-    learn = "learn sim:aerial?frames=1000000 --map disk/map.safetensors"
-    words = commands_of_one_process(learn, "compare a.npy b.npy --out disk/report")
-    found = mounted(folder, "ro", words)
-    assert found[:2] == ["status 2"] * 2
-    assert [line.startswith("dejavu: ") and "no permission" in line for line in found[2:]] == [True] * 2
-
-
-def test_a_limit_on_files_is_one_line(folder: Path) -> None:
+def test_a_limit_on_files_is_one_line(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
     (folder / "m.csv").write_text("old")
     before = names_in(folder)
-    process = start(
-        folder,
-        *("localize", "map.safetensors", "b.npy", "--out", "m.csv"),
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (500, 500)),
-    )
-    said = process.communicate(timeout=60)[1]
-    assert (process.returncode, said) == (2, b"dejavu: m.csv was not written: File too large\n")
+
+    def limited() -> None:
+        os.chdir(folder)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (500, 500))
+        run("localize", "map.safetensors", "b.npy", "--out", "m.csv")
+
+    assert (ended(limited), capfd.readouterr().err) == (2, "dejavu: m.csv was not written: File too large\n")
     assert (names_in(folder), (folder / "m.csv").read_text()) == (before, "old")
 
 
-# kills and several writers: processes that are forked, as torch takes seconds to import
-
-
-def forked(work: Callable[[], None]) -> int:
-    child = os.fork()
-    if child:
-        return child
-    try:
-        work()
-    except BaseException:
-        os._exit(1)
-    os._exit(0)
+# kills and several writers
 
 
 def test_a_kill_leaves_a_whole_map_and_a_whole_report(folder: Path) -> None:

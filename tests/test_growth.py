@@ -135,7 +135,7 @@ def test_what_the_new_places_hold_is_told_where_it_is_unlike_before(
 
     assert grown(route[:64]) == ""
     faint = grown(route.mean(0) + 0.01 * torch.randn(64, NUMBERS))
-    assert "the 64 places behind hold 0" in faint
+    assert "the 64 places appended hold 0" in faint
     assert ("those before" in faint) == ("hold" in settings or not stored)
 
 
@@ -248,9 +248,9 @@ def test_what_cannot_be_appended() -> None:
         (DejaVu(), walk(40), ("no map yet to append to",)),
         (merge(routes("a", "b"), ["a", "b"]), walk(64), ("routes a, b", "append to the map of a route")),
         (features, torch.rand(40, 7), ("7 features", "expected 6")),
-        (features, torch.rand(40, 1, 9, 9), ("holds frames", "ready features")),
+        (features, torch.rand(40, 1, 9, 9), ("has frames", "ready features")),
         (features, torch.full((40, NUMBERS), math.nan), ("NaN",)),
-        (images, walk(40), ("holds ready features", "from frames")),
+        (images, walk(40), ("has ready features", "from frames")),
         (images, torch.rand(40, 3, 48, 32), ("3 x 48 x 32", "3 x 32 x 32")),
         (images, torch.rand(40, 1, 32, 32), ("1 x 32 x 32", "3 x 32 x 32")),
     ):
@@ -414,7 +414,7 @@ def test_maps_that_cannot_be_merged() -> None:
     wider.frame_shape = (3, 40, 40)
     templates = template_model(whitening="none").learn(walk(90))
     for pair, words in (
-        ((one, other), ("a and b", "whitening", "learned apart", "--whitening MAP")),
+        ((one, other), ("a and b", "whitening", "learned separately", "--whitening MAP")),
         ((one, plain), ("features differ", "Joined; got HOG")),  # the defaults with a whitening and without
         ((hog, plain), ("whitening", "Whitening; got no whitening")),
         ((plain, wide), ("6 and 7",)),
@@ -567,7 +567,7 @@ def test_visits_that_cannot_be_averaged() -> None:
     at = torch.arange(90)
     for rows, places, words in (
         (walk(90), at + 1, ("shows place 90", "one of 90")),
-        (walk(80), at, ("(80, 6) of 90 places",)),
+        (walk(80), at, ("80 descriptors for 90 places",)),
         (torch.rand(90, 7), at, ("7",)),
         (torch.full((90, 6), math.nan), at, ("NaN",)),
         (torch.rand(90, 1, 9, 9), at, ("frames",)),

@@ -37,7 +37,7 @@ CHUNK, PLACES = 50, 1030
 @pytest.fixture(autouse=True)
 def _small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(learning, "SAMPLE", 400)
-    monkeypatch.setattr(learning, "SAVED", -1)  # after each chunk
+    monkeypatch.setattr(learning, "SAVE_INTERVAL", -1)  # after each chunk
 
 
 def route(places: int = PLACES, numbers: int = 12) -> Tensor:
@@ -110,14 +110,14 @@ def test_bytes_do_not_hang_on_how_a_route_is_read(tmp_path: Path) -> None:
 
 def test_convention_the_sample_is_evenly_spaced_and_of_whole_chunks() -> None:
     found = Sample.of(PLACES, CHUNK)
-    starts = found.frame[:: found.stretch]
-    assert (found.stretch, len(found.frame)) == (CHUNK, 400)
+    starts = found.frame[:: found.segment]
+    assert (found.segment, len(found.frame)) == (CHUNK, 400)
     assert set((starts % CHUNK).tolist()) == {0}
     assert (starts[0], starts[-1]) == (0, PLACES // CHUNK * CHUNK - CHUNK)
     assert int(starts.diff().max() - starts.diff().min()) <= CHUNK
     # long chunks leave room for several stretches
     found = Sample.of(PLACES, 500)
-    assert (found.stretch, len(found.frame)) == (100, 400)
+    assert (found.segment, len(found.frame)) == (100, 400)
     assert int(found.frame.max()) < PLACES
 
 
@@ -144,7 +144,7 @@ def test_a_second_traverse_tells_of_what_is_in_the_sample() -> None:
     shown = Sample.of(PLACES, CHUNK).views(Views(views.traverse, torch.arange(PLACES) - 30))
     assert torch.equal(Sample.of(PLACES, CHUNK).frame[shown.places] + 30, shown.traverse.frame)  # type: ignore[attr-defined]
     unseen = torch.tensor([one for one in range(PLACES) if one not in Sample.of(PLACES, CHUNK).frame][:40])
-    with refused("none of the 400 frames", "stretches of 50"):
+    with refused("none of the 400 frames", "segments of 50"):
         learned(route(), second=Views(ArrayTraverse(noisy[unseen]), unseen))
     model = DejaVu(whitening=Whitening(numbers=8), mapper=SpectralMapper(8.0, chunk=CHUNK))
     model.learn(route(), second=views)
@@ -188,7 +188,7 @@ def test_an_interruption_while_the_map_grows_adds_no_chunk_twice(
         if next(calls, False):
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(learning, "SAVED", 0)
+    monkeypatch.setattr(learning, "SAVE_INTERVAL", 0)
     monkeypatch.setattr(SpectralMap, "extend", interrupted)
     with pytest.raises(KeyboardInterrupt):
         resumed(tmp_path)
@@ -196,7 +196,7 @@ def test_an_interruption_while_the_map_grows_adds_no_chunk_twice(
 
 
 def test_the_partial_map_is_written_each_minute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(learning, "SAVED", 60)
+    monkeypatch.setattr(learning, "SAVE_INTERVAL", 60)
     now = iter(range(0, 10**6, 25))
     monkeypatch.setattr(learning, "monotonic", lambda: next(now))
     written: list[int] = []
@@ -235,7 +235,7 @@ def test_a_long_route_holds_the_share_that_its_sample_holds(
     (tmp_path / "m.part").unlink()
     noise[Sample.of(PLACES, CHUNK).frame] *= 0.1  # its fine step holds more of all else
     assert share() == pytest.approx(1, abs=0.01)
-    assert "hold is 0.8, and the lines hold" in caplog.text
+    assert "hold is 0.8, but the lines hold" in caplog.text
 
 
 def test_by_default_a_long_route_is_told_only_if_it_holds_less(caplog: pytest.LogCaptureFixture) -> None:
@@ -252,7 +252,7 @@ def test_by_default_a_long_route_is_told_only_if_it_holds_less(caplog: pytest.Lo
     noise = torch.randn(PLACES, 40, generator=random)
     noise[Sample.of(PLACES, CHUNK).frame] *= 2  # its coarse step holds less of all else
     model.learn(noise)
-    assert "hold is 0.85, and the lines hold" in caplog.text
+    assert "hold is 0.85, but the lines hold" in caplog.text
 
 
 def test_the_partial_map_of_another_run_is_refused(tmp_path: Path) -> None:
@@ -274,7 +274,7 @@ def test_the_partial_map_of_another_run_is_refused(tmp_path: Path) -> None:
     Checkpoint(tmp_path / "map.safetensors").remove()  # that opened nothing
     assert part.read_bytes() == kept
     part.write_bytes(kept[:-9])
-    with refused("map.safetensors.part", "no partial map"):
+    with refused("map.safetensors.part", "not a partial map"):
         learn(route())
     assert part.read_bytes() == kept[:-9]
 
@@ -352,7 +352,7 @@ def test_a_route_that_ends_early_is_refused() -> None:
 def test_descriptors_of_a_long_route_in_one_chunk_lie_in_a_file(monkeypatch: pytest.MonkeyPatch) -> None:
     values = route(PLACES, 40)
     monkeypatch.setattr(learning, "IN_MEMORY", PLACES * 160 - 1)
-    monkeypatch.setattr(learning, "FEW", PLACES * 100)
+    monkeypatch.setattr(learning, "DESCRIPTOR_MEMORY", PLACES * 100)
     model = DejaVu(whitening=Whitening(numbers=32))
     found = model.describe_reference(ArrayTraverse(values))
     assert found.dtype == torch.float16
@@ -421,7 +421,7 @@ def test_visits_are_averaged_in_chunk_by_chunk(tmp_path: Path, made: list[int]) 
     made.clear()
     assert file_of(growth.learn_mean(model(), route(), visits_of(places), **work), tmp_path) == bytes_
     assert sum(made) == PLACES - 8 * CHUNK
-    with refused("353", "of 400"):
+    with refused("353 descriptors", "400 places"):
         growth.learn_mean(model(), route(), visits_of(places)._replace(places=torch.arange(PLACES)))
 
 

@@ -284,7 +284,7 @@ def test_large_frames_are_reduced_and_queries_follow(
     large = nn.functional.interpolate(small, scale_factor=8, mode="nearest")  # 160 x 320
     model = DejaVu(HOG(cell=4), Whitening(views=1)).learn(large)
     assert model.frame_shape == (1, 80, 160)
-    assert [text for text in caplog.messages if "160 x 320 pixels are brought to 80 x 160" in text]
+    assert [text for text in caplog.messages if "160 x 320 pixels are resized to 80 x 160" in text]
     model.save(tmp_path / "map.safetensors")
     for known in (model.eval(), DejaVu.load(tmp_path / "map.safetensors")):
         for frames in (large, large[..., ::2, ::2], nn.functional.interpolate(small, scale_factor=3)):

@@ -183,7 +183,7 @@ def test_what_cannot_be_written_is_refused(tmp_path: Path, monkeypatch: pytest.M
         export_onnx(DejaVu(), tmp_path / "map.onnx")
     with refused("folder", "does not exist"):
         export_onnx(of_features(), tmp_path / "none" / "map.onnx")
-    with refused("what frames"):
+    with refused("does not know its frames"):
         export_onnx(DejaVu().learn_features(torch.rand(60, 4)), tmp_path / "map.onnx")
     with (
         monkeypatch.context() as patch,
@@ -191,8 +191,8 @@ def test_what_cannot_be_written_is_refused(tmp_path: Path, monkeypatch: pytest.M
     ):
         patch.setitem(sys.modules, "onnxruntime", None)
         export_onnx(of_features(), tmp_path / "map.onnx")
-    monkeypatch.setattr(onnx_file, "MOST_BYTES", 60 * 5 * 4 - 1)
-    with refused("60 places of 5 numbers", "GB"):
+    monkeypatch.setattr(onnx_file, "MAX_BYTES", 60 * 5 * 4 - 1)
+    with refused("60 places of 5 dimensions", "GB"):
         export_onnx(DejaVu().learn(torch.rand(60, 4)), tmp_path / "map.onnx")
     assert list(tmp_path.iterdir()) == []
 

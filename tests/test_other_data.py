@@ -202,7 +202,7 @@ def test_pairs_need_names_and_a_file_of_their_own(
         ("unnamed.safetensors", query, "m.csv", "p.txt", ("map unnamed.safetensors", "without a name")),
         (known, query, "m.csv", "./m.csv", ("--pairs m.csv is --out",)),
         (known, query, "m.csv", "no/p.txt", ("no/p.txt", "does not exist")),
-        (known, query, "m.csv", query, ("query.h5 is what is read",)),
+        (known, query, "m.csv", query, ("query.h5 is an input",)),
     ):
         error = fails(capsys, "localize", map, source, "--out", out, "--pairs", pairs)
         assert [word for word in words if word not in error] == []

@@ -19,7 +19,6 @@ import torch
 import yaml
 
 from benchmarks.__main__ import BENCHES
-from dejavu_torch import PlaceFilter
 from dejavu_torch.cli import COMMANDS, commands, completion, train
 from dejavu_torch.cli.parser import command_parser
 from dejavu_torch.features.augmentation import Augmentation
@@ -258,20 +257,6 @@ def test_training_in_python_as_shown(shown: str, tmp_path: Path, monkeypatch: py
     space: dict[str, Any] = {"my_backbone": SmallCNN(dimension=4, resize=(16, 16), widths=(2,), squeeze=2)}
     exec(shown, space)
     assert space["model"](torch.rand(2, 3, 64, 64)).shape == (2, 80)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("shown", with_block("PlaceFilter()", "optimizer"))
-def test_a_filter_is_learned_as_the_documentation_shows(shown: str) -> None:
-    space: dict[str, Any] = {}
-    exec(shown.replace("=240", "=60"), space)
-    near, scores = space["near"], space["scores"]
-    learned = next(one for one in space.values() if isinstance(one, PlaceFilter))
-    right = [
-        float((one.posterior(scores)[:, :-1] * near).sum(1).log().mean()) for one in (PlaceFilter(), learned)
-    ]
-    assert right[1] > right[0]
-    assert (space["match"].index - torch.arange(60)).abs().median() <= 5
 
 
 @pytest.mark.parametrize("shown", with_block('"reference_frame":'))

@@ -1,4 +1,4 @@
-"""Arrays of frames, or of ready-made features, as traverses."""
+"""Arrays of frames or of precomputed features as traverses."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.files import read_text, reading, state_of
-from dejavu_torch.data.folder import ROUNDING, rising
+from dejavu_torch.data.folder import ROUNDING, numbers_increase
 from dejavu_torch.data.frame_range import IndexedTraverse
 from dejavu_torch.memory import check_room
 from dejavu_torch.text import printable
@@ -26,20 +26,19 @@ EXPECTED = (
 
 
 class ArrayTraverse(IndexedTraverse):
-    """The frames or features of an array or tensor; of a memory-mapped file only what is used is read.
+    """The frames or features of an array or tensor; a memory-mapped file is read only as needed.
 
     Args:
-        values: uint8 frames (N,H,W) or (N,H,W,3), float frames (N,C,H,W) in [0, 1], or float
-            features (N,D).
-        name: what to call it in messages.
+        values: uint8 frames (N,H,W) or (N,H,W,3), float frames (N,C,H,W) in [0, 1], or float features (N,D).
+        name: for messages.
 
     Raises:
-        InputError: another shape or type, or no frames; while reading a file, float frames outside [0, 1] or
-            NaN.
+        InputError: another shape or type, or no frames; while reading a file, NaN or float frames outside
+            [0, 1].
     """
 
-    path: Path | None = None  # of the file that has all of the values, and nothing else
-    names: Sequence[str] = ()  # of the images that features are of, where a file beside theirs has them
+    path: Path | None = None  # of the file that holds exactly these values
+    names: Sequence[str] = ()  # of the images, if a file next to the features lists them
 
     def __init__(self, values: Tensor | np.ndarray, name: str = UNNAMED) -> None:
         shape = tuple(values.shape)
@@ -50,35 +49,34 @@ class ArrayTraverse(IndexedTraverse):
         if not (pixels or floats) or colours_last:
             raise InputError(f"{name} is {shape} {kind}; expected {EXPECTED}")
         if 0 in shape:
-            raise InputError(f"{name} is {shape}, which holds nothing; expected {EXPECTED}")
+            raise InputError(f"{name} is {shape}, which is empty; expected {EXPECTED}")
         self.name = name
         self.length = shape[0]
         self.values = values
 
     def read(self, frames: range) -> Tensor:
-        part = self._stored(frames)
+        part = self._slice(frames)
         if part.dtype == torch.uint8:
             part = part[..., None] if part.ndim == 3 else part
             return part.permute(0, 3, 1, 2).float() / 255
         batch = part if part.dtype == torch.float64 else part.float()
-        if batch.ndim == 4 and isinstance(self.values, np.memmap):  # a tensor is the caller's own affair
+        if batch.ndim == 4 and isinstance(self.values, np.memmap):  # tensors are not checked
             low, high = batch.flatten(1).aminmax(dim=1)
-            bad = ~((low >= -ROUNDING) & (high <= 1 + ROUNDING))  # or NaN
+            bad = ~((low >= -ROUNDING) & (high <= 1 + ROUNDING))  # also True for NaN
             if bad.any():
                 at = int(bad.nonzero()[0])
-                seen = f"numbers from {low[at]:.4g} to {high[at]:.4g}"
-                seen = seen if (low[at] - high[at]).isfinite() else "NaN or infinite numbers"
-                raise InputError(f"{self.name}: frame {frames[at]} holds {seen}; expected 0 to 1")
+                finite = (low[at] - high[at]).isfinite()
+                seen = f"values from {low[at]:.4g} to {high[at]:.4g}" if finite else "NaN or infinite values"
+                raise InputError(f"{self.name}: frame {frames[at]} has {seen}; expected 0 to 1")
             batch.clamp_(0, 1)
         return batch
 
-    def _stored(self, frames: range) -> Tensor:
-        """The values of frames, of the type that they have."""
+    def _slice(self, frames: range) -> Tensor:
+        """The values of frames, in their stored type."""
         part = self.values[frames.start : frames.stop : frames.step]
         if isinstance(part, Tensor):
             return part
-        # writable, of this machine
-        return torch.from_numpy(np.array(part, dtype=part.dtype.newbyteorder("=")))
+        return torch.from_numpy(np.array(part, dtype=part.dtype.newbyteorder("=")))  # a writable copy
 
     def frame_name(self, i: int) -> str:
         return self.names[i] if self.names else ""
@@ -86,49 +84,42 @@ class ArrayTraverse(IndexedTraverse):
     def state(self, start: int, stop: int) -> str:
         if self.path is not None:
             return state_of(self.path)
-        part = self._stored(range(start, stop)).detach().cpu().contiguous()
+        part = self._slice(range(start, stop)).detach().cpu().contiguous()
         return blake2b(part.view(-1).view(torch.uint8).numpy().data, digest_size=8).hexdigest()
 
     def __reduce__(self) -> Any:
-        # a file is opened where the traverse goes; its numbers do not go along
+        # a file is pickled as its path: the other process opens it
         return super().__reduce__() if self.path is None else (read_array, (self.path,))
 
 
 def read_array(path: Path) -> ArrayTraverse:
     """An `.npy` file of frames or features, memory-mapped.
 
-    Features (N,D) get the names of their images from a text file of the same name beside theirs, `X.txt`
-    beside `X.npy`, if there is one: a line for each.
+    Features (N,D) take the names of their images from `X.txt` next to `X.npy`, one per line, if it exists.
 
     Raises:
-        InputError: not a whole .npy file, an array of another shape or type, no memory for a frame, or
-            another number of names.
+        InputError: not a complete .npy file, an array of another shape or type, a frame that does not fit in
+            memory, or a wrong number of names.
     """
-    with reading(path, "is no whole .npy array", EXPECTED):
+    with reading(path, "is not a complete .npy array", EXPECTED):
         values = np.lib.format.open_memmap(path, mode="r")
         traverse = ArrayTraverse(values, printable(path))
         check_room(24.0 * math.prod(values.shape[1:]), f"a frame of {path}")
     traverse.path = path
-    beside = names_beside(path)
-    if values.ndim == 2 and beside.exists():
-        expected = f"{len(values)} names, a line for each row of {path}"
-        names = [line.strip() for line in read_text(beside, expected).splitlines() if line.strip()]
+    text = path.with_suffix(".txt")
+    if values.ndim == 2 and text.exists():
+        expected = f"{len(values)} names, one line for each row of {path}"
+        names = [line.strip() for line in read_text(text, expected).splitlines() if line.strip()]
         if len(names) != len(values):
-            raise InputError(f"{beside} has {len(names)} names; expected {expected}")
-        traverse.names, traverse.ordered = names, rising(names)
+            raise InputError(f"{text} has {len(names)} names; expected {expected}")
+        traverse.names, traverse.ordered = names, numbers_increase(names)
     return traverse
 
 
-def names_beside(path: Path) -> Path:
-    """Where the names of the images of an `.npy` file of features are."""
-    return path.with_suffix(".txt")
-
-
 def as_traverse(source: Traverse | Tensor) -> Traverse:
-    """A tensor or array of frames or features as a traverse; a traverse as it is."""
+    """A tensor or array of frames or features as a traverse; a traverse unchanged."""
     if isinstance(source, Tensor | np.ndarray):
         return ArrayTraverse(source)
     if isinstance(source, Traverse):
         return source
-    expected = "a Traverse, such as open_source gives, or a tensor"
-    raise InputError(f"got a {type(source).__name__}; expected {expected}")
+    raise InputError(f"got a {type(source).__name__}; expected a Traverse, as from open_source, or a tensor")

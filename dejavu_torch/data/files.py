@@ -1,4 +1,4 @@
-"""Files read, whatever they hold; `expected` is what messages say that a file should hold."""
+"""Reading files that may hold anything; `expected` is the second half of error messages."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import csv
 import stat
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from hashlib import blake2b
 from pathlib import Path
 
@@ -14,12 +14,12 @@ from dejavu_torch.memory import check_room
 from dejavu_torch.text import one_line
 from dejavu_torch.types import InputError
 
-LARGEST = 2**53  # beyond it a float does not hold every whole number
-BYTES_A_CHARACTER = 64  # that the lines of a table take once they are read
+LARGEST = 2**53  # a float64 holds every whole number up to here
+BYTES_PER_CHARACTER = 64  # of memory that a table takes once it is parsed
 
 
 def check_regular(path: Path, expected: str) -> int:
-    """The bytes of a file; refuses what is none, such as a fifo or a device, which would be waited for."""
+    """The size of a file in bytes; refuses all but regular files, as reading a fifo or device can block."""
     try:
         status = path.stat()
     except FileNotFoundError as error:
@@ -27,13 +27,13 @@ def check_regular(path: Path, expected: str) -> int:
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         raise InputError(f"{path} cannot be read: {why(error)}; expected {expected}") from error
     if not stat.S_ISREG(status.st_mode):
-        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "no regular file"
+        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "not a regular file"
         raise InputError(f"{path} is {kind}; expected {expected}")
     return status.st_size
 
 
 def state_of(*paths: Path) -> str:
-    """A digest of names, sizes and times of files, which a file that is changed changes."""
+    """A digest of the names, sizes and modification times of files."""
     digest = blake2b(digest_size=8)
     for path in paths:
         try:
@@ -46,10 +46,10 @@ def state_of(*paths: Path) -> str:
 
 @contextmanager
 def reading(path: Path, seen: str, expected: str) -> Iterator[None]:
-    """Read a file by what is not ours: whatever that raises is one refusal, whatever it warns of is no line.
+    """Read a file by a third-party library: its exceptions become InputErrors, its warnings are dropped.
 
     Args:
-        seen: what a message says of a file that cannot be read, such as "is no image".
+        seen: the message for a file that cannot be read, such as "is not an image".
     """
     check_regular(path, expected)
     try:
@@ -58,30 +58,30 @@ def reading(path: Path, seen: str, expected: str) -> Iterator[None]:
             yield
     except InputError:
         raise
-    except Exception as error:  # a decoder may raise anything: struct.error, KeyError, MemoryError, ..
+    except Exception as error:  # decoders raise anything: struct.error, KeyError, MemoryError, ...
         raise InputError(f"{path} {seen}: {why(error)}; expected {expected}") from error
 
 
 def why(error: Exception) -> str:
-    """An exception in words of one line."""
+    """An exception's message in one line."""
     return one_line(getattr(error, "strerror", None) or str(error) or type(error).__name__)
 
 
 def read_text(path: Path, expected: str) -> str:
-    """A whole text file, without a byte order mark, its lines ended by "\\n"."""
-    check_room(BYTES_A_CHARACTER * check_regular(path, expected), f"the text of {path}")
+    """A whole text file without byte order mark, lines ending in "\\n"."""
+    check_room(BYTES_PER_CHARACTER * check_regular(path, expected), f"the text of {path}")
     with reading(path, "cannot be read as UTF-8 text", expected):
         text = path.read_text(encoding="utf-8-sig")
         if "\0" in text:
-            raise ValueError("there is a null character in it")
+            raise ValueError("it contains a null character")
     return text
 
 
 def read_rows(path: Path, expected: str) -> list[tuple[int, list[str]]]:
-    """Number and cells of each line of a csv that is not blank.
+    """Line number and cells of each line of a csv that is not blank.
 
-    Cells are separated by semicolons, tabs, commas or spaces: by the first of these that the first line with
-    several cells has. Where semicolons separate, a comma may be a decimal one, and stays in its cell.
+    The separator is the first of semicolon, tab, comma and space that occurs in the first line with several
+    cells. Between semicolons, a comma stays in its cell: it may be a decimal comma.
     """
     lines = read_text(path, expected).splitlines()
     separator = next((sign for line in lines for sign in ";\t," if sign in line), " ")
@@ -94,9 +94,7 @@ def read_rows(path: Path, expected: str) -> list[tuple[int, list[str]]]:
 
 
 def as_number(text: str) -> float | None:
-    """A number that a frame or a coordinate can have, else None."""
-    try:
-        value = float(text)
-    except ValueError:
-        return None
-    return value if abs(value) < LARGEST else None
+    """A number below 2^53, as of a frame or a coordinate, else None."""
+    with suppress(ValueError):
+        return value if abs(value := float(text)) < LARGEST else None
+    return None

@@ -1,4 +1,4 @@
-"""Frames of a traverse brought to another size, as they are decoded where the reader can."""
+"""Frames of a traverse resized, while decoding if the reader supports it."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from dejavu_torch.types import InputError, Traverse
 
 
 class Fitted(Selection):
-    """Frames brought to another shape (C,H,W): sizes are resized, colours made grey or grey ones repeated."""
+    """Frames converted to another shape (C,H,W): resized, turned grey, or the grey channel repeated."""
 
     def __init__(self, traverse: Traverse, shape: tuple[int, ...]) -> None:
         if len(traverse.frame_shape) != 3 or len(shape) != 3:
-            raise InputError(f"{traverse.name} has no frames of the map's kind; expected frames")
+            raise InputError(f"{traverse.name} and the map differ in kind; expected frames, not features")
         super().__init__(traverse, range(LARGEST if traverse.length is None else traverse.length))
         self.shape, self.sized = shape, True
         self.length, self.place, self.cut = traverse.length, traverse.place, traverse.cut
@@ -34,7 +34,7 @@ class Fitted(Selection):
         if frames.shape[1] == channels:
             return frames
         if frames.shape[1] == 3:
-            from kornia.color import rgb_to_grayscale  # kornia takes a second to import
+            from kornia.color import rgb_to_grayscale  # slow to import
 
             frames = rgb_to_grayscale(frames)
         return frames.expand(-1, channels, -1, -1)
@@ -48,16 +48,16 @@ class Fitted(Selection):
 
 
 def fitted(traverse: Traverse, shape: tuple[int, ...]) -> Traverse:
-    """Frames of that shape (C,H,W), as they are or brought to it."""
+    """The traverse with frames of this shape (C,H,W)."""
     return traverse if tuple(traverse.frame_shape) == tuple(shape) else Fitted(traverse, shape)
 
 
 def at_size(traverse: Traverse, size: tuple[int, int]) -> Traverse:
-    """The frames of a traverse at another size (height, width): images and videos are decoded at it."""
+    """The frames of a traverse at another size (height, width); images and videos are decoded at it."""
     other = copy.copy(traverse)
     other.sized = True
     if isinstance(other, ImageFolder):
-        other.alike, other._first = True, None  # nobody asked for one size of all
+        other.same_aspect, other._first = True, None  # the user did not ask for this size
     if isinstance(other, (Video, ImageFolder)):
         other.height, other.width = size
     elif isinstance(other, Chain):
@@ -70,14 +70,14 @@ def at_size(traverse: Traverse, size: tuple[int, int]) -> Traverse:
 
 
 def size_like(own: tuple[int, ...], shape: tuple[int, ...]) -> tuple[int, int]:
-    """The size of frames of a shape (C,H,W), for frames of the same aspect ratio; else their own."""
+    """(H,W) of a shape (C,H,W) if frames of size `own` have the same aspect ratio, else `own`."""
     height, width = own
     same = len(shape) == 3 and not is_stretched((height, width), (shape[1], shape[2]))
     return (shape[1], shape[2]) if same else (height, width)
 
 
 def resize_like(frames: Tensor, shape: tuple[int, ...] | None) -> Tensor:
-    """Frames (B,C,H,W) at the size of frames of a shape (C,H,W); others, and ready features, as they are."""
+    """Frames (B,C,H,W) resized by `size_like`; features unchanged."""
     if frames.ndim != 4 or shape is None:
         return frames
     return resize_frames(frames, size_like(frames.shape[2:], shape))

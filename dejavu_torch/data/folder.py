@@ -24,30 +24,27 @@ from dejavu_torch.types import InputError
 log = logging.getLogger("dejavu_torch")
 
 NATURAL, LEXICOGRAPHIC = "natural", "lexicographic"  # orders of names
-SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"}
-MOST_READ = 2**28  # pixels of an image, such as a long strip; a small file can claim any number
-ROUNDING = 1e-3  # by which a number may miss the range from 0 to 1
-# and no other, such as one that starts a program
-FORMATS = "PNG", "JPEG", "BMP", "DIB", "TIFF", "WEBP", "PPM", "GIF"
-BYTES_A_PIXEL = 24  # that reading takes at most: decoded, as an array, and as floats
+IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"}
+MAX_IMAGE_PIXELS = 2**28  # enough for a long strip; a small file can claim any number
+ROUNDING = 1e-3  # by which a value may lie outside [0, 1]
+FORMATS = "PNG", "JPEG", "BMP", "DIB", "TIFF", "WEBP", "PPM", "GIF"  # none that starts a program
+BYTES_PER_PIXEL = 24  # peak while reading: decoded, as an array, and as floats
 
 
 class ImageFolder(IndexedTraverse):
-    """The images of a folder, sorted by name; numbers in names count as numbers (9 before 10). If all names
-    end in numbers that rise, such as frame_0001.png, the images are taken to be in order along the route.
+    """The images of a folder, sorted by name; numbers in names compare as numbers (9 before 10). If all names
+    end in increasing numbers, such as frame_0001.png, the images are assumed to be in order along the route.
 
-    Grey images give one channel, all others three; an image that says how the camera was turned is upright;
-    of several images in a file only the first counts.
+    Grey images have one channel, others three. EXIF orientation is applied. A file's first image is read.
 
     Args:
-        width, height: pixels to resize each image to as it is read, antialiased; 0 keeps the image's
-            own, or its aspect ratio where only the other is given.
-        order: "natural", as above, or "lexicographic", by text (10 before 9); "" is natural, and a line says
-            so where the two differ.
+        width, height: pixels to resize to, antialiased; 0 for both keeps the size, for one the aspect ratio.
+        order: "natural", as above, or "lexicographic", by text (10 before 9); "" is natural with a warning
+            if the two differ.
 
     Raises:
-        InputError: width or height out of range; another order; no such folder, or no images in it; while
-            reading, an image that cannot be read or that has another size than the first.
+        InputError: width, height or order out of range; no such folder, or no images in it; while reading,
+            an image that cannot be read or differs in size from the first.
     """
 
     def __init__(self, path: str | Path, width: int = 0, height: int = 0, order: str = "") -> None:
@@ -56,18 +53,18 @@ class ImageFolder(IndexedTraverse):
         if not folder.is_dir():
             raise InputError(f"{folder} is not there; expected a folder of images")
         inside = list(folder.iterdir())
-        images = [file for file in inside if file.suffix.lower() in SUFFIXES and file.name[0] != "."]
-        names = in_order([file.name for file in images if file.is_file()], order, printable(folder))
+        images = [file for file in inside if file.suffix.lower() in IMAGE_SUFFIXES and file.name[0] != "."]
+        names = sort_names([file.name for file in images if file.is_file()], order, printable(folder))
         self.files = [folder / name for name in names]
         if not names:
             folders = sorted((file.name for file in inside if file.is_dir()), key=natural)
-            inner = f"; it has folders such as {folders[0]}" if folders else ""
-            raise InputError(f"{folder} holds no images{inner}; expected files such as .png or .jpg")
+            inner = f" but folders such as {folders[0]}" if folders else ""
+            raise InputError(f"{folder} contains no images{inner}; expected files such as .png or .jpg")
         self.width, self.height, self.sized = width, height, bool(width or height)
         self.path, self.name = folder, printable(folder)
-        self.length, self.order, self.ordered = len(names), order, rising(names)
-        self.alike = False  # whether images of other aspect ratios are refused, as portraits
-        self._first: tuple[str, str, tuple[int, int]] | None = None  # that was read: name, shape, own size
+        self.length, self.order, self.ordered = len(names), order, numbers_increase(names)
+        self.same_aspect = False  # whether to refuse images of another aspect ratio, such as portraits
+        self._first: tuple[str, str, tuple[int, int]] | None = None  # image read: name, shape, original size
 
     def read(self, frames: range) -> Tensor:
         images = [self._image(self.files[i]) for i in frames]
@@ -86,7 +83,7 @@ class ImageFolder(IndexedTraverse):
     def _image(self, file: Path) -> Tensor:
         image = read_image(file, max(self.width, self.height))
         own = (image.shape[1], image.shape[2])
-        size = fitted_size(file, image.shape[1], image.shape[2], self.width, self.height)
+        size = fitted_size(file, *own, self.width, self.height)
         if size != image.shape[1:]:
             image = resize_frames(image[None], size)[0].clamp(0, 1)
         channels, height, width = image.shape
@@ -94,36 +91,34 @@ class ImageFolder(IndexedTraverse):
         self._first = self._first or (file.name, shape, own)
         name, expected, first = self._first
         if shape != expected:
-            raise InputError(f"{file} is {shape}; expected {expected} as {name}")
-        if self.alike and is_stretched(own, first):
+            raise InputError(f"{file} is {shape}; expected {expected} like {name}")
+        if self.same_aspect and is_stretched(own, first):
             ratio = f"the aspect ratio of {name}, {first[0]} x {first[1]}"
             raise InputError(f"{file} is {own[0]} x {own[1]} pixels; expected {ratio}")
         return image
 
 
 def check_size(path: Path, width: int, height: int) -> None:
-    """Refuse a size in pixels below 0, which stands for the frames' own, or beyond any frame."""
+    """Refuse a size in pixels that is negative or too large; 0 keeps the frames' own."""
     if min(width, height) < 0 or max(width, height) > MOST_PIXELS:
         expected = f"width and height of at least 0 each, at most {MOST_PIXELS} pixels"
         raise InputError(f"{path}: width={width}, height={height}; expected {expected}")
 
 
 def check_pixels(path: Path, rows: int, columns: int, most: int) -> None:
-    """Refuse, ahead of any allocation, more pixels than can be meant or than there is room for."""
+    """Refuse more pixels than `most` or than fit in memory, before allocating them."""
     seen = f"{path} has {rows} x {columns} pixels"
     if rows * columns > most:
         raise InputError(f"{seen}; expected at most {most}")
-    check_room(BYTES_A_PIXEL * rows * columns, f"{seen}, which")
+    check_room(BYTES_PER_PIXEL * rows * columns, f"{seen}, which")
 
 
 def fitted_size(path: Path, rows: int, columns: int, width: int, height: int) -> tuple[int, int]:
-    """(rows, columns) of frames resized to width and height; 0 is their own, or what keeps their aspect."""
+    """(rows, columns) after resizing to width and height; 0 for both keeps the size, for one the aspect."""
     wide = width or (max(1, round(columns * height / rows)) if height else columns)
     high = height or (max(1, round(rows * width / columns)) if width else rows)
     if (high, wide) != (rows, columns) and high * wide > MOST_PIXELS:
-        raise InputError(
-            f"{path} cannot be resized to {high} x {wide} pixels; expected at most {MOST_PIXELS}"
-        )
+        raise InputError(f"{path} resized has {high} x {wide} pixels; expected at most {MOST_PIXELS}")
     return high, wide
 
 
@@ -131,22 +126,20 @@ def read_image(path: Path, least: int = 0) -> Tensor:
     """One image file as (C,H,W) float32 in [0, 1]; C is 1 for grey images, else 3.
 
     Args:
-        least: pixels that each side needs, as the image is reduced afterwards: a JPEG is decoded at a half, a
-            quarter or an eighth of its size where that has as many. 0 decodes it whole.
+        least: minimum pixels of each side: a JPEG is decoded at 1/2, 1/4 or 1/8 of its size if that has as
+            many, as the image is reduced afterwards. 0 decodes at full size.
 
     Raises:
-        InputError: no image, over 2^28 pixels, more than there is memory for, or numbers outside [0, 1].
+        InputError: not an image, over 2^28 pixels, more than fit in memory, or values outside [0, 1].
     """
-    with (
-        reading(path, "cannot be read as an image", "an image such as .png or .jpg"),
-        Image.open(path, formats=FORMATS) as opened,
-    ):
+    unread, expected = "cannot be read as an image", "an image such as .png or .jpg"
+    with reading(path, unread, expected), Image.open(path, formats=FORMATS) as opened:
         if least:
             opened.draft(None, (least, least))
-        check_pixels(path, opened.height, opened.width, MOST_READ)
+        check_pixels(path, opened.height, opened.width, MAX_IMAGE_PIXELS)
         ImageOps.exif_transpose(opened, in_place=True)
         mode = opened.mode
-        wide = mode.startswith(("I", "F"))  # 16-bit grey, or floats that are in [0, 1] already
+        wide = mode.startswith(("I", "F"))  # 16-bit grey, or floats already in [0, 1]
         plain = mode if wide else "L" if mode in ("1", "L", "LA") else "RGB"
         pixels = np.asarray(opened if mode == plain else opened.convert(plain))
     if wide:
@@ -154,43 +147,39 @@ def read_image(path: Path, least: int = 0) -> Tensor:
         image.div_(65535 if mode.startswith("I") else 1)
         low, high = image.aminmax()
         slack = ROUNDING if mode.startswith("F") else 0
-        if not (low >= -slack and high <= 1 + slack):  # or NaN
-            raise InputError(f"{path} holds numbers from {low:.4g} to {high:.4g} of white; expected 0 to 1")
+        if not (low >= -slack and high <= 1 + slack):  # also True for NaN
+            raise InputError(f"{path} has values from {low:.4g} to {high:.4g} (1 is white); expected 0 to 1")
         return image.clamp_(0, 1)
-    # turned while they are bytes, and then floats of that order: the least that is held at once
+    # transposing bytes, not floats, keeps the peak of memory low
     channels = np.array(pixels.reshape(*pixels.shape[:2], -1).transpose(2, 0, 1), order="C")
     return torch.from_numpy(channels).float().div_(255)
 
 
 def natural(name: str) -> tuple[list[str | int], str]:
-    """What names are sorted by, their numbers as numbers."""
-    # odd positions are the digit runs, so that numbers only ever meet numbers
-    parts = re.split(r"(\d+)", name)
+    """A sort key that compares numbers in names as numbers."""
+    parts = re.split(r"(\d+)", name)  # digits at odd positions: numbers are compared only with numbers
     return [int(part) if j % 2 else part for j, part in enumerate(parts)], name
 
 
-def in_order(names: Iterable[str], order: str, source: str) -> list[str]:
-    """The names of the images of a source in an order, as of `ImageFolder`; `source` is for messages."""
+def sort_names(names: Iterable[str], order: str, source: str) -> list[str]:
+    """The names of images sorted by the `order` of `ImageFolder`; `source` is for messages."""
     if order not in ("", NATURAL, LEXICOGRAPHIC):
         raise InputError(f"{source}: order is {order!r}; expected {NATURAL} or {LEXICOGRAPHIC}")
     by_number = sorted(names, key=natural)
     by_text = sorted(by_number)
-    differing = [(a, b) for a, b in zip(by_number, by_text, strict=True) if a != b]
+    differing = [f"{a} before {b}" for a, b in zip(by_number, by_text, strict=True) if a != b]
     if differing and not order:
-        first, other = differing[0]
-        _say_once(
-            f"{source} is in natural order, {first} before {other}; ?order={LEXICOGRAPHIC} sorts by text, "
-            f"?order={NATURAL} leaves this line out"
-        )
+        _warn_order(source, differing[0])
     return by_text if order == LEXICOGRAPHIC else by_number
 
 
-@cache  # a command opens some sources several times
-def _say_once(line: str) -> None:
-    log.warning("%s", line)
+@cache  # a command may open a source several times
+def _warn_order(source: str, example: str) -> None:
+    remedies = f"?order={LEXICOGRAPHIC} sorts by text, ?order={NATURAL} hides this warning"
+    log.warning("%s is in natural order, %s; %s", source, example, remedies)
 
 
-def rising(names: Sequence[str]) -> bool:
-    """Whether all names, but for their suffixes, end in numbers that rise."""
-    numbers = [re.search(r"\d{1,99}$", Path(name).stem) for name in names]  # int refuses some thousand digits
+def numbers_increase(names: Sequence[str]) -> bool:
+    """Whether all names, without their suffixes, end in increasing numbers."""
+    numbers = [re.search(r"\d{1,99}$", Path(name).stem) for name in names]  # int refuses thousands of digits
     return None not in numbers and all(int(a[0]) < int(b[0]) for a, b in pairwise(filter(None, numbers)))

@@ -1,4 +1,4 @@
-"""Traverses whose frames can be read in any order, parts of a traverse, and several as one."""
+"""Traverses read in any order, parts of a traverse, and several joined to one."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from dejavu_torch.types import InputError, Traverse
 
 
 class IndexedTraverse(Traverse):
-    """A traverse of known length that reads only the frames asked for; a subclass says how, in `read`."""
+    """A traverse of known length that reads only the requested frames; a subclass implements `read`."""
 
     length: int
     seeks = True
 
     @abstractmethod
     def read(self, frames: range) -> Tensor:
-        """The frames of a range, which is not empty, as one batch."""
+        """The frames of a non-empty range as one batch."""
 
     def batches(self, size: int) -> Iterator[Tensor]:
         yield from self.select(range(self.length), size)
@@ -35,21 +35,21 @@ class IndexedTraverse(Traverse):
     def select(self, frames: range, size: int) -> Iterator[Tensor]:
         if size < 1:
             raise InputError(f"a batch holds {size} frames; expected at least 1")
-        there = range(frames.start, min(frames.stop, self.length), frames.step)
-        for first in range(0, len(there), size):
-            yield self.read(there[first : first + size])
+        existing = range(frames.start, min(frames.stop, self.length), frames.step)
+        for first in range(0, len(existing), size):
+            yield self.read(existing[first : first + size])
 
 
 class Selection(Traverse):
-    """The frames of a traverse with these numbers; names, times and places follow.
+    """The frames of a traverse with these numbers, with their names, times and places.
 
     Args:
         frame: (n,) int64, never decreasing, or a range.
 
-    Convention: frames count from 0 again. A traverse that does not seek is read through once.
+    Convention: frames are renumbered from 0. A traverse that does not seek is read through once.
     """
 
-    skips = True  # whether a gap is not read, if the traverse seeks
+    skips = True  # whether gaps are skipped if the traverse seeks
 
     def __init__(self, traverse: Traverse, frame: Tensor | range) -> None:
         self.traverse, self.frame = traverse, frame
@@ -73,7 +73,7 @@ class Selection(Traverse):
             return
         whole = range(int(frame[0]), int(frame[-1]) + 1)
         for run in runs(frame) if self.skips and self.traverse.seeks else [whole]:
-            yield from picked(self.traverse.select(run, size), run, frame, size)
+            yield from pick_frames(self.traverse.select(run, size), run, frame, size)
 
     @property
     def frame_shape(self) -> tuple[int, ...]:
@@ -91,11 +91,10 @@ class Selection(Traverse):
 
 
 class FrameRange(Selection):
-    """The frames [start, stop) of a traverse, every step-th of them; a stop of 0 is the end of the traverse.
+    """Every step-th of the frames [start, stop) of a traverse; a stop of 0 is its end.
 
     Raises:
-        InputError: start, stop or step out of range; while reading, a traverse of unknown length that has
-            no such frames.
+        InputError: start, stop or step out of range; while reading, missing frames (unknown length).
 
     Example:
         >>> from dejavu_torch.data.arrays import ArrayTraverse
@@ -111,15 +110,13 @@ class FrameRange(Selection):
         stops = stop == 0 or start < stop
         beyond = max(start, stop) > LARGEST or (length is not None and max(start + 1, stop) > length)
         if start < 0 or step < 1 or not stops or beyond:
-            part = f"a part of its {'' if length is None else f'{length} '}frames"
-            expected = "a step of at least 1" if step < 1 else part
+            frames = "frames" if length is None else f"{length} frames"
+            expected = "a step of at least 1" if step < 1 else f"a part of its {frames}"
             raise InputError(f"{traverse.name}: start={start}, stop={stop}, step={step}; expected {expected}")
         end = stop or length or LARGEST
-        # a longer step takes one frame as well
-        super().__init__(traverse, range(start, end, min(step, max(1, end - start))))
+        super().__init__(traverse, range(start, end, min(step, max(1, end - start))))  # at least one frame
         self.name = f"{traverse.name}[{start}:{stop or ''}{f':{step}' if step > 1 else ''}]"
-        if length is None:
-            self.length = None
+        self.length = None if length is None else self.length
         if traverse.cut is not None:
             self.cut = traverse.cut[0], traverse.cut[1][start : stop or None : self.frame.step]
         self._least = len(self.frame) if stop else 1
@@ -130,17 +127,17 @@ class FrameRange(Selection):
             count += len(batch)
             yield batch
         if count < self._least:
-            raise InputError(f"{self.name} holds {count} frames; expected {self._least} or more")
+            raise InputError(f"{self.name} has {count} frames; expected {self._least} or more")
 
     def identity(self) -> str:
         return f"{self.frame} of {self.traverse.identity()}"
 
 
 class Chain(Traverse):
-    """The frames of several traverses, all of one shape, one after the other: parts of one route.
+    """Several traverses with frames of one shape, concatenated: parts of one route.
 
-    Convention: a frame's name begins with that of its traverse: `morning/0001.png`. Where it truly was is
-        not known, as the traverses count for themselves.
+    Convention: frame names start with the name of their traverse: `morning/0001.png`. `place` is None, as
+        each traverse has its own numbering.
     """
 
     def __init__(self, traverses: Sequence[Traverse]) -> None:
@@ -151,19 +148,17 @@ class Chain(Traverse):
         for other in self.traverses:
             if other.frame_shape != first.frame_shape:
                 own, expected = (" x ".join(map(str, one.frame_shape)) for one in (other, first))
-                seen = f"{other.name} has frames of {own}"
-                raise InputError(f"{seen}; expected {expected}, as those of {first.name}")
+                raise InputError(f"{other.name} has frames of {own}; expected {expected} like {first.name}")
         self.name = " + ".join(one.name for one in self.traverses)
         self.seeks = all(one.seeks for one in self.traverses)
         self.sized = any(one.sized for one in self.traverses)
         self.ordered = all(one.ordered for one in self.traverses)
         lengths = [one.length for one in self.traverses]
-        if None not in lengths:
-            self.length = sum(length or 0 for length in lengths)
+        self.length = None if None in lengths else sum(length or 0 for length in lengths)
 
     @cached_property
     def starts(self) -> list[int]:
-        """The frame with which each begins, and the number of all frames."""
+        """The first frame of each traverse, then the total number of frames."""
         return list(accumulate((one.count() for one in self.traverses), initial=0))
 
     def count(self) -> int:
@@ -174,7 +169,7 @@ class Chain(Traverse):
             yield from traverse.batches(size)
 
     def between(self, start: int, stop: int) -> Iterator[Tensor]:
-        for traverse, first, last in self._within(start, stop):
+        for traverse, first, last in self._overlaps(start, stop):
             yield from traverse.between(first, last)
 
     @property
@@ -185,7 +180,7 @@ class Chain(Traverse):
         return " + ".join(one.identity() for one in self.traverses)
 
     def state(self, start: int, stop: int) -> str:
-        return " + ".join(traverse.state(first, last) for traverse, first, last in self._within(start, stop))
+        return " + ".join(one.state(first, last) for one, first, last in self._overlaps(start, stop))
 
     def frame_name(self, i: int) -> str:
         traverse, i = self._at(i)
@@ -196,30 +191,30 @@ class Chain(Traverse):
         traverse, i = self._at(i)
         return traverse.frame_time(i)
 
-    def _within(self, start: int, stop: int) -> Iterator[tuple[Traverse, int, int]]:
-        """Which frames of which traverses the frames [start, stop) are."""
+    def _overlaps(self, start: int, stop: int) -> Iterator[tuple[Traverse, int, int]]:
+        """Each traverse within the frames [start, stop), and its own frames [first, last) there."""
         for traverse, first, end in zip(self.traverses, self.starts, self.starts[1:], strict=False):
             if max(start, first) < min(stop, end):
                 yield traverse, max(0, start - first), min(stop, end) - first
 
     def _at(self, i: int) -> tuple[Traverse, int]:
-        """The traverse that frame i is of, and its number there."""
+        """The traverse of frame i, and its number there."""
         which = bisect_right(self.starts, i, hi=len(self.traverses)) - 1
         return self.traverses[which], i - self.starts[which]
 
 
 def chained(traverses: Sequence[Traverse]) -> Traverse:
-    """Several traverses as one route; a single one as it is."""
+    """Several traverses as one route; a single one unchanged."""
     return traverses[0] if len(traverses) == 1 else Chain(traverses)
 
 
 def parts_of(traverse: Traverse) -> list[Traverse]:
-    """What a traverse was chained of; itself where it was not."""
+    """The traverses of a chain; [traverse] of any other."""
     return traverse.traverses if isinstance(traverse, Chain) else [traverse]
 
 
-def picked(batches: Iterator[Tensor], span: range, frame: Tensor, size: int) -> Iterator[Tensor]:
-    """The frames with these numbers, never decreasing, out of batches of the frames of a span."""
+def pick_frames(batches: Iterator[Tensor], span: range, frame: Tensor, size: int) -> Iterator[Tensor]:
+    """The frames with these numbers (never decreasing) from the batches of a contiguous span of frames."""
     start, stop = torch.searchsorted(frame, torch.tensor([span.start, span.stop])).tolist()
     first, frame = span.start, frame[start:stop]
     for batch in batches:
@@ -232,7 +227,7 @@ def picked(batches: Iterator[Tensor], span: range, frame: Tensor, size: int) -> 
 
 
 def runs(numbers: Tensor) -> list[range]:
-    """Increasing whole numbers as runs without gaps, such as 1, 2, 3, 7 as 1 to 3 and 7."""
+    """Increasing whole numbers as contiguous ranges: 1, 2, 3, 7 as 1 to 3 and 7."""
     last = torch.cat([numbers.diff() != 1, numbers.new_ones(min(1, len(numbers)), dtype=torch.bool)])
-    first = last.roll(1)  # after the last of one run the next begins
+    first = last.roll(1)  # a run starts after the end of the previous one
     return [range(a, b + 1) for a, b in zip(numbers[first].tolist(), numbers[last].tolist(), strict=True)]

@@ -13,31 +13,30 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.files import reading, state_of
-from dejavu_torch.data.folder import LEXICOGRAPHIC, in_order, rising
+from dejavu_torch.data.folder import LEXICOGRAPHIC, numbers_increase, sort_names
 from dejavu_torch.data.frame_range import IndexedTraverse
 from dejavu_torch.memory import check_room
 from dejavu_torch.text import one_line, printable
 from dejavu_torch.types import InputError
 
-SUFFIXES = {".h5", ".hdf5"}
+H5_SUFFIXES = {".h5", ".hdf5"}
 KEY = "global_descriptor"
-EXPECTED = f"a group for each image that holds a dataset {KEY} (D,) of floats, as hloc writes it"
+EXPECTED = f"a group for each image with a dataset {KEY} (D,) of floats, as hloc writes it"
 
 
 class DescriptorFile(IndexedTraverse):
-    """The global descriptors in an HDF5 file of hloc (Hierarchical-Localization), sorted by the names of
-    their images as the images of a folder are; only what is used is read.
+    """The global descriptors in an HDF5 file of hloc (Hierarchical-Localization), sorted as in `ImageFolder`.
 
     Args:
-        path: a file with a group for each image, whose name may hold slashes, and in it a dataset
+        path: a file with a group for each image, whose name may contain slashes, each with a dataset
             `global_descriptor` (D,) float; other datasets are ignored.
-        order: as of `ImageFolder`.
+        order: as for `ImageFolder`.
 
     Shape: batches (B,D) float32.
 
     Raises:
         InputError: h5py is not installed, a file that cannot be read, no descriptors in it, or descriptors of
-            different lengths; while reading, NaN or infinite numbers.
+            different dimensions; while reading, NaN or infinite values.
     """
 
     def __init__(self, path: str | Path, order: str = "") -> None:
@@ -57,16 +56,17 @@ class DescriptorFile(IndexedTraverse):
 
         with self._open() as file:
             file.visititems(visit)
-            self.names = in_order(found, order, self.name)
+            self.names = sort_names(found, order, self.name)
         if not found:
-            raise InputError(f"{self.name} holds no {KEY}; expected {EXPECTED}")
+            raise InputError(f"{self.name} contains no {KEY}; expected {EXPECTED}")
         (width,) = found[self.names[0]]
         for image in self.names:
             if found[image] != (width,) or not width:
-                seen = f"{KEY} of {image} has {found[image][0]} numbers"
-                raise InputError(f"{self.name}: {seen}; expected {width or 'some'}, as of {self.names[0]}")
+                seen = f"{KEY} of {image} has {found[image][0]} dimensions"
+                expected = f"{width} like {self.names[0]}" if width else "at least 1"
+                raise InputError(f"{self.name}: {seen}; expected {expected}")
         check_room(24.0 * width, f"a descriptor of {self.name}")
-        self.length, self.order, self.ordered = len(self.names), order, rising(self.names)
+        self.length, self.order, self.ordered = len(self.names), order, numbers_increase(self.names)
 
     def read(self, frames: range) -> Tensor:
         with self._open() as file:
@@ -75,7 +75,7 @@ class DescriptorFile(IndexedTraverse):
         bad = ~batch.isfinite().all(1)
         if bad.any():
             image = self.names[frames[int(bad.nonzero()[0])]]
-            raise InputError(f"{self.name}: {KEY} of {image} holds NaN or infinite numbers; expected none")
+            raise InputError(f"{self.name}: {KEY} of {image} has NaN or infinite values; expected none")
         return batch
 
     def frame_name(self, i: int) -> str:
@@ -92,10 +92,8 @@ class DescriptorFile(IndexedTraverse):
         try:
             h5py = import_module("h5py")
         except ImportError as error:
-            seen = f"{self.name}: h5py, which reads it, is not there ({one_line(error)})"
-            raise InputError(f"{seen}; expected it: pip install 'dejavu_torch[h5]'") from error
-        with (
-            reading(self.path, "cannot be read as an HDF5 file", EXPECTED),
-            h5py.File(self.path, "r") as file,
-        ):
+            seen = f"{self.name} needs h5py, which cannot be imported ({one_line(error)})"
+            raise InputError(f"{seen}; expected pip install 'dejavu_torch[h5]'") from error
+        unread = "cannot be read as an HDF5 file"
+        with reading(self.path, unread, EXPECTED), h5py.File(self.path, "r") as file:
             yield file

@@ -1,4 +1,4 @@
-"""The names of a traverse's frames in a few bytes, for the header of a map."""
+"""The names of a traverse's frames, compressed for the header of a map."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from typing import Any
 from dejavu_torch.memory import check_room
 from dejavu_torch.types import InputError, Traverse
 
-LONGEST = 4096  # characters of a name, as of a path
-WIDEST = 18  # digits of a number in a name
-MOST = 2**30  # bytes that a code may unpack to
+MAX_NAME_LENGTH = 4096  # characters, as of a path
+MAX_DIGITS = 18  # of a number in a name
+MAX_DECODED_BYTES = 2**30
 
 
 def names_of(traverse: Traverse, frames: int) -> list[str]:
-    """The names of the first `frames` frames of a traverse; empty where it has none."""
+    """The names of the first `frames` frames of a traverse; [] if they have none."""
     names = [traverse.frame_name(i) for i in range(frames)]
     return names if any(names) else []
 
 
 def encode_names(names: Sequence[str]) -> str:
-    """Names as text: the numbers in them as differences from name to name where that is exact, compressed.
+    """Names as compressed text; numbers in them are stored as differences if that is exact.
 
-    File names with a counter, and times at a steady rate, take about a hundred bytes for thousands of frames.
+    Thousands of file names with a counter, or of times at a constant rate, take about 100 bytes.
 
     Example:
         >>> files = [f"left_{i:06}.png" for i in range(0, 10_000, 2)]
@@ -36,8 +36,8 @@ def encode_names(names: Sequence[str]) -> str:
         (True, True)
     """
     longest = max(map(len, names), default=0)
-    if longest > LONGEST:
-        raise InputError(f"a frame's name has {longest} characters; expected at most {LONGEST}")
+    if longest > MAX_NAME_LENGTH:
+        raise InputError(f"a frame's name has {longest} characters; expected at most {MAX_NAME_LENGTH}")
     value: Any = _numbered(names)
     if value is None or _names(value) != list(names):
         value = list(names)
@@ -45,31 +45,29 @@ def encode_names(names: Sequence[str]) -> str:
 
 
 def decode_names(code: str, count: int | None = None) -> list[str]:
-    """The names that `encode_names` gave; `count`: how many there have to be, None takes any."""
+    """The names that `encode_names` encoded; `count`: their expected number, None for any."""
     try:
-        text = zlib.decompressobj().decompress(base64.b64decode(code, validate=True), MOST)
+        text = zlib.decompressobj().decompress(base64.b64decode(code, validate=True), MAX_DECODED_BYTES)
         check_room(8 * len(text), "the names of frames")  # as objects
         value = json.loads(text)
         columns = value["columns"] if isinstance(value, dict) else None
         seen = len(value) if columns is None else len(columns[0]) - 1
         if count not in (None, seen):
-            raise InputError(f"it names {seen} frames; expected {count}")
+            raise InputError(f"there are names of {seen} frames; expected {count}")
         names = value if columns is None else _names(value)
     except InputError:
         raise
     except (AttributeError, IndexError, KeyError, TypeError, ValueError, RecursionError, zlib.error) as error:
         raise InputError(f"the names of frames cannot be read: {' '.join(str(error).split())}") from error
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise InputError("the names of frames cannot be read: they are no list of texts")
+        raise InputError("the names of frames cannot be read: they are not a list of strings")
     return names
 
 
 def _numbered(names: Sequence[str]) -> dict[str, Any] | None:
-    """Names that differ only in their numbers: the text between these, and each number's changes."""
+    """Names that differ only in their numbers: the text between them, and the changes of each; else None."""
     parts = [re.split("([0-9]+)", name) for name in names]
-    if not parts:
-        return None
-    if any(part[::2] != parts[0][::2] or any(len(text) > WIDEST for text in part[1::2]) for part in parts):
+    if any(part[::2] != parts[0][::2] or max(map(len, part[1::2]), default=0) > MAX_DIGITS for part in parts):
         return None
     columns: list[list[int]] = []
     for digits in zip(*(part[1::2] for part in parts), strict=True):
@@ -81,19 +79,18 @@ def _numbered(names: Sequence[str]) -> dict[str, Any] | None:
 
 def _names(numbered: dict[str, Any]) -> list[str]:
     first, *rest = numbered["texts"]
-    if any(not 1 <= width <= WIDEST for width, *_ in numbered["columns"]):
-        raise ValueError("a number in them is too wide")
-    if sum(map(len, numbered["texts"])) > LONGEST:
-        raise ValueError("a text in them is too long")
-    if any(not 0 <= n < 10**WIDEST for _, *changes in numbered["columns"] for n in accumulate(changes)):
-        raise ValueError("a number in them is out of range")
+    wide = any(not 1 <= width <= MAX_DIGITS for width, *_ in numbered["columns"])
+    if wide or sum(map(len, numbered["texts"])) > MAX_NAME_LENGTH:
+        raise ValueError("a name is too long")
+    if any(not 0 <= n < 10**MAX_DIGITS for _, *changes in numbered["columns"] for n in accumulate(changes)):
+        raise ValueError("a number is out of range")
     columns = [[str(n).zfill(width) for n in accumulate(changes)] for width, *changes in numbered["columns"]]
     rows = zip(*columns, strict=True)
     return [first + "".join(n + text for n, text in zip(row, rest, strict=True)) for row in rows]
 
 
 def clock_time(seconds: float) -> str:
-    """Hours, minutes, seconds and milliseconds, as frames of a video are named: 1:02:03.480."""
+    """Hours, minutes, seconds and milliseconds, as in the names of video frames: 1:02:03.480."""
     whole, thousandths = divmod(abs(round(1000 * seconds)), 1000)
     clock = f"{whole // 3600}:{whole // 60 % 60:02}:{whole % 60:02}.{thousandths:03}"
     return f"-{clock}" if seconds < 0 else clock

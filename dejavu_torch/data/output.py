@@ -1,4 +1,4 @@
-"""Files and folders written whole or not at all."""
+"""Atomic output: files and folders are written completely or not at all."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ from pathlib import Path
 
 try:
     import fcntl
-except ImportError:  # Windows: what is left behind stays
+except ImportError:  # Windows: folders of killed processes are not removed
     fcntl = None  # type: ignore[assignment]
 
 from dejavu_torch.types import InputError
 
-PREFIX = ".dejavu-"  # of the folders where files are written until they are whole
-HERE = f"{PREFIX}{zlib.crc32(os.fsencode(socket.gethostname())):08x}-"  # of those of this host
-LONGEST_NAME, LONGEST_PATH = 255, 4096 - 64  # bytes; a path leaves room for the files of a folder
+PREFIX = ".dejavu-"  # of the temporary folders for incomplete files
+HOST_PREFIX = f"{PREFIX}{zlib.crc32(os.fsencode(socket.gethostname())):08x}-"  # of those of this host
+MAX_NAME_BYTES, MAX_PATH_BYTES = 255, 4096 - 64  # a folder's path leaves room for its files
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-_temporary: set[Path] = set()  # the folders of this process that are there now
+_temporary: set[Path] = set()  # this process's temporary folders
 
 
 def check_output_file(path: Path) -> None:
-    """Refuse early, before long work, a file that could not be written. A link stands for its target."""
-    with _refusing(path, "cannot be written", ValueError):  # a name that the system cannot spell
+    """Refuse a file that could not be written, before long work starts. Links are followed."""
+    with _refusing(path, "cannot be written", ValueError):  # ValueError: an invalid name
         _check_name(path)
         target = _target(path)
         if target.is_dir():
             raise InputError(f"{path} is a folder; expected a file to write")
-        if path.exists() and not path.is_file():  # of the link: /dev/stdout leads to no path
-            raise InputError(f"{path} is no regular file; expected a file to write")
+        if path.exists() and not path.is_file():  # not target: /dev/stdout resolves to no path
+            raise InputError(f"{path} is not a regular file; expected a file to write")
         if target.is_symlink():
             raise InputError(f"{path} is a link to itself; expected a file to write")
         if not target.parent.is_dir():
@@ -45,33 +45,33 @@ def check_output_file(path: Path) -> None:
             if place.exists() and not os.access(place, os.W_OK):
                 raise InputError(f"{path} cannot be written: no permission to write in {place}")
         if target.exists():
-            _check_replaced(path, target)
+            _check_replaceable(path, target)
 
 
-def _check_replaced(path: Path, target: Path) -> None:
-    """Refuse to replace a file that somebody else writes or owns."""
-    there, folder = target.stat(), target.parent.stat()
+def _check_replaceable(path: Path, target: Path) -> None:
+    """Refuse to replace a file that is open as a stream or owned by somebody else."""
+    old, folder = target.stat(), target.parent.stat()
     for stream in range(3):
-        with suppress(OSError):  # it is closed
-            if os.path.samestat(there, os.fstat(stream)):
-                raise InputError(f"{path} is a standard stream of this process; expected a file of its own")
-    if Path("/proc") in _target(path.parent).parents:  # as /dev/fd is
-        raise InputError(f"{path} is an open file of a process; expected a file of its own")
+        with suppress(OSError):  # a closed stream
+            if os.path.samestat(old, os.fstat(stream)):
+                raise InputError(f"{path} is a standard stream of this process; expected another file")
+    if Path("/proc") in _target(path.parent).parents:  # such as /dev/fd
+        raise InputError(f"{path} is an open file of a process; expected another file")
     user = os.geteuid() if hasattr(os, "geteuid") else 0
-    if folder.st_mode & stat.S_ISVTX and user not in (0, there.st_uid, folder.st_uid):
+    if folder.st_mode & stat.S_ISVTX and user not in (0, old.st_uid, folder.st_uid):
         raise InputError(f"{path} cannot be written: in {target.parent} only its owner may replace it")
 
 
 def check_output_folder(path: Path) -> None:
-    """Refuse early, before long work, a folder that could not be made or written in."""
+    """Refuse a folder that could not be created or written to, before long work starts."""
     with _refusing(path, "cannot be made a folder", ValueError):
         _check_name(path)
-        there = _existing(path)
-        if not there.is_dir():
-            kind = "a file" if there.is_file() else "no folder"
-            raise InputError(f"{path} cannot be made a folder: {there} is {kind}; expected a new path")
-        if not os.access(there, os.W_OK):
-            raise InputError(f"no permission to write in the folder {there}")
+        parent = _existing(path)
+        if not parent.is_dir():
+            kind = "a file" if parent.is_file() else "not a folder"
+            raise InputError(f"{path} cannot be made a folder: {parent} is {kind}; expected a new path")
+        if not os.access(parent, os.W_OK):
+            raise InputError(f"no permission to write in the folder {parent}")
 
 
 def make_output_folder(path: Path) -> None:
@@ -82,7 +82,7 @@ def make_output_folder(path: Path) -> None:
 
 
 def remove_empty_folders(path: Path) -> None:
-    """Remove a folder that holds nothing but folders; files, and the folders they lie in, stay."""
+    """Remove empty folders under `path`, and `path` itself if nothing is left in it."""
     for folder, _, _ in os.walk(path, topdown=False):
         if not os.listdir(folder):
             os.rmdir(folder)
@@ -90,11 +90,10 @@ def remove_empty_folders(path: Path) -> None:
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """A temporary path whose file takes the place of `path` only when the block ends well.
+    """A temporary path whose file replaces `path` when the block ends without an exception.
 
-    It has the name of `path`, in a folder of its own beside it. A file that is there keeps its mode; where
-    `path` is a link, what it leads to is replaced. On the disk is the old file or the new one, whatever
-    happens: what a process that was killed left is removed when the next file is written there.
+    It has the name of `path`, in a `temporary_folder` next to it. An existing file keeps its mode; links are
+    followed. The disk always has the complete old or new file.
 
     Example:
         >>> target = Path(tempfile.mkdtemp()) / "note.txt"
@@ -107,7 +106,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     with _refusing(path, "was not written"), temporary_folder(_target(path).parent) as folder:
         yield folder / path.name
         _finish(folder / path.name, path)
-        with _signals_later():
+        with _delayed_signals():
             (folder / path.name).replace(_target(path))
         with suppress(OSError):
             _sync(_target(path).parent)
@@ -115,13 +114,10 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def whole_folder(path: Path, earlier: Iterable[str] = ()) -> Iterator[Path]:
-    """A temporary folder whose files take their places in `path`, one behind the other, when the block ends
-    well.
+    """A temporary folder whose files move to `path` when the block ends without an exception.
 
-    A folder that is new appears with all of them at once. One that is there keeps its other files.
-
-    Args:
-        earlier: names of files of an earlier run, which are removed where the block wrote none.
+    A new folder appears with all its files at once; in an existing one, files are replaced one by one, others
+    stay, and those named in `earlier`, from an earlier run, are removed if the block did not write them.
     """
     check_output_folder(path)
     with _refusing(path, "was not written"), temporary_folder(_existing(path)) as folder:
@@ -131,13 +127,13 @@ def whole_folder(path: Path, earlier: Iterable[str] = ()) -> Iterator[Path]:
             if path.is_dir():
                 check_output_file(path / name)
             _finish(folder / name, path / name)
-        with _signals_later():
+        with _delayed_signals():
             if not path.is_dir():
                 path.parent.mkdir(parents=True, exist_ok=True)
-                mode = _mode_of_new(folder)
-                with suppress(OSError):  # another process made one meanwhile
+                mode = _default_mode(folder)
+                with suppress(OSError):  # another process has created it meanwhile
                     folder.rename(path)
-                    path.chmod(mode)  # no sooner: one that may not be written in could not be moved
+                    path.chmod(mode)  # after the rename, which needs write permission
             for name in names if folder.is_dir() else ():
                 (folder / name).replace(_target(path / name))
             for name in {*earlier} - {*names}:
@@ -148,30 +144,28 @@ def whole_folder(path: Path, earlier: Iterable[str] = ()) -> Iterator[Path]:
 
 
 def remove_temporaries() -> None:
-    """Remove what this process has half written, before it ends at once."""
+    """Remove this process's temporary folders before it exits without cleanup."""
     for folder in list(_temporary):
         shutil.rmtree(folder, ignore_errors=True)
 
 
 @contextmanager
 def temporary_folder(parent: Path) -> Iterator[Path]:
-    """A folder of this process's own in `parent`, locked while it is in use; removed behind the block, also
-    by `remove_temporaries`, or after a kill by the next one in `parent`.
-    """
-    # the name, which a folder has from its first moment on, says that it is ours, and of this host: locks of
-    # a network file system may hold on one host only
-    for left in parent.glob(f"{HERE}{'?' * 8}"):  # of tempfile
-        if left.is_dir() and not left.is_symlink():
-            with _locked(left, wait=False) as abandoned:  # the system took the lock of a process it killed
+    """A new folder in `parent`, locked while in use. It is removed after the block, by `remove_temporaries`,
+    or, if the process was killed, by the next call for `parent`."""
+    # the prefix names the host: on a network file system, locks may hold on one host only
+    for old in parent.glob(f"{HOST_PREFIX}{'?' * 8}"):  # 8 characters of tempfile
+        if old.is_dir() and not old.is_symlink():
+            with _locked(old, wait=False) as abandoned:  # the system releases locks of killed processes
                 if abandoned:
-                    shutil.rmtree(left, ignore_errors=True)
+                    shutil.rmtree(old, ignore_errors=True)
     while True:
-        folder = Path(tempfile.mkdtemp(prefix=HERE, dir=parent))
+        folder = Path(tempfile.mkdtemp(prefix=HOST_PREFIX, dir=parent))
         _temporary.add(folder)
-        with suppress(FileNotFoundError):  # as below
+        with suppress(FileNotFoundError):  # see below
             folder.chmod(0o700)  # whatever the umask
         with _locked(folder):
-            if not folder.is_dir():  # another took it for abandoned before it was locked
+            if not folder.is_dir():  # another process removed it before it was locked
                 continue
             try:
                 yield folder
@@ -183,28 +177,24 @@ def temporary_folder(parent: Path) -> Iterator[Path]:
 
 @contextmanager
 def _locked(folder: Path, wait: bool = True) -> Iterator[bool]:
-    """Lock a folder: whether it is, and not where another has it, or the system knows no locks."""
-    place: int | None = None
-    locked = False
+    """Lock a folder; yields False if another process has locked it, or the system has no locks."""
+    descriptor, locked = -1, False
     try:
         with suppress(OSError, AttributeError):
-            place = os.open(folder, os.O_RDONLY)
-            fcntl.flock(place, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+            descriptor = os.open(folder, os.O_RDONLY)
+            fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
             locked = True
         yield locked
     finally:
-        if place is not None:
-            os.close(place)
+        if descriptor >= 0:
+            os.close(descriptor)
 
 
 def _finish(written: Path, path: Path) -> None:
-    """Have the disk hold a file that is to take the place of `path`, with the mode of what is there.
-
-    Its owner as well, where that is allowed.
-    """
+    """Flush a file to disk that will replace `path`, with the mode of `path` and, if allowed, its owner."""
     written.chmod(0o600)  # whatever the umask
     _sync(written)
-    mode = _mode_of_new(written.parent) & 0o666  # some writers make private files
+    mode = _default_mode(written.parent) & 0o666  # some writers make private files
     with suppress(FileNotFoundError):
         old = path.stat()
         mode = stat.S_IMODE(old.st_mode)
@@ -214,35 +204,34 @@ def _finish(written: Path, path: Path) -> None:
 
 
 def _sync(path: Path) -> None:
-    """Have the disk hold a file, or the names in a folder where the system can be asked to."""
-    place = os.open(path, os.O_RDONLY)
+    """Flush a file, or the entries of a folder, to disk."""
+    descriptor = os.open(path, os.O_RDONLY)
     try:
-        os.fsync(place)
+        os.fsync(descriptor)
     finally:
-        os.close(place)
+        os.close(descriptor)
 
 
 @contextmanager
-def _signals_later() -> Iterator[None]:
-    """Signals that a process may handle are handled behind the block, which is short."""
-    came: list[int] = []
-    ours = threading.current_thread() is threading.main_thread()  # the only one that handles signals
-    kept = {number: signal.getsignal(number) for number in SIGNALS if ours}
-    kept = {number: handler for number, handler in kept.items() if callable(handler)}
-    for number in kept:
-        signal.signal(number, lambda number, _: came.append(number))
+def _delayed_signals() -> Iterator[None]:
+    """Handle signals after the block, which is short."""
+    received: list[int] = []
+    main = threading.current_thread() is threading.main_thread()  # the only thread that handles signals
+    old = {number: handler for number in SIGNALS if main and callable(handler := signal.getsignal(number))}
+    for number in old:
+        signal.signal(number, lambda number, _: received.append(number))
     try:
         yield
     finally:
-        for number, handler in kept.items():
+        for number, handler in old.items():
             signal.signal(number, handler)
-        for number in came:
+        for number in received:
             signal.raise_signal(number)
 
 
 @contextmanager
 def _refusing(path: Path, what: str, also: type[Exception] = OSError) -> Iterator[None]:
-    """What the system refuses, an OSError or `also`, in one line."""
+    """Turn an OSError or `also` into an InputError of one line."""
     try:
         yield
     except InputError:
@@ -252,28 +241,27 @@ def _refusing(path: Path, what: str, also: type[Exception] = OSError) -> Iterato
 
 
 def _target(path: Path) -> Path:
-    """Where writing to a path goes: through links."""
     return Path(os.path.realpath(path))
 
 
 def _existing(path: Path) -> Path:
-    """The path, or the nearest of its parents, that is there, be it as a link that leads nowhere."""
+    """The path or its nearest existing parent; a broken link exists."""
     return next((place for place in (path, *path.parents) if os.path.lexists(place)), path)
 
 
 def _check_name(path: Path) -> None:
     if "\0" in str(path):
-        raise ValueError("there is a null character in it")
+        raise ValueError("it contains a null character")
     longest = max((len(os.fsencode(part)) for part in path.parts), default=0)
     length = len(os.fsencode(path.absolute()))
-    if longest > LONGEST_NAME or length > LONGEST_PATH:
-        expected = f"at most {LONGEST_NAME}, {LONGEST_PATH} in all"
-        raise InputError(f"{path} has a name of {longest} bytes, {length} in all; expected {expected}")
+    if longest > MAX_NAME_BYTES or length > MAX_PATH_BYTES:
+        seen = f"{path} has a name of {longest} bytes, {length} in all"
+        raise InputError(f"{seen}; expected at most {MAX_NAME_BYTES}, {MAX_PATH_BYTES} in all")
 
 
-def _mode_of_new(folder: Path) -> int:
-    """The mode of a folder that is made; asking the system for its mask would change that for a moment."""
-    fresh = Path(tempfile.mktemp(dir=folder))  # a name that no file in it has; the folder is our own
+def _default_mode(folder: Path) -> int:
+    """The mode of a new folder. Querying the umask instead would change it for a moment."""
+    fresh = Path(tempfile.mktemp(dir=folder))  # an unused name; nobody else writes in this folder
     fresh.mkdir()
     mode = fresh.stat().st_mode & 0o777
     fresh.rmdir()

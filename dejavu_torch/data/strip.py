@@ -1,4 +1,4 @@
-"""A window slid along one long image, as the paper makes its Aerial dataset (section IV-A)."""
+"""A window sliding along one long image, as in the paper's Aerial dataset (section IV-A)."""
 
 from __future__ import annotations
 
@@ -19,9 +19,8 @@ class SlidingWindow(IndexedTraverse):
     """Frame i is the window [i * step, i * step + width) of a strip.
 
     Args:
-        strip: (C,H,W) float in [0, 1].
+        strip: (C,H,W) float in [0, 1]; its name is for messages.
         width: of the window, pixels. step: pixels from one frame to the next.
-        name: what to call it in messages.
 
     Raises:
         InputError: not (C,H,W), or a window that does not fit.
@@ -38,9 +37,8 @@ class SlidingWindow(IndexedTraverse):
         if strip.ndim != 3 or not strip.is_floating_point():
             raise InputError(f"{name} is {tuple(strip.shape)} {strip.dtype}; expected float (C,H,W)")
         if not 1 <= width <= strip.shape[2] or step < 1:
-            expected = f"a window of 1 to {strip.shape[2]} pixels and a step of at least 1"
             seen = f"{name} is {strip.shape[2]} pixels long, window {width}, step {step}"
-            raise InputError(f"{seen}; expected {expected}")
+            raise InputError(f"{seen}; expected a window of at most the length, and a step of at least 1")
         self.name, self.strip, self.step = name, strip, step
         self.windows = strip.unfold(2, width, step).permute(2, 0, 1, 3)  # (N,C,H,width), a view
         self.length = len(self.windows)
@@ -55,24 +53,24 @@ class SlidingWindow(IndexedTraverse):
 
 
 def read_strip(path: Path, width: int, rows: str = "", halve: int = 0, grey: bool = False) -> SlidingWindow:
-    """A window slid along a long image file.
+    """A window sliding along a long image file.
 
     Args:
         width: of the window, pixels after halving.
         rows: "first:stop" of the rows to keep after halving; "" keeps all.
         halve: how many times to halve the image with a 2 x 2 box filter.
-        grey: turn colours to luminance first.
+        grey: convert colours to luminance first.
     """
     strip = read_image(path)
     if grey and strip.shape[0] == 3:
         strip = (strip * torch.tensor([0.299, 0.587, 0.114])[:, None, None]).sum(0, keepdim=True)
     if halve < 0 or min(strip.shape[1:]) >> halve < 1:
         seen = f"{path} is {strip.shape[1]} x {strip.shape[2]} pixels, to be halved {halve} times"
-        raise InputError(f"{seen}; expected at least 0 times, and a pixel to be left")
+        raise InputError(f"{seen}; expected at least 0 times, leaving at least one pixel")
     for _ in range(halve):
         strip = torch.nn.functional.avg_pool2d(strip, 2)
     if rows:
-        first, stop = (as_number(part) for part in (rows.partition(":")[0], rows.partition(":")[2]))
+        first, stop = map(as_number, rows.partition(":")[::2])
         if first is None or stop is None or first % 1 or stop % 1 or not 0 <= first < stop <= strip.shape[1]:
             raise InputError(f"{path}: rows {rows}; expected first:stop inside 0:{strip.shape[1]}")
         strip = strip[:, int(first) : int(stop)]

@@ -1,1 +1,1 @@
-"""Frames as they come -> places, one by one."""
+"""Live localization: a camera's frames -> places, one by one, and a page that shows them."""

@@ -1,4 +1,4 @@
-"""Frames read by a thread while others are localised; those that come too fast may be dropped."""
+"""Frames read by a thread while others are localized."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ WAITING = 2  # frames read ahead, if none is dropped
 
 
 class FrameReader:
-    """Iterates frames that a thread of its own reads, as a context manager; what reading raises comes last.
+    """A context manager that iterates frames read by a thread; an error of the reading is raised last.
 
     Args:
         newest: only the newest frame waits; earlier ones are dropped, and counted in `dropped`.
-        timeout: seconds without a frame after which the source has stalled, an InputError; None waits.
+        timeout: seconds without a frame that raise an InputError; None waits forever.
         name: of the source, for messages.
     """
 
@@ -33,9 +33,9 @@ class FrameReader:
     ) -> None:
         self.frames, self.newest, self.timeout, self.name = frames, newest, timeout, name
         self.dropped, self._closed = 0, False
-        # frames, and at the end None or what reading them raised
+        # frames, then None or the error of the reading
         self._waiting: queue.Queue[Frame | BaseException | None] = queue.Queue(WAITING)
-        # a thread that is stuck in a read does not keep the process
+        # a daemon, since a blocked read must not keep the process alive
         self._thread = threading.Thread(target=self._read, name="dejavu reader", daemon=True)
 
     def __enter__(self) -> FrameReader:
@@ -52,10 +52,10 @@ class FrameReader:
             try:
                 frame = self._waiting.get(timeout=self.timeout)
             except queue.Empty:
-                seen = f"{self.name} stalled: no frame in {self.timeout:g} seconds"
-                raise InputError(f"{seen}; expected it to go on") from None
+                seen = f"{self.name} stalled: no frame for {self.timeout:g} seconds"
+                raise InputError(f"{seen}; expected further frames") from None
             if frame is None or isinstance(frame, BaseException):
-                self._waiting.put(frame)  # for whoever iterates again
+                self._waiting.put(frame)  # for the next iteration
                 if frame is None:
                     return
                 raise frame
@@ -75,7 +75,7 @@ class FrameReader:
         self._waiting.put(end)
 
     def _drop(self) -> int:
-        """Drop the frames that wait; how many they were."""
+        """Drop the waiting frames, and count them."""
         count = 0
         with suppress(queue.Empty):
             while True:
@@ -85,12 +85,12 @@ class FrameReader:
 
 
 def in_real_time(frames: Iterable[Frame], name: str, rate: float | None = None) -> Iterator[Frame]:
-    """Each frame no earlier than its timestamp says, from the first on, or `rate` frames a second."""
-    began: float | None = None
+    """Frames at the pace of their timestamps, or at `rate` per second if they have none."""
+    start: float | None = None
     for frame in frames:
         seconds = frame.number / rate if rate and math.isnan(frame.seconds) else frame.seconds
         if math.isnan(seconds):
-            raise InputError(f"{name} has no times; expected a video for --realtime")
-        began = time.monotonic() - seconds if began is None else began
-        time.sleep(max(0.0, began + seconds - time.monotonic()))
+            raise InputError(f"{name} has no timestamps; expected a video for --realtime")
+        start = time.monotonic() - seconds if start is None else start
+        time.sleep(max(0.0, start + seconds - time.monotonic()))
         yield frame

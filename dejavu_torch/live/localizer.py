@@ -1,4 +1,4 @@
-"""One frame at a time on a map, with what the frames before it showed."""
+"""Localize one frame at a time, with the state of a sequence or a filter."""
 
 from __future__ import annotations
 
@@ -16,44 +16,41 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.types import InputError, SequenceModel
 
-EXPECTED = (
-    "uint8 (H,W), (H,W,3) or (3,H,W), or float of these shapes in [0, 1], or, of a map of ready features, "
-    "float (D,)"
-)
+EXPECTED = "uint8 (H,W), (H,W,3) or (3,H,W), or float in [0, 1], or float (D,) for a map of ready features"
 DTYPES = ("uint8", "float16", "bfloat16", "float32", "float64")
-FURTHEST = 100  # skipped frames that count; after more, a jump finds the place again
-ROUNDING = 1e-3  # by which a value may miss the range from 0 to 1
+MAX_SKIPPED = 100  # skipped frames that a filter moves for; after more, a jump finds the place again
+ROUNDING = 1e-3  # tolerance of the range [0, 1]
 
 
 class LiveMatch(NamedTuple):
-    """Where a frame was found; place, score, probability and accepted as of `Match`, NaN for none."""
+    """The match of a frame; place, score, probability and accepted as in `Match`, NaN for none."""
 
     place: int
-    frame: int  # the reference frame that the place shows, -1 for none
+    frame: int  # the reference frame of the place, -1 for none
     name: str  # of that frame, if it has one
     score: float
-    posterior: float  # the probability that a filter gives the place
+    posterior: float  # probability of the place from a filter
     probability: float
     accepted: bool
-    milliseconds: float  # from the frame to this answer
-    route: str = ""  # of a merged map, the one that the frame is on
+    milliseconds: float  # taken by this frame
+    route: str = ""  # of a merged map
 
 
 class LiveLocalizer:
-    """`DejaVu.localize` for frames that come one at a time.
+    """`DejaVu.localize` for one frame at a time.
 
     Args:
-        model: has a map. It is used as it is and where it is: on a GPU, frames are moved there.
+        model: with a map; frames are moved to its device.
         sequence: "filter" is a `PlaceFilter`; None matches each frame by itself.
-        keep_scores: keeps those of all places; without, a single frame is searched for as by `localize`.
+        keep_scores: keep the scores of all places; otherwise single frames are searched as in `localize`.
 
     Shape: a frame (H,W), (H,W,3) or (C,H,W), tensor or array, uint8 or float in [0, 1] -> `LiveMatch`.
 
     Attributes:
         scores: (N,) of the latest frame, on the model's device; None before the first, or if not kept.
 
-    Convention: the answers are those of `DejaVu.localize`, but for rounding. A frame that is refused changes
-        nothing. `localizer(frame, left_out)` says how many frames were skipped since the one before: a
+    Convention: the answers equal those of `DejaVu.localize` up to rounding. A refused frame changes nothing.
+        `left_out` in `localizer(frame, left_out)` is the number of frames skipped before this one: a
         `PlaceFilter` moves once more for each.
 
     Raises:
@@ -73,38 +70,34 @@ class LiveLocalizer:
         keep_scores: bool = True,
     ) -> None:
         if model.step is not None and model.velocity is not None:
-            raise InputError(
-                "the map's places are even steps along the ground, which are measured on a whole traverse; "
-                "expected a map without --velocity, or the frames taken as they are (--as_is)"
-            )
+            seen = "the map's places are even steps along the ground, which only a whole traverse shows"
+            raise InputError(f"{seen}; expected a map without --velocity, or unchanged frames (--as_is)")
         if not (sequence is None or sequence == "filter" or isinstance(sequence, SequenceModel)):
-            raise InputError(
-                f"the sequence is {sequence!r}; expected a SequenceModel such as PlaceFilter, 'filter', None"
-            )
+            seen = f"the sequence is {sequence!r}"
+            raise InputError(f"{seen}; expected a SequenceModel such as PlaceFilter, 'filter' or None")
         self.keep_scores = keep_scores
         self.model, self.sequence = model, PlaceFilter() if isinstance(sequence, str) else sequence
         self._pipeline = model.describer.pipeline
-        self._shape: tuple[int, ...] | None = None  # of the latest frame that fitted
+        self._shape: tuple[int, ...] | None = None  # of the latest valid frame
         whitening = model.whitening
         self._projection = whitening.unpacked() if whitening is not None and whitening.learned else None
         self.reset()
 
     def reset(self) -> None:
-        """Forget the frames so far."""
+        """Forget all frames."""
         self.scores: Tensor | None = None
         matching = self.model.matching(self.sequence)
-        self._localizer = self.model.localizer(
-            matching._replace(on_scores=self._keep) if self.keep_scores else matching
-        )
+        keep = self._keep if self.keep_scores else None
+        self._localizer = self.model.localizer(matching._replace(on_scores=keep))
 
     def _keep(self, scores: Tensor) -> None:
         self.scores = scores[0]
 
     @torch.no_grad()
     def __call__(self, frame: Tensor | np.ndarray, left_out: int = 0) -> LiveMatch:
-        began, model = time.perf_counter(), self.model
+        start, model = time.perf_counter(), self.model
         descriptor = self._describe(as_batch(frame, model.map.positions.device))
-        self._localizer.skip(min(left_out, FURTHEST))
+        self._localizer.skip(min(left_out, MAX_SKIPPED))
         match = self._localizer(descriptor)
         place, score, table = int(match.index), float(match.score), model.map.table
         shown, routes = int(table.frame_of(match.index)), model.map.routes
@@ -116,17 +109,17 @@ class LiveLocalizer:
             posterior=math.exp(-score) if isinstance(self.sequence, PlaceFilter) else math.nan,
             probability=math.nan if match.probability is None else float(match.probability),
             accepted=bool(match.accepted),
-            milliseconds=1e3 * (time.perf_counter() - began),
+            milliseconds=1e3 * (time.perf_counter() - start),
             route=routes[int(table.route_of(match.index))].name if routes and place >= 0 else "",
         )
 
     @property
     def posterior(self) -> Tensor | None:
-        """(N+1,) of a filter after the latest frame; None without one, or before the first frame."""
+        """(N+1,) of a filter after the latest frame; None without a filter, or before the first frame."""
         return self._localizer.posterior
 
     def _describe(self, batch: Tensor) -> Tensor:
-        """The descriptor of a frame that fits the map, (1,K)."""
+        """The descriptor (1,K) of a frame, which has to fit the map."""
         whitening, dimension = self.model.whitening, self.model.map.dimension
         batch = resize_like(batch, self.model.frame_shape)
         with in_mode(self._pipeline, False):
@@ -144,7 +137,7 @@ class LiveLocalizer:
 
 
 def as_batch(frame: Tensor | np.ndarray, device: torch.device | str = "cpu") -> Tensor:
-    """One frame as a batch (1,C,H,W) of floats in [0, 1], or one frame's ready features (D,) as (1,D)."""
+    """A frame as a batch (1,C,H,W) of floats in [0, 1], or ready features (D,) as (1,D)."""
     if isinstance(frame, np.ndarray) and frame.dtype.name in DTYPES:
         frame = torch.from_numpy(np.require(frame, frame.dtype.newbyteorder("="), ["C", "W"]))
     shape = tuple(getattr(frame, "shape", ()))
@@ -153,19 +146,19 @@ def as_batch(frame: Tensor | np.ndarray, device: torch.device | str = "cpu") -> 
     image = len(shape) == 2 or (len(shape) == 3 and (last or first))
     fits = image or (len(shape) == 1 and kind != "uint8")
     if not isinstance(frame, Tensor) or kind not in DTYPES or not fits or 0 in shape:
-        seen = f"{shape} {kind}{', which holds nothing' if 0 in shape else ''}" if shape else f"a {kind}"
+        seen = f"{shape} {kind}{', which is empty' if 0 in shape else ''}" if shape else f"a {kind}"
         raise InputError(f"the frame is {seen}; expected {EXPECTED}")
     values = frame.detach().to(device)
     if len(shape) == 1:
         return values.float()[None]
     if len(shape) == 2:
         values = values[None]
-    elif last and not (first and kind != "uint8"):  # a tensor of floats has its channels first
+    elif last and not (first and kind != "uint8"):  # if both fit, floats have their channels first
         values = values.permute(2, 0, 1)
     if kind == "uint8":
         return values[None].float().div_(255)
     values = values if values.dtype == torch.float64 else values.float()
     low, high = (float(end) for end in values.aminmax())
     if not (low >= -ROUNDING and high <= 1 + ROUNDING):
-        raise InputError(f"the frame holds numbers from {low:.4g} to {high:.4g}; expected 0 to 1")
+        raise InputError(f"the frame has values from {low:.4g} to {high:.4g}; expected 0 to 1")
     return values[None].clamp(0, 1)

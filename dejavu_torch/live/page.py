@@ -1,4 +1,4 @@
-"""A page of what happens live, served on this machine alone by the standard library."""
+"""A live page, served to this machine alone by the standard library."""
 
 from __future__ import annotations
 
@@ -26,43 +26,43 @@ from dejavu_torch.live.localizer import LiveMatch
 from dejavu_torch.types import InputError, Traverse
 
 HOST = "127.0.0.1"
-PORT = 8765  # by default
+PORT = 8765  # default
 COLUMNS = 512  # of the curve
-WIDTH = 640  # of pictures, pixels at most
-KEPT, SMALL = 20_000, 160  # pictures of a reference that is only read in order, and their width
+WIDTH = 640  # maximum, of pictures in pixels
+MAX_PICTURES, SMALL_WIDTH = 20_000, 160  # of a reference that can only be read in order
 PAGE = Path(__file__).with_name("page.html")
 
 
 class Snapshot(NamedTuple):
-    """What the page shows of one frame: `scores` (N,), or a `posterior` (N+1,); p50, p99 in milliseconds."""
+    """What the page shows of one frame."""
 
     frame: Frame
     match: LiveMatch
-    scores: Tensor
+    scores: Tensor  # (N,), or (N+1,) if it is a posterior
     posterior: bool
     frames: int
     dropped: int
-    p50: float
+    p50: float  # milliseconds
     p99: float
 
 
 class Page:
-    """Serves the page at http://127.0.0.1:PORT/ from threads of its own, as a context manager.
+    """A context manager that serves the page at http://127.0.0.1:PORT/ from its own threads.
 
     Args:
-        port: 0 is any that is free; `url` says which. One in use is refused.
+        port: 0 is any free one, see `url`. A port in use is refused.
         title: a line below the heading.
         reference: gives pictures of the reference's frames.
 
-    Convention: only requests for 127.0.0.1 and localhost are answered, so that no other site can ask for it
-        by a name of its own.
+    Convention: only requests for 127.0.0.1 and localhost are answered, so that other sites cannot read the
+        page through a host name that resolves to this machine.
     """
 
     def __init__(
         self, port: int = PORT, title: str = "", reference: Callable[[int], str | None] | None = None
     ) -> None:
         if not 0 <= port < 2**16:
-            raise InputError(f"port {port}; expected one from 0 to 65535, 0 being any that is free")
+            raise InputError(f"port {port}; expected one from 0 to 65535, 0 for any free one")
         self.title, self.reference = title, reference
         self.snapshot: Snapshot | None = None
         page = self
@@ -77,8 +77,8 @@ class Page:
         try:
             self._server = ThreadingHTTPServer((HOST, port), Handler)
         except OSError as error:
-            seen = f"port {port} of {HOST} cannot be had: {error.strerror}"
-            raise InputError(f"{seen}; expected a free one, such as 0 finds") from error
+            seen = f"port {port} of {HOST} cannot be opened: {error.strerror}"
+            raise InputError(f"{seen}; expected a free one, or 0 to find one") from error
         self._server.daemon_threads = True
         self.url = f"http://{HOST}:{self._server.server_address[1]}/"
 
@@ -95,6 +95,7 @@ class Page:
         self.snapshot = snapshot
 
     def answer(self, request: BaseHTTPRequestHandler) -> None:
+        """Answer a request for the page or its state."""
         host = request.headers.get("Host", "").partition(":")[0]
         address = urlsplit(request.path)
         body, kind, status = b"", "text/plain", HTTPStatus.OK
@@ -107,7 +108,7 @@ class Page:
             body, kind = json.dumps(self.state(seen)).encode(), "application/json"
         else:
             status = HTTPStatus.NOT_FOUND
-        with suppress(OSError):  # who asked has left
+        with suppress(OSError):  # the browser has disconnected
             request.send_response(status)
             request.send_header("Content-Type", kind)
             request.send_header("Content-Length", str(len(body)))
@@ -116,7 +117,7 @@ class Page:
             request.wfile.write(body)
 
     def state(self, seen: str = "") -> dict[str, Any]:
-        """What the page asks for again and again; little of a frame whose number it has `seen`."""
+        """What the page polls; only the number of the frame if the page has `seen` it."""
         if self.snapshot is None:
             return {"title": self.title, "number": -1}
         frame, match, scores, posterior, *counts = self.snapshot
@@ -128,7 +129,7 @@ class Page:
         return without_nan(facts) | {
             "places": len(scores) - posterior,
             "off": round(float(scores[-1]), 6) if posterior else None,
-            "kind": "Posterior over the route" if posterior else "Match over the route, the best place 1",
+            "kind": "Posterior along the route" if posterior else "Relative match along the route (best = 1)",
             "curve": curve(scores, posterior),
             "query": as_picture(frame.pixels),
             "reference": self.reference(match.frame) if self.reference and match.frame >= 0 else None,
@@ -136,14 +137,14 @@ class Page:
 
 
 def without_nan(facts: dict[str, Any]) -> dict[str, Any]:
-    """The facts for JSON, which has no NaN and no infinity."""
-    lost = [key for key, value in facts.items() if isinstance(value, float) and not math.isfinite(value)]
-    return facts | dict.fromkeys(lost)
+    """The facts with None for NaN and infinity, which JSON does not have."""
+    missing = [key for key, value in facts.items() if isinstance(value, float) and not math.isfinite(value)]
+    return facts | dict.fromkeys(missing)
 
 
 def curve(scores: Tensor, posterior: bool) -> list[float]:
-    """What the page draws of all places, as at most `COLUMNS` heights in [0, 1]: of scores (N,) that of the
-    best place in a column, 1 for the best of all and 0 for the worst; of a posterior (N+1,) the sum."""
+    """At most `COLUMNS` heights in [0, 1] along the map. For scores (N,): the best place of a column, scaled
+    from 0 for the worst to 1 for the best of all. For a posterior (N+1,): the sum of a column."""
     scores = scores.detach().float().cpu()
     places = len(scores) - posterior
     columns = min(COLUMNS, places)
@@ -158,7 +159,7 @@ def curve(scores: Tensor, posterior: bool) -> list[float]:
 
 
 def as_picture(pixels: np.ndarray | Tensor, width: int = WIDTH) -> str | None:
-    """A frame, (H,W,3) uint8 or (C,H,W) float, as the address of a JPEG in itself; None of ready features."""
+    """A frame, (H,W,3) uint8 or (C,H,W) float, as the data URL of a JPEG; None for ready features."""
     if isinstance(pixels, Tensor):
         if pixels.ndim != 3:
             return None
@@ -171,17 +172,17 @@ def as_picture(pixels: np.ndarray | Tensor, width: int = WIDTH) -> str | None:
 
 
 class ReferencePictures:
-    """Pictures of the frames of the map's reference, which has so many, for `Page`.
+    """Pictures of the frames of the map's reference, for `Page`.
 
-    Of a traverse that can only be read in order, as a video, a thread makes small pictures of at most `KEPT`
-    frames, of which the nearest is shown.
+    If the reference can only be read in order, like a video, a thread makes small pictures of at most
+    `MAX_PICTURES` frames, and the nearest one is shown.
     """
 
     def __init__(self, reference: Traverse, frames: int) -> None:
         if reference.length not in (None, frames):
             seen = f"{reference.name} has {reference.length} frames"
             raise InputError(f"{seen}; the map's reference has {frames}")
-        self.reference, self.step = reference, max(1, math.ceil(frames / KEPT))
+        self.reference, self.step = reference, max(1, math.ceil(frames / MAX_PICTURES))
         self._small: list[str | None] = []
         if not isinstance(reference, IndexedTraverse):
             threading.Thread(target=self._read, daemon=True).start()
@@ -190,13 +191,13 @@ class ReferencePictures:
         if isinstance(self.reference, IndexedTraverse):
             try:
                 return as_picture(next(self.reference.between(frame, frame + 1))[0])
-            except InputError:  # an image that is not there any more
+            except InputError:  # the image was removed
                 return None
         near = round(frame / self.step)
         return self._small[near] if near < len(self._small) else None
 
     def _read(self) -> None:
-        with suppress(InputError):  # the pictures so far stay
+        with suppress(InputError):  # keeps the pictures so far
             for i, batch in enumerate(self.reference.batches(1)):
                 if i % self.step == 0:
-                    self._small.append(as_picture(batch[0], SMALL))
+                    self._small.append(as_picture(batch[0], SMALL_WIDTH))

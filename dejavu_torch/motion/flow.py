@@ -1,4 +1,4 @@
-"""The shift between two patches of ground by optical flow of OpenCV, sparse or dense (section IV-B)."""
+"""The shift between two patches of ground by OpenCV's sparse or dense optical flow (section IV-B)."""
 
 from __future__ import annotations
 
@@ -16,87 +16,84 @@ from dejavu_torch.types import InputError
 Array = np.ndarray[Any, Any]
 Tracker = Callable[[Array, Array, float], tuple[Array, Array, Array]]
 
-TOLERANCE = 0.7  # pixels between what agrees
-STARTS = (0, -1, 1, -2, 2, -3, 3)  # eighths of the patch at which the search starts
-CONFIDENT = 0.8  # no other start is tried
-CORRELATED = 0.25  # between the 9 x 9 pixels around a point and around where it moved
+TOLERANCE = 0.7  # pixels within which displacements agree
+STARTS = (0, -1, 1, -2, 2, -3, 3)  # initial shifts, in eighths of the patch
+SUFFICIENT_CONFIDENCE = 0.8  # stops the search over initial shifts
+MIN_CORRELATION = 0.25  # between the 9 x 9 pixels around a point before and after it moved
 CONTRAST = 40.0  # grey levels per standard deviation of the patch
 
 
 def flow_shift(first: Tensor, second: Tensor, method: str) -> tuple[Tensor, Tensor]:
-    """How far the ground moved from one patch to the next, as in `phase_shifts`: shift (B,), confidence (B,).
+    """The shift of the ground between two patches, as in `phase_shifts`: shift (B,), confidence (B,).
 
-    The median displacement of the points that, tracked forward and back, end where they started. "lk" tracks
-    up to 200 corners (pyramidal Lucas-Kanade), "dis" every pixel around which the brightness changes along
-    the rows (dense inverse search). The confidence is the share of points that agree with the median, 0 for a
-    patch that is flat or not finite.
+    The shift is the median displacement of points that return to their start when tracked forward and back.
+    "lk" tracks up to 200 corners (pyramidal Lucas-Kanade), "dis" every pixel around which the brightness
+    varies from row to row (dense inverse search). The confidence is the share of points that agree with the
+    median, 0 for a patch that is flat or not finite.
 
-    Limits: |shift| up to about 0.4 h ("dis" 0.25 h, and only to 0.1 pixels). Lines along the way seem to
-        stand still: on a motorway both are worse than `phase_shifts`.
+    Limits: |shift| up to about 0.4 h ("dis" 0.25 h, accurate to 0.1 pixels only). Lines along the way appear
+        static: on a motorway both are worse than `phase_shifts`.
     """
     track = tracker(method)
-    found = [_shift(track, *pair) for pair in zip(_pictures(first), _pictures(second), strict=True)]
+    found = [_shift(track, *pair) for pair in zip(_to_uint8(first), _to_uint8(second), strict=True)]
     shift, confidence = first.new_tensor(found).view(-1, 2).T
     return shift, confidence
 
 
 def tracker(method: str) -> Tracker:
-    """`track(first, second, start)` of a method: where points of one picture are in another."""
+    """The function `track(first, second, start)` of a method, which follows points between two images."""
     if method not in TRACKERS:
         raise InputError(f"flow is {method!r}; expected phase, {', '.join(TRACKERS)}")
     try:
         import cv2
     except ImportError as error:
-        raise InputError(
-            f"optical flow needs OpenCV ({error}); expected it to be there: pip install 'dejavu_torch[flow]'"
-        ) from error
+        seen = f"optical flow needs OpenCV, which cannot be imported ({error})"
+        raise InputError(f"{seen}; expected pip install 'dejavu_torch[flow]'") from error
     return partial(TRACKERS[method], cv2)
 
 
-def _pictures(patches: Tensor) -> Array:
-    """(B,1,h,w) -> (B,h,w) uint8 of equal contrast; 0 if a patch shows nothing."""
+def _to_uint8(patches: Tensor) -> Array:
+    """(B,1,h,w) -> (B,h,w) uint8 of equal contrast; 0 for flat patches."""
     grey = patches[:, 0].detach().double().cpu()
     centred = grey - grey.mean((1, 2), keepdim=True)
     variance = centred.square().mean((1, 2), keepdim=True)
     levels = (CONTRAST * centred / variance.sqrt() + 128).round().clamp(0, 255)
-    pictures: Array = torch.where(variance >= FLAT, levels, 0).byte().numpy()
-    return pictures
+    images: Array = torch.where(variance >= FLAT, levels, 0).byte().numpy()
+    return images
 
 
 def _shift(track: Tracker, first: Array, second: Array) -> tuple[float, float]:
-    """Shift and confidence from the start on which most points agree."""
+    """Shift and confidence from the initial shift with the most agreeing points."""
     best = (0.0, 0.0)
     for eighths in STARTS:
         points, moved, returned = track(first, second, len(first) / 8 * eighths)
         if not returned.any():
             continue
         median = np.median(moved[returned], 0)
-        there = points + median
-        inside = ((there >= 0) & (there <= (first.shape[1] - 1, first.shape[0] - 1))).all(1)
+        target = points + median
+        inside = ((target >= 0) & (target <= (first.shape[1] - 1, first.shape[0] - 1))).all(1)
         agree = inside & returned & (np.abs(moved - median) < TOLERANCE).all(1)
-        # out of fewer than 8 points some agree by chance
-        confidence = float(agree.sum() / max(inside.sum(), len(points) / 2, 8))
+        confidence = float(agree.sum() / max(inside.sum(), len(points) / 2, 8))  # few agree by chance
         best = max(best, (float(median[1]), confidence), key=lambda found: found[1])
-        if confidence >= CONFIDENT:
+        if confidence >= SUFFICIENT_CONFIDENCE:
             break
     return best
 
 
 def _track_corners(cv2: Any, first: Array, second: Array, start: float) -> tuple[Array, Array, Array]:
-    """Points (P,2) as (x, y), how far they moved (P,2), and whether the way back returns (P,)."""
+    """Points (P,2) as (x, y), their displacements (P,2), and whether tracking back returns to them (P,)."""
     points = cv2.goodFeaturesToTrack(first, 200, 0.01, 3)
     if points is None:
         return np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, bool)
     flags, guess = cv2.OPTFLOW_USE_INITIAL_FLOW, np.array([0, start], np.float32)
     track = partial(cv2.calcOpticalFlowPyrLK, winSize=(15, 15), maxLevel=3, flags=flags)
-    there, found, _ = track(first, second, points, points + guess)
-    again, kept, _ = track(second, first, there, there - guess)
-    returned = (found & kept)[:, 0].astype(bool) & (np.abs(again - points) < TOLERANCE).all((1, 2))
-    return points[:, 0], (there - points)[:, 0], returned
+    moved, found, _ = track(first, second, points, points + guess)
+    back, kept, _ = track(second, first, moved, moved - guess)
+    returned = (found & kept)[:, 0].astype(bool) & (np.abs(back - points) < TOLERANCE).all((1, 2))
+    return points[:, 0], (moved - points)[:, 0], returned
 
 
 def _track_pixels(cv2: Any, first: Array, second: Array, start: float) -> tuple[Array, Array, Array]:
-    """As `_track_corners`."""
     search = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     mean = partial(cv2.boxFilter, ddepth=-1, ksize=(9, 9))
     y, x = np.indices(first.shape, np.float32)
@@ -107,14 +104,14 @@ def _track_pixels(cv2: Any, first: Array, second: Array, start: float) -> tuple[
     look_up = partial(cv2.remap, map1=points + moved, map2=None, interpolation=cv2.INTER_LINEAR)
     back = look_up(search.calc(second, first, -guess), borderValue=(np.inf, np.inf))
     returned = (np.abs(moved + back) < TOLERANCE).all(2)
-    # a dense flow is smooth over any two pictures: it must also lead to ground that looks alike
+    # dense flow is smooth between any two images: the ground it matches must also correlate
     one, other = first.astype(np.float32), look_up(second).astype(np.float32)
-    spread = (mean(one**2) - mean(one) ** 2) * (mean(other**2) - mean(other) ** 2)
+    variances = (mean(one**2) - mean(one) ** 2) * (mean(other**2) - mean(other) ** 2)
     covariance = mean(one * other) - mean(one) * mean(other)
-    alike = covariance / np.sqrt(np.maximum(spread, 1)) > CORRELATED
+    similar = covariance / np.sqrt(np.maximum(variances, 1)) > MIN_CORRELATION
     slope = mean(cv2.Sobel(first, cv2.CV_32F, 0, 1) ** 2)
     textured = slope >= 0.25 * slope.mean()
-    return points[textured], moved[textured], (returned & alike)[textured]
+    return points[textured], moved[textured], (returned & similar)[textured]
 
 
 TRACKERS: dict[str, Callable[..., tuple[Array, Array, Array]]] = {"lk": _track_corners, "dis": _track_pixels}

@@ -1,4 +1,4 @@
-"""How fast a camera moves, measured on the ground in front of it (section IV-B)."""
+"""Visual odometry: the speed of a camera, measured on the ground in front of it (section IV-B)."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from dejavu_torch.types import InputError, Traverse
 
 log = logging.getLogger("dejavu_torch")
 
-NAMED = 6  # segments without common ground that a warning lists
-LARGEST = 1024  # pixels: more rows than frames show of the ground, and shifts take their square
+MAX_LISTED = 6  # segments without common ground in a warning
+MAX_SIZE = 1024  # pixels: more than frames show of the ground, and the cost is quadratic
 
 
 class Odometry(NamedTuple):
     """distance: (N,) float64, pixels of ground (rows of the patch) from frame 0, negative if backwards.
-    confidence: (N-1,) of each step in [0, 1], as measured."""
+    confidence: (N-1,) of each step as measured, in [0, 1]."""
 
     distance: Tensor
     confidence: Tensor
@@ -37,20 +37,20 @@ class GroundOdometry(nn.Module):
 
     Args:
         corners: (x, y) of a region of ground in fractions of the frame: far left, far right, near right,
-            near left. Its sides should be parallel on the ground, as two rails are.
-        size: (rows, columns) of the patch it becomes, pixels, 32 to 1024 each. The longest step that can be
-            measured is about 0.42 of its rows.
-        step: pixels of ground from one resampled frame to the next; None is the median of the steps not 0.
-        least: confidence below which a step is interpolated, in [0, 1]. The default finds a cut in patches of
-            96 x 96; in those of 32 x 32 unrelated ground can agree by 0.8.
-        still: pixels of ground; a shorter step of either sign counts as 0, as of a standing camera. Ground of
-            little contrast needs more, slow footage at many frames a second less.
-        flow: how patches are compared: "phase" (`phase_shifts`), or optical flow of OpenCV, "lk" on corners
+            near left. Its sides should be parallel on the ground, like two rails.
+        size: (rows, columns) of its bird's-eye view, the patch, 32 to 1024 pixels each. Steps can be measured
+            up to about 0.42 of the rows.
+        step: pixels of ground between resampled frames; None is the median of the nonzero steps.
+        least: minimum confidence in [0, 1]; steps below it are interpolated. The default detects a cut in
+            patches of 96 x 96; in patches of 32 x 32, unrelated ground can reach 0.8.
+        still: dead band in pixels of ground: a shorter step of either sign is set to 0. Low contrast needs
+            more, slow footage at a high frame rate less.
+        flow: how patches are compared: "phase" (`phase_shifts`), or OpenCV's optical flow, "lk" on corners
             or "dis" on all pixels (`flow_shift`, with its limits; `pip install 'dejavu_torch[flow]'`).
 
     Shape: (N,C,H,W) -> shift (N-1,) in pixels of ground, forward > 0; confidence (N-1,) in [0, 1].
 
-    Convention: if periodic ground leaves several shifts, those that change least (`viterbi_path`).
+    Convention: if periodic ground allows several shifts, the smoothest path is chosen (`viterbi_path`).
 
     Raises:
         InputError: an argument out of range, OpenCV missing; forward: not (N,C,H,W) float, or N of 1.
@@ -72,8 +72,8 @@ class GroundOdometry(nn.Module):
     ) -> None:
         super().__init__()
         check_corners(corners)
-        if len(size) != 2 or min(size) < 32 or max(size) > LARGEST:
-            raise InputError(f"size is {tuple(size)}; expected (rows, columns) of 32 to {LARGEST} each")
+        if len(size) != 2 or min(size) < 32 or max(size) > MAX_SIZE:
+            raise InputError(f"size is {tuple(size)}; expected (rows, columns) of 32 to {MAX_SIZE} each")
         if step is not None and not 0 < step < math.inf:
             raise InputError(f"step is {step}; expected pixels of ground above 0, or None")
         if not 0 <= least <= 1:
@@ -81,7 +81,7 @@ class GroundOdometry(nn.Module):
         if not 0 <= still < math.inf:
             raise InputError(f"still is {still}; expected pixels of ground, at least 0")
         if flow != "phase":
-            tracker(flow)
+            tracker(flow)  # refuses other names, and a missing OpenCV
         self.corners = tuple((float(x), float(y)) for x, y in corners)
         self.size = (int(size[0]), int(size[1]))
         self.step = None if step is None else float(step)
@@ -100,28 +100,27 @@ class GroundOdometry(nn.Module):
         return [(shift[:, None], confidence[:, None])]
 
     def _path(self, parts: list[tuple[Tensor, Tensor]], name: str) -> tuple[Tensor, Tensor]:
-        """The likeliest shifts of all parts, (n,), and their confidence (n,)."""
+        """The shifts (n,) chosen by `viterbi_path` from all parts, and their confidences (n,)."""
         if not parts:
-            raise InputError(f"{name} has 1 frame; expected at least 2 to see motion")
+            raise InputError(f"{name} has 1 frame; expected at least 2 to measure motion")
         shifts, confidences = (torch.cat(part) for part in zip(*parts, strict=True))
         path = viterbi_path(shifts, confidences, self.size[0]).to(shifts.device)[:, None]
         return shifts.gather(1, path)[:, 0], confidences.gather(1, path)[:, 0]
 
     @torch.no_grad()
     def distances(self, traverse: Traverse, batch_size: int = 64, progress: bool = False) -> Odometry:
-        """Where the camera is at each frame of a traverse, which is read once, batch by batch.
+        """The position of the camera at each frame of a traverse, which is read once, batch by batch.
 
         Args:
-            batch_size: frames in memory at a time; fewer if they are large.
-            progress: show a progress bar on a terminal.
+            batch_size: frames in memory at a time, or fewer if they are large. progress: show a bar.
 
-        Convention: a step of a confidence below `least` (a cut, a drop-out) is interpolated between its
-            neighbours, and a warning names the frames. A step shorter than `still` is 0.
+        Convention: a step with confidence below `least` (a cut, a drop-out) is interpolated between its
+            neighbours, with a warning that names the frames. A step shorter than `still` is 0.
 
         Raises:
-            InputError: ready features, fewer than two frames, or no step of enough confidence.
+            InputError: features instead of frames, fewer than two frames, or no confident step.
         """
-        last: list[Tensor] = []  # patch of the batch before
+        last: list[Tensor] = []  # the last patch of the previous batch
         parts: list[tuple[Tensor, Tensor]] = []
         text, hidden = "measuring the ground", None if progress else True
         with tqdm(total=traverse.length, desc=text, unit="frame", disable=hidden, leave=False) as bar:
@@ -138,38 +137,35 @@ class GroundOdometry(nn.Module):
         return Odometry(torch.cat([shift.new_zeros(1), shift.cumsum(0)]), confidence)
 
     def _warn_coarse(self, batch: Tensor, name: str) -> None:
-        """Warn of a patch finer than the frames: interpolated rows hardly move."""
+        """Warn of a patch with more rows than the frames resolve: motion is underestimated."""
         (height, width), (rows, columns) = batch.shape[2:], self.size
         (ax, ay), (bx, by), (cx, cy), (dx, dy) = self.corners
-        # pixels between the middles of the region's far and near edge
+        # pixels between the midpoints of the region's far and near edge
         shown = math.hypot((cx + dx - ax - bx) / 2 * (width - 1), (cy + dy - ay - by) / 2 * (height - 1))
         if rows > 2 * shown:
-            fits = f"size ({int(2 * shown)}, {columns})"
-            fits = fits if shown >= 16 else "larger frames, or a larger region,"
+            remedy = f"size ({int(2 * shown)}, {columns})" if shown >= 16 else "larger frames or regions"
             log.warning(
-                "%s: the patch has %d rows, its region only %.0f in frames of %d x %d pixels: slow motion is "
-                "underestimated, %s would do",
-                *(name, rows, shown, height, width, fits),
+                "%s: the patch has %d rows, its region only %.0f in frames of %d x %d pixels, which "
+                "underestimates slow motion: use %s",
+                *(name, rows, shown, height, width, remedy),
             )
 
     extra_repr = settings_of
 
 
 def interpolated(shift: Tensor, valid: Tensor, name: str) -> Tensor:
-    """Steps (n,), those that are not valid interpolated between the others, a warning naming their frames;
-    before the first valid step and after the last, that one."""
+    """Steps (n,) with the invalid ones interpolated, constant before the first and after the last valid one,
+    and a warning that names their frames."""
     bad, good = (~valid).nonzero()[:, 0], valid.nonzero()[:, 0]
     if not len(bad):
         return shift
     if not len(good):
-        raise InputError(
-            f"{name}: none of {len(shift)} steps shows the same ground twice; "
-            "expected corners on the ground in front of the camera"
-        )
+        seen = f"{name}: none of {len(shift)} steps shows the same ground twice"
+        raise InputError(f"{seen}; expected corners on the ground in front of the camera")
     segments = [f"{run.start} to {run.stop}" for run in runs(bad)]
-    more = f" and {len(segments) - NAMED} more" if len(segments) > NAMED else ""
+    more = f" and {len(segments) - MAX_LISTED} more" if len(segments) > MAX_LISTED else ""
     log.warning(
         "%s: no common ground in frames %s%s (%d of %d steps): the velocity there is interpolated",
-        *(name, ", ".join(segments[:NAMED]), more, len(bad), len(shift)),
+        *(name, ", ".join(segments[:MAX_LISTED]), more, len(bad), len(shift)),
     )
     return torch.from_numpy(np.interp(np.arange(len(shift)), good.numpy(), shift[good].numpy())).to(shift)

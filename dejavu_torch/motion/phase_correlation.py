@@ -1,4 +1,4 @@
-"""The shift between two patches of ground by correlation of phases (section IV-B)."""
+"""The shift between two patches of ground by phase correlation (section IV-B)."""
 
 from __future__ import annotations
 
@@ -10,30 +10,29 @@ from torch.nn.functional import avg_pool2d, pad
 
 from dejavu_torch.motion.ground_plane import FLAT
 
-REACH = 0.42  # largest shift, as a share of the patch
+MAX_SHIFT = 0.42  # as a fraction of the patch
 SWAY = 3  # pixels to either side
-PEAKS = 4  # of the coarse scores, each refined
-MIN_CONFIDENCE = 0.4  # unrelated patches reach 0.15 to 0.25, the same ground 0.6 and more
-BAND = 0.1  # cycles/pixel: the far rows are interpolated, and their finest detail does not move
+PEAKS = 4  # coarse maxima to refine
+MIN_CONFIDENCE = 0.4  # unrelated patches reach 0.15 to 0.25, the same ground at least 0.6
+BAND = 0.1  # cycles/pixel: the finest detail of the interpolated far rows does not move
 
 
 def phase_shifts(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-    """How far the ground may have moved along the rows from one patch to the next, for each pair.
+    """Candidates for the shift of the ground along the rows from one patch to the next, for each pair.
 
-    Correlation of phases, each frequency weighted by its coherence over the columns, so that noise and motion
-    blur weigh little. Each peak at half the resolution is refined by windows that move with the ground.
+    Phase correlation with each frequency weighted by its coherence over the columns, which suppresses noise
+    and motion blur. Each peak at half resolution is refined by windows that move with the ground.
 
-    Shape: patches of any gain and offset of brightness, at least 32 x 32, (B,1,h,w), (B,1,h,w) ->
+    Shape: patches (B,1,h,w), (B,1,h,w) of any brightness gain and offset, at least 32 x 32 ->
         shift (B,K) in pixels, rows of the patch; confidence (B,K) in [0, 1].
 
     Convention: shift > 0 is forward: row r of the first is row r + shift of the second. |shift| is at most
-        about 0.42 h, sway at most 3 columns. The confidence is the mean coherence: 1 for the same picture,
+        about 0.42 h, sway at most 3 columns. The confidence is the mean coherence: 1 for identical patches,
         mostly 0.6 to 1 for the same ground, 0.15 to 0.25 for unrelated ground (patches of 96 x 96), 0 for
         patches that are flat or not finite.
     """
     count, _, height, _ = first.shape
-    # coarse: every whole lag at half the resolution
-    reach = int(REACH * (height // 2))
+    reach = int(MAX_SHIFT * (height // 2))  # coarse: all integer lags at half resolution
     lags = torch.arange(-reach, reach + 1.0).to(first)
     one, other = (avg_pool2d(patch, 2)[:, 0] for patch in (first, second))
     score = _coherence(one, other, first.new_zeros(count), lags, SWAY // 2 + 1, 2 * BAND)
@@ -51,18 +50,18 @@ def phase_shifts(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _coherence(first: Tensor, second: Tensor, guess: Tensor, lags: Tensor, sway: int, band: float) -> Tensor:
-    """Mean coherence (B,T) at the shifts guess (B,) + lag (T,), the best over sways of up to `sway` columns;
-    band: standard deviation of a Gaussian over the frequencies, cycles/pixel."""
+    """Mean coherence (B,T) at the shifts guess (B,) + lags (T,), maximal over sways of up to `sway` columns;
+    band: standard deviation of a Gaussian low-pass, cycles/pixel."""
     height, width = first.shape[1:]
     row = torch.arange(height).to(first)
-    common = (height - guess.abs())[:, None]  # rows of ground in both
+    common = (height - guess.abs())[:, None]  # rows visible in both
     start = (-guess).clamp(min=0)[:, None]
     spectra = []
     for patch, moved in ((first, 0.0), (second, guess[:, None])):  # the window moves with the ground
         at = (row - start - moved + 0.5) / common
         window = torch.where((at > 0) & (at < 1), (math.pi * at).sin(), 0.0)[..., None]
         mean = (patch * window).sum(1, keepdim=True) / window.sum(1, keepdim=True)
-        # without frequency 0: rails look the same wherever they are
+        # without frequency 0: rails look the same in every row
         spectra.append(torch.fft.rfft((patch - mean) * window, dim=1)[:, 1:])
     frequency = torch.arange(1, height // 2 + 1).to(first) / height
     low_pass = (-0.5 * (frequency / band) ** 2).exp()
@@ -83,7 +82,7 @@ def _coherence(first: Tensor, second: Tensor, guess: Tensor, lags: Tensor, sway:
 
 
 def _vertex(score: Tensor, at: Tensor) -> Tensor:
-    """Offset, in samples, of the top of a parabola through the best sample and its neighbours."""
+    """Offset, in samples, of the vertex of a parabola through the best sample and its neighbours."""
     inside = at.clamp(1, score.shape[1] - 2)
     left, mid, right = (score.gather(1, (inside + k)[:, None])[:, 0] for k in (-1, 0, 1))
     curve = (2 * mid - left - right).clamp(min=1e-9)
@@ -91,10 +90,10 @@ def _vertex(score: Tensor, at: Tensor) -> Tensor:
 
 
 def viterbi_path(shifts: Tensor, confidences: Tensor, height: int) -> Tensor:
-    """Which of the shifts (n,K) of each pair, if the pairs follow one another: (n,) int64, on the CPU.
+    """The candidate of the shifts (n,K) to choose for each of n consecutive pairs: (n,) int64, on the CPU.
 
-    Sleepers look the same one period further on. The path with the highest sum of confidences less changes of
-    the shift, in patch heights (`height`, pixels), resolves that.
+    Periodic ground, such as sleepers, is ambiguous. The path maximises the sum of confidences minus changes
+    of the shift, in patch heights (`height`, pixels).
     """
     shifts, confidences = shifts.double().cpu(), confidences.double().cpu()
     change = (shifts[1:, :, None] - shifts[:-1, None]).abs() / height

@@ -1,1 +1,1 @@
-"""Query features + compressed map -> place."""
+"""Query descriptors + compressed map -> places."""

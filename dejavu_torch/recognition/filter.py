@@ -1,4 +1,4 @@
-"""A probability for every place, followed along the queries, and for being off the map."""
+"""Probabilities of all places, and of being off the map, filtered along the queries."""
 
 from __future__ import annotations
 
@@ -13,57 +13,58 @@ from torch import Tensor, nn
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.types import InputError, SequenceModel
 
-IMPOSSIBLE = 1e-30  # a probability that still has a gradient
-LIKELY = 0.99  # of all probability: a stretch of places with less is not scored alone
-UNLIKELY = 1e-4  # of all probability: a place with less ends such a stretch
+MIN_PROBABILITY = 1e-30  # a probability of 0, with a finite gradient
+LOCAL_MASS = 0.99  # minimum probability of a range of places that is scored alone
+LOCAL_EDGE = 1e-4  # places with less probability are cut off the ends of that range
 
 
 class Moments(NamedTuple):
-    """Mean and standard deviation (Q,1) of the finite scores, 1 if all are alike; and which are finite."""
+    """Statistics of the finite scores of each query."""
 
-    mean: Tensor
-    spread: Tensor
-    varied: Tensor  # (Q,1), whether the scores differ at all
-    valid: Tensor  # (Q,N)
+    mean: Tensor  # (Q,1)
+    spread: Tensor  # (Q,1) standard deviation, 1 if all scores are equal
+    varied: Tensor  # (Q,1) whether the scores differ
+    valid: Tensor  # (Q,N) which are finite
 
 
 def moments_of(scores: Tensor) -> Moments:
-    """Of scores (Q,N)."""
+    """Moments of scores (Q,N)."""
     valid = scores.isfinite()
     count = valid.sum(1, keepdim=True).clamp(min=1)
     mean = torch.where(valid, scores, 0).sum(1, keepdim=True) / count
     variance = torch.where(valid, mean - scores, 0).square().sum(1, keepdim=True) / count
-    most = scores.masked_fill(~valid, -math.inf).amax(1, keepdim=True)
-    varied = (most > scores.amin(1, keepdim=True)) & (variance > 0)
+    highest = scores.masked_fill(~valid, -math.inf).amax(1, keepdim=True)
+    varied = (highest > scores.amin(1, keepdim=True)) & (variance > 0)
     return Moments(mean, torch.where(varied, variance, 1).sqrt(), varied, valid)
 
 
 class PlaceFilter(SequenceModel):
-    """Where the latest query is, from all queries so far: the forward algorithm of a hidden Markov model.
+    """The place of the latest query given all queries: the forward algorithm of a hidden Markov model.
 
-    Its states are the N places and one more, off the map. A place scored z standard deviations below the mean
-    of a query's scores has the likelihood exp(sharpness z), being off the map exp(sharpness off_map).
+    Its states are the N places and one off-map state. A place scored z standard deviations below the mean of
+    a query's scores has the likelihood exp(sharpness z), the off-map state exp(sharpness off_map).
 
     Args:
         moves: probabilities of moving by 0, 1, .., V places from one query to the next; they add up to 1.
-            Driving off the end of the map leaves it.
+            Moving past the end of the map leaves it.
         jump: probability of being anywhere on the map next. leave, enter: of leaving and entering the map.
-        sharpness: nats for a standard deviation; low, as consecutive frames are alike.
-        off_map: standard deviations; a place that stands out less than this suggests being off the map.
-        within: places; the score of a place counts its neighbours up to here, the less the further away.
-        threshold: accept a match whose score is below; None leaves it to `DejaVu.acceptance`.
-        search_every: queries from one search of all places to the next. In between only the stretch of places
-            that holds nearly all of the probability is scored, if there is one. Probabilities then differ by
-            up to about 0.02, and a jump is noticed at the next search.
+        sharpness: nats per standard deviation; low, since consecutive frames are similar.
+        off_map: standard deviations; a query with no place further below the mean suggests being off the map.
+        within: places; the score of a place includes its neighbours up to this distance, with weights that
+            decrease with it.
+        threshold: accept a match if its score is below; None leaves it to `DejaVu.acceptance`.
+        search_every: queries from one search of all places to the next. Between them, only a range of places
+            with nearly all of the probability is scored, if there is one. Probabilities then differ by up to
+            about 0.02, and a jump is noticed at the next search.
 
     Shape: scores (Q,N), the posterior (N+1,) before them or None -> (Q,N), -log of a probability in nats.
 
-    Convention: causal. exp(-score) is at most the probability that the right place lies within `within`
-        places. The state is the posterior, its last element that of being off the map, and all 0 before the
-        first query. A place that nothing covers scores +inf. `moves` to `off_map` are parameters.
+    Convention: causal. exp(-score) is at most the probability that the right place is within `within` places.
+        The state is the posterior, the off-map probability last, and all 0 before the first query. A place
+        that nothing covers scores +inf. `moves` to `off_map` are parameters.
 
-    Source: an off-map state is in the topometric filter of Xu, Fischer, Sünderhauf and Milford (RA-L 2021);
-        motion model and likelihood are ours.
+    Source: the topometric filter of Xu, Fischer, Sünderhauf and Milford (RA-L 2021) has an off-map state; the
+        motion model and the likelihood are ours.
 
     Raises:
         InputError: settings, scores or a posterior of another shape or out of range.
@@ -92,15 +93,15 @@ class PlaceFilter(SequenceModel):
         moves = tuple(float(move) for move in moves)
         if not all(0 <= rate <= 1 for rate in (jump, leave, enter)) or jump + leave > 1:
             seen = f"jump {jump}, leave {leave}, enter {enter}"
-            raise InputError(f"{seen}; expected probabilities, jump and leave at most 1 together")
+            raise InputError(f"{seen}; expected probabilities, jump + leave at most 1")
         if not all(move >= 0 for move in moves) or not abs(sum(moves) - 1) < 1e-6:
             raise InputError(f"the moves are {[*moves]}; expected probabilities that add up to 1")
         if not 0 < sharpness < math.inf or not math.isfinite(off_map):
             seen = f"sharpness {sharpness}, off_map {off_map}"
             raise InputError(f"{seen}; expected finite numbers, the sharpness above 0")
-        for name, value, lowest in (("within", within, 0), ("search_every", search_every, 1)):
-            if not isinstance(value, int) or value < lowest:
-                raise InputError(f"{name} is {value}; expected a whole number, at least {lowest}")
+        for name, value, minimum in (("within", within, 0), ("search_every", search_every, 1)):
+            if not isinstance(value, int) or value < minimum:
+                raise InputError(f"{name} is {value}; expected a whole number, at least {minimum}")
         if threshold is not None and math.isnan(threshold):
             raise InputError("the threshold is NaN; expected a number, or None")
         self.move_logits = nn.Parameter(_logits(*moves))
@@ -119,7 +120,7 @@ class PlaceFilter(SequenceModel):
     def posterior(self, scores: Tensor, before: Tensor | None = None) -> Tensor:
         """Probability of each place, and of being off the map, after each query.
 
-        Shape: (Q,N), (N+1,) or None -> (Q,N+1), the last column being off the map; rows add up to 1.
+        Shape: (Q,N), (N+1,) or None -> (Q,N+1), off the map last; rows add up to 1.
         """
         if before is None:
             before = self.start(scores.shape[-1])
@@ -133,12 +134,12 @@ class PlaceFilter(SequenceModel):
         return self.near_scores(posteriors[1:, :-1], scores), posteriors[-1]
 
     def _posteriors(self, scores: Tensor, state: Tensor) -> Tensor:
-        """The state and what it becomes with each query, (Q+1,N+1)."""
+        """The state before the first and after each query, (Q+1,N+1)."""
         if scores.ndim != 2 or scores.shape[1] < 1 or not scores.is_floating_point():
             raise InputError(f"scores are {tuple(scores.shape)} {scores.dtype}; expected floats (Q,N)")
         places = scores.shape[1]
         if state.shape != (places + 1,):
-            raise InputError(f"a posterior {tuple(state.shape)} of another map; expected ({places + 1},)")
+            raise InputError(f"the posterior is {tuple(state.shape)}; expected ({places + 1},) for this map")
         rows = [state.to(scores)]
         for likelihood in self.likelihoods(scores, moments_of(scores)):
             expected = self.moved(rows[-1], places)
@@ -148,26 +149,26 @@ class PlaceFilter(SequenceModel):
         return torch.stack(rows)
 
     def likelihoods(self, scores: Tensor, moments: Moments) -> Tensor:
-        """Likelihoods of W places, of being off the map, and of a place that scores as the mean, up to a
-        factor: (Q,W) -> (Q,W+2), the greatest of each row 1."""
+        """Likelihoods of W places, of being off the map, and of a place with the mean score, (Q,W) ->
+        (Q,W+2), scaled to a maximum of 1 in each row."""
         valid, sharpness = scores.isfinite(), self.log_sharpness.to(scores).exp()
         z = torch.where(valid, moments.mean - scores, 0) / moments.spread
-        others = torch.stack([self.off_map.to(z), z.new_zeros(())]).expand(len(z), 2)
-        logits = torch.cat([(sharpness * z).masked_fill(~valid, -math.inf), sharpness * others], 1)
+        off_and_mean = torch.stack([self.off_map.to(z), z.new_zeros(())]).expand(len(z), 2)
+        logits = torch.cat([(sharpness * z).masked_fill(~valid, -math.inf), sharpness * off_and_mean], 1)
         logits = torch.where(moments.varied, logits, 0)
         return (logits - logits.amax(1, keepdim=True)).exp()
 
     def anywhere(self, places: int) -> Tensor:
-        """The belief before the first query: off the map or on it, as many as leave and enter."""
+        """The belief before the first query: on or off the map in the equilibrium of leaving and entering."""
         leave, enter = self.rate_logits.softmax(0)[2], self.enter_logit.sigmoid()
         off = (leave / (leave + enter)).clamp(max=0.5)
         return torch.cat([((1 - off) / places).expand(places), off[None]])
 
     def moved(self, belief: Tensor, places: int, start: int = 0) -> Tensor:
-        """The belief before the next query, of up to V more places, if there are.
+        """The belief before the next query, extended by up to V places.
 
         A belief (W+1,) holds the probability of each of the places [start, start + W) and of being off the
-        map; all other places have the rest together.
+        map; the other places share the rest.
         """
         moves, rates = (logits.to(belief).softmax(0) for logits in (self.move_logits, self.rate_logits))
         (stay, jump, leave), enter = rates, self.enter_logit.sigmoid().to(belief)
@@ -179,10 +180,10 @@ class PlaceFilter(SequenceModel):
         return torch.cat([stay * moved + anywhere, off[None]])
 
     def near_scores(self, posterior: Tensor, scores: Tensor, lowest: Tensor | None = None) -> Tensor:
-        """-log of the probability of each place and its neighbours, at least `lowest`, (Q,W) -> (Q,W); +inf
-        where scores are."""
-        within = min(self.within, posterior.shape[1])  # further neighbours there are not
-        side = within + 1  # two means over so many make a triangle
+        """-log of the probability, at least `lowest`, of each place and its neighbours, (Q,W) -> (Q,W); +inf
+        if the place's score is."""
+        within = min(self.within, posterior.shape[1])
+        side = within + 1  # two box filters make a triangle
         padded = F.pad(posterior[:, None], (within, within))
         mass = side * F.avg_pool1d(F.avg_pool1d(padded, side, 1), side, 1)[:, 0]
         mass = mass.clamp(torch.finfo(mass.dtype).tiny, 1.0)  # an exporter promotes no types
@@ -195,7 +196,7 @@ class PlaceFilter(SequenceModel):
             raise InputError(f"moves of up to {furthest} places on a map of {places}; expected fewer")
 
     def threshold_of(self, threshold: float | None) -> float | None:
-        """The filter's own: its scores are probabilities, not distances."""
+        """The filter's own threshold: its scores are probabilities, not distances."""
         return self.threshold
 
     @torch.no_grad()
@@ -210,24 +211,24 @@ class PlaceFilter(SequenceModel):
 
 
 class LocalSearch:
-    """A filter that between two searches scores only the likely stretch of places; keeps its state.
+    """A filter that scores only the likely range of places between two searches, and keeps its state.
 
-    All other places count as if they scored as the mean; mean and spread are those of the last search.
+    All other places get the mean score; mean and spread are those of the last search.
 
     Args:
-        scores: of all places, (1,K) -> (1,N), when it searches.
+        scores: of all places, (1,K) -> (1,N), for a search.
     """
 
     def __init__(self, filter: PlaceFilter, route: PlaceMap, scores: Callable[[Tensor], Tensor]) -> None:
         self.filter, self.route, self.all_scores = filter, route, scores
         self.belief: Tensor | None = None  # of the places from `start` on, and of being off the map
-        self.start = self.skipped = 0  # skipped: queries before the next
+        self.start = self.skipped = 0  # skipped: queries since the last
         self.search: Moments | None = None  # of the last search
-        self.since = 0  # queries from it on
+        self.since = 0  # queries since then
 
     def __call__(self, query: Tensor, whole: bool = False) -> tuple[Tensor, int]:
-        """Scores (1,W) for the next query (1,K), the best among them, and the first of these places; `whole`:
-        of all places."""
+        """Scores (1,W) of a range that includes the best place of the next query (1,K), or of all places if
+        `whole`; and the first of these places."""
         filter, places, moments, since = self.filter, self.route.places, self.search, self.since
         near = None if moments is None or since >= filter.search_every else self._likely()
         belief, start = (self.posterior, 0) if near is None else near
@@ -243,26 +244,27 @@ class LocalSearch:
         others = places - scores.shape[1]  # places that are not scored
         expected = expected.to(scores)
         belief = updated(expected, filter.likelihoods(scores, moments)[0], _rest(expected, others))
-        if near is None and moments.varied:  # a query that says nothing is no search
+        if near is None and moments.varied:  # a query with equal scores is not a search
             self.search, since = moments, 0
         self.belief, self.start, self.since, self.skipped = belief, start, since + 1, 0
         lowest = (filter.within + 1) * _rest(belief, others) / max(1, others)
         lowest = lowest.clamp(torch.finfo(belief.dtype).tiny, 1)
-        found, elsewhere = filter.near_scores(belief[None, :-1], scores, lowest), -lowest.log()
-        if not others or (not whole and bool(found.amin() < elsewhere)):
-            return found, start
+        local, elsewhere = filter.near_scores(belief[None, :-1], scores, lowest), -lowest.log()
+        if not others or (not whole and bool(local.amin() < elsewhere)):
+            return local, start
         row = elsewhere.repeat(1, places).masked_fill_(~moments.valid, math.inf)
-        row[:, start : start + found.shape[1]] = found
+        row[:, start : start + local.shape[1]] = local
         return row, 0
 
     def _likely(self) -> tuple[Tensor, int] | None:
-        """The belief of a stretch that holds nearly all of it, if any, with a margin; and its first place."""
+        """The belief in a range with nearly all of the probability, plus a margin, and its first place; None
+        if there is no such range."""
         assert self.belief is not None
         on, within = self.belief[:-1], self.filter.within
-        (likely,) = (on > UNLIKELY).nonzero(as_tuple=True)
+        (likely,) = (on > LOCAL_EDGE).nonzero(as_tuple=True)
         first, last = (int(likely[0]), int(likely[-1])) if len(likely) else (0, -1)
         on = on[first : last + 1]
-        if float(on.sum()) <= LIKELY:
+        if float(on.sum()) <= LOCAL_MASS:
             return None
         first += self.start
         left, right = min(within, first), min(within, self.route.places - first - len(on))
@@ -281,17 +283,18 @@ class LocalSearch:
 
 
 def updated(expected: Tensor, likelihood: Tensor, rest: Tensor | float = 0) -> Tensor:
-    """Bayes' rule, of a belief (W+1,) and the rest; if what is likely was impossible, the belief stays."""
+    """Bayes' rule for a belief (W+1,) and the rest; the belief stays if the query rules it out."""
     joint = expected * likelihood[:-1]
     total = joint.sum() + rest * likelihood[-1]
-    return torch.where(total > IMPOSSIBLE, joint / torch.where(total > IMPOSSIBLE, total, 1), expected)
+    possible = total > MIN_PROBABILITY
+    return torch.where(possible, joint / torch.where(possible, total, 1), expected)
 
 
 def _rest(belief: Tensor, others: int) -> Tensor:
-    """The probability of so many other places together."""
+    """The total probability of the other places."""
     return (1 - belief.sum()).clamp(min=0) * (others > 0)
 
 
 def _logits(*probabilities: float) -> Tensor:
-    """Logarithms whose gradients are finite where a probability is 0."""
-    return torch.tensor(probabilities).clamp(min=IMPOSSIBLE).log()
+    """Logarithms, finite for a probability of 0."""
+    return torch.tensor(probabilities).clamp(min=MIN_PROBABILITY).log()

@@ -1,4 +1,4 @@
-"""Descriptors of consecutive queries -> matches, with what the queries before showed."""
+"""Descriptors of consecutive queries -> matches, with the state of a sequence or a filter."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from torch import Tensor
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.recognition.calibration import TOLERANCE, Platt, Track, confidence, confidence_of
 from dejavu_torch.recognition.filter import LocalSearch, PlaceFilter
-from dejavu_torch.recognition.search import SCORES_AT_ONCE, Find, Search, Wanted, lowest_needed, search
+from dejavu_torch.recognition.search import SCORES_AT_ONCE, Find, Search, Wanted, num_needed, search
 from dejavu_torch.recognition.select import Acceptance, accept, best_candidates, best_match
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.text import bar
 from dejavu_torch.types import Match, SequenceModel, Together
 
 ROWS = 4096  # descriptors on the device at a time
-CACHED = 2**20  # scores summed at a time: they stay in the processor's cache
-FEW = 1 / 16  # of the places of a block: to keep more of the best takes longer than all scores
-SAMPLED = 64  # places at least for a number that a search by samples holds of a query
-LISTED = 16  # numbers held for each of the best of a query, while two lists are merged
+CACHED = 2**20  # scores processed at a time in a sequence: they stay in the cache
+MAX_SHARE = 1 / 16  # of a block's places; selecting more of the lowest scores is slower than keeping all
+PLACES_PER_NUMBER = 64  # a coarse search holds at most one number of a query per this many places
+PER_BEST = 16  # held for each of a query's lowest scores, while two lists are merged
 
 
 class Matching(NamedTuple):
@@ -34,11 +34,11 @@ class Matching(NamedTuple):
 
     sequence: SequenceModel | None = None  # None matches each query by itself
     beside: Mapping[Together, SequenceModel] = MappingProxyType({})  # further ways, see `Match.sequences`
-    k: int | None = None  # candidates of a query; None gives matches (Q,)
-    radius: int = 0  # places, any two candidates differ by more
+    k: int | None = None  # candidates per query; None gives matches (Q,)
+    radius: int = 0  # suppression radius in places
     rule: Acceptance = Acceptance()
-    platt: Platt | None = None  # makes probabilities
-    on_scores: Callable[[Tensor], None] | None = None  # is given the scores (B,N) that places are found by
+    platt: Platt | None = None  # gives probabilities
+    on_scores: Callable[[Tensor], None] | None = None  # receives the final scores (B,N)
     search: Search = "auto"  # of single queries
 
 
@@ -49,15 +49,14 @@ class Localizer:
     """Consecutive queries -> matches; keeps the state of a sequence or a filter between batches.
 
     Args:
-        route: the map; None for scores that are made elsewhere, which only `match` takes.
-        find: finds candidates of single queries in place of `search`, as a `CoarseSearch` or the workers of a
-            cluster do.
-        approximate: scores of all places, about, for a `PlaceFilter` that does not always search; None is the
-            map's own.
+        route: the map; None if only `match` is used, with scores from elsewhere.
+        find: finds candidates of single queries instead of `search`, such as a `CoarseSearch` or a cluster.
+        approximate: approximate scores of all places, for a `PlaceFilter` with search_every > 1; None uses
+            the map's exact ones.
 
     Shape: descriptors (B,K) of the next queries -> Match of (B,), or (B,k), on the CPU, without gradients.
 
-    Convention: memory does not grow with the queries. A call that raises leaves the state as it was.
+    Convention: memory does not grow with the queries. A call that raises leaves the state unchanged.
 
     Example:
         >>> from dejavu_torch import SpectralMapper
@@ -78,7 +77,7 @@ class Localizer:
         sequence, routes = matching.sequence, () if route is None else route.routes
         self.own: Together = sequence.length if isinstance(sequence, SequenceMatcher) else "filter"
         self.models = {**matching.beside, **({} if sequence is None else {self.own: sequence})}
-        self.states: dict[Together, Tensor] = {}  # of the models; none before the first query
+        self.states: dict[Together, Tensor] = {}  # of the models; empty before the first query
         self.firsts = (0, *accumulate(one.places for one in routes[:-1]))  # the first place of each route
         self.local: LocalSearch | None = None
         if route is not None and isinstance(sequence, PlaceFilter) and not matching.beside:
@@ -95,12 +94,12 @@ class Localizer:
         wanted = [(matching.k or 1, matching.radius)]
         if matching.platt is not None:
             wanted.append((min(2, places), TOLERANCE))
-        n = lowest_needed(wanted, places)
-        few = self.find is not None or places > SCORES_AT_ONCE
-        few = few or n <= max(1, FEW * min(places, route.block_places))
+        n = num_needed(wanted, places)
+        few = n <= max(1, MAX_SHARE * min(places, route.block_places))
+        few = few or self.find is not None or places > SCORES_AT_ONCE
         way, size = self._by_scores, places
         if not self.models and matching.on_scores is None and few:
-            way, size = partial(self._by_search, wanted), max(LISTED * n, places // SAMPLED)
+            way, size = partial(self._by_search, wanted), max(PER_BEST * n, places // PLACES_PER_NUMBER)
         parts = descriptors.split(max(1, min(ROWS, SCORES_AT_ONCE // size)))
         return Match.joined(way(part.to(route.positions.device)) for part in bar(parts, progress))
 
@@ -114,7 +113,7 @@ class Localizer:
 
     @torch.no_grad()
     def skip(self, queries: int) -> None:
-        """So many queries were skipped: a `PlaceFilter` moves once more for each."""
+        """Skip queries: a `PlaceFilter` moves once more for each."""
         filter = self.matching.sequence
         if self.local is not None:
             self.local.skipped += queries
@@ -125,27 +124,20 @@ class Localizer:
 
     @property
     def posterior(self) -> Tensor | None:
-        """(N+1,) of a filter after the latest query; None without one, or before the first query."""
+        """(N+1,) of a filter after the latest query; None without a filter, or before the first query."""
         return self.states.get("filter") if self.local is None else self.local.posterior
 
     def _in_sequence(self, scores: Tensor) -> Match:
         states = self.states or {T: one.start(scores.shape[1]).to(scores) for T, one in self.models.items()}
         steps = {T: one.step(scores, states[T], self.firsts) for T, one in self.models.items()}
         single = self.matching.sequence is None
-        together, confidence = scores if single else steps[self.own][0], None
+        final, confidence = scores if single else steps[self.own][0], None
         if self.matching.platt is not None:
-            confidence = confidence_of(scores) if single else self.track(together, scores)
-        match = self._answer(self._candidates(together), confidence)
+            confidence = confidence_of(scores) if single else self.track(final, scores)
+        match = self._answer(self._candidates(final), confidence)
         self.states = {T: state for T, (_, state) in steps.items()}
         beside = {T: best_match(steps[T][0]).map(Tensor.cpu) for T in self.matching.beside}
         return match._replace(sequences=beside)
-
-    def _locally(self, descriptor: Tensor) -> Match:
-        assert self.local is not None
-        whole = self.matching.k is not None or self.matching.on_scores is not None
-        scores, start = self.local(descriptor, whole)
-        match = self._candidates(scores)
-        return match._replace(index=match.index + start)
 
     def _candidates(self, scores: Tensor) -> Match:
         if self.matching.on_scores is not None:
@@ -153,7 +145,7 @@ class Localizer:
         return best_candidates(scores, self.matching.k or 1, self.matching.radius)
 
     def _answer(self, match: Match, confidence: Tensor | None = None) -> Match:
-        """Candidates (B,k) as they are handed out, with the probability that the first is right."""
+        """Candidates (B,k) with their acceptance, and the probability that the first is right."""
         matching, match = self.matching, match.map(Tensor.cpu)
         match = match._replace(accepted=accept(match.score, matching.rule.threshold))
         if matching.platt is not None and confidence is not None:
@@ -168,15 +160,20 @@ class Localizer:
         assert self.route is not None
         if self.local is None:
             return self.match(self.route.scores(descriptors))
-        return self._answer(Match.joined(map(self._locally, descriptors.split(1))))
+        whole, matches = self.matching.k is not None or self.matching.on_scores is not None, []
+        for descriptor in descriptors.split(1):
+            scores, start = self.local(descriptor, whole)
+            match = self._candidates(scores)
+            matches.append(match._replace(index=match.index + start))
+        return self._answer(Match.joined(matches))
 
     def _by_search(self, wanted: Wanted, descriptors: Tensor) -> Match:
-        """By some of the lowest scores alone, of which candidates (k, radius) are chosen."""
+        """Candidates from the lowest scores alone; `wanted` has those of the answer first."""
         if self.find is not None:
             score, place = self.find(descriptors, wanted)
         else:
             assert self.route is not None
-            n, scan = lowest_needed(wanted, self.route.places), self.matching.search == "scan"
+            n, scan = num_needed(wanted, self.route.places), self.matching.search == "scan"
             score, place = search(self.route, descriptors, n, scan)
         match, *second = (best_candidates(score, *one, places=place) for one in wanted)
         return self._answer(match, *map(confidence, second))

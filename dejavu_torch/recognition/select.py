@@ -1,4 +1,4 @@
-"""The best places and whether to believe them (section III-C, eq. 5 and eq. 6)."""
+"""The best places, and which of them are accepted (section III-C, eq. 5 and eq. 6)."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ from torch import Tensor
 
 from dejavu_torch.types import InputError, Match
 
-HIGHEST = torch.finfo(torch.float64).max  # of the numbers that a file can hold: every score is below
-PROBABLE = 0.5  # what a calibrated map accepts from by default
+HIGHEST = torch.finfo(torch.float64).max  # threshold that accepts every finite score; JSON has no infinity
+PROBABLE = 0.5  # minimum probability that a calibrated map accepts by default
 
 
 class Acceptance(NamedTuple):
     """Which answers are accepted; `DejaVu.acceptance` chooses it."""
 
-    threshold: float | None = None  # those whose score is below; None accepts every finite score
-    precision: float | None = None  # instead, those that are at least so probably right
-    given: bool = True  # whether one of the two was asked for, or is stored in the map
+    threshold: float | None = None  # scores below it; None accepts every finite score
+    precision: float | None = None  # instead, probabilities of at least this
+    given: bool = True  # whether the user gave one of the two, or the map stores it
 
     def __str__(self) -> str:
         if self.precision is not None:
-            rule = f"accepted where the probability is at least {self.precision:.9g}"
+            rule = f"accepted if the probability is at least {self.precision:.9g}"
         elif self.threshold is None or self.threshold >= HIGHEST:
             rule = "every query with a finite score is accepted"
         elif self.given:
-            rule = f"accepted where the score is below {self.threshold:.9g}"
+            rule = f"accepted if the score is below {self.threshold:.9g}"
         else:
-            rule = f"accepted where the filter itself gives more than {math.exp(-self.threshold):.9g}"
+            rule = f"accepted if the filter's own probability is above {math.exp(-self.threshold):.9g}"
         return rule if self.given else f"no threshold given or stored for this way of matching: {rule}"
 
 
@@ -38,9 +38,9 @@ def best_match(scores: Tensor, threshold: float | None = None) -> Match:
 
     Shape: (Q,N) -> Match of (Q,).
 
-    Convention: S is a difference, so a match is *below* the threshold: the text of section III-C,
-        not eq. 6 as printed. Of equal scores the lowest place wins. A query whose best score is
-        +inf reports nothing: place -1, not accepted.
+    Convention: S is a difference, so a match is *below* the threshold, as the text of section III-C says, not
+        the printed eq. 6. The lowest place wins among equal scores. A query whose best score is +inf
+        reports nothing: place -1, not accepted.
 
     Raises:
         InputError: not (Q,N) with N >= 1.
@@ -54,15 +54,15 @@ def best_match(scores: Tensor, threshold: float | None = None) -> Match:
 
 
 def best_candidates(scores: Tensor, k: int, radius: int, places: Tensor | None = None) -> Match:
-    """The best place, then again and again the best of those further than `radius` places from all before.
+    """The k best places of each query, by non-maximum suppression with a radius in places.
 
     Args:
-        places: (Q,N) of the scores, if these are not all places in order.
+        places: (Q,N) of the scores, if they are not all places in order.
 
     Shape: (Q,N) -> Match of (Q,k).
 
-    Convention: of equal scores the first wins. If no place with a finite score is left, the place is -1 and
-        the score +inf; all others are accepted.
+    Convention: the first wins among equal scores. A candidate without a finite score is place -1 with score
+        +inf; all others are accepted.
     """
     if not isinstance(scores, Tensor):
         raise InputError(f"scores are a {type(scores).__name__}; expected a tensor (Q,N)")
@@ -77,14 +77,14 @@ def best_candidates(scores: Tensor, k: int, radius: int, places: Tensor | None =
         found.append((index, score))
         if rank + 1 == k:
             break
-        if places is None:  # a window cut off at an end of the map repeats that end, which is in it
+        if places is None:  # clamping only repeats an end of the map that is inside the window
             window = torch.arange(-min(radius, columns), min(radius, columns) + 1, device=scores.device)
             scores = scores.scatter(1, (at[:, None] + window).clamp(0, columns - 1), torch.inf)
         else:
             scores = scores.masked_fill((places - index[:, None]).abs() <= radius, torch.inf)
     index, score = (torch.stack(column, 1) for column in zip(*found, strict=True))
     finite = score.isfinite()
-    if k > 1:  # a query with a NaN has no candidates
+    if k > 1:  # NaN in a query leaves it without candidates
         finite = finite & finite[:, :1]
         score = score.masked_fill(~finite, torch.inf)
     index = torch.where(finite, index, -1)
@@ -92,16 +92,16 @@ def best_candidates(scores: Tensor, k: int, radius: int, places: Tensor | None =
 
 
 def check_candidates(k: int, radius: int, places: int | None = None) -> None:
-    """Refuse k or a radius out of range; `places` is None if their number is unknown."""
+    """Refuse k or a radius out of range; `places` is None if unknown."""
     if k < 1:
-        raise InputError(f"{k} candidates a query; expected at least 1")
+        raise InputError(f"{k} candidates per query; expected at least 1")
     if places is not None and k > places:
-        raise InputError(f"{k} candidates a query on {places} places; expected at most {places}")
+        raise InputError(f"{k} candidates per query on {places} places; expected at most {places}")
     if radius < 0:
-        raise InputError(f"candidates more than {radius} places apart; expected at least 0")
+        raise InputError(f"the suppression radius is {radius} places; expected at least 0")
 
 
 def accept(score: Tensor, threshold: float | None) -> Tensor:
-    """Eq. 6: which finite scores are below the threshold; None accepts all of them."""
+    """Eq. 6: which finite scores are below the threshold; None accepts all."""
     found = score.isfinite()
     return found if threshold is None else found & (score < threshold)

@@ -1,4 +1,4 @@
-"""The place of the latest of several consecutive queries."""
+"""Scores from several consecutive queries."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dejavu_torch.types import InputError, SequenceModel
 
-LONGEST = 2**16  # queries of a sequence
+MAX_LENGTH = 2**16  # queries of a sequence
 
 log = logging.getLogger("dejavu_torch")
 
@@ -21,26 +21,26 @@ log = logging.getLogger("dejavu_torch")
 class SequenceMatcher(SequenceModel):
     """Scores of places from the latest T queries instead of one, for any map.
 
-    The score of place i is the mean along trajectories that end there: of the query k steps before the
-    latest, the score of place i - v k, rounded; of several speeds v the best counts.
+    The score of place i is the mean along the trajectory that ends there: for the query k steps before the
+    latest, the score of place i - v k, rounded. The best of several speeds v counts.
 
     Args:
         length: T, queries of a sequence.
-        speeds: each v in places a query: 1 where both traverses went equally fast, negative for the way back.
+        speeds: each v in places per query: 1 for equally fast traverses, negative for the opposite direction.
 
     Shape: scores (Q,N), state (R,N) or None -> (Q,N), lower is better.
 
-    Convention: causal. The state holds the scores of the last queries, R < T; rows of NaN are no queries. A
-        trajectory ends at the ends of its route, and places that nothing covers are left out of the mean;
-        less than half of it on the map scores +inf, and so does a place that nothing covers for the latest
-        query. Half a place is rounded up.
+    Convention: causal. The state holds the scores of the last R < T queries; rows of NaN are placeholders. A
+        trajectory ends at the ends of its route, and the mean ignores places that nothing covers. The score
+        is +inf if less than half of the trajectory is on the map, or if nothing covers the place for the
+        latest query. Half a place is rounded up.
 
-    Source: constant-speed search of SeqSLAM (Milford and Wyeth, ICRA 2012), causal and without its
+    Source: the constant-speed search of SeqSLAM (Milford and Wyeth, ICRA 2012), causal and without its
         normalisation.
 
     Raises:
-        InputError: a length below 1 or above 65536, no speeds, or speeds that are not finite; forward: scores
-            or a state of another shape.
+        InputError: a length outside 1..65536, no speeds, or speeds that are not finite; forward: scores or a
+            state of another shape.
 
     Example:
         >>> scores = torch.tensor([[0.0, 5, 5, 0], [5, 0.0, 0, 5], [0, 5, 0.0, 5]])
@@ -50,17 +50,15 @@ class SequenceMatcher(SequenceModel):
 
     def __init__(self, length: int = 11, speeds: Sequence[float] = (1.0,)) -> None:
         super().__init__()
-        if not isinstance(length, int) or not 1 <= length <= LONGEST:
-            seen = f"a sequence of {length} queries"
-            raise InputError(f"{seen}; expected a whole number, at least 1, at most {LONGEST}")
-        given = tuple(float(speed) for speed in speeds) if isinstance(speeds, Iterable) else ()
-        if not given or not all(map(math.isfinite, given)):
-            seen = f"the speeds are {speeds}"
-            raise InputError(f"{seen}; expected finite numbers of places a query, at least one")
-        self.length, self.speeds = length, given
+        if not isinstance(length, int) or not 1 <= length <= MAX_LENGTH:
+            raise InputError(f"a sequence of {length} queries; expected a whole number, 1 to {MAX_LENGTH}")
+        self.length = length
+        self.speeds = tuple(float(speed) for speed in speeds) if isinstance(speeds, Iterable) else ()
+        if not self.speeds or not all(map(math.isfinite, self.speeds)):
+            raise InputError(f"the speeds are {speeds}; expected finite numbers of places per query")
 
     def _shifts(self, speed: float) -> list[int]:
-        """How many places back a trajectory is 0, 1, .., T - 1 queries before the latest."""
+        """Places from a trajectory's end back to it, 0, 1, .., T - 1 queries before the latest."""
         return [math.floor(speed * k + 0.5) for k in range(self.length)]
 
     def start(self, places: int, fixed: bool = False) -> Tensor:
@@ -86,7 +84,7 @@ class SequenceMatcher(SequenceModel):
         return best, rows[max(0, len(rows) - self.length + 1) :]
 
     def _best(self, rows: Tensor, used: Tensor) -> Tensor:
-        """Scores on one route, (R,N) -> (Q,N), by as many rows as are `used` by each query."""
+        """Scores on one route, (R,N) -> (Q,N); `used`: (Q,) rows that each query uses."""
         valid = rows.isfinite()
         gaps = torch.compiler.is_exporting() or not bool(valid.all())
         known, counted = (torch.where(valid, rows, 0), valid.to(rows)) if gaps else (rows, None)
@@ -95,21 +93,21 @@ class SequenceMatcher(SequenceModel):
         return best.masked_fill(~valid[-len(used) :], math.inf) if gaps else best
 
     def _means(self, rows: Tensor, counted: Tensor | None, used: Tensor, speed: float) -> Tensor:
-        """Mean scores along trajectories; `counted` is 1 for a finite score, else 0; None if all are."""
+        """Mean scores along trajectories; `counted`: 1 for a finite score, else 0; None if all are finite."""
         shifts = self._shifts(speed)[: len(rows)]
         total = _along(rows, shifts, len(used))
         if counted is not None:
             count = _along(counted, shifts, len(used))
-        else:  # the same for all queries that have as many before them
-            fewest = min(len(rows) - len(used) + 1, len(shifts))
-            count = _along(torch.ones_like(rows[: len(shifts)]), shifts, len(shifts) - fewest + 1)
-            count = count if len(count) == 1 else count[used - fewest]
+        else:  # it depends on `used` alone
+            lowest = min(len(rows) - len(used) + 1, len(shifts))
+            count = _along(torch.ones_like(rows[: len(shifts)]), shifts, len(shifts) - lowest + 1)
+            count = count if len(count) == 1 else count[used - lowest]
         return torch.where(2 * count >= used[:, None], total / count.clamp(min=1), math.inf)
 
     def trajectory(self, scores: Tensor, place: int) -> Tensor:
-        """The cells of which the last query's score of a place, which is finite, is the mean.
+        """The cells whose mean is the last query's score of a place, which has to be finite.
 
-        Shape: (Q,N) -> (C,2) query and place of each of at most T cells, the latest query first.
+        Shape: (Q,N) -> (C,2), query and place of each of at most T cells, the latest query first.
         """
         means = [float(SequenceMatcher(self.length, (v,))(scores)[-1, place]) for v in self.speeds]
         back = torch.tensor(self._shifts(self.speeds[means.index(min(means))])[: len(scores)])
@@ -120,24 +118,23 @@ class SequenceMatcher(SequenceModel):
     def check(self, queries: int | None, places: int) -> None:
         for speed in self.speeds:
             if abs(self._shifts(speed)[-1]) >= places:
-                seen = f"a sequence of {self.length} queries at {speed:g} places a query"
-                problem = f"{seen} on a map of {places} places"
-                raise InputError(f"{problem}; expected a shorter one, or speeds that do not leave the map")
+                seen = f"a sequence of {self.length} queries at {speed:g} places per query on {places} places"
+                raise InputError(f"{seen}; expected a shorter one, or speeds that do not leave the map")
         if queries is not None and self.length > queries:
-            log.warning("a sequence of %d queries, but there are %d: all of them count", self.length, queries)
+            log.warning("a sequence of %d queries, but there are %d: all are used", self.length, queries)
 
     def extra_repr(self) -> str:
         return f"length={self.length}, speeds={list(self.speeds)}"
 
 
 def _along(rows: Tensor, shifts: list[int], queries: int) -> Tensor:
-    """Sums along the trajectories that end at each place of the last queries, (R,N) -> (Q,N)."""
+    """Sums along the trajectories that end at each place, for each of the last queries, (R,N) -> (Q,N)."""
     places, before = rows.shape[1], len(rows) - queries
     far = min(places, max(map(abs, shifts)))
     padded = F.pad(rows, (far, far))
     total = rows.new_zeros(queries, places)
     for k, shift in enumerate(shifts):
-        first = max(0, k - before)  # the first query that has one k steps before it
+        first = max(0, k - before)  # the first query with a predecessor k steps before
         left = far - max(-far, min(shift, far))
         total[first:] += padded[before + first - k : len(rows) - k, left : left + places]
     return total

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -28,14 +29,22 @@ def test_every_command_is_understood_and_every_way_is_used() -> None:
 def test_reports_are_kept_and_made_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    flight = Footage("sim:aerial?frames=120", "sim:aerial?frames=120&traverse=1")
+    flight = Footage("sim:aerial?frames=48", "sim:aerial?frames=48&traverse=1")
     broken = flight._replace(query="{data}/nowhere.mp4")
     monkeypatch.setattr(results, "FOOTAGE", {"flight": flight, "broken": broken})
     given = ("results", tmp_path, "--out", tmp_path / "out", "--ways", "HOG", "--jobs", "2")
-    benchmark(*given)
+    real = subprocess.run
+
+    def refusing(command: list[str], **settings: Any) -> subprocess.CompletedProcess[bytes]:
+        refused = ["sh", "-c", "echo 'dejavu: nowhere.mp4 is not there'; exit 2"]  # sooner than a command
+        return real(refused if any("nowhere" in word for word in command) else command, **settings)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(subprocess, "run", refusing)
+        benchmark(*given)
     bench = json.loads((tmp_path / "out" / "bench.json").read_text())
     good, bad = bench["rows"]
-    assert shlex.split(good["command"])[:3] == ["dejavu", "compare", "sim:aerial?frames=120"]
+    assert shlex.split(good["command"])[:3] == ["dejavu", "compare", "sim:aerial?frames=48"]
     assert 0 <= good["null"]["auc"] <= 1
     assert good["hog"]["auc"] == round(good["hog"]["auc"], 4)
     assert "nowhere.mp4" in bad["skipped"]

@@ -121,7 +121,7 @@ def test_a_file_that_is_no_whole_array_is_refused(tmp_path: Path) -> None:
     cut = [whole[:length] for length in range(0, len(whole), 7)]
     for content in (*cut, b"not an array\n" * 9, b"\x80\x04\x95 a pickle"):
         path.write_bytes(content)
-        with refused(str(path), "no whole .npy array", "expected frames (N,H,W)"):
+        with refused(str(path), "not a complete .npy array", "expected frames (N,H,W)"):
             read_array(path)
 
 
@@ -132,7 +132,7 @@ def test_pickled_objects_are_refused_and_not_run(tmp_path: Path) -> None:
 
     path = tmp_path / "a.npy"
     np.save(path, np.array([Trap()], dtype=object), allow_pickle=True)
-    with refused(str(path), "no whole .npy array"):
+    with refused(str(path), "not a complete .npy array"):
         read_array(path)
     assert not (tmp_path / "ran").exists()
 
@@ -169,7 +169,7 @@ def test_a_header_that_no_array_has_is_refused(tmp_path: Path, kind: str, shape:
 
 def test_a_file_of_no_frames_is_said_to_hold_nothing(tmp_path: Path) -> None:
     header = "{'descr': '<f4', 'fortran_order': False, 'shape': (0, 9999999999)}"
-    with refused("a.npy", "(0, 9999999999), which holds nothing"):
+    with refused("a.npy", "(0, 9999999999), which is empty"):
         read_array(written(tmp_path / "a.npy", header))
 
 

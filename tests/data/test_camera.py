@@ -63,7 +63,7 @@ def test_frames_are_brought_to_a_size_as_those_of_a_file(tmp_path: Path, stream:
         first = next(iter(camera))
     assert camera.note == ""
     assert stretched("pipe", (32, 48), (16, 16)) == (
-        "pipe: frames of 32 x 48 pixels are brought to the map's 16 x 16, which stretches them"
+        "pipe: frames of 32 x 48 pixels are stretched to the map's 16 x 16"
     )
     assert torch.equal(torch.from_numpy(first.pixels.copy()).permute(2, 0, 1) / 255, expected[0])
 
@@ -79,7 +79,7 @@ def test_a_stream_that_changes_size_keeps_what_came_before(tmp_path: Path, strea
 
 def test_the_end_of_an_address_is_told(tmp_path: Path, stream: bytes) -> None:
     (tmp_path / "clip.ts").write_bytes(stream)
-    with served(tmp_path) as address, refused("clip.ts ended after 12 frames", "go on"):
+    with served(tmp_path) as address, refused("clip.ts ended after 12 frames", "expected more frames"):
         list(Camera(f"{address}/clip.ts"))
 
 

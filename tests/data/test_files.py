@@ -19,7 +19,7 @@ from dejavu_torch.types import InputError
     [
         ("missing", "is not there"),
         ("", "a folder"),
-        ("fifo", "no regular file"),
+        ("fifo", "not a regular file"),
         ("a\0b", "null"),
         ("x" * 5000, "too long"),
     ],

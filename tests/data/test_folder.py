@@ -122,8 +122,8 @@ def test_names_of_one_width_need_no_word_on_their_order(
     ("name", "given", "words"),
     [
         ("missing", (), ("missing", "expected a folder")),
-        ("empty", (), ("empty", "holds no images", "expected files such as .png")),
-        (".", (), ("holds no images", "it has folders such as empty")),
+        ("empty", (), ("empty", "contains no images", "expected files such as .png")),
+        (".", (), ("contains no images", "but folders such as empty")),
         ("full", (-1, 0), ("width=-1", "expected width and height of at least 0")),
         ("full", (10**5, 10**5), ("expected", "at most")),
     ],

@@ -450,14 +450,14 @@ SQUARE, SOME = np.eye(3, dtype=bool), torch.tensor([0, 2])
 @pytest.mark.parametrize(
     ("hard", "places", "queries", "words"),
     [
-        (np.ones((3, 2)), 2, 3, ("(3, 2)", "(2, 3)", "transposed it fits")),
+        (np.ones((3, 2)), 2, 3, ("(3, 2)", "(2, 3)", "its transpose fits")),
         (np.ones((3, 5)), None, SOME, ("(3, 5)", "(reference frames, 3)")),
-        (np.ones((3, 2)), None, SOME, ("transposed it fits",)),
+        (np.ones((3, 2)), None, SOME, ("its transpose fits",)),
         (np.ones((4, 4)), 3, 4, ("(4, 4)", "(3, 4)")),
         (np.ones((3, 6)), 3, 5, ("(3, 6)", "(3, 5)")),
-        (np.ones(3), 3, 1, ("(3,)", "a column a query")),
+        (np.ones(3), 3, 1, ("(3,)", "one column per query")),
         (np.array([["1"]]), 1, 1, ("<U1",)),
-        (np.array([[{}]], dtype=object), 1, 1, ("no whole .npz",)),
+        (np.array([[{}]], dtype=object), 1, 1, ("not a complete .npz",)),
         (np.full((3, 3), np.nan), 3, 3, ("not finite",)),
     ],
 )
@@ -469,7 +469,7 @@ def test_a_matrix_that_does_not_fit_is_refused(
 
 
 def test_other_npz_files_are_refused(tmp_path: Path) -> None:
-    with refused("truth.npz", "holds gt, S", "GThard"):
+    with refused("truth.npz", "contains gt, S", "GThard"):
         read(saved(tmp_path, gt=SQUARE, S=SQUARE), 3, 3)
     with refused("differ in shape"):
         read(saved(tmp_path, GThard=SQUARE, GTsoft=np.ones((2, 3))), None, 3)
@@ -478,7 +478,7 @@ def test_other_npz_files_are_refused(tmp_path: Path) -> None:
     np.save(single, SQUARE)
     for data in (whole[: len(whole) // 2], b"", b"query,place\n", single.getvalue()):
         path.write_bytes(data)
-        with refused("truth.npz", "no whole .npz", "GThard"):
+        with refused("truth.npz", "not a complete .npz", "GThard"):
             read(str(path), 3, 3)
 
 
@@ -514,13 +514,13 @@ def test_json_lists_all_right_places_of_each_query(scratch: Path, rows: list[lis
 @pytest.mark.parametrize(
     ("rows", "queries", "words"),
     [
-        ("[[1], [2]", 2, ("is no JSON",)),
-        ("[" * 99_999, 2, ("is no JSON",)),
-        ({"0": [1]}, 1, ("holds a dict", "expected a list")),
-        (3, 1, ("holds a int", "expected a list")),
-        ([[1], [2]], 3, ("holds a list of 2", "3 queries")),
-        ([[1], [2]], 1, ("holds a list of 2", "1 queries")),
-        ([[1], [2]], torch.tensor([0, 2]), ("holds a list of 2", "3 queries or more")),
+        ("[[1], [2]", 2, ("is not JSON",)),
+        ("[" * 99_999, 2, ("is not JSON",)),
+        ({"0": [1]}, 1, ("contains a dict", "expected a list")),
+        (3, 1, ("contains a int", "expected a list")),
+        ([[1], [2]], 3, ("contains a list of 2", "3 queries")),
+        ([[1], [2]], 1, ("contains a list of 2", "1 queries")),
+        ([[1], [2]], torch.tensor([0, 2]), ("contains a list of 2", "3 queries or more")),
         ([1, 2], 2, ("query 0: 1;", "expected a list")),
         ([[1], [2, "3"]], 2, ('query 1: "3"', "from 0 to 9")),
         ([[1], [2.0]], 2, ("query 1: 2.0", "from 0 to 9")),
@@ -566,7 +566,7 @@ def test_utm_needs_two_folders_of_images_with_coordinates() -> None:
     for name in ("1.png", "@1@.png", "@x@3@.png"):
         with refused(name, "@easting@northing@"):
             find_ground_truth("utm", good, Named([name]), 1, 1)
-    with refused("no image names", "folders of images"):
+    with refused("no image names", "a folder of images"):
         find_ground_truth("utm", route(1), good, 1, 1)
     for query in (good, None):
         with refused("truth utm", "both traverses"):
@@ -661,7 +661,7 @@ def test_as_many_resampled_frames_are_no_ground_truth() -> None:
         ("-3", {}, "place = query - 3"),
         ("utm", {}, "within 25 m by the coordinates in image names"),
         ("utm:7.5", {}, "within 7.5 m"),
-        (None, {}, "as the sources say themselves"),
+        (None, {}, "both sources are aligned"),
         (None, {"positions": True}, "positions that both traverses carry"),
     ],
 )
@@ -715,14 +715,14 @@ def test_a_matrix_larger_than_the_memory_is_not_unpacked(
 
 def test_entries_of_other_kinds_are_refused(tmp_path: Path) -> None:
     for method in (zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA):  # of which few bytes unpack to any number
-        with refused("another compression"):
+        with refused("a compression other than"):
             read(packed(tmp_path, "'|b1'", "(3, 3)", b"\1" * 9, method), 3, 3)
     path = Path(packed(tmp_path, "'|b1'", "(3, 3)", b"\1" * 9))
     locked = bytearray(path.read_bytes())
     for flags in (6, locked.index(b"PK\1\2") + 8):
         locked[flags] |= 1
     path.write_bytes(locked)
-    with refused("no whole .npz", "encrypted"):
+    with refused("not a complete .npz", "encrypted"):
         read(str(path), 3, 3)
 
 

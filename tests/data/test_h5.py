@@ -83,14 +83,14 @@ BAD[2] = np.nan
 @pytest.mark.parametrize(
     ("rows", "words"),
     [
-        ({}, ("holds no global_descriptor", "expected a group for each image")),
-        ({"a.jpg": ROWS[0], "b/c.jpg": ROWS[1, :5]}, ("b/c.jpg has 5 numbers", "expected 6", "a.jpg")),
+        ({}, ("contains no global_descriptor", "expected a group for each image")),
+        ({"a.jpg": ROWS[0], "b/c.jpg": ROWS[1, :5]}, ("b/c.jpg has 5 dimensions", "expected 6", "a.jpg")),
         ({"a.jpg": ROWS[0], "b.jpg": BAD}, ("global_descriptor of b.jpg", "NaN")),
         ({"a.jpg": np.full(3, np.inf)}, ("global_descriptor of a.jpg", "infinite")),
         ({"a.jpg": ROWS}, ("global_descriptor of a.jpg is (4, 6) float16", "(D,)")),
         ({"a.jpg": 0.5}, ("global_descriptor of a.jpg is () float64",)),
         ({"a.jpg": np.arange(4)}, ("is (4,) int64", "of floats")),
-        ({"a.jpg": ROWS[0, :0]}, ("a.jpg has 0 numbers",)),
+        ({"a.jpg": ROWS[0, :0]}, ("a.jpg has 0 dimensions",)),
         ({"a.jpg": "text"}, ("global_descriptor of a.jpg is ()",)),
     ],
 )
@@ -102,7 +102,7 @@ def test_other_contents_are_refused(tmp_path: Path, rows: dict[str, Any], words:
 
 def test_local_features_alone_are_refused(tmp_path: Path) -> None:
     path = written(tmp_path / "feats.h5", {"a.jpg": np.zeros((4, 2), np.float32)}, "keypoints")
-    with refused("feats.h5 holds no global_descriptor"):
+    with refused("feats.h5 contains no global_descriptor"):
         open_source(path)
 
 
@@ -139,12 +139,12 @@ def test_a_file_that_is_no_whole_hdf5_is_refused(tmp_path: Path) -> None:
             open_source(path)
     path.unlink()
     os.mkfifo(path)
-    with refused("a.h5 is no regular file"):
+    with refused("a.h5 is not a regular file"):
         open_source(path)
 
 
 def test_without_h5py_a_line_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = written(tmp_path / "a.h5", {"a.jpg": ROWS[0]})
     monkeypatch.setitem(sys.modules, "h5py", None)
-    with refused("a.h5", "h5py", "not there", "pip install 'dejavu_torch[h5]'"):
+    with refused("a.h5", "h5py", "cannot be imported", "pip install 'dejavu_torch[h5]'"):
         open_source(path)

@@ -17,7 +17,7 @@ from PIL import Image
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.folder import ImageFolder
 from dejavu_torch.data.frame_range import FrameRange
-from dejavu_torch.data.names import LONGEST, clock_time, decode_names, encode_names, names_of
+from dejavu_torch.data.names import MAX_NAME_LENGTH, clock_time, decode_names, encode_names, names_of
 
 
 def packed(names: list[str]) -> str:
@@ -72,9 +72,9 @@ def test_the_names_of_a_traverse(tmp_path: Path) -> None:
 
 
 def test_a_name_beyond_reason_is_refused() -> None:
-    packed(["\U0001f600" * LONGEST])
+    packed(["\U0001f600" * MAX_NAME_LENGTH])
     with refused("4097 characters", "at most 4096"):
-        packed(["x" * (LONGEST + 1)])
+        packed(["x" * (MAX_NAME_LENGTH + 1)])
 
 
 def coded(value: object) -> str:

@@ -19,7 +19,7 @@ import pytest
 from helpers import refused
 
 from dejavu_torch.data.output import (
-    HERE,
+    HOST_PREFIX,
     check_output_file,
     check_output_folder,
     make_output_folder,
@@ -208,7 +208,7 @@ def test_the_file_that_a_stream_goes_to_is_refused_and_stays(tmp_path: Path, mod
         try:
             os.dup2(file.fileno(), 1)
             for path in ("/dev/stdout", "/dev/fd/1", "/proc/self/fd/1", log, f"/dev/fd/{file.fileno()}"):
-                with refused(str(path), "of its own"):
+                with refused(str(path), "expected another file"):
                     check_output_file(Path(path))
         finally:
             os.dup2(kept, 1)
@@ -336,13 +336,13 @@ def test_what_a_killed_process_left_is_removed_and_what_another_writes_is_not(
 
 
 def test_only_what_this_host_left_is_removed(tmp_path: Path) -> None:
-    foreign = [".dejavu-notes", ".dejavu-abcdefgh", ".dejavu-00000000-abcdefgh", f"{HERE}notes"]
-    for name in (*foreign, f"{HERE}abcdefgh"):
+    foreign = [".dejavu-notes", ".dejavu-abcdefgh", ".dejavu-00000000-abcdefgh", f"{HOST_PREFIX}notes"]
+    for name in (*foreign, f"{HOST_PREFIX}abcdefgh"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "x").write_text("kept")
-    (tmp_path / f"{HERE}abcdefgi").symlink_to(".dejavu-notes")
+    (tmp_path / f"{HOST_PREFIX}abcdefgi").symlink_to(".dejavu-notes")
     write(tmp_path / "a")
     with whole_folder(tmp_path / "new") as temporary:
         (temporary / "a").touch()
-    assert {path.parent.name for path in tmp_path.glob(".dejavu-*/x")} == {*foreign, f"{HERE}abcdefgi"}
-    assert not (tmp_path / f"{HERE}abcdefgh").exists()
+    assert {path.parent.name for path in tmp_path.glob(".dejavu-*/x")} == {*foreign, f"{HOST_PREFIX}abcdefgi"}
+    assert not (tmp_path / f"{HOST_PREFIX}abcdefgh").exists()

@@ -72,7 +72,7 @@ def test_a_simulator() -> None:
         ("{}/images?order=size", ["images: order is 'size'", "expected natural or lexicographic"]),
         ("{}/frames.npy?width=4", ["unknown 'width'", "expected start, stop, step"]),
         ("{}/long.png", ["long.png is a single image", "expected a folder of images"]),
-        (__file__, ["none of the kinds", "expected a folder of images"]),
+        (__file__, ["of an unknown kind", "expected a folder of images"]),
         *((path, ["is not there"]) for path in ("", "?width=3", "a" * 5000, "a\0b", "\udcff", "b/" * 3000)),
     ],
 )

@@ -106,7 +106,7 @@ def test_a_frame_rate_that_varies_is_told_once(
             assert numbers(all_of(video)) == list(range(12))
         assert torch.equal(times_of(video), torch.tensor(ticks, dtype=torch.float64) / 25)
     (message,) = caplog.messages
-    seen = f"{video.path}: the frame rate varies, 40 to 120 ms from frame to frame (median 40)"
+    seen = f"{video.path}: the frame rate varies, 40 to 120 ms per frame (median 40)"
     assert message.startswith(seen)
     assert "\n" not in message
 
@@ -203,7 +203,7 @@ def test_sizes_that_no_frame_has_are_refused(tmp_path: Path) -> None:
     path = clip(tmp_path / "a.mkv", pictures(2))
     with refused(str(path), "width=-1", "expected width and height of at least 0"):
         Video(path, width=-1)
-    with refused(str(path), "cannot be resized to 1000000 x 1500000 pixels"):
+    with refused(str(path), "resized has 1000000 x 1500000 pixels"):
         all_of(Video(path, height=1_000_000))
 
 
@@ -262,7 +262,7 @@ def test_a_cut_behind_a_frame_is_refused(
     with av.open(str(path)) as container:
         ends = [packet.pos + packet.size for packet in container.demux(video=0) if packet.size]
     path.write_bytes(path.read_bytes()[: ends[kept - 1] + more])
-    with refused(str(path), "cut off", "expected a whole video file"):
+    with refused(str(path), "cut off", "expected a complete video file"):
         Video(path)
 
 
@@ -276,7 +276,7 @@ def test_a_hole_in_the_middle_is_refused_in_one_line(
     capfd.readouterr()
     for filling in (b"\0", b"\x5a", b"\xff"):
         path.write_bytes(whole[:at] + width * filling + whole[at + width :])
-        with refused(str(path), "expected a whole video file"):
+        with refused(str(path), "expected a complete video file"):
             all_of(Video(path))
     assert capfd.readouterr() == ("", "")
 

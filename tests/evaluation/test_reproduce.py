@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
 from unittest.mock import create_autospec
 
 import pytest
 import torch
 from helpers import refused
-from torch import Tensor
 
 from dejavu_torch.cli import main
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import as_ground_truth
-from dejavu_torch.data.simulate.train import Railway
 from dejavu_torch.data.source import open_source
 from dejavu_torch.evaluation.compare import Comparison, compare
 from dejavu_torch.evaluation.curves import evaluate
@@ -139,27 +136,10 @@ def test_the_command_writes_an_index_over_the_reports(
     assert {"ideal", "ideal_leave_out", "chunk_lengths", "published", "auc", "null"} <= set(report)
 
 
-def drawn_once(draw: Callable[[Railway, Tensor], Tensor]) -> Callable[[Railway, Tensor], Tensor]:
-    """Frames of a train take long to draw, and are read several times."""
-    held: dict[tuple[str, int], Tensor] = {}
-
-    def frames(self: Railway, at: Tensor) -> Tensor:
-        keys = [(self.name, i) for i in at.tolist()]
-        new = [key for key in keys if key not in held]
-        if new:
-            held.update(zip(new, draw(self, torch.tensor([i for _, i in new])), strict=True))
-        return torch.stack([held[key] for key in keys])
-
-    return frames
-
-
 @pytest.fixture(scope="module")
 def outdoor() -> Comparison:
     """The first 420 frames, from the start of the train on, in chunks of 64."""
-    paper = shorter("outdoor", 64)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Railway, "_frames", drawn_once(Railway._frames))
-        return reproduce("outdoor", paper, frames=420, lengths=(32, 64))
+    return reproduce("outdoor", shorter("outdoor", 64), frames=420, lengths=(32, 64))
 
 
 def metres_of(result: Comparison, traverse: int, frames: torch.Tensor) -> torch.Tensor:

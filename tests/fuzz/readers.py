@@ -255,7 +255,7 @@ def samples_of_a_search(case: Case) -> None:
     route, chosen = model.map, case.random.choice((Plan(1, 1, 2, 1.0, 0), Plan(4, 2, 2, 1.0, 0)))
     assert isinstance(route, SpectralMap)
     data, search, queries = Path("in/route.samples"), CoarseSearch(route, chosen), route.decode(0)[:5]
-    map_file.write_map(data, search.made, key_of(route, chosen))
+    map_file.write_map(data, search.tensors, key_of(route, chosen))
     sealed_again = case.random.random() < 0.5
     whole = data.read_bytes()
     data.write_bytes(crafted(case.random, data) if sealed_again else damaged(case.random, whole))
@@ -264,7 +264,7 @@ def samples_of_a_search(case: Case) -> None:
     score, place = read(queries, [(2, 1)])
     if not bool(((place >= -1) & (place < route.places) | score.isinf()).all()):
         raise Wrong(f"places {place.tolist()} of {route.places}")
-    if not sealed_again and not all(map(torch.equal, read.made.values(), search.made.values())):
+    if not sealed_again and not all(map(torch.equal, read.tensors.values(), search.tensors.values())):
         raise Wrong("damaged samples are read as others")
 
 

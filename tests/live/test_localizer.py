@@ -118,7 +118,7 @@ def test_ready_features() -> None:
     ("frame", "words"),
     [
         (np.zeros((24, 32, 3), np.int64), ("int64", "(24, 32, 3)", "uint8")),
-        (np.zeros((0, 32, 3), np.uint8), ("(0, 32, 3)", "nothing")),
+        (np.zeros((0, 32, 3), np.uint8), ("(0, 32, 3)", "empty")),
         (torch.full(SHAPE, 2.0), ("2", "0 to 1")),
         (torch.full(SHAPE, math.nan), ("nan", "0 to 1")),
         (np.zeros((64, 48, 3), np.uint8), ("64 x 48", "24 x 32")),

@@ -441,7 +441,7 @@ def test_an_embedding_of_a_network_from_elsewhere_must_be_given(path: Path) -> N
         (
             lambda: embedding(Patch()),
             lambda: embedding(Patch(), grid=2),
-            ("Embedding of grid=1; got grid=2",),
+            ("Embedding with grid=1; got grid=2",),
         ),
         (lambda: embedding(Patch()), lambda: embedding(Small()), ("Patch", "Small")),
         (lambda: embedding(Patch()), Small, ("Embedding; got", "Small")),

@@ -302,9 +302,13 @@ SIDEWAYS = ((0.1, 0.9), (0.1, 0.2), (0.9, 0.2), (0.9, 0.9))  # its rows run alon
 @pytest.mark.parametrize(
     ("shape", "settings", "told"),
     [
-        ((64, 128), {}, "96 rows, its region only 16 in frames of 64 x 128 pixels: slow motion"),
-        ((120, 160), {"size": (96, 48)}, "size (61, 48) would do"),
-        ((60, 80), {}, "larger frames, or a larger region, would do"),
+        (
+            (64, 128),
+            {},
+            "96 rows, its region only 16 in frames of 64 x 128 pixels, which underestimates slow motion",
+        ),
+        ((120, 160), {"size": (96, 48)}, "use size (61, 48)"),
+        ((60, 80), {}, "use larger frames or regions"),
         ((240, 51), {"corners": SIDEWAYS}, "its region only 40 in frames of 240 x 51"),
         ((120, 160), {"size": (61, 96)}, ""),
         ((240, 320), {}, ""),
@@ -418,7 +422,7 @@ BOW_TIE = ((0.2, 0.5), (0.8, 0.9), (0.8, 0.5), (0.2, 0.9))
         (lambda: GroundOdometry()(short().values[:1]), ("the input has 1 frame;", "at least 2")),
         (lambda: distance(short().values[:1]), ("the drive has 1 frame;", "at least 2")),
         (lambda: distance(torch.zeros(5, 1, 60, 80)), ("none of 4 steps", "expected corners on the ground")),
-        (lambda: distance(torch.rand(5, 7)), ("features", "(5, 7)", "frames (B,C,H,W)")),
+        (lambda: distance(torch.rand(5, 7)), ("features", "(5, 7)", "expected (B,C,H,W)")),
     ],
 )
 def test_what_is_refused(call: Callable[[], Any], facts: tuple[str, ...]) -> None:

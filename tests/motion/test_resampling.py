@@ -154,13 +154,13 @@ def test_names_and_shape_are_those_of_the_frames_that_are_shown() -> None:
 @pytest.mark.parametrize(
     ("call", "facts"),
     [
-        (lambda: resampled((4, 60), step=4000.0), ("at least one step, 4000",)),
-        (lambda: resampled((4, 60), step=1e-9), ("at most 20 a frame",)),
-        (lambda: resampled((4, 60), step=1e-300), ("at most 20 a frame",)),
-        (lambda: resampled((0, 29)), ("stands still", "30 frames", "expected motion")),
+        (lambda: resampled((4, 60), step=4000.0), ("at least one step of 4000",)),
+        (lambda: resampled((4, 60), step=1e-9), ("at most 20 per frame",)),
+        (lambda: resampled((4, 60), step=1e-300), ("at most 20 per frame",)),
+        (lambda: resampled((0, 29)), ("does not move", "30 frames", "expected motion")),
         (
             lambda: template_model(velocity=camera()).learn(torch.rand(90, 8)),
-            ("(64, 8)", "ready features show no ground"),
+            ("(64, 8)", "features do not show the ground"),
         ),
     ],
 )

@@ -260,8 +260,8 @@ MUTANTS = [
     Mutant(
         "A third visit that is averaged into a map weighs a third.",
         "dejavu_torch/growth.py",
-        "means = with_visits(route.decode(g), counts[start:stop], rows",
-        "means = with_visits(route.decode(g), torch.ones(stop - start), rows",
+        "means = learning.with_visits(route.decode(g), counts[start:stop], rows",
+        "means = learning.with_visits(route.decode(g), torch.ones(stop - start), rows",
         ("tests/test_behaviour.py::test_a_third_visit_weighs_a_third",),
     ),
     Mutant(
@@ -359,8 +359,8 @@ MUTANTS = [
     Mutant(
         "Behind k frames that were left out the live filter moves k + 1 times.",
         "dejavu_torch/live/localizer.py",
-        "self._localizer.skip(min(left_out, FURTHEST))",
-        "self._localizer.skip(min(max(left_out - 1, 0), FURTHEST))",
+        "self._localizer.skip(min(left_out, MAX_SKIPPED))",
+        "self._localizer.skip(min(max(left_out - 1, 0), MAX_SKIPPED))",
         ("tests/test_behaviour.py::test_frames_left_out_move_a_filter_on",),
     ),
     Mutant(

@@ -349,15 +349,15 @@ MUTANTS = [
     Mutant(
         "Of routes of one name that are merged, each further one gets a number.",
         "dejavu_torch/growth.py",
-        "parts[_another(wanted, parts)] = part",
+        "parts[_free_name(wanted, parts)] = part",
         "parts[wanted] = part",
         ("tests/test_growth.py::test_merging_merged_maps_and_names_that_are_there",),
     ),
     Mutant(
         "A long route is learned from a sample of all of its length.",
         "dejavu_torch/learning.py",
-        "starts = torch.arange(count) * last // (count - 1) * stretch",
-        "starts = torch.arange(count) * stretch",
+        "starts = torch.arange(count) * last // (count - 1) * segment",
+        "starts = torch.arange(count) * segment",
         ("tests/test_learning.py::test_convention_the_sample_is_evenly_spaced_and_of_whole_chunks",),
     ),
     Mutant(
@@ -479,7 +479,7 @@ MUTANTS = [
     Mutant(
         "FILE.part is written once a minute, not after each chunk.",
         "dejavu_torch/learning.py",
-        "return monotonic() - self.written > SAVED",
+        "return monotonic() - self.written > SAVE_INTERVAL",
         "return True",
         ("tests/test_learning.py::test_the_partial_map_is_written_each_minute",),
     ),
@@ -542,7 +542,7 @@ MUTANTS = [
     Mutant(
         "The names beside an array are no place for an output.",
         "dejavu_torch/data/source.py",
-        'if place.suffix.lower() == ".npy" else []',
+        'if path.suffix.lower() == ".npy" else []',
         "if False else []",
         ("tests/test_faults.py::-k what_is_read",),
     ),

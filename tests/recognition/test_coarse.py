@@ -28,7 +28,7 @@ EXACT = Plan(1, 1, 4, 1.0, 0)
 @pytest.fixture
 def searched(monkeypatch: pytest.MonkeyPatch) -> None:
     """Maps of a few hundred places are searched as long ones are."""
-    monkeypatch.setattr(coarse, "FEWEST", 500)
+    monkeypatch.setattr(coarse, "MIN_PLACES", 500)
 
 
 def smooth_model(places: int = 3000, seed: int = 0, **settings: Any) -> DejaVu:
@@ -153,7 +153,7 @@ def test_the_memory_by_default_grows_with_the_places(
     learned = smooth_model().map
     expected = plan(learned, 10**9)
     monkeypatch.setattr(coarse, "MEMORY", least)
-    monkeypatch.setattr(coarse, "A_PLACE", a_place)
+    monkeypatch.setattr(coarse, "MEMORY_PER_PLACE", a_place)
     if chosen:
         assert plan(learned) == expected
     else:
@@ -173,7 +173,7 @@ def test_samples_follow_from_the_energy_of_the_lines_and_the_memory() -> None:
     assert less.refined >= chosen.refined
     search = CoarseSearch(learned, chosen)  # type: ignore[arg-type]
     kept = [one for part in (search.coarse, search.fine) for one in (part.rows, part.norm, part.place)]
-    padding = 2 * coarse.GROUP * coarse.BESIDE * (24 + coarse.OTHERS)
+    padding = 2 * coarse.GROUP * coarse.GROUPS_PER_BLOCK * (24 + coarse.OVERHEAD)
     assert sum(one.nbytes for one in kept) <= 1.1 * chosen.bytes + padding
     with refused("memory is 100 bytes", "for a chunk"):
         plan(learned, 100)

@@ -26,7 +26,7 @@ from dejavu_torch.recognition.search import Search
 @pytest.fixture(autouse=True)
 def searched(monkeypatch: pytest.MonkeyPatch) -> None:
     """Maps of a few hundred places are searched as long ones are."""
-    monkeypatch.setattr(coarse, "FEWEST", 500)
+    monkeypatch.setattr(coarse, "MIN_PLACES", 500)
 
 
 @pytest.fixture
@@ -130,7 +130,7 @@ def test_what_is_no_whole_file_of_samples_is_refused_and_stays(
 ) -> None:
     change(file, kept)
     before = file.read_bytes()
-    with refused(str(file), "is no whole file of a search's samples: it is ", reason, "or none to be there"):
+    with refused(str(file), "is not a complete file of search samples: it is ", reason, "or no file there"):
         again(kept, file).localize(queries_of()[:1])
     assert file.read_bytes() == before
 
@@ -201,7 +201,7 @@ def test_where_no_samples_are_searched_a_file_is_refused(file: Path, monkeypatch
             model.localize(queries, **way)  # type: ignore[arg-type]
     with refused("scores of all places are kept", "; expected none kept (no --page)"):
         LiveLocalizer(model, None)
-    with monkeypatch.context() as patch, refused("places are found elsewhere", "; expected one of the two"):
+    with monkeypatch.context() as patch, refused("places are found elsewhere", "only one of the two"):
         patch.setattr(model, "find", lambda *_: pytest.fail("searched"))
         model.localize(queries)
     assert LiveLocalizer(model, None, keep_scores=False)(queries[0]).place >= 0

@@ -141,7 +141,7 @@ def test_many_of_the_best_are_taken_from_all_scores(monkeypatch: pytest.MonkeyPa
         assert torch.equal(found.index, best_candidates(route.rows, k, radius).index)
         assert route.batches == batches
         route.batches.clear()
-    monkeypatch.setattr(localizer, "SCORES_AT_ONCE", 8 * localizer.LISTED * (2 * (2 * 5 + 1) + 1))
+    monkeypatch.setattr(localizer, "SCORES_AT_ONCE", 8 * localizer.PER_BEST * (2 * (2 * 5 + 1) + 1))
     assert Localizer(route, Matching(k=3, radius=5))(rows_of(route)).index.shape == (21, 3)
     assert route.batches == [8, 8, 5]
     monkeypatch.setattr(searching, "SCORES_AT_ONCE", 4 * 1000)

@@ -118,7 +118,7 @@ OLD = {"_use_new_zipfile_serialization": False}
     [
         (lambda path, last: None, ["is not there"]),
         (lambda path, last: path.mkdir(), ["is a folder"]),
-        (lambda path, last: os.mkfifo(path), ["is no regular file"]),
+        (lambda path, last: os.mkfifo(path), ["is not a regular file"]),
         (lambda path, last: path.write_text("no checkpoint"), ["cannot be read"]),
         (lambda path, last: torch.save([1, 2], path), ["is of type list"]),
         (lambda path, last: torch.save({"epoch": 1}, path), ["pytorch-lightning_version None"]),

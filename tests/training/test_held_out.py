@@ -159,7 +159,7 @@ def test_the_untrained_map_is_of_frames_of_the_queries_size(
     model.learn(ArrayTraverse(footage(0.0, 24, 32)))
     scores = beside_untrained(model, reference, query, as_ground_truth(torch.arange(24)[:, None]), 2)
     assert UNTRAINED in scores
-    assert len([line for line in warned(caplog) if "brought to" in line]) == (size is not None)
+    assert len([line for line in warned(caplog) if "resized to" in line]) == (size is not None)
 
 
 @pytest.mark.parametrize("settings", [{"hold": 0.9}, {"step": 1.0}])

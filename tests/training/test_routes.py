@@ -287,7 +287,7 @@ LEARN = ["learn", "third.npy", "--map", "new.safetensors", "--descriptor", WEIGH
         ([*LEARN, "--weight_bits", "8"], ["--weight_bits", "one or the other"]),
         ([*LEARN, "--whitening", WEIGHTS], ["--whitening", "--descriptor"]),
         ([*LEARN[:4], "--descriptor", "train.yaml"], ["train.yaml"]),
-        ([*LEARN[:3], WEIGHTS, "--descriptor", WEIGHTS], ["is what is read"]),
+        ([*LEARN[:3], WEIGHTS, "--descriptor", WEIGHTS], ["is an input"]),
         (
             ["compare", *2 * ["third.npy"], "--map", "m.safetensors", "--descriptor", WEIGHTS, "--out", "o"],
             ["--descriptor", "--map has its own settings"],

@@ -69,5 +69,5 @@ def test_a_training_starts_from_8_bits_and_refuses_damaged_ones(tmp_path: Path) 
         start_from(again, path)
     without = {name: tensor for name, tensor in tensors.items() if not name.endswith(".scale")}
     write_map(path, without, header)
-    with refused(str(path), "of int8", "expected float numbers"):
+    with refused(str(path), "is int8", "expected a float type"):
         start_from(again, path)

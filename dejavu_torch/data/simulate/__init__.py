@@ -1,9 +1,9 @@
-"""Routes that are drawn by the computer, so that the true place of every frame is known."""
+"""Simulated routes: the true place of every frame is known."""
 
 from dejavu_torch.data.simulate.aerial import AerialRoad
 from dejavu_torch.data.simulate.outdoor import Outdoor
 from dejavu_torch.data.simulate.route import SimulatedRoute
 from dejavu_torch.data.simulate.underground import Underground
 
-# a new route: subclass SimulatedRoute (or Railway) in a file of its own, and name it here
+# for a new route, subclass SimulatedRoute (or Railway) in a file of its own and add it here
 SIMULATORS: dict[str, type[SimulatedRoute]] = {c.kind: c for c in (AerialRoad, Outdoor, Underground)}

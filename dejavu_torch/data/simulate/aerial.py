@@ -1,4 +1,4 @@
-"""A road seen from a drone, painted procedurally: `sim:aerial`.
+"""A procedurally painted road as seen from a drone: `sim:aerial`.
 
 One image column is one frame step, about 0.25 m of road. The lane dashes repeat exactly every `DASH_PERIOD`
 frames and the chevrons every `CHEVRON_PERIOD`.
@@ -21,19 +21,17 @@ from dejavu_torch.types import InputError
 DASH_PERIOD = 93
 CHEVRON_PERIOD = 171
 VIEW = 64  # the camera sees VIEW x VIEW image pixels
-MARGIN = 8  # columns beyond the first and the last view, so that yaw never leaves the image
-HEIGHT = 96  # rows of the painted image; the camera flies along the middle one
-# columns of the two tiles of ground that repeats; co-prime, so that no place is like another
-TILES = (997, 1009)
+MARGIN = 8  # columns before the first and after the last view, for yaw
+HEIGHT = 96  # rows of the painted image; the camera follows the middle one
+TILES = (997, 1009)  # columns of the two repeating tiles; coprime, so each pair of phases is unique
 LONGEST = {"once": 2**17, "repeat": math.lcm(*TILES)}  # frames, by ground
-PLAIN = 9  # rows from the middle of the view to the edge of the road between tiles: over a cell of HOG
+PLAIN = 9  # rows from the middle of the view to the edge of the plain road in tiles: over a cell of HOG
 
-ROAD = 40.0  # image row of the road's middle
-HALF, LANE = 14.0, 6.3  # rows from the road's middle to its edge, to a lane's middle
+ROAD = 40.0  # image row of the road's centre
+HALF, LANE = 14.0, 6.3  # rows from the road's centre to its edge, to the centre of a lane
 SUN = (0.75, -0.66)  # direction towards the sun, (x, y)
 
-# colours, rrggbb
-WHITE, GRAVEL, GLASS, DARK = "edebe0", "998f7a", "1a212b", "0d0f12"
+WHITE, GRAVEL, GLASS, DARK = "edebe0", "998f7a", "1a212b", "0d0f12"  # colours, rrggbb
 ASPHALT, MEADOW = "69696b", "597036"
 ROOFS = ("99452e", "7a3d2e", "5c5e66", "856b54")
 LEAVES = ("2e5c1f", "3d6626", "4f5e24", "266633", "47612b")
@@ -43,7 +41,7 @@ PLOTS = ("trees", "trees", "trees", "bushes", "bushes", "house", "house", "lane"
 
 
 class Canvas(NamedTuple):
-    """Pixels (3,h,w) painted in place, at column x and y rows below the road's middle, with a fine grain."""
+    """Pixels (3,h,w) to paint in place, at column x and y rows below the road's centre, with fine grain."""
 
     pixels: Tensor
     grain: Tensor
@@ -58,7 +56,7 @@ class Canvas(NamedTuple):
         return Canvas(pixels, grain, x, y[:, None] - ROAD, scale)
 
     def near(self, x: float, y: float, reach: float = 45.0, turn: float = 0.0) -> Canvas:
-        """The square within reach of (x, y), with x and y relative to that point and turned by radians."""
+        """The square within reach of (x, y), in coordinates relative to that point, rotated by radians."""
         rows, columns = (
             slice(*(max(0, math.floor((at + side * reach) * self.scale)) for side in (-1, 1)))
             for at in (y + ROAD, x)
@@ -68,7 +66,7 @@ class Canvas(NamedTuple):
         return Canvas(pixels, grain, c * dx + s * dy, c * dy - s * dx, self.scale)
 
     def fill(self, distance: Tensor, colour: str, shade: Tensor | float = 1.0, alpha: float = 1.0) -> None:
-        """Blend in colour * shade where distance, in image pixels, is negative; antialiased."""
+        """Blend in colour * shade at negative distances (in image pixels), antialiased."""
         cover = (0.5 - self.scale * distance).clamp(0, 1) * alpha
         self.pixels.add_(cover * (rgb(colour) * shade - self.pixels))
 
@@ -78,14 +76,13 @@ class Canvas(NamedTuple):
         return torch.hypot(a.clamp(min=0), b.clamp(min=0)) + torch.maximum(a, b).clamp(max=0) - corner
 
     def blob(self, radius: float, random: Random) -> Tensor:
-        """Signed distance, roughly, to an uneven disc around the origin."""
+        """Approximate signed distance to an irregular disc around the origin."""
         angle = torch.atan2(self.y, self.x)
         bumps = sum(0.09 * torch.sin(k * angle + random.uniform(0, 2 * math.pi)) for k in (2, 3, 5))
         return torch.hypot(self.x, self.y) - radius * (1 + bumps)
 
 
 def _paint_tree(canvas: Canvas, random: Random, x: float, y: float, radius: float) -> None:
-    """A tree or bush with its shadow."""
     p, fall = canvas.near(x, y, 2 * radius), 0.75 * radius
     p.fill(torch.hypot(p.x + fall * SUN[0], p.y + fall * SUN[1]) - radius, DARK, alpha=0.55)
     light = 1 + 0.38 * (p.x * SUN[0] + p.y * SUN[1]) / radius + 0.22 * p.grain
@@ -93,7 +90,6 @@ def _paint_tree(canvas: Canvas, random: Random, x: float, y: float, radius: floa
 
 
 def _paint_house(canvas: Canvas, random: Random, x: float, y: float) -> None:
-    """A house with a ridged roof, a chimney and its shadow."""
     p, roof = canvas.near(x, y, turn=random.uniform(-0.15, 0.15)), random.pick(ROOFS)
     length, width = random.uniform(30, 46), random.uniform(22, 28)
     chimney = length * random.uniform(-0.35, 0.35)
@@ -105,10 +101,8 @@ def _paint_house(canvas: Canvas, random: Random, x: float, y: float) -> None:
     p.fill(p.box(chimney, -4, 3.2, 3.2), GRAVEL)
 
 
-def _paint_vehicle(
-    canvas: Canvas, random: Random, x: float, y: float, heading: int, lorry: bool = False
-) -> None:
-    """A car or a lorry along the road; heading is +1 towards growing columns, else -1."""
+def _paint_car(canvas: Canvas, random: Random, x: float, y: float, heading: int, lorry: bool = False) -> None:
+    """A car or lorry; heading is +1 towards higher columns, else -1."""
     p, paint = canvas.near(x, y, 26, random.uniform(-0.02, 0.02)), random.pick(PAINTS)
     length, width, fall = (44.0, 9.6, 3.0) if lorry else (random.uniform(16, 20), 7.6, 1.6)
     p.fill(p.box(-fall * SUN[0], -fall * SUN[1], length + 0.6, width + 0.6, 2), DARK, alpha=0.65)
@@ -123,10 +117,10 @@ def _paint_vehicle(
 
 
 def _paint_fields(canvas: Canvas, random: Random, tone: Tensor) -> None:
-    """Fields on both sides, each with its crop and rows, and a grass verge along the road."""
+    """Fields with crops on both sides, and the verge of the road."""
     for side in (-1, 1):
         x = random.uniform(-150, -50)
-        while x < canvas.x[-1] + 60:  # the next field covers the far end of this one
+        while x < canvas.x[-1] + 60:  # each field overlaps the end of the previous one
             (colour, rows), length = random.pick(CROPS), random.uniform(110, 330)
             p, turned = (canvas.near(x, 0, length + 60, turn) for turn in (0.0, random.uniform(-1.2, 1.2)))
             furrow = torch.sin(turned.x / random.uniform(0.7, 1.1) + 0.45 * p.grain)
@@ -140,7 +134,7 @@ def _paint_fields(canvas: Canvas, random: Random, tone: Tensor) -> None:
 
 
 def _paint_plot(canvas: Canvas, random: Random, kind: str, x: float, side: int) -> None:
-    """What lies flat on the ground beside the road."""
+    """The flat parts of a plot next to the road."""
     if kind == "lane":
         p = canvas.near(x, 0, 60, random.uniform(-0.25, 0.25))
         mouth = 6.5 + 5 * (3 - side * p.y / 7).clamp(0, 1) ** 2
@@ -161,7 +155,7 @@ def _paint_plot(canvas: Canvas, random: Random, kind: str, x: float, side: int) 
 
 
 def road_markings(columns: int, scale: int = 1) -> tuple[Tensor, Tensor]:
-    """Coverage of the markings that repeat exactly, lane dashes and chevrons, at `scale` samples a pixel.
+    """Coverage of the periodic markings, lane dashes and chevrons, at `scale` samples per pixel.
 
     Shape: two (HEIGHT * scale, columns * scale) float32 in [0,1].
     """
@@ -169,13 +163,13 @@ def road_markings(columns: int, scale: int = 1) -> tuple[Tensor, Tensor]:
     x = torch.arange(columns * scale)
     dash, chevron = ((x % (period * scale) + 0.5) / scale for period in (DASH_PERIOD, CHEVRON_PERIOD))
     dashes = torch.maximum((dash - 40).abs() - 19, y.abs() - 1.0)
-    slant = chevron - 48 + 1.1 * (y - LANE).abs()  # constant along the edges of an arrow that points to +x
+    slant = chevron - 48 + 1.1 * (y - LANE).abs()  # constant along the edges of an arrow towards +x
     chevrons = torch.maximum(((slant.abs() - 10).abs() - 2.4) / 1.5, (y - LANE).abs() - 4.6)
     return (0.5 - scale * dashes).clamp(0, 1), (0.5 - scale * chevrons).clamp(0, 1)
 
 
 def _paint_road(canvas: Canvas, random: Random, tone: Tensor, lanes: list[tuple[float, int]]) -> None:
-    """The carriageway with its grain, repairs, cracks and markings; lanes interrupt the edge line."""
+    """The carriageway with repairs, cracks and markings; side lanes (x, side) interrupt the edge line."""
     speckle, half = random.normal(*tone.shape), canvas.y.abs() - HALF
     tracks = torch.cos((canvas.y.abs() - LANE) * 0.98)  # worn by wheels
     canvas.fill(half, ASPHALT, 1 + 0.05 * speckle + 0.05 * tone + 0.035 * tracks)
@@ -202,7 +196,7 @@ def _paint_road(canvas: Canvas, random: Random, tone: Tensor, lanes: list[tuple[
 
 
 def paint_route(frames: int, seed: int = 0) -> Tensor:
-    """Paint the route from above, without the traffic of any one flight; the seed chooses all but markings.
+    """Paint the route from above without traffic; the seed determines all but the markings.
 
     Shape: (3, HEIGHT, frames + VIEW + 2 * MARGIN) float32 in [0,1].
     """
@@ -229,26 +223,24 @@ def paint_route(frames: int, seed: int = 0) -> Tensor:
             _paint_house(canvas, random, x, side * random.uniform(36, 42))
         if kind == "parking":
             for place in (-14, 12)[: random.pick((1, 2))]:
-                _paint_vehicle(canvas, random, x + place, side * (HALF + 6.5), side)
+                _paint_car(canvas, random, x + place, side * (HALF + 6.5), side)
     return F.avg_pool2d(canvas.pixels.clamp(0, 1), scale)
 
 
-@lru_cache(1)  # all flights over them share them, and they are small
+@lru_cache(1)  # shared by all flights of a seed
 def paint_tiles(seed: int = 0) -> tuple[Tensor, Tensor]:
-    """Paint the two tiles of ground that repeats: one lies above the middle of the road, one below.
+    """Paint the two repeating tiles of ground, above and below the middle of the view: each has half of a
+    plain road, the same in every column, and the roadside of a route of its own.
 
-    Both show their half of a road that is the same in every column, and beyond it the roadside of a route of
-    their own.
-
-    Shape: two (3, HEIGHT / 2, TILES[k]) float32 in [0,1], row 0 the one that is nearest to the middle.
+    Shape: two (3, HEIGHT / 2, TILES[k]) float32 in [0,1], row 0 nearest to the middle.
     """
     tiles = []
     for side, period in enumerate(TILES):
         edge = round(ROAD + HALF)
-        beside = paint_route(period, 2 * seed + side)[:, edge : edge + HEIGHT // 2 - PLAIN, :period]
+        roadside = paint_route(period, 2 * seed + side)[:, edge : edge + HEIGHT // 2 - PLAIN, :period]
         road = rgb(ASPHALT).repeat(1, PLAIN, 1)
         road[:, PLAIN - 3] = rgb(WHITE)[:, 0]  # the edge line
-        tiles.append(torch.cat([road.expand(-1, -1, period), beside], 1))
+        tiles.append(torch.cat([road.expand(-1, -1, period), roadside], 1))
     return tiles[0], tiles[1]
 
 
@@ -256,21 +248,19 @@ def paint_tiles(seed: int = 0) -> tuple[Tensor, Tensor]:
 class AerialRoad(SimulatedRoute):
     """A flight along a painted road, one image column per frame: `sim:aerial`.
 
-    Frame i of every flight over the same seed is centred on the same column, so place i is frame i.
-    Each flight has its own traffic, light, drift, yaw and sensor noise; flight 0, the reference, is
-    steadier than the others.
+    Frame i of all flights of a seed is centred on the same column, so place i is frame i. Each flight has its
+    own traffic, light, drift, yaw and sensor noise; flight 0, the reference, is steadier than the others.
 
     Args:
-        seed: chooses the route, at least 0.
-        traverse: chooses the flight, at least 0; 0 is the reference.
-        frames: number of frames, 1 to 131072; with ground="repeat" to 1005973, where both tiles begin anew.
+        seed: selects the route, at least 0.
+        traverse: selects the flight, at least 0; 0 is the reference.
+        frames: number of frames, 1 to 131072; with ground="repeat" to 1005973, the tiles' common period.
         size: height and width of a frame in pixels, 16 to 256; it always shows VIEW x VIEW image pixels.
-        noise: standard deviation of the sensor noise, 0 to 1, on the scale where white is 1.
-        drift: largest sideways drift, 0 to 8 image pixels.
-        yaw: largest turn of the camera, 0 to 5 degrees.
+        noise: standard deviation of the sensor noise, 0 to 1; white is 1.
+        drift: maximal sideways drift, 0 to 8 image pixels.
+        yaw: maximal rotation of the camera, 0 to 5 degrees.
         ground: "once": only the lane dashes and chevrons repeat. "repeat": the upper half of the view repeats
-            every `TILES[0]` frames and the lower half every `TILES[1]`, without traffic: a place is the pair
-            of its phases.
+            every `TILES[0]` frames, the lower every `TILES[1]`, without traffic: two phases identify a place.
 
     Example:
         >>> next(AerialRoad(traverse=1, frames=3).batches(8)).shape
@@ -313,31 +303,29 @@ class AerialRoad(SimulatedRoute):
             x = random.uniform(0, 200)
             while x < image.shape[2]:
                 y, lorry = heading * LANE + random.uniform(-0.8, 0.8), random.uniform(0, 1) < 0.25
-                _paint_vehicle(canvas, random, x, y, heading, lorry)
+                _paint_car(canvas, random, x, y, heading, lorry)
                 x += random.uniform(90, 600)
         return image.clamp_(0, 1)
 
     @cached_property
     def _tiles(self) -> list[Tensor]:
-        """The two halves of the ground that repeats as (3, HEIGHT, P + margins), each mirrored at the middle:
-        a sample near the middle, which mixes two rows, finds its own tile on both sides.
-        """
+        """The tiles (3, HEIGHT, P + margins), mirrored at the middle, so that samples do not mix them."""
         tiles = [torch.cat([tile.flip(1), tile], 1) for tile in paint_tiles(self.seed)]
         return [torch.cat([tile, tile[..., : VIEW + 2 * MARGIN]], 2) for tile in tiles]
 
     def _frames(self, at: Tensor) -> Tensor:
-        fine = math.ceil(VIEW / self.size)  # a small frame averages samples that lie an image pixel apart
+        fine = math.ceil(VIEW / self.size)  # a small frame averages samples one image pixel apart
         across = ((torch.arange(fine * self.size).double() + 0.5) / (fine * self.size) - 0.5) * VIEW
         down = across[:, None]
         c, s, drift = (curve[at, None, None] for curve in (self._yaw.cos(), self._yaw.sin(), self._drift))
-        column = MARGIN + VIEW / 2 + c * across - s * down  # from the frame's first one
+        column = MARGIN + VIEW / 2 + c * across - s * down  # relative to the frame's first column
         row = HEIGHT / 2 + drift + s * across + c * down
         if self.ground == "once":
             seen = _sample(self._scene, at, column, row)
         else:
             tiles = zip(self._tiles, TILES, strict=True)
-            halves = [_sample(tile, at % period, column, row) for tile, period in tiles]
-            seen = torch.where((row < HEIGHT / 2)[:, None], halves[0], halves[1])
+            upper, lower = (_sample(tile, at % period, column, row) for tile, period in tiles)
+            seen = torch.where((row < HEIGHT / 2)[:, None], upper, lower)
         seen = F.avg_pool2d(seen, fine) * self._gain[at, :, None, None]
         seen = seen ** self._gamma[at, None, None, None]
         for frame, i in zip(seen, at.tolist(), strict=True):
@@ -346,7 +334,7 @@ class AerialRoad(SimulatedRoute):
 
 
 def _sample(image: Tensor, first: Tensor, column: Tensor, row: Tensor) -> Tensor:
-    """Samples of an image (3,H,W) at columns, counted from the first of each frame, and rows: (B,h,w)."""
+    """Samples of an image (3,H,W) at rows and, relative to each frame's first column, columns (B,h,w)."""
     height, width = image.shape[1:]
     column = first[:, None, None] + column
     grid = torch.stack([2 * column / width - 1, 2 * row / height - 1], -1).float()

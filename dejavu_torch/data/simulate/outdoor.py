@@ -1,4 +1,4 @@
-"""The railway in the open: masts, fences, vegetation, houses and stations along two tracks."""
+"""An outdoor railway: masts, fences, vegetation, houses and stations along two tracks."""
 
 from __future__ import annotations
 
@@ -15,28 +15,24 @@ from dejavu_torch.data.simulate.sheets import FAR, Light, Sheet, Thing, View
 from dejavu_torch.data.simulate.train import Railway
 
 TRACKS = (0.0, 4.0)
-HALF = 13.0  # metres of fine ground on either side
+HALF = 13.0  # metres of detailed ground on either side
 CELL = (0.1, 0.2)  # metres of a texture cell across and along
 
 
 @dataclass(eq=False)
 class Outdoor(Railway):
-    """A train ride in the open along 2 km of double track: `sim:outdoor`.
+    """An outdoor train ride along 2 km of double track: `sim:outdoor`.
 
-    Sleepers every 0.6 m; overhead-line masts every 50 to 60 m, fence posts every 2.4 to 4 m, cable lids
-    every 9 to 16 m, each period constant within a stretch; platform lamps every 15 m. Vegetation,
-    houses, signals, crossings and stations occur once. At 25 frames per second the reference moves
-    about 0.49 m per frame on average (seed 0: 4195 frames).
+    Sleepers every 0.6 m; overhead-line masts every 50 to 60 m, fence posts every 2.4 to 4 m, cable lids every
+    9 to 16 m, each with a constant period per segment; platform lamps every 15 m. Vegetation, houses,
+    signals, crossings and stations do not repeat. The reference moves 0.49 m per frame on average (seed 0:
+    4195 frames).
 
     Metres right of the camera's track: the other track 4, signals 6.6, fence 7.4, bushes -7.8 and 8.2, trees
     -11 and 12.5, houses -26 and 30. Two or three platforms of 150 m from -1.65 to -7, 0.9 above the rails;
     masts at -3.4, 7 high.
 
-    Args: those of `Railway`; the reference cruises at 17 m/s.
-
-    Example:
-        >>> Outdoor(traverse=1, frames=40).distance[-1].item() < 2000
-        True
+    Args: as for `Railway`; the reference cruises at 17 m/s.
     """
 
     kind = "outdoor"
@@ -53,7 +49,7 @@ class Outdoor(Railway):
             ("fence post", (2.4, 4.0), (150, 400), (40, 160)),
             ("cable lid", (9, 16), (200, 500), (60, 200)),
         ):
-            structures += scenery.stretches(random, name, self.route, *ranges)
+            structures += scenery.periodic_segments(random, name, self.route, *ranges)
         for start in stations:
             lamps = round(start + 6, 2), round(start + STATION, 2)
             structures.append(Structure("platform lamp", 15.0, *lamps))
@@ -73,7 +69,7 @@ class Outdoor(Railway):
         at = random.scattered(20, self.end, (45, 170))
         yield Thing("signals", 0, 1.3, random.pick(("9aa39b", "c0b59a")), at, 0.9, 0.6)  # cabinets
         at = world.away(random.scattered(200, self.end, (420, 800)), 20)
-        if len(at):  # level crossings: the road with its line, the rails on it and its signs
+        if len(at):  # level crossings: road, centre line, rails and signs
             yield Thing("ground", 0, 2 * HALF, "4b4c4f", at, 7.0)
             yield Thing("ground", 0, HALF - 2, "e8e6dc", at + 3.4, 0.25)
             for x in TRACKS:
@@ -87,7 +83,7 @@ class Outdoor(Railway):
         yield Thing("train", 0.3, 3.9, body, nose, 76, 2.8)
         yield Thing("train", 2.0, 3.1, "1c232c", nose, 76, 2.6)
         yield Thing("train", 3.9, 4.1, "5a5d60", nose, 76, 2.8)
-        if self.traverse % 2:  # the sun is out: shadows of the masts, and of what stands on the right
+        if self.traverse % 2:  # sunshine: shadows of the masts, and from the right
             for mast in (s for s in world.structures if s.name == "mast"):
                 yield Thing("ground", HALF - 3.4, HALF + 9, "101418", mast.at + 1.5, 0.35, opacity=0.5)
             at = random.scattered(0, self.end, (5, 22))
@@ -106,10 +102,9 @@ class Outdoor(Railway):
 
 
 def _pieces(structure: Structure, random: Random, route: float) -> Iterator[Thing]:
-    """What a structure consists of."""
     at, name = structure.at, structure.name
     if name == "sleeper":
-        for x in reversed(TRACKS):  # where two share a pixel, the camera's own track is painted last
+        for x in reversed(TRACKS):  # the camera's own track is painted last, over the other
             yield Thing("ground", x + HALF - 1.3, x + HALF + 1.3, "b5aea2", at, 0.26)
         for x in TRACKS:
             yield from scenery.rails("ground", x + HALF, route)
@@ -130,7 +125,7 @@ def _pieces(structure: Structure, random: Random, route: float) -> Iterator[Thin
 
 
 def _station(start: float, random: Random) -> Iterator[Thing]:
-    """A platform with its edge and signs, behind it a low wall and a house with windows."""
+    """A platform with its edge and signs, a low wall and a house with windows."""
     yield Thing("edge", 0, 1.1, "8d8a84", start, STATION)
     yield Thing("edge", 0.95, 1.1, "e8e4d8", start, STATION)
     paving = random.pick(("a39e96", "8f8078", "b3aca0"))
@@ -191,7 +186,7 @@ def _sheets(random: Random, end: float) -> dict[str, Sheet]:
 
 
 def _ground(random: Random, columns: int) -> Tensor:
-    """Ballast under the tracks, a path beside them and grass beyond, (4,V,S)."""
+    """Ballast under the tracks, a path next to them and grass beyond, (4,V,S)."""
     size = round(2 * HALF / CELL[0]), columns
     x = ((torch.arange(size[0]) + 0.5) * CELL[0] - HALF)[:, None]
     off = torch.stack([(x - track).abs() for track in TRACKS]).amin(0)
@@ -213,7 +208,7 @@ def _ground(random: Random, columns: int) -> Tensor:
 def _growth(
     random: Random, end: float, height: float, cell: Range, leaves: tuple[str, str], bare: float
 ) -> Tensor:
-    """Bushes or trees seen from the side, (4,V,S), row 0 at the foot; bare is the part without any."""
+    """Bushes or trees from the side, (4,V,S), row 0 at the foot; bare is the fraction without any."""
     rows, columns = round(height / cell[0]), round(end / cell[1])
     y = ((torch.arange(rows) + 0.5) * cell[0])[:, None]
     crowns = random.texture(1, columns, 0.9 * height / cell[1])[0]
@@ -228,7 +223,7 @@ def _growth(
 
 
 def _paint_houses(random: Random, texture: Tensor, cell: Range, end: float) -> None:
-    """Buildings with rows of windows, painted into a side texture in place."""
+    """Paint buildings with rows of windows into a side texture, in place."""
     for s in random.scattered(0, end, (25, 140)).tolist():
         width, height = random.uniform(9, 34), random.uniform(4, 10)
         colour = rgb(random.pick(("c9bda3", "a2553f", "d8d4cc", "8a8f98", "c48f5a", "e2d9b8")))

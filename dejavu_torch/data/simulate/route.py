@@ -1,4 +1,4 @@
-"""What every simulated route shares: checked options, an address, frames on demand, repeatable draws."""
+"""The base of all simulated routes: checked options, an address, frames on demand, reproducible draws."""
 
 from __future__ import annotations
 
@@ -22,40 +22,38 @@ _T = TypeVar("_T")
 
 
 def option(default: float, low: float, high: float = math.inf) -> Any:
-    """A field with its default, least and greatest value; it takes whole numbers where the default is one."""
+    """A field with its default, minimum and maximum; only whole numbers are valid if the default is one."""
     return field(default=default, metadata={"span": (low, high)})
 
 
 def choice(*names: str) -> Any:
-    """A field that takes one of these names, the first by default."""
+    """A field with one of these names as value, the first by default."""
     return field(default=names[0], metadata={"names": names})
 
 
 class SimulatedRoute(IndexedTraverse):
-    """A route drawn by the computer, so that the true place of every frame is known.
+    """A simulated route: the true place of every frame is known.
 
-    A subclass is a dataclass whose fields are each an `option` or a `choice`, `seed` and `traverse` among
-    them. It sets `length` and `place` and draws frames in `_frames`, each from its number and the options
-    alone.
+    A subclass is a dataclass of `option` and `choice` fields, including `seed` and `traverse`. It sets
+    `length` and `place`, and draws each frame in `_frames` from its number and the options only.
     """
 
-    kind: ClassVar[str]  # its name, as in `sim:KIND?seed=0`
+    kind: ClassVar[str]  # as in `sim:KIND?seed=0`
     ordered: ClassVar[bool] = True  # type: ignore[misc]
     length: int
     place: Tensor
 
     def __post_init__(self) -> None:
-        """Refuse options out of their span, and name the route by those that differ from their defaults."""
+        """Check the options, and name the route by those that differ from their defaults."""
         address = []
         for entry in fields(self):  # type: ignore[arg-type]  # a subclass is a dataclass
             key, default = entry.name, getattr(type(self), entry.name)
             value = getattr(self, key)
-            wanted = _problem(key, value, default, entry.metadata)
-            if wanted:
-                raise InputError(f"sim:{self.kind} has {key}={value}; expected {wanted}")
+            if expected := _expected(key, value, default, entry.metadata):
+                raise InputError(f"sim:{self.kind} has {key}={value}; expected {expected}")
             value = type(default)(value)
             setattr(self, key, value)
-            # frames=0 is the whole route; any other number of frames is part of the name
+            # the name includes the number of frames, unless 0: the whole route
             if key in ("seed", "traverse") or value != (0 if key == "frames" else default):
                 address.append(f"{key}={value}")
         self.name = f"sim:{self.kind}?" + "&".join(address)
@@ -65,10 +63,10 @@ class SimulatedRoute(IndexedTraverse):
         """Draw the frames with these numbers. Shape: (B,) int64 -> (B,3,H,W) float32 in [0,1]."""
 
     def __reduce__(self) -> Any:
-        # without what was drawn already
+        # without the scenery drawn so far
         return type(self), tuple(getattr(self, entry.name) for entry in fields(self))  # type: ignore[arg-type]
 
-    @cached_property  # a frame takes long to draw
+    @cached_property  # drawing a frame is slow
     def frame_shape(self) -> tuple[int, ...]:
         return super().frame_shape
 
@@ -76,8 +74,8 @@ class SimulatedRoute(IndexedTraverse):
         return self._frames(torch.arange(frames.start, frames.stop, frames.step))
 
 
-def _problem(key: str, value: object, default: object, allowed: Mapping[str, Any]) -> str:
-    """What is expected of an option, where its value is something else."""
+def _expected(key: str, value: object, default: object, allowed: Mapping[str, Any]) -> str:
+    """The valid values of an option; "" if its value is one of them."""
     if "names" in allowed:
         return "" if value in allowed["names"] else " or ".join(allowed["names"])
     low, high = allowed["span"]
@@ -89,7 +87,7 @@ def _problem(key: str, value: object, default: object, allowed: Mapping[str, Any
 
 
 class Random:
-    """Draws that depend on the key alone and never touch torch's global generator."""
+    """Draws that depend on the key only, independent of torch's global generator."""
 
     def __init__(self, *key: object) -> None:
         digest = blake2b(repr(key).encode(), digest_size=4).digest()
@@ -105,7 +103,7 @@ class Random:
         return torch.randn(shape, generator=self.generator)
 
     def texture(self, height: int, width: int, cell: float) -> Tensor:
-        """Smooth noise of unit variance: 4 octaves from `cell` pixels down, halved each. (height, width)."""
+        """Smooth noise (height, width) of unit variance: 4 octaves, the coarsest of `cell` pixels."""
         total = torch.zeros(height, width)
         for k in range(4):
             knots = self.normal(1, 1, *(2 + int(n * 2**k / cell) for n in (height, width)))
@@ -113,7 +111,7 @@ class Random:
         return total / total.std()
 
     def scattered(self, start: float, stop: float, gap: tuple[float, float]) -> Tensor:
-        """Increasing positions without a period, gaps drawn from this range, (n,) float64, at least one."""
+        """Aperiodic increasing positions with gaps drawn from this range, (n,) float64, at least one."""
         found = [start + self.uniform(0, gap[1])]
         while (after := found[-1] + self.uniform(*gap)) < stop:
             found.append(after)

@@ -1,7 +1,7 @@
-"""What railways are built of: structures that repeat with a period, textures, rails, waiting people.
+"""Scenery of railways: periodic structures, textures, rails, waiting people.
 
-Cross-sections are in metres from the camera, which looks along the middle of its track: x to the right,
-y up. These figures are frozen: results are measured on them.
+Cross-sections are in metres from the camera, which looks along the centre of its track: x right, y up.
+These values are frozen: results are measured on them.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from torch import Tensor
 from dejavu_torch.data.simulate.route import Random, rgb
 from dejavu_torch.data.simulate.sheets import FAR, Sheet, Thing
 
-RAIL = -2.4  # where the top of the rails would be: platforms are measured from here
-FOOT = RAIL - 0.2  # the track bed, flat, with sleepers and rails painted on it
-GAUGE = 1.5  # from the middle of one rail to that of the other
-STATION = 150.0  # metres of platform
+RAIL = -2.4  # height of the top of the rails, the datum of platforms
+FOOT = RAIL - 0.2  # height of the flat track bed, with sleepers and rails painted on it
+GAUGE = 1.5  # between the centres of the rails
+STATION = 150.0  # length of a platform
 
 Range = tuple[float, float]
 
 
 class Structure(NamedTuple):
-    """Something that repeats along the track from start, and short of stop, with a period; all in metres."""
+    """Objects that repeat along the track in [start, stop) with a period; all in metres."""
 
     name: str
     period: float
@@ -34,28 +34,28 @@ class Structure(NamedTuple):
 
     @property
     def at(self) -> Tensor:
-        """Where each one stands, (n,) float64 metres."""
+        """The position of each object, (n,) float64 metres."""
         count = int((self.stop - self.start) / self.period - 1e-9) + 1
         return self.start + self.period * torch.arange(count, dtype=torch.float64)
 
 
 class World(NamedTuple):
-    """A railway: its sheets nearest first, what repeats, where each station's platform begins."""
+    """A railway: its sheets, nearest first, what repeats, and the start of each station's platform."""
 
     sheets: dict[str, Sheet]
     structures: tuple[Structure, ...]
     stations: tuple[float, ...]
 
     def away(self, at: Tensor, margin: float) -> Tensor:
-        """Those of the positions that lie further than this from every platform."""
+        """The positions farther than `margin` from every platform."""
         clear = [not any(s - margin < x < s + STATION + margin for s in self.stations) for x in at.tolist()]
         return at[torch.tensor(clear)]
 
 
-def stretches(
+def periodic_segments(
     random: Random, name: str, route: float, period: Range, length: Range, gap: Range
 ) -> Iterator[Structure]:
-    """Stretches with a period each, drawn from these ranges, with gaps between them."""
+    """Segments of the route, each with its own period, and gaps between them, drawn from these ranges."""
     start = random.uniform(5, 5 + gap[1])
     while start < route:
         stop = min(start + random.uniform(*length), route + FAR)
@@ -64,14 +64,14 @@ def stretches(
 
 
 def rails(sheet: str, middle: float, route: float) -> Iterator[Thing]:
-    """The two rails of a track, on a sheet of ground, around this middle."""
+    """The two rails of a track on a sheet of ground."""
     for x in (middle - GAUGE / 2, middle + GAUGE / 2):
         yield Thing(sheet, x - 0.09, x + 0.09, "3d2f28", -FAR, route + 3 * FAR)
         yield Thing(sheet, x - 0.035, x + 0.035, "c3c6cc", -FAR, route + 3 * FAR)
 
 
 def people(world: World, random: Random, groups: int, foot: float, neck: float) -> Iterator[Thing]:
-    """Groups of people waiting along every platform, in coats from foot to neck, metres on their sheet."""
+    """Groups of people waiting along every platform; foot and neck in metres on their sheet."""
     for start in world.stations:
         for _ in range(groups):
             at = random.scattered(start + 3, start + STATION - 10, (4, 40))
@@ -81,13 +81,13 @@ def people(world: World, random: Random, groups: int, foot: float, neck: float) 
 
 
 def broad(random: Random, rows: int, columns: int, cell: float) -> Tensor:
-    """Smooth noise, interpolated from a quarter of the size, (V,S)."""
+    """Smooth noise (V,S), interpolated from a quarter of its size."""
     small = random.texture(rows // 4 + 1, columns // 4 + 1, cell / 4)
     return F.interpolate(small[None, None], (rows, columns), mode="bilinear")[0, 0]
 
 
 def mottled(random: Random, colour: str, rows: int, columns: int, rough: float, patchy: float) -> Tensor:
-    """Colour with a fine grain and larger patches, (3,V,S)."""
+    """A colour with fine grain and larger patches, (3,V,S)."""
     grain = rough * random.normal(rows, columns) + patchy * broad(random, rows, columns, 24.0)
     return rgb(colour) * (1 + grain)
 

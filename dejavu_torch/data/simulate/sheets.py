@@ -1,8 +1,7 @@
-"""A world along a straight track: flat sheets with objects on them, and the painter that draws frames of it.
+"""Renders frames of a straight track: flat sheets along it, with boxes on them.
 
-Metres: s along the track, x to the right and y up from the camera's mean position. A sheet runs along
-the whole track, so each pixel's ray meets it at a constant distance ahead, and a frame taken at s is one
-lookup per sheet at s + that distance, composited front to back.
+Metres: s along the track, x right and y up from the camera's mean position. Each pixel's ray meets a sheet at
+a constant distance ahead, so a frame is one lookup per sheet at s + that distance, composited front to back.
 """
 
 from __future__ import annotations
@@ -17,22 +16,18 @@ from torch import Tensor
 
 from dejavu_torch.data.simulate.route import rgb
 
-FAR = 240.0  # metres ahead beyond which everything is haze
-FOCAL = 0.55  # focal length, of the frame's width: 85 degrees across
-HORIZON = 0.38  # how far down the frame the horizon lies, of its height
+FAR = 240.0  # metres ahead; nothing is drawn beyond
+FOCAL = 0.55  # focal length in frame widths: 85 degrees horizontally
+HORIZON = 0.38  # distance of the horizon from the top of the frame, in frame heights
 
 Point = tuple[float, float]
 
 
 class View:
-    """The rays of a pinhole camera that looks along the track, row by row.
-
-    Args:
-        height, width: of the image in pixels.
-        margin: rows and columns beyond it on every side.
+    """The rays of a pinhole camera looking along the track; sizes in pixels, the margin on every side.
 
     Attributes:
-        up, right: (P,) metres by which each pixel's ray rises and moves aside per metre ahead.
+        up, right: (P,) slopes of each pixel's ray, row by row, metres per metre ahead.
     """
 
     def __init__(self, height: int, width: int, margin: int = 0) -> None:
@@ -45,7 +40,7 @@ class View:
         self.up, self.right = (t.flatten() for t in torch.meshgrid(up, right, indexing="ij"))
 
     def project(self, x: float, y: float, ahead: float) -> Point:
-        """Where a point is seen: (0, 0) the centre of the top left pixel, (1, 1) of the bottom right one."""
+        """Image coordinates of a point: (0, 0) at the centre of the top left pixel, (1, 1) bottom right."""
         height, width = self.size
         across = 0.5 * width + x / ahead / self.pixel
         down = HORIZON * height - y / ahead / self.pixel
@@ -53,41 +48,31 @@ class View:
 
 
 class Rays(NamedTuple):
-    """Where the rays of one view meet one sheet; each (P,)."""
+    """Intersections of the rays of a view with a sheet; each (P,)."""
 
     pixels: Tensor
     ahead: Tensor  # metres along the track
     across: Tensor  # metres from the sheet's first edge
     skew: Tensor  # metres across per metre ahead
     slope: Tensor  # metres ahead per metre towards the camera's path
-    wide: Tensor  # pixel's extent along the track, metres
+    wide: Tensor  # extent of the pixel along the track, metres
     tall: Tensor  # and across
-    detail: list[tuple[int, int, Tensor]]  # texture levels, each with the rays that read it
+    detail: list[tuple[int, int, Tensor]]  # texture levels, each with the rays that use it
 
 
 @dataclass(eq=False)
 class Thing:
-    """Equal boxes that stand on a sheet, one at each position along the track.
+    """Equal boxes on a sheet, one at each position along the track; lengths in metres."""
 
-    Args:
-        sheet: its name.
-        low, high: extent across the sheet, in metres from its first edge.
-        colour: rrggbb.
-        at: (n,) increasing positions, or one, in metres, of the side that faces the camera.
-        length: metres along the track.
-        depth: metres by which the box rises from the sheet towards the camera's path.
-        opacity: 0 to 1. lit: True for what shines by itself.
-    """
-
-    sheet: str
-    low: float
+    sheet: str  # name
+    low: float  # extent across the sheet, from its first edge
     high: float
-    colour: str
-    at: Tensor | float
-    length: float
-    depth: float = 0.0
+    colour: str  # rrggbb
+    at: Tensor | float  # (n,) increasing positions, or one, of the side that faces the camera
+    length: float  # along the track
+    depth: float = 0.0  # height over the sheet, towards the camera's path
     opacity: float = 1.0
-    lit: bool = False
+    lit: bool = False  # emits light
 
     def __post_init__(self) -> None:
         at = torch.as_tensor(self.at, dtype=torch.float64).flatten()
@@ -95,52 +80,44 @@ class Thing:
         self._at = torch.cat([torch.tensor([-math.inf]), at.float()])
         self._gap = float(at.diff().min()) if len(at) > 1 else math.inf
         self.first = float(at[0])
-        # seen from FAR ahead, a box hides what lies behind it
-        self.last = float(at[-1]) + self.length + (FAR if self.depth else 0)
+        self.last = float(at[-1]) + self.length + (FAR if self.depth else 0)  # its face hides more
 
     def _last(self, s: Tensor) -> tuple[Tensor, Tensor]:
-        """How many stand at s or before, and metres from the last of them, infinite where there is none."""
+        """The number of boxes up to s, and the distance to the last of them, infinite for none."""
         count = torch.searchsorted(self._at, s.contiguous(), right=True) - 1
         return count, s - self._at[count]
 
     def cover(self, s: Tensor, half: Tensor, slope: Tensor) -> Tensor:
-        """The part of [s - half, s + half] that the boxes hide, a metre of depth `slope` metres of it."""
+        """The fraction of [s - half, s + half] that boxes hide; a metre of depth hides `slope` metres."""
         extent = (self.length + self.depth * slope).clamp(max=self._gap)
         (first, before), (second, after) = self._last(s - half), self._last(s + half)
         before, after = torch.minimum(before, extent), torch.minimum(after, extent)
         return (((second - first) * extent + after - before) / (2 * half)).clamp(0, 1)
 
-    def draw(
-        self, rays: Rays, place: Tensor, across: Tensor, half: Tensor, paint: Tensor, alpha: Tensor
-    ) -> None:
+    def draw(self, rays: Rays, s: Tensor, across: Tensor, half: Tensor, paint: Tensor, alpha: Tensor) -> None:
         """Paint the boxes over their sheet, in place."""
-        rise = self.depth * rays.slope  # metres of sheet that the box's face hides
+        rise = self.depth * rays.slope  # metres of the sheet hidden by the box's face
         top = rays.across - rays.skew * rise
         reach = rays.tall + 0.5
         near = torch.maximum(rays.across, top) > self.low - reach
         here = (near & (torch.minimum(rays.across, top) < self.high + reach)).nonzero().flatten()
         if len(here):
-            s, met = place[:, here], across[:, here]
+            s, across = s[:, here], across[:, here]
             cover = self.cover(s, half[:, here], rays.slope[here])
-            if self.depth:  # the ray meets the box before it meets the sheet
-                met = met - rays.skew[here] * torch.minimum(self._last(s)[1], rise[here])
-            cover = (cover * _within(met, rays.tall[here], self.low, self.high) * self.opacity)[:, None]
+            if self.depth:  # the ray meets the box before the sheet
+                across = across - rays.skew[here] * torch.minimum(self._last(s)[1], rise[here])
+            cover = (cover * _within(across, rays.tall[here], self.low, self.high) * self.opacity)[:, None]
             paint[:, :, here] = torch.lerp(paint[:, :, here], self._paint, cover)
             alpha[:, :, here] = torch.lerp(alpha[:, :, here], torch.ones(()), cover)
 
 
 class Light(NamedTuple):
-    """What a traverse's light does to a world.
+    """The light of a traverse."""
 
-    lamp: strength of the headlight next to the train; it falls off over `reach` metres.
-    ambient: (S,) light along the track, one value per metre. haze: (3,1) what distance fades into.
-    fade: metres over which it does.
-    """
-
-    lamp: float
+    lamp: float  # strength of the headlight next to the train, which falls off over `reach` metres
     reach: float
-    ambient: Tensor
-    haze: Tensor
+    ambient: Tensor  # (S,) light along the track, one value per metre
+    haze: Tensor  # (3,1) colour of the distance, reached over `fade` metres
     fade: float
 
     def at(self, ahead: Tensor, s: Tensor) -> Tensor:
@@ -151,10 +128,10 @@ class Light(NamedTuple):
 
 
 class Sheet:
-    """A flat strip along the track, from edge a to edge b of its cross-section.
+    """A flat strip along the track.
 
     Args:
-        a, b: (x, y) in metres.
+        a, b: (x, y) in metres, the edges of its cross-section.
         texture: (4,V,S) float32, colour times opacity and opacity, or None for an invisible sheet.
         cell: metres of one texture cell across and along.
     """
@@ -184,7 +161,7 @@ class Sheet:
         return Rays(pixels, ahead, across, skew, slope, tall * slope, tall, self._detail(tall * slope, tall))
 
     def _detail(self, wide: Tensor, tall: Tensor) -> list[tuple[int, int, Tensor]]:
-        """The levels whose texels are as large as the pixels, and which rays read each."""
+        """The levels whose texels are as large as the pixels, and the rays that use each."""
         if not self._levels:
             return []
         levels = [(a / b).log2().round().clamp(0, 6) for a, b in zip((tall, wide), self.cell, strict=True)]
@@ -202,59 +179,56 @@ class Sheet:
         aside, shift = ((sway[:, :1] * x + sway[:, 1:] * y).float() for x, y in (self.normal, self.along))
         ahead = rays.ahead * (1 - aside / self.distance)
         across = rays.across + rays.skew * (ahead - rays.ahead) + shift
-        where = s[:, None] + ahead.double()
-        place = where.float()
+        exact = s[:, None] + ahead.double()
+        place = exact.float()
         paint, alpha = torch.zeros(len(s), 3, len(rays.pixels)), torch.zeros(len(s), 1, len(rays.pixels))
         for down, along, here in rays.detail:
             image = self._level(down, along)
-            u = where[:, here] / (self.cell[1] * 2**along)
+            u = exact[:, here] / (self.cell[1] * 2**along)
             v = across[:, here] / (self.cell[0] * 2**down)
             grid = torch.stack([(2 * u / image.shape[2] - 1).float(), 2 * v / image.shape[1] - 1], -1)
-            texels = F.grid_sample(
-                image.expand(len(s), -1, -1, -1), grid[:, None], padding_mode="border", align_corners=False
-            )[:, :, 0]
+            images = image.expand(len(s), -1, -1, -1)
+            texels = F.grid_sample(images, grid[:, None], padding_mode="border", align_corners=False)[:, :, 0]
             inside = _within(across[:, here], rays.tall[here], 0.0, self.size)[:, None]
             paint[:, :, here], alpha[:, :, here] = texels[:, :3] * inside, texels[:, 3:] * inside
         half = (rays.wide + step[:, None].float()) / 2
         near, far = float(s.min()), float(s.max()) + FAR
-        live = [thing for thing in self.things if thing.first < far and thing.last > near]
-        for thing in live:
-            if not thing.lit:
-                thing.draw(rays, place, across, half, paint, alpha)
         fog = torch.exp(-rays.ahead / light.fade)
-        paint = paint * (light.at(ahead, place) * fog)[:, None] + alpha * (1 - fog) * light.haze
-        for thing in live:
-            if thing.lit:
-                thing.draw(rays, place, across, half, paint, alpha)
+        for lit in (False, True):  # things that emit light are not shaded
+            for thing in self.things:
+                if thing.lit == lit and thing.first < far and thing.last > near:
+                    thing.draw(rays, place, across, half, paint, alpha)
+            if not lit:
+                paint = paint * (light.at(ahead, place) * fog)[:, None] + alpha * (1 - fog) * light.haze
         return paint, alpha
 
 
 def _within(across: Tensor, tall: Tensor, low: float, high: float) -> Tensor:
-    """The part of each pixel within [low, high] across the sheet."""
+    """The fraction of each pixel within [low, high] across the sheet."""
     top, bottom = (across + tall / 2).clamp(max=high), (across - tall / 2).clamp(min=low)
     return ((top - bottom) / tall).clamp(0, 1)
 
 
 class Painter:
-    """Draws the frames of one view on a list of sheets, nearest first, and the sky (3,P) behind them."""
+    """Draws frames of a view of sheets, nearest first, and the sky (3,P) behind them."""
 
     def __init__(self, view: View, sheets: list[Sheet], light: Light, sky: Tensor) -> None:
         self.view, self.sheets, self.light, self.sky = view, sheets, light, sky
         self._rays = [sheet.rays(view) for sheet in sheets]
 
     def draw(self, s: Tensor, step: Tensor, sway: Tensor) -> Tensor:
-        """Frames (B,3,H,W), of the view's shape.
+        """Frames (B,3,H,W) of the view's shape.
 
         Args:
-            s: (B,) float64 metres. step: (B,) metres that the camera moves during the exposure.
-            sway: (B,2) metres of the camera right and up of its mean.
+            s: (B,) float64 metres. step: (B,) metres of motion during the exposure.
+            sway: (B,2) metres right and up of the camera's mean position.
         """
         colour = torch.zeros(len(s), *self.sky.shape)
         clear = torch.ones(len(s), 1, self.sky.shape[1])
         for sheet, rays in zip(self.sheets, self._rays, strict=True):
             if len(rays.pixels):
                 paint, alpha = sheet.draw(rays, self.light, s, step, sway)
-                left = clear[:, :, rays.pixels]
-                colour[:, :, rays.pixels] += left * paint
-                clear[:, :, rays.pixels] = left * (1 - alpha)
+                rest = clear[:, :, rays.pixels]
+                colour[:, :, rays.pixels] += rest * paint
+                clear[:, :, rays.pixels] = rest * (1 - alpha)
         return (colour + clear * self.sky).view(len(s), 3, *self.view.shape)

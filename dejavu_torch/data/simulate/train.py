@@ -1,4 +1,4 @@
-"""A camera on the front of a train: its ride, its sway and its light, whatever the railway."""
+"""A camera on the front of a train: its motion, sway and light on any railway."""
 
 from __future__ import annotations
 
@@ -22,44 +22,39 @@ from dejavu_torch.types import InputError
 
 FPS = 25.0
 ACCELERATION = 0.9  # metres per second squared, the same for braking
-GRAIN = 0.125  # metres; the speed is planned on this grid
-EXPOSURE = 0.4  # part of a frame's time during which the shutter is open
-LEFT, RIGHT, AHEAD = 1.4, 2.4, 12.0  # metres: a strip of ground beside the sleepers, and how far it extends
+GRAIN = 0.125  # metres; grid of the speed profile
+EXPOSURE = 0.4  # fraction of a frame's time in which the shutter is open
+LEFT, RIGHT, AHEAD = 1.4, 2.4, 12.0  # metres: sides and far edge of a strip of ground next to the sleepers
 
 
 @dataclass(eq=False)
 class Railway(SimulatedRoute):
-    """A ride along a railway; a subclass builds the railway and says how it is lit.
+    """A train ride; a subclass builds the railway and its light.
 
-    The camera takes 25 frames a second, 2.6 m above the track bed and 2.4 m above the level of the rails,
-    with square pixels, a focal length of 0.55 frame widths and its horizon at 0.38 of the frame's height;
-    the shutter is open for 0.4 of a frame's time. The train speeds up and brakes by 0.9 m/s^2, crawls twice
-    and stops once, on odd traverses twice.
+    The camera takes 25 frames per second, 2.6 m above the track bed and 2.4 m above the rails, with square
+    pixels, a focal length of 0.55 frame widths, the horizon at 0.38 of the frame's height and an exposure of
+    0.4 frame times. The train accelerates and brakes by 0.9 m/s^2, slows down twice and stops once, on odd
+    traverses twice.
 
     Args:
-        seed: chooses the railway, at least 0.
-        traverse: chooses the ride, 0 to 9, with its own speeds and stops, light, sway, people and trains; 0
-            is the reference.
+        seed: selects the railway, at least 0.
+        traverse: selects the ride, 0 to 9, its speeds, stops, light, sway, people, trains; 0: the reference.
         frames: number of frames from the start; 0 for the whole route.
-        height, width: of a frame in pixels, 16 to 512 and 16 to 1024; half to 4 times as wide as high.
-        speed: metres per second at which the reference cruises, 5 to 40; other rides, at 0.85 to 1.2 of it.
-        noise: standard deviation of the sensor noise, 0 to 1, on the scale where white is 1.
-        shake: how much the camera sways, 0 to 3; 1 moves it up to 6 cm aside and 0.5 degrees in roll, the
-            reference's half as much.
+        height, width: of a frame in pixels, 16 to 512 and 16 to 1024; the width 0.5 to 4 times the height.
+        speed: cruising speed of the reference in m/s, 5 to 40; other rides have 0.85 to 1.2 of it.
+        noise: standard deviation of the sensor noise, 0 to 1; white is 1.
+        shake: camera sway, 0 to 3; 1 is up to 6 cm sideways and 0.5 degrees of roll, half that at traverse 0.
 
     Attributes:
         distance: (N,) float64, metres along the track of each frame.
-        place: (N,) float64, the same in units of reference frames; where the reference stands still,
-            the first frame of the stop, and past its last frame, that one.
+        place: (N,) float64, the same in reference frames: of a stop the first one, at most the last one.
         structures: what repeats, each with its name, period, start and stop in metres.
-        corners: (x, y) of the corners of a strip of ground: far left, far right, near right, near left, in
-            fractions of the frame, (0, 0) the centre of its top left pixel and (1, 1) of its bottom right
-            one. It lies 1.4 to 2.4 m to the right, beside the sleepers, and reaches from where all of it is
-            in sight to 12 m ahead; sway and roll are left out.
-        ground_span: metres along the track from that strip's near edge to its far one.
+        corners: (x, y) of a strip of ground in fractions of the frame as in `View.project`: far left, far
+            right, near right, near left. It is 1.4 to 2.4 m right of the camera, next to the sleepers, from
+            the first point in view up to 12 m ahead, without sway and roll.
+        ground_span: length of that strip along the track in metres.
 
-    Convention: all of these figures, and those of the scenery, are frozen: results are measured on these
-        routes.
+    Convention: these values, and those of the scenery, are frozen: results are measured on these routes.
     """
 
     seed: int = option(0, 0)
@@ -86,20 +81,18 @@ class Railway(SimulatedRoute):
         self.size = self.height, self.width
         self.length = self.frames or len(distance)
         self.distance = distance[: self.length]
-        self.place = torch.arange(self.length).double()
-        if self.traverse:
-            self.place = reference_place(reference, self.distance)
+        numbers = torch.arange(self.length).double()
+        self.place = reference_place(reference, self.distance) if self.traverse else numbers
         self._step = distance.diff(append=distance[-1:])[: self.length] * EXPOSURE
         self._paths = self._wander(len(distance))
         view = View(*self.size)
-        # a little above the bottom row, and where all of it is in sight
-        near = 1.05 * max(FOOT / float(view.up.min()), RIGHT / float(view.right.max()))
+        near = 1.05 * max(FOOT / float(view.up.min()), RIGHT / float(view.right.max()))  # margin 5 %
         corners = (LEFT, AHEAD), (RIGHT, AHEAD), (RIGHT, near), (LEFT, near)
         self.corners = tuple(view.project(x, FOOT, ahead) for x, ahead in corners)
         self.ground_span = AHEAD - near
 
     def _ride(self, traverse: int) -> Tensor:
-        """Metres of each frame of a traverse over the whole route."""
+        """The position of each frame of a traverse over the whole route, metres."""
         random, route = Random(self.kind, "ride", self.seed, traverse), self.route
         cruise = self.speed * (random.uniform(0.85, 1.2) if traverse else 1.0)
         slow = []
@@ -126,8 +119,7 @@ class Railway(SimulatedRoute):
 
     @property
     def end(self) -> float:
-        """Where the scenery ends, in sight of the last frame."""
-        return self.route + FAR
+        return self.route + FAR  # metres: the last frame sees the scenery up to here
 
     @cached_property
     def _world(self) -> World:
@@ -140,27 +132,23 @@ class Railway(SimulatedRoute):
         return world
 
     @abstractmethod
-    def _build(self, random: Random) -> World:
-        """The railway that all traverses of a seed meet, nothing on its sheets yet."""
+    def _build(self, random: Random) -> World: ...  # without anything on its sheets
 
     @abstractmethod
-    def _things(self, world: World, random: Random) -> Iterator[Thing]:
-        """What stands on its sheets."""
+    def _things(self, world: World, random: Random) -> Iterator[Thing]: ...  # in every traverse
 
     @abstractmethod
-    def _visitors(self, world: World, random: Random) -> Iterator[Thing]:
-        """What this traverse alone meets."""
+    def _visitors(self, world: World, random: Random) -> Iterator[Thing]: ...  # in this traverse only
 
     @abstractmethod
     def _light(self, world: World) -> Light: ...
 
     @abstractmethod
-    def _sky(self, view: View, random: Random) -> Tensor:
-        """What lies behind everything, (3,P)."""
+    def _sky(self, view: View, random: Random) -> Tensor: ...  # the background (3,P)
 
     @cached_property
     def _painter(self) -> Painter:
-        """Draws frames with a margin, from which pitch, yaw and roll cut them out."""
+        """Draws frames with a margin for pitch, yaw and roll."""
         view = View(*self.size, margin=math.ceil(0.05 * max(self.size)))
         sky = self._sky(view, Random(self.kind, "light", self.seed, self.traverse))
         return Painter(view, list(self._world.sheets.values()), self._light(self._world), sky)
@@ -169,22 +157,21 @@ class Railway(SimulatedRoute):
         path = {name: curve[at] for name, curve in self._paths.items()}
         swing = self.shake * (1.0 if self.traverse else 0.5)
         sway = swing * torch.stack([0.06 * path["aside"], 0.04 * path["lift"]], 1)
-        seen = self._painter.draw(self.distance[at], self._step[at], sway)
-        seen = self._turned(seen, swing, path)
+        seen = self._rotated(self._painter.draw(self.distance[at], self._step[at], sway), swing, path)
         random = Random(self.kind, "looks", self.seed, self.traverse)
         looks = [random.pick(values) for values in ((0.72, 0.82, 1.18), (0.85, 1.18), (-0.09, 0.09))]
         gain, gamma, warm = looks if self.traverse else (1.0, 1.0, 0.0)
         warmth = warm + 0.02 * path["warm"]
         balance = torch.stack([1 + warmth, torch.ones_like(warmth), 1 - warmth], 1)
-        level = gain * (1 + 0.06 * path["gain"])
-        seen = (seen * (balance * level[:, None]).float()[:, :, None, None]).clamp(0, 1)
+        balance = balance * (gain * (1 + 0.06 * path["gain"]))[:, None]
+        seen = (seen * balance.float()[:, :, None, None]).clamp(0, 1)
         seen = seen ** (gamma + 0.03 * path["gamma"]).float()[:, None, None, None]
         for frame, i in zip(seen, at.tolist(), strict=True):
             frame += self.noise * Random(self.kind, "noise", self.seed, self.traverse, i).normal(*frame.shape)
         return seen.clamp_(0, 1)
 
-    def _turned(self, seen: Tensor, swing: float, path: dict[str, Tensor]) -> Tensor:
-        """The frames without their margin, shifted by pitch and yaw and turned by roll."""
+    def _rotated(self, seen: Tensor, swing: float, path: dict[str, Tensor]) -> Tensor:
+        """The frames without their margin, shifted by pitch and yaw and rotated by roll."""
         height, width = self.size
         roll = math.radians(0.5) * swing * path["roll"]
         reach = 0.012 * width * swing  # pixels
@@ -200,15 +187,14 @@ class Railway(SimulatedRoute):
 def ride(
     route: float, cruise: float, slow: Sequence[tuple[float, ...]], stops: Sequence[tuple[float, ...]]
 ) -> Tensor:
-    """Where a train is at each frame, (N,) float64 metres, from one end of a route to the other.
+    """The position of a train at each frame from one end of a route to the other, (N,) float64 metres.
 
     Args:
-        route: metres. cruise: metres per second.
-        slow: (start, stop, metres per second) of each slow section.
-        stops: (place in metres, seconds) of each full stop, in order.
+        route: metres. cruise: m/s. slow: (start, stop, m/s) of each slow section.
+        stops: (metres, seconds) of each full stop, in order.
     """
     s = np.arange(round(route / GRAIN) + 1) * GRAIN
-    square = np.full(len(s), cruise**2)  # square of the speed: it changes evenly along the track
+    square = np.full(len(s), cruise**2)  # of the speed: linear in s under constant acceleration
     for start, stop, speed in slow:
         square[(s >= start) & (s <= stop)] = speed**2
     nodes = np.arange(len(s))
@@ -218,8 +204,7 @@ def ride(
     square = np.minimum.accumulate(square - gain * nodes) + gain * nodes
     square = np.minimum.accumulate((square - gain * nodes[::-1])[::-1])[::-1] + gain * nodes[::-1]
     speed = np.sqrt(square)
-    taken = 2 * GRAIN / (speed[1:] + speed[:-1])
-    clock = np.concatenate([[0.0], np.cumsum(taken)])
+    clock = np.concatenate([[0.0], np.cumsum(2 * GRAIN / (speed[1:] + speed[:-1]))])
     for halt, (_, seconds) in reversed(list(zip(halts, stops, strict=True))):
         clock = np.concatenate([clock[: halt + 1], clock[halt:] + seconds])
         s = np.concatenate([s[: halt + 1], s[halt:]])
@@ -227,7 +212,7 @@ def ride(
 
 
 def reference_place(reference: Tensor, distance: Tensor) -> Tensor:
-    """The reference frame number at each distance, interpolated; of a stop the first frame.
+    """The interpolated reference frame at each distance; for a stop, its first frame.
 
     Shape: metres of the reference frames (N,), never decreasing, and distance (Q,) -> (Q,) float64.
     """

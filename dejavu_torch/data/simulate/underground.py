@@ -1,4 +1,4 @@
-"""The railway in a tunnel: an arched lining with its fittings, and wide bright stations."""
+"""An underground railway: an arched tunnel with its fittings, and wide bright stations."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from dejavu_torch.data.simulate.scenery import FOOT, RAIL, STATION, Structure, W
 from dejavu_torch.data.simulate.sheets import FAR, Light, Point, Sheet, Thing, View
 from dejavu_torch.data.simulate.train import Railway
 
-HALF = 2.5  # metres from the middle to the wall
-SPRING, CROWN, FLAT = 0.8, 2.1, 1.1  # heights where the arch begins and ends; half its flat top
+HALF = 2.5  # metres from the centre to the wall
+SPRING, CROWN, FLAT = 0.8, 2.1, 1.1  # heights of the foot and top of the arch; half its flat top
 EDGE, STEP, BACK = -1.6, RAIL + 1.0, -7.5  # a platform's edge, height and back wall
 ROOF = 3.2  # height of a station's ceiling
 CELL = (0.12, 0.25)  # metres of a texture cell across and along
@@ -27,21 +27,16 @@ LINING = ("ceiling", "wall left", "arch left", "wall right", "arch right")
 class Underground(Railway):
     """A train ride through 4 km of tunnel with four stations: `sim:underground`.
 
-    Sleepers every 0.75 m; stretches of lamps every 10 to 18 m, ribs every 4.5 to 8 m, panel joints every
-    2.4 to 3.6 m, cable brackets every 1.5 to 2.5 m and niches every 22 to 38 m, each period constant
-    within a stretch that starts and stops anywhere; in stations lights every 6 m and columns every 12 m.
-    Signs, cabinets, signals, cross passages and stains occur once. At 25 frames per second the
-    reference moves about 0.73 m per frame on average (seed 0: 5313 frames).
+    Sleepers every 0.75 m; lamps every 10 to 18 m, ribs every 4.5 to 8 m, panel joints every 2.4 to 3.6 m,
+    cable brackets every 1.5 to 2.5 m and niches every 22 to 38 m, each with a constant period per segment;
+    in stations lights every 6 m and columns every 12 m. Signs, cabinets, signals, cross passages and stains
+    do not repeat. The reference moves 0.73 m per frame on average (seed 0: 5313 frames).
 
     The tunnel is 5 m wide, its walls 3.4 m high and its crown 4.7 m above the track bed. Stations are 150 m
     long, with a platform from 1.6 to 7.5 m left of the camera, 1 m above the rails, under a ceiling 5.6 m
     above them.
 
-    Args: those of `Railway`; the reference cruises at 25 m/s.
-
-    Example:
-        >>> Underground(traverse=1, frames=40).distance[-1].item() < 4000
-        True
+    Args: as for `Railway`; the reference cruises at 25 m/s.
     """
 
     kind = "underground"
@@ -59,8 +54,8 @@ class Underground(Railway):
             ("bracket", (1.5, 2.5), (200, 600), (50, 250)),
             ("niche", (22, 38), (300, 700), (50, 250)),
         ):
-            for stretch in scenery.stretches(random, name, self.route, *ranges):
-                structures += _between_stations(stretch, stations)
+            for segment in scenery.periodic_segments(random, name, self.route, *ranges):
+                structures += _between_stations(segment, stations)
         for start in stations:
             structures.append(Structure("station light", 6.0, start, round(start + STATION, 2)))
             structures.append(Structure("column", 12.0, round(start + 5, 2), round(start + STATION - 3, 2)))
@@ -96,7 +91,7 @@ class Underground(Railway):
             yield Thing(wall, 0, 0.9, "c8641e", random.scattered(60, self.route, (250, 700)), 1.2, 0.35)
 
     def _light(self, world: World) -> Light:
-        """A headlight, and lamps whose light rises where a station begins."""
+        """A headlight, and ambient light that is brighter in stations."""
         lamp, tunnel, station = (0.55, 0.34, 0.5) if self.traverse else (0.7, 0.22, 0.42)
         s = torch.arange(round(self.route + 2 * FAR), dtype=torch.float32)
         ambient = torch.full_like(s, tunnel)
@@ -110,7 +105,7 @@ class Underground(Railway):
 
 
 def _between_stations(whole: Structure, stations: tuple[float, ...]) -> Iterator[Structure]:
-    """The parts of a stretch that lie in the tunnel, each long enough to repeat."""
+    """The parts of a segment between stations that are at least 4 periods long."""
     start = whole.start
     for station in (*stations, whole.stop + STATION):
         stop = min(station, whole.stop)
@@ -120,7 +115,6 @@ def _between_stations(whole: Structure, stations: tuple[float, ...]) -> Iterator
 
 
 def _pieces(structure: Structure, random: Random, sizes: dict[str, float], route: float) -> Iterator[Thing]:
-    """What a structure consists of."""
     at, name = structure.at, structure.name
     if name == "sleeper":
         yield Thing("floor", HALF - 1.3, HALF + 1.3, "a19b90", at, 0.3)
@@ -153,7 +147,7 @@ def _pieces(structure: Structure, random: Random, sizes: dict[str, float], route
 
 
 def _station(start: float, random: Random, sizes: dict[str, float]) -> Iterator[Thing]:
-    """A platform on the left under a high ceiling, tiled walls and signs; every station has its colours."""
+    """A platform on the left, tiled walls and signs, in the station's own colours."""
     tile = random.pick(("d9dcd6", "9fb8c4", "d6c79a", "a8c09a", "c9a294"))
     band = random.pick(("1c3f94", "b3261e", "186b3a", "d08a1e", "3a3a40"))
     floor = random.pick(("a8a49c", "8d8680", "bdb4a4"))
@@ -175,13 +169,12 @@ def _station(start: float, random: Random, sizes: dict[str, float]) -> Iterator[
         for colour in ("b8452e", "2f6f9a", "e3d27a"):
             at = random.scattered(start + 2, start + STATION - 12, (14, 50))
             yield Thing(sheet, low, low + 1.5, colour, at, random.uniform(1.5, 3.5))
-    yield Thing(
-        "signs", 0.4, 3.0, band, random.scattered(start + 3, start + STATION - 20, (20, 45)), 0.15, 0.5
-    )
+    at = random.scattered(start + 3, start + STATION - 20, (20, 45))
+    yield Thing("signs", 0.4, 3.0, band, at, 0.15, 0.5)
 
 
 def _sheets(random: Random, end: float, stations: tuple[float, ...]) -> dict[str, Sheet]:
-    """The cross-section, nearest first; the lining is open where a station is, on the left and above."""
+    """The cross-section, nearest first; in stations the lining is open on the left and above."""
     columns = round(end / CELL[1])
     s = (torch.arange(columns) + 0.5) * CELL[1]
     tunnel = torch.stack([(s < start) | (s >= start + STATION) for start in stations]).all(0)
@@ -205,14 +198,14 @@ def _sheets(random: Random, end: float, stations: tuple[float, ...]) -> dict[str
         "people": Sheet((-5.0, STEP), (-5.0, ROOF)),
         "signs": Sheet((-5.0, 1.6), (-1.7, 1.6)),
         "platform back": Sheet((-HALF, STEP), (BACK, STEP)),
-        # the dark face that closes a station where the tunnel goes on
+        # a dark face closes the station at its ends
         "back": Sheet((BACK, STEP), (BACK, ROOF), surface(ROOF - STEP, "4e4c49", 0.04, 0.08), CELL),
         "roof": Sheet((BACK, ROOF), (HALF, ROOF), surface(HALF - BACK, "4e4c49", 0.04, 0.08), CELL),
     }
 
 
 def _concrete(random: Random, rows: int, columns: int) -> Tensor:
-    """The tunnel's lining with stains that run down it, (4,V,S)."""
+    """The tunnel's lining with vertical stains, (4,V,S)."""
     image = scenery.mottled(random, "8b8780", rows, columns, 0.05, 0.10)
     streaks = random.texture(1, columns, 6.0) + 0.4 * random.texture(rows, columns, 10.0)
     damp = (random.texture(1, columns, 160.0) - 0.2).clamp(0, 1)
