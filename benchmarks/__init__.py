@@ -1,1 +1,1 @@
-"""What users would pick instead, beside the package."""
+"""Benchmarks of the package against what users would pick instead."""

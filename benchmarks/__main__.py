@@ -1,4 +1,4 @@
-"""`python -m benchmarks NAME --out DIR`: this package beside what users would pick instead."""
+"""`python -m benchmarks NAME --out DIR`: the package against what users would pick instead."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dejavu_torch.data.output import check_output_folder
 from dejavu_torch.data.source import check_not_read
 from dejavu_torch.text import printable
 
-BENCHES: dict[str, Any] = {  # each returns what is to be printed
+BENCHES: dict[str, Any] = {  # each returns the lines to print
     "results": results.run_results,
     "matcher": matcher.run_matcher,
     "storage": storage.run_storage,
@@ -40,7 +40,7 @@ def run(given: Sequence[str]) -> None:
         options = parser.parse_args(given[1:]).as_dict()
         out = options["out"]
         check_not_read(out / "bench.json", *options.get("sources", ()), options.get("codebooks"))
-        check_output_folder(out)  # before the long work
+        check_output_folder(out)  # before the work
         *tables, note = BENCHES[given[0]](**options)
         shown = out / ("bench.png" if (out / "bench.png").exists() else "bench.json")
         print(*tables, printable(f"{note}; next: open {shown}"), sep="\n")

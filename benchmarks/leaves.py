@@ -1,4 +1,4 @@
-"""Drawn images that show nothing, and have what photographs have: edges and textures of all sizes, light."""
+"""Abstract images with the statistics of photographs: edges and textures of all sizes, light."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import math
 import torch
 from torch import Tensor
 
-SHAPES = 70  # of an image, the later ones smaller
+SHAPES = 70  # in an image, from large to small
 
 
 def leaves(count: int, side: int, seed: int) -> Tensor:
-    """Dead leaves: opaque shapes over each other, coloured or striped, in noise of 1 / f and uneven light.
+    """Dead leaves: opaque shapes over each other, coloured or striped, with 1 / f noise and uneven light.
 
     Source: the model is Matheron's; that networks learn from such images, Baradad, Wulff, Wang, Isola and
     Torralba, Learning to See by Looking at Noise (NeurIPS 2021).

@@ -1,4 +1,4 @@
-"""How fast frames of a video are found one by one on a long map: `benchmarks live`."""
+"""`benchmarks live`: how fast single frames of a video are found on a long map."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from dejavu_torch.live.localizer import LiveLocalizer
 from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.filter import PlaceFilter
 
-RATE = 30  # frames a second
+RATE = 30  # frames per second
 CAMERA = (480, 640)
-SIZES = ((480, 640), (120, 160))  # that maps are learned from
+SIZES = ((480, 640), (120, 160))  # of the frames that maps are learned from
 NUMBERS = 128  # of a descriptor
 NEAR = 5  # places
-NOISE = 0.1  # of a feature's spread, between two looks at one place
+NOISE = 0.1  # between two views of a place, in standard deviations of a feature
 COLUMNS: dict[str, Column] = {
     "p50 ms": ("seconds", ".1f", 1e-3),
     "p99 ms": ("seconds_p99", ".1f", 1e-3),
@@ -41,7 +41,7 @@ COLUMNS: dict[str, Column] = {
     f"dropped at {RATE}/s": ("dropped", ".0f"),
     "found": ("recall_at_1", ".3f"),
 }
-WARM = 10  # frames ahead of those that are timed
+WARM = 10  # frames before timing starts
 SEARCHED = (1, 50)  # the filter's search_every
 
 
@@ -54,17 +54,15 @@ def bench_live(
 ) -> list[Row]:
     """Localize the frames of a video one by one on a map of many places, with HOG and the filter.
 
-    Convention: the route is the video once, and for the rest its descriptors turned at random, block by
-        block: other places that change as a real route does. Only the time is of interest: the frames are
-        those that were learned.
+    Convention: the route is the video once, and otherwise its descriptors rotated at random, block by block,
+        so that they change as on a real route. Only the time matters: the queries are the learned frames.
 
     Returns:
-        case: camera, and the map's frames. seconds: of a decoded frame's way to its place, the median;
-        seconds_p99: the longest but for 1 %. rate: frames a second from the file to the place, decoding
-        beside it; cpu_seconds: that a frame takes of all cores together, which other programs change little.
-        dropped: of the frames at `RATE` a second. recall_at_1: share that was found. parts: seconds of
-        decoding, features, whitening, scores and filter, each by itself, the median of some; "search" is that
-        of a frame without a filter.
+        case: size of the camera's and the map's frames. seconds: from a decoded frame to its place, the
+        median; seconds_p99: the 99th percentile. rate: frames per second from the file, decoding in parallel;
+        cpu_seconds: of all cores per frame, which other programs change little. dropped: frames dropped at
+        `RATE` per second. recall_at_1: share found. parts: median seconds of decoding, features, whitening,
+        scores and filter, each by itself; "search" is a single query without a filter.
     """
     with tempfile.TemporaryDirectory() as folder, torch.no_grad():
         path = Path(folder) / "drive.mkv"
@@ -81,21 +79,21 @@ def bench_live(
 def live_row(video: Video, camera: tuple[int, int], model: DejaVu, first: int, every: int) -> Row:
     localizer = LiveLocalizer(model, PlaceFilter(search_every=every), keep_scores=every == 1)
     found, milliseconds = 0, []
-    with FrameReader(shots_of(video)) as feed:
-        for shot in feed:
-            if shot.number == WARM:
+    with FrameReader(shots_of(video)) as reader:
+        for frame in reader:
+            if frame.number == WARM:
                 began, busy = time.perf_counter(), time.process_time()
-            match = localizer(shot.pixels)
+            match = localizer(frame.pixels)
             milliseconds.append(match.milliseconds)
-            found += abs(match.place - first - shot.number) <= NEAR
+            found += abs(match.place - first - frame.number) <= NEAR
     frames = len(milliseconds)
     rate = (frames - WARM) / (time.perf_counter() - began)
     cpu = (time.process_time() - busy) / (frames - WARM)
     p50, p99 = (float(p) / 1e3 for p in np.percentile(milliseconds[WARM:], (50, 99)))
     localizer.reset()
-    with FrameReader(in_real_time(shots_of(video), "drive"), newest=True) as feed:
-        for shot in feed:
-            localizer(shot.pixels)
+    with FrameReader(in_real_time(shots_of(video), "drive"), newest=True) as reader:
+        for frame in reader:
+            localizer(frame.pixels)
     (height, width), places = video.frame_shape[1:], model.map.places
     return {
         "case": f"{camera[0]} x {camera[1]} on a map of {height} x {width}",
@@ -105,7 +103,7 @@ def live_row(video: Video, camera: tuple[int, int], model: DejaVu, first: int, e
         "rate": rate,
         "cpu_seconds": cpu,
         "frames": frames,
-        "dropped": feed.dropped,
+        "dropped": reader.dropped,
         "recall_at_1": found / frames,
         "places": places,
         "route_bytes_per_place": model.map.summary().route_bytes / places,
@@ -115,7 +113,7 @@ def live_row(video: Video, camera: tuple[int, int], model: DejaVu, first: int, e
 
 
 def write_drive(path: Path, frames: int, size: tuple[int, int]) -> None:
-    """A video of a camera that moves along a texture, `RATE` frames a second of (height, width) pixels."""
+    """Write a video of a camera that moves along a texture, `RATE` frames per second of (height, width)."""
     import av
 
     height, width = size
@@ -123,7 +121,7 @@ def write_drive(path: Path, frames: int, size: tuple[int, int]) -> None:
     generator = torch.Generator().manual_seed(0)
     length = width + step * frames
     ground = torch.zeros(1, 3, height, length)
-    for cell in (64, 24, 8):  # pixels of what is seen
+    for cell in (64, 24, 8):  # pixels
         coarse = torch.rand(1, 3, height // cell + 2, length // cell + 2, generator=generator)
         ground += interpolate(coarse, (height, length), mode="bicubic") / 3
     pixels = ground[0].clamp(0, 1).mul(255).byte().permute(1, 2, 0).numpy()
@@ -139,7 +137,7 @@ def write_drive(path: Path, frames: int, size: tuple[int, int]) -> None:
 
 
 def long_model(video: Video, places: int, numbers: int) -> tuple[DejaVu, int]:
-    """A model whose map has the frames of a video among many places, and the place of the first of them."""
+    """A model whose map holds the frames of a video among many places, and the place of the first one."""
     model = DejaVu(HOG(), Whitening(numbers=numbers)).eval()
     assert model.whitening is not None
     features = torch.cat([model.describe(batch) for batch in video.batches(16)])
@@ -159,7 +157,7 @@ def long_model(video: Video, places: int, numbers: int) -> tuple[DejaVu, int]:
 
 
 def parts_of(model: DejaVu, video: Video, every: int) -> dict[str, float]:
-    """Seconds of each part of a frame's way by itself, the median of some runs."""
+    """Median seconds of each part of the processing of a frame."""
     whitening, filter = model.whitening, PlaceFilter(search_every=every)
     assert whitening is not None
     began = time.perf_counter()
@@ -177,7 +175,7 @@ def parts_of(model: DejaVu, video: Video, every: int) -> dict[str, float]:
     if every == 1:
         works["scores"] = lambda: model.map.scores(descriptor)
         works["filter"] = lambda: filter.step(scores, state)
-    else:  # together, of a frame that others led to
+    else:  # together, after other frames
         near = model.localizer(model.matching(filter))
         near(descriptor.expand(WARM, -1))
         works["scores and filter"] = lambda: near(descriptor)
@@ -195,13 +193,13 @@ def run_live(*, out: Path) -> list[str]:
     """
     rows = bench_live()
     drawn = {}
-    for row in rows:  # the camera is the same in all
+    for row in rows:  # all have the same camera
         name = f"{row['case'].partition(' on ')[2]}: {row['contender']}"
         parts = {"dejavu": row["seconds"]} | row["parts"]
         drawn[name] = {part: 1e3 * seconds for part, seconds in parts.items()}
-    picture = plot_ratios(drawn, "milliseconds a frame (p50), and of each part by itself")
+    picture = plot_ratios(drawn, "milliseconds per frame (p50), and of each part by itself")
     write_bench(out, rows, picture, rate=RATE)
     columns: dict[str, Column] = {name: (name, ".1f", 1e-3) for row in rows for name in row["parts"]}
     figures = table([dict.fromkeys(columns) | row | row["parts"] for row in rows], COLUMNS | columns)
-    note = "100000 places; found: within 5; from decoding on: milliseconds of each part by itself"
+    note = "100000 places; found: within 5; columns from decoding on: milliseconds of each part"
     return [figures, note]

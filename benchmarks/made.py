@@ -1,4 +1,4 @@
-"""Descriptors of a long route, made as they are read, like those of a route that is there."""
+"""Descriptors of a long route, made as they are read, with the statistics of a measured route."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from torch import Tensor
 from dejavu_torch.data.frame_range import IndexedTraverse
 from dejavu_torch.types import InputError
 
-REACH = 2048  # places on either side that a made descriptor depends on, at most
-BLOCK = 4096  # places made at a time; each block has its own random numbers
+REACH = 2048  # places on either side that influence a made descriptor, at most
+BLOCK = 4096  # places made together; each block has its own random numbers
 PRIME = 1_000_003  # between the random numbers of one seed and the next
 
 
 class Likeness(NamedTuple):
-    """What descriptors of K numbers are like along one route, and how those of a second traverse differ.
+    """Statistics of descriptors of K dimensions along a route, and of their change on a second traverse.
 
-    mean: (K,), of the route. axes: (K,K), its principal components as columns. filters: (2R,K), which make
-    each component of white noise: the spectrum along the route. query_mean: (K,), of the second traverse.
-    rho: (K,), what is left of each number there, by regression. spread: (K,K), makes of white noise what
-    comes on top of it. sizes: (n,), how large that was of each query, beside its root mean square.
+    mean: (K,), of the route. axes: (K,K), its principal components as columns. filters: (2R,K), from white
+    noise to each component, by its spectrum along the route. query_mean: (K,), of the second traverse. rho:
+    (K,), regression of its dimensions on those of the route. spread: (K,K), from white noise to the residual.
+    sizes: (n,), size of each query's residual over the root mean square.
     """
 
     mean: Tensor
@@ -59,7 +59,7 @@ def likeness(places: Tensor, queries: Tensor, truth: Tensor) -> Likeness:
 
 
 def _filters(series: Tensor) -> Tensor:
-    """Filters that make of white noise what has the spectrum of (N,K) series: (2R,K), the middle one at R."""
+    """Filters (2R,K), centred at R, that give white noise the spectrum of (N,K) series."""
     count = len(series)
     reach = min(REACH, 1 << (count // 4).bit_length() - 1)
     window = torch.hann_window(2 * reach)[:, None]
@@ -67,7 +67,7 @@ def _filters(series: Tensor) -> Tensor:
     spectra = (torch.fft.rfft(series[s : s + 2 * reach] * window, dim=0).abs().square() for s in starts)
     power: Tensor = sum(spectra, torch.zeros(()))
     filters: Tensor = torch.fft.irfft(power.sqrt(), dim=0).roll(reach, 0) * window
-    # white noise in, as much variance out as was there
+    # keeps the variance of the series for white noise of variance 1
     size: Tensor = torch.linalg.vector_norm(filters, dim=0)
     return filters * (series.std(0) / size.clamp(min=1e-12))
 
@@ -75,8 +75,8 @@ def _filters(series: Tensor) -> Tensor:
 class MadeRoute(IndexedTraverse):
     """Descriptors with the covariance, and the spectrum along the route, of one that was measured.
 
-    Convention: Gaussian, then scaled to length 1 as whitened descriptors are. A place depends on its number
-        and the seed alone: any part of the route can be made by itself, and is not held.
+    Convention: Gaussian, then scaled to length 1 like whitened descriptors. A place depends only on its
+        number and the seed, so any part of the route can be made by itself.
     """
 
     def __init__(self, like: Likeness, length: int, seed: int = 0) -> None:
@@ -91,7 +91,7 @@ class MadeRoute(IndexedTraverse):
         return torch.cat([self._made(int(b))[at[blocks == b] - int(b) * BLOCK] for b in blocks.unique()])
 
     def seen_again(self, places: Tensor) -> Tensor:
-        """The same places on a second traverse: what is left of each number, and noise. (Q,) -> (Q,K)"""
+        """The same places on a second traverse. (Q,) -> (Q,K)"""
         like = self.like
         own = torch.cat([self.read(range(i, i + 1)) for i in places.tolist()])
         generator = torch.Generator().manual_seed(PRIME * self.seed + PRIME - 1)

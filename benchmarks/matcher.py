@@ -1,4 +1,4 @@
-"""HOG, L1 distances, sequences, filters, exported maps: timed beside what computes the same."""
+"""`benchmarks matcher`: HOG, L1 distances, sequences, filters and exported maps timed against other code."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from dejavu_torch.types import FrequencyLayer
 
 BATCH = 64
 AT_MOST = 60  # seconds for all runs of one contender together
-PERIODS = (191, 193, 197, 199, 211)  # of the layers that sequences are matched in: 991 phases
-WIDE = 64  # numbers of the descriptors that are filtered
-NUMBERS = 128  # of those of single frames
+PERIODS = (191, 193, 197, 199, 211)  # of the layers for sequences: 991 phases
+WIDE = 64  # dimensions of the descriptors for filters
+NUMBERS = 128  # dimensions of the descriptors of single frames
 COLUMNS: dict[str, Column] = {
     "seconds": ("seconds", ".3f"),
     "x ours": ("ratio_to_ours", ".1f"),
@@ -52,8 +52,8 @@ def run_matcher(*, out: Path) -> list[str]:
     rows = list(bench_matcher())
     write_bench(out, rows, bars(rows))
     absent = any("No module" in (row["skipped"] or "") for row in rows)
-    hint = ["what is skipped needs pip install '.[bench,export]'"] * absent
-    return [table(rows, COLUMNS), *hint, "x ours: seconds / those of the fastest dejavu"]
+    hint = ["skipped contenders need pip install '.[bench,export]'"] * absent
+    return [table(rows, COLUMNS), *hint, "x ours: seconds / seconds of the fastest dejavu"]
 
 
 @torch.no_grad()
@@ -67,18 +67,18 @@ def bench_matcher(
     exports: Sequence[tuple[int, int, int, int]] = ((50, 64, 64, 3072), (20, 480, 640, 100_000)),
     torch_compile: bool = True,
 ) -> Iterator[Row]:
-    """Time HOG beside scikit-image, L1 distances beside torch, scipy and faiss; sequences, filters two ways;
-    frames one by one beside the same in onnxruntime.
+    """Time HOG against scikit-image, L1 distances against torch, scipy and faiss, sequences and filters in
+    two ways, and single frames against onnxruntime.
 
     Args:
         frames: of each HOG case. repeats: timed runs of each contender, in turn; the best counts.
         images: height, width. distances: queries, features, templates. sequences: queries, T, places.
-        filters: queries, places; the difference is one of probabilities.
+        filters: queries, places; the difference is in probabilities.
         exports: frames, height, width, places.
-        torch_compile: also a sum that `torch.compile` makes a loop of; compiling takes its time.
+        torch_compile: also time a sum compiled by `torch.compile`; compiling is slow.
 
-    Convention: one process, float32, and the same number of threads, torch.get_num_threads(), for all
-        that can use several; ours with one thread as well.
+    Convention: one process, float32, and torch.get_num_threads() threads for all that can use several; ours
+        also with one thread.
     """
     generator = torch.Generator().manual_seed(0)
     for height, width in images:
@@ -105,14 +105,14 @@ def bench_matcher(
 
 
 def both(run: Run) -> list[Contender]:
-    """Our work with all threads and, where there are several, with one."""
+    """Our code with all threads and, if there are several, with one."""
     threads = torch.get_num_threads()
     alone = Contender("dejavu (one thread)", lambda: run)
     return [Contender("dejavu", lambda: run, threads), *[alone] * (threads > 1)]
 
 
 def hog_contenders(some: Tensor, frames: int, repeats: int) -> list[Contender]:
-    """All `frames`, of which `some` differ."""
+    """HOG of `frames` frames, which repeat `some`."""
     dimension = hog(some[:1]).shape[1]
 
     def ours() -> Tensor:
@@ -186,7 +186,7 @@ def l1_contenders(query: Tensor, templates: Tensor, torch_compile: bool) -> list
 
 
 def sequence_contenders(query: Tensor, templates: Tensor, length: int, places: int) -> list[Contender]:
-    """A feature a layer, so that it is not the distances that take the time."""
+    """Sequences on layers of one feature, so that the distances take little time."""
     plan = tuple(FrequencyLayer(Fraction(tau), tau, 0, places, (j,)) for j, tau in enumerate(PERIODS))
     blocks = [templates[:tau, j, None] for j, tau in enumerate(PERIODS)]
     route, matcher = TemplateMap(plan, blocks, places, len(plan)), SequenceMatcher(length)
@@ -196,7 +196,7 @@ def sequence_contenders(query: Tensor, templates: Tensor, length: int, places: i
         for scores in route.scores(query).split(size):
             found, state = matcher.step(scores, state)
             rows.append(found)
-        return torch.cat(rows)[:, length:]  # before it some are +inf
+        return torch.cat(rows)[:, length:]  # earlier ones may be +inf
 
     one_by_one = Contender("dejavu (a query at a time)", lambda: partial(drive, 1), torch.get_num_threads())
     return [*both(partial(drive, len(query))), one_by_one]
@@ -209,7 +209,7 @@ def smooth(steps: Tensor) -> Tensor:
 
 
 def filter_contenders(route: Tensor, noise: Tensor) -> list[Contender]:
-    """A drive along the middle of a route, seen with as much noise as there is route."""
+    """Filters on a drive along the middle of a route, with noise as large as the signal."""
     spectral = SpectralMapper(None, step=2.0, chunk=1024)(route)
     first = max(0, (len(route) - len(noise)) // 2)
     queries = (route[first : first + len(noise)] + noise).split(16)
@@ -221,12 +221,12 @@ def filter_contenders(route: Tensor, noise: Tensor) -> list[Contender]:
             localizer(part)
         return torch.cat([(-row).exp() for row in rows])
 
-    beside = Contender("dejavu (all places)", lambda: partial(drive, 1), torch.get_num_threads())
-    return [*both(partial(drive, 50)), beside]
+    whole = Contender("dejavu (all places)", lambda: partial(drive, 1), torch.get_num_threads())
+    return [*both(partial(drive, 50)), whole]
 
 
 def random_model(frames: Tensor, route: Tensor, generator: torch.Generator) -> DejaVu:
-    """HOG, a whitening and a map made of random numbers: what they find takes as long as what is right."""
+    """HOG with a whitening and a map of random numbers, which take as long as learned ones."""
     whitening = Whitening(numbers=NUMBERS)
     model = DejaVu(HOG(), whitening, SpectralMapper(None, step=0.05))
     features = model.describe(frames[:1]).shape[1]
@@ -238,7 +238,7 @@ def random_model(frames: Tensor, route: Tensor, generator: torch.Generator) -> D
 
 
 def export_contenders(model: DejaVu, frames: Tensor, sizes: list[int]) -> list[Contender]:
-    """Frames one by one; the bytes of the exported file are put into `sizes`."""
+    """Single frames; appends the bytes of the exported file to `sizes`."""
     threads = torch.get_num_threads()
 
     def exported() -> Run:

@@ -1,4 +1,4 @@
-"""What all benchmarks share: contenders, rows, time, memory, processes, and what is written."""
+"""Shared by all benchmarks: contenders, rows, time, memory, processes, and output."""
 
 from __future__ import annotations
 
@@ -40,23 +40,23 @@ from dejavu_torch.types import InputError, Traverse
 
 COMPARED = ("torch", "numpy", "numba", "scikit-image", "scipy", "faiss-cpu", "onnxruntime")
 PROCESS = Path("/proc/self")
-OURS = "dejavu"  # what the names of our contenders start with
+OURS = "dejavu"  # start of the names of our contenders
 
-Row = dict[str, Any]  # a line of bench.json; what is not known of it is None
+Row = dict[str, Any]  # a row of bench.json; unknown values are None
 KEYS = (
     *("seconds", "seconds_first", "ratio_to_ours", "peak_bytes", "bytes", "threads", "difference"),
     *("measured_rows", "skipped", "recall_at_1", "file_bytes", "cpu_seconds"),
 )
 Column = tuple[str, str] | tuple[str, str, float]  # key of a row, format, unit
 Run = Callable[[], Tensor]
-Find = Callable[[Tensor], tuple[Tensor, Tensor]]  # of queries the best score, lower is better, and place
+Find = Callable[[Tensor], tuple[Tensor, Tensor]]  # queries -> best score, lower is better, and its place
 
 
 class Contender(NamedTuple):
-    """What is measured side by side; the names of ours start with "dejavu".
+    """One of the alternatives that are measured; the names of ours start with "dejavu".
 
-    prepare: imports what it needs and returns what does the work; what it raises says why there are no
-    figures. threads: that it may use. family: of those that make one front.
+    prepare: imports what it needs and returns a function that does the work; its exceptions say why there are
+    no figures. threads: the number it may use. family: of contenders that form one front.
     """
 
     name: str
@@ -69,31 +69,31 @@ class Store(ABC):
     """A way to keep a route in a file and to find places on it, each in a process of its own."""
 
     def prepare(self, route: IndexedTraverse) -> float | None:
-        """Choose by the route, which is no part of learning; the step of a map that learns with one."""
+        """Choose settings by the route, outside of learning; returns the step of a map learned with one."""
         return None
 
     @abstractmethod
     def learn(self, route: IndexedTraverse, path: Path) -> int:
-        """Keep a route in a file; how many bytes of it are the route's."""
+        """Write a route to a file; returns the bytes that grow with the route."""
 
     @abstractmethod
     def load(self, path: Path, device: str = "cpu") -> Find:
-        """Make ready to find queries in a file; who cannot use the device takes the CPU."""
+        """A function that finds queries in a file, on the device or, if it cannot use that, on the CPU."""
 
 
 def new_row(case: str, contender: str, keys: Sequence[str] = KEYS, **facts: Any) -> Row:
-    """A row of so many keys, of which these facts are known."""
+    """A row with all keys, of which these facts are known."""
     return {"case": case, "contender": contender} | dict.fromkeys(keys) | facts
 
 
 def failure(error: Exception) -> str:
-    """What a row says of an error that left it without figures."""
+    """What a row says about an error."""
     return f"{type(error).__name__}: {one_line(error)}"[:200]
 
 
 @contextmanager
 def threads(count: int) -> Iterator[None]:
-    """In the block torch uses so many threads."""
+    """In the block torch uses this many threads."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
@@ -105,17 +105,17 @@ def threads(count: int) -> Iterator[None]:
 def benchmark(case: str, contenders: Sequence[Contender], repeats: int) -> list[Row]:
     """Time all in turn, round after round, and compare every result with that of the first, which is ours.
 
-    A result with fewer rows than the case has stands for a part of the work.
+    A result with fewer rows than the case is from a part of the work.
 
-    Convention: not counted are one run of each that loads and compiles, and one that measures memory.
-        An error of the first is raised; one of another is a row that names it.
+    Convention: two runs of each are not timed: one that loads and compiles, and one that measures memory. An
+        error of the first contender is raised; errors of others become rows.
 
     Returns:
-        seconds: for the whole case, best of the repeats. seconds_first: of the first run, with all that is
-        loaded and compiled for it. ratio_to_ours: seconds over those of our fastest. peak_bytes: most memory
-        held during a run beyond what was held before. bytes: of the result. difference: largest to our
-        result. measured_rows: where only a part of the case was run: seconds and bytes are scaled up from
-        it, seconds_first and peak_bytes are its own. skipped: why there are no figures.
+        seconds: for the whole case, best of the repeats. seconds_first: of the first run, including loading
+        and compiling. ratio_to_ours: seconds over those of our fastest. peak_bytes: most memory held during a
+        run, minus that before. bytes: of the result. difference: largest one to our result. measured_rows: if
+        only a part of the case was run: seconds and bytes are scaled up from it, seconds_first and peak_bytes
+        are not. skipped: why there are no figures.
     """
     rows = [new_row(case, one.name) for one in contenders]
     runs: list[tuple[Row, Run, float, int]] = []
@@ -130,7 +130,7 @@ def benchmark(case: str, contenders: Sequence[Contender], repeats: int) -> list[
                 row["peak_bytes"] = peak_memory(run)
             expected = result if expected is None else expected
             row["difference"] = float((result - expected[: len(result)]).abs().max())
-        except Exception as error:  # whatever another program fails with
+        except Exception as error:  # another program may raise anything
             if expected is None:
                 raise
             row |= new_row(case, contender.name, skipped=failure(error))
@@ -139,7 +139,7 @@ def benchmark(case: str, contenders: Sequence[Contender], repeats: int) -> list[
         row |= {"bytes": round(result.nbytes * scale), "threads": contender.threads}
         row["measured_rows"] = len(result) if scale > 1 else None
         runs.append((row, run, scale, contender.threads))
-        del result  # it would hide what the next one needs
+        del result  # its memory would hide that of the next one
     for _ in range(repeats):
         for row, run, scale, count in runs:
             with threads(count):
@@ -150,23 +150,23 @@ def benchmark(case: str, contenders: Sequence[Contender], repeats: int) -> list[
 
 
 def with_ratios(rows: Sequence[Row]) -> list[Row]:
-    """The rows with their seconds over those of our fastest of the case; not of ours in another family."""
+    """The rows with their seconds over those of our fastest in the case, of the family `OURS` or none."""
     fastest: dict[str, float] = {}
     for row in rows:
         ours = row["contender"].startswith(OURS) and row.get("family", OURS) == OURS
         if ours and row["seconds"]:
             fastest[row["case"]] = min(row["seconds"], fastest.get(row["case"], math.inf))
-    told = []
+    rated = []
     for row in rows:
         known = row["seconds"] and row["case"] in fastest
-        told.append(row | {"ratio_to_ours": row["seconds"] / fastest[row["case"]] if known else None})
-    return told
+        rated.append(row | {"ratio_to_ours": row["seconds"] / fastest[row["case"]] if known else None})
+    return rated
 
 
 def peak_memory(run: Callable[[], object]) -> int | None:
-    """Most bytes of memory during a run beyond those before it; None where the system does not tell."""
+    """Most bytes of memory during a run, minus those before it; None except on Linux."""
     try:
-        (PROCESS / "clear_refs").write_text("5")  # Linux: the peak begins anew
+        (PROCESS / "clear_refs").write_text("5")  # Linux: resets the peak
     except OSError:
         run()
         return None
@@ -176,21 +176,21 @@ def peak_memory(run: Callable[[], object]) -> int | None:
 
 
 def resident(what: str = "VmRSS") -> int:
-    """Bytes of memory that this process holds now, or held at most ("VmHWM"); of Linux."""
+    """Bytes of memory that this process holds now, or held at most ("VmHWM"), on Linux."""
     lines = (PROCESS / "status").read_text().splitlines()
     return 1024 * int(next(line.split()[1] for line in lines if line.startswith(what)))
 
 
 def give_back() -> None:
-    """Return to the system what is free in the heap, where its library can."""
+    """Return free memory of the heap to the system, if its C library can."""
     gc.collect()
     with suppress(AttributeError, OSError):
         ctypes.CDLL(None).malloc_trim(0)
 
 
 def in_process(module: str, arguments: object) -> dict[str, Any]:
-    """What a module prints as JSON, run by itself on arguments; where it fails why, as `skipped`."""
-    # without the current folder, from which nothing is imported
+    """The JSON that a module prints when it is run on arguments; if it fails, the reason as `skipped`."""
+    # without the current folder (-P), but with the same search path
     search = os.pathsep.join(filter(None, sys.path))
     done = subprocess.run(
         [sys.executable, "-P", "-m", module, json.dumps(arguments)],
@@ -200,7 +200,7 @@ def in_process(module: str, arguments: object) -> dict[str, Any]:
         preexec_fn=end_with_parent if sys.platform == "linux" else None,
     )
     if done.returncode < 0:
-        return {"skipped": f"ended by signal {-done.returncode}, such as for want of memory"}
+        return {"skipped": f"ended by signal {-done.returncode}, perhaps for lack of memory"}
     if done.returncode:
         return {"skipped": (done.stderr.strip().splitlines() or ["it failed"])[-1][:200]}
     facts: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
@@ -208,32 +208,32 @@ def in_process(module: str, arguments: object) -> dict[str, Any]:
 
 
 def done_once(words: Sequence[str], folder: Path, made: Path) -> str | None:
-    """Run `dejavu`, with a log in a folder, unless the same command made a file before.
+    """Run `dejavu`, with a log in a folder, unless the same command has made a file already.
 
-    So a run of many commands goes on where another was stopped.
+    This lets a stopped run of many commands continue.
 
     Returns:
-        what it said last if it failed.
+        its last message if it failed.
     """
     well, log = folder / "command.txt", folder / "log.txt"
     if made.exists() and well.exists() and well.read_text(encoding="utf-8") == shlex.join(words):
         return None
     folder.mkdir(parents=True, exist_ok=True)
     well.unlink(missing_ok=True)
-    alone = os.environ | {"OMP_NUM_THREADS": "1"}  # several at a time
+    alone = os.environ | {"OMP_NUM_THREADS": "1"}  # several commands run at a time
     with log.open("w", encoding="utf-8") as file:
         command = [sys.executable, "-m", "dejavu_torch.cli", *words]
         status = subprocess.run(command, stdout=file, stderr=file, check=False, env=alone).returncode
     if status:
         said = log.read_text(encoding="utf-8").strip().splitlines()
-        told = status == 2 and said
-        return one_line(said[-1].removeprefix("dejavu: ") if told else f"ended with status {status}")
+        known = status == 2 and said
+        return one_line(said[-1].removeprefix("dejavu: ") if known else f"ended with status {status}")
     well.write_text(shlex.join(words), encoding="utf-8")
     return None
 
 
 def end_with_parent() -> None:
-    """Have the system end this process when its parent ends, as by Ctrl-C."""
+    """Let the system end this process with its parent, such as by Ctrl-C."""
     ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
 
 
@@ -244,11 +244,13 @@ def truth_of(
     queries: int | None = None,
     given: str | None = None,
 ) -> GroundTruth:
-    """What is given or the sources say, or frame i is place i; frames, queries: of those that do not know
-    their length.
+    """The given ground truth, that of the sources, or frame i is place i.
+
+    Args:
+        frames, queries: lengths of traverses that do not know theirs.
 
     Raises:
-        InputError: nothing tells the right places.
+        InputError: there is no ground truth.
     """
     truth = ground_truth_of(given, reference, query, frames, queries, aligned=True)
     if truth is None:
@@ -260,9 +262,9 @@ def truth_of(
 
 
 def write_bench(out: Path, rows: Sequence[Row], picture: Plot | None = None, **facts: Any) -> None:
-    """Write bench.json, and bench.png where there is a picture, into a folder: all of it or nothing.
+    """Write bench.json, and bench.png if there is a picture, into a folder: both or nothing.
 
-    With the rows stands what figures depend on beside the machine.
+    bench.json also has the versions and settings that the figures depend on.
     """
     versions: dict[str, str | None] = {"dejavu_torch": dejavu_torch.__version__}
     for package in COMPARED:
@@ -287,15 +289,15 @@ def write_bench(out: Path, rows: Sequence[Row], picture: Plot | None = None, **f
 
 @cache
 def commit() -> str | None:
-    """That of the clone this runs in."""
-    told = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"]
+    """The commit of this clone."""
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"]
     with suppress(OSError, subprocess.SubprocessError):
-        return subprocess.run(told, capture_output=True, text=True, check=True).stdout.strip()
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
     return None
 
 
 def bars(rows: Sequence[Row], key: str = "ratio_to_ours", unit: float = 1.0, **label: str) -> Plot | None:
-    """A figure of each row that has it, by case and contender; None where no row does."""
+    """Bars of one figure of the rows, by case and contender; None if no row has it."""
     cases: dict[str, dict[str, float]] = {}
     for row in rows:
         if row[key] is not None:
@@ -304,7 +306,7 @@ def bars(rows: Sequence[Row], key: str = "ratio_to_ours", unit: float = 1.0, **l
 
 
 def table(rows: Sequence[Row], columns: Mapping[str, Column], name: str = "{case}: {contender}") -> str:
-    """The figures as aligned text, the header first, and at the end why there are none."""
+    """The figures as aligned text under a header, with the reason if there are none."""
 
     def text(value: float | None, form: str, unit: float = 1.0) -> str:
         return "" if value is None else format(value / unit, form)

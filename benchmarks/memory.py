@@ -1,4 +1,4 @@
-"""Memory of learning a route and of finding places on it, as `benchmarks memory` measures it."""
+"""`benchmarks memory`: memory for learning a route and for localizing on it."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ from dejavu_torch.types import InputError, Traverse
 PLACES = (1000, 10_000, 50_000)
 QUERIES = (100, 10_000)
 FEWEST = 64  # places that every contender can learn
-PIECE = 4096  # frames painted at a time
-TRIAL = 16  # frames of the route that loads what is loaded late
+PIECE = 4096  # frames painted together
+TRIAL = 16  # frames of the trial run, which loads what is loaded late
 TOLERANCE = 5  # frames
 NAMES = ("places", "queries")  # of the two drives' files
 LOADED = "programs loaded"
@@ -121,20 +121,20 @@ CONTENDERS: dict[str, Store] = {
 def localize(store: Store, path: Path, queries: Traverse) -> Tensor:
     """The place of each query on the route of a file, (Q,)."""
     find, found = store.load(path), []
-    for part in queries.batches(BATCH):  # tensors that stay between large ones would keep the heap from reuse
+    for part in queries.batches(BATCH):  # small tensors kept between large ones would fragment the heap
         found += find(part)[1].tolist()
     return torch.tensor(found)
 
 
 def kept(folder: Path, contender: str, places: int) -> Path:
-    """What a contender keeps of a route."""
+    """The file of a contender for a route."""
     return folder / f"{list(CONTENDERS).index(contender)}-{places}"
 
 
 def paint_drives(folder: Path, places: int) -> None:
-    """Two drives over pieces of `sim:aerial`, one behind the other, the second in other light and with noise.
+    """Two drives over consecutive pieces of `sim:aerial`, the second in other light and with noise.
 
-    Each is one long image, of which a frame is a window: thousands of frames take no memory of their own.
+    Each is one long image whose windows are the frames, so that thousands of frames need no memory.
     """
     columns = places + VIEW
     pieces = [paint_route(PIECE, seed)[..., :PIECE] for seed in range(-(-columns // PIECE))]
@@ -153,7 +153,7 @@ def paint_drives(folder: Path, places: int) -> None:
 
 
 class Drive(IndexedTraverse):
-    """The frames of a drive, one image (VIEW,W,3), whose first columns are shown (N,)."""
+    """The frames of a drive: windows of an image (VIEW,W,3) that start at the columns `shown`, (N,)."""
 
     def __init__(self, image: NDArray[np.uint8], shown: Tensor) -> None:
         self.name, self.length = "drive", len(shown)
@@ -166,18 +166,18 @@ class Drive(IndexedTraverse):
 
 
 def shown_by(queries: int, places: int) -> Tensor:
-    """The places that queries show, (Q,): evenly along the route, from its start again where it ends."""
+    """The places of the queries, (Q,): evenly along the route, which they pass again if there are more."""
     return torch.arange(queries) * max(1, places // queries) % places
 
 
 def measure(contender: str, places: int, queries: int, threads: int, folder: Path) -> dict[str, Any]:
-    """Watch the memory of this process, which has done nothing else: what it knows of a row.
+    """Measure the memory of this process, which has done nothing else: the facts of a row.
 
     Args:
-        places: of the route; 0 only loads the programs. queries: that are localized; 0 learns.
+        places: of the route; 0 only loads the programs. queries: number to localize; 0 learns.
 
-    Convention: a trial on few frames goes ahead, which loads what is loaded late; what it leaves free is
-        given back, so that the run cannot use it.
+    Convention: a trial on few frames first loads what is loaded late; the memory it frees is returned to the
+        system, so that the run cannot reuse it.
     """
     torch.set_num_threads(threads)
     store, file = CONTENDERS[contender], kept(folder, contender, places)
@@ -206,14 +206,13 @@ def measure(contender: str, places: int, queries: int, threads: int, folder: Pat
 
 
 def bench_memory(places: Sequence[int] = (), queries: Sequence[int] = QUERIES) -> Iterator[Row]:
-    """Memory that each contender takes to learn routes and to localize on one, each time in a new process.
+    """Memory that each contender needs to learn routes and to localize on one, each in a new process.
 
     Queries are frames of a second drive, evenly along the route of the middle size.
 
     Yields:
-        A row for each case and contender. peak_bytes: most memory during the run beyond what the process
-        held before, when it had done all on `TRIAL` frames; a row "programs loaded" has that itself. bytes:
-        of the file. seconds: of the only run.
+        A row for each case and contender. peak_bytes: most memory during the run, minus that after a trial on
+        `TRIAL` frames, which the row "programs loaded" has. bytes: of the file. seconds: of the only run.
     """
     sizes = sorted(set(places or PLACES))
     if sizes[0] < FEWEST:
@@ -234,16 +233,16 @@ def bench_memory(places: Sequence[int] = (), queries: Sequence[int] = QUERIES) -
 
 
 def run_memory(*, out: Path, places: Sequence[int] = ()) -> list[str]:
-    """Memory of learning a route and of localizing on it.
+    """Memory for learning a route and for localizing on it.
 
     Args:
         out: folder for bench.json and bench.png
-        places: frames that are learned; 1000, 10000 and 50000 if not given
+        places: numbers of frames to learn; 1000, 10000 and 50000 if not given
     """
     rows = with_ratios(list(bench_memory(places)))
     drawn = [row for row in rows if row["case"] != LOADED]
-    write_bench(out, rows, bars(drawn, "peak_bytes", 1e6, label="memory at most, in MB; less is better"))
-    return [table(rows, COLUMNS), "peak: beyond that of the programs loaded"]
+    write_bench(out, rows, bars(drawn, "peak_bytes", 1e6, label="peak memory in MB; less is better"))
+    return [table(rows, COLUMNS), "peak: without that of the loaded programs"]
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """`python -m benchmarks.pages REPORT/index.html --out FILE.json`: axe-core on a report and the live page.
 
-Needs `pip install playwright axe-playwright-python`, and chromium on the PATH. --shots DIR keeps screenshots.
+Needs `pip install playwright axe-playwright-python` and chromium on the PATH. --shots DIR saves screenshots.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ OPEN = "all => all.forEach(one => one.open = true)"
 
 @contextmanager
 def live_page(places: int = 256) -> Iterator[str]:
-    """The address of a live page that shows one frame, accepted."""
+    """The address of a live page that shows one accepted frame."""
     first, second = (
         next(open_source(f"sim:aerial?frames={places}&traverse={one}").batches(places)) for one in (0, 1)
     )
@@ -45,11 +45,11 @@ def live_page(places: int = 256) -> Iterator[str]:
 
 
 def check_pages(addresses: Mapping[str, str], shots: Path | None = None) -> dict[str, Any]:
-    """What axe-core finds on pages, by their names, at three widths, light and dark, all folds open.
+    """Run axe-core on pages, by name, at three widths, light and dark, with all folds open.
 
     Returns:
         Versions, and a row for each page, width and scheme: `violations` as [impact, rule, elements], and
-        `overflow`, how many pixels the page is wider than the window.
+        `overflow`, by how many pixels the page is wider than the window.
     """
     from axe_playwright_python.sync_playwright import Axe
     from playwright.sync_api import sync_playwright
@@ -64,7 +64,7 @@ def check_pages(addresses: Mapping[str, str], shots: Path | None = None) -> dict
                     page = browser.new_page(viewport=size, color_scheme=scheme)
                     page.goto(address)
                     page.wait_for_function("[...document.images].every(one => one.complete)")
-                    page.wait_for_timeout(500)  # the live page asks for its state
+                    page.wait_for_timeout(500)  # until the live page has its state
                     if shots is not None:
                         page.screenshot(path=shots / f"{name}_{width}_{scheme}.png")
                     page.eval_on_selector_all("details", OPEN)

@@ -16,13 +16,13 @@ from dejavu_torch.evaluation.score_plots import area_axis, drawn_areas
 
 OURS = COLOURS["map"]
 RATIO = "time over that of our fastest; less is better"
-# of `plot_growth`: the families of a kind, in turn
+# colours of the families in `plot_growth`
 _GROWTH = {
     "dejavu": ("#5aa9d6", "#00406b", OURS),
     "null": (COLOURS["null"], COLOURS["null_same_plan"], GREY),
 }
 _OTHERS = ("#222222", "#e07b00", "#c21f0a", "#10b248", "#b43cff", "#f2b80f", "#7a4a1f")
-FAMILIES = {  # of `plot_frontiers`: colour and line
+FAMILIES = {  # colours and lines in `plot_frontiers`
     "dejavu": (OURS, "-"),
     "dejavu, given maps": ("#00406b", "--"),
     "null": (COLOURS["null"], ":"),
@@ -46,7 +46,7 @@ FAMILIES = {  # of `plot_frontiers`: colour and line
 
 
 def plot_ratios(cases: Mapping[str, Mapping[str, float]], label: str = RATIO) -> Plot:
-    """A figure of each contender by case, its time over ours if not said otherwise: one bar each."""
+    """A bar for each contender of each case: its time over ours unless `label` says otherwise."""
     bars = [len(ratios) for ratios in cases.values()]
     height = 0.5 + 0.42 * sum(bars) + 0.5 * len(bars)
     figure, axes = canvas(height, len(bars), squeeze=False, height_ratios=bars)
@@ -68,7 +68,7 @@ def plot_areas(cases: Mapping[str, Mapping[str, float]], kinds: Mapping[str, str
     """Areas of contenders, a row for each case.
 
     Args:
-        kinds: the colour of those whose names begin so; what follows gives the mark.
+        kinds: colours by the beginning of a name; the rest of the name gives the marker.
     """
     figure, axis = canvas(1.2 + 0.3 * len(kinds) + 0.5 * len(cases))
     marks: dict[str, str] = {}
@@ -93,10 +93,12 @@ def plot_areas(cases: Mapping[str, Mapping[str, float]], kinds: Mapping[str, str
 def plot_growth(
     panels: Mapping[str, Mapping[str, Sequence[tuple[float, float]]]], linear: Collection[str] = ()
 ) -> Plot:
-    """Figures (places, figure) of contenders over the number of places, a panel each, both axes logarithmic.
+    """Lines of contenders over the number of places, both axes logarithmic.
 
-    What stands before the first comma of a name is its family, which gives the colour; a mark is of one
-    contender. Families that start with "dejavu" are ours. linear: panels of shares, 0 to 1.
+    Args:
+        panels: heading -> contender -> points (places, figure). The part of a name before the first comma is
+            the family, which gives the colour; those that start with "dejavu" are ours.
+        linear: panels of shares from 0 to 1.
     """
     names = list(dict.fromkeys(name for lines in panels.values() for name in lines))
     styles = _growth_styles(names)
@@ -119,7 +121,7 @@ def plot_growth(
 
 
 def _growth_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """A style of each contender: of its family the colour, of its own the mark and the line."""
+    """A style for each contender: a colour of its family, a marker and a line of its own."""
     colours: dict[str, str] = {}
     members: Counter[str] = Counter()
     styles = {}
@@ -146,13 +148,13 @@ def plot_frontiers(
     cases: Mapping[str, Mapping[str, Sequence[tuple[float, float]]]],
     whitenings: Mapping[str, Sequence[tuple[str, int, float]]] = MappingProxyType({}),
 ) -> Plot:
-    """The best area of each family of stores over route bytes per place, a panel for each route.
+    """The largest AUC of each family of stores over route bytes per place, a panel for each route.
 
-    Convention: areas below `LOWEST` and above `HIGHEST` are drawn as these.
+    Convention: areas are clipped to `LOWEST` and `HIGHEST`.
 
     Args:
         cases: case -> family -> bytes per place and area, ascending.
-        whitenings: case -> name, fixed bytes and area of a map by each; a panel below that of the case.
+        whitenings: case -> name, fixed bytes and area of a map by each, in a panel below that of the case.
     """
     names = list(dict.fromkeys(name for families in cases.values() for name in families))
     panels = [share for case in cases for share in ([1.0, 0.6] if case in whitenings else [1.0])]
@@ -187,7 +189,7 @@ def plot_frontiers(
 
 
 def _plot_whitenings(axis: Any, whitenings: Sequence[tuple[str, int, float]]) -> None:
-    """The area of a map by each whitening, with its name and bytes, the largest on top."""
+    """The AUC of a map with each whitening, with its name and bytes, the largest on top."""
     ordered = sorted(whitenings, key=lambda one: one[1])
     areas = [area for _, _, area in ordered]
     axis.scatter(areas, range(len(ordered)), color=OURS)

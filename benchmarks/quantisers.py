@@ -1,4 +1,4 @@
-"""Ways to store descriptors in few bytes, and what each gives back: keyframes, PCA, quantisers."""
+"""Ways to store descriptors in few bytes, and their decoded descriptors: keyframes, PCA, quantisers."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from dejavu_torch.types import InputError
 
 CENTROIDS = 256  # of a codebook: a code is a byte
 
-Code = Callable[[Tensor], Tensor]  # descriptors (n,K) -> what a store gives back of them, (n,K)
+Code = Callable[[Tensor], Tensor]  # descriptors (n,K) -> encoded and decoded, (n,K)
 
 
 class Kept(NamedTuple):
-    """Descriptors (N,K) of all places as a store gives them back, and the bytes that it takes.
+    """Decoded descriptors (N,K) of all places, and the bytes of their store.
 
-    route: those that grow with the route, codebooks fitted on it included. fixed: the others, beside the
-    whitening. apart: k, if only every k-th place is stored and the others are given back as the one before.
+    route: bytes that grow with the route, including codebooks fitted on it. fixed: the others, without the
+    whitening. apart: k, if only every k-th place is stored and repeated for those after it.
     """
 
     descriptors: Tensor
@@ -37,7 +37,7 @@ class Kept(NamedTuple):
 
 
 def spectral(places: Tensor, budget: float, seed: int | None = None) -> Kept:
-    """The spectral map of so many route bytes per place; with a seed that of shuffled places, the null."""
+    """The spectral map with this many route bytes per place; with a seed its null, of shuffled places."""
     order = torch.arange(len(places)) if seed is None else shuffled(places, seed)[0]
     route = SpectralMapper(budget)(places[order])
     back = torch.empty_like(places)
@@ -46,26 +46,26 @@ def spectral(places: Tensor, budget: float, seed: int | None = None) -> Kept:
 
 
 def every_kth(
-    places: Tensor, k: int, each: int, code: Code | None = None, between: bool = False, beside: int = 0
+    places: Tensor, k: int, each: int, code: Code | None = None, between: bool = False, overhead: int = 0
 ) -> Kept:
-    """Every k-th place, at `each` bytes and `beside` bytes once; `code` is what the store gives back of them.
+    """Every k-th place, coded by `code` in `each` bytes, plus `overhead` bytes once.
 
-    between: also store the last place, and give back straight lines between the stored ones.
+    between: also store the last place, and interpolate linearly between the stored ones.
     """
     count = len(places)
     chosen = keyframes(count, k) if between else torch.arange(0, count, k)
     keys = places[chosen] if code is None else code(places[chosen])
-    size = len(keys) * each + beside
+    size = len(keys) * each + overhead
     if between:
         return Kept(between_keyframes(keys, count, k), size)
     return Kept(keys.repeat_interleave(k, 0)[:count], size, apart=k)
 
 
 def principal(places: Tensor, numbers: int, k: int = 1) -> Kept:
-    """The strongest principal components of every k-th place, in int8 with a scale each; between them lines.
+    """The strongest principal components of every k-th place, in int8 with a scale each, interpolated.
 
-    The mean and the axes, a byte a number, count as fixed, though they are fitted on the route: axes of
-    another one would do nearly as well.
+    The mean and the axes, in one byte per number, count as fixed although they are fitted on the route: those
+    of another route would do nearly as well.
     """
     if numbers > min(places.shape):
         raise InputError(f"{numbers} principal components of descriptors {tuple(places.shape)}")
@@ -79,23 +79,23 @@ def principal(places: Tensor, numbers: int, k: int = 1) -> Kept:
 
 
 def signs(places: Tensor) -> Tensor:
-    """What a bit a number gives back: 1 and -1."""
+    """Descriptors coded in one bit per dimension: 1 or -1."""
     return torch.where(places >= 0, 1.0, -1.0)
 
 
 class Quantiser:
-    """What a code of faiss gives back, by the key of its factory: product codes `PQ8x8np` (Jegou et al.,
+    """Descriptors coded by faiss, by the key of its factory: product codes `PQ8x8np` (Jegou et al.,
     2011) and `OPQ8,PQ8x8np` (Ge et al., 2013), residual ones `RQ8x8`, `LSQ8x8`, `PRQ2x4x8`, and without
     codebooks `PCAR64,SQtqmse1` (TurboQuant), `RR128,RaBitQ`, `RR128,EDEN`.
 
     Args:
         training: descriptors (n,K).
-        multiple: of K that the code needs; descriptors are padded by zeros.
+        multiple: divisor that the code needs K to have; descriptors are padded with zeros.
 
     each: bytes of a code. width: K, padded.
 
     Raises:
-        InputError: a code that faiss lacks, or that it cannot train on these.
+        InputError: faiss lacks the code, or cannot train it on these descriptors.
     """
 
     def __init__(self, training: Tensor, key: str, multiple: int = 1) -> None:
@@ -103,7 +103,7 @@ class Quantiser:
 
         if "x8" in key and len(training) < CENTROIDS:
             raise InputError(
-                f"{len(training)} places to train codebooks on; expected at least {CENTROIDS}, one a centroid"
+                f"{len(training)} places to train codebooks; expected at least {CENTROIDS}, one per centroid"
             )
         self.numbers = training.shape[1]
         self.width = -(-self.numbers // multiple) * multiple
@@ -126,7 +126,7 @@ class Quantiser:
 
 @contextmanager
 def silent() -> Iterator[None]:
-    """In the block no warnings: faiss has one for each codebook with fewer than 39 places a centroid."""
+    """Silence stderr in the block: faiss warns of each codebook with fewer than 39 places per centroid."""
     sys.stderr.flush()
     kept = os.dup(2)
     try:

@@ -1,4 +1,4 @@
-"""Descriptors of ground that truly repeats, made of its two tiles: `sim:aerial?ground=repeat`."""
+"""Descriptors of ground that repeats exactly, made from its two tiles: `sim:aerial?ground=repeat`."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from dejavu_torch.maps.quantisation import quantise
 from dejavu_torch.maps.spectrum import spectrum
 from dejavu_torch.model import DejaVu
 
-LOOKED_AT = 16  # numbers of a descriptor that a step is chosen by
+LOOKED_AT = 16  # dimensions of a descriptor by which a step is chosen
 HALVINGS = 12
 ROWS = 8192
 
 
 @torch.no_grad()
 def tiles_of(model: DejaVu) -> dict[str, Tensor]:
-    """What each tile adds to whitened descriptors of HOG ahead of their scaling to length 1, by phase: (P,K).
+    """The part of each tile in whitened descriptors of HOG, before scaling to length 1, by phase: (P,K).
 
-    Blocks of HOG see one tile or the road between them, which is the same everywhere: so a descriptor of a
-    frame without noise, drift and yaw is a sum of two.
+    A block of HOG sees one tile or the road between them, which is the same everywhere, so without noise,
+    drift and yaw a descriptor is the sum of two parts.
     """
     assert isinstance(model.features, HOG)
     assert model.whitening is not None
@@ -39,7 +39,7 @@ def tiles_of(model: DejaVu) -> dict[str, Tensor]:
 
 
 class TiledRoute(IndexedTraverse):
-    """Descriptors of two tiles, over and over; first, second: see `tiles_of`."""
+    """Descriptors of two tiles that repeat; first, second: see `tiles_of`."""
 
     def __init__(self, first: Tensor, second: Tensor, length: int) -> None:
         self.first, self.second, self.length = first, second, length
@@ -51,7 +51,7 @@ class TiledRoute(IndexedTraverse):
 
 
 def step_that_holds(share: float, route: IndexedTraverse, chunk: int) -> float:
-    """The step of a spectral map that keeps so much of a route's variance, by some of its numbers."""
+    """The step of a spectral map that holds this share of a route's variance, by some of its dimensions."""
     columns = torch.linspace(0, route.frame_shape[0] - 1, LOOKED_AT).long()
     series = torch.cat([part[:, columns] for part in route.batches(ROWS)])
     series -= series.mean(0)

@@ -1,4 +1,4 @@
-"""The figures of the documentation: `benchmarks results` runs the commands and keeps what they said."""
+"""`benchmarks results`: runs the commands for the figures of the documentation and keeps the reports."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ from benchmarks.measure import Row, done_once, write_bench
 from benchmarks.trainings import ROAD, drive
 from dejavu_torch.types import InputError
 
-SEEDS = (0, 3, 4)  # of the simulated routes; settings were chosen on others
+SEEDS = (0, 3, 4)  # of the simulated routes; settings were chosen with other seeds
 
 
 class Footage(NamedTuple):
-    """Two traverses, and words of `dejavu compare` that go with them; {data} is the folder of the footage.
+    """Two traverses and their options of `dejavu compare`; {data} is the folder of the footage.
 
-    strange: footage of other places, whose answers are all wrong.
+    distractors: footage of other places, for which all answers are wrong.
     """
 
     reference: str
     query: str
     words: str = ""
-    strange: str = ""
+    distractors: str = ""
 
 
-def road(part: str = "", strange: str = "sim:outdoor?stop=2000") -> Footage:
-    return Footage(ROAD.format(1, part), ROAD.format(2, part), strange=strange)
+def road(part: str = "", distractors: str = "sim:outdoor?stop=2000") -> Footage:
+    return Footage(ROAD.format(1, part), ROAD.format(2, part), distractors=distractors)
 
 
-def railway(part: str, strange: str) -> Footage:
+def railway(part: str, distractors: str) -> Footage:
     summer, winter = (f"{{data}}/nordland/{one}?" for one in ("summer", "winter"))
-    return Footage(summer + part, winter + part, "--truth 0 --tolerance 1", winter + strange)
+    return Footage(summer + part, winter + part, "--truth 0 --tolerance 1", winter + distractors)
 
 
 def filmed(name: str, tolerance: int) -> Footage:
@@ -46,9 +46,9 @@ def filmed(name: str, tolerance: int) -> Footage:
     return Footage(one.reference, one.query, f"--truth {one.truth} --tolerance {tolerance}")
 
 
-def simulated(kind: str, seed: int, strange: str) -> Footage:
+def simulated(kind: str, seed: int, distractors: str) -> Footage:
     one = f"sim:{kind}?seed={seed}"
-    return Footage(one, f"{one}&traverse=1", "", f"sim:{strange}?stop=2000")
+    return Footage(one, f"{one}&traverse=1", "", f"sim:{distractors}?stop=2000")
 
 
 FOOTAGE = {
@@ -65,23 +65,27 @@ FOOTAGE = {
     "road, second half": road("&start=1348", ROAD.format(2, "&stop=1348")),
     "road": road(),
     **{
-        f"sim:{kind}, seed {seed}": simulated(kind, seed, strange)
-        for kind, strange in (("aerial", "outdoor"), ("outdoor", "underground"), ("underground", "outdoor"))
+        f"sim:{kind}, seed {seed}": simulated(kind, seed, distractors)
+        for kind, distractors in (
+            ("aerial", "outdoor"),
+            ("outdoor", "underground"),
+            ("underground", "outdoor"),
+        )
         for seed in SEEDS
     },
 }
-IN_ORDER = (  # a route of each kind that is long enough for 21 queries together
+IN_ORDER = (  # a route of each kind, long enough for sequences of 21
     *("city 1", "city 2", "laps", "railway, first half", "railway, second half", "road, second half"),
     *("sim:aerial, seed 0", "sim:outdoor, seed 0", "sim:underground, seed 0"),
 )
-SEEDED = ("default", "HOG and pixels")  # on all seeds, the others on the first
+SEEDED = ("default", "HOG and pixels")  # run with all seeds, the others with the first
 SECOND = "railway, second half"
 PIXELS = (
     "{class_path: dejavu_torch.features.joined.Joined, init_args: {shares: [1, .5], members: "
     "[{class_path: dejavu_torch.HOG}, {class_path: PatchPixels, init_args: "
     "{size: [24, 48], channel: grey}}]}}"
 )
-WAYS = {  # of `dejavu compare`; {default} and {visits} are folders of maps
+WAYS = {  # options of `dejavu compare`; {default} and {visits} are folders of maps
     "default": "--storage_curve",
     "HOG": "--features HOG --calibration none",
     "HOG and pixels": f"--features {shlex.quote(PIXELS)} --calibration none",
@@ -104,38 +108,38 @@ class Run(NamedTuple):
 
 
 def runs(ways: Sequence[str]) -> Iterator[Run]:
-    """Every way on every footage that it is for."""
+    """Every way on all footage that it applies to."""
     for way in ways:
         for name, one in FOOTAGE.items():
-            for_it = {"sequence": name in IN_ORDER, "filter": bool(one.strange), "visits": name == SECOND}
+            for_it = {"sequence": name in IN_ORDER, "filter": bool(one.distractors), "visits": name == SECOND}
             again = name.endswith(tuple(f"seed {seed}" for seed in SEEDS[1:]))
             if not for_it.get(way, True) or (again and way not in SEEDED):
                 continue
             words = ["compare", one.reference, one.query, *shlex.split(one.words), *shlex.split(WAYS[way])]
             words = [word.replace("{footage}", slug(name)) for word in words]
-            if way in ("default", "filter") and one.strange:
-                words += ["--distractors", one.strange]
+            if way in ("default", "filter") and one.distractors:
+                words += ["--distractors", one.distractors]
             yield Run(name, way, words)
 
 
 def slug(name: str) -> str:
-    """A name as that of a folder."""
+    """A name as the name of a folder."""
     return re.sub(r"\W+", "_", name)
 
 
 def kept(report: dict[str, Any]) -> Row:
-    """The figures of a report, without what is long: of the map, its curve, and all that stands beside it."""
+    """The figures of a report for the map, its curve, and everything it is compared with."""
     figures = ("auc", "recall_at_1", "recall_at_100_precision", "route_bytes", "bytes", "sequences")
     own = ("frames", "fixed_bytes", "route_bytes_per_place", "noise_over_map", "storage", "rejection")
-    beside = {
+    rivals = {
         name: of for name, of in report.items() if isinstance(of, dict) and "auc" in of and name not in own
     }
     row = {name: report[name] for name in (*figures, *own) if name in report}
-    return row | {name: {key: of[key] for key in figures if key in of} for name, of in beside.items()}
+    return row | {name: {key: of[key] for key in figures if key in of} for name, of in rivals.items()}
 
 
 def rounded(value: Any) -> Any:
-    """With four decimals."""
+    """Round the numbers in a value to four decimals."""
     if isinstance(value, dict):
         return {name: rounded(one) for name, one in value.items()}
     if isinstance(value, list):
@@ -147,15 +151,15 @@ def run_results(data: Path, *, out: Path, ways: Sequence[str] = (), jobs: int = 
     """`dejavu compare` on footage of every kind, for the tables of the documentation.
 
     Args:
-        data: folder of the footage, as the tests have it
-        out: folder for bench.json and the reports, which a later run takes from there
-        ways: by name; all if not given. "filter" and "sequence" take the maps that "default" made
-        jobs: commands at a time, each of one thread
+        data: folder of the footage, as for the tests
+        out: folder for bench.json and the reports, which later runs reuse
+        ways: names of ways to run; all if not given. "filter" and "sequence" use the maps of "default"
+        jobs: commands that run in parallel, with one thread each
 
-    Convention: commands in bench.json have data/, default/ and visits/ in place of the folders.
+    Convention: commands in bench.json have data/, default/ and visits/ for the folders.
 
     Raises:
-        InputError: a name that is none of the ways, or less than one job.
+        InputError: an unknown way, or less than one job.
     """
     if unknown := [way for way in ways if way not in WAYS]:
         raise InputError(f"{unknown[0]!r} is no way; expected one of {', '.join(map(repr, WAYS))}")
@@ -182,7 +186,7 @@ def run_results(data: Path, *, out: Path, ways: Sequence[str] = (), jobs: int = 
         if (said := done_once(placed(VISITS.split(), folders), made.parent, made)) is not None:
             raise InputError(said)
     rows: list[Row] = []
-    for first in (True, False):  # the others need the maps of the default
+    for first in (True, False):  # the other ways need the maps of the default
         part = [run for run in planned if (run.way == "default") == first]
         with ThreadPoolExecutor(jobs) as pool:
             rows += tqdm(pool.map(row_of, part), "results", len(part), disable=None, leave=False)

@@ -1,4 +1,4 @@
-"""How maps grow with the route, beside the indexes of faiss on the same descriptors: `benchmarks scale`."""
+"""`benchmarks scale`: how maps grow with the route, against the indexes of faiss on the same descriptors."""
 
 from __future__ import annotations
 
@@ -53,13 +53,13 @@ from dejavu_torch.types import InputError, Match
 
 PLACES = (10_000, 100_000, 1_000_000)
 FEWEST, MOST = 500, 10**8
-RENDERED = 100_000  # places that are drawn; beyond them descriptors are made
-DESCRIBED = 10_000  # places that the whitening has seen
-QUERIES, SINGLE, BATCH = 2000, 20, 256  # in all, those of them that are timed one by one, of a batch
-CHECKED = 10_000  # places at which made descriptors stand beside drawn ones
-SHUFFLED = 100_000  # places of a null at most
-MEMORY = 8_000_000_000  # bytes of a process
-COPIED = 2**27  # bytes of a copy that shows the bandwidth
+RENDERED = 100_000  # places whose frames are drawn; for more, descriptors are made
+DESCRIBED = 10_000  # places to learn the whitening from
+QUERIES, SINGLE, BATCH = 2000, 20, 256  # all queries, those timed one by one, those in a batch
+CHECKED = 10_000  # places at which made descriptors are compared with drawn ones
+SHUFFLED = 100_000  # most places of a null
+MEMORY = 8_000_000_000  # most bytes of a process
+COPIED = 2**27  # bytes of a copy that measures the bandwidth
 TOLERANCE = 5
 FAISS = {
     "trained": TRAINED,
@@ -71,11 +71,10 @@ FAISS = {
 
 
 class Task(NamedTuple):
-    """What is measured of a contender.
+    """One contender to measure.
 
-    case: of the rows. source: of the descriptors, see `Folder`. places: N. threads: that learn. device: that
-    localizes. room, step: route bytes per place and step that it is to take, of those that do not say
-    themselves.
+    case: of the rows. source: of the descriptors, see `Folder`. places: N. threads: for learning. device: for
+    localizing. room, step: route bytes per place and step, for contenders that use those of another.
     """
 
     case: str
@@ -89,15 +88,15 @@ class Task(NamedTuple):
 
     def file(self, folder: Path) -> Path:
         learned = self.contender
-        for search in SEARCHED:  # of one map
+        for search in SEARCHED:  # these share one file
             learned = learned.removesuffix(f", {search}")
         return folder / f"kept-{self.case}-{list(CONTENDERS).index(learned)}"
 
 
 class Kept(IndexedTraverse):
-    """The first places of descriptors that lie in a file.
+    """The first places of the descriptors in a file.
 
-    Mapped for each part anew: pages that stay mapped would count as memory of those who read them.
+    The file is mapped again for each part: pages that stay mapped would count as memory of the process.
     """
 
     def __init__(self, path: Path, length: int) -> None:
@@ -109,7 +108,7 @@ class Kept(IndexedTraverse):
 
 
 def learn(task: Task, folder: Path) -> dict[str, Any]:
-    """Keep the descriptors; the figures of a row that this tells."""
+    """Store the descriptors; returns figures of a row."""
     torch.set_num_threads(task.threads)
     contender, file = CONTENDERS[task.contender](task.room, task.step), task.file(folder)
     route = Kept(folder / f"{task.source}.npy", task.places)
@@ -129,12 +128,16 @@ def learn(task: Task, folder: Path) -> dict[str, Any]:
 
 
 def localize(task: Task, folder: Path) -> dict[str, Any]:
-    """Find the queries in what was kept, one by one and in batches; the figures that this tells."""
+    """Find the queries in the stored file, one by one and in batches; returns figures of a row."""
     torch.set_num_threads(1)
     state = load_file(folder / f"{task.case}.safetensors")
     queries, truth = state["queries"], state["truth"]
     contender = CONTENDERS[task.contender](task.room, task.step)
-    parts = [queries[:1], *queries[:SINGLE].split(1), *queries.split(BATCH)]  # the first loads what is late
+    parts = [
+        queries[:1],
+        *queries[:SINGLE].split(1),
+        *queries.split(BATCH),
+    ]  # the first loads what is loaded late
     alone = 1 + len(queries[:SINGLE])
     seconds: list[float] = []
     found: list[tuple[Tensor, Tensor]] = []
@@ -181,21 +184,21 @@ def localize(task: Task, folder: Path) -> dict[str, Any]:
 
 
 def bandwidth(device: str) -> float:
-    """Bytes a second that a copy reads and writes, on one thread of a CPU or on another device."""
+    """Bytes per second that a copy reads and writes, on one thread of a CPU or on another device."""
     source = torch.zeros(COPIED, dtype=torch.uint8, device=device)
     target = torch.ones_like(source)
     fastest = math.inf
     for _ in range(5):
         began = time.perf_counter()
         target.copy_(source)
-        target[-1].item()  # waits for it
+        target[-1].item()  # waits for the copy
         fastest = min(fastest, time.perf_counter() - began)
     return 2 * COPIED / fastest
 
 
 def measured(task: Task, folder: Path) -> Row:
-    """A contender's row: it learns in one process and localizes in another. What was learned is kept until
-    another one learns, for other ways to search it."""
+    """The row of a contender, which learns in one process and localizes in another. Its file is kept until
+    the next one learns, for other ways to search it."""
     known = task.file(folder).with_suffix(".json")
     if not known.exists():
         for file in folder.glob("kept-*"):
@@ -208,13 +211,13 @@ def measured(task: Task, folder: Path) -> Row:
 
 
 class Folder:
-    """Descriptors of all cases, each made once; where they lie, `source` names them.
+    """The descriptors of all cases, each made once, in files named by their `source`.
 
-    "drawn": of frames. "made": like those, see `MadeRoute`. "tiles", "flown": of ground that repeats, of its
-    two tiles, see `TiledRoute`, and of frames.
+    "drawn": of frames. "made": with the statistics of those, see `MadeRoute`. "tiles", "flown": of ground
+    that repeats, from its two tiles, see `TiledRoute`, and from frames.
 
     Args:
-        path: an empty folder. drawn: places of `sim:aerial`, whose first ones the whitening is learned from.
+        path: an empty folder. drawn: places of `sim:aerial`, of which the first ones train the whitening.
     """
 
     def __init__(self, path: Path, drawn: int) -> None:
@@ -226,17 +229,17 @@ class Folder:
         self.like: Likeness = likeness(places, self.described(self.second, shown), shown)
 
     def make(self, places: int) -> None:
-        """Descriptors like those drawn; shorter routes are the first of them."""
+        """Make descriptors like those drawn; shorter routes are their first places."""
         self.keep("made", places, MadeRoute(self.like, places).batches(ROWS))
 
     def draw_again(self, places: int, flown: int) -> None:
-        """The ground that repeats: of its tiles, and of a flight over its first places."""
+        """Make descriptors of ground that repeats, from its tiles and from a flight over its first places."""
         self.keep("tiles", places, TiledRoute(**tiles_of(self.model), length=places).batches(ROWS))
         if flown:
             self.keep("flown", flown, self.seen(AerialRoad(frames=flown, ground="repeat"), range(flown)))
 
     def ask(self, case: str, source: str, places: int) -> None:
-        """Describe the queries of a case: the second flight, evenly along the route."""
+        """Describe the queries of a case: frames of a second flight, evenly along the route."""
         shown = spread(places)
         if source == "made":
             queries = MadeRoute(self.like, places).seen_again(shown)
@@ -259,7 +262,7 @@ class Folder:
         """Write descriptors as they are made.
 
         Raises:
-            InputError: no room for them.
+            InputError: they do not fit.
         """
         bar = tqdm(total=places, desc=name, disable=None, leave=False)
         try:
@@ -279,7 +282,7 @@ class Folder:
 
 
 def spread(places: int) -> Tensor:
-    """The places that queries show, (Q,), evenly along the route."""
+    """The places of the queries, (Q,), evenly along the route."""
     count = min(QUERIES, places)
     return torch.arange(count) * (places // count)
 
@@ -290,19 +293,19 @@ def bench_scale(
     """All contenders at all sizes, a row at a time.
 
     Args:
-        places: N of each size, `PLACES` where none is given. device: that our maps localize on.
-        contenders: in place of all those of the cases `places=N`, of which alone there are rows then.
+        places: N of each size, `PLACES` if not given. device: for our maps to localize on.
+        contenders: only these of the cases `places=N`, and no other cases.
 
     Yields:
-        Rows of the cases `places=N`: up to `RENDERED` places `sim:aerial`, beyond it descriptors that are
-        made to be like it, see `MadeRoute`; `made=N`: such descriptors at a size that is drawn as well;
-        `repeat=N`: ground that repeats, see `TiledRoute`; `templates=N`: see `bench_templates`.
+        Rows of the cases `places=N`: `sim:aerial` up to `RENDERED` places, for more descriptors with its
+        statistics, see `MadeRoute`; `made=N`: such descriptors at a size that is also drawn; `repeat=N`:
+        ground that repeats, see `TiledRoute`; `templates=N`: see `bench_templates`.
 
     Raises:
-        InputError: too few places or too many, an unknown contender, or no room for the descriptors.
+        InputError: too few or too many places, an unknown contender, or descriptors that do not fit.
     """
     if unknown := set(contenders) - PLACED.keys():
-        raise InputError(f"contenders are {sorted(unknown)}; expected of {list(PLACED)}")
+        raise InputError(f"contenders are {sorted(unknown)}; expected some of {list(PLACED)}")
     sizes = sorted(set(places or PLACES))
     if sizes[0] < FEWEST or sizes[-1] > MOST:
         raise InputError(f"bench scale got places {sizes}; expected {FEWEST} to {MOST} each")
@@ -317,7 +320,7 @@ def bench_scale(
         if repeating:
             folder.draw_again(repeating[-1], max([n for n in repeating if n <= RENDERED], default=0))
         for n in sizes:
-            if n in made[:1] and not contenders:  # ahead of which made descriptors are checked
+            if n in made[:1] and not contenders:  # check made descriptors before using them
                 yield from rows_of(folder, "made", "made", CHECKED, device, placed)
             yield from rows_of(folder, "places", "made" if n in made else "drawn", n, device, placed)
             if n in repeating:
@@ -326,7 +329,7 @@ def bench_scale(
             yield from rows_of(folder, "repeat", "tiles", n, device, REPEATED)
     if contenders:
         return
-    for row in bench_templates(sizes if places else TEMPLATES):  # a query by itself takes as long as of many
+    for row in bench_templates(sizes if places else TEMPLATES):  # batches are no faster than single queries
         count, size = int(row["case"].partition("=")[2]), row["file_bytes"]
         same = {key: row[key] for key in ("seconds", "peak_bytes", "threads", "skipped", "difference")}
         same |= {"seconds_one": row["seconds"], "route_bytes": size, "bytes_per_place": size and size / count}
@@ -336,7 +339,7 @@ def bench_scale(
 def rows_of(
     folder: Folder, kind: str, source: str, places: int, device: str, names: Iterable[str]
 ) -> Iterator[Row]:
-    """Contenders of a case, `kind=places`."""
+    """The rows of a case, `kind=places`."""
     case, threads = f"{kind}={places}", torch.get_num_threads()
     folder.ask(case, source, places)
     room = step = 0.0
@@ -355,13 +358,13 @@ def rows_of(
 def run_scale(
     *, out: Path, places: Sequence[int] = (), device: str = "cpu", contenders: Sequence[str] = ()
 ) -> list[str]:
-    """Time, memory, bytes and accuracy over the number of places, beside the indexes of faiss.
+    """Time, memory, bytes and accuracy over the number of places, against the indexes of faiss.
 
     Args:
         out: folder for bench.json and bench.png
-        places: 10000, 100000 and 1000000 if not given
-        device: what localizes: as of `dejavu localize`
-        contenders: by name, in this order; all but "usearch int8" if not given
+        places: numbers of places; 10000, 100000 and 1000000 if not given
+        device: device to localize on, as in `dejavu localize`
+        contenders: names of contenders to run, in this order; all but "usearch int8" if not given
     """
     device = str(device_of(device))
     rows: list[Row] = []
@@ -373,7 +376,7 @@ def run_scale(
             write_bench(out, rows, exponents=exponents(rows), **facts)
             if not bar.disable:
                 bar.write(f"{row['case']}: {row['contender']}", sys.stderr)
-    finally:  # also where a later row fails
+    finally:  # even if a later row fails
         panels = pictured(rows)
         if panels:
             picture = plot_growth(panels, linear=[RECALL])
@@ -382,7 +385,7 @@ def run_scale(
 
 
 def limit_memory() -> None:
-    """Have the system refuse this process more than `MEMORY`, where it can."""
+    """Let the system refuse this process more than `MEMORY`, if it can."""
     with suppress(ImportError, ValueError, OSError):
         import resource
 
@@ -391,7 +394,7 @@ def limit_memory() -> None:
 
 if __name__ == "__main__":
     what, given, place = json.loads(sys.argv[1])
-    with suppress(ImportError):  # loaded ahead of what is measured, as are loops that numba compiles
+    with suppress(ImportError):  # loaded before measuring, like the loops that numba compiles
         import faiss  # noqa: F401
     for module in (codec, distance):
         module._compiled()

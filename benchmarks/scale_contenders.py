@@ -1,4 +1,4 @@
-"""What stands side by side in `benchmarks scale`: ways to keep descriptors, and to find the nearest."""
+"""The contenders of `benchmarks scale`: ways to store descriptors and to find the nearest one."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.search import Search
 
-ROWS = 8192  # descriptors read at a time
+ROWS = 8192  # descriptors read together
 CHUNK = 8192
 SHARE = 0.8  # of the variance of a repeating route
-TRAINED, ROTATED = 100_000, 20_000  # samples at most of an index of faiss, of its rotation
-CELLS_PER_PROBE, PROBED_AT_LEAST = 32, 32  # of an inverted file
+TRAINED, ROTATED = 100_000, 20_000  # most samples to train an index of faiss, and its rotation
+CELLS_PER_PROBE, PROBED_AT_LEAST = 32, 32  # in an inverted file
 EF_SEARCH = 64  # candidates while a graph is searched
 
 
 class Mapped(Store):
-    """Ours: a map, of frames with the default whitening (None), or of descriptors as they are.
+    """Our map, of frames with the default whitening (None), or of descriptors ("none").
 
     Args:
-        shuffled: in random order, the null. search: see `DejaVu.localize`.
+        shuffled: learn in random order, the null. search: see `DejaVu.localize`.
     """
 
-    model: DejaVu  # once it is loaded
+    model: DejaVu  # after loading
 
     def __init__(
         self,
@@ -76,7 +76,7 @@ class Mapped(Store):
 
 
 class Held(Mapped):
-    """Ours, in steps that keep so much of the variance of a route."""
+    """Our map with the step that holds `SHARE` of the variance of a route."""
 
     mapper: SpectralMapper
 
@@ -89,15 +89,15 @@ class Faiss(Store):
     """An index of faiss over descriptors of length 1.
 
     Args:
-        factory: what `faiss.index_factory` takes; {cells} stands for the cells of an inverted file.
-        probes: of these that are searched; None for as many as `CELLS_PER_PROBE` says.
+        factory: key for `faiss.index_factory`; {cells} stands for the number of cells of an inverted file.
+        probes: number of cells to search; None chooses it by `CELLS_PER_PROBE`.
     """
 
     def __init__(self, factory: str, probes: int | None = None) -> None:
         self.factory, self.probes = factory, probes
 
     def parts(self, route: IndexedTraverse) -> Iterable[Tensor]:
-        """What is kept of a route, batch by batch."""
+        """The descriptors of a route to store, in batches."""
         return route.batches(ROWS)
 
     def describe(self, queries: Tensor) -> Tensor:
@@ -111,7 +111,9 @@ class Faiss(Store):
         cells = max(1, min(4 * math.isqrt(route.length), -(-route.length // every) // 40))
         numbers = self.describe(route.read(range(1))).shape[1]
         index: Any = faiss.index_factory(numbers, self.factory.format(cells=cells))
-        if isinstance(index, faiss.IndexPreTransform):  # else training it takes longer than all the rest
+        if isinstance(
+            index, faiss.IndexPreTransform
+        ):  # without this limit, training it takes longer than all the rest
             chain: Any = index.chain
             rotation: Any = faiss.downcast_VectorTransform(chain.at(0))
             rotation.max_train_points = ROTATED
@@ -144,7 +146,7 @@ class Faiss(Store):
 
 
 class Usearch(Store):
-    """A graph of usearch over descriptors of length 1, in 8 bits a number."""
+    """A graph of usearch over descriptors of length 1, in 8 bits per dimension."""
 
     def learn(self, route: IndexedTraverse, path: Path) -> int:
         from usearch.index import Index
@@ -170,7 +172,7 @@ class Usearch(Store):
 
 
 class Interpolated(Store):
-    """Every k-th descriptor in int8 and straight lines between them, in so many bytes per place."""
+    """Every k-th descriptor in int8, interpolated, in this many bytes per place."""
 
     def __init__(self, room: float) -> None:
         self.room = room
@@ -214,9 +216,8 @@ ONE_CHUNK = f"{OURS}, one chunk"
 FIXED = f"{OURS}, chunks of {CHUNK}"
 FLOWN = f"{OURS}, one chunk, of noisy frames"
 
-# by name: what it is made of, given the route bytes per place and the step of `ONE_CHUNK` at this size, where
-# it is to take the same. "np" leaves out the training of faiss's filter by Hamming distances, which takes
-# long and is not used here
+# functions of the route bytes per place and the step of `ONE_CHUNK` at this size, for contenders that use the
+# same. "np" skips the training of faiss's filter by Hamming distances, which is slow and not used here
 PLACED: dict[str, Callable[[float, float], Store]] = {
     f"{OURS} 1 B": lambda *_: Mapped(SpectralMapper(1.0, chunk=CHUNK)),
     f"{OURS} 1 B, exact": lambda *_: Mapped(SpectralMapper(1.0, chunk=CHUNK), search="exact"),
@@ -247,6 +248,10 @@ REPEATED: dict[str, Callable[[float, float], Store]] = {
     "interpolated frames": lambda room, _: Interpolated(room),
 }
 CONTENDERS = PLACED | REPEATED
-REQUESTED = ("usearch int8",)  # measured where they are named: this takes long to learn 10^6 places
-SEARCHED = ("exact", "scan", "64 probes")  # ways to search what a contender without them in its name keeps
-GIVEN = CONTENDERS.keys() - {ONE_CHUNK, FIXED, FLOWN}  # those whose bytes per place are given, and no result
+REQUESTED = ("usearch int8",)  # only measured if named: it is slow to learn 10^6 places
+SEARCHED = ("exact", "scan", "64 probes")  # ways to search the file of the contender without them in its name
+GIVEN = CONTENDERS.keys() - {
+    ONE_CHUNK,
+    FIXED,
+    FLOWN,
+}  # contenders whose bytes per place are set, not measured

@@ -1,4 +1,4 @@
-"""What `benchmarks scale` reports: rows, how they grow with the number of places, tables and pictures."""
+"""The report of `benchmarks scale`: rows, their growth with the number of places, tables and pictures."""
 
 from __future__ import annotations
 
@@ -11,21 +11,13 @@ from benchmarks.measure import Column, Row, new_row, table
 from benchmarks.scale_contenders import GIVEN
 from dejavu_torch.data.simulate.aerial import LONGEST
 
-FITTED = 3  # sizes at least
-RECALL = "recall@1"  # the panel of it
+FITTED = 3  # fewest sizes to fit
+RECALL = "recall@1"  # name of its panel
 KEYS = (
     *("places", "seconds", "seconds_one", "peak_bytes", "learn_peak_bytes", "bytes", "route_bytes"),
     *("bytes_per_place", "learn_rate", "recall_at_1", "auc", "queries", "threads", "ratio_to_ours"),
-    *(
-        "seconds_threads",
-        "seconds_one_threads",
-        "skipped",
-        "seconds_load",
-        "step",
-        "difference",
-        "device",
-        "bandwidth_share",
-    ),
+    *("seconds_threads", "seconds_one_threads", "skipped", "seconds_load", "step", "difference"),
+    *("device", "bandwidth_share"),
 )
 COLUMNS: dict[str, Column] = {
     "B/place": ("bytes_per_place", ".3g"),
@@ -51,33 +43,31 @@ PANELS = {
 
 
 def scale_row(case: str, contender: str, places: int, **facts: Any) -> Row:
-    """What one contender takes at one size; None where it is not known.
+    """The figures of one contender at one size; None if unknown.
 
-    places: N. seconds: of a query of a batch of `BATCH`; seconds_one: of a query by itself, the median; both
-    on one thread, from the descriptor to the place; seconds_threads and seconds_one_threads: on all threads.
-    seconds_load: from the file to the first answer.
-    peak_bytes: most memory while localizing beyond that of the programs, learn_peak_bytes while learning,
-    each in a process of its own. bytes: of the file. route_bytes: of ours all that grows with the route, mean
-    and tables with it; of an index its codes and links alone, without identifiers and codebooks. step: of the
-    lines of a map that is not learned to a budget. learn_rate: descriptors a second; ours codes chunks in
-    one thread, whatever `threads`, those that an index is trained and filled by. ratio_to_ours: seconds over
-    those of our fastest. difference: largest to the places of the scan, of templates. device: that
-    localized. bandwidth_share: of a copy's, by the bytes that a scan goes through once for each batch;
-    peak_bytes are those of the device.
+    places: N. seconds: per query in a batch of `BATCH`; seconds_one: of a single query, the median; both on
+    one thread, from the descriptor to the place; seconds_threads and seconds_one_threads: on all threads.
+    seconds_load: from the file to the first answer. peak_bytes: most memory while localizing, without that of
+    the programs, on the device; learn_peak_bytes: while learning, each in its own process. bytes: of the
+    file. route_bytes: for a map all that grows with the route, with mean and tables; for an index only its
+    codes and links, without identifiers and codebooks. step: of a map that is not learned to a budget.
+    learn_rate: descriptors per second; a map codes chunks in one thread, an index uses `threads`.
+    ratio_to_ours: seconds over those of our fastest. difference: for templates, largest one to the places of
+    the scan. device: used to localize. bandwidth_share: bytes that a scan reads per batch, over those that a
+    copy moves in the same time.
     """
     return new_row(case, contender, KEYS, **{"places": places} | facts)
 
 
 def kind_of(row: Row) -> str:
-    """The case of a row without its size."""
+    """The case of a row, without its size."""
     return str(row["case"].partition("=")[0])
 
 
 def grown(rows: Iterable[Row], kind: str, key: str) -> dict[str, list[tuple[int, float]]]:
-    """Of each contender a figure over N, where it tells of growth.
+    """A figure of each contender over N, if it shows growth.
 
-    Bytes that are given tell nothing. Nor does the one size at which ground that repeats ends with a whole
-    cycle, beside those at which it does not.
+    Bytes that are set do not, nor does the one size at which repeating ground ends with a whole cycle.
     """
     found: dict[str, list[tuple[int, float]]] = {}
     for row in rows:
@@ -90,9 +80,9 @@ def grown(rows: Iterable[Row], kind: str, key: str) -> dict[str, list[tuple[int,
 
 
 def exponents(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
-    """How each figure of each contender grows with N, by kind of case: the slope of a line in logarithms.
+    """The exponent of N in each figure of each contender, by kind of case: the slope of a line in logarithms.
 
-    Convention: a line is fitted to 3 sizes or more, of what `grown` tells.
+    Convention: the line is fitted to at least 3 sizes of `grown`.
     """
     found: dict[str, dict[str, dict[str, float]]] = {}
     for kind in dict.fromkeys(map(kind_of, rows)):
@@ -106,7 +96,7 @@ def exponents(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
 
 
 def pictured(rows: Sequence[Row]) -> dict[str, dict[str, list[tuple[float, float]]]]:
-    """What is drawn over the number of places: heading -> contender -> points."""
+    """The lines to draw over the number of places: heading -> contender -> points."""
     found = {}
     for heading, (kind, key, unit) in PANELS.items():
         lines = grown(rows, kind, key).items()
@@ -115,7 +105,7 @@ def pictured(rows: Sequence[Row]) -> dict[str, dict[str, list[tuple[float, float
 
 
 def scale_tables(rows: Sequence[Row]) -> list[str]:
-    """A table of each case under its heading, and one of the exponents."""
+    """A table for each case under its heading, and one of the exponents."""
     found = []
     for case in dict.fromkeys(row["case"] for row in rows):
         found.append(

@@ -1,4 +1,4 @@
-"""Accuracy over bytes: the map beside what else would keep the same descriptors."""
+"""`benchmarks storage`: accuracy over bytes of the map and of other stores of the same descriptors."""
 
 from __future__ import annotations
 
@@ -44,36 +44,36 @@ from dejavu_torch.types import InputError, Match, Traverse
 
 BUDGETS = (0.5, 1.0, 1.6, 2.5, 3.2, 5.0, 10.0, 16.0)  # route bytes per place of ours and of the null
 SHOWN = (1.0, 1.6, 3.2, 5.0, 10.0)  # of the table
-NEAR = 1.02  # a budget is met by what takes at most so much of it
-SPACED = (1, 2, 3, 4, 5, 8, 10)  # k of every k-th frame as it is
-BETWEEN = (8, 10, 16, 25, 40, 64, 100)  # and with straight lines between
+NEAR = 1.02  # a budget is met by at most this share of it
+SPACED = (1, 2, 3, 4, 5, 8, 10)  # k of every k-th frame, repeated
+BETWEEN = (8, 10, 16, 25, 40, 64, 100)  # and interpolated
 COMPONENTS, COMPONENT_SPACED = (2, 4, 8, 16, 32), (1, 2, 5, 10)
 CODE_SPACED = (1, 2, 3, 4, 5, 8)
 BIT_SPACED = (1, 2, 3, 4, 5, 8, 10, 16)
 QUALITIES, VIDEO_SPACED = (24, 32, 40, 51), (1, 4, 8)  # crf
-CODES = {  # keys of faiss's factory, what K must be a multiple of, and numbers of the codebooks for each of K
+CODES = {  # keys of faiss's factory, divisor that K must have, and numbers in the codebooks per dimension
     "PQ": [(f"PQ{m}x8np", m, 256) for m in (4, 8, 16, 32)],
     "OPQ": [(f"OPQ{m},PQ{m}x8np", m, 256) for m in (4, 8, 16, 32)],
     "RQ": [(f"RQ{m}x8", 1, 256 * m) for m in (4, 8, 16)],
     "LSQ": [(f"LSQ{m}x8", 1, 256 * m) for m in (4, 8)],
     "PRQ": [(f"PRQ2x{m // 2}x8", 2, 128 * m) for m in (8, 16)],
 }
-MOST = 32  # route bytes per place of codebooks that count; larger ones are a row without figures
-ROTATED = {  # keys of codes without codebooks, axes that count, bytes of a code that decoding does not read
+MOST = 32  # most route bytes per place of codebooks; larger ones are a row without figures
+ROTATED = {  # keys of codes without codebooks, axes to count, bytes of a code that decoding does not need
     "TurboQuant": [(f"PCAR{n},SQtqmse1", n, 0) for n in (32, 64, 128)],
     "RaBitQ": [("PCAR64,RaBitQ", 64, 4), ("RR{},RaBitQ", 0, 4)],
     "EDEN": [("PCAR64,EDEN", 64, 4), ("RR{},EDEN", 0, 4)],
 }
-BUILT_IN = {"aerial": (3072, 10_000), "outdoor": (0,), "underground": (0,)}  # frames, 0 the whole route
-WHITENINGS: dict[str, dict[str, Any]] = {  # other settings than the defaults
+BUILT_IN = {"aerial": (3072, 10_000), "outdoor": (0,), "underground": (0,)}  # frames; 0 is the whole route
+WHITENINGS: dict[str, dict[str, Any]] = {  # settings other than the defaults
     "16 bits": {"bits": 16},
     "8 bits": {"bits": 8},
     "64 numbers": {"numbers": 64},
     "32 numbers": {"numbers": 32},
 }
-WHITENED = 5.0  # route bytes per place of the map behind each of them
-AT, LEVEL = 1.6, 0.95  # the area of ours at so many bytes is asked of others, but at most this: near 1 it
-# hangs on single queries
+WHITENED = 5.0  # route bytes per place of the map with each of them
+# others must reach our AUC at this many bytes, but at most this one: near 1 single queries decide
+AT, LEVEL = 1.6, 0.95
 TOLERANCE = 5
 KEYS = (
     *("family", "seconds", "peak_bytes", "bytes", "fixed_bytes", "route_bytes", "route_bytes_per_place"),
@@ -81,17 +81,17 @@ KEYS = (
 )
 OURS, NULL, OTHERS, GIVEN = "dejavu", "null", "dejavu, other whitenings", "dejavu, given maps"
 PAPER = "the paper"
-LEAST_MISSED = 0.002  # 1 - AUC of a store that is as good as perfect: below it single queries decide
+LEAST_MISSED = 0.002  # 1 - AUC of a store that counts as perfect: below it single queries decide
 
-Answer = tuple[Match, int, int]  # what a contender finds, its bytes that grow with the route, and all others
+Answer = tuple[Match, int, int]  # the matches of a contender, its route bytes and its fixed bytes
 Points = Sequence[tuple[float, float]]  # bytes per place and area
 
 
 class Route(NamedTuple):
-    """A route described: places (N,K) and queries (Q,K), whitened alike.
+    """The descriptors of a route: places (N,K) and queries (Q,K), with the same whitening.
 
-    reference: the frames of the places. other: the route of the free codebooks and of a whitening that is
-    shared; None leaves them out, and says so.
+    reference: the frames of the places. other: the route to train free codebooks and a shared whitening on;
+    None skips these.
     """
 
     name: str
@@ -112,12 +112,12 @@ class Route(NamedTuple):
 
     @property
     def matching(self) -> Matching:
-        """Single queries, and sequences of each T that there is room for."""
+        """Single queries, and sequences of each T that fits the route."""
         sequence = SequenceMatcher(max(length for length in LENGTHS if length <= len(self.places)))
         return Matching(sequence, models_beside(sequence, False, len(self.queries), len(self.places)))
 
     def another(self, what: str) -> Traverse:
-        """The other route, which something is learned on."""
+        """The other route, to learn something on."""
         if self.other is None:
             raise InputError(f"no other route to {what}; expected --codebooks SOURCE")
         self.model.describer.check_sizes(self.reference, self.other)
@@ -140,28 +140,28 @@ def run_storage(
     Args:
         sources: pairs REFERENCE QUERY; the built-in routes if not given
         out: folder for bench.json and bench.png
-        map: maps of the REFERENCE to set beside the others, each with descriptors of its own
-        codebooks: another route, where codebooks and a whitening are learned that count nothing
-        whitening: a map whose whitening describes all routes; each learns its own if not given
-        places: frames of the built-in sim:aerial; 3072 and 10000 if not given
-        truth: places of the queries, as `dejavu compare` takes it; by default frame i is place i
-        tolerance: places that a right answer may be off
+        map: maps of the REFERENCE to compare with, each with its own descriptors
+        codebooks: another route, for codebooks and a whitening whose bytes are not counted
+        whitening: map whose whitening is used for all routes; each learns its own if not given
+        places: numbers of frames of the built-in sim:aerial; 3072 and 10000 if not given
+        truth: places of the queries, as in `dejavu compare`; by default frame i is place i
+        tolerance: answers this many places off are still right
     """
     if tolerance < 0:
         raise InputError(f"--tolerance {tolerance}; expected at least 0")
     if truth is not None and len(sources) != 2:
-        raise InputError(f"--truth is of one pair, and there are {len(sources)} sources; expected 2")
+        raise InputError(f"--truth is for one pair, and there are {len(sources)} sources; expected 2")
     given = {path.stem: DejaVu.load(path) for path in map}
     if len(given) < len(map):
         raise InputError(f"--map {' '.join(str(path) for path in map)}; expected files of different names")
     shared = None if whitening is None else DejaVu.load(whitening)
     rows: list[Row] = []
     for row in bench_storage(sources, places, codebooks, given, shared, truth, tolerance):
-        rows = with_ratios([*rows, row])  # written as they are finished
+        rows = with_ratios([*rows, row])  # written as soon as it is finished
         write_bench(out, rows, equal_auc=equal_areas(rows), tolerance=tolerance)
     facts = {"equal_auc": equal_areas(rows), "missed_over_best": missed(rows), "tolerance": tolerance}
     write_bench(out, rows, pictured(rows), **facts)
-    note = "the best of each family, T queries matched together"
+    note = "the best of each family, with sequences of T queries"
     return [*storage_tables(rows), *skipped_lines(rows), note]
 
 
@@ -177,12 +177,11 @@ def bench_storage(
     """Accuracy over bytes of all contenders on all routes, a row at a time; see `run_storage`.
 
     Yields:
-        family: of contenders that make one front. seconds: to store the route and match all queries; of what
-        has descriptors of its own with describing all frames, and of the first of several rows that share a
-        training with that. peak_bytes: most memory held meanwhile beyond what was held before.
-        ratio_to_ours: seconds over those of our fastest. bytes: of all, with the whitening; those that do not
-        grow with the route are `fixed_bytes`, the others `route_bytes`. sequences: by T, scores of T queries
-        together. skipped: why there are no figures.
+        family: of contenders that form one front. seconds: to store the route and match all queries; includes
+        describing all frames for contenders with their own descriptors, and training in the first of several
+        rows that share one. peak_bytes: most memory meanwhile, minus that before. ratio_to_ours: seconds over
+        those of our fastest. bytes: all, with the whitening: `route_bytes`, which grow with the route, and
+        `fixed_bytes`. sequences: by T, scores of sequences of T. skipped: why there are no figures.
     """
     given = {} if given is None else given
     routes = routes_of(sources, places, codebooks, bool(given))
@@ -198,15 +197,15 @@ def bench_storage(
 def routes_of(
     sources: Sequence[str], places: Sequence[int], codebooks: str | None, given: bool
 ) -> list[tuple[str, Traverse, Traverse, Traverse | None]]:
-    """Name, reference, query and the route of the free codebooks of each route; all refused early."""
+    """Name, reference, query and other route of each route; refuses early what does not fit."""
     pairs = list(zip(sources[::2], sources[1::2], strict=False))
     twice = [f"{a} and {b}" for i, (a, b) in enumerate(pairs) if (a, b) in pairs[:i]]
     if len(sources) % 2:
         raise InputError(f"bench storage got {len(sources)} sources; expected pairs, REFERENCE QUERY ...")
     if given and len(pairs) != 1:
-        raise InputError(f"a map is of one route, and there are {len(sources)} sources; expected one pair")
+        raise InputError(f"--map is for one pair, and there are {len(sources)} sources; expected one pair")
     if sources and places:
-        raise InputError("--places are of the built-in sim:aerial; expected none beside sources")
+        raise InputError("--places is for the built-in sim:aerial; expected it without sources")
     if places and min(places) < 2:
         raise InputError(f"--places {' '.join(map(str, places))}; expected at least 2 each")
     if twice:
@@ -215,7 +214,7 @@ def routes_of(
         other = None if codebooks is None else open_source(codebooks)
         return [(f"{a} and {b}", open_source(a), open_source(b), other) for a, b in pairs]
     if codebooks is not None:
-        raise InputError("--codebooks are of pairs of sources; the built-in routes have seed 1 of their own")
+        raise InputError("--codebooks is for pairs of sources; the built-in routes use their seed 1")
     found: list[tuple[str, Traverse, Traverse, Traverse | None]] = []
     for kind, sizes in (BUILT_IN | ({"aerial": tuple(places)} if places else {})).items():
         for size in sizes:
@@ -227,7 +226,7 @@ def routes_of(
 
 
 def model_by(whitening: DejaVu | None) -> DejaVu:
-    """One with the defaults, or with the whitening of another."""
+    """A default model, with the whitening of another if given."""
     model = DejaVu()
     if whitening is not None:
         model.take_whitening(whitening)
@@ -235,12 +234,12 @@ def model_by(whitening: DejaVu | None) -> DejaVu:
 
 
 def check(model: DejaVu, reference: Traverse, query: Traverse, truth: str | None = None) -> None:
-    """Refuse, before the long work, a pair that does not fit the model or each other."""
+    """Refuse early a pair that does not fit the model or each other."""
     features, whitening = model.describer.check_sizes(reference, query), model.whitening
     if whitening is not None and whitening.learned and sum(whitening.sizes) != features:
         raise InputError(
             f"the whitening is of {sum(whitening.sizes)} features and {reference.name} gives {features} "
-            "a frame; expected as many, as frames of one size give"
+            "per frame; expected as many, so frames of the same size"
         )
     if reference.length is not None and query.length is not None:
         truth_of(reference, query, reference.length, query.length, truth)
@@ -257,7 +256,7 @@ def described(
     truth: str | None = None,
     tolerance: int = TOLERANCE,
 ) -> Route:
-    """A route's descriptors by a model, which learns its whitening where it has none; None is the default."""
+    """A route described by a model, which learns its whitening if it has none; None is the default model."""
     model = DejaVu() if model is None else model
     places, queries = both(model, reference, query)
     right = truth_of(reference, query, len(places), len(queries), truth)
@@ -265,33 +264,33 @@ def described(
 
 
 def both(model: DejaVu, reference: Traverse, query: Traverse) -> tuple[Tensor, Tensor]:
-    """Descriptors of the reference, which a whitening is learned from if there is none, and of the query."""
+    """Descriptors of the reference, from which a missing whitening is learned, and of the query."""
     places = model.describe_reference(reference, None, "describing")
     return places.float(), model.extract_all(query, "describing the query").float()
 
 
 def contenders_of(route: Route, given: Mapping[str, DejaVu] | None = None) -> Iterator[Contender]:
-    """All that is set side by side on a route, ours first; given: see `run_storage`."""
+    """All contenders on a route, ours first; given: the maps of `run_storage`."""
     yield from stores_of(route)
     assert route.model.whitening is not None
-    if not route.model.whitening.fixed:  # else it was given, and there is none to change
+    if not route.model.whitening.fixed:  # a given one is not varied
         for name in (*WHITENINGS, "of another route"):
             answer = partial(by_other_whitening, route, name)
             yield ready(f"dejavu {WHITENED:g}, whitening {name}", OTHERS, answer)
     for name, model in (given or {}).items():
         yield ready(f"dejavu, {name}", GIVEN, partial(by_map, route, partial(lambda one: one, model)))
-    # template means of the features themselves at frequencies found in them, frame by frame
+    # template means of the features at the periods found in them
     paper = partial(by_map, route, lambda: paper_model().learn(route.reference))
     yield ready(PAPER, PAPER, paper)
 
 
 def ready(name: str, family: str, answer: Callable[[], Answer]) -> Contender:
-    """A contender that needs nothing to be made ready."""
+    """A contender that needs no preparation."""
     return Contender(name, lambda: answer, family=family)
 
 
 def stores_of(route: Route) -> Iterator[Contender]:
-    """Ways to keep the very same descriptors."""
+    """Ways to store the same descriptors."""
     places, numbers = route.places, route.places.shape[1]
 
     def store(family: str, name: str, keep: Callable[..., Kept], *given: Any, **settings: Any) -> Contender:
@@ -349,21 +348,21 @@ def stores_of(route: Route) -> Iterator[Contender]:
 
 
 def named(code: str, k: int) -> str:
-    """A code of every k-th place, straight lines between them."""
+    """The name of a code of every k-th place, interpolated."""
     return f"{code} of {every(k, 'frame')}{', interpolated' * (k > 1)}"
 
 
 def video(route: Route, codec: str, crf: int, k: int) -> Kept:
-    """Every k-th frame coded and described again, straight lines between the descriptors."""
+    """Every k-th frame, coded, decoded and described, with interpolated descriptors."""
     coded = CodedVideo(route.reference, codec, crf, step=k)
     keys, count = route.model.extract_all(coded).float(), len(route.places)
-    if k > 1 and (count - 1) % k:  # the last place is given back as the last one stored
+    if k > 1 and (count - 1) % k:  # the last place is decoded as the last one stored
         keys = torch.cat([keys, keys[-1:]])
     return Kept(between_keyframes(keys, count, k) if k > 1 else keys, coded.bytes)
 
 
 def by_other_whitening(route: Route, name: str) -> Answer:
-    """The map of the same frames by another whitening."""
+    """A map of the same frames with another whitening."""
     model = DejaVu(whitening=Whitening(**WHITENINGS.get(name, {})))
     if name not in WHITENINGS:
         source = DejaVu()
@@ -375,14 +374,14 @@ def by_other_whitening(route: Route, name: str) -> Answer:
 
 
 def among(route: Route, keep: Callable[[], Kept]) -> Answer:
-    """Nearest of the descriptors that a store gives back, by cosine."""
+    """The nearest decoded descriptors of a store, by cosine."""
     kept = keep()
     found = nearest_frames(kept.descriptors, route.queries, kept.apart, "cosine", None, route.matching)
     return found, kept.route, kept.fixed + route.fixed
 
 
 def by_map(route: Route, made: Callable[[], DejaVu]) -> Answer:
-    """A map on descriptors of its own."""
+    """A map with its own descriptors."""
     model = made()
     found = model.localize_descriptors(model.extract_all(route.query), route.matching)
     summary = model.summary()
@@ -390,7 +389,7 @@ def by_map(route: Route, made: Callable[[], DejaVu]) -> Answer:
 
 
 def judged(route: Route, contender: Contender) -> Row:
-    """Store a route, match all queries, and score them: single ones, and sequences of each T with room."""
+    """Store a route, match all queries, and score them: single ones, and sequences of each T that fits."""
     row = new_row(route.name, contender.name, KEYS, family=contender.family)
     answers: list[Answer] = []
     began = time.perf_counter()
@@ -398,7 +397,7 @@ def judged(route: Route, contender: Contender) -> Row:
         peak = peak_memory(lambda: answers.append(contender.prepare()()))
     except InputError as error:
         return row | {"skipped": str(error)}
-    except (ImportError, ValueError) as error:  # a program that is not installed, a codec that is not there
+    except (ImportError, ValueError) as error:  # a program or codec that is not installed
         return row | {"skipped": failure(error)}
     seconds, ((found, size, fixed),) = time.perf_counter() - began, answers
     scores = evaluate_each(found.sequences, route.truth, route.tolerance)
@@ -416,7 +415,7 @@ def judged(route: Route, contender: Contender) -> Row:
 
 
 def front(rows: Sequence[Row], length: int = 1) -> list[tuple[float, float]]:
-    """What no other row reaches with fewer bytes, by ascending bytes; of sequences of T queries."""
+    """The front: AUCs of sequences of T that no other row reaches with fewer bytes, by ascending bytes."""
     points = [(row["route_bytes_per_place"], area(row, length) or 0.0) for row in rows]
     best: list[tuple[float, float]] = []
     for size, auc in sorted(points, key=lambda point: (point[0], -point[1])):
@@ -426,15 +425,15 @@ def front(rows: Sequence[Row], length: int = 1) -> list[tuple[float, float]]:
 
 
 def area(row: Row, length: int) -> float | None:
-    """The AUC of sequences of T queries; None where the route has no room for them."""
+    """The AUC of sequences of T; None if they do not fit the route."""
     auc: float | None = row["sequences"].get(str(length), {}).get("auc")
     return auc
 
 
 def bytes_for(auc: float, points: Points) -> float | None:
-    """Bytes per place at which a front reaches an area, on straight lines over the logarithm of bytes.
+    """Bytes per place at which a front reaches an AUC, linear over the logarithm of bytes.
 
-    None where it never does. Where its smallest point does, that point's, which it may need less than.
+    None if it never does; the smallest point's bytes, an upper bound, if that does already.
     """
     i = next((i for i, point in enumerate(points) if point[1] >= auc), None)
     if i is None:
@@ -448,7 +447,7 @@ def bytes_for(auc: float, points: Points) -> float | None:
 
 
 def by(key: str, rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """The rows that have figures by their case or family, in order."""
+    """The rows with figures, by case or family, in order."""
     found: dict[str, list[Row]] = {}
     for row in rows:
         if row["skipped"] is None:
@@ -457,16 +456,16 @@ def by(key: str, rows: Sequence[Row]) -> dict[str, list[Row]]:
 
 
 def families(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """The rows of each family but `OTHERS`, which differ in what does not grow with the route."""
+    """The rows of each family except `OTHERS`, which differs in fixed bytes."""
     return {name: some for name, some in by("family", rows).items() if name != OTHERS}
 
 
 def equal_areas(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """For each of our rows and T, the bytes per place that each family needs for the same area.
+    """For each of our rows and T, the bytes per place that each family needs for the same AUC.
 
     Returns:
         Entries of bench.json: case, T, auc and route_bytes_per_place of ours, `bytes_per_place` by family,
-        None where it never gets there, and `null_over_ours`.
+        None if it never reaches that, and `null_over_ours`.
     """
     found = []
     for case, own in by("case", rows).items():
@@ -486,7 +485,7 @@ def equal_areas(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 def missed(rows: Sequence[Row]) -> dict[str, float]:
     """1 - AUC of ours over that of the best rival with as many bytes, for each case: the geometric mean over
-    1 to 5 route bytes per place. Rivals are the stores of the same descriptors but the null."""
+    1 to 5 route bytes per place. Rivals are the stores of the same descriptors, except the null."""
     found = {}
     for case, own in by("case", rows).items():
         known = families(own)
@@ -501,12 +500,12 @@ def missed(rows: Sequence[Row]) -> dict[str, float]:
 
 
 def best(rows: Sequence[Row], size: float) -> float | None:
-    """The largest area that takes so many route bytes per place, if any does."""
+    """The largest AUC in this many route bytes per place, if any."""
     return max((auc for taken, auc in front(rows) if taken <= NEAR * size), default=None)
 
 
 def whitenings(rows: Sequence[Row]) -> dict[str, list[tuple[str, int, float]]]:
-    """Name, fixed bytes and area of our map by each whitening, for each route with others than its own."""
+    """Name, fixed bytes and AUC of our map with each whitening, for each route with several."""
     found = {}
     for case, own in by("case", rows).items():
         ours = [("the default", row) for row in own if row["contender"] == f"{OURS} {WHITENED:g}"]
@@ -527,10 +526,10 @@ def pictured(rows: Sequence[Row]) -> Plot:
 
 
 def storage_tables(rows: Sequence[Row], at: float = AT) -> Iterator[str]:
-    """For each route, as aligned text, the best area of each family in so many bytes per place.
+    """For each route, as aligned text, the best AUC of each family by bytes per place.
 
-    A second table has the bytes per place that each family needs, by T, for our area at `at` bytes or, where
-    that is larger, for `LEVEL`; a third the areas by other whitenings.
+    A second table has the bytes per place that each family needs, by T, for our AUC at `at` bytes, or for
+    `LEVEL` if that is less; a third the AUC with other whitenings.
     """
     others = whitenings(rows)
     for case, own in by("case", rows).items():
@@ -561,7 +560,7 @@ def needed(auc: float, points: Points) -> str:
 
 
 def skipped_lines(rows: Sequence[Row]) -> list[str]:
-    """Why rows were skipped, one line for each reason, with the first of them."""
+    """Why rows were skipped: a line for each reason, with the first row."""
     reasons: dict[tuple[str, str], list[str]] = {}
     for row in rows:
         if row["skipped"]:

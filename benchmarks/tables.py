@@ -1,6 +1,6 @@
-"""Tables of docs/results from the json beside them: `python -m benchmarks.tables [NAME=bench.json ...]`.
+"""Write the tables of docs/results from its json files: `python -m benchmarks.tables [NAME=bench.json ...]`.
 
-A given file is first kept there, as NAME.json. Pages have tables between `<!-- table: NAME -->` and
+A given file is first stored there as NAME.json. Tables are between `<!-- table: NAME -->` and
 `<!-- end of table -->`.
 """
 
@@ -22,25 +22,21 @@ from dejavu_torch.evaluation.contenders import LENGTHS
 
 FOLDER = Path(__file__).parents[1] / "docs" / "results"
 MARKED = re.compile(r"(<!-- table: ([\w ,:]+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
-CODES = {  # of the same kind in one row
+CODES = {  # rows of codes of the same kind
     **{"dejavu": ("dejavu",), "null": ("null",), "dejavu, trained": ("dejavu, given maps",)},
-    **{
-        "every k-th frame": ("interpolated",),
-        "PCA": ("PCA",),
-        "signs": ("binary",),
-        "PQ, OPQ": ("PQ", "OPQ"),
-    },
+    **{"every k-th frame": ("interpolated",), "PCA": ("PCA",), "signs": ("binary",)},
+    **{"PQ, OPQ": ("PQ", "OPQ")},
     **{"RQ, LSQ, PRQ": ("RQ", "LSQ", "PRQ"), "TurboQuant": ("TurboQuant",)},
     **{"RaBitQ, EDEN": ("RaBitQ", "EDEN"), "video": ("video",)},
 }
 
 
 def kept(bench: dict[str, Any]) -> dict[str, Any]:
-    """A bench.json without what is unknown and what no table shows."""
+    """A bench.json without unknown values and what no table shows."""
     left_out = ("equal_auc", "seconds", "peak_bytes", "ratio_to_ours", "missed_over_best")
     rows = [{k: v for k, v in row.items() if v is not None and k not in left_out} for row in bench["rows"]]
     for row in rows:
-        if "family" in row:  # of a store: what the curve shows
+        if "family" in row:  # of a store: the curve suffices
             for name in ("sequences", "bytes", "route_bytes", "recall_at_1"):
                 row.pop(name, None)
     facts = {name: of for name, of in bench.items() if name not in ("rows", *left_out)}
@@ -53,7 +49,7 @@ def read(name: str) -> dict[str, Any]:
 
 
 def reports(way: str) -> dict[str, Row]:
-    """What `benchmarks results` measured in a way, by footage."""
+    """The rows of `benchmarks results` for a way, by footage."""
     return {row["case"]: row for row in read("routes")["rows"] if row["contender"] == way}
 
 
@@ -71,7 +67,7 @@ def size(each: float) -> str:
 
 
 def by_seeds(found: dict[str, Row], figures: Callable[[Row], Sequence[float | None]]) -> Iterable[list[str]]:
-    """A row for each footage: figures of it, or their mean over the seeds of a simulated route."""
+    """A row of figures for each footage, or of their means over the seeds of a simulated route."""
     groups: dict[str, list[Row]] = {}
     for name in FOOTAGE:
         if name in found:
@@ -85,13 +81,13 @@ def by_seeds(found: dict[str, Row], figures: Callable[[Row], Sequence[float | No
 
 
 def routes() -> str:
-    """The default map of each route beside its null and the baselines."""
+    """The default map of each route with its null and the baselines."""
     head = ["AUC", "**map**", "null", "float", "HOG", "every k-th", "recall@1", "of HOG", "bytes", "fixed kB"]
 
     def figures(row: Row) -> list[float | None]:
-        beside = [row[name]["auc"] for name in ("null", "uncompressed", "hog", "hog_stride_coarsest")]
+        rivals = [row[name]["auc"] for name in ("null", "uncompressed", "hog", "hog_stride_coarsest")]
         recalls = [row["recall_at_1"], row["hog"]["recall_at_1"]]
-        return [row["auc"], *beside, *recalls, row["route_bytes_per_place"], row["fixed_bytes"] / 1000]
+        return [row["auc"], *rivals, *recalls, row["route_bytes_per_place"], row["fixed_bytes"] / 1000]
 
     rows = [
         [*row[:-2], size(float(row[-2])), f"{float(row[-1]):.0f}"]
@@ -101,7 +97,7 @@ def routes() -> str:
 
 
 def sizes() -> str:
-    """The AUC of map and null at each size."""
+    """The AUC of map and null by size."""
     known = reports("default")
     budgets = (1, 2.5, 5, 10, 20)
 
@@ -126,7 +122,7 @@ def sizes() -> str:
 
 
 def descriptors() -> str:
-    """The AUC of maps by the descriptor."""
+    """The AUC of maps by descriptor."""
     ways = {"default": "HOG, `Distilled`", "HOG and pixels": "HOG, pixels", "HOG": "HOG alone"}
     columns = [
         dict_of(by_seeds(reports(way), lambda row: [row["auc"], row["uncompressed"]["auc"]])) for way in ways
@@ -142,7 +138,7 @@ def dict_of(rows: Iterable[list[str]]) -> dict[str, list[str]]:
 
 
 def sequences() -> str:
-    """The AUC of T queries together and of a filter: of the map, its null, and HOG of all frames."""
+    """The AUC of sequences and of a filter, for the map, its null, and HOG of all frames."""
     keys = [*map(str, LENGTHS), "filter"]
     table = [["AUC of map, null, HOG", *(f"T = {key}" if key.isdigit() else key for key in keys)]]
     for name, row in (*reports("sequence").items(), *reports("visits").items()):
@@ -154,18 +150,20 @@ def sequences() -> str:
 
 
 def rejection(way: str = "default") -> str:
-    """Precision asked for and reached, right answers accepted, and frames of other places accepted."""
+    """Precision requested and reached, right answers accepted, and frames of other places accepted."""
     table: list[list[str]] = []
     for name, row in reports(way).items():
         found = row.get("rejection", {}).get("precision")
         if not found:
             continue
         asked = [f"{one['asked']:g}" for one in found]
-        strange = [one["accepted"] for one in row["rejection"].get("off_map", {}).values()]
+        distractors = [one["accepted"] for one in row["rejection"].get("off_map", {}).values()]
         if not table:
             table.append(["precision reached, right answers accepted, others accepted", *asked])
         cells = [[area(one["precision"]), area(one["kept"])] for one in found]
-        cells = [[*cell, *(area(of[key]) for of in strange)] for cell, key in zip(cells, asked, strict=True)]
+        cells = [
+            [*cell, *(area(of[key]) for of in distractors)] for cell, key in zip(cells, asked, strict=True)
+        ]
         table.append([name, *map(", ".join, cells)])
     return markdown(table)
 
@@ -175,7 +173,7 @@ def filtered() -> str:
 
 
 def storage(name: str) -> str:
-    """The best area of each kind of code in so many bytes, on a route."""
+    """The best AUC of each kind of code on a route, by bytes."""
     rows = read(f"storage_{name}")["rows"]
     rows = [
         row | {"skipped": row.get("skipped"), "sequences": {"1": {"auc": row.get("auc")}}} for row in rows
@@ -196,7 +194,7 @@ def storage(name: str) -> str:
 
 
 def trainings() -> str:
-    """The AUC of untrained and trained maps and the nulls of these, by size: the mean over seeds."""
+    """The mean AUC over seeds of untrained and trained maps and the nulls of these, by size."""
     sizes = ("1 B", "5 B", "default")
     table = [["AUC of untrained, **trained**, its null", "HOG", *sizes, "trained, lowest to highest"]]
     found: dict[str, dict[str, list[float]]] = {}
@@ -232,7 +230,7 @@ def made(name: str) -> str:
 
 
 def filled(page: str) -> str:
-    """A page with its tables made anew."""
+    """A page with its tables written again."""
     return MARKED.sub(lambda found: f"{found[1]}\n{made(found[2])}\n{found[3]}", page)
 
 

@@ -1,4 +1,4 @@
-"""The best place on long template maps, searched in their layers and by the scores of all places."""
+"""The best place on long template maps, by a search in their layers and by the scores of all places."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ OURS, SCAN = "dejavu two layers", "scan"
 def bench_templates(places: Sequence[int], queries: int = 8, repeats: int = 5) -> Iterator[Row]:
     """Time the best place of single queries on maps of two layers, a row at a time.
 
-    Convention: seconds, those of the first run too, are of a single query, in one thread, with its distances
-        to all templates. `file_bytes` are what grows of the map's file: the templates and their layers.
+    Convention: seconds, also of the first run, are of a single query in one thread, including its distances
+        to all templates. `file_bytes` are those that grow with the map: the templates and their layers.
     """
     generator = torch.Generator().manual_seed(0)
     for count in places:
@@ -43,7 +43,7 @@ def bench_templates(places: Sequence[int], queries: int = 8, repeats: int = 5) -
 
 
 def random_map(places: int, generator: torch.Generator) -> TemplateMap:
-    """Random templates of two co-prime periods, the least that tell so many places apart."""
+    """Random templates of two co-prime periods, the smallest that distinguish this many places."""
     short = math.isqrt(places)
     short += short * (short + 1) < places
     plan, blocks = [], []

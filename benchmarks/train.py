@@ -1,4 +1,4 @@
-"""How fast a descriptor is trained, and what it is then worth: `benchmarks train`."""
+"""`benchmarks train`: the time to train a descriptor, and its accuracy."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from dejavu_torch.types import InputError, Traverse
 ROUTE = ("sim:aerial?frames=1000", "sim:aerial?frames=1000&traverse=1")
 STEPS = 600
 SEEDS = (0, 1, 2)
-BUDGETS = (2.4, 1.0, 0.4)  # route bytes per place of the maps that are made of a descriptor
+BUDGETS = (2.4, 1.0, 0.4)  # route bytes per place of the maps of a descriptor
 TOLERANCE = 5
 STRENGTHS: dict[str, Any] = {"shift": (0.02, 0.08), "occlusion": 0.5}  # of configs/train_road.yaml
 WEIGHT_DECAY = 0.5
@@ -36,7 +36,7 @@ RATE = 0.3  # of a bit per place, there
 
 
 class Rung(NamedTuple):
-    """A way to train: backbone, augmentation, precision of the trainer, learning rate, rate of a bit."""
+    """A way to train: backbone, augmentation, precision of the trainer, learning rate, weight of a bit."""
 
     name: str
     backbone: Callable[[], nn.Module]
@@ -47,12 +47,12 @@ class Rung(NamedTuple):
 
 
 def network() -> SmallCNN:
-    """That of configs/train_road.yaml, without its local contrast."""
+    """The network of configs/train_road.yaml, without local contrast."""
     return SmallCNN(squeeze=24, cell=0)
 
 
 def ladder() -> list[Rung]:
-    """Each rung changes one thing of the one before; 16 bits only where the processor has them."""
+    """Each rung changes one thing in the one before; 16 bits only if the processor has them."""
     from dejavu_torch.training.export import has_bf16
 
     rungs = [Rung("fused augmentation", network, lambda: Augmentation(**STRENGTHS))]
@@ -123,14 +123,14 @@ def run_train(
     Args:
         sources: REFERENCE QUERY; the built-in road if not given
         out: folder for bench.json and bench.png
-        steps: those of each training; 600 if not given
-        seeds: a training each; 0, 1 and 2 if not given
+        steps: steps of each training; 600 if not given
+        seeds: seeds, with a training each; 0, 1 and 2 if not given
 
-    Convention: on the CPU; seconds are of the steps alone; auc and recall_at_1 are by route bytes per place
-        of the map, where they suffice for one.
+    Convention: on the CPU; seconds are for the steps only; auc and recall_at_1 are by route bytes per place,
+        without those that are too few for a map.
 
     Raises:
-        InputError: other than two sources, no steps or seeds, or nothing that tells the right places.
+        InputError: not two sources, no steps or seeds, or no ground truth.
     """
     from dejavu_torch.training.export import has_bf16
 
@@ -158,11 +158,11 @@ def run_train(
     seen = (
         f"{rows[0]['case']}, seeds {', '.join(map(str, dict.fromkeys(seeds)))}, threads: {rows[0]['threads']}"
     )
-    return [text_table(table), f"{seen}; each row changes one thing of the row above"]
+    return [text_table(table), f"{seen}; each row changes one thing in the row above"]
 
 
 def spread(values: list[float]) -> str:
-    """Their mean, the lowest and the highest; of one itself."""
+    """The mean of some values with their minimum and maximum, or a single value."""
     if len(values) < 2:
         return f"{values[0]:.3f}" if values else "-"
     return f"{sum(values) / len(values):.3f} ({min(values):.3f}-{max(values):.3f})"

@@ -1,4 +1,4 @@
-"""What a training is worth on routes of many kinds, beside the untrained map: `benchmarks trainings`."""
+"""`benchmarks trainings`: trained maps against untrained ones on routes of many kinds."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from dejavu_torch.types import InputError, Match
 SEEDS = (0, 1, 2)
 ROAD = "strip:{{data}}/aerial_road/pass{}.png?halve=1&rows=32:128&width=96{}"
 TRAINED, UNTRAINED, HOG = "trained", "untrained", "HOG of all frames"
-NULL = "null"  # shuffled frames in as many bytes
+NULL = "null"  # shuffled frames in the same bytes
 SIZES = {"1 B": SpectralMapper(1.0), "5 B": SpectralMapper(5.0), "default": SpectralMapper()}
 
 
 class Route(NamedTuple):
-    """Two traverses and their truth, {data} being the folder of the footage.
+    """Two traverses and their truth; {data} is the folder of the footage.
 
-    preset, options: of the training. start: another training, whose weights it begins with.
+    preset, options: of the training. start: another training, whose weights it starts from.
     """
 
     reference: str
@@ -47,7 +47,7 @@ class Route(NamedTuple):
     start: Route | None = None
 
     def below(self, data: Path) -> Route:
-        """With the folder in place."""
+        """The route with the folder filled in."""
         placed: dict[str, Any] = {
             name: one.format(data=shlex.quote(str(data)) if name == "options" else data)
             for name, one in self._asdict().items()
@@ -81,7 +81,7 @@ ROUTES = {
     "corridor": Route("{data}/corridor/ref", "{data}/corridor/query", 0, "{data}/corridor/truth.csv"),
     "laps": drive("donkey_lap", 10),
 }
-# the other presets, each on a route like that which it was made for
+# the other presets, each on the kind of route it is for
 PRESETS = {
     "train_small, sim:aerial": simulated("aerial", "train_small"),
     "train_railway, sim:outdoor": simulated("outdoor", "train_railway"),
@@ -95,9 +95,9 @@ PRESETS = {
 
 
 def trained(name: str, route: Route, seed: int, out: Path, options: Sequence[str]) -> Path | str:
-    """The map of a training, by the command that a user would run, or what that said where it failed.
+    """The map of a training by the user's command, or the error of that.
 
-    Where the same command ended well before, its map is kept: a run goes on where another was stopped.
+    If the same command has succeeded before, its map is reused, so that a stopped run can continue.
     """
     folder = out / f"{name.replace(', ', '_').replace(' ', '_').replace(':', '_')}_{seed}"
     words = ["train", "fit", "--config", route.preset, "--data.source", route.reference]
@@ -115,7 +115,7 @@ def trained(name: str, route: Route, seed: int, out: Path, options: Sequence[str
 
 
 class Judge:
-    """Compares maps of a route on its second traverse."""
+    """Evaluates maps of a route on its second traverse."""
 
     def __init__(self, name: str, route: Route) -> None:
         self.name, self.tolerance = name, route.tolerance
@@ -129,7 +129,7 @@ class Judge:
         return row | {"auc": scores.auc, "recall_at_1": scores.recall_at_1, "route_bytes_per_place": size}
 
     def of(self, contender: str, model: DejaVu, seed: int | None = None) -> list[Row]:
-        """Rows of a model's descriptors in maps of several sizes, or of its templates, and of their nulls."""
+        """Rows for maps of a model's descriptors by size, or for its templates, and for their nulls."""
         places, queries = model.extract_all(self.reference), model.extract_all(self.query)
         rows = []
         for name, mapper in SIZES.items() if isinstance(model.map, SpectralMap) else [("", None)]:
@@ -162,22 +162,22 @@ def run_trainings(
     jobs: int = 1,
     options: str = "",
 ) -> list[str]:
-    """What `dejavu train` is worth on routes of many kinds, beside the untrained map and HOG.
+    """Accuracy of `dejavu train` on routes of many kinds, against the untrained map and HOG.
 
     Args:
-        data: folder of the footage, as the tests have it
-        out: folder for bench.json, bench.png and the trained maps, which a later run takes from there
-        routes: names; all seven if not given
-        seeds: a training each; 0, 1 and 2 if not given
-        presets: the other presets, each on a route of its own, in place of `train_road` on all
-        jobs: trainings at a time, each of one thread
-        options: more of `dejavu train fit`, the same for all, as in '--options=--model.rate 0'
+        data: folder of the footage, as for the tests
+        out: folder for bench.json, bench.png and the trained maps, which later runs reuse
+        routes: names of routes; all seven if not given
+        seeds: seeds, with a training each; 0, 1 and 2 if not given
+        presets: run the other presets, each on its own route, instead of `train_road` on all
+        jobs: trainings that run in parallel, with one thread each
+        options: further options of `dejavu train fit` for all trainings, as in '--options=--model.rate 0'
 
-    Convention: no training sees the second traverse; its tolerance is that of the preset. Bytes are of the
-        route, per place; where they are too few for a short route there is no row.
+    Convention: no training sees the second traverse; its tolerance is that of the preset. Bytes are route
+        bytes per place; there is no row if they are too few for a short route.
 
     Raises:
-        InputError: a name that is none of the routes, or a seed out of range.
+        InputError: an unknown route, or a seed out of range.
     """
     cases, seeds = PRESETS if presets else ROUTES, list(dict.fromkeys(seeds or SEEDS))
     try:
@@ -190,7 +190,7 @@ def run_trainings(
         seen = f"bench trainings got {jobs} jobs and seeds {seeds}"
         raise InputError(f"{seen}; expected at least one, and seeds from 0 to 2^32 - 1")
     chosen = {name: cases[name].below(data) for name in routes or cases}
-    judges = {name: Judge(name, route) for name, route in chosen.items()}  # refuses what is not there
+    judges = {name: Judge(name, route) for name, route in chosen.items()}  # refuses missing sources
     works = [(name, seed) for name in chosen for seed in seeds]
     with ThreadPoolExecutor(jobs) as pool:
         made = pool.map(lambda work: trained(work[0], chosen[work[0]], work[1], out, words), works)

@@ -52,7 +52,7 @@ class DejaVu(nn.Module):
     """Learn a compressed map of a route from what repeats along it, and find places on it (section III).
 
     Args:
-        features: any nn.Module (B,C,H,W) -> (B,D); None is `default_features`.
+        features: any nn.Module (B,C,H,W) -> (B,D); None is HOG with `Distilled`, HOG alone if unwhitened.
         whitening: reduces features to few dimensions, learned with each map unless it is `fixed`; None is
             Whitening for a SpectralMapper and "none" for templates. "none" keeps the features, except that a
             SpectralMapper reduces ready features of over 256 dimensions to principal components.
@@ -65,8 +65,8 @@ class DejaVu(nn.Module):
             reduces the longer side to 160 pixels and changes nothing else.
         velocity: measures the motion of the ground, so that places and queries are even steps along it
             (section IV-B); None uses the frames as they are.
-        weight_bits: of each weight of the features in the file; 8 rounds the weights in place, with a scale
-            for each output channel.
+        weight_bits: bits of each weight of the features in the file; 8 rounds the weights in place, with a
+            scale for each output channel.
 
     Shape: forward: frames (Q,C,H,W) or features (Q,D) -> scores (Q,N), lower is better.
 

@@ -53,7 +53,7 @@ def test_a_map_grows_in_its_own_file_or_in_another(
     capsys.readouterr()
     run("learn", NEXT, "--append", first, "--map", other)
     told = capsys.readouterr().out
-    assert f"64 places behind the 64 of {first}; written to {other}" in told
+    assert f"64 places appended to the 64 of {first}; written to {other}" in told
     assert "128 of 128 places covered" in told
     assert first.read_bytes() == before
     run("learn", NEXT, "--append", own)
@@ -195,7 +195,7 @@ def test_a_visit_is_averaged_into_a_map_that_is_there(
         ("learn d.npy d.npy --map m.safetensors --calibration ./d.npy", ["d.npy itself"]),
         ("learn d.npy --map m.safetensors --average_truth 0", ["--average SOURCE"]),
         ("merge first.safetensors --map m.safetensors", ["first.safetensors", "at least two"]),
-        ("merge first.safetensors ./first.safetensors --map m.safetensors", ["one file"]),
+        ("merge first.safetensors ./first.safetensors --map m.safetensors", ["the same file"]),
         ("merge first.safetensors f.safetensors --map m.safetensors", ["first", "f cannot be merged"]),
         ("merge first.safetensors f.safetensors --map f.safetensors", ["f.safetensors is an input"]),
         ("compare a.npy a.npy --map both.safetensors --out e", ["both.safetensors has", "first, other"]),

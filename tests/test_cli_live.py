@@ -69,7 +69,7 @@ def test_a_line_a_frame_as_localize_finds_them(
     assert [line["frame"] for line in found] == [*range(64)]
     assert [line["time"] for line in found] == pytest.approx([i / 25 for i in range(64)])
     assert found[30]["name"] in ("0:00:01.160", "0:00:01.200", "0:00:01.240")
-    times = r"milliseconds a frame: p50 [\d.]+, p99 [\d.]+"
+    times = r"milliseconds per frame: p50 [\d.]+, p99 [\d.]+"
     assert re.fullmatch(f"dejavu: 64 frames, 0 dropped; {times}; [^\n]*filter[^\n]* 0.5\n", err)
     assert [one["accepted"] for one in found] == [one["posterior"] > 0.5 for one in found]
     run(
@@ -235,7 +235,7 @@ def test_a_page_of_a_file_plays_in_real_time_and_stays_until_ctrl_c(folder: Path
     ("words", "told"),
     [
         ("sim:aerial?frames=20 --realtime", "no times"),
-        ("/dev/video99 --realtime", "its own time"),
+        ("/dev/video99 --realtime", "is live already"),
         ("missing.mp4", "missing.mp4 is not there"),
         ("sim:aerial?frames=20 --reference sim:aerial", "--page"),
         ("sim:aerial?frames=20 --page 0 --reference sim:aerial?frames=20", "20 frames"),

@@ -126,7 +126,7 @@ def test_the_next_line_brings_the_network_back(tmp_path: Path, capsys: pytest.Ca
     ("words", "seen"),
     [
         (("zoo.transform", "--features.network.name", "x"), ("zoo.transform made a", "nn.Module")),
-        (("zoo.leave",), ("zoo.leave ends the program (bye); expected what makes a network",)),
+        (("zoo.leave",), ("zoo.leave ends the program (bye); expected one that makes a network",)),
         (("zoo.nothing", "--features.network.name", "x"), ("'zoo' has no attribute 'nothing'",)),
         (("zoo.typed", "--features.network.widht", "x"), ("widht",)),
         (("zoo.load", "--features.network.repo", "x"), ("model",)),

@@ -48,7 +48,7 @@ def test_convention_11_matches_count_frames_of_the_sources(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rows = localize(folder, "again.csv")
-    assert f"{len(QUERY)} frames make 101 even steps of 6 pixels of ground" in capsys.readouterr().out
+    assert f"{len(QUERY)} frames resampled to 101 even steps of 6 pixels of ground" in capsys.readouterr().out
     main(["info", f"{folder}/m.safetensors"])
     told = capsys.readouterr().out
     assert "places are 6 pixels of ground apart" in told

@@ -141,7 +141,7 @@ def test_learn_and_info_tell_what_the_map_holds(folder: Path, capsys: pytest.Cap
         assert f"{summary.route_bytes} of the route, {per_place:.2f} per place" in told
         assert f"{summary.fixed_bytes} fixed" in told
         assert f"whitening {summary.fixed['whitening']}" in told
-        assert "1764 + 1440 to 48 numbers" in told
+        assert "1764 + 1440 to 48 dimensions" in told
         assert "views=2" in told
         assert "less than half" not in told
     assert "route_bytes_per_place=None" in info

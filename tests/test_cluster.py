@@ -249,7 +249,7 @@ def test_a_short_route_starts_no_cluster(tmp_path: Path, capsys: pytest.CaptureF
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(clustering, "Cluster", None)
         run(*command, "--calibration", "none", "--cluster", "auto")
-    assert "64 frames are learned here" in capsys.readouterr().out
+    assert "is not used for 64 frames" in capsys.readouterr().out
 
 
 def test_a_cluster_that_is_not_there_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -268,7 +268,7 @@ def test_files_are_written_whatever_becomes_of_what_is_printed(
         main()
 
     assert ended(command) == status
-    said = "dejavu: what was printed is not whole: No space left on device\n"
+    said = "dejavu: the printed output is incomplete: No space left on device\n"
     assert capfd.readouterr().err == said * (redirected == "full")
     text = (folder / "m.csv").read_text()  # and nothing that was printed
     assert (text[:12], text.count("\n")) == ("query,place,", 65)
@@ -278,7 +278,7 @@ def test_files_are_written_whatever_becomes_of_what_is_printed(
     ("words", "status", "said"),
     [
         ("| grep -q usage:", 0, ""),
-        ("> /dev/full", 2, "dejavu: what was printed is not whole: No space left on device\n"),
+        ("> /dev/full", 2, "dejavu: the printed output is incomplete: No space left on device\n"),
         ("dance 2>&-", 2, ""),
         ("''", 2, "dejavu: '' is no command; expected one of"),
     ],

@@ -211,7 +211,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert (facts["threshold"], facts["first_state"]) == (0.5, "nan")
     before = (tmp_path / "map.onnx").read_bytes()
     assert "such as route.onnx" in fails(capsys, *words, tmp_path / "map.pt")
-    assert "expected one or the other" in fails(
+    assert "expected one of them" in fails(
         capsys, *words, tmp_path / "map.onnx", "--filter", "--sequence", "3"
     )
     assert "fewer" in fails(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -14,20 +15,19 @@ from dejavu_torch.cli import process
 from dejavu_torch.cli.names import COMMANDS, FIRST_DAY
 from dejavu_torch.text import one_line, printable
 
-LONGEST = 300  # characters of a message of torch's
+LONGEST = 300  # characters kept of torch's messages
 
 
 def main(
     arguments: Sequence[str] | None = None, program: Callable[[Sequence[str]], None] | None = None
 ) -> None:
-    """Entry point of the `dejavu` command, and of `python -m benchmarks`, whose errors are one line as well.
+    """Entry point of `dejavu` and of `python -m benchmarks`.
 
     Args:
-        program: what runs a command line, if not the commands of `dejavu`.
+        program: runs a command line; that of `dejavu` by default.
 
-    Environment: OMP_NUM_THREADS, how many threads torch computes with. Unless OMP_WAIT_POLICY says otherwise
-        they sleep while they wait for each other: spinning, which is the default of most builds, takes the
-        cores from other programs.
+    Environment: OMP_NUM_THREADS, the number of threads of torch. OMP_WAIT_POLICY is passive unless it is set:
+        spinning threads, the default of most builds, take the cores from other programs.
     """
     if arguments is None:
         process.take_over()
@@ -49,29 +49,29 @@ def main(
 
 @contextmanager
 def _shortages_of_one_line() -> Iterator[None]:
-    """In the block a lack of memory, or of levels to nest, ends the command."""
+    """In the block a lack of memory, or too deep a recursion, ends the command with one line."""
     try:
         yield
     except (MemoryError, RuntimeError, ImportError, OSError) as error:
         text = one_line(str(error))
         if isinstance(error, RecursionError):
             fail(f"nested too deeply: {text}")
-        told = ("an't allocate memory", "annot allocate memory", "out of memory")
-        if not isinstance(error, MemoryError) and not any(words in text for words in told):
+        phrases = ("an't allocate memory", "annot allocate memory", "out of memory")
+        if not isinstance(error, MemoryError) and not any(phrase in text for phrase in phrases):
             raise
         fail(f"not enough memory: {text.rpartition('DefaultCPUAllocator: ')[2][:LONGEST] or 'it ran out'}")
 
 
 @contextmanager
 def errors_of_one_line(given: Sequence[str]) -> Iterator[None]:
-    """In the block, which imports torch, errors in the command line or its files end the command."""
+    """In the block, which imports torch, errors in the command line or in files end it with one line."""
     _log_to_stderr()
     try:
         here = os.getcwd()
-    except FileNotFoundError:  # some libraries would end the process
-        fail("the current folder does not exist any more; expected one that does")
+    except FileNotFoundError:  # which would crash some libraries
+        fail("the current folder no longer exists; expected one that does")
     if here not in sys.path:
-        sys.path.append(here)  # a user's own classes, as `python -m` finds them
+        sys.path.append(here)  # for a user's own classes, as with `python -m`
     from dejavu_torch.cli.parser import UsageError
     from dejavu_torch.data.output import remove_temporaries
     from dejavu_torch.types import InputError
@@ -105,14 +105,12 @@ def run_command(given: Sequence[str]) -> None:
         function = getattr(commands, f"run_{name}")
         chosen = parse(name, function, words)
         if COMMAND in function.__annotations__:
-            import shlex
-
             chosen[COMMAND] = shlex.join(["dejavu", *given])
         function(**chosen)
 
 
 def _log_to_stderr() -> None:
-    """Messages and warnings of all libraries as lines of ours."""
+    """Print messages and warnings of all libraries as lines of ours."""
     import logging
     import warnings
 
@@ -123,19 +121,19 @@ def _log_to_stderr() -> None:
     handler = logging.StreamHandler()
     handler.setFormatter(OneLine("dejavu: %(message)s"))
     logging.basicConfig(handlers=[handler], level=logging.WARNING)
-    logging.getLogger("PIL").setLevel(logging.CRITICAL)  # what it says of an image is in the one line
+    logging.getLogger("PIL").setLevel(logging.CRITICAL)  # our errors quote it
     log = logging.getLogger("dejavu_torch")
     warnings.showwarning = lambda message, *_, **__: log.warning("%s", message)
 
 
 def _check_output() -> None:
     problem = process.output_problem()
-    if problem is not None:
-        fail(f"what was printed is not whole: {problem}")
+    if not isinstance(problem, BrokenPipeError | None):
+        fail(f"the printed output is incomplete: {problem.strerror}")
 
 
 def overview(word: str) -> NoReturn:
-    """What there is, where the first word is no command, and exit."""
+    """Print version, help or an error for a first word that is no command, and exit."""
     if word == "--version":
         print(f"dejavu_torch {__version__}")
     elif word in ("--help", "-h"):
@@ -145,7 +143,7 @@ def overview(word: str) -> NoReturn:
             print(f"\n{heading}:", *(f"  {name:<10}  {COMMANDS[name]}" for name in names), sep="\n")
         print("\n`dejavu COMMAND --help` shows its options, `dejavu --version` the version.")
     elif word == "bench":
-        where = "in a clone of the repository, with pip install '.[bench]'"
+        where = "in a clone of the repository, after pip install '.[bench]'"
         fail(f"the benchmarks are not part of the package; expected `python -m benchmarks` {where}")
     else:
         fail(f"{word!r} is no command; expected one of {', '.join(COMMANDS)} (see --help)")
@@ -153,6 +151,6 @@ def overview(word: str) -> NoReturn:
 
 
 def fail(message: str) -> NoReturn:
-    """One line on stderr, exit status 2."""
+    """Print one line on stderr and exit with status 2."""
     print(f"dejavu: {printable(one_line(message))}", file=sys.stderr)
     raise SystemExit(2)

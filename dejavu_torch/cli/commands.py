@@ -1,6 +1,6 @@
-"""What the commands do: each a thin skin over functions, whose docstring is its help.
+"""The commands: thin functions whose docstrings are their help.
 
-Only what every command needs is imported above: the rest, such as matplotlib, when a command runs.
+Only what every command needs is imported here; the rest, such as matplotlib, is imported when a command runs.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import shlex
 import threading
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,24 +20,8 @@ import torch
 from torch import Tensor, nn
 
 from dejavu_torch import growth
+from dejavu_torch.cli import options
 from dejavu_torch.cli.device import device_of
-from dejavu_torch.cli.options import (
-    NO_CALIBRATION,
-    UNREAD,
-    Acceptance,
-    Growth,
-    Judging,
-    KeptSearching,
-    Learning,
-    LiveSearches,
-    Loading,
-    Searches,
-    Searching,
-    Sequences,
-    load_map,
-    named_features,
-    several,
-)
 from dejavu_torch.data.frame_range import chained
 from dejavu_torch.data.names import names_of
 from dejavu_torch.data.output import check_output_file, check_output_folder, whole_folder
@@ -47,7 +31,7 @@ from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.views import Views
 from dejavu_torch.learning import SAMPLE as SHORT
 from dejavu_torch.learning import Checkpoint, ChunkCoder, Code
-from dejavu_torch.maps.place_map import Mapper, PlaceMap
+from dejavu_torch.maps.place_map import Mapper
 from dejavu_torch.maps.spectral import HELD, SpectralMapper
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.model import DejaVu
@@ -64,8 +48,8 @@ if TYPE_CHECKING:
     from dejavu_torch.evaluation.compare import Comparison
     from dejavu_torch.evaluation.report import Report
 
-COMPARED = ("map.safetensors", "matches.csv")  # beside a report of them
-APART = 5  # places: any two candidates of a query are further apart
+COMPARED = ("map.safetensors", "matches.csv")  # files next to the report of a comparison
+SUPPRESSION = 5  # suppression radius in places: two candidates of a query are further apart
 
 
 def run_demo(
@@ -76,18 +60,18 @@ def run_demo(
     model: DejaVu,
     command: str,
 ) -> None:
-    """The main job on the built-in route: learn, localize a second traverse, report.
+    """Learn the built-in route, localize a second traverse of it, and write a report.
 
     Args:
         out: folder for report and pictures
-        seed: which route, and of the whitening and the null control
-        second: another visit, or several, '[A,B]', from which to learn what changes
+        seed: seed of the route, the whitening and the null control
+        second: second traverse from which to learn what changes, or several, '[A,B]'
     """
     from dejavu_torch.evaluation.compare import compare
     from dejavu_torch.evaluation.reproduce import paper_model
 
-    _check_report_folder(out, COMPARED, several(second))
-    given = Learning(seed, second)
+    _check_report_folder(out, COMPARED, options.several(second))
+    given = options.Learning(seed, second)
     given.seed_whitening(model)
     learned, localized = f"sim:aerial?seed={seed}", f"sim:aerial?seed={seed}&traverse=1"
     reference, query = open_source(learned), open_source(localized)
@@ -108,26 +92,26 @@ def run_learn(
     sources: Sequence[str] = (),
     *,
     map: Path | None = None,
-    growing: Growth,
-    learning: Learning,
+    growing: options.Growth,
+    learning: options.Learning,
     cluster: str | None = None,
     model: DejaVu,
     command: str,
 ) -> None:
-    """Learn a map; print its plan, its summary and the bytes per place.
+    """Learn a map, and print what it holds and its bytes per place.
 
     Args:
         sources: folder of images (9 before 10, or photos?order=lexicographic), video (clip.mp4?width=160),
             .npy of frames or features, .h5 of hloc's global descriptors, sim:NAME?seed=0&traverse=0, or
-            strip:IMAGE?width=96; several are one route, one behind the other
+            strip:IMAGE?width=96; several follow each other along one route
         map: map file to write (.safetensors)
-        cluster: Ray workers that make the chunks of a long route: auto, one for each processor of this
-            machine, or the address of a cluster. Sources are read there, by the same paths
+        cluster: encode the chunks of a long route on Ray workers: auto starts one per processor, else the
+            address of a cluster. They read the sources by the same paths
     """
     append = growing.append
     if not sources and not (append and growing.average):
         raise InputError("there is no source; expected one, or --append MAP with --average SOURCE")
-    assert map is not None  # the parser has seen to it
+    assert map is not None  # the parser checks it
     where = device_of(learning.device, learns=True)
     model = growing.model(model).to(where)
     if cluster is not None:
@@ -143,11 +127,17 @@ def run_learn(
         _print_steps(traverse)
         traverse, views = learning.with_second(model, traverse)
     visits = None if growing.average is None else growing.visits(model, traverse)
-    learning.check_precision(model, visits.traverse if traverse is None else traverse)  # type: ignore[union-attr]
+    learning.check_calibrated(model, visits.traverse if traverse is None else traverse)  # type: ignore[union-attr]
     traverse, known = learning.with_calibration(model, traverse)
-    places: Tensor | None = None  # that the traverse shows, where it is not from the first on
+    places: Tensor | None = None  # that the traverse shows; None: all, from the first on
     done, start, checkpoint = "", model.map.places, Checkpoint(map)
-    with _coding(cluster) as code:
+    code: Code = ChunkCoder.chunks
+    with ExitStack() as stack:
+        if cluster is not None:
+            from dejavu_torch.cluster import Cluster, code_on
+
+            # started only when there are chunks: that takes seconds
+            code = lambda *work: code_on(stack.enter_context(Cluster(cluster)), *work)  # noqa: E731
         if traverse is None:
             assert visits is not None
             checkpoint.check_unused()
@@ -157,15 +147,14 @@ def run_learn(
             growth.append(model, traverse, progress=True, checkpoint=checkpoint, code=code, visits=visits)
             places = torch.arange(start, model.map.places)
             known = known and known._replace(places=known.places + torch.where(known.places >= 0, start, 0))
-            done = f"{len(places)} places behind the {start} of {append}; written to {map}"
+            done = f"{len(places)} places appended to the {start} of {append}; written to {map}"
         elif visits is not None:
             growth.learn_mean(model, traverse, visits, True, views, checkpoint, code)
         else:
             model.learn(traverse, progress=True, second=views, checkpoint=checkpoint, code=code)
     if cluster is not None and append is None and model.map.places <= SHORT:
-        seen = f"{model.map.places} frames are learned here"
-        print(f"{seen}: --cluster {cluster} is for the chunks of over {SHORT}")
-    if learning.calibration != NO_CALIBRATION:
+        print(f"--cluster {cluster} is not used for {model.map.places} frames, only for more than {SHORT}")
+    if learning.calibration != options.NO_CALIBRATION:
         growth.calibrate_if_possible(model, traverse, known, places, True)
     model.matching()
     model.save(map)
@@ -181,55 +170,53 @@ def run_localize(
     source: str,
     *,
     out: Path,
-    acceptance: Acceptance,
+    acceptance: options.Acceptance,
     top: int | None = None,
     pairs: Path | None = None,
     corners: list[list[float]] | None = None,
-    sequences: Searches,
-    searching: KeptSearching,
+    sequences: options.Searches,
+    searching: options.KeptSearching,
     cluster: str | None = None,
-    loading: Loading,
+    loading: options.Loading,
 ) -> None:
     """Find the frames of a source on a map.
 
     Args:
         map: map file
-        source: as of `dejavu learn`
+        source: frames to find, as in `dejavu learn`
         out: csv of query,place,score,accepted[,probability][,rank][,route],query_name,place_name
-        top: write so many places of each query, no two within 5 of each other, a row each with its rank; a
+        top: write this many places per query, no two within 5 of each other, each in a row with its rank; a
             probability is that of the first
-        pairs: also write lines `query_name place_name`, as hloc and COLMAP read them, one for each place
-        corners: where this camera sees the ground that the map's saw in its --velocity.corners
-        cluster: Ray workers among which the map is divided, as of `dejavu learn`; they take single queries
+        pairs: also write lines `query_name place_name` for hloc and COLMAP, one per place
+        corners: where this camera sees the patch of ground that the map's --velocity.corners describe
+        cluster: divide the map among Ray workers, as in `dejavu learn`; for single queries only
     """
     from dejavu_torch.evaluation.matches import check_pair_names
 
     device_of(loading.device)
-    check_output_file(out)
-    check_not_read(out, map, source, searching.search_file)
-    if pairs is not None:
-        check_output_file(pairs)
-        check_not_read(pairs, map, source, searching.search_file)
-        if pairs.resolve() == out.resolve():
-            raise InputError(f"--pairs {pairs} is --out as well; expected another name")
-    matcher = sequences.matcher(APART, acceptance.threshold)
+    for written in filter(None, (out, pairs)):
+        check_output_file(written)
+        check_not_read(written, map, source, searching.search_file)
+    if pairs is not None and pairs.resolve() == out.resolve():
+        raise InputError(f"--pairs {pairs} is --out as well; expected another name")
+    matcher = sequences.matcher(SUPPRESSION, acceptance.threshold)
     acceptance.check(matcher)
     if cluster is not None:
         _check_cluster(cluster, loading.device)
-        if sequences.filter or sequences.sequence != 1:
-            together = "--filter" if sequences.filter else f"--sequence {sequences.sequence}"
-            raise InputError(f"--cluster {cluster} and {together}; expected one of them")
-        if searching.search_file is not None:
-            together = f"--search_file {searching.search_file}"
-            raise InputError(f"--cluster {cluster} and {together}; expected one of them")
+        length = sequences.sequence != 1 and sequences.sequence
+        others = {"filter": sequences.filter, "sequence": length, "search_file": searching.search_file}
+        options.refuse_with(f"--cluster {cluster}", **others)
     model = loading.model(map)
     searching.of(model)
     if corners is not None:
-        why = "--as_is measures no ground" if loading.as_is else f"{map} was learned without --velocity"
-        _set_corners(model, corners, why)
+        if model.velocity is None or model.step is None:
+            why = "--as_is measures no ground" if loading.as_is else f"{map} was learned without --velocity"
+            raise InputError(f"--corners {corners}: {why}; expected a map and frames at even steps")
+        check_corners(corners)
+        model.velocity.corners = tuple((float(x), float(y)) for x, y in corners)
     acceptance.of(model)
     if top is not None:
-        check_candidates(top, APART, model.map.places)
+        check_candidates(top, SUPPRESSION, model.map.places)
     query = model.fit(open_source(source), model.frame_shape or ())
     if pairs is not None:
         check_pair_names(model.frame_names, f"the map {map}")
@@ -238,7 +225,7 @@ def run_localize(
         query = model.resample(query, model.step, True, model.frame_shape)
         _print_steps(query)
     rule = model.matching(matcher).rule
-    matches = model.matches(query, "localizing", matcher, None, top, APART)
+    matches = model.matches(query, "localizing", matcher, None, top, SUPPRESSION)
     if top is not None:
         matches = (part.map(Tensor.flatten) for part in matches)
     counts: Counter[str] = Counter()
@@ -248,10 +235,15 @@ def run_localize(
             counts.update(probable_counts(match))
             yield match
 
-    with _searching(cluster, model):
+    with ExitStack() as stack:
+        if cluster is not None:
+            from dejavu_torch.cluster import Cluster, ClusterSearch
+
+            workers = stack.enter_context(Cluster(cluster))
+            model.find = ClusterSearch(workers, model.map, model.search, model.search_memory)
         total, accepted = _write_matches(out, counted(), query, model, top, pairs)
     if not model.map.summary().covered:
-        print("the map holds no layers: no place can be reported")
+        print("the map has no layers, so no place can be reported")
     elif not rule.given:
         print(rule)
     _say(f"{total} queries, {accepted} accepted; written to {out}")
@@ -267,30 +259,29 @@ def run_live(
     map: Path,
     source: str,
     *,
-    sequences: LiveSearches,
-    searching: KeptSearching,
-    acceptance: Acceptance,
+    sequences: options.LiveSearches,
+    searching: options.KeptSearching,
+    acceptance: options.Acceptance,
     page: int | None = None,
     reference: str | None = None,
     realtime: bool = False,
     timeout: float = 10.0,
-    loading: Loading,
+    loading: options.Loading,
 ) -> None:
-    """Find frames as they come: a line of JSON for each on stdout, a summary on stderr at the end.
+    """Find frames as they arrive: a line of JSON for each on stdout, a summary on stderr at the end.
 
-    Frames of cameras, addresses, pipes, videos and folders are brought to the size of the map's frames.
+    Frames are resized to the size of the map's frames.
 
     Args:
         map: map file
         source: a camera (/dev/video0), an address (rtsp://host/path), a named pipe, - for standard input, or
-            a source as of `dejavu learn`. Of cameras, addresses and pipes the newest frame is taken, and
-            those that came while the one before was being found are dropped; of a file none is
+            a source as in `dejavu learn`. Cameras, addresses and pipes always give their newest frame and
+            drop those that arrived meanwhile; files drop none
         page: show frame, reference frame and posterior at http://127.0.0.1:PORT; 8765 if no port is given, 0
-            for any that is free. A file is then played in real time, and the page stays until Ctrl-C
-        reference: what the map was learned from, a source as of `dejavu learn`, for the pictures of the page
-        realtime: take the frames of a video at their times, and drop those that come too fast
-        timeout: seconds without a frame after which a camera, address or pipe, the only ones it is for, has
-            stalled
+            for any free port. A file then plays in real time, and the page stays until Ctrl-C
+        reference: what the map was learned from, a source as in `dejavu learn`, for the pictures of the page
+        realtime: play a video in real time, and drop frames that arrive too fast
+        timeout: seconds without a frame after which a camera, address or pipe has stalled
     """
     from dejavu_torch.cli.live import follow
     from dejavu_torch.data.camera import without_password
@@ -300,7 +291,7 @@ def run_live(
         raise InputError(f"--reference {reference} without --page; expected both")
     if not 0 < timeout <= threading.TIMEOUT_MAX:
         raise InputError(f"--timeout {timeout:g}; expected seconds, above 0")
-    matcher = sequences.matcher(APART, acceptance.threshold)
+    matcher = sequences.matcher(SUPPRESSION, acceptance.threshold)
     acceptance.check(matcher)
     model = loading.model(map)
     searching.of(model)
@@ -314,52 +305,44 @@ def run_compare(
     query: str,
     *,
     out: Path,
-    judging: Judging,
-    learning: Learning,
+    judging: options.Judging,
+    learning: options.Learning,
     map: Path | None = None,
-    sequences: Sequences,
-    searching: Searching,
+    sequences: options.Sequences,
+    searching: options.Searching,
     model: DejaVu,
     command: str,
 ) -> None:
-    """Learn, localize and evaluate, beside baselines and null control.
+    """Learn one traverse, localize another on it, and evaluate, with baselines and a null control.
 
     Args:
-        reference: traverse to learn, a source as of `dejavu learn`
-        query: second traverse, likewise
+        reference: traverse to learn, a source as in `dejavu learn`
+        query: traverse to localize, likewise
         out: folder for report, pictures, matches.csv and map.safetensors
-        map: evaluate this map of the reference as it is, and learn none
+        map: evaluate this map of the reference instead of learning one
     """
     from dejavu_torch.evaluation.compare import compare
 
     where = device_of(learning.device, learns=map is None)
-    acceptance = Acceptance(model.threshold, model.precision)
+    acceptance = options.Acceptance(model.threshold, model.precision)
     matcher = sequences.matcher(max(0, judging.tolerance), acceptance.threshold)
     ordered = judging.in_order(matcher is not None)
     acceptance.check(matcher, judging.distractors)
     if map is not None:
-        model = load_map(map, named_features(model))
+        model = options.load_map(map, options.named_features(model))
         if model.map.routes:
             names = ", ".join(route.name for route in model.map.routes)
             raise InputError(f"--map {map} has the routes {names}; expected a map of {reference} alone")
         acceptance.of(model)
     if sequences.filter and acceptance.threshold is not None:
-        model.threshold = None  # it is of the filter's probabilities, and none for the map to keep
+        model.threshold = None  # it is for the filter's scores, so the map must not keep it
     searching.of(model.to(where))
     first, queries = open_source(reference), open_source(query)
-    read = [reference, query, *several(learning.second)]
-    _check_report_folder(out, COMPARED, read, [judging.truth, *learning.files])
-    others = *several(learning.second), learning.calibration
-    beside = [open_source(one) for one in others if one not in UNREAD]
-    strange = judging.off_map([first, queries, *beside])
-    if map is None:
-        learning.check_precision(model, first)
-    frames = learning.calibration is None and len(first.frame_shape) == 3  # by which it is calibrated
-    if learning.calibration in UNREAD and not (frames if map is None else model.calibration is not None):
-        for name, value in (("--precision", model.precision), ("--distractors", judging.distractors)):
-            if value:
-                seen = f"{name} {value}: what is accepted is told by the probabilities of a calibrated map"
-                raise InputError(f"{seen}; expected --calibration SOURCE, or none of both options")
+    seconds = options.several(learning.second)
+    _check_report_folder(out, COMPARED, [reference, query, *seconds], [judging.truth, *learning.files])
+    others = [open_source(one) for one in (*seconds, learning.calibration) if one not in options.UNREAD]
+    distractors = judging.off_map([first, queries, *others])
+    learning.check_calibrated(model, first, map, judging.distractors)
     learning.seed_whitening(model)
     first, views = learning.with_second(model, first, queries)
     first, known = learning.with_calibration(model, first, queries)
@@ -375,8 +358,8 @@ def run_compare(
         second=views,
         sequence=matcher,
         top=1 if judging.top is None else judging.top,
-        calibration="none" if learning.calibration == NO_CALIBRATION else known,
-        distractors=strange,
+        calibration="none" if learning.calibration == options.NO_CALIBRATION else known,
+        distractors=distractors,
         storage_curve=judging.storage_curve,
         ordered=ordered,
         progress=True,
@@ -398,21 +381,21 @@ def run_evaluate(
     recall_values: Sequence[int] = (),
     command: str,
 ) -> None:
-    """Evaluate the matches in a csv, whatever found them: scores, curve, coverage.
+    """Evaluate the matches of any method from a csv: scores, curve, coverage.
 
     Args:
         matches: csv of query,place,score[,accepted][,probability][,rank][,route]
-        truth: as of `dejavu compare`
+        truth: right places, as in `dejavu compare`
         out: folder for report and pictures
-        tolerance: right within this many places, inclusive
-        interpolate: fill in a csv that lists some queries only
-        reference: says how many frames there are, and has the coordinates for utm; as of `dejavu learn`
-        query: as --reference, of the queries
-        map: says how many frames there are, and which place each of them is where the map's are resampled
-        route: of matches on a merged map, the route that --truth, --reference and the query are of; answers
-            on other routes are wrong
-        recall_values: such as 1 5 10 20: also print the share of all queries that have a right answer among
-            their first N ranks; with --tolerance 0 the figures of VPR-methods-evaluation
+        tolerance: answers this many places off are still right
+        interpolate: interpolate a --truth that lists only some queries
+        reference: source of the places, for their number and the coordinates of utm; as in `dejavu learn`
+        query: source of the queries, likewise
+        map: map of the matches, for its number of frames and, if they are resampled, their places
+        route: route of a merged map that --truth, --reference and the queries belong to; answers on other
+            routes are wrong
+        recall_values: also print the share of queries with a right answer among their first N ranks, for each
+            N, such as 1 5 10 20; with --tolerance 0 these are the figures of VPR-methods-evaluation
     """
     from dejavu_torch.evaluation.evaluate import evaluate_file
     from dejavu_torch.evaluation.report import report_folder, write_report
@@ -428,23 +411,21 @@ def run_evaluate(
         recalls = result.report.facts["recall_values"]
         print(", ".join(f"R@{first}: {100 * recall:.1f}" for first, recall in recalls.items()))
         if tolerance:
-            unit = result.report.facts["unit"]
-            print(
-                f"these allow {tolerance} {unit} beside the right places; VPR-methods-evaluation allows none"
-            )
+            off = f"{tolerance} {result.report.facts['unit']}"
+            print(f"answers may be {off} off here; in VPR-methods-evaluation they may not")
     _print_scores(result.report, out)
 
 
 def run_reproduce(
     dataset: str = "all", *, out: Path, seed: int = 0, tolerance: int = 5, command: str
 ) -> None:
-    """The paper's datasets, simulated, beside the paper's own numbers.
+    """Repeat the paper's experiments on simulated routes, and compare with its published numbers.
 
     Args:
         dataset: aerial, outdoor, underground or all
         out: folder for the reports
-        seed: which routes
-        tolerance: right within this many places, inclusive
+        seed: seed of the routes
+        tolerance: answers this many places off are still right
     """
     from dejavu_torch.evaluation import paper_tables as tables
     from dejavu_torch.evaluation.report import report_folder, text_table, write_index, write_report
@@ -456,7 +437,7 @@ def run_reproduce(
     check_output_folder(out)
     reports: dict[str, Report] = {}
     for name in names:
-        print(f"{name}: a second traverse, the database itself, chunks of other lengths", flush=True)
+        print(f"{name}: a second traverse, the reference itself, other chunk lengths", flush=True)
         result = reproduce(name, tolerance=tolerance, seed=seed, progress=True)
         run, title = result.run, f"dejavu reproduce: {name}"
         plan = str(run.model.summary())
@@ -477,19 +458,19 @@ def run_export(
     map: Path,
     *,
     onnx: Path,
-    sequences: Sequences,
+    sequences: options.Sequences,
     threshold: float | None = None,
     features: nn.Module | None = None,
 ) -> None:
-    """Write a map, and what is ahead of it, as an ONNX file, opset 18: frames in, scores of all places out.
+    """Write a map and its features as an ONNX file (opset 18): frames in, scores of all places out.
 
-    With a sequence or a filter the file takes a frame and a state, and gives the next state.
+    With a sequence or a filter, the file also takes a state and returns the next one.
 
     Args:
         map: map file
         onnx: file to write (.onnx)
-        threshold: noted in the file; the map's own if not given
-        features: class of the map's features, if not ours
+        threshold: threshold to store in the file; the map's own if not given
+        features: class of the map's features, if it is not part of dejavu_torch
     """
     from dejavu_torch.export import OPSET, export_onnx
 
@@ -497,11 +478,11 @@ def run_export(
         raise InputError(f"--onnx {onnx} is no name of an ONNX file; expected one such as route.onnx")
     check_output_file(onnx)
     check_not_read(onnx, map)
-    matcher = sequences.matcher(APART, threshold)
-    model = load_map(map, features)
-    Acceptance(threshold).of(model)
+    matcher = sequences.matcher(SUPPRESSION, threshold)
+    model = options.load_map(map, features)
+    options.Acceptance(threshold).of(model)
     if matcher is not None and model.precision is not None:
-        seen = f"the map's precision, {model.precision}, is of single frames in an ONNX file"
+        seen = f"the map's precision, {model.precision}, only holds for single frames in an ONNX file"
         raise InputError(f"{seen}; expected --threshold with a sequence or a filter")
     written = export_onnx(model, onnx, matcher)
     for kind in ("inputs", "outputs"):
@@ -512,22 +493,22 @@ def run_export(
 
 
 def run_merge(maps: Sequence[Path], *, map: Path, features: nn.Module | None = None, command: str) -> None:
-    """Join the maps of several routes that describe frames alike: an answer is then a route and its frame.
+    """Merge the maps of several routes with the same descriptors: an answer is then a route and its frame.
 
-    Routes describe frames alike where all but the first were learned with --whitening FIRST.safetensors.
+    For the same descriptors, learn all maps but the first with --whitening FIRST.safetensors.
 
     Args:
-        maps: map files, at least two; a route is named after its file, one of a merged map keeps its name
+        maps: at least two map files; a route is named after its file, those of a merged map keep their names
         map: map file to write (.safetensors)
-        features: class of the maps' features, if not ours
+        features: class of the maps' features, if it is not part of dejavu_torch
     """
     _check_map_file(map, *maps)
     for one, other in combinations(maps, 2):
         if one.exists() and other.exists() and one.samefile(other):
-            raise InputError(f"{other} and {one} are one file; expected each map once")
+            raise InputError(f"{other} and {one} are the same file; expected each map once")
     if len(maps) < 2:
         raise InputError(f"{maps[0]} alone; expected at least two maps to merge")
-    models = [load_map(path, copy.deepcopy(features)) for path in maps]
+    models = [options.load_map(path, copy.deepcopy(features)) for path in maps]
     model = growth.merge(models, [path.stem for path in maps])
     model.save(map)
     print_map(model)
@@ -535,11 +516,11 @@ def run_merge(maps: Sequence[Path], *, map: Path, features: nn.Module | None = N
 
 
 def run_info(map: Path, *, features: nn.Module | None = None, command: str) -> None:
-    """What is in a map, and its summary.
+    """Show what a map holds and how it was made.
 
     Args:
         map: map file
-        features: class of the map's features, if not ours
+        features: class of the map's features, if it is not part of dejavu_torch
     """
     from dejavu_torch.maps.distance import l1_backend
     from dejavu_torch.maps.file import FORMAT
@@ -547,10 +528,10 @@ def run_info(map: Path, *, features: nn.Module | None = None, command: str) -> N
 
     model = DejaVu.load(map, features)
     print_map(model)
-    with suppress(InputError):  # a chunk that is too long for the memory
+    with suppress(InputError):  # a chunk that does not fit into memory
         print(f"single queries: {plan(model.map) or 'all places are scored'}")
     if model.frame_shape is not None:
-        kind = "frames of " if len(model.frame_shape) == 3 else "ready features, "
+        kind = "frames of " if len(model.frame_shape) == 3 else "features, "
         print(f"learned from {kind}{' x '.join(str(n) for n in model.frame_shape)}")
     made_by = [*model.features.members] if isinstance(model.features, Joined) else [model.features]
     parts = [model.preprocess, *made_by, model.mapper, *model.mapper.children()]
@@ -565,12 +546,12 @@ def run_info(map: Path, *, features: nn.Module | None = None, command: str) -> N
         print(f"trained for {steps} steps, seed {seed}")
     if model.weight_bits < 32:
         print(f"weights of {model.weight_bits} bits, a scale for each output channel")
-    print(f"map format {FORMAT}, its checksums agree")
+    print(f"map format {FORMAT}, checksums agree")
     calibration = (model.calibration or Calibration())._asdict()
     known = [name for name, platt in calibration.items() if platt is not None]
     print(f"calibrated for: {', '.join(known) or 'nothing'}; precision: {model.precision}")
     print(f"single queries: {model.acceptance()}")
-    print(f"L1 here by {l1_backend()}, spectrogram by {BACKEND}")
+    print(f"L1 by {l1_backend()}, spectrogram by {BACKEND}, on this machine")
     if model.map.places:
         _print_localize(map, model, command)
     else:
@@ -578,146 +559,97 @@ def run_info(map: Path, *, features: nn.Module | None = None, command: str) -> N
         print_next("learn", "ROUTE", "--descriptor", map, *words, "--map", "route.safetensors")
 
 
-def _set_corners(model: DejaVu, corners: list[list[float]], why: str) -> None:
-    """Where a camera sees the ground; `why` a model does not measure it."""
-    if model.velocity is None or model.step is None:
-        raise InputError(f"--corners {corners}: {why}; expected a map and frames at even steps")
-    check_corners(corners)
-    model.velocity.corners = tuple((float(x), float(y)) for x, y in corners)
-
-
 def _check_cluster(cluster: str, device: str, mapper: Mapper | None = None) -> None:
-    """Refuse early what no cluster does, or learns by this mapper."""
+    """Refuse early what no cluster does, or not with this mapper."""
     from dejavu_torch.cluster import check_installed
 
-    if device != "cpu":
-        raise InputError(f"--cluster {cluster} and --device {device}; expected one of them")
+    options.refuse_with(f"--cluster {cluster}", device=device != "cpu" and device)
     check_installed()
     if not isinstance(mapper, SpectralMapper | None):
-        seen = f"--cluster {cluster} makes chunks, and {type(mapper).__name__} makes none"
+        seen = f"--cluster {cluster} encodes chunks, and {type(mapper).__name__} has none"
         raise InputError(f"{seen}; expected a spectral map")
 
 
-@contextmanager
-def _coding(cluster: str | None) -> Iterator[Code]:
-    """What makes the chunks of a long route: this process, or a cluster, which ends with the block."""
-    if cluster is None:
-        yield ChunkCoder.chunks
-        return
-    from dejavu_torch.cluster import Cluster, code_on
-
-    with ExitStack() as stack:
-        # no sooner than there are chunks to make: it takes seconds
-        yield lambda *work: code_on(stack.enter_context(Cluster(cluster)), *work)
-
-
-@contextmanager
-def _searching(cluster: str | None, model: DejaVu) -> Iterator[None]:
-    """In the block the map is divided among the workers of a cluster, if there is one."""
-    if cluster is None:
-        yield
-        return
-    from dejavu_torch.cluster import Cluster, ClusterSearch
-
-    with Cluster(cluster) as workers:
-        model.find = ClusterSearch(workers, model.map, model.search, model.search_memory)
-        try:
-            yield
-        finally:
-            model.find = None
-
-
 def _check_map_file(path: Path, *read: str | Path | None) -> None:
-    """Refuse early a map that cannot be written, or that is what is read."""
+    """Refuse early a map file that cannot be written or is also read."""
     if path.suffix != ".safetensors":
         expected = path.with_suffix(".safetensors") if path.name else "such as route.safetensors"
-        raise InputError(f"--map {path} is no name of a map; expected {expected}")
+        raise InputError(f"--map {path} is not the name of a map; expected {expected}")
     check_output_file(path)
     check_not_read(path, *read)
 
 
 def features_words(model: DejaVu, command: str, option: str = "--features") -> list[str]:
-    """The options `--features ..` of a later command, where a map cannot bring its features back itself.
+    """The options `--features ..` that a later command needs if the map file cannot restore its features.
 
     Args:
-        command: as it was typed; its words with `option` say what the features are.
+        command: as it was typed; its words with `option` name the features.
     """
     parts = with_parts(recipe_of(model.features))
     foreign = [one.class_path for one in parts if one.class_path not in REGISTRY]
     if not foreign:
         return []
-    told, values, named = [], False, False
+    found, values, named = [], False, False
     for word in shlex.split(command):
         own = f"{word.partition('=')[0]}.".startswith(f"{option}.")
         if own or values:
-            told.append(f"--features{word.removeprefix(option)}" if own else word)
+            found.append(f"--features{word.removeprefix(option)}" if own else word)
         named |= word.partition("=")[0] == option
         values = own and "=" not in word
     if named:
-        return told
+        return found
     several = isinstance(model.features, Joined) and len(foreign) > 1
     name = json.dumps(recipe_of(model.features).init_args["members"]) if several else foreign[0]
-    return ["--features", name, *told]  # a config file has named it
+    return ["--features", name, *found]  # a config file named them
 
 
 def _check_report_folder(
-    out: Path, beside: Sequence[str], sources: Sequence[str | None], files: Sequence[str | Path | None] = ()
+    out: Path, others: Sequence[str], sources: Sequence[str | None], files: Sequence[str | Path | None] = ()
 ) -> None:
-    """Refuse early a folder that cannot be made or written in, or where what is read would be lost.
+    """Refuse early a folder that cannot be written, or in which files that are read would be lost.
 
     Args:
-        beside: files that are written there beside the report. sources, files: that are read.
+        others: files written there besides the report. sources, files: that are read.
     """
     check_not_read(out, *sources)
     check_output_folder(out)
     if out.is_dir():
         from dejavu_torch.evaluation.report import PICTURES
 
-        for name in ("index.html", "report.json", *beside, *(f"{name}.png" for name in PICTURES)):
+        for name in ("index.html", "report.json", *others, *(f"{name}.png" for name in PICTURES)):
             check_output_file(out / name)
             check_not_read(out / name, *sources, *files)
 
 
 def _print_steps(traverse: Traverse) -> None:
     if isinstance(traverse, ResampledTraverse):
-        steps = f"even steps of {traverse.step:.4g} pixels of ground"
-        print(f"{len(traverse.positions)} frames make {traverse.length} {steps}")
+        steps = f"{traverse.length} even steps of {traverse.step:.4g} pixels of ground"
+        print(f"{len(traverse.positions)} frames resampled to {steps}")
 
 
 def print_map(model: DejaVu) -> None:
-    """What a map holds, and what would hold more where that is little."""
-    summary = model.summary()
+    """Print what a map holds, and the bytes that would hold enough if that is little."""
+    summary, start = model.summary(), 0
     if summary.places and not summary.covered:
         print("this route does not repeat")
     print(summary)
-    for line in route_lines(model.map):
-        _say(line)
+    for route in model.map.routes:
+        assert isinstance(model.map, SpectralMap)  # only these can be merged
+        size, stop = model.map.part(route.name).summary().route_bytes, start + route.places
+        frames = f" of {route.frames} frames" * (route.frames != route.places)
+        text = f"route {route.name}: places {start}-{stop - 1}{frames}, {size} bytes"
+        _say(f"{text}, {size / route.places:.2f} per place")
+        start = stop
     if len(model.map.visits):
         counts = model.map.visit_counts.double()
         print(f"each place is the mean of {counts.mean():.3g} visits ({counts.min():g} to {counts.max():g})")
     whitening = model.whitening
     if whitening is not None:
         sizes = " + ".join(map(str, whitening.sizes))
-        print(f"Whitening, {sizes} to {len(whitening.scale)} numbers: {whitening.extra_repr()}")
+        print(f"Whitening, {sizes} to {len(whitening.scale)} dimensions: {whitening.extra_repr()}")
     if isinstance(model.map, SpectralMap) and model.map.needed is not None:
         more = f"about {model.map.needed:.3g} bytes per place would hold {HELD}, as --mapper.hold {HELD} does"
         print(f"the lines hold less than half of the descriptors' variance: {more}")
-
-
-def route_lines(route: PlaceMap) -> list[str]:
-    """The routes of a merged map: their places, frames and bytes."""
-    if not isinstance(route, SpectralMap):
-        return []
-    lines, start = [], 0
-    for one in route.routes:
-        size = route.part(one.name).summary().route_bytes
-        shown = f" of {one.frames} frames" * (one.frames != one.places)
-        lines.append(
-            f"route {one.name}: places {start}-{start + one.places - 1}{shown}, {size} bytes, "
-            f"{size / one.places:.2f} per place"
-        )
-        start += one.places
-    return lines
 
 
 def _print_localize(map: Path, model: DejaVu, command: str, query: str = "QUERY", lead: str = "next") -> None:
@@ -729,12 +661,12 @@ def _print_localize(map: Path, model: DejaVu, command: str, query: str = "QUERY"
 
 
 def print_next(*words: object, lead: str = "next") -> None:
-    """What to run after this."""
+    """Print the command to run next."""
     _say(f"{lead}: {shlex.join(['dejavu', *(str(word) for word in words)])}")
 
 
 def _say(text: str) -> None:
-    """A line with names in it."""
+    """Print a line that may hold names of files."""
     print(printable(text))
 
 
@@ -744,8 +676,8 @@ def _publish(
     """Write map, matches and report of a comparison, and print its scores.
 
     Args:
-        given: file of the map, where it was not learned.
-        top: how many candidates of each query to write; None writes the matches.
+        given: file of the map, unless it was learned.
+        top: candidates of each query to write; None writes the matches.
     """
     from dejavu_torch.evaluation.report import report_folder, write_report
 
@@ -754,7 +686,7 @@ def _publish(
     _print_contradiction(result.report)
     print_map(run.model)
     if run.truth is None:
-        print("nothing tells which places are right, see --truth: matches and pictures, no scores")
+        print("no ground truth (see --truth): matches and pictures, but no scores")
     if not rule.given:
         print(rule)
     match = run.match
@@ -776,7 +708,7 @@ def _write_matches(
     ranks: int | None = None,
     pairs: Path | None = None,
 ) -> tuple[int, int]:
-    """Write the matches of a query that the map was asked for; returns how many (queries, accepted)."""
+    """Write the matches of a query; returns the numbers of queries and of accepted answers."""
     from dejavu_torch.evaluation.matches import write_matches
 
     frames, source = None, query
@@ -787,7 +719,7 @@ def _write_matches(
 
 
 def _print_contradiction(report: Report) -> None:
-    """Say ahead of all else that the answers lie elsewhere than a ground truth says."""
+    """Say first if the answers contradict the ground truth."""
     if report.ours.scores is not None and "line" in report.facts:
         _say(told_line(report.facts, True))
 

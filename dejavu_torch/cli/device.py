@@ -1,4 +1,4 @@
-"""--device of the commands."""
+"""The --device option."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from dejavu_torch.types import InputError
 
 
 def device_of(name: str, learns: bool = False) -> torch.device:
-    """The device of that name.
+    """The device with that name.
 
     Args:
         name: cpu, cuda, cuda:N or mps.
-        learns: whether it is to learn, which takes double precision.
+        learns: whether a map is learned on it, which needs double precision.
 
     Raises:
-        InputError: another name, or a device that this machine does not have.
+        InputError: another name, or a device that this machine lacks.
 
     Example:
         >>> device_of("cpu")
@@ -34,5 +34,5 @@ def device_of(name: str, learns: bool = False) -> torch.device:
     if device.type == "mps" and not torch.backends.mps.is_available():
         raise InputError("--device mps is not there; expected cpu, which this machine has")
     if device.type == "mps" and learns:
-        raise InputError("--device mps has no double precision, which learning takes; expected cpu or cuda")
+        raise InputError("--device mps has no double precision, which learning needs; expected cpu or cuda")
     return device

@@ -1,4 +1,4 @@
-"""What `dejavu live` does: frames in, lines of JSON out, and a page beside them."""
+"""`dejavu live`: frames in, lines of JSON and a page out."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from contextlib import ExitStack, suppress
 
 import numpy as np
 
-from dejavu_torch.cli.process import interrupts_raise, reader_left
+from dejavu_torch.cli.process import interrupts_raise, output_problem
 from dejavu_torch.data.camera import Camera, Frame, is_stream, shots_of, stretched
 from dejavu_torch.data.source import open_source
 from dejavu_torch.live.feed import FrameReader, in_real_time
@@ -22,8 +22,8 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.text import printable
 from dejavu_torch.types import InputError, SequenceModel
 
-RECENT = 10_000  # answers whose milliseconds are kept
-RATE = 10  # frames a second that a page shows of a source without times
+RECENT = 10_000  # answers whose times are kept
+RATE = 10  # frames per second on the page, for a source without times
 
 log = logging.getLogger("dejavu_torch")
 
@@ -40,15 +40,15 @@ def follow(
 ) -> None:
     """Localize the frames of a source until it ends or Ctrl-C; see `run_live`.
 
-    Convention: with a page a file is played in real time, and the page stays until Ctrl-C.
+    Convention: with a page, a file plays in real time, and the page stays until Ctrl-C.
 
     Raises:
-        InputError: what is wrong with the source, behind the lines and the summary of what came before.
+        InputError: the source fails; the lines and the summary of earlier frames are printed first.
     """
     localizer = LiveLocalizer(model, sequence, keep_scores=port is not None)
-    shots, newest, name = shots_from(source, model, realtime, port is not None)
+    frames, newest, name = frames_from(source, model, realtime, port is not None)
     recent: deque[float] = deque(maxlen=RECENT)  # milliseconds
-    frames = 0
+    count = 0
     with ExitStack() as stack:
         page = None
         if port is not None:
@@ -56,88 +56,89 @@ def follow(
             if reference is not None:
                 if model.map.routes:
                     seen = f"--reference {reference}: the map has {len(model.map.routes)} routes"
-                    raise InputError(f"{seen}; expected the page without, or the map of that route")
+                    raise InputError(f"{seen}; expected the map of one route, or no --reference")
                 shown = len(model.map.positions) or model.map.places
                 pictures = ReferencePictures(open_source(reference), shown)
             page = stack.enter_context(Page(port, title, pictures))
-            _tell(f"the page is at {page.url}")
-        feed = stack.enter_context(FrameReader(shots, newest, timeout if is_stream(source) else None, name))
+            _log(f"the page is at {page.url}")
+        reader = stack.enter_context(
+            FrameReader(frames, newest, timeout if is_stream(source) else None, name)
+        )
         try:
             with interrupts_raise(), suppress(KeyboardInterrupt):
                 latest = -1
-                for shot in feed:
-                    match = localizer(shot.pixels, shot.number - latest - 1)
-                    latest = shot.number
+                for frame in reader:
+                    match = localizer(frame.pixels, frame.number - latest - 1)
+                    latest = frame.number
                     recent.append(match.milliseconds)
-                    frames += 1
-                    print(line_of(shot, match))
-                    if reader_left():
+                    count += 1
+                    print(line_of(frame, match))
+                    if isinstance(output_problem(), BrokenPipeError):
                         break
                     if page is not None and localizer.scores is not None:
                         posterior = localizer.posterior
                         drawn = localizer.scores if posterior is None else posterior
-                        counts = (frames, feed.dropped, *percentiles(recent))
-                        page.show(Snapshot(shot, match, drawn, posterior is not None, *counts))
+                        stats = (count, reader.dropped, *percentiles(recent))
+                        page.show(Snapshot(frame, match, drawn, posterior is not None, *stats))
                 else:
                     if page is not None and not is_stream(source):
-                        _tell(f"that was the last frame; the page stays at {page.url} until Ctrl-C")
+                        _log(f"that was the last frame; the page stays at {page.url} until Ctrl-C")
                         while True:
                             time.sleep(3600)
         finally:
-            if frames:
+            if count:
                 p50, p99 = percentiles(recent)
-                times = f"milliseconds a frame: p50 {p50:.1f}, p99 {p99:.1f}"
+                times = f"milliseconds per frame: p50 {p50:.1f}, p99 {p99:.1f}"
                 rule = model.acceptance(sequence)
-                told = "" if rule.given else f"; {rule}"
-                _tell(f"{frames} frames, {feed.dropped} dropped; {times}{told}")
+                _log(f"{count} frames, {reader.dropped} dropped; {times}{'' if rule.given else f'; {rule}'}")
 
 
-def shots_from(
+def frames_from(
     source: str, model: DejaVu, realtime: bool, shown: bool = False
 ) -> tuple[Iterable[Frame], bool, str]:
-    """What a source gives, whether only its newest frame counts, and its name.
+    """The frames of a source, whether older ones are dropped for the newest, and its name.
 
     Args:
-        shown: on a page, which a file is played for at its own pace.
+        shown: on a page, for which a file is played in real time.
     """
     shape = model.frame_shape
     size = (shape[1], shape[2]) if shape is not None and len(shape) == 3 else None
     if is_stream(source):
         camera = Camera(source, size)
         if realtime:
-            raise InputError(f"--realtime: {camera.name} has its own time; expected a video file with it")
-        return _noted(camera), True, camera.name
+            raise InputError(f"--realtime: {camera.name} is live already; expected a video file with it")
+        return _with_warning(camera), True, camera.name
     own, traverse = open_source(source).frame_shape, open_source(source, size)
     if traverse.frame_shape != own and size is not None:
         note = stretched(traverse.name, (own[1], own[2]), size)
         if note:
             log.warning("%s", note)
-    shots = shots_of(traverse)
+    frames = shots_of(traverse)
     if realtime or shown:
-        shots = in_real_time(shots, traverse.name, None if realtime else RATE)
-    return shots, realtime, traverse.name
+        frames = in_real_time(frames, traverse.name, None if realtime else RATE)
+    return frames, realtime, traverse.name
 
 
-def _noted(camera: Camera) -> Iterable[Frame]:
-    for shot in camera:
-        if camera.note and not shot.number:
+def _with_warning(camera: Camera) -> Iterable[Frame]:
+    for frame in camera:
+        if camera.note and not frame.number:
             log.warning("%s", camera.note)
-        yield shot
+        yield frame
 
 
-def line_of(shot: Frame, match: LiveMatch) -> str:
+def line_of(image: Frame, match: LiveMatch) -> str:
     """An answer as a line of JSON."""
     answer = match._asdict() | {"milliseconds": round(match.milliseconds, 3)}
     place, frame, route = (answer.pop(name) for name in ("place", "frame", "route"))
-    facts = {"frame": shot.number, "time": shot.seconds, "place": place, "reference_frame": frame, **answer}
+    facts = {"frame": image.number, "time": image.seconds, "place": place, "reference_frame": frame, **answer}
     return json.dumps(without_nan(facts | ({"route": route} if route else {})))
 
 
 def percentiles(milliseconds: Iterable[float]) -> tuple[float, float]:
-    """p50 and p99 of the times of at least one answer."""
+    """The p50 and p99 of some times."""
     p50, p99 = np.percentile([*milliseconds], (50, 99))
     return float(p50), float(p99)
 
 
-def _tell(text: str) -> None:
+def _log(text: str) -> None:
     print(f"dejavu: {printable(text)}", file=sys.stderr, flush=True)

@@ -1,17 +1,17 @@
-"""The commands, in the order in which messages name them."""
+"""The commands in the order of messages, with their lines in `dejavu --help`."""
 
-COMMANDS = {  # and what `dejavu --help` says of them
-    "demo": "learn the built-in route, localize a second traverse of it, report",
+COMMANDS = {
+    "demo": "learn the built-in route, localize a second traverse, write a report",
     "learn": "learn a map",
-    "localize": "find the frames of a source on a map",
-    "live": "find the frames of a camera on a map, one by one",
-    "compare": "learn, localize and evaluate, beside baselines and null control",
-    "evaluate": "evaluate the matches in a csv, whatever found them",
-    "reproduce": "the paper's experiments on simulated routes, beside its own numbers",
+    "localize": "find frames on a map",
+    "live": "find the frames of a camera on a map, one at a time",
+    "compare": "learn, localize and evaluate, with baselines and a null control",
+    "evaluate": "evaluate the matches of any method from a csv",
+    "reproduce": "repeat the paper's experiments on simulated routes",
     "train": "train features that repeat: fit, validate, test or export",
-    "merge": "join the maps of several routes",
-    "export": "write a map, and what is ahead of it, as an ONNX file",
-    "info": "what is in a map",
-    "completion": "print a script by which bash or zsh completes all this",
+    "merge": "merge the maps of several routes",
+    "export": "write a map and its features as an ONNX file",
+    "info": "show what a map holds",
+    "completion": "print a completion script for bash or zsh",
 }
-FIRST_DAY = ("demo", "compare", "learn", "localize", "info")  # what `dejavu --help` begins with
+FIRST_DAY = ("demo", "compare", "learn", "localize", "info")  # listed first by `dejavu --help`

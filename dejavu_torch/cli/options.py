@@ -1,4 +1,4 @@
-"""Options that several commands share, with their checks: each field is an option, `Args:` its help."""
+"""Options that several commands share: each field is an option, and `Args:` has its help."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.types import InputError, SequenceModel, Traverse
 
 NO_CALIBRATION = "none"
-UNREAD = (None, NO_CALIBRATION)  # of --calibration: no source
+UNREAD = (None, NO_CALIBRATION)  # values of --calibration that name no source
 Reference = TypeVar("Reference", Traverse, Traverse | None)
 
 
 @dataclass
 class Sequences:
-    """How consecutive queries are matched together.
+    """How consecutive queries support each other.
 
     Args:
-        sequence: queries that are matched together, one place after another
-        speeds: of a sequence, places a query, such as '[.8,1,1.25]'; 1 if not given
-        filter: the most probable place given all queries so far; scores and --threshold are -log of its
-            probability
-        moves: of the filter, probabilities of moving by 0, 1, 2, .. places; '[.2,.6,.2]' if not given
+        sequence: match this many consecutive queries together, at constant speed
+        speeds: speeds of a sequence in places per query, such as '[.8,1,1.25]'; 1 if not given
+        filter: match each query with all queries before it, by a probability for every place; scores and
+            --threshold are then -log(probability)
+        moves: the filter's probabilities of moving by 0, 1, 2, .. places; '[.2,.6,.2]' if not given
     """
 
     sequence: int = 1
@@ -45,16 +45,15 @@ class Sequences:
     moves: list[float] | None = None
 
     def matcher(self, within: int, threshold: float | None) -> SequenceModel | None:
-        """The filter, or a sum over so many queries; None for single queries.
+        """The filter or the sequence matcher; None for single queries.
 
         Args:
-            within, threshold: of the filter, which keeps its own threshold if that is None.
+            within, threshold: of the filter; None keeps the filter's own threshold.
         """
         settings = {"moves": self.moves, "search_every": getattr(self, "search_every", None)}
         given: dict[str, Any] = {name: value for name, value in settings.items() if value is not None}
         if self.filter:
-            if self.sequence > 1:
-                raise InputError(f"--sequence {self.sequence} and --filter; expected one or the other")
+            refuse_with("--filter", sequence=self.sequence > 1 and self.sequence)
             chosen = PlaceFilter(within=within, **given)
             chosen.threshold = chosen.threshold if threshold is None else threshold
             return chosen
@@ -68,11 +67,11 @@ class Sequences:
 
 @dataclass
 class Searches(Sequences):
-    """As above, for what need not search all places for each query.
+    """Also how often the filter searches all places.
 
     Args:
-        search_every: of the filter, queries from one search of all places to the next; in between only those
-            near the last place are scored; 1 if not given
+        search_every: let the filter search all places only at every n-th query, and in between score those
+            near the last place; 1 if not given
     """
 
     search_every: int | None = None
@@ -80,10 +79,10 @@ class Searches(Sequences):
 
 @dataclass
 class LiveSearches(Searches):
-    """The filter, unless queries are matched another way.
+    """The filter unless a sequence is given.
 
     Args:
-        sequence: frames that are matched together in place of the filter; 1 takes each by itself
+        sequence: match this many frames together instead of filtering; 1 matches each frame by itself
     """
 
     sequence: int | None = None  # type: ignore[assignment]
@@ -95,41 +94,38 @@ class LiveSearches(Searches):
 
 @dataclass
 class Searching:
-    """How single queries are searched for.
+    """How places are searched for single queries.
 
     Args:
-        search: coarse scores the places near the best samples of a long spectral map, exact rules out all
-            others, scan scores all; auto is the faster of coarse and scan
-        search_memory: MB for these samples; 100, of over 10^6 places 100 bytes each, if not given
+        search: coarse scores only the places near the best samples of a long spectral map, exact also all
+            that may be better, scan all; auto is the faster of coarse and scan
+        search_memory: MB for these samples; if not given 100, or 100 bytes per place above 10^6 places
     """
 
     search: Search = "auto"
     search_memory: float | None = None
 
     def of(self, model: DejaVu) -> None:
-        """How a model searches from now on."""
+        """Set how a model searches."""
         memory = self.search_memory
         if memory is not None and not memory > 0:
             raise InputError(f"--search_memory {memory:g}; expected a number above 0, in MB")
         check_search(self.search)
         model.search, model.search_memory = self.search, None if memory is None else int(1e6 * memory)
+        model.search_file = getattr(self, "search_file", None)
 
 
 @dataclass
 class KeptSearching(Searching):
-    """How single queries find places on a map that is opened again and again.
+    """Also a file that keeps the samples for the next command.
 
     Args:
-        search_file: file of the samples of a coarse or exact search, written if it does not exist, else read;
-            a file made from another map, or with another --search or --search_memory, is refused. A filter
-            needs --search_every above 1 with it: else it scores all places
+        search_file: file for the samples of a coarse or exact search: written if it does not exist, else
+            read. It is refused for another map, --search or --search_memory. A filter uses it only with
+            --search_every above 1
     """
 
     search_file: Path | None = None
-
-    def of(self, model: DejaVu) -> None:
-        super().of(model)
-        model.search_file = self.search_file
 
 
 @dataclass
@@ -137,9 +133,9 @@ class Loading:
     """How a map is loaded.
 
     Args:
-        as_is: take the frames as they are, though the map's are resampled
-        device: what computes: cpu, cuda, cuda:1 or mps
-        features: class of the map's features, if not ours
+        as_is: do not resample the frames, even if those of the map are resampled
+        device: cpu, cuda, cuda:1 or mps
+        features: class of the map's features, if it is not part of dejavu_torch
     """
 
     as_is: bool = False
@@ -154,13 +150,13 @@ class Loading:
 
 
 def named_features(model: DejaVu) -> nn.Module | None:
-    """The features of a model, for a file to be read with; None if they are default ones, for its own."""
+    """The features to load a file with: those of a model, or None, the file's own, for the default ones."""
     default = default_features(model.whitening is not None)
     return None if recipe_of(model.features) == recipe_of(default) else model.features
 
 
 def load_map(path: Path, features: nn.Module | None = None) -> DejaVu:
-    """As `DejaVu.load`; a descriptor is refused, which finds nothing by itself."""
+    """As `DejaVu.load`, but refuse a descriptor without a map."""
     model = DejaVu.load(path, features)
     if not model.map.places:
         raise InputError(f"{path} is {NO_MAP.replace('FILE', str(path))}")
@@ -172,48 +168,49 @@ class Acceptance:
     """Which matches are accepted.
 
     Args:
-        threshold: accept a match whose score is below; .inf accepts all
-        precision: accept instead what is at least as probably right, such as .99. Without either, and none in
-            the map, .5 on a calibrated map, else all
+        threshold: accept matches with a score below this; .inf accepts all
+        precision: accept matches that are right with at least this probability, such as .99. If neither the
+            options nor the map say anything: .5 on a calibrated map, else all
     """
 
     threshold: float | None = None
     precision: float | None = None
 
     def check(self, sequence: SequenceModel | None, distractors: object = None) -> None:
-        """Refuse at once what does not go with a precision, or with what else needs probabilities."""
-        if self.threshold is not None and self.precision is not None:
-            seen = f"--threshold {self.threshold:g} and --precision {self.precision:g}"
-            raise InputError(f"{seen}; expected one of them")
+        """Refuse what excludes a precision or distractors, which both need probabilities."""
+        if self.threshold is not None:
+            refuse_with(f"--threshold {self.threshold:g}", precision=self.precision)
         check_precision(self.precision)
         if isinstance(sequence, PlaceFilter):
-            together = f"--search_every {sequence.search_every}" if sequence.search_every > 1 else ""
+            without = f"--search_every {sequence.search_every}" if sequence.search_every > 1 else ""
         else:
-            together = f"--sequence {sequence.length}" if isinstance(sequence, SequenceMatcher) else ""
+            without = f"--sequence {sequence.length}" if isinstance(sequence, SequenceMatcher) else ""
         for name, value in (("--precision", self.precision), ("--distractors", distractors)):
-            if together and value:
-                why = "probabilities are of single queries and of a filter that searches all places each time"
-                raise InputError(f"{together} and {name} {value}: {why}; expected one of the two options")
+            if without and value:
+                why = (
+                    "only single queries, and a filter that searches all places each time, have probabilities"
+                )
+                raise InputError(f"{without} and {name} {value}: {why}; expected one of the two options")
 
     def of(self, model: DejaVu) -> None:
-        """What a model accepts from now on, if one of the two is given."""
+        """Set what a model accepts, if one of the two is given."""
         if self.threshold is not None or self.precision is not None:
             model.threshold, model.precision = self.threshold, self.precision
 
 
 @dataclass
 class Learning:
-    """What a map is learned with beside its route.
+    """What a map is learned with in addition to its route.
 
     Args:
-        seed: of the whitening, if it has none of its own, and of the null control
-        second: another visit, or several, '[A,B]', from which to learn what changes
-        second_truth: places it shows, as --truth; one for all, or '[A,B]'
-        descriptor: file whose features are taken, as `dejavu train` makes, or a map
-        calibration: a further traverse, which tells how probably answers are right, or none; changed frames
-            of the route if not given
+        seed: seed of the whitening, unless it has its own, and of the null control
+        second: second traverse from which to learn what changes, or several, '[A,B]'
+        second_truth: places that it shows, in the formats of --truth; one for all, or '[A,B]'
+        descriptor: file to take the features from: a map, or a descriptor of `dejavu train`
+        calibration: traverse that calibrates the probability of right answers, or none; augmented frames of
+            the route if not given
         calibration_truth: places that it shows, likewise
-        device: what learns: cpu, cuda or cuda:1
+        device: cpu, cuda or cuda:1
     """
 
     seed: int = 0
@@ -226,19 +223,19 @@ class Learning:
 
     @property
     def files(self) -> list[Any]:
-        """What is read."""
+        """What these options read."""
         given = [*several(self.second), *map(str, several(self.second_truth))]
         return [*given, self.descriptor, self.calibration, self.calibration_truth]
 
     def seed_whitening(self, model: DejaVu) -> None:
-        """The command's seed for a whitening that is to be learned and has none of its own."""
+        """Give the seed to a whitening that will be learned and has none."""
         if model.whitening is not None and not model.whitening.fixed and not model.map.places:
             model.whitening.seed = model.whitening.seed or self.seed
 
     def with_second(
         self, model: DejaVu, reference: Traverse, query: Traverse | None = None
     ) -> tuple[Traverse, Views | None]:
-        """The reference, and the further traverses that whitening learns from."""
+        """The reference, and the second traverses that the whitening learns from."""
         if self.second is None:
             check_no_truth("second", self.second_truth)
             return reference, None
@@ -253,43 +250,48 @@ class Learning:
     def with_calibration(
         self, model: DejaVu, reference: Reference, query: Traverse | None = None
     ) -> tuple[Reference, Views | None]:
-        """The reference, if there is one, and the traverse that its map, or the model's, is calibrated by."""
+        """The reference, if there is one, and the traverse that calibrates its map, or the model's."""
         source, truth = self.calibration, self.calibration_truth
-        if source is None or source == NO_CALIBRATION:
+        if source in UNREAD:
             check_no_truth("calibration", truth)
             return reference, None
         others: list[Traverse | None] = [query]
         others += [] if reference is None else parts_of(source_of(reference))
         others += [open_source(one) for one in several(self.second)]
-        traverse = open_another("calibration", source, others)
+        traverse = open_another("calibration", str(source), others)
         if reference is not None:
             reference = model.resample(reference, model.step, True, model.frame_shape)
             traverse = model.fit(traverse, reference.frame_shape)
             model.describer.check_sizes(reference, traverse)
         return reference, growth.associate(model, reference, traverse, truth)
 
-    def check_precision(self, model: DejaVu, traverse: Traverse) -> None:
-        """Refuse a precision, given or the map's, that nothing is there to calibrate for."""
+    def check_calibrated(
+        self, model: DejaVu, traverse: Traverse, map: Path | None = None, distractors: object = None
+    ) -> None:
+        """Refuse a precision, given or the map's, and distractors, if the map is not calibrated."""
         why = ""
-        if self.calibration == NO_CALIBRATION:
+        if self.calibration in UNREAD and map is not None:
+            why = "" if model.calibration is not None else f"{map}, which is not calibrated"
+        elif self.calibration == NO_CALIBRATION:
             why = "--calibration none"
         elif self.calibration is None and len(traverse.frame_shape) != 3:
             why = f"{traverse.name}, which has no frames to calibrate by"
-        if model.precision is not None and why:
-            expected = "expected --calibration SOURCE, or --threshold in place of the precision"
-            raise InputError(f"a precision, {model.precision}, and {why}; {expected}")
+        for given, name in ((model.precision, "a precision,"), (distractors, "--distractors")):
+            if why and given:
+                instead = ", or --threshold instead" if given is model.precision else ""
+                raise InputError(f"{name} {given}, and {why}; expected --calibration SOURCE{instead}")
 
 
 @dataclass
 class Growth:
-    """What a map is grown by.
+    """How a map grows.
 
     Args:
-        append: map file behind whose places those of the source come; it is written again unless --map names
-            another file
-        average: a further traverse of the source's places, averaged in before they are coded; without a
-            source of those of --append, which are decoded, averaged and coded again at the same step
-        average_truth: which places it shows, as --truth of `dejavu compare`
+        append: append the places of the source to this map file; it is overwritten unless --map names another
+            file
+        average: another traverse, averaged into the places of the source before they are coded; without a
+            source, into those of --append, which are decoded, averaged and coded again with the same step
+        average_truth: places that it shows, in the formats of --truth of `dejavu compare`
     """
 
     append: Path | None = None
@@ -297,7 +299,7 @@ class Growth:
     average_truth: str | None = None
 
     def model(self, given: DejaVu) -> DejaVu:
-        """That of --append, with the features and the acceptance of the given one; or that one."""
+        """The model of --append with the features and acceptance of the given one, else the given one."""
         if self.append is None:
             return given
         model = load_map(self.append, named_features(given))
@@ -305,7 +307,7 @@ class Growth:
         return model
 
     def check(self, sources: Iterable[str], calibration: str | None) -> None:
-        """Refuse to average a traverse with itself, or to calibrate by what a map has been averaged with."""
+        """Refuse to average a traverse with itself, or to calibrate by the averaged one."""
         if self.average is None:
             check_no_truth("average", self.average_truth)
             return
@@ -314,25 +316,25 @@ class Growth:
             open_another("calibration", str(calibration), [traverse])
 
     def visits(self, model: DejaVu, reference: Traverse | None) -> Views:
-        """The further traverse, and which places it shows, of the reference or of the map."""
+        """The traverse to average, and which places of the reference or the map it shows."""
         return growth.associate(model, reference, open_source(str(self.average)), self.average_truth)
 
 
 @dataclass
 class Judging:
-    """How answers are judged, and what else a report of them has.
+    """How answers are evaluated, and what else a report has.
 
     Args:
-        truth: offset (place = query + offset), csv of query,place[,place...], json of a list per query, npz
+        truth: offset (place = query + offset), csv of query,place[,place...], json with a list per query, npz
             with GThard, or utm:25 by image names
-        tolerance: right within so many places, inclusive
-        interpolate: fill in a csv that lists some queries only
-        leave_out: of templates, a diagnostic: the reference on itself, without so many frames each side
-        top: write so many places of each query, no two within the tolerance
-        distractors: another route, or several, '[A,B]': what is accepted there
-        storage_curve: also evaluate maps of other sizes, which takes as long as all the rest
-        ordered: queries are in order, as those of videos are: a filter stands beside single ones
-        unordered: they are not
+        tolerance: answers this many places off are still right
+        interpolate: interpolate a --truth that lists only some queries
+        leave_out: diagnostic for templates: the reference on itself, without this many frames on each side
+        top: write this many places per query, no two within the tolerance
+        distractors: other route, or several, '[A,B]', to report what is accepted there
+        storage_curve: also evaluate maps of other sizes; this doubles the time
+        ordered: queries are in order, as in a video: also evaluate a filter
+        unordered: queries are in no order
     """
 
     truth: str | None = None
@@ -346,10 +348,9 @@ class Judging:
     unordered: bool = False
 
     def in_order(self, together: bool) -> bool | None:
-        """Whether queries, matched together or not, are in order; None if their source is to tell."""
-        if self.unordered and (self.ordered or together):
-            other = "--ordered" if self.ordered else "queries that are matched together"
-            raise InputError(f"--unordered and {other}; expected one of them, or none")
+        """Whether queries, matched together or not, are in order; None leaves it to their source."""
+        if self.unordered:
+            refuse_with("--unordered", ordered=self.ordered, sequence=together and "or --filter")
         return self.ordered if self.ordered or self.unordered else None
 
     def off_map(self, traverses: Collection[Traverse]) -> list[Traverse]:
@@ -357,19 +358,27 @@ class Judging:
         return [open_another("distractors", one, traverses) for one in several(self.distractors)]
 
 
+def refuse_with(option: str, **others: object) -> None:
+    """Refuse an option if one of the others, which exclude it, is given."""
+    for name, value in others.items():
+        if value:
+            other = f"--{name}" if value is True else f"--{name} {value}"
+            raise InputError(f"{option} and {other}; expected one of them")
+
+
 def check_no_truth(option: str, truth: object) -> None:
-    """Refuse a truth of a traverse that is not given."""
+    """Refuse the truth of a traverse that is not given."""
     if truth is not None:
-        raise InputError(f"--{option}_truth {truth} is of no traverse; expected --{option} SOURCE with it")
+        raise InputError(f"--{option}_truth {truth} without --{option}; expected --{option} SOURCE with it")
 
 
 def several(given: Any) -> list[Any]:
-    """What an option names that takes one or several."""
+    """The values of an option that takes one or several."""
     return [] if given is None else [*given] if isinstance(given, list) else [given]
 
 
 def open_another(option: str, source: str, others: Iterable[Traverse | None]) -> Traverse:
-    """The traverse of an option, none of those that are read already, however its path is written."""
+    """Open the traverse of an option; refuse one of the others, however its path is written."""
     traverse = open_source(source)
     for other in others:
         if other is not None and Path(other.name).resolve() == Path(traverse.name).resolve():

@@ -1,4 +1,4 @@
-"""What the commands understand: a parser from each command's function, and errors of one line."""
+"""The parsers of the commands, made from their functions, with errors of one line."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ import pydoc
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import redirect_stdout
+from contextlib import redirect_stdout, suppress
 from dataclasses import is_dataclass
-from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any, NoReturn, cast, get_args, get_origin
 
@@ -21,7 +20,7 @@ import yaml
 from jsonargparse.typing import restricted_string_type
 from torch import nn
 
-from dejavu_torch.cli.options import named_features
+from dejavu_torch.cli.options import named_features, refuse_with
 from dejavu_torch.cli.presets import check_config, check_word, find_config
 from dejavu_torch.data.files import LARGEST
 from dejavu_torch.data.source import check_not_read
@@ -34,23 +33,21 @@ from dejavu_torch.types import InputError
 
 MODEL = "model"  # the parameter of a command that is a DejaVu: each of its arguments is an option
 COMMAND = "command"  # the parameter that is the command line itself
-# classes whose options can be given alone, where the constructor's type is a base class
-DEFAULT_PARTS = {
-    "mapper": {"class_path": "dejavu_torch.SpectralMapper"},
-}
+# the class whose options can be given without it, for a constructor argument of a base class
+DEFAULT_PARTS = {"mapper": {"class_path": "dejavu_torch.SpectralMapper"}}
 HINT = (
     "Parts have options of their own, such as --whitening.numbers 64, --mapper.route_bytes_per_place 2.5 "
-    "or, of HOG alone, --features.cell 4: see --features.help HOG, --whitening.help, --mapper.help "
+    "or, for HOG alone, --features.cell 4: see --features.help HOG, --whitening.help, --mapper.help "
     "SpectralMapper, --preprocess.help and --velocity.help. --config local_maxima makes a map of templates, "
-    "with options such as --mapper.periods.window 512. --features '[HOG, Distilled]' joins the features of "
-    "several. --features hub:megaloc is a pretrained network: it downloads and runs code from GitHub. "
-    "--whitening also takes none, or a map file, with the features that it was learned from; --descriptor "
-    "takes those alone, from a map or from what `dejavu train` makes of several routes."
+    "with options such as --mapper.periods.window 512. --features '[HOG, Distilled]' joins several features. "
+    "--features hub:megaloc is a pretrained network: it downloads and runs code from GitHub. --whitening "
+    "also accepts none, or a map file, whose features are then used as well; --descriptor uses only the "
+    "features, of a map or of the file that `dejavu train` writes for several routes."
 )
-BARE = {"velocity": "GroundOdometry", "page": 8765}  # what an option without a value means
+BARE = {"velocity": "GroundOdometry", "page": 8765}  # values of options given without one
 MapFile = restricted_string_type("MapFile", r".*\.safetensors")
-NETWORKS = ("features", "backbone", "network")  # options that name a class, or a function that makes one
-LONGEST = 300  # characters of a message that is told whole
+NETWORKS = ("features", "backbone", "network")  # options that name a class or a function that makes one
+LONGEST = 300  # characters of a message; longer ones are cut
 
 
 class UsageError(InputError):
@@ -58,17 +55,17 @@ class UsageError(InputError):
 
 
 def causes(error: BaseException | None) -> Iterator[BaseException]:
-    """An exception and those that it was raised from; jsonargparse wraps each in one that says more."""
+    """An exception and its causes; jsonargparse wraps each in one that says more."""
     while error is not None:
         yield error
         error = error.__cause__ or error.__context__
 
 
 def refusal(error: Exception) -> InputError:
-    """What a part's constructor refused."""
+    """The error of a part's constructor, as an InputError."""
     chain = list(causes(error))
     own = [one for one in chain if isinstance(one, InputError)]
-    if own:  # what Python calls None is null here
+    if own:  # Python's None is YAML's null
         return type(own[-1])(re.sub(r"\bNone\b", "null", str(own[-1])))
     return InputError(f"a part cannot be built: {one_line(chain[-1])[:LONGEST] or type(chain[-1]).__name__}")
 
@@ -83,52 +80,47 @@ def whole_numbers(value: object) -> Iterator[int]:
 
 
 def made(function: str, **arguments: Any) -> nn.Module:
-    """What a function makes, such as torch.hub.load, of any signature: `Parser` writes a command line so.
+    """The network that a function of any signature makes, such as torch.hub.load; see `with_made`.
 
     Args:
-        function: its import path, as the user typed it; no map or checkpoint gets here.
+        function: its import path as the user typed it, never from a map or checkpoint.
     """
     maker = _function_at(function)
     if maker is None:
         raise InputError(f"{function} is no function that can be imported; expected one, or a class")
     try:
-        with redirect_stdout(sys.stderr):  # where nobody reads lines of JSON
+        with redirect_stdout(sys.stderr):  # keeps stdout to lines of JSON
             network = maker(**arguments)
-    except SystemExit as stop:  # it would end the command without a word
-        raise InputError(f"{function} ends the program ({stop}); expected what makes a network") from stop
+    except SystemExit as stop:  # it would end the command silently
+        raise InputError(f"{function} ends the program ({stop}); expected one that makes a network") from stop
     if not isinstance(network, nn.Module):
         raise InputError(f"{function} made a {type(network).__name__}; expected an nn.Module")
-    # it would take the first GPU, wherever the model is
+    # DataParallel would use the first GPU, wherever the model is
     return network.module.cpu() if isinstance(network, nn.DataParallel) else network
 
 
 def _function_at(path: str) -> Callable[..., Any] | None:
-    """The function or method of such a name; None where there is none."""
+    """The function or method of that name, or None."""
     try:
         found = pydoc.locate(path) if "." in path else None
-    except pydoc.ErrorDuringImport:  # the parser says so
+    except pydoc.ErrorDuringImport:  # the parser reports it
         return None
     return found if inspect.isroutine(found) else None
 
 
 def with_made(words: Sequence[str]) -> list[str]:
-    """The command line with what `made` makes where it names a function in place of a class.
+    """The command line with a call of `made` for a function that is named instead of a class.
 
-    `--features timm.create_model --features.model_name NAME` is the name's call; jsonargparse itself takes
-    functions only whose return value and arguments are annotated.
+    `--features timm.create_model --features.model_name NAME` calls that function; jsonargparse itself only
+    accepts functions with annotated arguments and return value.
     """
-    words = list(_with_members(with_hub(words)))
+    words = list(_with_members(_joined(with_hub(words))))
     configured = any(word.startswith(("--config=", "-c")) or word == "--config" for word in words)
-    makers = {}
-    for word, after in pairwise([*words, ""]):
-        option, equals, value = word.partition("=")
-        if option.startswith("--") and option.lstrip("-").rpartition(".")[2] in NETWORKS:
-            path = value if equals else after
-            makers[option] = path if _function_at(path) is not None else ""
+    named = (word.partition("=") for word in words if _names_network(word))
+    makers = {option: path if _function_at(path) is not None else "" for option, _, path in named}
     spelt: list[str] = []
-    skip = False
     for word in words:
-        option, equals, _ = word.partition("=")
+        option = word.partition("=")[0]
         part = option.rpartition(".")[0]
         own = part if makers.get(part) and not makers.get(option) else option
         path = makers.get(own, "")
@@ -136,56 +128,59 @@ def with_made(words: Sequence[str]) -> list[str]:
         if made_by and made_by[1] in spelt:
             made_by = []
         elif not configured and own in ("--features", "--model.backbone"):
-            spelt.append(f"{own}=null")  # or arguments of the default would be those of another class
-        spelt += made_by  # ahead of its arguments, wherever they are typed
-        if skip:
-            skip = False
-        elif not path:
+            spelt.append(f"{own}=null")  # else arguments of the default class would be kept
+        spelt += made_by  # before its arguments, wherever they are typed
+        if not path:
             spelt.append(word)
-        elif option == own:
-            skip = not equals
-        else:
+        elif option != own:
             spelt.append(f"{own}.dict_kwargs.{word.removeprefix(own + '.')}")
     return spelt
 
 
-def with_hub(words: Sequence[str]) -> list[str]:
-    """The command line with the words that `hub:NAME` stands for, but for those that are typed, wherever."""
+def _names_network(word: str) -> bool:
+    """Whether a word is an option that names a class, or a function that makes one."""
+    return word.startswith("--") and word.partition("=")[0].lstrip("-").rpartition(".")[2] in NETWORKS
+
+
+def _joined(given: Sequence[str]) -> list[str]:
+    """The command line with `--features=NAME` for `--features NAME`, and so for all networks."""
+    words = [*given]
+    for at in range(len(words) - 2, -1, -1):
+        if _names_network(words[at]) and "=" not in words[at] and not words[at + 1].startswith("-"):
+            words[at : at + 2] = [f"{words[at]}={words[at + 1]}"]
+    return words
+
+
+def with_hub(given: Sequence[str]) -> Sequence[str]:
+    """The command line with the settings that `hub:NAME` stands for, except those that are typed."""
+    words = _joined(given)
     typed = [word.partition("=")[0] for word in words]
-    found = []
-    for at, (word, after) in enumerate(pairwise([*words, ""])):
-        option, equals, value = word.partition("=")
-        value = value if equals else after
-        if value.startswith(hub.PREFIX) and option.lstrip("-").rpartition(".")[2] in NETWORKS[:2]:
-            found.append((at, at + (1 if equals else 2), option, value))
-    if not found:
-        return [*words]
-    if len(found) > 1:
-        raise UsageError(f"{' and '.join(one[3] for one in found)}; expected one of them, or a list")
-    at, end, option, value = found[0]
-    whole = hub.known(value)
+    values = {at: word.partition("=")[2] for at, word in enumerate(words) if _names_network(word)}
+    short = [
+        at
+        for at, value in values.items()
+        if value.startswith(hub.PREFIX) and not typed[at].endswith("network")
+    ]
+    if not short:
+        return given
+    if len(short) > 1:
+        raise UsageError(f"{' and '.join(values[at] for at in short)}; expected one of them, or a list")
+    at, option, whole = short[0], typed[short[0]], hub.known(values[short[0]])
     settings = whole["init_args"] | {"network": "torch.hub.load"}
     settings |= {f"network.{key}": one for key, one in whole["init_args"]["network"]["init_args"].items()}
-    told = {f"{option}.{k}": v if type(v) is str else json.dumps(v) for k, v in settings.items()}
-    spelt = [f"{option}=null", f"{option}={whole['class_path']}"]  # nothing of a config
-    spelt += [f"{k}={v}" for k, v in told.items() if k not in typed]
+    named = {f"{option}.{k}": v if type(v) is str else json.dumps(v) for k, v in settings.items()}
+    spelt = [f"{option}=null", f"{option}={whole['class_path']}"]  # drops settings of a config
+    spelt += [f"{k}={v}" for k, v in named.items() if k not in typed]
     first = next(i for i, one in enumerate(typed) if one.startswith(f"{option}.") or i == at)
-    return [*words[:first], *spelt, *words[first:at], *words[end:]]
+    return [*words[:first], *spelt, *words[first:at], *words[at + 1 :]]
 
 
 def _with_members(words: Sequence[str]) -> Iterator[str]:
-    """The command line with `Joined` where an option that names features is a list of them."""
-    following = iter(words)
-    for word in following:
-        option, equals, value = word.partition("=")
-        named = option.startswith("--") and option.lstrip("-").rpartition(".")[2] in NETWORKS
-        behind = [] if equals or not named else [*islice(following, 1)]
-        value = behind[0] if behind else value
-        if named and value in REGISTRY:
-            yield f"{option}={_path_of(value)}"
-            continue
-        if not named or not value.lstrip().startswith("["):
-            yield from (word, *behind)
+    """The command line with `Joined` for a list of features."""
+    for word in words:
+        option, _, value = word.partition("=")
+        if not _names_network(word) or not value.lstrip().startswith("["):
+            yield f"{option}={_path_of(value)}" if _names_network(word) and value in REGISTRY else word
             continue
         try:
             members = yaml.safe_load(value)
@@ -200,7 +195,7 @@ def _with_members(words: Sequence[str]) -> Iterator[str]:
 
 
 def _made_in(value: Any) -> Any:
-    """A value of YAML with paths of our classes, and what `made` makes where a `class_path` is a function."""
+    """A YAML value with import paths of our classes, and calls of `made` for each function in it."""
     if isinstance(value, list):
         members = [{"class_path": one} if str(one).startswith(hub.PREFIX) else one for one in value]
         return [_path_of(one) if isinstance(one, str) else _made_in(one) for one in members]
@@ -220,19 +215,19 @@ def _made_in(value: Any) -> Any:
 
 
 def _merged(base: Any, over: Any) -> Any:
-    """A mapping, and those in it, with what overrules it; another class has none of the settings."""
+    """Two nested mappings, of which the second overrides the first; another class discards the settings."""
     if not isinstance(base, dict) or not isinstance(over, dict) or "class_path" in over:
         return over
     return base | {key: _merged(base.get(key), one) for key, one in over.items()}
 
 
 def _path_of(name: str) -> str:
-    """The import path of a class of ours; another name as it is, which jsonargparse looks for everywhere."""
+    """The import path of one of our classes; other names are left to jsonargparse."""
     return f"{REGISTRY[name].__module__}.{name}" if name in REGISTRY else name
 
 
 class HelpFormatter(jsonargparse.DefaultHelpFormatter):
-    """Help without the list of every class that is installed; an option without a default has none."""
+    """Help without lists of all installed classes, and without defaults of null."""
 
     def _expand_help(self, action: Any) -> str:
         text, cut, _ = super()._expand_help(action).partition(", known subclasses: ")
@@ -241,7 +236,7 @@ class HelpFormatter(jsonargparse.DefaultHelpFormatter):
 
 
 class Preset(jsonargparse.ActionConfigFile):  # type: ignore[name-defined, misc]
-    """--config: a preset by its name, or a YAML file of options."""
+    """--config: the name of a preset, or a YAML file of options."""
 
     def __call__(self, parser: Any, cfg: Any, values: Any, option_string: str | None = None) -> None:
         path = find_config(values)
@@ -250,30 +245,26 @@ class Preset(jsonargparse.ActionConfigFile):  # type: ignore[name-defined, misc]
 
 
 class Parser(jsonargparse.ArgumentParser):
-    """A parser whose errors are UsageErrors of one line, and whose options overrule its --config."""
+    """A parser whose errors are UsageErrors of one line, and whose options override its --config."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, formatter_class=HelpFormatter, allow_abbrev=False, **kwargs)
 
-    def parse_args(  # type: ignore[override]
-        self, args: Sequence[str] | None = None, *rest: Any, **settings: Any
-    ) -> Any:
+    def parse_args(self, args: Any = None, *rest: Any, **settings: Any) -> Any:
         for word in args or ():
             check_word(word)
-        # a null for a part of a part is handed to the parser of that part as None
-        words = args and with_made([f"{w[:-4]}null" if w.endswith("=None") else w for w in args])
-        if words and self._has_features_of_no_class(words):
+        # a nested null reaches the parser of its part as None
+        words = with_made([f"{w[:-4]}null" if w.endswith("=None") else w for w in args or ()])
+        start = 1 if self._subparsers is not None else 0  # after the subcommand
+        configs, others = self._configs(words[start:])
+        if "--features" in self._option_string_actions and self._need_class(configs, others):
             self.set_defaults({"features": {"class_path": _path_of("HOG")}})
-        parsed = super().parse_args(words and self._config_first(words), *rest, **settings)
+        words[start:] = [*(f"--config={name}" for name in configs), *others]
+        parsed = super().parse_args(words, *rest, **settings)
         for key, value in vars(parsed.as_flat()).items():
             if any(abs(number) > LARGEST for number in whole_numbers(value)):
                 self.error(f"--{key} is {value}; expected whole numbers of at most {LARGEST}")
         return parsed
-
-    def _config_first(self, words: Sequence[str]) -> Sequence[str]:
-        start = 1 if self._subparsers is not None else 0  # behind the subcommand
-        configs, others = self._configs(words[start:])
-        return [*words[:start], *(f"--config={name}" for name in configs), *others]
 
     def _configs(self, words: Sequence[str]) -> tuple[Sequence[str], Sequence[str]]:
         """The values of --config, and the other words."""
@@ -286,21 +277,17 @@ class Parser(jsonargparse.ArgumentParser):
         found, others = reader.parse_known_args(words)
         return found.config, others
 
-    def _has_features_of_no_class(self, words: Sequence[str]) -> bool:
-        """Whether arguments of the features are given without their class: they are those of HOG."""
-        if "--features" not in self._option_string_actions:
-            return False
-        configs, others = self._configs(words)
-        if any(word.startswith("--features.") for word in others):
+    @staticmethod
+    def _need_class(configs: Sequence[str], words: Sequence[str]) -> bool:
+        """Whether arguments of the features are given, maybe without a class, which is then HOG."""
+        if any(word.startswith("--features.") for word in words):
             return True
         for name in configs:
-            try:
+            with suppress(InputError):  # parsing the config reports it
                 check_config(path := find_config(name))
-            except InputError:
-                continue  # it is told where the config is parsed
-            given = yaml.safe_load(path.read_text("utf-8")).get("features")
-            if isinstance(given, dict) and "class_path" not in given:
-                return True
+                given = yaml.safe_load(path.read_text("utf-8")).get("features")
+                if isinstance(given, dict) and "class_path" not in given:
+                    return True
         return False
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
@@ -308,16 +295,16 @@ class Parser(jsonargparse.ArgumentParser):
         if required:
             positional = {action.dest for action in self._actions if not action.option_strings}
             words = [
-                name if name in positional else f"--{name.partition('.')[2] or name}"  # behind fit.
+                name if name in positional else f"--{name.partition('.')[2] or name}"  # without `fit.`
                 for name in names.split(", ")
             ]
             message = f"{head}{required}{', '.join(words)}"
-        told = one_line(_by_options(message, ex))
-        raise UsageError(told if len(told) < LONGEST else f"{told[:LONGEST]} ...") from ex
+        text = one_line(_by_options(message, ex))
+        raise UsageError(text if len(text) < LONGEST else f"{text[:LONGEST]} ...") from ex
 
 
 def _by_options(message: str, error: Exception | None) -> str:
-    """What jsonargparse says: of an option's value what the innermost parser or type says of it."""
+    """The message of jsonargparse, or for an option's value that of the innermost parser or type."""
     key = re.match(r'Parser key "([^"]+)"', message)
     if key is None:
         stages = re.match(r'expected "subcommand" to be one of {(.*)}', message)
@@ -327,8 +314,8 @@ def _by_options(message: str, error: Exception | None) -> str:
     option = "--" + key[1].replace(".init_args", "")
     short = re.search(rf"\b{hub.PREFIX}[\w+.-]*", message)
     if short:
-        where = "a short name behind --features or --model.backbone on the command line, alone or in a list"
-        return f"{option}: {short[0]}; expected {where}"
+        where = "--features or --model.backbone on the command line, alone or in a list"
+        return f"{option}: {short[0]}; expected a short name only as value of {where}"
     chain = list(causes(error))
     part = next((one for one in chain if isinstance(one, UsageError)), None)
     if part is not None:
@@ -336,23 +323,22 @@ def _by_options(message: str, error: Exception | None) -> str:
         return inner if inner.startswith(option) else f"{option}: {inner}"
     setting = re.search(r"NestedArg\(key='([\w.]+)'", message)
     if setting:
-        return f"{option}.{setting[1]}: what {option} names has no settings; expected one or the other"
-    told = re.sub(r"<class '(?:\w+\.)*(\w+)'>", r"\1", str(chain[-1])).replace("typing.Literal", "one of ")
+        return f"{option}.{setting[1]}: the value of {option} has no settings; expected one or the other"
+    text = re.sub(r"<class '(?:\w+\.)*(\w+)'>", r"\1", str(chain[-1])).replace("typing.Literal", "one of ")
     others = ", none or a map file" * ("MapFile" in message)
     wanted = f"expected the import path of a class{others}, not"
-    told = told.replace("Expected a dot import path string:", wanted)
-    value = re.match(r"Expected an? (.*)\. Got value: (.*)", told, re.DOTALL)
-    return f"{option} is {value[2]}; expected {value[1]}" if value else f"{option}: {told}"
+    text = text.replace("Expected a dot import path string:", wanted)
+    value = re.match(r"Expected an? (.*)\. Got value: (.*)", text, re.DOTALL)
+    return f"{option} is {value[2]}; expected {value[1]}" if value else f"{option}: {text}"
 
 
 def command_parser(name: str, function: Callable[..., None], program: str = "dejavu") -> Parser:
     """The parser of one command of a program, made from its function.
 
     Args:
-        function: its positional parameters are positional arguments, optional ones where they have a default,
-            its keyword-only ones are options, and `Args:` of its docstring has their help. Those annotated
-            `Sequence` take any number of words, or, without a default, at least one. Those of a
-            dataclass are options likewise.
+        function: positional parameters become positional arguments (optional with a default), keyword-only
+            ones options, and the fields of a dataclass options too; `Args:` of the docstrings has their help.
+            A `Sequence` accepts any number of words, without a default at least one.
     """
     text, helps = described(function)
     parser = Parser(prog=f"{program} {name}", description=text)
@@ -370,7 +356,7 @@ def command_parser(name: str, function: Callable[..., None], program: str = "dej
 
 
 def described(thing: Callable[..., Any]) -> tuple[str | None, dict[str, str | None]]:
-    """What a docstring says of a function, or of a dataclass and those it extends, and of each argument."""
+    """The description and the help of each argument, of a function or of a dataclass with its bases."""
     helps: dict[str, str | None] = {}
     for one in reversed(thing.__mro__ if isinstance(thing, type) else [thing]):
         text = docstring_parser.parse(inspect.getdoc(one) or "")
@@ -379,7 +365,7 @@ def described(thing: Callable[..., Any]) -> tuple[str | None, dict[str, str | No
 
 
 def add_option(parser: Parser, parameter: inspect.Parameter, helps: Mapping[str, str | None]) -> None:
-    """An option, or a positional argument, as `command_parser` says."""
+    """Add an option or a positional argument, see `command_parser`."""
     keyword, default = parameter.kind is parameter.KEYWORD_ONLY, parameter.default
     settings: dict[str, Any] = {"help": helps[parameter.name]}
     if parameter.annotation is bool:
@@ -400,7 +386,7 @@ def add_option(parser: Parser, parameter: inspect.Parameter, helps: Mapping[str,
 
 
 def grouped(function: Callable[..., None], arguments: dict[str, Any]) -> dict[str, Any]:
-    """Arguments with those of each of the function's dataclasses as one."""
+    """The arguments, with those of each dataclass of the function gathered in it."""
     for key, parameter in inspect.signature(function, eval_str=True).parameters.items():
         if is_dataclass(parameter.annotation):
             options = cast(type, parameter.annotation)
@@ -410,7 +396,7 @@ def grouped(function: Callable[..., None], arguments: dict[str, Any]) -> dict[st
 
 
 def add_model(parser: Parser) -> None:
-    """Every argument of DejaVu as an option, and --config."""
+    """Add --config, and every argument of DejaVu as an option."""
     parser.description = f"{parser.description} {HINT}"
     parser.add_argument(
         "-c", "--config", action=Preset, help="preset (default, local_maxima, paper) or YAML file"
@@ -425,11 +411,11 @@ def add_model(parser: Parser) -> None:
 
 
 def parse(name: str, function: Callable[..., None], words: Sequence[str]) -> dict[str, Any]:
-    """The arguments of a command's function, from the words behind its name.
+    """The arguments of a command's function, from the words after its name.
 
     Raises:
         UsageError: words that the command does not understand.
-        InputError: what the constructor of a part refuses.
+        InputError: a part cannot be built with its arguments.
     """
     parser = command_parser(name, function)
     parsed = parser.parse_args(list(words))
@@ -443,46 +429,43 @@ def parse(name: str, function: Callable[..., None], words: Sequence[str]) -> dic
 
 
 def _model_of(name: str, arguments: dict[str, Any], words: Sequence[str]) -> DejaVu:
-    """The model that the arguments, which lose what it takes, describe.
+    """The model that the arguments describe, which are removed from them.
 
     Args:
-        words: of the command line, without values behind a `=`.
+        words: of the command line, without the values after `=`.
     """
     _check_settings(name, arguments, words)
     del arguments["config"]
     settings = {one: arguments.pop(one) for one in inspect.signature(DejaVu).parameters}
-    files: dict[str, Path] = {}
-    if isinstance(settings["whitening"], MapFile):
-        files["whitening"] = Path(settings["whitening"])
-        settings["whitening"] = None
-    if arguments.get("descriptor"):
-        files["descriptor"] = arguments["descriptor"]
-    for what, path in files.items():
-        _check_own(words, {"preprocess", "weight_bits"}, f"the {what} of {path}")
-    model = DejaVu(**settings)
-    if len(files) == 2:
-        seen = f"--whitening {files['whitening']} has its own features"
-        raise UsageError(f"{seen}; expected it or --descriptor {files['descriptor']}")
-    for what, path in files.items():  # features of our own come from there as well
-        file = DejaVu.load(path, named_features(model))
-        if what == "descriptor":
-            model.take_descriptor(file)
-            continue
-        check_not_read(arguments["map"] if name == "learn" else arguments["out"] / "map.safetensors", path)
+    whitening, descriptor = settings["whitening"], arguments.get("descriptor")
+    if isinstance(whitening, MapFile):
+        refuse_with(f"--whitening {whitening}", descriptor=descriptor)
+        _check_own(words, {"preprocess", "weight_bits"}, f"the whitening of {whitening}")
+        check_not_read(
+            arguments["map"] if name == "learn" else arguments["out"] / "map.safetensors", whitening
+        )
+        model = DejaVu(**settings | {"whitening": None})
+        file = DejaVu.load(Path(whitening), named_features(model))
         try:
             model.take_whitening(file)
         except InputError as error:
-            raise InputError(f"--whitening {path}: {error}") from error
+            raise InputError(f"--whitening {whitening}: {error}") from error
+        return model
+    if descriptor:
+        _check_own(words, {"preprocess", "weight_bits"}, f"the descriptor of {descriptor}")
+    model = DejaVu(**settings)
+    if descriptor:
+        model.take_descriptor(DejaVu.load(descriptor, named_features(model)))
     return model
 
 
 def _check_settings(name: str, arguments: dict[str, Any], words: Sequence[str]) -> None:
-    """Refuse settings beside a map that has its own, and a command to learn without a file to write."""
+    """Refuse settings that a given map has already, and `learn` without a file to write."""
     if name == "learn":
         arguments["map"] = arguments["map"] or arguments["append"]
         if arguments["map"] is None:
             raise UsageError("the following arguments are required: --map")
-    given = {"compare": "map", "learn": "append"}.get(name)  # a map that is taken as it is
+    given = {"compare": "map", "learn": "append"}.get(name)  # a map that keeps its settings
     if given and arguments[given]:
         own = {*inspect.signature(DejaVu).parameters} - {"features", "threshold", "precision"}
         own |= {"config", "second", "second_truth", "descriptor"}
@@ -490,7 +473,7 @@ def _check_settings(name: str, arguments: dict[str, Any], words: Sequence[str]) 
 
 
 def _check_own(words: Sequence[str], own: set[str], whose: str) -> None:
-    """Refuse options of what a file brings."""
+    """Refuse options for what a file has."""
     for word in words:
         option = "config" if word.startswith("-c") else word[2:].partition(".")[0]
         if word.startswith("-") and option in own:

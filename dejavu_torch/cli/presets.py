@@ -1,4 +1,4 @@
-"""Presets: the configs that come with the package, by name from any folder."""
+"""Presets: the configs of the package, by name."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from dejavu_torch.data.files import check_regular, read_text, reading
 from dejavu_torch.types import InputError
 
 PACKAGE = Path(__file__).parents[1]
-# installed, the folder lies inside the package; in a checkout beside it
+# inside the installed package; in a clone next to it
 FOLDER = PACKAGE / "configs" if (PACKAGE / "configs").is_dir() else PACKAGE.parent / "configs"
 
 EXPECTED = "a YAML file of options"
-LARGEST, DEEPEST, MOST = 2**18, 50, 10_000  # bytes, levels and values of a config, aliases written out
+LARGEST, DEEPEST, MOST = 2**18, 50, 10_000  # bytes, levels and values of a config, with aliases expanded
 LONGEST = 4096  # characters of a word or value, as of a path
 
 
@@ -26,16 +26,16 @@ def preset_names() -> list[str]:
 
 
 def find_config(name: str) -> Path:
-    """The config file of that path, or else the preset of that name.
+    """The config file with that path, else the preset with that name.
 
     Raises:
-        InputError: neither is there.
+        InputError: there is neither.
 
     Example:
         >>> find_config("paper").name
         'paper.yaml'
     """
-    if os.path.exists(name) and not os.path.isdir(name):  # False also of what is no path at all
+    if os.path.exists(name) and not os.path.isdir(name):  # False also for what is no path
         return Path(name)
     if name in preset_names():
         return FOLDER / f"{name}.yaml"
@@ -44,10 +44,10 @@ def find_config(name: str) -> Path:
 
 
 def check_config(path: Path) -> None:
-    """Refuse what is no YAML file of options, ahead of what makes objects of it.
+    """Refuse what is not a YAML file of options, before objects are made from it.
 
     Raises:
-        InputError: no regular file, no text, no YAML, not a mapping or an empty one; see `count_values`.
+        InputError: not a regular file, text, YAML, or a mapping with keys; or too large, see `count_values`.
     """
     if check_regular(path, EXPECTED) > LARGEST:
         raise InputError(f"{path} is larger than {LARGEST} bytes; expected {EXPECTED}")
@@ -61,11 +61,11 @@ def check_config(path: Path) -> None:
 
 
 def count_values(node: yaml.Node, level: int = 1, count: int = 0) -> int:
-    """How many values a node of YAML and those before it stand for, with aliases written out.
+    """The number of values in a YAML node, aliases expanded, plus `count`.
 
     Raises:
-        ValueError: more, deeper or longer values than any config has, or a key twice in one mapping. Loaders
-            take them: aliases that name each other keep them busy for hours, many levels end the process.
+        ValueError: more, deeper or longer values than any config has, or a duplicate key. Loaders accept
+            these: nested aliases keep them busy for hours, many levels crash the process.
     """
     line = f"line {node.start_mark.line + 1}"
     if level > DEEPEST:
@@ -91,7 +91,7 @@ def count_values(node: yaml.Node, level: int = 1, count: int = 0) -> int:
 
 
 def check_word(word: str) -> None:
-    """Refuse a word that is YAML, as the value of any option may be, but more than an option can mean."""
+    """Refuse a word that no option can mean; the value of any option may be YAML."""
     if not word or (word.startswith("--") and word.endswith("=")):
         raise InputError(f"{word or 'a word'} is empty; expected a name or a value")
     if len(word) > LONGEST:
@@ -99,9 +99,9 @@ def check_word(word: str) -> None:
     if "&" in word and "*" in word:  # aliases
         try:
             node = yaml.compose(word.partition("=")[2] if word.startswith("--") else word, yaml.SafeLoader)
-            if node is not None:  # a comment
+            if node is not None:  # not a comment
                 count_values(node)
-        except yaml.YAMLError:  # an address, or a name
+        except yaml.YAMLError:  # an address or a name
             pass
         except ValueError as error:
             raise InputError(f"{word}: {error}; expected a value as an option has") from error

@@ -1,6 +1,6 @@
 """The command as a process: its standard streams, and the signals that end it.
 
-Little is imported here, so that signals are in hand before what takes time.
+Little is imported here, so that signals are handled before slow imports.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ if TYPE_CHECKING:
 
 INTERRUPTED = "dejavu: interrupted\n"
 ENDING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-cleanup: list[Callable[[], None]] = []  # what is done before the process ends at once
-_state = {"process": 0, "interrupted": 0}  # the number of the command's process; whether Ctrl-C was raised
+cleanup: list[Callable[[], None]] = []  # called before a signal ends the process
+_state = {"process": 0, "interrupted": 0}  # the process id of the command; whether Ctrl-C was raised
 
 
 class Stream(io.FileIO):
-    """A standard stream that falls silent where nobody takes more of it: a command still writes its files."""
+    """A standard stream that ignores writes after the first failure: a command still writes its files."""
 
     problem: OSError | None = None
 
     def write(self, data: ReadableBuffer, /) -> int:
-        """Write, or, once that has failed, do nothing."""
+        """Write, or do nothing after a failure."""
         if self.problem is None:
             try:
                 return super().write(data)
@@ -41,14 +41,14 @@ class Stream(io.FileIO):
 
 
 def take_over() -> None:
-    """Handle signals and standard streams, where the command is the process and no call among others."""
+    """Handle signals and standard streams, if the command is the process and not a call in a program."""
     _state["process"] = os.getpid()
     for number in ENDING:
-        if signal.getsignal(number) != signal.SIG_IGN:  # as nohup, or a shell's &, has it
+        if signal.getsignal(number) != signal.SIG_IGN:  # set by nohup, or by a shell's &
             signal.signal(number, stop)
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         stream = getattr(sys, name)
-        if stream is None:  # closed: the number must not become that of a file
+        if stream is None:  # closed: no file may get its number
             os.dup2(os.open(os.devnull, os.O_RDWR), number)
         if name != "stdin" and stream is getattr(sys, f"__{name}__"):
             lines = stream is None or stream.line_buffering or stream.write_through
@@ -57,25 +57,15 @@ def take_over() -> None:
             setattr(sys, name, io.TextIOWrapper(buffer, encoding, "backslashreplace", line_buffering=lines))
 
 
-def reader_left() -> bool:
-    """Whether nobody reads what is printed any more, as behind `| head`; what is printed is sent first."""
-    return isinstance(_problem(), BrokenPipeError)
-
-
-def output_problem() -> str | None:
-    """Why what was printed did not arrive, where it is not that nobody reads on."""
-    problem = _problem()
-    return None if problem is None or isinstance(problem, BrokenPipeError) else problem.strerror
-
-
-def _problem() -> OSError | None:
+def output_problem() -> OSError | None:
+    """Flush stdout; why printed text was lost, a BrokenPipeError if its reader left, as `| head` does."""
     sys.stdout.flush()
     raw = getattr(getattr(sys.stdout, "buffer", None), "raw", None)
     return raw.problem if isinstance(raw, Stream) else None
 
 
 def let_go() -> None:
-    """What is left is the end of the interpreter: no Ctrl-C interrupts it."""
+    """Let no Ctrl-C interrupt the end of the interpreter."""
     if _state["process"]:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         for number in ENDING[1:]:
@@ -83,10 +73,9 @@ def let_go() -> None:
 
 
 def stop(number: int, frame: FrameType | None = None) -> NoReturn:
-    """Handle a signal: end here and now, after Ctrl-C with one line.
+    """Handle a signal: end immediately, with one line after Ctrl-C.
 
-    An exception instead would pass through imports, extensions and destructors, which turn it into others or
-    swallow it.
+    An exception would pass through imports, extensions and destructors that convert or swallow it.
     """
     if os.getpid() != _state["process"]:  # a worker that was forked
         os._exit(128 + number)
@@ -97,7 +86,7 @@ def stop(number: int, frame: FrameType | None = None) -> NoReturn:
     if number == signal.SIGINT:
         with suppress(OSError):
             os.write(2, b"\n" * os.isatty(2) + INTERRUPTED.encode())  # below ^C or a progress bar
-    for one in ENDING:  # a flush may wait for who reads
+    for one in ENDING:  # a flush may wait for the reader
         signal.signal(one, signal.SIG_DFL)
     with suppress(Exception):  # as in the middle of a print
         sys.stdout.flush()
@@ -106,7 +95,7 @@ def stop(number: int, frame: FrameType | None = None) -> NoReturn:
 
 @contextmanager
 def interrupts_raise() -> Iterator[None]:
-    """In the block Ctrl-C is a KeyboardInterrupt, for work that keeps what it has when interrupted."""
+    """In the block Ctrl-C raises KeyboardInterrupt, for work that keeps its results when interrupted."""
     if signal.getsignal(signal.SIGINT) != stop:
         yield
         return
@@ -118,13 +107,13 @@ def interrupts_raise() -> Iterator[None]:
 
 
 def _raise(number: int, frame: FrameType | None) -> NoReturn:
-    signal.signal(number, stop)  # where this is swallowed, the next one counts
+    signal.signal(number, stop)  # if this exception is swallowed, the next Ctrl-C ends the process
     _state["interrupted"] = 1
     raise KeyboardInterrupt
 
 
 def end_if_interrupted(error: BaseException) -> None:
-    """End as Ctrl-C does where an exception is one, or came behind one, which extensions turn into others."""
+    """End as after Ctrl-C if the exception is one or followed one, as extensions convert it."""
     if not isinstance(error, KeyboardInterrupt) and not _state["interrupted"]:
         return
     if _state["process"]:

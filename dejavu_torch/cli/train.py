@@ -1,4 +1,4 @@
-"""`dejavu train`: Lightning's own command line over our task and data."""
+"""`dejavu train`: Lightning's command line for our task and data."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import logging
 import os
 import shlex
 import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from functools import partialmethod
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from pytorch_lightning.callbacks import Checkpoint, ModelCheckpoint, ProgressBar
 from pytorch_lightning.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 
 from dejavu_torch.cli.commands import features_words, print_map, print_next
+from dejavu_torch.cli.options import several
 from dejavu_torch.cli.parser import Parser, Preset, refusal, with_hub
 from dejavu_torch.cli.process import interrupts_raise
 from dejavu_torch.data.output import check_output_folder, make_output_folder, remove_empty_folders, whole_file
@@ -34,14 +35,11 @@ from dejavu_torch.training.losses import NothingLearned
 from dejavu_torch.training.task import TEMPERATURE, PlaceRecognitionTask, load_weights
 from dejavu_torch.types import InputError
 
-LEAST = {  # of numbers that Lightning takes as they are, and fails on later; or null
-    "trainer.val_check_interval": 1e-9,
-    "trainer.check_val_every_n_epoch": 1,
-    "trainer.accumulate_grad_batches": 1,
-}
+# minima of settings, or null, that Lightning accepts and fails on later
+MINIMA = {"val_check_interval": 1e-9, "check_val_every_n_epoch": 1, "accumulate_grad_batches": 1}
 BF16 = ("bf16-mixed", "bf16")
 EVERY = 500  # steps between two validations, and between two checkpoints
-TOLERANCE = 5  # of `dejavu compare`, unless it is given
+TOLERANCE = 5  # default of `dejavu compare`
 TRAINER = {
     "max_steps": 3000,
     "accelerator": "auto",
@@ -52,7 +50,7 @@ TRAINER = {
     "num_sanity_val_steps": 0,
     "log_every_n_steps": 10,
 }
-# parts that are our own unless another class is named, so that their options can be given alone
+# default classes of parts, whose options can be given without the class
 PARTS: dict[str, dict[str, Any]] = {
     "model.backbone": {"class_path": "dejavu_torch.features.cnn.SmallCNN"},
     "model.mapper": {
@@ -62,16 +60,10 @@ PARTS: dict[str, dict[str, Any]] = {
     "model.preprocess": {"class_path": "dejavu_torch.Preprocess"},
     "data.augmentation": {"class_path": "dejavu_torch.features.augmentation.Augmentation"},
 }
-QUIET = (  # what Lightning warns of and needs no action
-    "args parameter is intended",
-    "num_workers",
-    "tensorboard",
-    "training batches",
-    "isinstance.treespec",
-    "exists and is not empty",
-    "your dataloader is not resumable",
-    "not supported by the model summary",
-    "in eval mode at the start of training",
+QUIET = (  # warnings of Lightning that need no action
+    "args parameter is intended|num_workers|tensorboard|training batches|isinstance.treespec|"
+    "exists and is not empty|your dataloader is not resumable|not supported by the model summary|"
+    "in eval mode at the start of training"
 )
 log = logging.getLogger("dejavu_torch")
 
@@ -79,7 +71,7 @@ log = logging.getLogger("dejavu_torch")
 class MapTrainer(Trainer):
     """Lightning's trainer, which also writes the map of a checkpoint."""
 
-    words: Sequence[str] = ()  # of the command line, for what to do next
+    words: Sequence[str] = ()  # of the command line, for the next commands to print
 
     def export(
         self,
@@ -91,21 +83,21 @@ class MapTrainer(Trainer):
         """Write the map of a checkpoint.
 
         Args:
-            ckpt_path: the checkpoint; the last one of trainer.default_root_dir where it is not given.
-            weights_only: accepted, as the config of a fit has it; no code of a checkpoint is ever run.
+            ckpt_path: the checkpoint; the last one in trainer.default_root_dir if not given.
+            weights_only: accepted, since configs have it; no code of a checkpoint is ever run.
         """
         assert ckpt_path is not None  # TrainCLI found one
         load_weights(model, ckpt_path)
         model.require_map()
         model.dejavu.velocity = datamodule.velocity
-        if model.made:  # of the frames of the reference
+        if model.made:  # from the frames of the reference
             self.strategy.connect(model)
             model.trainer, self.datamodule, datamodule.trainer = self, datamodule, self
             datamodule.setup("export")
             model.setup("export")
             model.relearn()
         else:
-            log.warning("the map is not calibrated: of templates `dejavu train fit` alone does that")
+            log.warning("the map is not calibrated: for templates only `dejavu train fit` does that")
         folder, export = Path(self.default_root_dir), MapExport()
         make_output_folder(folder)
         export.write(model, folder, datamodule if model.made else None)
@@ -113,43 +105,39 @@ class MapTrainer(Trainer):
 
 
 class TrainParser(Parser, LightningArgumentParser):
-    """Lightning's parser, whose errors are one line."""
+    """Lightning's parser with errors of one line."""
 
 
 class TrainCLI(LightningCLI):
-    """fit writes DIR/map.safetensors, of several routes DIR/descriptor.safetensors; validate, test and export
-    take a checkpoint."""
+    """fit writes DIR/map.safetensors, for several routes DIR/descriptor.safetensors; the others read a
+    checkpoint."""
 
     def __init__(self, args: list[str], **settings: Any) -> None:
-        self.words = args  # also for what to do next
+        self.words = args
         super().__init__(args=args, **settings)
 
     @staticmethod
     def subcommands() -> dict[str, set[str]]:
-        """Lightning's without predict, which `dejavu localize` does, and with export."""
+        """Lightning's, without predict, which is `dejavu localize`, and with export."""
         every = LightningCLI.subcommands() | {"export": {"model", "datamodule"}}
         return {name: every[name] for name in ("fit", "validate", "test", "export")}
 
     @staticmethod
     def init_parser(**kwargs: Any) -> LightningArgumentParser:
-        """A parser whose errors are one line."""
+        """A parser with errors of one line."""
         parser = TrainParser(**kwargs)
-        parser.add_argument(
-            "-c", "--config", action=Preset, help="YAML file or preset; its keys are the options below"
-        )
+        parser.add_argument("-c", "--config", action=Preset, help="preset or YAML file of the options below")
         return parser
 
-    def _prepare_subcommand_parser(
-        self, klass: type, subcommand: str, **kwargs: Any
-    ) -> LightningArgumentParser:
-        """Options of the command that is asked for, where it is known: those of all four take longer."""
+    def _prepare_subcommand_parser(self, klass: type, subcommand: str, **kwargs: Any) -> Any:
+        """The options of the given subcommand only, which is faster than all four."""
         if {*self.words[:1]} & ({*self.subcommands()} - {subcommand}):
             return self.init_parser(**kwargs)
         return super()._prepare_subcommand_parser(klass, subcommand, **kwargs)
 
     @staticmethod
     def add_core_arguments_to_parser(parser: LightningArgumentParser) -> None:
-        """Our options ahead of Lightning's."""
+        """Our options, before Lightning's."""
         parser.add_lightning_class_args(PlaceRecognitionTask, "model")
         parser.add_lightning_class_args(RouteData, "data")
         parser.add_lightning_class_args(MapTrainer, "trainer")
@@ -160,7 +148,7 @@ class TrainCLI(LightningCLI):
         """The options that all stages share."""
         parser = cls.init_parser()
         cls.add_core_arguments_to_parser(parser)
-        parser.add_argument("--ckpt_path", type=Path, help="checkpoint to go on from, or to take")
+        parser.add_argument("--ckpt_path", type=Path, help="checkpoint to resume or to use")
         return parser
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
@@ -170,32 +158,28 @@ class TrainCLI(LightningCLI):
         for part in ("trainer", "model", "data"):
             if not isinstance(chosen[part], Namespace):
                 raise InputError(f"{part} is {chosen[part]!r:.40}; expected options, as KEY: VALUE")
-        for name, least in LEAST.items():
-            value = chosen[name]
-            if isinstance(value, (int, float)) and value < least:
-                raise InputError(f"{name} is {value}; expected a number of at least {least:g}")
-        seed = chosen["seed_everything"]
+        seed, trainer = chosen["seed_everything"], chosen["trainer"]
+        for name, minimum in MINIMA.items():
+            value = trainer[name]
+            if isinstance(value, (int, float)) and value < minimum:
+                raise InputError(f"trainer.{name} is {value}; expected a number of at least {minimum:g}")
         if not isinstance(seed, bool | None) and not 0 <= seed < 2**32:
             raise InputError(f"seed_everything is {seed}; expected a number from 0 to 2^32 - 1")
-        trainer = chosen["trainer"]
         if trainer["max_steps"] is None:
             raise InputError("trainer.max_steps is null; expected a number of at least 1, or -1 for no end")
-        nodes, strategy = trainer["num_nodes"], trainer["strategy"]
-        if strategy not in ("auto", "ddp"):
-            raise InputError(f"trainer.strategy is {strategy!s:.40}; expected auto or ddp")
-        if nodes != 1 and not {"MASTER_ADDR", "SLURM_JOB_ID"} & os.environ.keys():
-            raise InputError(  # they would wait for each other forever
-                f"trainer.num_nodes is {nodes}, and nothing tells where the other machines are; expected "
+        if trainer["strategy"] not in ("auto", "ddp"):
+            raise InputError(f"trainer.strategy is {trainer['strategy']!s:.40}; expected auto or ddp")
+        if trainer["num_nodes"] != 1 and not {"MASTER_ADDR", "SLURM_JOB_ID"} & os.environ.keys():
+            raise InputError(  # the machines would wait for each other forever
+                f"trainer.num_nodes is {trainer['num_nodes']}, but no address of the first is set; expected "
                 "MASTER_ADDR, MASTER_PORT and NODE_RANK in the environment, as torchrun and SLURM set them"
             )
 
     def _parse_ckpt_path(self) -> None:
-        """Settings come from the config alone: Lightning would take some from the checkpoint, and import the
-        classes that it names."""
+        """Do nothing: Lightning would read settings from the checkpoint, and import the classes it names."""
 
     def before_instantiate_classes(self) -> None:
-        """Validation is by steps unless it is asked for otherwise, and at the end where a map is made for it;
-        one device of several."""
+        """Use one device, and validate by steps by default; at the end only if that makes a map."""
         chosen = self.config[self.subcommand]
         trainer, mapper = chosen["trainer"], chosen["model"]["mapper"]
         made = isinstance(mapper, Namespace) and not mapper["class_path"].endswith("TemplateMapper")
@@ -206,7 +190,7 @@ class TrainCLI(LightningCLI):
             trainer["val_check_interval"] = every if steps > 0 else EVERY
 
     def instantiate_classes(self) -> None:
-        """What a part's constructor refuses, in one line."""
+        """Report the errors of constructors in one line."""
         try:
             super().instantiate_classes()
         except Exception as error:
@@ -216,33 +200,31 @@ class TrainCLI(LightningCLI):
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         """A trainer with our callbacks."""
         asked = self.config_init[self.subcommand]["trainer"]
-        own = _listed(asked["callbacks"])
+        own = several(asked["callbacks"])
         root = Path(asked["default_root_dir"])
         for callback in own:
             if isinstance(callback, ModelCheckpoint) and callback.dirpath is None:
-                callback.dirpath = str(root / "checkpoints")  # all files of a run lie in one folder
-        if self.subcommand == "fit" and not asked["fast_dev_run"]:  # a trial leaves an earlier run as it is
+                callback.dirpath = str(root / "checkpoints")  # in the same folder as all files of a run
+        if self.subcommand == "fit" and not asked["fast_dev_run"]:  # a trial keeps an earlier run
             own.append(MapExport())
             chosen = asked["enable_checkpointing"] is False or any(isinstance(c, Checkpoint) for c in own)
             own += [] if chosen else [LastCheckpoint(EVERY)]
         if self.subcommand == "fit" and asked["enable_progress_bar"] in (None, True):
             own += [] if any(isinstance(c, ProgressBar) for c in own) else [StepBar()]
-        for plugin in _listed(asked["plugins"]):
+        for plugin in several(asked["plugins"]):
             if isinstance(plugin, CheckpointIO) and getattr(plugin, "checkpoint_io", plugin) is None:
-                plugin.checkpoint_io = CheckpointFiles()  # type: ignore[attr-defined]  # what it wraps
+                plugin.checkpoint_io = CheckpointFiles()  # type: ignore[attr-defined]  # the wrapped one
         accelerators = torch.cuda.is_available() or torch.backends.mps.is_available()
         on_cpu = asked["accelerator"] == "cpu" or (asked["accelerator"] == "auto" and not accelerators)
         if asked["precision"] in BF16 and on_cpu and not has_bf16():
-            log.warning(
-                "this processor is not known to have numbers of 16 bits: 32 are taken, which are faster"
-            )
+            log.warning("this processor seems to lack bfloat16: float32 is used, which is faster")
             kwargs["precision"] = "32-true"
         trainer = super().instantiate_trainer(callbacks=own, **kwargs)
         trainer.words = self.words  # type: ignore[attr-defined]  # a MapTrainer
         return trainer
 
     def before_fit(self) -> None:
-        """Refuse ahead of the work what cannot work."""
+        """Refuse early what cannot work."""
         asked = self.config[self.subcommand]["trainer"]
         if asked["max_steps"] == -1 and asked["max_epochs"] in (None, -1) and not asked["fast_dev_run"]:
             raise InputError("the training has no end; expected trainer.max_steps or trainer.max_epochs")
@@ -259,11 +241,11 @@ class TrainCLI(LightningCLI):
             log.warning("%s holds an earlier run, which this one replaces", root)
 
     def fit(self, **arguments: Any) -> None:
-        """Train; where nothing is learned, once more from the start at a third of the learning rate."""
+        """Train; if nothing is learned, start again with a third of the learning rate."""
         try:
             self._fit(**arguments)
         except NothingLearned as error:
-            if self.trainer.world_size > 1:  # its processes cannot begin again
+            if self.trainer.world_size > 1:  # its processes cannot start again
                 raise
             model = self.config[self.subcommand]["model"]
             first, model["lr"] = model["lr"], model["lr"] / 3
@@ -274,52 +256,39 @@ class TrainCLI(LightningCLI):
             try:
                 self._fit(**arguments | again)
             except NothingLearned as last:
-                told = f"{last}, with --model.lr {first:.3g} and {model['lr']:.3g}: no map is written"
+                text = f"{last}, with --model.lr {first:.3g} and {model['lr']:.3g}: no map is written"
                 routes = self.datamodule.listed["source"]
                 if len(routes) == 1:
-                    untrained = f"`dejavu learn {shlex.quote(str(routes[0]))} --map FILE` makes one untrained"
-                    told = f"{told}; {untrained}"
-                raise InputError(told) from last
+                    text += f"; `dejavu learn {shlex.quote(str(routes[0]))} --map FILE` makes one untrained"
+                raise InputError(text) from last
 
     def _fit(self, **arguments: Any) -> None:
-        """Train, and print what was written, also where the user interrupts."""
-        root = Path(self.trainer.default_root_dir)
-        refused = False
+        """Train, and print what was written, even if the user interrupts."""
+        root, failed = self.trainer.default_root_dir, False
         try:
-            with interrupts_raise(), self._taking_over(arguments):
-                self.trainer.fit(**arguments)
-        except (InputError, OSError) as error:
-            refused = True
-            if isinstance(error, OSError):
-                raise InputError(f"the training in {root} has failed: {error.strerror or error}") from error
+            with interrupts_raise():
+                self._run("fit", **arguments)
+        except InputError:
+            failed = True
             raise
+        except OSError as error:
+            failed = True
+            raise InputError(f"the training in {root} has failed: {error.strerror or error}") from error
         finally:
             for callback in self.trainer.callbacks:  # type: ignore[attr-defined]
                 if isinstance(callback, MapExport):
                     print_written(callback, self.datamodule, self.words)
             last = self._last_checkpoint() if self.trainer.is_global_zero else None
-            if self.trainer.interrupted and last is not None and not refused:
+            if self.trainer.interrupted and last is not None and not failed:
                 print_next("train", *self.words, "--ckpt_path", last, lead="to go on")
 
-    def validate(self, **arguments: Any) -> None:
-        """Figures of a checkpoint."""
-        with self._taking_over(arguments):
-            self.trainer.validate(**arguments)
-
-    def test(self, **arguments: Any) -> None:
-        """Figures of a checkpoint on the query."""
-        with self._taking_over(arguments):
-            self.trainer.test(**arguments)
-
-    @contextmanager
-    def _taking_over(self, arguments: dict[str, Any]) -> Iterator[None]:
-        """What fails leaves no folder of the config alone, which Lightning writes ahead of all work, nor the
-        folders that were made for it."""
+    def _run(self, stage: str, **arguments: Any) -> None:
+        """Run a stage; after a failure remove new folders with nothing but Lightning's config."""
         root = Path(self.trainer.default_root_dir)
         new = [folder for folder in (root, *root.parents) if not folder.exists()]
         try:
             with taking_over(arguments.get("ckpt_path"), lambda: self.model.resumed):
-                yield
+                getattr(self.trainer, stage)(**arguments)
         except Exception:
             files = [path for path in root.rglob("*") if path.is_file()] if new else []
             if [path.name for path in files] == ["config.yaml"]:
@@ -328,11 +297,13 @@ class TrainCLI(LightningCLI):
                 remove_empty_folders(new[-1])
             raise
 
+    validate, test = partialmethod(_run, "validate"), partialmethod(_run, "test")
+
     def before_validate(self) -> None:
-        """Without --ckpt_path the last checkpoint of the folder is taken, never untrained weights."""
+        """Without --ckpt_path use the last checkpoint of the folder, never untrained weights."""
         chosen, last = self.config_init[self.subcommand], self._last_checkpoint()
         if chosen.get("ckpt_path") not in (None, "", "last"):
-            path = chosen["ckpt_path"]  # the two words are Lightning's, and mean none here
+            path = chosen["ckpt_path"]  # Lightning's words for a checkpoint have no meaning here
             if path in ("best", "hpc") or not Path(path).exists():
                 raise InputError(f"{path} is not there; {EXPECTED}")
             return
@@ -344,7 +315,7 @@ class TrainCLI(LightningCLI):
     before_test = before_export = before_validate
 
     def after_validate(self) -> None:
-        """Say what the figures are of, and what to do next."""
+        """Print the name of the checkpoint and the next command."""
         if not self.trainer.is_global_zero:
             return
         checkpoint = self.config_init[self.subcommand]["ckpt_path"]
@@ -367,69 +338,63 @@ class TrainCLI(LightningCLI):
 
 
 class ConfigFile(SaveConfigCallback):
-    """Keeps the config of a run beside its figures, whole or not at all."""
+    """Saves the config of a run next to its figures, completely or not at all."""
 
     def __init__(self, parser: LightningArgumentParser, config: Any, **_: Any) -> None:
         super().__init__(parser, config, save_to_log_dir=False)
         self.folder = Path()
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Where the figures lie is a question to all processes, of which one writes."""
+        """Find the folder in all processes, of which one writes."""
         self.folder = Path(trainer.log_dir or trainer.default_root_dir)
         super().setup(trainer, pl_module, stage)
 
     def save_config(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Write it."""
         make_output_folder(self.folder)
         with whole_file(self.folder / self.config_filename) as temporary:
-            # with what is null, as the fourth argument says, whose name changed
+            # the fourth argument, whose name changed, keeps null values
             self.parser.save(self.config, temporary, "yaml", False, overwrite=True, multifile=False)
 
 
-def _listed(given: Any) -> list[Any]:
-    """One, several or none, as Lightning takes callbacks and plugins."""
-    return [*given] if isinstance(given, list) else [] if given is None else [given]
-
-
 def print_written(export: MapExport, data: RouteData, words: Sequence[str]) -> None:
-    """What was written, what it is worth where that is known, and what to do next."""
+    """Print what was written, its figures if they are known, and the next command."""
     if export.written is None:
         return
     path, model = export.written
     print_map(model)
     if export.scores:
-        on = unseen_of(data) or "changed frames of stretches that training never saw"
+        on = unseen_of(data) or "augmented frames of segments that training never saw"
         print(f"written to {path}; on {on}, within {data.tolerance}:")
         for name, one in export.scores.items():
             print(f"  {name:20} AUC {one.auc:.3f}, recall@1 {one.recall_at_1:.3f}")
         first = export.scores[TRAINED].auc
         if beaten := [name for name, one in export.scores.items() if one.auc > first]:
             source = shlex.quote(str(data.sources["source"]))
-            told = "the trained map is worse than %s; `dejavu learn %s --map FILE` makes a map untrained"
-            log.warning(told, " and ".join(beaten), source)
+            text = "the trained map is worse than %s; `dejavu learn %s --map FILE` makes a map untrained"
+            log.warning(text, " and ".join(beaten), source)
     elif model.map.places:
-        seen, another = "changed copies of its own frames", "a second"
+        seen, another = "augmented copies of its own frames", "a second"
         if data.sources["second"]:
-            seen, another = "both its traverses, changed,", "a third"
-        print(f"written to {path}; it has seen {seen} alone: only {another} traverse shows what it is worth:")
+            seen, another = "augmented frames of both its traverses", "a third"
+        print(f"written to {path}; trained on {seen}, so only {another} traverse shows its accuracy:")
     else:
         print(f"written to {path}")
     print_what_next(path, data, model, words)
 
 
 def unseen_of(data: RouteData) -> Any:
-    """The traverse to validate on, else the one to test on, as it was given; None where there is neither."""
+    """The traverse to validate on, else the one to test on, else None."""
     return data.sources["validation"] or data.sources["query"]
 
 
 def print_what_next(path: Path, data: RouteData, model: DejaVu, words: Sequence[str]) -> None:
-    """How to see what a map is worth, or to make one with a descriptor.
+    """Print the command that evaluates a map, or learns one with a descriptor.
 
     Args:
-        words: of the command line, which say where a backbone comes from that no map may name.
+        words: of the command line, which name a backbone that no map may name.
     """
     option = "--model.backbone"
-    if type(model.features) is Embedding:  # the map has its settings, all but those of the network
+    if type(model.features) is Embedding:  # the map has its settings, except those of the network
         option += ".network"
     features = features_words(model, shlex.join(["train", *with_hub(words)]), option)
     if len(data.listed["source"]) > 1:
@@ -450,10 +415,9 @@ def run_train(arguments: Sequence[str]) -> None:
     """
     for name in ("pytorch_lightning", "lightning_fabric"):
         logging.getLogger(name).setLevel(logging.WARNING)
-    if _get_rank():  # one process speaks for all
+    if _get_rank():  # only the first process prints
         log.setLevel(logging.ERROR)
-    for message in QUIET:
-        warnings.filterwarnings("ignore", f".*{message}.*")
+    warnings.filterwarnings("ignore", f".*({QUIET})")
     try:
         TrainCLI(
             list(arguments),
@@ -465,7 +429,7 @@ def run_train(arguments: Sequence[str]) -> None:
             save_config_callback=ConfigFile,
         )
     except InputError:
-        if _get_rank():  # the first process says it
+        if _get_rank():  # the first process reports it
             raise SystemExit(2) from None
         raise
     except RuntimeError as error:
@@ -475,6 +439,6 @@ def run_train(arguments: Sequence[str]) -> None:
     except MisconfigurationException as error:
         raise InputError(str(error)) from error
     except SystemExit as error:
-        if isinstance(error.__context__, KeyboardInterrupt):  # Lightning would have it be a failure
+        if isinstance(error.__context__, KeyboardInterrupt):  # Lightning exits as after a failure
             raise KeyboardInterrupt from error
         raise

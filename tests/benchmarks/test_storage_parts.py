@@ -31,7 +31,7 @@ def test_every_kth_place_gives_back_the_one_before() -> None:
     kept = every_kth(places, 7, each=48)
     assert torch.equal(kept.descriptors, places[torch.arange(300) // 7 * 7])
     assert (kept.route, kept.fixed, kept.apart) == (43 * 48, 0, 7)
-    between = every_kth(places, 7, 12, as_int8, between=True, beside=5)
+    between = every_kth(places, 7, 12, as_int8, between=True, overhead=5)
     assert (between.route, between.apart) == (44 * 12 + 5, 1)  # and the last place
     assert error(between, places) < error(kept, places)
     assert signs(torch.tensor([[-0.5, 0.0, 3.0]])).tolist() == [[-1, 1, 1]]

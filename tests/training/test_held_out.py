@@ -131,7 +131,7 @@ def test_at_the_end_the_map_is_calibrated_and_set_beside_the_untrained_one(
     words += ["--model.mapper", "SpectralMapper", "--model.mapper.route_bytes_per_place", 8]
     train("fit", *words, "--trainer.default_root_dir", tmp_path / "run")
     said = capsys.readouterr().out
-    assert "stretches that training never saw" in said
+    assert "segments that training never saw" in said
     rows = [line.split("AUC")[0].strip() for line in said.splitlines() if "recall@1" in line]
     assert rows == ["the trained map", "HOG of all frames", "the untrained map"]
     model = DejaVu.load(tmp_path / "run" / "map.safetensors", import_module("mine").Plain())

@@ -285,7 +285,7 @@ LEARN = ["learn", "third.npy", "--map", "new.safetensors", "--descriptor", WEIGH
         ([*LEARN, "--features.cell", "4"], ["learned with", "SmallCNN"]),
         ([*LEARN, "--preprocess.contrast", "patch"], ["--preprocess.contrast", "one or the other"]),
         ([*LEARN, "--weight_bits", "8"], ["--weight_bits", "one or the other"]),
-        ([*LEARN, "--whitening", WEIGHTS], ["--whitening", "expected it or --descriptor"]),
+        ([*LEARN, "--whitening", WEIGHTS], ["--whitening", "--descriptor"]),
         ([*LEARN[:4], "--descriptor", "train.yaml"], ["train.yaml"]),
         ([*LEARN[:3], WEIGHTS, "--descriptor", WEIGHTS], ["is an input"]),
         (
