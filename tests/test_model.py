@@ -387,6 +387,7 @@ def on_waves(query: Tensor) -> Any:
             lambda: DejaVu().learn(pictures()).localize(torch.rand(3, 5)),
             ("the array gives 5 features", "1548, as frames of 1 x 16 x 32 give"),
         ),
+        (lambda: DejaVu().learn(torch.rand(1, 6)), ("the array has 1 frame", "at least 2")),
         (lambda: on_waves(pictures(3)), ("frames", "ready features", "expected features (Q, 2)")),
         *(
             (lambda values=values: wave_model().learn(values), (str(tuple(values.shape)), "expected frames"))
