@@ -295,6 +295,7 @@ def test_the_first_screen_answers_and_the_pairs_are_beside_it(tmp_path: Path) ->
     places = [page.index(one) for one in order]
     assert places == sorted(places)
     assert page.count("pairs</h2>") == 1
+    assert " </code>" not in page  # a blank before the colon or comma that follows
     # definitions and details are folded
     assert len(re.findall(r"<dl>", page)) == len(
         re.findall(r"<details>(?:(?!</details>).)*?<dl>", page, re.DOTALL)
