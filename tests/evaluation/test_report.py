@@ -155,9 +155,9 @@ def test_the_page_begins_with_plain_words() -> None:
     baseline = Contender("all frames", SCORES._replace(recall_at_1=0.9), 64000, 1)
     assert headline(report({"frames": 32}, uncompressed=baseline)).replace("\xa0", " ") == (
         "20 queries were looked up on a map of 32 places: 75.0 % were found in their right place (recall@1). "
-        "Sorted by score, the answers have an area under the precision-recall curve (AUC) of 0.500; 1 is "
-        "perfect. The map takes 125 bytes per place. The features as they are would take 2000 and find "
-        "90.0 %."
+        "Sorted by score, the answers have an area under the precision-recall curve (AUC) of 0.500; with 20 "
+        "queries 0.950 is perfect. The map takes 125 bytes per place. The features as they are "
+        "would take 2000 and find 90.0 %."
     )
     some = headline(report({"with_answer": 16})).replace("\xa0", " ")
     assert "Of the 16 that have a right place, 75.0 %" in some  # recall is of those, not of all 20
