@@ -213,7 +213,13 @@ def test_the_next_step_is_a_filter_or_more_bytes_if_these_find_more() -> None:
     one = report({"kind": "spectral"}, uncompressed=floats)._replace(ours=ours)
     found = " ".join(steps(one)).replace("\xa0", " ")
     assert "87.5 % are found" in found
-    assert "--mapper.hold .95" in found
+    assert "--mapper.hold .95`: the" in found
+    # what --map would refuse
+    given = " ".join(steps(one._replace(facts=one.facts | {"seconds_learn": 0.0})))
+    assert given.count("without `--map`") == 2
+    trained = " ".join(steps(one._replace(facts=one.facts | {"trained": {"steps": 1}})))
+    assert "--model.mapper.route_bytes_per_place" in trained
+    assert "--mapper.hold" not in trained
 
 
 def key(page: str) -> dict[str, str]:
