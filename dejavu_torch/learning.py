@@ -131,7 +131,7 @@ class Describer(NamedTuple):
     ) -> None:
         whitening = self.whitening
         assert whitening is not None
-        if len(features) < 2 and not is_ready(traverse):
+        if len(features) < 2:
             raise InputError(f"{traverse.name} has 1 frame; expected at least 2")
         source = "" if second is None else f"by {second.traverse.name}"
         if second is None and not is_ready(traverse) and whitening.views != 0:

@@ -575,6 +575,10 @@ class DejaVu(nn.Module):
             shape: of one query, (C,H,W) or (D,). dimension: D, its features. name: for the message.
         """
         reference, expected = self.frame_shape, self.features_per_frame
+        if len(shape) == 1 and dimension != expected:
+            learned = f", as frames of {' x '.join(map(str, reference or ()))} give"
+            seen = f"{name} gives {dimension} features; the map expects {expected}"
+            raise InputError(f"{seen}{learned * (len(reference or ()) == 3)}")
         if reference is None or len(shape) != 3:
             return
         if len(reference) == 1:

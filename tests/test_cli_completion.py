@@ -69,6 +69,7 @@ def completed(script: Path, line: str) -> list[str]:
         ("dejavu compare ba", {"bash"}),  # a file of the folder
         ("dejavu compare --truth zo", {"zoo"}),
         ("dejavu train f", {"fit"}),
+        ("dejavu completion ", {"bash", "zsh"}),
         ("dejavu train fit --trainer.max_st", {"--trainer.max_steps"}),
         ("dejavu train fit --config ", {*preset_names(), "bash", "zoo"}),
     ],
@@ -78,7 +79,7 @@ def test_a_tab_completes(line: str, offered: set[str], script: Path) -> None:
 
 
 def test_another_shell_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    assert "'fish'; expected bash or zsh" in fails(capsys, "completion", "fish")
+    assert "fish; expected one of ['bash', 'zsh']" in fails(capsys, "completion", "fish")
 
 
 def test_without_shtab_it_says_what_to_install(

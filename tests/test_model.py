@@ -377,12 +377,17 @@ def on_waves(query: Tensor) -> Any:
             lambda: template_model(periods=SpectrogramAnalysis(short="refuse")).learn(waves()),
             ("72 places", "1024"),
         ),
-        (lambda: on_waves(torch.rand(3, 5)), ("(3, 5)", "(Q, 2)")),
-        (lambda: wave_model().learn(waves())(torch.rand(3, 1)), ("(3, 1)", "(Q, 2)")),
+        (lambda: on_waves(torch.rand(3, 5)), ("the array gives 5 features", "expects 2")),
+        (lambda: wave_model().learn(waves())(torch.rand(3, 1)), ("the query gives 1 features", "expects 2")),
         (
             lambda: wave_model().learn(pictures()).localize(torch.rand(3, 1, 32, 32)),
             ("32 x 32", "324 features", "expects 108"),
         ),
+        (
+            lambda: DejaVu().learn(pictures()).localize(torch.rand(3, 5)),
+            ("the array gives 5 features", "1548, as frames of 1 x 16 x 32 give"),
+        ),
+        (lambda: DejaVu().learn(torch.rand(1, 6)), ("the array has 1 frame", "at least 2")),
         (lambda: on_waves(pictures(3)), ("frames", "ready features", "expected features (Q, 2)")),
         *(
             (lambda values=values: wave_model().learn(values), (str(tuple(values.shape)), "expected frames"))

@@ -6,7 +6,7 @@ import argparse
 import importlib
 import os
 from collections.abc import Iterator
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
 from jsonargparse import ArgumentParser
 from torch import nn
@@ -28,7 +28,7 @@ PREAMBLE = {  # completes --config
 }
 
 
-def run_completion(shell: str = "bash") -> None:
+def run_completion(shell: Literal["bash", "zsh"] = "bash") -> None:
     """Print a script with which a shell completes commands, options, presets and files.
 
     To use it in this shell only, in bash: eval "$(dejavu completion bash)". To keep it, write it to
@@ -37,12 +37,12 @@ def run_completion(shell: str = "bash") -> None:
     Args:
         shell: bash or zsh
     """
-    if shell not in PREAMBLE:
-        raise InputError(f"there is no completion for {shell!r}; expected {' or '.join(PREAMBLE)}")
     try:
         shtab = importlib.import_module("shtab")
     except ImportError as error:
-        raise InputError("shtab is not installed; expected pip install '.[completion]'") from error
+        raise InputError(
+            "shtab is not installed; expected it: pip install 'dejavu_torch[completion]'"
+        ) from error
     from dejavu_torch.cli.train import TrainCLI
 
     # a plain tree: for jsonargparse's own, shtab would list the options of every class in torch

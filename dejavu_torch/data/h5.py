@@ -45,13 +45,13 @@ class DescriptorFile(IndexedTraverse):
 
         def visit(name: str, item: Any) -> None:
             image, _, leaf = name.rpartition("/")
-            if leaf != KEY or not image:
+            if leaf != KEY:
                 return
             shape, kind = getattr(item, "shape", None) or (), getattr(item, "dtype", np.dtype("O"))
             elsewhere = getattr(item, "external", None) or getattr(item, "is_virtual", False)
-            if len(shape) != 1 or kind.kind != "f" or elsewhere:
+            if len(shape) != 1 or kind.kind != "f" or elsewhere or not image:
                 seen = f"{shape} {kind.name}{' of another file' if elsewhere else ''}"
-                raise InputError(f"{self.name}: {KEY} of {image} is {seen}; expected {EXPECTED}")
+                raise InputError(f"{self.name}: {KEY} of {image or '/'} is {seen}; expected {EXPECTED}")
             found[image] = shape
 
         with self._open() as file:

@@ -157,6 +157,7 @@ def compare(
         if has_map:
             if reference.length is not None:
                 check_places(model, reference.length, reference.name)
+            model.check_queries(reference.frame_shape, feature_shape, reference.name)
             places = model.extract_all(reference, text)
             _check_given_map(model, places, reference.name, tolerance)
         else:

@@ -182,6 +182,8 @@ class ReferencePictures:
         if reference.length not in (None, frames):
             seen = f"{reference.name} has {reference.length} frames"
             raise InputError(f"{seen}; the map's reference has {frames}")
+        if len(reference.frame_shape) != 3:
+            raise InputError(f"{reference.name} holds features; expected frames to show")
         self.reference, self.step = reference, max(1, math.ceil(frames / MAX_PICTURES))
         self._small: list[str | None] = []
         if not isinstance(reference, IndexedTraverse):

@@ -122,6 +122,13 @@ def a_group(group: Any) -> None:
     group.create_group("global_descriptor")
 
 
+def test_one_table_for_all_images_is_refused(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["global_descriptor"] = ROWS
+    with refused("a.h5", "of / is (4, 6) float16", "expected a group for each image"):
+        open_source(tmp_path / "a.h5")
+
+
 @pytest.mark.parametrize("make", [in_another_file, seen_in_another_file, a_group])
 def test_numbers_that_the_file_does_not_hold_are_refused(tmp_path: Path, make: Callable[[Any], None]) -> None:
     with h5py.File(tmp_path / "a.h5", "w") as file:

@@ -124,6 +124,11 @@ def test_another_reference_than_the_map_s_is_refused(trained: DejaVu, frames: in
         compare(kind(route(0, frames)), kind(route(1)), "0", model=trained)
 
 
+def test_a_reference_of_other_features_than_the_map_s_is_refused(trained: DejaVu) -> None:
+    with refused("the array gives 6 features", "expects 60"):
+        compare(torch.rand(240, 6), torch.rand(240, 6), "0", model=trained)
+
+
 def test_a_traverse_matched_with_itself_is_warned_of(model: DejaVu, caplog: pytest.LogCaptureFixture) -> None:
     same = route(0)
     compare(same, same, "0", model=model)

@@ -156,8 +156,8 @@ def test_the_page_begins_with_plain_words() -> None:
     assert headline(report({"frames": 32}, uncompressed=baseline)).replace("\xa0", " ") == (
         "20 queries were localized on a map of 32 places: 75.0 % were matched to their right place "
         "(recall@1). Sorted by score, the answers have an area under the precision-recall curve (AUC) of "
-        "0.500; 1 is perfect. The map takes 125 bytes per place. Storing the features uncompressed would "
-        "take 2000 bytes per place and find 90.0 %."
+        "0.500; with 20 queries 0.950 is perfect. The map takes 125 bytes per place. Storing the features "
+        "uncompressed would take 2000 bytes per place and find 90.0 %."
     )
     some = headline(report({"with_answer": 16})).replace("\xa0", " ")
     assert "Of the 16 that have a right place, 75.0 %" in some  # recall is of those, not of all 20
@@ -213,7 +213,13 @@ def test_the_next_step_is_a_filter_or_more_bytes_if_these_find_more() -> None:
     one = report({"kind": "spectral"}, uncompressed=floats)._replace(ours=ours)
     found = " ".join(steps(one)).replace("\xa0", " ")
     assert "87.5 % of these queries are found" in found
-    assert "--mapper.hold .95" in found
+    assert "--mapper.hold .95`: the" in found
+    # what --map would refuse
+    given = " ".join(steps(one._replace(facts=one.facts | {"seconds_learn": 0.0})))
+    assert given.count("without `--map`") == 2
+    trained = " ".join(steps(one._replace(facts=one.facts | {"trained": {"steps": 1}})))
+    assert "--model.mapper.route_bytes_per_place" in trained
+    assert "--mapper.hold" not in trained
 
 
 def key(page: str) -> dict[str, str]:
@@ -295,6 +301,7 @@ def test_the_first_screen_answers_and_the_pairs_are_beside_it(tmp_path: Path) ->
     places = [page.index(one) for one in order]
     assert places == sorted(places)
     assert page.count("pairs</h2>") == 1
+    assert " </code>" not in page  # a blank before the colon or comma that follows
     # definitions and details are folded
     assert len(re.findall(r"<dl>", page)) == len(
         re.findall(r"<details>(?:(?!</details>).)*?<dl>", page, re.DOTALL)

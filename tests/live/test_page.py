@@ -19,6 +19,7 @@ from helpers import refused
 from videos import clip, pictures
 
 from dejavu_torch import open_source
+from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.camera import Frame
 from dejavu_torch.live.localizer import LiveMatch
 from dejavu_torch.live.page import PAGE, Page, ReferencePictures, Snapshot, as_picture, curve
@@ -128,6 +129,8 @@ def test_reference_pictures_of_any_source(tmp_path: Path) -> None:
     assert video(5) is None
     with refused("5 frames", "7"):
         ReferencePictures(open_source(tmp_path / "frames.npy"), 7)
+    with refused("the array holds features", "frames to show"):
+        ReferencePictures(ArrayTraverse(torch.rand(5, 8)), 5)
     assert as_picture(torch.rand(6)) is None  # ready features
 
 
