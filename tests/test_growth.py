@@ -450,6 +450,7 @@ def test_a_state_that_does_not_fit_leaves_a_merged_map_as_it_was() -> None:
             ("routes of [100, 131] frames", "expected 230"),
         ),
         ({"routes": ["a", "b"]}, ("routes[0] holds 'a'", "name, places, frames")),
+        ({"routes": {"four": 1}}, ("routes is {'four': 1}",)),
     ):
         with refused(*words):
             merged.map.load_state_dict(good | {"_extra_state": extra | change})

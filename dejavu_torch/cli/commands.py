@@ -725,16 +725,19 @@ def _print_contradiction(report: Report) -> None:
 
 
 def _print_scores(report: Report, out: Path) -> None:
+    from dejavu_torch.evaluation import report as page
     from dejavu_torch.evaluation.rejection import rejection_table
-    from dejavu_torch.evaluation.report import score_table, sequence_table, steps_after, summary, text_table
 
     rejection = rejection_table(report.facts.get("rejection", {}))
-    for rows in (score_table(report), sequence_table(report), rejection):
+    for rows in (page.score_table(report), page.sequence_table(report), rejection):
         if rows:
-            print(text_table(rows))
-    _say(summary(report))
-    if report.ours.scores is None:
-        for before, text in (("", told_line(report.facts, False)), ("next: ", steps_after(report.facts))):
-            if text:
-                _say(f"{before}{text}")
+            print(page.text_table(rows))
+    _say(page.summary(report))
+    if report.ours.scores is not None:
+        _say(page.verdict(report))
+    else:
+        if line := told_line(report.facts, False):
+            _say(line)
+        if steps := page.steps_after(report.facts):
+            _say(f"next: {steps}")
     _say(f"next: open {out / 'index.html'}")

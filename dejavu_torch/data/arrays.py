@@ -108,7 +108,7 @@ def read_array(path: Path) -> ArrayTraverse:
     traverse.path = path
     text = path.with_suffix(".txt")
     if values.ndim == 2 and text.exists():
-        expected = f"{len(values)} names, one line for each row of {path}"
+        expected = f"{len(values)} names, one line for each row of {path}, or no such file"
         names = [line.strip() for line in read_text(text, expected).splitlines() if line.strip()]
         if len(names) != len(values):
             raise InputError(f"{text} has {len(names)} names; expected {expected}")

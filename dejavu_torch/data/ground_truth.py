@@ -209,7 +209,7 @@ def find_ground_truth(
         found = as_ground_truth(offset_truth(numbers, frames, parsed))
     elif isinstance(parsed, float):
         if reference is None or query is None:
-            raise InputError(f"truth utm:{parsed:g} reads the names of images; expected both traverses")
+            raise InputError(f"truth utm:{parsed:g} reads the names of images; expected reference and query")
         coordinates = _rows_of(utm_coordinates(query), numbers)
         found = as_ground_truth(near_truth(utm_coordinates(reference), coordinates, parsed))
     elif parsed.suffix.lower() == ".npz":

@@ -156,7 +156,7 @@ def _fits(value: Any, origin: Any, inner: tuple[Any, ...]) -> bool:
         return any(type(value) is type(one) and value == one for one in inner)
     if origin in (int, float, str, bool, None, type(None)):
         return type(value) in ((int, float) if origin is float else (origin or type(None),))
-    return origin is Any or isinstance(value, dict)
+    return origin is Any or (isinstance(value, dict) and origin not in (tuple, list, Sequence))
 
 
 def checked_fields(value: Any, kinds: Mapping[str, Any], where: str) -> dict[str, Any]:
