@@ -569,7 +569,7 @@ def test_utm_needs_two_folders_of_images_with_coordinates() -> None:
     with refused("no image names", "a folder of images"):
         find_ground_truth("utm", route(1), good, 1, 1)
     for query in (good, None):
-        with refused("truth utm", "both traverses"):
+        with refused("truth utm", "reference and query"):
             find_ground_truth("utm", None, query, 1, 1)
     with refused("query 1", "below 1"):
         find_ground_truth("utm", good, good, 1, torch.tensor([1]))
