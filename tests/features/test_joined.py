@@ -227,7 +227,7 @@ def test_a_users_own_module_beside_ours_comes_from_the_caller(flights: list[Tens
     model.save(tmp_path / "map.safetensors")
     with refused("Means", "only the caller can load"):
         DejaVu.load(tmp_path / "map.safetensors")
-    with refused("Joined of members"):
+    with refused("Joined with members"):
         DejaVu.load(tmp_path / "map.safetensors", Joined([Means(), HOG()]))
     expected = model(flights[1][:4])
     for given in (Joined([HOG(), Means()]), Means()):
@@ -321,7 +321,7 @@ def test_a_list_in_a_config_file(folder: Path) -> None:
 
 def test_learn_and_localize(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run(*LEARN, LIST)
-    assert "Whitening, 1764 + 2048 to 30 numbers" in capsys.readouterr().out
+    assert "Whitening, 1764 + 2048 to 30 dimensions" in capsys.readouterr().out
     run("info", "map.safetensors")
     told = capsys.readouterr().out
     assert "HOG: orientations=9" in told
