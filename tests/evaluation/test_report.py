@@ -184,6 +184,14 @@ STEPS: list[tuple[dict[str, Any], float | None, str, list[str]]] = [  # facts, r
         {"line": {"offset": 7, "answers": 9, "confident": 9}, "truth": "place = query"},
         *(0.0, "Not by this ground truth", ["--truth 7"]),
     ),
+    (
+        {"least_probability": 0.5, "accepted": 20, "accepted_right": 4, "kind": "spectral", "filter": True},
+        *(0.2, "Of 20 accepted answers 4", ["order of the frames", "--second", "localize"]),
+    ),
+    (
+        {"least_probability": 0.5, "accepted": 20, "accepted_right": 5, "filter": True},
+        *(0.2, "Of 20 accepted answers 5", []),
+    ),
     ({"probably_right": {"0.9": 18, "0.5": 19}}, None, "Probably: ", ["--filter", "--precision", "--truth"]),
     (
         {"probably_right": {"0.9": 0, "0.5": 1}},
