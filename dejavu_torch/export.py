@@ -42,9 +42,9 @@ MAX_REASON = 200  # characters of an error of torch
 class Exported(NamedTuple):
     """The result of an export."""
 
-    facts: dict[str, Any]  # the file's metadata
+    facts: dict[str, Any]  #: the file's metadata
     bytes: int
-    difference: float  # the largest to torch's scores, relative above 1, on frames of noise
+    difference: float  #: the largest to torch's scores, relative above 1, on frames of noise
 
 
 class Decoded(nn.Module):
