@@ -54,11 +54,11 @@ OnFirst = Callable[[Tensor, Tensor], None]  # receives the first batch of frames
 class Describer(NamedTuple):
     """Describes frames; all that a worker process needs for it."""
 
-    pipeline: nn.Module  #: (B,C,H,W) -> (B,D), preprocess and features
-    whitening: Whitening | None  #: (B,D) -> (B,K)
+    pipeline: nn.Module  # (B,C,H,W) -> (B,D), preprocess and features
+    whitening: Whitening | None  # (B,D) -> (B,K)
     batch_size: int
     device: torch.device
-    warned: set[tuple[str, str]]  #: (traverse, line) of warnings that were logged
+    warned: set[tuple[str, str]]  # (traverse, line) of warnings that were logged
 
     def features(
         self, traverse: Traverse, progress: str | None = None, on_first: OnFirst | None = None
@@ -230,10 +230,10 @@ class ChunkCoder(NamedTuple):
     """
 
     describer: Describer
-    frames: int  #: N, of the route
-    chunk: int  #: places of a chunk
-    code: Callable[[Tensor], Chunk]  #: descriptors (W,K) of a chunk -> Chunk
-    visits: Views | None = None  #: frames of a traverse that `seeks`, to average with those of their places
+    frames: int  # N, of the route
+    chunk: int  # places of a chunk
+    code: Callable[[Tensor], Chunk]  # descriptors (W,K) of a chunk -> Chunk
+    visits: Views | None = None  # frames of a traverse that `seeks`, to average with those of their places
 
     @classmethod
     def like(

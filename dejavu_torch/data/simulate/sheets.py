@@ -114,10 +114,10 @@ class Thing:
 class Light(NamedTuple):
     """The light of a traverse."""
 
-    lamp: float  #: strength of the headlight next to the train, which falls off over `reach` metres
+    lamp: float  # strength of the headlight next to the train, which falls off over `reach` metres
     reach: float
-    ambient: Tensor  #: (S,) light along the track, one value per metre
-    haze: Tensor  #: (3,1) colour of the distance, reached over `fade` metres
+    ambient: Tensor  # (S,) light along the track, one value per metre
+    haze: Tensor  # (3,1) colour of the distance, reached over `fade` metres
     fade: float
 
     def at(self, ahead: Tensor, s: Tensor) -> Tensor:
