@@ -40,11 +40,15 @@ MAX_REASON = 200  # characters of an error of torch
 
 
 class Exported(NamedTuple):
-    """The result of an export."""
+    """The result of an export.
 
-    facts: dict[str, Any]  # the file's metadata
+    facts: the file's metadata. bytes: of the file. difference: the largest to torch's scores, relative above
+    1, on frames of noise.
+    """
+
+    facts: dict[str, Any]
     bytes: int
-    difference: float  # the largest to torch's scores, relative above 1, on frames of noise
+    difference: float
 
 
 class Decoded(nn.Module):

@@ -92,7 +92,8 @@ def _spilling(what: str) -> Iterator[None]:
 
 
 def empty(rows: int, columns: int, device: torch.device, in_memory: int = IN_MEMORY) -> Tensor:
-    """Uninitialised float32; on the CPU, more than `in_memory` bytes are in an unnamed temporary file."""
+    """Uninitialised (rows,columns) float32; on the CPU, more than `in_memory` bytes are in an unnamed
+    temporary file. InputError if there is no room for it."""
     size = 4 * rows * columns
     if device.type != "cpu" or size <= in_memory:
         return torch.empty(rows, columns, device=device)

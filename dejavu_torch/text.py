@@ -24,9 +24,10 @@ def one_line(text: object) -> str:
 
 
 def settings_of(module: nn.Module, *hidden: str) -> str:
-    """The constructor's arguments, as `extra_repr` shows them."""
-    names = (name for name in signature(type(module)).parameters if name not in hidden)
-    return ", ".join(f"{name}={getattr(module, name)!r}" for name in names)
+    """The constructor's arguments, also of base classes, as `extra_repr` shows them."""
+    names = dict.fromkeys(name for cls in type(module).__mro__ for name in signature(cls).parameters)
+    shown = (name for name in names if name not in hidden and hasattr(module, name))  # some are not kept
+    return ", ".join(f"{name}={getattr(module, name)!r}" for name in shown)
 
 
 def bar(steps: Sequence[Step], text: str | None) -> Iterable[Step]:

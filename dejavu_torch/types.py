@@ -151,7 +151,7 @@ class FrequencyLayer:
         if max(self.stop * b, a * self.phases) >= 2**63:
             raise InputError(f"{seen} up to {self.stop}; expected numbers whose products are below 2^63")
         if not self.features or not all(i < j for i, j in pairwise((-1, *self.features))):
-            raise InputError(f"layer features {self.features!s:.60}; expected 1 or more, increasing from 0")
+            raise InputError(f"layer features {self.features!s:.60}; expected 1 or more, increasing, >= 0")
 
     def phase(self, places: Tensor) -> Tensor:
         """Phase of each place, in exact integer arithmetic. (n,) int64 -> (n,) int64 in 0..P-1."""

@@ -79,9 +79,9 @@ def _numbered(names: Sequence[str]) -> dict[str, Any] | None:
 
 def _names(numbered: dict[str, Any]) -> list[str]:
     first, *rest = numbered["texts"]
-    wide = any(not 1 <= width <= MAX_DIGITS for width, *_ in numbered["columns"])
-    if wide or sum(map(len, numbered["texts"])) > MAX_NAME_LENGTH:
-        raise ValueError("a name is too long")
+    odd = any(not 1 <= width <= MAX_DIGITS for width, *_ in numbered["columns"])
+    if odd or sum(map(len, numbered["texts"])) > MAX_NAME_LENGTH:
+        raise ValueError("the width of a number or the length of a name is out of range")
     if any(not 0 <= n < 10**MAX_DIGITS for _, *changes in numbered["columns"] for n in accumulate(changes)):
         raise ValueError("a number is out of range")
     columns = [[str(n).zfill(width) for n in accumulate(changes)] for width, *changes in numbered["columns"]]

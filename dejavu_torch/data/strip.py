@@ -38,7 +38,7 @@ class SlidingWindow(IndexedTraverse):
             raise InputError(f"{name} is {tuple(strip.shape)} {strip.dtype}; expected float (C,H,W)")
         if not 1 <= width <= strip.shape[2] or step < 1:
             seen = f"{name} is {strip.shape[2]} pixels long, window {width}, step {step}"
-            raise InputError(f"{seen}; expected a window of at most the length, and a step of at least 1")
+            raise InputError(f"{seen}; expected a window of 1 to {strip.shape[2]}, and a step of at least 1")
         self.name, self.strip, self.step = name, strip, step
         self.windows = strip.unfold(2, width, step).permute(2, 0, 1, 3)  # (N,C,H,width), a view
         self.length = len(self.windows)

@@ -84,7 +84,8 @@ class Embedding(nn.Module):
 
     Args:
         network: frames (B,channels,h,w) -> feature maps (B,K,h',w'), tokens (B,T,K), which are averaged, or
-            vectors (B,K), such as `kornia.feature.HardNet()` with 1 channel; of several, the first vectors.
+            vectors (B,K), such as `kornia.feature.HardNet()` with 1 channel of 32 x 32; of several outputs,
+            the first vectors.
         dimension: D, number of features; None returns the pooled output itself.
         channels: of the network's input, 3 or 1; grey frames are repeated, colours become luminance.
         resize: (height, width) in pixels to resize frames to, antialiased.

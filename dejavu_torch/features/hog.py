@@ -59,7 +59,7 @@ class HOG(nn.Module):
         height, width = frames.shape[-2:] if self.resize is None else self.resize
         least = self.cell * self.block
         if min(height, width) < least:
-            raise InputError(f"HOG got frames of {height} x {width}; expected one block, {least} x {least}")
+            raise InputError(f"HOG got frames of {height} x {width}; expected at least {least} x {least}")
         return in_parts(self._describe, frames)
 
     def _describe(self, frames: Tensor) -> Tensor:

@@ -133,7 +133,8 @@ class Preprocess(nn.Module):
 
     Shape: (B,C,H,W) -> (B,1,H,W), or (B,C,H,W) if `channel` is None.
 
-    Convention: without channel and contrast any input passes unchanged. "clahe" maps a difference to [0, 1].
+    Convention: without channel and contrast any input passes unchanged. Before "clahe" a difference d becomes
+        (d + 1) / 2.
 
     Raises:
         InputError: settings out of range; forward: frames that do not fit them.

@@ -98,9 +98,11 @@ class PlaceMap(nn.Module, ABC):
         return FrameTable(self.places, self.positions, self.routes)
 
     def frame_of(self, places: Tensor) -> Tensor:
+        """The reference frame of each place, see `FrameTable`."""
         return self.table.frame_of(places)
 
     def place_of(self, frames: Tensor) -> Tensor:
+        """The place nearest to each reference frame, see `FrameTable`."""
         return self.table.place_of(frames)
 
     @property

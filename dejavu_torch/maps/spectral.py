@@ -43,10 +43,12 @@ class SpectralMapper(Mapper):
     Shape: descriptors (N,K) -> SpectralMap of N places.
 
     Convention: the written route takes 98 to 100 % of the budget, or less if the finest useful step needs
-        less. Without `resolution` a map holds `hold`, or what that step holds; samples stand for long routes.
+        less. Without `resolution` a map holds at least `hold`, unless that step holds less; a long route is
+        held as far as its sample tells.
 
     Raises:
-        InputError: settings out of range; forward: no two different finite descriptors, too few bytes.
+        InputError: settings out of range; forward: fewer than two places, descriptors that are not finite or
+            all the same, or a budget that cannot be met.
 
     Example:
         >>> wave = torch.sin(torch.arange(500.0)[:, None] * torch.tensor([0.1, 0.23, 0.37]))

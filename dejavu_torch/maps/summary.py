@@ -67,10 +67,12 @@ class MapSummary:
 
     @property
     def fixed_bytes(self) -> int:
+        """Sum of `fixed`."""
         return sum(self.fixed.values())
 
     @property
     def route_bytes(self) -> int:
+        """Sum of `route`."""
         return sum(self.route.values())
 
     @property
@@ -80,6 +82,7 @@ class MapSummary:
 
     @property
     def bytes_per_place(self) -> float:
+        """`map_bytes` over the number of places."""
         return self.map_bytes / max(self.places, 1)
 
     def with_parts(self, fixed: Mapping[str, int]) -> MapSummary:

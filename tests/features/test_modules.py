@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 from helpers import refused
 from torch import nn
 
-from dejavu_torch import HOG, GroundOdometry, ImposedPeriods, Preprocess, SpectrogramAnalysis, Whitening
+from dejavu_torch import (
+    HOG,
+    GroundOdometry,
+    ImposedPeriods,
+    Preprocess,
+    SpectralMapper,
+    SpectrogramAnalysis,
+    TemplateMapper,
+    Whitening,
+)
 from dejavu_torch.features import preprocess
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.distilled import Distilled
@@ -54,6 +65,15 @@ def test_a_recipe_builds_the_same_module(name: str) -> None:
     again = build(recipe, nn.Module)
     assert repr(again) == repr(module)
     assert recipe_of(again) == recipe
+
+
+@pytest.mark.parametrize("base", [HOG, SpectralMapper, TemplateMapper])
+def test_a_subclass_with_arguments_of_its_own_shows_those_of_its_base(base: Any) -> None:
+    class Own(base):  # type: ignore[misc]
+        def __init__(self, own: int = 3, **given: Any) -> None:
+            super().__init__(**given)
+
+    assert repr(Own()) == repr(base()).replace(base.__name__, "Own", 1)
 
 
 @pytest.mark.parametrize("name", [name for name in MODULES if name != "network"])
