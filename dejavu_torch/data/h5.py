@@ -45,20 +45,22 @@ class DescriptorFile(IndexedTraverse):
 
         def visit(name: str, item: Any) -> None:
             image, _, leaf = name.rpartition("/")
-            if leaf != KEY:
+            if leaf != KEY or not image:
                 return
             shape, kind = getattr(item, "shape", None) or (), getattr(item, "dtype", np.dtype("O"))
             elsewhere = getattr(item, "external", None) or getattr(item, "is_virtual", False)
-            if len(shape) != 1 or kind.kind != "f" or elsewhere or not image:
+            if len(shape) != 1 or kind.kind != "f" or elsewhere:
                 seen = f"{shape} {kind.name}{' of another file' if elsewhere else ''}"
-                raise InputError(f"{self.name}: {KEY} of {image or '/'} is {seen}; expected {EXPECTED}")
+                raise InputError(f"{self.name}: {KEY} of {image} is {seen}; expected {EXPECTED}")
             found[image] = shape
 
         with self._open() as file:
             file.visititems(visit)
+            shared = KEY in file
             self.names = sort_names(found, order, self.name)
         if not found:
-            raise InputError(f"{self.name} contains no {KEY}; expected {EXPECTED}")
+            seen = f"has one {KEY} for all images" if shared else f"contains no {KEY}"
+            raise InputError(f"{self.name} {seen}; expected {EXPECTED}")
         (width,) = found[self.names[0]]
         for image in self.names:
             if found[image] != (width,) or not width:
