@@ -14,7 +14,7 @@ from contextlib import redirect_stdout, suppress
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 DOCS = Path(__file__).parent
 ROOT = DOCS.parent
@@ -68,7 +68,7 @@ def public_names() -> dict[str, Any]:
 
 
 def named_by(one: Any) -> set[type]:
-    """The bases of a class, and the classes in signatures."""
+    """The bases of a class, and the classes in signatures, also those in aliases such as `Pictures`."""
     members = [value for name, value in vars(one).items() if name[0] != "_" or name == "__init__"]
     words = {
         word
@@ -77,8 +77,8 @@ def named_by(one: Any) -> set[type]:
         for word in re.findall(r"\w+", str(text))
     }
     space = vars(sys.modules[one.__module__])
-    named = {space[word] for word in words if inspect.isclass(space.get(word))}
-    return named | set(getattr(one, "__mro__", ()))
+    found = (part for word in words for part in (space.get(word), *get_args(space.get(word))))
+    return {*filter(inspect.isclass, found), *getattr(one, "__mro__", ())}
 
 
 def room_of(one: Any) -> str:

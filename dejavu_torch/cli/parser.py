@@ -8,7 +8,7 @@ import json
 import pydoc
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import redirect_stdout, suppress
 from dataclasses import is_dataclass
 from pathlib import Path
@@ -292,18 +292,18 @@ class Parser(jsonargparse.ArgumentParser):
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         head, required, names = message.partition("required: ")
+        positional = {action.dest for action in self._actions if not action.option_strings}
         if required:
-            positional = {action.dest for action in self._actions if not action.option_strings}
             words = [
                 name if name in positional else f"--{name.partition('.')[2] or name}"  # without `fit.`
                 for name in names.split(", ")
             ]
             message = f"{head}{required}{', '.join(words)}"
-        text = one_line(_by_options(message, ex))
+        text = one_line(_by_options(message, ex, positional))
         raise UsageError(text if len(text) < LONGEST else f"{text[:LONGEST]} ...") from ex
 
 
-def _by_options(message: str, error: Exception | None) -> str:
+def _by_options(message: str, error: Exception | None, positional: Collection[str]) -> str:
     """The message of jsonargparse, or for an option's value that of the innermost parser or type."""
     key = re.match(r'Parser key "([^"]+)"', message)
     if key is None:
@@ -311,7 +311,7 @@ def _by_options(message: str, error: Exception | None) -> str:
         if stages:
             return f"no stage given; expected one of {stages[1].replace(',', ', ')}"
         return re.sub(r"^Option '([\w.]+)'", r"--\1", message)
-    option = "--" + key[1].replace(".init_args", "")
+    option = "--" * (key[1] not in positional) + key[1].replace(".init_args", "")
     short = re.search(rf"\b{hub.PREFIX}[\w+.-]*", message)
     if short:
         where = "--features or --model.backbone on the command line, alone or in a list"

@@ -204,6 +204,9 @@ def count_queries(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> 
 
     queries = judged + unknown (to the truth) + ignored (an ignored place is reported). Of the judged ones,
     with_answer have a right answer, accepted are accepted, and accepted_right are accepted at a right place.
+
+    Raises:
+        InputError: as `evaluate`.
     """
     kept, right = _judged(match, truth, tolerance)
     good = is_right(kept.index, right.positives, tolerance)

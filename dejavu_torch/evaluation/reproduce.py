@@ -208,7 +208,11 @@ def boundary_effect(
 def known_boundaries(
     result: Comparison, cuts: Sequence[int], tolerance: int
 ) -> dict[str, tuple[Contender, BoundaryEffect]]:
-    """The cost of chunks that do not end where structures start and stop (section V, underground)."""
+    """The cost of chunks that do not end where structures start and stop (section V, underground).
+
+    Raises:
+        InputError: a comparison without ground truth, or whose periods are not of `SpectrogramAnalysis`.
+    """
     mapper, truth = _mapper(result.run.model), result.run.truth
     if truth is None or mapper is None:
         raise InputError("the comparison lacks a ground truth or SpectrogramAnalysis; expected both")

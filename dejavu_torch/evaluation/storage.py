@@ -27,7 +27,17 @@ BUDGETS = (1.0, 2.5, 5.0, 10.0, 20.0)  # route bytes per place
 def coded_at_sizes(
     run: Localization, budgets: Sequence[float] = BUDGETS, seed: int = 0, progress: bool = False
 ) -> dict[str, list[Stored]]:
-    """Code the descriptors of a spectral map at several budgets, and evaluate each with the run's queries."""
+    """Code the run's descriptors at several budgets, and evaluate each with the run's queries.
+
+    Args:
+        budgets: route bytes per place. seed: for shuffling the null control.
+
+    Returns:
+        For `map`, `null` and `interpolated`, one entry for each budget that can be met, in their order.
+
+    Raises:
+        InputError: the map is not spectral, or there is no ground truth.
+    """
     run = run._replace(matching=SINGLE) if run.sequence is None else run  # without a filter for each size
     route = run.model.map
     if not isinstance(route, SpectralMap) or run.truth is None:

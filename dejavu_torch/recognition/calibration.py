@@ -45,6 +45,7 @@ class Calibration(NamedTuple):
     filter: Platt | None = None  # a `PlaceFilter` with search_every = 1
 
     def of(self, sequence: SequenceModel | None) -> Platt | None:
+        """The scaling for a way of matching; None if that is not calibrated."""
         if sequence is None:
             return self.single
         return self.filter if isinstance(sequence, PlaceFilter) and sequence.search_every == 1 else None
@@ -95,7 +96,7 @@ def fit(confidence: Tensor, right: Tensor, weight: Tensor | None = None) -> Plat
 
 def confidence_of(scores: Tensor) -> Tensor:
     """Confidence in the best place of each query, (Q,N) -> (Q,): -score + `MARGIN` x margin, or -inf if no
-    place is params. The margin is the difference to the best score beyond `TOLERANCE` places."""
+    place is found. The margin is the difference to the best score beyond `TOLERANCE` places."""
     return confidence(best_candidates(scores, min(2, scores.shape[1]), TOLERANCE))
 
 

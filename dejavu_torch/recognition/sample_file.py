@@ -42,6 +42,9 @@ def check_searches(path: Any, matching: Matching, elsewhere: bool) -> None:
 def kept_search(path: Path, route: PlaceMap, limit: int | None = None, exact: bool = False) -> CoarseSearch:
     """As `coarse_search`, with samples read from a file, or written to it if it does not exist.
 
+    Args:
+        limit, exact: see `plan`.
+
     Raises:
         InputError: the map has to be scanned; the file is damaged, not a file of samples, or of another map
             or plan; or it cannot be written.

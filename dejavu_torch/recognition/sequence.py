@@ -55,7 +55,8 @@ class SequenceMatcher(SequenceModel):
         self.length = length
         self.speeds = tuple(float(speed) for speed in speeds) if isinstance(speeds, Iterable) else ()
         if not self.speeds or not all(map(math.isfinite, self.speeds)):
-            raise InputError(f"the speeds are {speeds}; expected finite numbers of places per query")
+            seen = f"the speeds are {speeds}"
+            raise InputError(f"{seen}; expected at least one finite number of places per query")
 
     def _shifts(self, speed: float) -> list[int]:
         """Places from a trajectory's end back to it, 0, 1, .., T - 1 queries before the latest."""

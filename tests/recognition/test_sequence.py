@@ -151,7 +151,7 @@ def test_convention_2_a_place_that_nothing_covers_is_not_reported() -> None:
     [
         (lambda: SequenceMatcher(0), ["a sequence of 0 queries", "expected a whole number, 1 to "]),
         (lambda: SequenceMatcher(2.5), ["a sequence of 2.5 queries", "whole number"]),  # type: ignore[arg-type]
-        (lambda: SequenceMatcher(3, []), ["speeds are []", "finite"]),
+        (lambda: SequenceMatcher(3, []), ["speeds are []", "at least one finite"]),
         (lambda: SequenceMatcher(3, [1.0, math.nan]), ["speeds are [1.0, nan]", "finite"]),
         (lambda: SequenceMatcher(3)(torch.zeros(3, 4).long()), ["(3, 4) torch.int64", "floats"]),
         (lambda: SequenceMatcher(3)(torch.rand(4)), ["scores are (4,)", "(Q,N)"]),
