@@ -387,7 +387,7 @@ def run_evaluate(
         matches: csv of query,place,score[,accepted][,probability][,rank][,route]
         truth: right places, as in `dejavu compare`
         out: folder for report and pictures
-        tolerance: answers this many places off are still right
+        tolerance: answers up to this many places off are right
         interpolate: interpolate a --truth that lists only some queries
         reference: source of the places, for their number and the coordinates of utm; as in `dejavu learn`
         query: source of the queries, likewise
@@ -425,7 +425,7 @@ def run_reproduce(
         dataset: aerial, outdoor, underground or all
         out: folder for the reports
         seed: seed of the routes
-        tolerance: answers this many places off are still right
+        tolerance: answers up to this many places off are right
     """
     from dejavu_torch.evaluation import paper_tables as tables
     from dejavu_torch.evaluation.report import report_folder, text_table, write_index, write_report

@@ -327,7 +327,7 @@ class Judging:
     Args:
         truth: offset (place = query + offset), csv of query,place[,place...], json with a list per query, npz
             with GThard, or utm:25 by image names
-        tolerance: answers this many places off are still right
+        tolerance: answers up to this many places off are right
         interpolate: interpolate a --truth that lists only some queries
         leave_out: diagnostic for templates: the reference on itself, without this many frames on each side
         top: write this many places per query, no two within the tolerance
