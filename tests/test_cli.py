@@ -58,7 +58,7 @@ def test_convention_4_threshold_option_then_map_then_probability_then_all(
         return sum(row["accepted"] == "1" for row in csv.DictReader(out.open()))
 
     run("localize", small_map, QUERY, "--out", out)
-    assert "probability is at least 0.5" in capsys.readouterr().out
+    assert "default for this way of matching: accepted if the probability is at least 0.5" in capsys.readouterr().out
     assert accepted() == sum(float(row["probability"]) >= 0.5 for row in csv.DictReader(out.open()))
     run("localize", small_map, "sim:aerial?frames=96&seed=9", "--out", out)  # another road
     assert accepted() == sum(float(row["probability"]) >= 0.5 for row in csv.DictReader(out.open())) < 96
@@ -66,13 +66,13 @@ def test_convention_4_threshold_option_then_map_then_probability_then_all(
     assert "every query with a finite score" in capsys.readouterr().out
     assert accepted() == 96
     run("localize", small_map, QUERY, "--threshold", ".inf", "--out", out)
-    assert "no threshold" not in capsys.readouterr().out
+    assert "default for this way" not in capsys.readouterr().out
     assert accepted() == 96
     score = sorted(float(row["score"]) for row in csv.DictReader(out.open()))[40]
     run("learn", SMALL, "--map", route, "--threshold", str(score))
     capsys.readouterr()
     run("localize", route, QUERY, "--out", out)
-    assert "no threshold" not in capsys.readouterr().out
+    assert "default for this way" not in capsys.readouterr().out
     assert 35 <= accepted() <= 41
     run("localize", route, QUERY, "--out", out, "--threshold", "0")
     assert accepted() == 0

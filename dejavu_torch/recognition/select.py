@@ -30,7 +30,7 @@ class Acceptance(NamedTuple):
             rule = f"accepted if the score is below {self.threshold:.9g}"
         else:
             rule = f"accepted if the filter's own probability is above {math.exp(-self.threshold):.9g}"
-        return rule if self.given else f"no threshold given or stored for this way of matching: {rule}"
+        return rule if self.given else f"default for this way of matching: {rule}"
 
 
 def best_match(scores: Tensor, threshold: float | None = None) -> Match:
