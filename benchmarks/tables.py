@@ -31,7 +31,7 @@ CODES = {  # rows of codes of the same kind
 }
 
 
-def kept(bench: dict[str, Any]) -> dict[str, Any]:
+def stored(bench: dict[str, Any]) -> dict[str, Any]:
     """A bench.json without unknown values and what no table shows."""
     left_out = ("equal_auc", "seconds", "peak_bytes", "ratio_to_ours", "missed_over_best")
     rows = [{k: v for k, v in row.items() if v is not None and k not in left_out} for row in bench["rows"]]
@@ -43,8 +43,12 @@ def kept(bench: dict[str, Any]) -> dict[str, Any]:
     return facts | {"rows": rounded(rows)}
 
 
+def file_of(name: str) -> Path:
+    return FOLDER / f"{name.replace(' ', '_')}.json"
+
+
 def read(name: str) -> dict[str, Any]:
-    bench: dict[str, Any] = json.loads((FOLDER / f"{name}.json").read_text(encoding="utf-8"))
+    bench: dict[str, Any] = json.loads(file_of(name).read_text(encoding="utf-8"))
     return bench
 
 
@@ -66,8 +70,10 @@ def size(each: float) -> str:
     return f"{each:.1f}" if each < 10 else f"{each:.0f}"
 
 
-def by_seeds(found: dict[str, Row], figures: Callable[[Row], Sequence[float | None]]) -> Iterable[list[str]]:
-    """A row of figures for each footage, or of their means over the seeds of a simulated route."""
+def by_seeds(
+    found: dict[str, Row], figures: Callable[[Row], Sequence[float | None]]
+) -> Iterable[tuple[str, list[float | None]]]:
+    """The figures of each footage, or their means over the seeds of a simulated route."""
     groups: dict[str, list[Row]] = {}
     for name in FOOTAGE:
         if name in found:
@@ -77,7 +83,7 @@ def by_seeds(found: dict[str, Row], figures: Callable[[Row], Sequence[float | No
         means = [
             None if None in column else mean(one for one in column if one is not None) for column in columns
         ]
-        yield [f"`{name}`" if name.startswith("sim:") else name, *map(area, means)]
+        yield f"`{name}`" if name.startswith("sim:") else name, means
 
 
 def routes() -> str:
@@ -89,9 +95,10 @@ def routes() -> str:
         recalls = [row["recall_at_1"], row["hog"]["recall_at_1"]]
         return [row["auc"], *rivals, *recalls, row["route_bytes_per_place"], row["fixed_bytes"] / 1000]
 
+    forms: list[Callable[[Any], str]] = [*[area] * 7, size, "{:.0f}".format]
     rows = [
-        [*row[:-2], size(float(row[-2])), f"{float(row[-1]):.0f}"]
-        for row in by_seeds(reports("default"), figures)
+        [name, *(form(one) for form, one in zip(forms, means, strict=True))]
+        for name, means in by_seeds(reports("default"), figures)
     ]
     return markdown([head, *rows])
 
@@ -115,8 +122,8 @@ def sizes() -> str:
         return [at(row, name, budget) for budget in budgets for name in ("map", "null")]
 
     rows = []
-    for name, *cells in by_seeds(known, figures):
-        pairs = zip(cells[::2], cells[1::2], strict=True)
+    for name, means in by_seeds(known, figures):
+        pairs = zip(map(area, means[::2]), map(area, means[1::2]), strict=True)
         rows.append([name, *(f"{map}, {null}" if map else "" for map, null in pairs)])
     return markdown([["AUC of map, null; route bytes per place", *map(str, budgets)], *rows])
 
@@ -125,16 +132,12 @@ def descriptors() -> str:
     """The AUC of maps by descriptor."""
     ways = {"default": "HOG, `Distilled`", "HOG and pixels": "HOG, pixels", "HOG": "HOG alone"}
     columns = [
-        dict_of(by_seeds(reports(way), lambda row: [row["auc"], row["uncompressed"]["auc"]])) for way in ways
+        dict(by_seeds(reports(way), lambda row: [row["auc"], row["uncompressed"]["auc"]])) for way in ways
     ]
     head = ["AUC of map, of its descriptors in float", *ways.values()]
     return markdown(
-        [head, *([name, *(", ".join(column[name]) for column in columns)] for name in columns[0])]
+        [head, *([name, *(", ".join(map(area, column[name])) for column in columns)] for name in columns[0])]
     )
-
-
-def dict_of(rows: Iterable[list[str]]) -> dict[str, list[str]]:
-    return {name: cells for name, *cells in rows}
 
 
 def sequences() -> str:
@@ -174,7 +177,7 @@ def filtered() -> str:
 
 def storage(name: str) -> str:
     """The best AUC of each kind of code on a route, by bytes."""
-    rows = read(f"storage_{name}")["rows"]
+    rows = read(f"storage {name}")["rows"]
     rows = [
         row | {"skipped": row.get("skipped"), "sequences": {"1": {"auc": row.get("auc")}}} for row in rows
     ]
@@ -223,10 +226,10 @@ TABLES: dict[str, Callable[[], str]] = {
 
 def made(name: str) -> str:
     """A table, and what it was measured with."""
-    source = name.replace(" ", "_") if (FOLDER / f"{name.replace(' ', '_')}.json").exists() else "routes"
+    source = name if file_of(name).exists() else "routes"
     facts = read(source)
     said = ", ".join(str(facts[key]) for key in ("commit", "date", "machine") if key in facts)
-    return f"{TABLES[name]()}\n*{source}.json: {said}.*\n"
+    return f"{TABLES[name]()}\n*{file_of(source).name}: {said}.*\n"
 
 
 def filled(page: str) -> str:
@@ -236,11 +239,9 @@ def filled(page: str) -> str:
 
 def main(given: Sequence[str]) -> None:
     for name, _, path in (word.partition("=") for word in given):
-        bench = kept(json.loads(Path(path).read_text(encoding="utf-8")))
+        bench = stored(json.loads(Path(path).read_text(encoding="utf-8")))
         rows = ",\n".join(json.dumps(row) for row in bench.pop("rows"))  # a line each
-        (FOLDER / f"{name}.json").write_text(
-            f'{json.dumps(bench)[:-1]}, "rows": [\n{rows}\n]}}\n', encoding="utf-8"
-        )
+        file_of(name).write_text(f'{json.dumps(bench)[:-1]}, "rows": [\n{rows}\n]}}\n', encoding="utf-8")
     for page in FOLDER.parent.rglob("*.md"):
         page.write_text(filled(page.read_text(encoding="utf-8")), encoding="utf-8")
 

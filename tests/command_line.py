@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -56,6 +57,12 @@ def write_images(folder: Path, images: np.ndarray) -> Path:
     for i, image in enumerate(images):
         Image.fromarray(image).save(folder / f"{i}.png")
     return folder
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    """The rows of a csv, such as matches.csv."""
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
 
 
 def report_of(folder: Path) -> dict[str, Any]:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import fails, frames, report_of, run
+from command_line import fails, frames, report_of, rows_of, run
 
 from dejavu_torch import DejaVu
 
@@ -36,11 +35,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     sure.precision = 0.9
     sure.save(folder / "sure.safetensors")
     return folder
-
-
-def matches(path: Path) -> list[dict[str, str]]:
-    with path.open(encoding="utf-8") as file:
-        return list(csv.DictReader(file))
 
 
 def test_a_map_grows_in_its_own_file_or_in_another(
@@ -102,7 +96,7 @@ def test_merged_routes_are_listed_and_matches_name_them(
     query = "sim:aerial?frames=96&seed=1&traverse=1"
     run("localize", merged, query, "--out", tmp_path / "m.csv")
     assert "--route ROUTE" in capsys.readouterr().out
-    rows = matches(tmp_path / "m.csv")
+    rows = rows_of(tmp_path / "m.csv")
     assert [*rows[0]] == ["query", "place", "score", "accepted", "route", "query_name", "place_name"]
     right = [row["route"] == "other" and abs(int(row["query"]) - int(row["place"])) <= 5 for row in rows]
     assert sum(right) > 48
@@ -114,7 +108,7 @@ def test_merged_routes_are_listed_and_matches_name_them(
         assert report["elsewhere"] == sum(row["route"] == "first" for row in rows)
         assert (report["route"], report["accepted"]) == ("other", 96)
     run("localize", merged, query, "--out", tmp_path / "top.csv", "--top", "5")
-    top = matches(tmp_path / "top.csv")
+    top = rows_of(tmp_path / "top.csv")
     assert [*top[0]][4:6] == ["rank", "route"]
     assert [row["route"] for row in top[::5]] == [row["route"] for row in rows]
     run("evaluate", tmp_path / "top.csv", *other)

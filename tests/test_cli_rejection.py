@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import fails, report_of, run
+from command_line import fails, report_of, rows_of, run
 
 from dejavu_torch import DejaVu
 from dejavu_torch.features.views import FEWEST
@@ -37,15 +36,10 @@ def learned(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def rows(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def test_a_learned_map_tells_probabilities_and_accepts_by_them(learned: Path, tmp_path: Path) -> None:
     for sequence in ((), ("--filter",)):
         run("localize", learned, AGAIN, "--precision", ".9", "--out", tmp_path / "m.csv", *sequence)
-        found = rows(tmp_path / "m.csv")
+        found = rows_of(tmp_path / "m.csv")
         assert [row["accepted"] == "1" for row in found] == [
             float(row["probability"]) >= 0.9 for row in found
         ]

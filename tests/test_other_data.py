@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import re
 from glob import glob
 from pathlib import Path
@@ -10,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from command_line import fails, report_of, run
+from command_line import fails, report_of, rows_of, run
 from PIL import Image
 from test_readme import understand
 
@@ -57,11 +56,6 @@ def recalls(folder: Path, predictions: np.ndarray, values: tuple[int, ...] = VAL
     return ", ".join(
         f"R@{n}: {100 * share:.1f}" for n, share in zip(values, hits / len(predictions), strict=True)
     )
-
-
-def rows_of(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def test_ranks_of_another_tool_have_its_recall(

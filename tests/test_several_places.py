@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from command_line import frames, report_of, run
+from command_line import frames, report_of, rows_of, run
 from footage import QUERY, REFERENCE, camera, everything, footage
 from helpers import Fixed, refused, template_model
 
@@ -33,10 +32,6 @@ def route(pair: tuple[Path, Path]) -> Path:
     path = pair[0].parent / "map.safetensors"
     run("learn", pair[0], "--map", path)
     return path
-
-
-def rows_of(path: Path) -> list[dict[str, str]]:
-    return list(csv.DictReader(path.open(newline="")))
 
 
 # in Python

@@ -209,11 +209,8 @@ def run_localize(
     model = loading.model(map)
     searching.of(model)
     if corners is not None:
-        if model.velocity is None or model.step is None:
-            why = "--as_is measures no ground" if loading.as_is else f"{map} was learned without --velocity"
-            raise InputError(f"--corners {corners}: {why}; expected a map and frames at even steps")
-        check_corners(corners)
-        model.velocity.corners = tuple((float(x), float(y)) for x, y in corners)
+        why = "--as_is measures no ground" if loading.as_is else f"{map} was learned without --velocity"
+        _set_corners(model, corners, why)
     acceptance.of(model)
     if top is not None:
         check_candidates(top, SUPPRESSION, model.map.places)
@@ -253,6 +250,14 @@ def run_localize(
     table: tuple[str | Path, ...] = () if model.step is None else ("--map", map)
     table += ("--route", "ROUTE") if model.map.routes else ()
     print_next("evaluate", out, "--truth", "TRUTH", *table, "--out", "scores")
+
+
+def _set_corners(model: DejaVu, corners: list[list[float]], why: str) -> None:
+    """Let a model measure another camera's ground; `why` it measures none is for the message."""
+    if model.velocity is None or model.step is None:
+        raise InputError(f"--corners {corners}: {why}; expected a map and frames at even steps")
+    check_corners(corners)
+    model.velocity.corners = tuple((float(x), float(y)) for x, y in corners)
 
 
 def run_live(
