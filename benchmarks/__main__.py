@@ -5,7 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from benchmarks import cluster, distil, live, matcher, memory, results, scale, storage, train, trainings
+from benchmarks import (
+    cluster,
+    distil,
+    live,
+    matcher,
+    memory,
+    results,
+    scale,
+    spread,
+    storage,
+    train,
+    trainings,
+)
 from dejavu_torch.cli import errors_of_one_line, fail, main
 from dejavu_torch.cli.parser import command_parser
 from dejavu_torch.data.output import check_output_folder
@@ -23,6 +35,7 @@ BENCHES: dict[str, Any] = {  # each returns the lines to print
     "memory": memory.run_memory,
     "scale": scale.run_scale,
     "cluster": cluster.run_cluster,
+    "spread": spread.run_spread,
 }
 
 

@@ -207,10 +207,15 @@ def in_process(module: str, arguments: object) -> dict[str, Any]:
     return facts
 
 
-def done_once(words: Sequence[str], folder: Path, made: Path) -> str | None:
+def done_once(
+    words: Sequence[str], folder: Path, made: Path, environment: dict[str, str] | None = None
+) -> str | None:
     """Run `dejavu`, with a log in a folder, unless the same command has made a file already.
 
     This lets a stopped run of many commands continue.
+
+    Args:
+        environment: variables of the command, beside those of this process.
 
     Returns:
         its last message if it failed.
@@ -220,7 +225,7 @@ def done_once(words: Sequence[str], folder: Path, made: Path) -> str | None:
         return None
     folder.mkdir(parents=True, exist_ok=True)
     well.unlink(missing_ok=True)
-    alone = os.environ | {"OMP_NUM_THREADS": "1"}  # several commands run at a time
+    alone = os.environ | {"OMP_NUM_THREADS": "1"} | (environment or {})  # several commands run at a time
     with log.open("w", encoding="utf-8") as file:
         command = [sys.executable, "-m", "dejavu_torch.cli", *words]
         status = subprocess.run(command, stdout=file, stderr=file, check=False, env=alone).returncode

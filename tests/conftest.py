@@ -1,4 +1,4 @@
-"""What all tests share: one thread, fixed seeds, and where the real data lies."""
+"""What all tests share: the number of threads, fixed seeds, and where the real data lies."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ from dejavu_torch.resize import resize_frames
 collect_ignore = ["mutants"]  # it has no tests, and runs them
 
 # commands and notebooks run in processes of their own, beside each other
-os.environ.setdefault("OMP_NUM_THREADS", "1")
+THREADS = int(os.environ.get("DEJAVU_TEST_THREADS", "1"))
+os.environ.setdefault("OMP_NUM_THREADS", str(THREADS))
 
 # a shell has what runs in its background ignore Ctrl-C, and commands take over what they find
 if (
@@ -78,9 +79,9 @@ def pytest_collection_finish() -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _one_thread() -> None:
+def _few_threads() -> None:
     """Many small operations: on a busy machine two threads mostly wait for each other."""
-    torch.set_num_threads(1)
+    torch.set_num_threads(THREADS)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -96,6 +97,7 @@ def _short_work(request: pytest.FixtureRequest) -> Iterator[None]:
         if request.path.stem in FEW_VIEWS:
             patch.setattr("dejavu_torch.features.whitening.VIEWS", 1)
             patch.setattr("dejavu_torch.features.whitening.VIEWS_PER_COMPONENT", 1)
+            patch.setattr("dejavu_torch.features.whitening.COPIES", 1)
             patch.setattr("dejavu_torch.features.views.FEWEST", 100)
             patch.setattr(distilled, "resize_frames", lambda frames, size: resize_frames(frames, (48, 48)))
         if not request.path.stem.startswith(DRAWN):

@@ -10,7 +10,7 @@ from command_line import fails, report_of, rows_of, run
 
 from dejavu_torch import DejaVu
 from dejavu_torch.features.views import FEWEST
-from dejavu_torch.features.whitening import VIEWS, VIEWS_PER_COMPONENT
+from dejavu_torch.features.whitening import COPIES, VIEWS, VIEWS_PER_COMPONENT
 
 ROUTE, AGAIN, THIRD, SEA = (
     f"sim:{name}"
@@ -30,6 +30,7 @@ def learned(tmp_path_factory: pytest.TempPathFactory) -> Path:
         # as many copies of frames as outside of tests, for the probabilities of a filter
         patch.setattr("dejavu_torch.features.whitening.VIEWS", VIEWS)
         patch.setattr("dejavu_torch.features.whitening.VIEWS_PER_COMPONENT", VIEWS_PER_COMPONENT)
+        patch.setattr("dejavu_torch.features.whitening.COPIES", COPIES)
         patch.setattr("dejavu_torch.features.views.FEWEST", FEWEST)
         # as many numbers as half of so few places make a filter less sure, not more
         run("learn", ROUTE, "--map", path, "--whitening.numbers", "16")

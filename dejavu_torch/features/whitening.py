@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import torch
 from torch import Tensor, nn
@@ -24,7 +24,10 @@ PLACES_PER_DIMENSION = 2  # on a short route, at least
 COMPONENTS = 400  # principal components that are whitened, by default
 VIEWS = 4  # of a frame, at least
 VIEWS_PER_COMPONENT = 30  # at least: as 4 views of each of 3000 frames
-MAX_VIEWS = 12  # of a frame: more take time and change nothing
+MAX_VIEWS = 12  # of a frame, unless a short route has fewer than COPIES then
+COPIES, MOST_OF_SHORT = 6000, 60  # of all frames, of each: chance decides less on a short route
+BITS = (4, 8, 16)  # of a number of the projection
+FULL_BITS = 4 * DIMENSIONS  # per row of the projection of a long route
 SHRINKAGE = 0.03  # at least
 SPARE = 32  # further directions of the randomised subspace, for accuracy
 ROUNDS = 3  # of its iteration
@@ -90,11 +93,13 @@ class Whitening(nn.Module):
         numbers: K, at most the rank. None is 128, but at most half the places; without views 256.
         components: principal components that are whitened, at least K.
         shrinkage: of `learned_whitening`. None is 0.03, or more if there are few views.
-        views: augmented copies of each frame. None is 4, on a short route up to 12: 30 per component.
+        views: augmented copies of each frame. None is 4, below 3000 frames up to 12: 30 per component; below
+            500 frames up to 60: 6000 in all.
         most_views: copies in all; frames are drawn evenly if there would be more.
         strengths: arguments of `Augmentation`, instead of `STRENGTHS`.
         seed: of the copies.
-        bits: of each number of the projection: 4 (two to a byte), 8 or 16.
+        bits: of each number of the projection: 4 (two to a byte), 8 or 16. None is 4, on a short route the
+            most with which its fewer dimensions take no more bytes than 128 of 4 bits.
         power: of each dimension's absolute value, above 0 and at most 1, to lower peaks, as of new objects.
         groups: D_1, D_2, .. of concatenated descriptors, each whitened by itself and scaled to length 1; then
             follow the K dimensions that best keep their inner products, the largest lowered a little. None
@@ -131,7 +136,7 @@ class Whitening(nn.Module):
         most_views: int = 20000,
         strengths: Mapping[str, Any] | None = None,
         seed: int = 0,
-        bits: int = 4,
+        bits: Literal[4, 8, 16] | None = None,
         power: float = 1.0,
         groups: list[int] | None = None,
         group_numbers: int | None = None,
@@ -145,9 +150,9 @@ class Whitening(nn.Module):
         kept = [1, *(one for one in (numbers, group_numbers) if one is not None)]
         shares = power, 1 if shrinkage is None else shrinkage
         counts = 1 <= min(kept) <= max(kept) <= components and (views or 0) >= 0 and most_views >= 1
-        if not counts or bits not in (4, 8, 16) or not all(0 < share <= 1 for share in shares):
+        if not counts or bits not in (None, *BITS) or not all(0 < share <= 1 for share in shares):
             expected = "1 <= numbers <= components, views >= 0, most_views >= 1, shrinkage and power above 0 "
-            expected += "and at most 1, bits of 4, 8 or 16"
+            expected += "and at most 1, bits of 4, 8 or 16, or None"
             raise InputError(f"Whitening got {settings_of(self, 'strengths', 'seed')}; expected {expected}")
         if groups is not None and min(groups, default=0) < 1:
             raise InputError(f"the groups are {self.groups}; expected a dimension of at least 1 for each")
@@ -221,7 +226,8 @@ class Whitening(nn.Module):
         if self.views is not None:
             return self.views
         components = min(frames, features, self.components)
-        return min(MAX_VIEWS, max(VIEWS, math.ceil(VIEWS_PER_COMPONENT * components / frames)))
+        several = min(MAX_VIEWS, math.ceil(VIEWS_PER_COMPONENT * components / frames))
+        return max(VIEWS, several, min(MOST_OF_SHORT, COPIES // frames))
 
     def kept(self, places: int, features: int, views: bool) -> int:
         """Dimensions to keep, unless the rank of the route is lower."""
@@ -300,10 +306,12 @@ class Whitening(nn.Module):
 
         With 4 bits two numbers share a byte; the first half of the columns are the low bits.
         """
-        self.scale = projection.abs().amax(0) / (2 ** (self.bits - 1) - 1)
+        fitting = (bits for bits in BITS[:0:-1] if bits * projection.shape[1] <= FULL_BITS)
+        bits = next(fitting, BITS[0]) if self.bits is None else self.bits
+        self.scale = projection.abs().amax(0) / (2 ** (bits - 1) - 1)
         whole = (projection / self.scale).round()
-        self.projection = whole.to(torch.int8 if self.bits <= 8 else torch.int16)
-        if self.bits == 4:
+        self.projection = whole.to(torch.int8 if bits <= 8 else torch.int16)
+        if bits == 4:
             low, high = nn.functional.pad(whole + 8, (0, whole.shape[1] % 2)).to(torch.uint8).chunk(2, 1)
             self.projection = low | high << 4
         self.offset = (mean @ whole) * self.scale

@@ -174,10 +174,19 @@ def test_numbers_follow_the_rank_and_the_length_of_the_route(caplog: pytest.LogC
 
 def test_short_routes_are_looked_at_more_often() -> None:
     frames = 60, 400, 1000, 2700, 3000, 90_000
-    assert [Whitening().copies(count, 1764) for count in frames] == [12, 12, 12, 5, 4, 4]
-    assert Whitening().copies(400, 40) == 4  # 40 features have no more components
-    assert Whitening(components=100).copies(400, 1764) == 8
+    assert [Whitening().copies(count, 1764) for count in frames] == [60, 15, 12, 5, 4, 4]
+    assert Whitening().copies(2000, 40) == 4  # 40 features have no more components
+    assert Whitening(components=100).copies(1000, 1764) == 6
     assert Whitening(views=2).copies(60, 1764) == 2
+
+
+def test_fewer_numbers_have_more_bits_in_as_many_bytes() -> None:
+    whitening, sizes = Whitening(), []
+    for numbers in (20, 32, 33, 64, 65, 128, 200):
+        whitening.take(torch.zeros(50), torch.randn(50, numbers), None)
+        sizes.append(whitening.projection.nbytes / (50 * numbers))
+    assert sizes[:6] == pytest.approx([2, 2, 1, 1, 0.5, 0.5], rel=0.02)
+    assert sizes[6] == 0.5
 
 
 @pytest.mark.parametrize("bits", [4, 8, 16])
