@@ -69,7 +69,8 @@ class Coder(nn.Module):
         with torch.autocast(descriptors.device.type, enabled=False):
             components = to_length((descriptors.to(self.mean.dtype) - self.mean) @ self.projection)
             if self.training and self.noise:
-                components = to_length(components + self.noise * torch.randn_like(components))
+                noise = torch.randn(components.shape).to(components)  # the same on every device
+                components = to_length(components + self.noise * noise)
         coded: Tensor = self.layers(components)
         return coded
 
