@@ -61,7 +61,9 @@ class Coder(nn.Module):
         """Set `learned_whitening` of (n,K) views and the (n,K) places that they show."""
         mean, projection = learned_whitening(views, places, self.projection.shape[1])
         self.mean.copy_(mean)
-        self.projection.copy_(projection)
+        # an eigenvector may have either sign, on which the layers behind it hang
+        largest = projection.gather(0, projection.abs().argmax(0, keepdim=True))
+        self.projection.copy_(projection * largest.sign())
         self.whitened.fill_(True)
 
     def forward(self, descriptors: Tensor) -> Tensor:

@@ -46,8 +46,7 @@ def learned_whitening(
 
     With d = (view - place) / 2, m = (view + place) / 2, C = E[d d^T], B = Cov[m], shrinkage a in (0, 1] (None
     is `oracle_shrinkage`, at least 0.03) and W = (1 - a) C + a tr(C) / K I, P has the `kept` directions with
-    the largest p^T B p / p^T W p, scaled to p^T W p = 1 (Mikolajczyk and Matas, ICCV 2007). Of each, the
-    number of the largest size is positive: a library may give an eigenvector either sign.
+    the largest p^T B p / p^T W p, scaled to p^T W p = 1 (Mikolajczyk and Matas, ICCV 2007).
 
     Shape: (n,K), (n,K) -> mean (K,), P (K,kept), float32.
     """
@@ -70,9 +69,7 @@ def learned_whitening(
     # P = L^-T E, where W = L L^T and E holds the eigenvectors of L^-1 B L^-T
     unit = torch.linalg.inv(torch.linalg.cholesky(within))
     vectors = torch.linalg.eigh(unit @ (second - torch.outer(mean, mean)) @ unit.T).eigenvectors.flip(1)
-    projection = unit.T @ vectors[:, :kept]
-    largest = projection.gather(0, projection.abs().argmax(0, keepdim=True))
-    return mean.float(), (projection * largest.sign()).float()
+    return mean.float(), (unit.T @ vectors[:, :kept]).float()
 
 
 def oracle_shrinkage(covariance: Tensor, samples: int) -> float:

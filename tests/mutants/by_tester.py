@@ -555,9 +555,9 @@ MUTANTS = [
     ),
     Mutant(
         "A code is trained alike whatever signs a library gives eigenvectors.",
-        "dejavu_torch/features/whitening.py",
-        "(projection * largest.sign()).float()",
-        "projection.float()",
+        "dejavu_torch/features/embedding.py",
+        "projection * largest.sign()",
+        "projection",
         ("tests/training/test_training_on_gpu.py::-k stages",),
     ),
     Mutant(
