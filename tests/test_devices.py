@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterator
 from contextlib import nullcontext
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from command_line import fails, run
-from torch import Tensor
+from devices import DEVICE, pretend
+from torch import Tensor, nn
 
 from dejavu_torch import (
+    HOG,
     DejaVu,
+    Embedding,
     FrequencyLayer,
+    GroundOdometry,
     ImposedPeriods,
     LiveLocalizer,
+    PhaseTemplates,
     PlaceFilter,
     Preprocess,
     SequenceMatcher,
@@ -25,13 +32,24 @@ from dejavu_torch import (
     TemplateMap,
     TemplateMapper,
     Whitening,
+    compare,
+    evaluate,
+    growth,
+    learning,
     open_source,
 )
 from dejavu_torch.cli.device import device_of
 from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.evaluation.controls import leave_out_match, null_control
+from dejavu_torch.features.augmentation import Augmentation
+from dejavu_torch.features.cnn import SmallCNN
+from dejavu_torch.features.distilled import Distilled
+from dejavu_torch.features.joined import Joined
+from dejavu_torch.features.pixels import PatchPixels
+from dejavu_torch.features.views import Views
 from dejavu_torch.maps.place_map import Mapper
-from dejavu_torch.recognition.select import best_candidates
-from dejavu_torch.types import SequenceModel
+from dejavu_torch.recognition import coarse
+from dejavu_torch.recognition.select import best_candidates, best_match
 
 SEQUENCES = [PlaceFilter(), PlaceFilter(search_every=5), SequenceMatcher(3), None]
 ELSEWHERE = f"cuda:{torch.cuda.device_count()}"  # the first that is not there
@@ -51,7 +69,9 @@ def models() -> dict[str, DejaVu]:
 
 @pytest.fixture(scope="module")
 def frames() -> Tensor:
-    return torch.cat(list(open_source("sim:aerial?frames=60").batches(64)))
+    """(40,3,32,32)"""
+    whole = torch.cat(list(open_source("sim:aerial?frames=40").batches(64)))
+    return nn.functional.interpolate(whole, (32, 32), mode="area")
 
 
 @pytest.mark.parametrize("kind", models())
@@ -60,19 +80,100 @@ def test_a_frame_stays_on_its_device(kind: str, frames: Tensor, monkeypatch: pyt
     monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())  # which does not know meta
     model = models()[kind].learn(frames).to("meta")
     with torch.no_grad():
-        scores = model(torch.empty(4, 3, 64, 64, device="meta"))
-        descriptors = model.whitened(model.describe(torch.empty(4, 3, 64, 64, device="meta")))
+        scores = model(torch.empty(4, 3, 32, 32, device="meta"))
+        descriptors = model.whitened(model.describe(torch.empty(4, 3, 32, 32, device="meta")))
         together = PlaceFilter()(model.map.scores(descriptors))
-        assert (together.device.type, together.shape) == ("meta", (4, 60))
+        assert (together.device.type, together.shape) == ("meta", (4, 40))
         assert best_candidates(scores, 3, 5).index.device.type == "meta"
     with pytest.raises(RuntimeError, match="device"):
         torch.zeros(1) + scores[0, :1]
 
 
-# on the CPU as well, so that the tests themselves run everywhere
+PLAN = tuple(FrequencyLayer(Fraction(p), p, 0, 12, (0, 1)) for p in (3, 4))
+MODULES: dict[str, nn.Module] = {
+    "HOG": HOG(),
+    "Distilled": Distilled(),
+    "Joined": Joined([HOG(), PatchPixels()]),
+    "PatchPixels": PatchPixels(),
+    "SmallCNN": SmallCNN(8, channels=3, resize=(16, 16), widths=(4, 8), squeeze=4),
+    "Embedding": Embedding(nn.Conv2d(3, 8, 3), 8, hidden=12, cell=4, resize=(16, 16), mean=0.5, std=0.2),
+    "Preprocess": Preprocess(channel="grey", contrast="patch"),
+    "Augmentation": Augmentation(perspective=3.0),
+}
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_a_module_gives_what_it_gives_on_the_cpu(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its numbers on a device, its shape on `meta`; but an augmentation draws numbers of its own, and looks
+    at them."""
+    frames, module = torch.rand(3, 3, 32, 32), MODULES[name].train(name == "Augmentation")
+    expected = module(frames)
+    with pretend() as device:
+        found = copy.deepcopy(module).to(device)(frames.to(device))
+        assert found.device == device
+        if name == "Augmentation":
+            return
+        torch.testing.assert_close(found.cpu(), expected, rtol=1e-4, atol=1e-4)
+    monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())
+    there = copy.deepcopy(module).to("meta")(frames.to("meta"))
+    assert (there.device.type, there.shape, there.dtype) == ("meta", expected.shape, expected.dtype)
+
+
+def test_what_has_no_frames_stays_on_its_device() -> None:
+    features, scores = torch.rand(12, 2), torch.rand(9, 30)
+    blocks, matches = PhaseTemplates()(features, PLAN), best_candidates(scores, 2, 5)
+    with pretend() as device:
+        for there in (device, torch.device("meta")):
+            found = PhaseTemplates()(features.to(there), PLAN)
+            assert [(one.shape, one.device) for one in found] == [(one.shape, there) for one in blocks]
+            index = best_candidates(scores.to(there), 2, 5).index
+            assert (index.shape, index.device) == (matches.index.shape, there)
+        for one in (SequenceMatcher(3), SequenceMatcher(3, speeds=(0.5, 1, 2)), PlaceFilter()):
+            expected = one(scores)  # these look at numbers, which `meta` lacks
+            torch.testing.assert_close(one.to(device)(scores.to(device)).cpu(), expected)
+
+
+def refused_mixtures(device: torch.device) -> dict[str, object]:
+    there = torch.arange(3.0, device=device)
+    return {
+        "an index": lambda: torch.zeros(3)[there.long()],
+        "a mask": lambda: torch.zeros(3)[there > 0],
+        "a sum": lambda: there + torch.zeros(3),
+        "a number among rows": lambda: torch.stack([there[0], torch.tensor(0.0)]),
+        "values put": lambda: there.index_put((torch.tensor([0]),), torch.zeros(1)),
+        "another's generator": lambda: torch.rand(3, generator=torch.Generator(), device=device),
+        "numpy": there.numpy,
+    }
+
+
+@pytest.mark.parametrize("name", refused_mixtures(torch.device("cpu")))
+def test_the_pretended_device_refuses(name: str) -> None:
+    with pretend() as device, pytest.raises((RuntimeError, TypeError), match="device"):
+        refused_mixtures(device)[name]()  # type: ignore[operator]
+
+
+def test_the_pretended_device_takes_what_a_gpu_takes() -> None:
+    with pretend() as device:
+        there = torch.arange(3.0, device=device)
+        made = there.new_zeros(2), torch.zeros(2).to(there), torch.tensor([1.0], device=there.device)
+        assert {one.device for one in (*made, nn.Linear(2, 2).to(device).weight)} == {device}
+        assert there[torch.tensor([1, 2])].tolist() == [1, 2]
+        assert (there * torch.tensor(2.0)).tolist() == [0, 2, 4]
+        assert torch.zeros(3).copy_(there).device.type == "cpu"
+        there[:2] += 1
+        assert there.cpu().numpy().tolist() == [1, 2, 2]
+        assert there.topk(1).indices.item() != there.cpu().topk(1).indices.item()
+
+
 CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
 GPU = pytest.param("cuda", marks=[pytest.mark.gpu, CUDA])
-DEVICES = ["cpu", GPU]
+
+
+@pytest.fixture(params=[DEVICE.type, GPU])
+def device(request: pytest.FixtureRequest) -> Iterator[str]:
+    """The pretended device, and a GPU where there is one."""
+    with pretend() if request.param == DEVICE.type else nullcontext():
+        yield request.param
 
 
 @pytest.fixture(autouse=True)
@@ -83,17 +184,29 @@ def whole_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
 
 LEARNED: dict[str, Mapper] = {
     "templates": TemplateMapper(ImposedPeriods([3, 4, 5], bin=4)),
-    "found": TemplateMapper(SpectrogramAnalysis(60, false_alarm=None), reduction="sum", temperature=3.0),
+    "found": TemplateMapper(SpectrogramAnalysis(40, false_alarm=None), reduction="sum", temperature=3.0),
     "spectral": SpectralMapper(None, step=1e-4),  # so fine that what rounding moves by a step is not seen
     "chunks": SpectralMapper(None, step=1e-4, chunk=16, transform="dct", metric="l2"),
 }
 
 
-@pytest.mark.parametrize("device", DEVICES)
+def small(**settings: Any) -> DejaVu:
+    return DejaVu(**{"features": HOG(), "mapper": SpectralMapper(chunk=30)} | settings)
+
+
+@pytest.fixture(scope="module")
+def visits(frames: Tensor) -> tuple[ArrayTraverse, ArrayTraverse]:
+    """A route, and a second visit."""
+    return ArrayTraverse(frames), ArrayTraverse(0.9 * frames + 0.02 * torch.rand_like(frames))
+
+
+Visits = tuple[ArrayTraverse, ArrayTraverse]
+
+
 @pytest.mark.parametrize("kind", LEARNED)
 def test_a_map_learned_on_a_gpu_scores_as_that_of_the_cpu(kind: str, device: str, frames: Tensor) -> None:
     maps = [DejaVu(whitening="none", mapper=LEARNED[kind]).to(one).learn(frames) for one in ("cpu", device)]
-    query = frames[3:40:4] * 0.9 + 0.02
+    query = frames[3::4] * 0.9 + 0.02
     scores, found = (model(query.to(model.map.positions.device)) for model in maps)
     assert found.device.type == device
     assert scores.isfinite().all()
@@ -103,7 +216,6 @@ def test_a_map_learned_on_a_gpu_scores_as_that_of_the_cpu(kind: str, device: str
     assert matches[0].index.tolist() == matches[1].index.tolist()
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_a_whitening_learned_on_a_gpu_is_that_of_the_cpu(device: str, frames: Tensor) -> None:
     whitening = Whitening(numbers=8, views=2, bits=16)
     models = [DejaVu(whitening=copy.deepcopy(whitening)).to(one).learn(frames) for one in ("cpu", device)]
@@ -112,12 +224,10 @@ def test_a_whitening_learned_on_a_gpu_is_that_of_the_cpu(device: str, frames: Te
     torch.testing.assert_close(known[1] @ known[1].T, known[0] @ known[0].T, rtol=1e-3, atol=1e-3)
 
 
-@pytest.mark.parametrize("device", DEVICES)
-def test_a_map_calibrated_on_a_gpu_is_as_sure_as_that_of_the_cpu(device: str, frames: Tensor) -> None:
-    traverse = ArrayTraverse(frames)
-    models = [DejaVu(whitening="none", mapper=LEARNED["spectral"]).to(one) for one in ("cpu", device)]
+def test_a_map_calibrated_on_a_gpu_is_as_sure_as_that_of_the_cpu(device: str, visits: Visits) -> None:
+    models = [small(whitening="none", mapper=LEARNED["spectral"]).to(one) for one in ("cpu", device)]
     for model in models:
-        model.learn(traverse).calibrate(traverse)
+        model.learn(visits[0]).calibrate(visits[0], Views(visits[1], torch.arange(40)))
     expected, found = (model.calibration for model in models)
     assert expected is not None
     assert found is not None
@@ -126,7 +236,6 @@ def test_a_map_calibrated_on_a_gpu_is_as_sure_as_that_of_the_cpu(device: str, fr
     assert found.filter == pytest.approx(expected.filter, rel=1e-2)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_two_layers_are_searched_on_a_gpu(device: str) -> None:
     plan = tuple(FrequencyLayer(Fraction(p), p, 5, 60_000, (j,)) for j, p in enumerate((210, 286)))
     generator = torch.Generator().manual_seed(0)
@@ -141,27 +250,92 @@ def test_two_layers_are_searched_on_a_gpu(device: str) -> None:
     assert torch.equal(route.scores(queries).gather(1, place[:, None])[:, 0], score)
 
 
-@pytest.mark.parametrize("device", [GPU])
-@pytest.mark.parametrize("sequence", SEQUENCES)
 @pytest.mark.parametrize("kind", models())
-def test_a_gpu_finds_what_the_cpu_finds(
-    kind: str, sequence: SequenceModel | None, device: str, frames: Tensor
-) -> None:
+def test_a_gpu_finds_what_the_cpu_finds(kind: str, device: str, frames: Tensor) -> None:
     here = models()[kind].learn(frames)
     there = models()[kind].to(device).learn(frames)
     assert {tensor.device.type for tensor in there.state_dict().values() if isinstance(tensor, Tensor)} == {
         device
     }
-    expected = here.localize(frames, sequence=sequence)
     there.load_state_dict(here.state_dict())  # learned alike but for rounding
-    match = there.localize(frames, sequence=sequence)
-    assert match.score.device.type == "cpu"
-    torch.testing.assert_close(match.score, expected.score, rtol=1e-4, atol=1e-4)
-    localizer = LiveLocalizer(there, sequence)
-    found = [localizer(frame).score for frame in frames]
-    assert found == pytest.approx(expected.score.tolist(), rel=1e-4, abs=1e-4)
-    assert localizer.scores is not None
-    assert localizer.scores.device.type == device
+    queries = frames[::8]
+    candidates = there.candidates(queries, 2)
+    assert torch.equal(candidates.score[:, 0], there.localize(queries).score)
+    for sequence in SEQUENCES:
+        expected = here.localize(queries, sequence=sequence)
+        match = there.localize(queries, sequence=sequence)
+        assert match.score.device.type == "cpu"
+        torch.testing.assert_close(match.score, expected.score, rtol=1e-4, atol=1e-4)
+        localizer = LiveLocalizer(there, sequence)
+        found = [localizer(frame).score for frame in queries]
+        assert found == pytest.approx(expected.score.tolist(), rel=1e-4, abs=1e-4)
+        assert localizer.scores is not None
+        assert localizer.scores.device.type == device
+
+
+@pytest.mark.parametrize("mapper", ["templates", "spectral"])
+def test_a_comparison_runs_on_a_gpu(
+    mapper: str, device: str, visits: Visits, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With calibration, baselines and nulls; the map is then saved, and loaded to the device."""
+    for drawn in ("draw_pictures", "draw_reliability"):  # from a model on the CPU
+        monkeypatch.setattr(f"dejavu_torch.evaluation.compare.{drawn}", lambda *_: {})
+    chosen = LEARNED["templates"] if mapper == "templates" else SpectralMapper()
+    compared = compare(*visits, "0", small(mapper=chosen).to(device), ordered=True, top=2)
+    assert compared.report.ours.scores is not None
+    model, path = compared.run.model, tmp_path / "map.safetensors"
+    model.to(device).save(path)
+    other = DejaVu.load(path).to(device)
+    assert torch.equal(other.localize(visits[1]).index, model.cpu().localize(visits[1]).index)
+
+
+def test_a_map_grows_on_a_gpu(device: str, visits: Visits) -> None:
+    route, again = visits
+    second = Views(again, torch.arange(40))
+    model = small().to(device).learn(route, second=second, visits=second)
+    model.calibrate(route, second)
+    grown = growth.append(copy.deepcopy(model), again, visits=Views(route, torch.arange(40)))
+    assert growth.average(model, Views(again, torch.arange(40))) == 40
+    merged = growth.merge([model, grown], ["a", "b"])
+    assert merged.map.places == 120
+    for sequence in (PlaceFilter(), SequenceMatcher(3), None):
+        assert merged.localize(torch.cat([*again.batches(5)])[::8], sequence=sequence).index.shape == (5,)
+    assert {one.device.type for one in merged.state_dict().values() if isinstance(one, Tensor)} == {device}
+
+
+def test_a_long_route_is_learned_and_searched_on_a_gpu(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From a sample, chunk by chunk, with principal components of wide features; then by its own samples."""
+    monkeypatch.setattr(learning, "SAMPLE", 200)
+    monkeypatch.setattr(coarse, "MIN_PLACES", 100)
+    wave = torch.sin(0.05 * torch.arange(600.0)[:, None] * torch.rand(260) + torch.arange(260))
+    model = DejaVu(mapper=SpectralMapper(8.0, chunk=200)).to(device).learn(wave)
+    queries = wave[::50] + 0.01
+    expected = model.localize(queries, search="scan")
+    for search in ("coarse", "exact"):
+        assert torch.equal(model.localize(queries, search=search).index, expected.index)
+        assert model._coarse[1] is not None
+
+
+def test_even_steps_are_learned_on_a_gpu(device: str) -> None:
+    strip = nn.functional.interpolate(torch.rand(1, 1, 60, 16), scale_factor=4)[0]
+    frames = torch.stack([strip[:, 2 * i : 2 * i + 64] for i in range(40)]).flip(0)
+    model = small(velocity=GroundOdometry(step=3.0, size=(32, 32))).to(device).learn(frames)
+    assert model.map.positions.device.type == device
+    shown = model.map.frame_of(model.localize(frames).index)
+    assert (shown.device.type, int(shown.diff().min()) >= 0) == ("cpu", True)
+    assert GroundOdometry().to(device)(frames[:3].to(device))[0].device.type == device
+
+
+def test_controls_and_scores_are_computed_on_a_gpu(device: str, visits: Visits) -> None:
+    model = small(mapper=LEARNED["templates"]).to(device).learn(visits[0])
+    features = model.describe(next(visits[0].batches(40)).to(device))
+    for same in (True, False):
+        assert null_control(model, features, features, same_plan=same).index.shape == (40,)
+    assert leave_out_match(model, features, 2).index.shape == (40,)
+    match, truth = best_match(model.map.scores(features)), torch.arange(40)[:, None]
+    assert match.index.device.type == device
+    scores = evaluate(match.map(Tensor.cpu), truth, 2)
+    assert evaluate(match, truth, 2) == evaluate(match, truth.to(device), 2) == scores
 
 
 @pytest.mark.gpu

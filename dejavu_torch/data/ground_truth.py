@@ -46,7 +46,7 @@ def as_ground_truth(truth: Tensor | GroundTruth) -> GroundTruth:
     """Correct places (Q,R), -1 as padding, as a GroundTruth in which every query is judged."""
     if isinstance(truth, GroundTruth):
         return truth
-    judged = torch.ones(len(truth), dtype=torch.bool)
+    judged = torch.ones(len(truth), dtype=torch.bool, device=truth.device)
     return GroundTruth(truth, judged, truth.new_zeros(len(truth), 0))
 
 

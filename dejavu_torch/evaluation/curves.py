@@ -75,7 +75,7 @@ def pr_curve(
     last = torch.ones_like(ordered, dtype=torch.bool)
     last[:-1] = ordered[1:] != ordered[:-1]
     tp = true_positives[last]
-    accepted = torch.arange(1, len(ordered) + 1, dtype=torch.float64)[last]
+    accepted = torch.arange(1, len(ordered) + 1, device=score.device)[last].double()
     total = answerable.sum().double()
     # each answerable query that has not reported yet is a false negative
     relevant = total if recall == "all" else tp + (total - answered[last])
@@ -236,9 +236,9 @@ def check_truth(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> No
 
 
 def _judged(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> tuple[Match, GroundTruth]:
-    """Matches and truth of the queries that are scored."""
+    """Matches and truth of the queries that are scored, on the CPU."""
     check_truth(match, truth, tolerance)
-    truth = as_ground_truth(truth)
+    match, truth = match.map(Tensor.cpu), GroundTruth(*(part.cpu() for part in as_ground_truth(truth)))
     kept = counted(match.index, truth, tolerance)
     if not kept.any():
         seen = f"of {len(kept)} queries {int(truth.judged.sum())} are in the truth and none can be judged"

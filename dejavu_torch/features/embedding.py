@@ -61,7 +61,9 @@ class Coder(nn.Module):
         """Set `learned_whitening` of (n,K) views and the (n,K) places that they show."""
         mean, projection = learned_whitening(views, places, self.projection.shape[1])
         self.mean.copy_(mean)
-        self.projection.copy_(projection)
+        # an eigenvector may have either sign, on which the layers behind it hang
+        largest = projection.gather(0, projection.abs().argmax(0, keepdim=True))
+        self.projection.copy_(projection * largest.sign())
         self.whitened.fill_(True)
 
     def forward(self, descriptors: Tensor) -> Tensor:
@@ -69,7 +71,8 @@ class Coder(nn.Module):
         with torch.autocast(descriptors.device.type, enabled=False):
             components = to_length((descriptors.to(self.mean.dtype) - self.mean) @ self.projection)
             if self.training and self.noise:
-                components = to_length(components + self.noise * torch.randn_like(components))
+                noise = torch.randn(components.shape).to(components)  # the same on every device
+                components = to_length(components + self.noise * noise)
         coded: Tensor = self.layers(components)
         return coded
 

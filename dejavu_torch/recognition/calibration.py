@@ -72,7 +72,7 @@ def fit(confidence: Tensor, right: Tensor, weight: Tensor | None = None) -> Plat
     columns = torch.stack([(x - mean) / spread, torch.ones_like(x)], 1)
     hits, misses = float(weight[y].sum()), float(weight[~y].sum())
     target = torch.where(y, (hits + 1) / (hits + 2), 1 / (misses + 2)).double()
-    params = torch.tensor([0.0, math.log((hits + 1) / (misses + 1))], dtype=torch.float64)
+    params = x.new_tensor([0.0, math.log((hits + 1) / (misses + 1))])
 
     def loss(at: Tensor) -> Tensor:
         return F.binary_cross_entropy_with_logits(columns @ at, target, weight, reduction="sum")
@@ -80,7 +80,7 @@ def fit(confidence: Tensor, right: Tensor, weight: Tensor | None = None) -> Plat
     for _ in range(MAX_STEPS):
         p = torch.sigmoid(columns @ params)
         curvature = (columns * (weight * p * (1 - p))[:, None]).T @ columns
-        curvature += 1e-9 * torch.eye(2, dtype=torch.float64)
+        curvature.diagonal().add_(1e-9)
         step = torch.linalg.solve(curvature, columns.T @ (weight * (p - target)))
         while loss(params - step) > loss(params) and float(step.abs().max()) > 1e-9:
             step = step / 2
@@ -163,7 +163,7 @@ def calibrated(
                 index = best_match(scored).index
                 right = ((index - places).abs() <= TOLERANCE) & (index >= 0) & on_map
                 columns = confidences, right, torch.full_like(right, on_map)
-                rows.append(tuple(column[places >= 0].cpu() for column in columns))
+                rows.append(tuple(column.cpu()[places.cpu() >= 0] for column in columns))
     if not answers[0]:
         raise InputError("there are no queries to calibrate by; expected some")
     platts: list[Platt | None] = []

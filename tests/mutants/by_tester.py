@@ -546,4 +546,25 @@ MUTANTS = [
         "if False else []",
         ("tests/test_faults.py::-k what_is_read",),
     ),
+    Mutant(
+        "A map is calibrated on a GPU, whose places are no index of what a filter's track keeps on the CPU.",
+        "dejavu_torch/recognition/calibration.py",
+        "column.cpu()[places.cpu() >= 0]",
+        "column[places >= 0].cpu()",
+        ("tests/test_devices.py::-k calibrated_on_a_gpu",),
+    ),
+    Mutant(
+        "A code is trained alike whatever signs a library gives eigenvectors.",
+        "dejavu_torch/features/embedding.py",
+        "projection * largest.sign()",
+        "projection",
+        ("tests/training/test_training_on_gpu.py::-k stages",),
+    ),
+    Mutant(
+        "The noise of a code is the same on every device.",
+        "dejavu_torch/features/embedding.py",
+        "torch.randn(components.shape).to(components)",
+        "torch.randn_like(components)",
+        ("tests/training/test_training_on_gpu.py::-k stages",),
+    ),
 ]

@@ -34,13 +34,13 @@ from dejavu_torch.training.task import PlaceRecognitionTask
 BATCH = 16  # of all processes
 
 
-def residues() -> Embedding:
-    """With batch normalisation, which is by each process's part of a batch."""
+def residues(noise: float = 0.0) -> Embedding:
+    """With batch normalisation, which is by each process's part of a batch; each draws its own noise."""
     first = nn.Conv2d(1, 4, 3, stride=2, bias=False)
     network = nn.Sequential(first, nn.BatchNorm2d(4), nn.ReLU(), nn.Conv2d(4, 8, 3))
     made = Embedding(network, dimension=8, hidden=12, channels=1, resize=(16, 16))
     assert made.coder is not None
-    made.coder.noise = 0.0  # each process draws its own
+    made.coder.noise = noise
     return made
 
 

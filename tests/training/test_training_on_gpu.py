@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from devices import DEVICE, pretend
+from pytorch_lightning.accelerators import CPUAccelerator
+from pytorch_lightning.strategies import SingleDeviceStrategy
 from small_training import backbone, data_of, footage, still, trainer
 from test_several_processes import CASES, Steps, residues
 
@@ -19,18 +23,29 @@ CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
 GPU = pytest.param("cuda", marks=[pytest.mark.gpu, CUDA])
 
 
+class Accelerator(CPUAccelerator):
+    """Of the pretended device."""
+
+    def setup_device(self, device: torch.device) -> None:
+        pass
+
+
 def trained(case: str, device: str, folder: Path, **settings: Any) -> tuple[list[dict[str, float]], DejaVu]:
     """What the steps log, and the map that is written."""
     torch.manual_seed(0)
-    task = PlaceRecognitionTask(residues() if case == "stages" else backbone(), **CASES[case], lr=1e-2)
-    steps = Steps()
-    running = trainer(folder, steps, max_steps=6, accelerator=device, devices=1)
+    network = residues(noise=0.3) if case == "stages" else backbone()
+    task = PlaceRecognitionTask(network, **CASES[case], lr=1e-2)
+    steps, where = Steps(), {"accelerator": device}
+    if device == DEVICE.type:
+        where = {"accelerator": "auto", "strategy": SingleDeviceStrategy(DEVICE, Accelerator())}
+    running = trainer(folder, steps, max_steps=6, devices=1, **where)
     torch.manual_seed(1)
-    running.fit(task, data_of(**{"second": footage(0.1), "augmentation": still()} | settings))
+    with pretend() if device == DEVICE.type else nullcontext():
+        running.fit(task, data_of(**{"second": footage(0.1), "augmentation": still()} | settings))
     return steps.figures, DejaVu.load(folder / "map.safetensors", task.dejavu.features)
 
 
-@pytest.mark.parametrize("device", ["cpu", GPU])
+@pytest.mark.parametrize("device", [DEVICE.type, GPU])
 @pytest.mark.parametrize("case", ["templates", "rate", "stages"])
 def test_losses_are_those_of_the_cpu(
     case: str, device: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -39,19 +54,22 @@ def test_losses_are_those_of_the_cpu(
     steps, _ = trained(case, "cpu", tmp_path / "here")
     found, model = trained(case, device, tmp_path / "there")
     assert len(steps) == len(found)
+    near = 1e-3 if case == "stages" else 1e-4  # whitening amplifies what rounds descriptors
     for step, other in zip(steps, found, strict=True):
         losses = {name: value for name, value in step.items() if name.startswith("train/")}
-        assert {name: other[name] for name in losses} == pytest.approx(losses, rel=1e-4, abs=1e-4)
+        assert {name: other[name] for name in losses} == pytest.approx(losses, rel=near, abs=near)
     assert model.map.places == 40
 
 
-@pytest.mark.gpu
-@CUDA
-def test_a_map_trained_on_a_gpu_scores_alike_on_both(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("device", [DEVICE.type, GPU])
+def test_a_map_trained_on_a_gpu_scores_alike_on_both(
+    device: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
     given = {"validation": footage(0.05), "validation_truth": "0"}
-    _, model = trained("augmented", "cuda", tmp_path, augmentation=Augmentation(), **given)
+    _, model = trained("augmented", device, tmp_path, augmentation=Augmentation(), **given)
     query = ArrayTraverse(footage(0.1))
     here = model.localize(query)
-    there = model.to("cuda").localize(query)
+    with pretend() if device == DEVICE.type else nullcontext():
+        there = model.to(device).localize(query)
     torch.testing.assert_close(there.score, here.score, rtol=1e-4, atol=1e-4)
