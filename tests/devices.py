@@ -116,10 +116,8 @@ def computed(func: Any, args: Any, kwargs: Any) -> Any:
         out = own_way(kind, func, own, kwargs)
 
     def there(one: Any) -> Any:
-        if isinstance(one, Tensor):
-            return (
-                held[id(one)] if id(one) in held else There(one)
-            )  # in place, an operation gives the tensor that it got
+        if isinstance(one, Tensor):  # an operation in place gives the tensor that it got
+            return held[id(one)] if id(one) in held else There(one)
         return type(one)(map(there, one)) if type(one) in (list, tuple) else one
 
     return there(out)
