@@ -43,12 +43,12 @@ _Components: TypeAlias = tuple[Tensor, Tensor, Tensor, int]  # mean, basis, vari
 
 
 def learned_whitening(
-    views: Tensor, places: Tensor, kept: int, shrinkage: float | None = 0.5
+    views: Tensor, places: Tensor, kept: int, shrinkage: float | None = 0.5, samples: int | None = None
 ) -> tuple[Tensor, Tensor]:
     """The projection to directions that distinguish places but change little between two views of one.
 
     With d = (view - place) / 2, m = (view + place) / 2, C = E[d d^T], B = Cov[m], shrinkage a in (0, 1] (None
-    is `oracle_shrinkage`, at least 0.03) and W = (1 - a) C + a tr(C) / K I, P has the `kept` directions with
+    is `oracle_shrinkage` of `samples` views, n if None, at least 0.03) and W = (1 - a) C + a tr(C) / K I, P has the `kept` directions with
     the largest p^T B p / p^T W p, scaled to p^T W p = 1 (Mikolajczyk and Matas, ICCV 2007).
 
     Shape: (n,K), (n,K) -> mean (K,), P (K,kept), float32.
@@ -66,7 +66,7 @@ def learned_whitening(
         seen = f"the mean square difference of {n} views from their places is {scale.item():.2g}"
         raise InputError(f"{seen}; expected a finite one above rounding: augmentation or a second traverse")
     if shrinkage is None:
-        shrinkage = max(SHRINKAGE, oracle_shrinkage(within, n))
+        shrinkage = max(SHRINKAGE, oracle_shrinkage(within, samples or n))
     within = (1 - shrinkage) * within
     within.diagonal().add_(shrinkage * scale)
     # P = L^-T E, where W = L L^T and E holds the eigenvectors of L^-1 B L^-T
@@ -268,8 +268,10 @@ class Whitening(nn.Module):
                 member.take(mean, basis, variances.mean().sqrt())
         else:
             pairs = _projected_views(places, views, found)
+            # copies of one frame are much alike: more of them are no further samples
+            samples = min(pairs[0].shape[1], VIEWS * len(places))
             for member, (mean, basis, _, kept), (shown, own) in zip(members, found, pairs, strict=True):
-                centre, projection = learned_whitening(shown, own, kept, self.shrinkage)
+                centre, projection = learned_whitening(shown, own, kept, self.shrinkage, samples)
                 member.take(mean + basis @ centre, basis @ projection, None)
         if groups is not None:
             some = places[:: max(1, len(places) // SAMPLED)].to(self.scale.device).split(sizes, 1)

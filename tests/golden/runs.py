@@ -1,4 +1,4 @@
-"""Six small runs of `dejavu compare`: report.json, matches.csv and the bytes of the map."""
+"""Seven small runs of `dejavu compare`: report.json, matches.csv and the bytes of the map."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
+import numpy as np
 
 from dejavu_torch.cli import main
 
@@ -22,14 +23,20 @@ def _visits(route: str) -> tuple[str, str]:
     return f"sim:{route}", f"sim:{route}&traverse=1"
 
 
-# few large components, in 16 bits: a whitening that does not multiply what another processor rounds otherwise
+# A whitening multiplies what another processor rounds otherwise, and turns directions of nearly equal variance:
+# the runs have none, or few large components.
+PLAIN = ("--features", "[HOG,Distilled]", "--whitening", "none")
 CALM = (
     *("--whitening.views", "2", "--whitening.components", "40", "--whitening.numbers", "24"),
     *("--whitening.shrinkage", "0.3", "--whitening.bits", "16"),
 )
-# {data} is DEJAVU_TEST_DATA
+# {data} is DEJAVU_TEST_DATA, {made} a folder of `descriptors`
 RUNS: dict[str, tuple[str, ...]] = {
-    "demo": (*_visits("aerial?seed=0&frames=400"), *CALM, "--storage_curve"),
+    "demo": (*_visits(f"aerial?seed=0&frames=300&{SMALL}"), *PLAIN),
+    "descriptors": (
+        *("{made}/0.npy", "{made}/1.npy", "--truth", "0", "--second", "{made}/2.npy", "--storage_curve"),
+        *("--second_truth", "0", "--whitening.numbers", "8", "--whitening.bits", "16", "--ordered"),
+    ),
     "paper": (*_visits(f"aerial?frames=200&{SMALL}"), "--config", "paper", "--mapper.periods.window", "100"),
     "templates": (
         *_visits(f"aerial?seed=1&frames=256&{SMALL}"),
@@ -38,7 +45,7 @@ RUNS: dict[str, tuple[str, ...]] = {
     "corridor": (
         "{data}/corridor/ref?width=64&height=48",
         "{data}/corridor/query?width=64&height=48",
-        *("--truth", "{data}/corridor/truth.csv", *CALM),
+        *("--truth", "{data}/corridor/truth.csv", *PLAIN),
     ),
     "sequence": (
         *_visits(f"aerial?seed=3&frames=200&noise=0.05&{SMALL}"),
@@ -61,24 +68,36 @@ EXACT = {
 }
 LOOSE = {"lines": 0.02, "noise_over_map": 0.02, "null_over_map": 0.1, "threshold_of_full_precision": 0.02}
 SCORE = 1e-4  # of scores and probabilities in matches.csv
-# the same of whitened maps, which another processor rounds otherwise
-WHITENED = {"demo": 2e-2, "corridor": 2e-3}
 SAME = 0.995  # of the places in it
+
+
+def descriptors(visit: int) -> np.ndarray:
+    """(400,16) float32 of a visit to a smooth route; variances that no rounding puts in another order."""
+    random = np.random.default_rng(7)
+    i, waves = np.arange(400)[:, None], random.integers(1, 40, 16)
+    route = sum(np.sin(2 * np.pi * (k * waves * i / 400 + random.random(16))) for k in (1, 2, 3))
+    noise = np.random.default_rng(visit).normal(size=(400, 16)) * np.linspace(0.2, 0.8, 16)
+    return ((route + noise) * 0.8 ** np.arange(16)).astype(np.float32)
 
 
 def run(name: str, out: Path, data: Path | None) -> None:
     """Run one of them; its pictures are of few pixels."""
-    words = [word.replace("{data}", str(data)) for word in RUNS[name]]
+    made = out.parent / f"{name}_made"
+    if any("{made}" in word for word in RUNS[name]):
+        made.mkdir()
+        for visit in range(3):
+            np.save(made / f"{visit}.npy", descriptors(visit))
+    words = [word.replace("{data}", str(data)).replace("{made}", str(made)) for word in RUNS[name]]
     with matplotlib.rc_context({"savefig.dpi": 10}):
         main(["compare", *words, "--out", str(out)])
 
 
 def write(name: str, out: Path, data: Path | None) -> None:
     """Run it, and keep what it made."""
-    run(name, out, data)
-    text = (out / "report.json").read_text().replace(str(data), "{data}")
+    run(name, out / "report", data)
+    text = (out / "report" / "report.json").read_text().replace(str(data), "{data}").replace(str(out), "")
     (HERE / f"{name}.report.json").write_text(text)
-    shutil.copyfile(out / "matches.csv", HERE / f"{name}.matches.csv")
+    shutil.copyfile(out / "report" / "matches.csv", HERE / f"{name}.matches.csv")
 
 
 def golden_report(name: str) -> dict[str, Any]:
