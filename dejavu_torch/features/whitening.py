@@ -24,6 +24,7 @@ PLACES_PER_DIMENSION = 2  # on a short route, at least
 COMPONENTS = 400  # principal components that are whitened, by default
 VIEWS = 4  # of a frame, at least
 VIEWS_PER_COMPONENT = 30  # at least: as 4 views of each of 3000 frames
+INDEPENDENT = 4  # views of a frame; others are so much like these that they are no further samples
 MAX_VIEWS = 12  # of a frame, unless a short route has fewer than COPIES then
 COPIES, MOST_OF_SHORT = 6000, 60  # of all frames, of each: chance decides less on a short route
 BITS = (4, 8, 16)  # of a number of the projection
@@ -268,8 +269,7 @@ class Whitening(nn.Module):
                 member.take(mean, basis, variances.mean().sqrt())
         else:
             pairs = _projected_views(places, views, found)
-            # copies of one frame are much alike: more of them are no further samples
-            samples = min(pairs[0].shape[1], VIEWS * len(places))
+            samples = min(pairs[0].shape[1], INDEPENDENT * len(places))
             for member, (mean, basis, _, kept), (shown, own) in zip(members, found, pairs, strict=True):
                 centre, projection = learned_whitening(shown, own, kept, self.shrinkage, samples)
                 member.take(mean + basis @ centre, basis @ projection, None)

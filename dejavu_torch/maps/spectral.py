@@ -22,8 +22,7 @@ log = logging.getLogger("dejavu_torch")
 ROWS = 2**14  # descriptors checked at a time
 HALF = 0.5  # share of the variance; a map that holds less reports the bytes that would hold `HELD`
 HELD = 0.85  # default share of the variance: such maps are nearly as accurate as their descriptors
-# lines take as many by default, if they then hold more: per place, and in all, which is little beside a whitening
-LINE_BYTES, SHORT_BYTES = 5.0, 6000
+LINE_BYTES = 5.0  # per place: lines take as many by default, if they then hold more
 
 
 class SpectralMapper(Mapper):
@@ -39,8 +38,7 @@ class SpectralMapper(Mapper):
             For video with many frames per place, 8 makes a better map than 0; with few, a worse one.
         hold: share of the descriptors' variance that the lines hold before `resolution` removes any: 1 -
             squared errors / squared differences from the mean. The step is the largest that holds it. None,
-            without bytes and step, is .85, or more if 5 bytes per place or 6 kB in all hold more, as with few
-            features or on a short route.
+            without bytes and step, is .85, or more if 5 bytes per place hold more, as with few features.
 
     Shape: descriptors (N,K) -> SpectralMap of N places.
 
@@ -152,7 +150,7 @@ class SpectralMapper(Mapper):
             return self.step
         if self.route_bytes_per_place is None:
             step = lines.even().step_that_holds(self.hold or HELD)
-            room = 0 if self.hold else max(LINE_BYTES * len(lines.lines), SHORT_BYTES)
+            room = 0 if self.hold else LINE_BYTES * len(lines.lines)
             return lines.step_of(room) if lines.coded_bytes(step) < room else step
         places, dimension = lines.lines.shape
         budget, least = self.route_bytes_per_place, (fixed + lines.coded_bytes(lines.coarsest)) / places
