@@ -18,7 +18,7 @@ from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.spectrum import from_spectrum, spectrum
 from dejavu_torch.recognition.localizer import SINGLE
-from dejavu_torch.text import bar
+from dejavu_torch.text import with_progress
 from dejavu_torch.types import InputError, Match
 
 BUDGETS = (1.0, 2.5, 5.0, 10.0, 20.0)  # route bytes per place
@@ -53,7 +53,7 @@ def coded_at_sizes(
     }
     found: dict[str, list[Stored]] = {key: [] for key in kinds}
     cases = [(key, budget) for key in kinds for budget in budgets]
-    for key, budget in bar(cases, "storage" if progress else None):
+    for key, budget in with_progress(cases, "storage" if progress else None):
         for answers, size in kinds[key](budget):
             answers = answers.renumbered(route.table.scored)
             scores = evaluate(answers, run.truth, run.tolerance)

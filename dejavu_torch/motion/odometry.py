@@ -9,13 +9,12 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor, nn
-from tqdm import tqdm
 
 from dejavu_torch.data.frame_range import runs
 from dejavu_torch.motion.flow import flow_shift, tracker
 from dejavu_torch.motion.ground_plane import TRAPEZIUM, Corners, check_corners, ground_patch
 from dejavu_torch.motion.phase_correlation import MIN_CONFIDENCE, phase_shifts, viterbi_path
-from dejavu_torch.text import settings_of
+from dejavu_torch.text import progress_of, settings_of
 from dejavu_torch.types import InputError, Traverse
 
 log = logging.getLogger("dejavu_torch")
@@ -122,15 +121,14 @@ class GroundOdometry(nn.Module):
         """
         last: list[Tensor] = []  # the last patch of the previous batch
         parts: list[tuple[Tensor, Tensor]] = []
-        text, hidden = "measuring the ground", None if progress else True
-        with tqdm(total=traverse.length, desc=text, unit="frame", disable=hidden, leave=False) as bar:
+        with progress_of("measuring the ground" if progress else None, traverse.length) as update:
             for batch in traverse.batches(traverse.batch_size(batch_size)):
                 patches = torch.cat([*last, ground_patch(batch, self.corners, self.size)])
                 if not last:
                     self._warn_coarse(batch, traverse.name)
                 parts += self._shifts(patches)
                 last = [patches[-1:]]
-                bar.update(len(batch))
+                update(len(batch))
         shift, confidence = (part.cpu() for part in self._path(parts, traverse.name))
         shift = interpolated(shift.double(), confidence >= self.least, traverse.name)
         shift = torch.where(shift.abs() < self.still, 0.0, shift)
