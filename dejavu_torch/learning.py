@@ -258,22 +258,25 @@ class ChunkCoder(NamedTuple):
     @torch.no_grad()
     def chunks(self, traverse: Traverse, wanted: range, label: str | None = None) -> Iterator[Chunk]:
         """Code a range of chunks, one at a time; InputError as from `feature_batches` and `code_chunk`."""
-        start, stop = self.span(wanted)
-        part = _ByChunks(traverse, start, stop, self.chunk)
-        held: list[Tensor] = []
-        done = start
-        with in_one_thread():
-            for rows in self.describer.descriptors(part, label):
-                held.append(rows)
-                done += len(rows)
-                if done % self.chunk == 0 or done == stop:
-                    rows, held = torch.cat(held), []
-                    if self.visits is not None:
-                        visits = views_of(self.visits, torch.arange(done - len(rows), done))
-                        rows = self.describer.averaged(rows, visits)
-                    yield self.code(rows)
-        if done < stop:
-            raise InputError(f"{traverse.name} ended at frame {done}; expected its {self.frames} frames")
+        part = _ByChunks(traverse, *self.span(wanted), self.chunk)
+        batches = self.describer.descriptors(part, label)
+        for start in wanted:
+            with in_one_thread():  # not while the caller has the chunk
+                chunk = self._next(batches, *self.span(range(start, start + 1)), traverse.name)
+            yield chunk
+
+    def _next(self, batches: Iterator[Tensor], start: int, stop: int, name: str) -> Chunk:
+        """Code the frames [start, stop), of which `batches` has the descriptors next."""
+        held, done = [], start
+        while done < stop:
+            if (rows := next(batches, None)) is None:
+                raise InputError(f"{name} ended at frame {done}; expected its {self.frames} frames")
+            held.append(rows)
+            done += len(rows)
+        rows = torch.cat(held)
+        if self.visits is not None:
+            rows = self.describer.averaged(rows, views_of(self.visits, torch.arange(start, stop)))
+        return self.code(rows)
 
 
 class _ByChunks(Traverse):
