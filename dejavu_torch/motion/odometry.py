@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from dejavu_torch.data.frame_range import runs
-from dejavu_torch.motion.flow import flow_shift, tracker
+from dejavu_torch.motion.flow import TRACKERS, flow_shift
 from dejavu_torch.motion.ground_plane import TRAPEZIUM, Corners, check_corners, ground_patch
 from dejavu_torch.motion.phase_correlation import MIN_CONFIDENCE, phase_shifts, viterbi_path
 from dejavu_torch.text import progress_of, settings_of
@@ -52,7 +52,7 @@ class GroundOdometry(nn.Module):
     Convention: if periodic ground allows several shifts, the smoothest path is chosen (`viterbi_path`).
 
     Raises:
-        InputError: an argument out of range, OpenCV missing; forward: not (N,C,H,W) float, or N of 1.
+        InputError: an argument out of range; forward: OpenCV missing, not (N,C,H,W) float, or N of 1.
 
     Example:
         >>> shift, confidence = GroundOdometry()(torch.rand(1, 3, 120, 160).expand(5, 3, 120, 160))
@@ -79,8 +79,8 @@ class GroundOdometry(nn.Module):
             raise InputError(f"least is {least}; expected a confidence from 0 to 1")
         if not 0 <= still < math.inf:
             raise InputError(f"still is {still}; expected pixels of ground, at least 0")
-        if flow != "phase":
-            tracker(flow)  # refuses other names, and a missing OpenCV
+        if flow not in ("phase", *TRACKERS):
+            raise InputError(f"flow is {flow!r}; expected phase, {', '.join(TRACKERS)}")
         self.corners = tuple((float(x), float(y)) for x, y in corners)
         self.size = (int(size[0]), int(size[1]))
         self.step = None if step is None else float(step)
