@@ -70,10 +70,10 @@ def noise_over_map(route: SpectralMap, features: Tensor, seed: int = 0) -> float
     segment with less energy than others, saves bytes too. All other savings come from smoothness.
     """
     lines = spectrum((features.float() - route.means[0].float()).T, route.transform)
-    band = (2 * torch.arange(1, lines.shape[1] + 1, device=lines.device).log2()).long()
+    band = (2 * torch.arange(1, lines.shape[1] + 1, device=lines.device).float().log2()).long()
     sums = lines.new_zeros(len(lines), int(band[-1]) + 1).index_add(1, band, lines.square())
     energy = (sums / band.bincount().clamp(min=1))[:, band]
-    normal = torch.randn(lines.shape, generator=torch.Generator().manual_seed(seed))
+    normal = torch.randn(lines.shape, dtype=torch.float32, generator=torch.Generator().manual_seed(seed))
     noise = from_spectrum(energy.sqrt() * normal.to(energy), route.transform).T + route.means[0].float()
     settings = route.chunk, route.transform, route.metric, route.resolution
     mapper = SpectralMapper(None, float(route.steps.mean()), *settings)
