@@ -159,9 +159,7 @@ class Describer(NamedTuple):
         """Descriptors (N,K) of places, averaged with those of visits to them."""
         if not len(visits.places):
             return rows
-        return with_visits(
-            rows.float(), torch.ones(len(rows), dtype=torch.float32), *self.visits(visits, label)
-        )
+        return with_visits(rows.float(), torch.ones(len(rows)).float(), *self.visits(visits, label))
 
     def seekable(self, views: Views, label: str | None = None) -> Views:
         """Views whose traverse `seeks`: the same, or their features, kept in a file if they are many."""
@@ -529,9 +527,7 @@ def is_ready(traverse: Traverse | None) -> bool:
 
 def positions_of(traverse: Traverse | None) -> Tensor:
     """(F,) even steps from the first place to each frame of a resampled traverse; otherwise (0,)."""
-    return (
-        traverse.positions if isinstance(traverse, ResampledTraverse) else torch.zeros(0, dtype=torch.float32)
-    )
+    return traverse.positions if isinstance(traverse, ResampledTraverse) else torch.zeros(0).float()
 
 
 def _with_places(batches: Iterator[Tensor], places: Tensor) -> Iterator[tuple[Tensor, Tensor]]:

@@ -130,11 +130,9 @@ class Augmentation(nn.Module):
         draw = (2 * _random(clips, 6, len(clips)) - 1) * _happens(clips, WARPED).flatten()
         angle, tilts = (turn * draw[0]).deg2rad(), (slant * draw[1:3]).deg2rad()
         zooms, moves = 1 + zoom * draw[3], draw[4:] * sides[:, None] * clips.new_tensor(shift)[:, None]
-        u = torch.arange(1 - width, width, 2, dtype=clips.dtype, device=clips.device) / (2 * longest)
-        v = torch.arange(1 - height, height, 2, dtype=clips.dtype, device=clips.device)[:, None] / (
-            2 * longest
-        )
-        points = torch.stack(torch.broadcast_tensors(u, v, u.new_ones(()))).flatten(1)
+        like = {"dtype": clips.dtype, "device": clips.device}
+        u, v = (torch.arange(1 - n, n, 2, **like) / (2 * longest) for n in (width, height))
+        points = torch.stack(torch.broadcast_tensors(u, v[:, None], u.new_ones(()))).flatten(1)
         source = _homography(angle, zooms, moves, tilts) @ points
         grid = (source[:, :2] / source[:, 2:]).mT * (2 / sides)
         images, grid = clips.flatten(1, 2), grid.view(-1, height, width, 2)

@@ -154,11 +154,9 @@ class Whitening(nn.Module):
         self.strengths = {**STRENGTHS, **(strengths or {})}
         self.fixed = False  # whether it comes from elsewhere and is not learned again
         self.register_buffer("projection", torch.zeros(0, 0, dtype=torch.int8))  # (D,K), see `take`
-        self.register_buffer("scale", torch.zeros(0, dtype=torch.float32))  # (K,)
-        self.register_buffer("offset", torch.zeros(0, dtype=torch.float32))  # (K,), the projected mean
-        self.register_buffer(
-            "length", torch.zeros(0, dtype=torch.float32)
-        )  # (1,), the constant dimension, or (0,)
+        self.register_buffer("scale", torch.zeros(0).float())  # (K,)
+        self.register_buffer("offset", torch.zeros(0).float())  # (K,), the projected mean
+        self.register_buffer("length", torch.zeros(0).float())  # (1,), the constant dimension, or (0,)
         self.members = nn.ModuleList()  # a whitening per group, whose outputs the projection joins
 
     @property
