@@ -130,8 +130,8 @@ class Augmentation(nn.Module):
         draw = (2 * _random(clips, 6, len(clips)) - 1) * _happens(clips, WARPED).flatten()
         angle, tilts = (turn * draw[0]).deg2rad(), (slant * draw[1:3]).deg2rad()
         zooms, moves = 1 + zoom * draw[3], draw[4:] * sides[:, None] * clips.new_tensor(shift)[:, None]
-        like: dict[str, Any] = {"dtype": clips.dtype, "device": clips.device}
-        u, v = (torch.arange(1 - n, n, 2, **like) / (2 * longest) for n in (width, height))
+        u, v = (torch.arange(1 - n, n, 2, device=clips.device) for n in (width, height))
+        u, v = (pixels.to(clips) / (2 * longest) for pixels in (u, v))
         points = torch.stack(torch.broadcast_tensors(u, v[:, None], u.new_ones(()))).flatten(1)
         source = _homography(angle, zooms, moves, tilts) @ points
         grid = (source[:, :2] / source[:, 2:]).mT * (2 / sides)
