@@ -265,8 +265,8 @@ def described(
 
 def both(model: DejaVu, reference: Traverse, query: Traverse) -> tuple[Tensor, Tensor]:
     """Descriptors of the reference, from which a missing whitening is learned, and of the query."""
-    places = model.describe_reference(reference, None, "describing")
-    return places.float(), model.extract_all(query, "describing the query").float()
+    places = model.describe_reference(reference, None, True)
+    return places.float(), model.extract_all(query, True).float()
 
 
 def contenders_of(route: Route, given: Mapping[str, DejaVu] | None = None) -> Iterator[Contender]:
@@ -376,7 +376,7 @@ def by_other_whitening(route: Route, name: str) -> Answer:
 def among(route: Route, keep: Callable[[], Kept]) -> Answer:
     """The nearest decoded descriptors of a store, by cosine."""
     kept = keep()
-    found = nearest_frames(kept.descriptors, route.queries, kept.apart, "cosine", None, route.matching)
+    found = nearest_frames(kept.descriptors, route.queries, kept.apart, "cosine", matching=route.matching)
     return found, kept.route, kept.fixed + route.fixed
 
 

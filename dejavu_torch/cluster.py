@@ -21,7 +21,6 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from tqdm import tqdm
 
 from dejavu_torch.data.output import SIGNALS
 from dejavu_torch.learning import ChunkCoder
@@ -29,7 +28,7 @@ from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.maps.spectral_map import Chunk, SpectralMap
 from dejavu_torch.recognition.coarse import coarse_search
 from dejavu_torch.recognition.search import Best, Search, Wanted, num_needed, search
-from dejavu_torch.text import one_line
+from dejavu_torch.text import one_line, progress_of
 from dejavu_torch.types import InputError, Traverse
 
 AUTO = "auto"
@@ -113,7 +112,7 @@ def code_on(
     coder: ChunkCoder,
     traverse: Traverse,
     wanted: range,
-    progress: str | None = None,
+    label: str | None = None,
     together: int = 0,
 ) -> Iterator[Chunk]:
     """As `ChunkCoder.chunks`, on a cluster: the same bytes in the same order.
@@ -130,14 +129,13 @@ def code_on(
     if not traverse.seeks:
         together = max(together, -(-len(wanted) // cluster.workers))
     tasks = [wanted[i : i + together] for i in range(0, len(wanted), together)]
-    total, disable = len(range(*coder.span(wanted))), None if progress else True
     done: dict[int, Chunk] = {}
     failed: dict[int, str] = {}
     following = wanted.start
-    with tqdm(total=total, desc=progress, unit="frame", disable=disable, leave=False) as bar:
+    with progress_of(label, len(range(*coder.span(wanted)))) as update:
         for task, chunks, failure in cluster.code(coder, traverse, tasks):
             done |= zip(task, chunks, strict=False)
-            bar.update(sum(chunk.places for chunk in chunks))
+            update(sum(chunk.places for chunk in chunks))
             if failure:
                 start, stop = coder.span(task[len(chunks) :])
                 failed[task[len(chunks)]] = f"frames {start} to {stop - 1}{failure}"

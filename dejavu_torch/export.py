@@ -161,7 +161,8 @@ def export_onnx(model: DejaVu, path: str | Path, sequence: SequenceModel | None 
         raise InputError(f"{seen}; expected at most {MAX_BYTES / 1e9:.1f} GB in an ONNX file")
     device = model.map.positions.device
     graph = Graph(model, sequence)
-    noise = torch.rand(TRIED, *model.frame_shape, generator=torch.Generator().manual_seed(0)).to(device)
+    shape, generator = (TRIED, *model.frame_shape), torch.Generator().manual_seed(0)
+    noise = torch.rand(shape, generator=generator, dtype=torch.float32).to(device)
     noise[1:, ..., : noise.shape[-1] // 2], noise[2:] = 0, 0  # half a flat frame, a flat frame
     facts = _facts(model, sequence)
     with torch.no_grad(), in_mode(graph, False), _quiet():

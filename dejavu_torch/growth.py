@@ -84,8 +84,8 @@ def append(
     if checkpoint is not None:
         own = digests(base=checksums(route.packed(), route.get_extra_state()))
         checkpoint.open(run_key(model, added, visits=visits) | own, added, grown, model.whitening)
-    text = "learning" if progress else None
-    learning.append_places(grown, model.describer, added, route.places, visits, text, checkpoint, code)
+    label = "learning" if progress else None
+    learning.append_places(grown, model.describer, added, route.places, visits, label, checkpoint, code)
     if counts is not None:
         before = grown.visit_counts
         grown.count_visits(before + F.pad(counts.to(before), (route.places, 0)))

@@ -61,16 +61,16 @@ class Describer(NamedTuple):
     warned: set[tuple[str, str]]  # (traverse, line) of warnings that were logged
 
     def features(
-        self, traverse: Traverse, progress: str | None = None, on_first: OnFirst | None = None
+        self, traverse: Traverse, label: str | None = None, on_first: OnFirst | None = None
     ) -> Iterator[Tensor]:
         """Batches (B,D) of features, without gradients; see `feature_batches`."""
-        return feature_batches(traverse, self.pipeline, self.batch_size, self.device, progress, on_first)
+        return feature_batches(traverse, self.pipeline, self.batch_size, self.device, label, on_first)
 
     def descriptors(
-        self, traverse: Traverse, progress: str | None = None, on_first: OnFirst | None = None
+        self, traverse: Traverse, label: str | None = None, on_first: OnFirst | None = None
     ) -> Iterator[Tensor]:
         """Batches (B,K) of descriptors, without gradients."""
-        return map(self.whitened, self.features(traverse, progress, on_first))
+        return map(self.whitened, self.features(traverse, label, on_first))
 
     def whitened(self, features: Tensor) -> Tensor:
         """Features (B,D) -> descriptors (B,K)."""
@@ -91,7 +91,7 @@ class Describer(NamedTuple):
         self,
         traverse: Traverse,
         second: Views | None = None,
-        progress: str | None = None,
+        label: str | None = None,
         spectral: bool = True,
     ) -> Tensor:
         """Descriptors (N,K) of a reference; the whitening is learned from it first, unless it is fixed.
@@ -113,13 +113,13 @@ class Describer(NamedTuple):
         if learns and spectral and self._exceeds_memory(traverse):
             sample = Sample.of(traverse.count(), SAMPLE)
             own = second and sample.views(second)
-            self.reference(Selection(traverse, sample.frame), own, progress and "sampling")
+            self.reference(Selection(traverse, sample.frame), own, label and "sampling")
         elif learns:
-            features = concatenate(self.features(traverse, progress, check_first))
-            self._learn_whitening(features, traverse, second, progress)
+            features = concatenate(self.features(traverse, label, check_first))
+            self._learn_whitening(features, traverse, second, label)
             return concatenate(self.whitened(part.to(self.device)) for part in features.split(ROWS))
         storage = (DESCRIPTOR_MEMORY, self.whitening is not None) if spectral else ()
-        return concatenate(self.descriptors(traverse, progress, check_first), *storage)
+        return concatenate(self.descriptors(traverse, label, check_first), *storage)
 
     def _exceeds_memory(self, traverse: Traverse) -> bool:
         """Whether the float32 features of a traverse longer than `SAMPLE` exceed the memory."""
@@ -127,7 +127,7 @@ class Describer(NamedTuple):
         return frames > SAMPLE and 4 * frames * self.count_features(traverse) > IN_MEMORY
 
     def _learn_whitening(
-        self, features: Tensor, traverse: Traverse, second: Views | None, progress: str | None
+        self, features: Tensor, traverse: Traverse, second: Views | None, label: str | None
     ) -> None:
         whitening = self.whitening
         assert whitening is not None
@@ -142,42 +142,44 @@ class Describer(NamedTuple):
         if second is None:
             whitening.learn(features, None, *groups)
         else:
-            batches = self.features(second.traverse, progress and f"learning what changes: {source}")
+            batches = self.features(second.traverse, label and f"learning what changes: {source}")
             whitening.learn(features, _with_places(batches, second.places.to(self.device)), *groups)
         whitening.to(self.device)
 
-    def visits(self, views: Views, progress: str | None = None) -> tuple[Tensor, Tensor]:
+    def visits(self, views: Views, label: str | None = None) -> tuple[Tensor, Tensor]:
         """Descriptors (n,K) of the frames with a known place, and these places (n,)."""
-        rows = concatenate(self.descriptors(views.traverse, progress and "averaging"))
+        rows = concatenate(self.descriptors(views.traverse, label and "averaging"))
         if len(rows) != len(views.places):
             seen = f"{views.traverse.name} gives {len(rows)} descriptors for {len(views.places)} places"
             raise InputError(f"{seen}; expected one for each")
         known = views.places.to(rows.device) >= 0
         return rows[known], views.places[known.to(views.places.device)]
 
-    def averaged(self, rows: Tensor, visits: Views, progress: str | None = None) -> Tensor:
+    def averaged(self, rows: Tensor, visits: Views, label: str | None = None) -> Tensor:
         """Descriptors (N,K) of places, averaged with those of visits to them."""
         if not len(visits.places):
             return rows
-        return with_visits(rows.float(), torch.ones(len(rows)), *self.visits(visits, progress))
+        return with_visits(rows.float(), torch.ones(len(rows)).float(), *self.visits(visits, label))
 
-    def seekable(self, views: Views, progress: str | None = None) -> Views:
+    def seekable(self, views: Views, label: str | None = None) -> Views:
         """Views whose traverse `seeks`: the same, or their features, kept in a file if they are many."""
         if views.traverse.seeks:
             return views
-        features = concatenate(self.features(views.traverse, progress and "averaging"))
+        features = concatenate(self.features(views.traverse, label and "averaging"))
         return Views(ArrayTraverse(features.cpu(), views.traverse.name), views.places)
 
-    def check_sizes(self, reference: Traverse, query: Traverse) -> int:
-        """The number of features per frame; refuses traverses in which it differs, before any long work."""
-        counts = [self.count_features(traverse) for traverse in (reference, query)]
-        if counts[0] != counts[1]:
-            seen = " and ".join(
-                f"{traverse.name} gives {count} features per frame of "
-                f"{' x '.join(map(str, traverse.frame_shape))}"
-                for traverse, count in zip((reference, query), counts, strict=True)
-            )
-            raise InputError(f"{seen}; expected the same number, from frames of the same size")
+    def check_sizes(self, reference: Traverse, *queries: Traverse) -> int:
+        """The number of features per frame; refuses queries in which it differs, or which are frames if the
+        reference is ready features, before any long work."""
+        counts = [self.count_features(traverse) for traverse in (reference, *queries)]
+        for query, count in zip(queries, counts[1:], strict=True):
+            if count != counts[0] or (is_ready(reference) and not is_ready(query)):
+                seen = " and ".join(
+                    f"{traverse.name} gives {own} features per frame of "
+                    f"{' x '.join(map(str, traverse.frame_shape))}"
+                    for traverse, own in ((reference, counts[0]), (query, count))
+                )
+                raise InputError(f"{seen}; expected the same number, from frames of the same size")
         return counts[0]
 
     def count_features(self, traverse: Traverse) -> int:
@@ -254,24 +256,27 @@ class ChunkCoder(NamedTuple):
         return chunks.start * self.chunk, min(chunks.stop * self.chunk, self.frames)
 
     @torch.no_grad()
-    def chunks(self, traverse: Traverse, wanted: range, progress: str | None = None) -> Iterator[Chunk]:
+    def chunks(self, traverse: Traverse, wanted: range, label: str | None = None) -> Iterator[Chunk]:
         """Code a range of chunks, one at a time; InputError as from `feature_batches` and `code_chunk`."""
-        start, stop = self.span(wanted)
-        part = _ByChunks(traverse, start, stop, self.chunk)
-        held: list[Tensor] = []
-        done = start
-        with in_one_thread():
-            for rows in self.describer.descriptors(part, progress):
-                held.append(rows)
-                done += len(rows)
-                if done % self.chunk == 0 or done == stop:
-                    rows, held = torch.cat(held), []
-                    if self.visits is not None:
-                        visits = views_of(self.visits, torch.arange(done - len(rows), done))
-                        rows = self.describer.averaged(rows, visits)
-                    yield self.code(rows)
-        if done < stop:
-            raise InputError(f"{traverse.name} ended at frame {done}; expected its {self.frames} frames")
+        part = _ByChunks(traverse, *self.span(wanted), self.chunk)
+        batches = self.describer.descriptors(part, label)
+        for start in wanted:
+            with in_one_thread():  # not while the caller has the chunk
+                chunk = self._next(batches, *self.span(range(start, start + 1)), traverse.name)
+            yield chunk
+
+    def _next(self, batches: Iterator[Tensor], start: int, stop: int, name: str) -> Chunk:
+        """Code the frames [start, stop), of which `batches` has the descriptors next."""
+        held, done = [], start
+        while done < stop:
+            if (rows := next(batches, None)) is None:
+                raise InputError(f"{name} ended at frame {done}; expected its {self.frames} frames")
+            held.append(rows)
+            done += len(rows)
+        rows = torch.cat(held)
+        if self.visits is not None:
+            rows = self.describer.averaged(rows, views_of(self.visits, torch.arange(start, stop)))
+        return self.code(rows)
 
 
 class _ByChunks(Traverse):
@@ -407,13 +412,13 @@ def fit(
     traverse: Traverse,
     second: Views | None = None,
     visits: Views | None = None,
-    progress: str | None = None,
+    label: str | None = None,
 ) -> SpectralMap:
     """A map without places, but with whitening, mean and step from the sample of a long traverse."""
     frames = traverse.count()
     sample = Sample.of(frames, mapper.chunk)
     own = second and sample.views(second)
-    rows = describer.reference(Selection(traverse, sample.frame), own, progress and "sampling")
+    rows = describer.reference(Selection(traverse, sample.frame), own, label and "sampling")
     if visits is not None:
         rows = describer.averaged(rows, views_of(visits, sample.frame))
     share = len(rows) / frames  # of the fixed bytes, charged to the sample
@@ -427,7 +432,7 @@ def append_places(
     traverse: Traverse,
     start: int = 0,
     visits: Views | None = None,
-    progress: str | None = None,
+    label: str | None = None,
     checkpoint: Checkpoint | None = None,
     code: Code = ChunkCoder.chunks,
 ) -> None:
@@ -440,9 +445,7 @@ def append_places(
     Raises:
         InputError: frames that cannot be read, or a full disk; finished chunks are kept.
     """
-    coder = ChunkCoder.like(
-        route, describer, traverse.count(), visits and describer.seekable(visits, progress)
-    )
+    coder = ChunkCoder.like(route, describer, traverse.count(), visits and describer.seekable(visits, label))
     missing = range(-(-(route.places - start) // route.chunk), coder.total)
     held: list[Chunk] = []
 
@@ -454,7 +457,7 @@ def append_places(
                 checkpoint.save(route, describer.whitening, traverse, route.places - start)
 
     try:
-        for chunk in code(coder, traverse, missing, progress) if missing else ():
+        for chunk in code(coder, traverse, missing, label) if missing else ():
             held.append(chunk)
             # several chunks at a time, since each extension copies the map
             if sum(one.places for one in held) >= SAMPLE or (checkpoint is not None and checkpoint.due):
@@ -524,7 +527,7 @@ def is_ready(traverse: Traverse | None) -> bool:
 
 def positions_of(traverse: Traverse | None) -> Tensor:
     """(F,) even steps from the first place to each frame of a resampled traverse; otherwise (0,)."""
-    return traverse.positions if isinstance(traverse, ResampledTraverse) else torch.zeros(0)
+    return traverse.positions if isinstance(traverse, ResampledTraverse) else torch.zeros(0).float()
 
 
 def _with_places(batches: Iterator[Tensor], places: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
@@ -542,7 +545,7 @@ def calibration_of(
     reference: Traverse | None,
     views: Views | None = None,
     places: Tensor | None = None,
-    progress: str | None = None,
+    label: str | None = None,
 ) -> Calibration:
     """See `DejaVu.calibrate`."""
     if views is None:
@@ -559,7 +562,7 @@ def calibration_of(
     else:
         length = max(STRETCH, min(MAX_SEGMENT, SEGMENT_SCORES // route.places))
         views = _segments_of(views, length, max(LEAST, CALIBRATION_SCORES // route.places))
-    name, descriptors = views.traverse.name, concatenate(describer.descriptors(views.traverse, progress))
+    name, descriptors = views.traverse.name, concatenate(describer.descriptors(views.traverse, label))
     if len(descriptors) != len(views.places):
         seen = f"{name} has {len(descriptors)} frames and {len(views.places)} places"
         raise InputError(f"{seen}; expected the same number")

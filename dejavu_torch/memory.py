@@ -1,4 +1,4 @@
-"""Free memory, and tensors in temporary files."""
+"""Free memory, tensors in temporary files, and the type of new ones."""
 
 from __future__ import annotations
 
@@ -21,6 +21,17 @@ OWN_CGROUP = Path("/proc/self/cgroup")  # which of them the process is in
 RECLAIMABLE = ("inactive_file", "active_file", "slab_reclaimable")
 IN_MEMORY = 2**29  # bytes of features that are kept in memory
 BLOCK_BYTES = 2**26  # a tensor this large returns to the system when it is freed, a batch may not
+
+
+@contextmanager
+def in_float32() -> Iterator[None]:
+    """In the block new tensors are float32, whatever the user's default."""
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float32)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(before)
 
 
 def free_memory() -> float:
@@ -96,7 +107,7 @@ def empty(rows: int, columns: int, device: torch.device, in_memory: int = IN_MEM
     temporary file. InputError if there is no room for it."""
     size = 4 * rows * columns
     if device.type != "cpu" or size <= in_memory:
-        return torch.empty(rows, columns, device=device)
+        return torch.empty(rows, columns, dtype=torch.float32, device=device)
     with _spilling(f"{rows} x {columns} numbers"), tempfile.TemporaryFile() as file:
         if hasattr(os, "posix_fallocate"):  # a full disk would end the process later
             os.posix_fallocate(file.fileno(), 0, size)

@@ -40,7 +40,7 @@ from dejavu_torch.recognition.sample_file import check_searches, kept_search
 from dejavu_torch.recognition.search import SCORES_AT_ONCE, Find, Search, check_search
 from dejavu_torch.recognition.select import HIGHEST, PROBABLE, Acceptance, check_candidates
 from dejavu_torch.resize import reduced_size
-from dejavu_torch.text import bar
+from dejavu_torch.text import with_progress
 from dejavu_torch.types import BATCH_NUMBERS, InputError, Match, SequenceModel, Training, Traverse
 
 log = logging.getLogger("dejavu_torch")
@@ -182,7 +182,7 @@ class DejaVu(nn.Module):
                 model stays unchanged.
         """
         traverse = self.resample(as_traverse(traverse), progress=progress)
-        describer, text = self._describer_of(traverse), "learning" if progress else None
+        describer, label = self._describer_of(traverse), "learning" if progress else None
         mapper = self.mapper.with_overhead(learning.positions_of(traverse).nbytes)
         route: PlaceMap
         counts: Tensor | None = None
@@ -195,15 +195,15 @@ class DejaVu(nn.Module):
                 model_file.run_key(self, traverse, second, visits), traverse, route, describer.whitening
             )
             if not resumed:
-                route = learning.fit(mapper, describer, traverse, second, visits, text)
-            learning.append_places(route, describer, traverse, 0, visits, text, checkpoint, code)
+                route = learning.fit(mapper, describer, traverse, second, visits, label)
+            learning.append_places(route, describer, traverse, 0, visits, label, checkpoint, code)
             learning.log_reached(route, mapper)
         else:
             if checkpoint is not None:
                 checkpoint.check_unused()
-            rows = describer.reference(traverse, second, text, isinstance(mapper, SpectralMapper))
+            rows = describer.reference(traverse, second, label, isinstance(mapper, SpectralMapper))
             if visits is not None:
-                rows = describer.averaged(rows, visits, text)
+                rows = describer.averaged(rows, visits, label)
             route = learning.learn_descriptors(mapper, rows)
         if counts is not None:
             route.count_visits(1 + counts)
@@ -222,16 +222,15 @@ class DejaVu(nn.Module):
         return self._keep_map(learning.learn_descriptors(mapper, features), traverse)
 
     def describe_reference(
-        self, traverse: Traverse, second: Views | None = None, progress: str | None = None
+        self, traverse: Traverse, second: Views | None = None, progress: bool = False
     ) -> Tensor:
         """Descriptors (N,K) of the reference for `learn_features`; the whitening is learned from it.
 
         Args:
-            second: see `learn`; InputError if no whitening learns from it.
-            progress: text of a progress bar on a terminal; None shows none.
+            second, progress: see `learn`; InputError if no whitening learns from the second.
         """
-        describer = self._describer_of(traverse)
-        rows = describer.reference(traverse, second, progress, isinstance(self.mapper, SpectralMapper))
+        describer, label = self._describer_of(traverse), "learning" if progress else None
+        rows = describer.reference(traverse, second, label, isinstance(self.mapper, SpectralMapper))
         self._keep_whitening(describer.whitening)
         return rows
 
@@ -382,8 +381,8 @@ class DejaVu(nn.Module):
         own = None
         if reference is not None and views is None:
             own = self.fit(as_traverse(reference), self.frame_shape or ())
-        text = "calibrating" if progress else None
-        self.calibration = learning.calibration_of(self.describer, self.map, own, views, places, text)
+        label = "calibrating" if progress else None
+        self.calibration = learning.calibration_of(self.describer, self.map, own, views, places, label)
         return self
 
     def describe(self, frames: Tensor) -> Tensor:
@@ -407,7 +406,7 @@ class DejaVu(nn.Module):
     def localize(
         self,
         queries: Traverse | Tensor,
-        progress: str | None = None,
+        progress: bool = False,
         sequence: SequenceModel | None = None,
         search: Search | None = None,
     ) -> Match:
@@ -416,7 +415,7 @@ class DejaVu(nn.Module):
         Args:
             queries: a Traverse or a tensor: frames (Q,C,H,W) or features (Q,D). They are resampled like the
                 map's frames, see `resample`.
-            progress: text of a progress bar on a terminal; None shows none.
+            progress: see `learn`.
             sequence: scores consecutive queries together, such as a `SequenceMatcher` or a `PlaceFilter`;
                 None matches each query by itself.
             search: for single queries: "coarse" scores the places near the best samples of a long spectral
@@ -436,21 +435,21 @@ class DejaVu(nn.Module):
         descriptors: Tensor,
         matching: Matching | SequenceModel | None = None,
         order: Tensor | None = None,
-        progress: str | None = None,
+        progress: bool = False,
     ) -> Match:
         """As `localize`, for descriptors (Q,K), whitened if the model whitens.
 
         Args:
-            matching: a Matching, or the sequence of `localize`. progress: see `localize`.
+            matching: a Matching, or the sequence of `localize`. progress: see `learn`.
             order: (N,) the frame of each place of a shuffled map; the match then counts frames.
         """
         matching = matching if isinstance(matching, Matching) else self.matching(matching)
-        localizer = self.localizer(matching)
+        localizer, label = self.localizer(matching), "localizing" if progress else None
         if order is None:
-            return localizer(descriptors, progress)
+            return localizer(descriptors, label)
         matcher, place = Localizer(None, matching), order.argsort()
         parts = descriptors.split(max(1, SCORES_AT_ONCE // self.map.places))
-        scores = (self.map.scores(part.to(self.map.positions.device)) for part in bar(parts, progress))
+        scores = (self.map.scores(part.to(self.map.positions.device)) for part in with_progress(parts, label))
         with torch.no_grad():
             return Match.joined(matcher.match(part[:, place.to(part.device)]) for part in scores)
 
@@ -483,7 +482,7 @@ class DejaVu(nn.Module):
     def matches(
         self,
         queries: Traverse | Tensor,
-        progress: str | None = None,
+        progress: bool = False,
         sequence: SequenceModel | None = None,
         search: Search | None = None,
         k: int | None = None,
@@ -498,14 +497,15 @@ class DejaVu(nn.Module):
         if sequence is not None:
             sequence.check(queries.length, self.map.places)
         if self.step is not None:
-            queries = self.resample(queries, self.step, progress is not None, self.frame_shape)
+            queries = self.resample(queries, self.step, progress, self.frame_shape)
         shape, name = queries.frame_shape, queries.name
 
         def on_first(frames: Tensor, features: Tensor) -> None:
             self.check_queries(shape, features.shape[1], name)
             self.describer.warn_of_bright(frames, name)
 
-        yield from map(localizer, self.describer.descriptors(queries, progress, on_first))
+        label = "localizing" if progress else None
+        yield from map(localizer, self.describer.descriptors(queries, label, on_first))
 
     def candidates(
         self,
@@ -532,7 +532,7 @@ class DejaVu(nn.Module):
             >>> DejaVu().learn(wave).candidates(wave[20:22], k=3).index[:, 0]
             tensor([20, 21])
         """
-        return Match.joined(self.matches(queries, None, sequence, search, k, apart))
+        return Match.joined(self.matches(queries, False, sequence, search, k, apart))
 
     def matching(self, sequence: SequenceModel | None = None, search: Search | None = None) -> Matching:
         """How queries are matched, with probabilities if the map is calibrated for it. Raises InputError if a
@@ -558,9 +558,10 @@ class DejaVu(nn.Module):
             return Acceptance(precision=PROBABLE, given=False)
         return Acceptance(None if sequence is None else sequence.likely, given=False)
 
-    def extract_all(self, traverse: Traverse, progress: str | None = None) -> Tensor:
+    def extract_all(self, traverse: Traverse, progress: bool = False) -> Tensor:
         """Descriptors (N,K) of a whole traverse; many are kept in a temporary file, see `concatenate`."""
-        return concatenate(self.describer.descriptors(traverse, progress))
+        label = f"describing {traverse.name}" if progress else None
+        return concatenate(self.describer.descriptors(traverse, label))
 
     @property
     def features_per_frame(self) -> int:

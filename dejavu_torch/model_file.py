@@ -44,6 +44,7 @@ from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.maps.weights import is_rounded, packed, unpacked
+from dejavu_torch.memory import in_float32
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
@@ -252,7 +253,8 @@ def read_model(make: Callable[..., M], path: Path, features: nn.Module | None) -
                 probe = nn.ModuleDict({"features": _part(header, "features", None)})
                 own = {name: one for name, one in weights.items() if name.startswith("features.")}
                 probe.load_state_dict(own, assign=True)
-        parts = {name: _part(header, name, features) for name in PARTS}
+        with in_float32():
+            parts = {name: _part(header, name, features) for name in PARTS}
         parts["whitening"] = parts["whitening"] or "none"
         model: Any = make(**parts, **{name: header[name] for name in SETTINGS})
         _fill(model.map, tensors, header["map"])

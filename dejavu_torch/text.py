@@ -1,8 +1,11 @@
-"""Text in messages: of unknown origin, such as file names, and of settings; progress bars."""
+"""Text in messages: of unknown origin, such as file names, and of settings; progress."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from inspect import signature
 from typing import TYPE_CHECKING, TypeVar
 from unicodedata import category
@@ -11,6 +14,7 @@ if TYPE_CHECKING:
     from torch import nn
 
 Step = TypeVar("Step")
+FIRST_LINE, LINE_EVERY = 30.0, 60.0  # seconds until the first line of progress, and between lines
 
 
 def printable(text: object) -> str:
@@ -30,9 +34,37 @@ def settings_of(module: nn.Module, *hidden: str) -> str:
     return ", ".join(f"{name}={getattr(module, name)!r}" for name in shown)
 
 
-def bar(steps: Sequence[Step], text: str | None) -> Iterable[Step]:
-    """The steps of a long task, with a progress bar on stderr if it is a terminal; None shows no bar."""
+@contextmanager
+def progress_of(
+    label: str | None, total: int | None, unit: str = "frame"
+) -> Iterator[Callable[[int], object]]:
+    """A function to call with the number of frames newly done: it shows a bar on stderr, or lines if that is
+    no terminal; nothing if `label` is None."""
     from tqdm import tqdm
 
-    shown: Iterable[Step] = tqdm(steps, text, disable=None if text else True, leave=False)
-    return shown
+    if label is not None and sys.stderr.isatty():
+        with tqdm(total=total, desc=label, unit=unit, leave=False) as bar:
+            yield bar.update
+        return
+    began, done = time.monotonic(), 0
+    due = began + FIRST_LINE
+
+    def update(more: int) -> None:
+        nonlocal done, due
+        done, now = done + more, time.monotonic()
+        if label is None or now < due or not done:
+            return
+        due = now + LINE_EVERY
+        of = f" of {total}" if total else ""
+        left = f", {max(0, total - done) * (now - began) / done:.0f} s left" if total else ""
+        tqdm.write(f"dejavu: {label}: {done}{of} {unit}s{left}", file=sys.stderr)
+
+    yield update
+
+
+def with_progress(steps: Sequence[Step], label: str | None) -> Iterator[Step]:
+    """The steps of a long task; see `progress_of`."""
+    with progress_of(label, len(steps), "step") as update:
+        for step in steps:
+            yield step
+            update(1)

@@ -18,6 +18,7 @@ from command_line import TEMPLATES, fails, frames, report_of, run, write_images
 
 from dejavu_torch import DejaVu, SpectrogramAnalysis, TemplateMapper, open_source
 from dejavu_torch.cli import COMMANDS, commands
+from dejavu_torch.features.joined import Joined
 from dejavu_torch.types import Training
 
 SMALL = "sim:aerial?frames=96"
@@ -93,17 +94,34 @@ def test_config_and_options(tmp_path: Path) -> None:
     assert {(layer.start, layer.stop) for layer in model.map.plan} == {(0, 128), (128, 256)}
 
 
-def test_classes_of_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "my_network.py").write_text("import torch\nclass Net(torch.nn.Flatten):\n    pass\n")
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--features", "my_network.Net"),
+        ("--features", "[{class_path: my_network.Net}]"),
+        ("--features", "my_network.made"),
+        ("--config", "own.yaml"),
+    ],
+)
+def test_classes_of_the_current_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, str]
+) -> None:
+    """Only if they are named: the folder may have modules of any name."""
+    (tmp_path / "my_network.py").write_text(
+        "import torch\nclass Net(torch.nn.Flatten):\n    pass\ndef made(): return Net()\n"
+    )
+    (tmp_path / "own.yaml").write_text("features: {class_path: my_network.Net}")
     np.save(tmp_path / "frames.npy", frames(64))
-    words = ["learn", "frames.npy", "--map", "a.safetensors", "--features", "my_network.Net"]
     monkeypatch.chdir(tmp_path)
     # as for an installed command, which does not look there by itself
     monkeypatch.setattr(sys, "path", [place for place in sys.path if place and Path(place) != tmp_path])
+    run("learn", "frames.npy", "--map", "a.safetensors")
+    assert str(tmp_path) not in sys.path
     with pytest.raises(ImportError):
         import_module("my_network")
-    run(*words)
-    assert DejaVu.load("a.safetensors", sys.modules.pop("my_network").Net()).map.places == 64
+    run("learn", "frames.npy", "--map", "a.safetensors", *words)
+    own = sys.modules.pop("my_network").Net()
+    assert DejaVu.load("a.safetensors", Joined([own]) if "[" in words[1] else own).map.places == 64
 
 
 def test_what_learn_says_to_do_next_can_be_done(

@@ -25,13 +25,13 @@ ARROWS = {
     "recognition": "text types data maps",
     "motion": "text types memory data",
     "learning": "types memory data features maps recognition motion",
-    "model_file": "text version types data features periods maps recognition motion learning",
+    "model_file": "text version types memory data features periods maps recognition motion learning",
     "model": "text types memory resize data features maps recognition motion learning model_file",
     "growth": "types data features maps motion learning model_file model",
     "cluster": "text types data maps recognition learning",
     "live": "types data features recognition model",
-    "evaluation": "text version types memory resize data features periods maps recognition motion model_file "
-    "model growth",
+    "evaluation": "text version types memory resize data features periods maps recognition motion learning "
+    "model_file model growth",
     "export": "text version types data features maps recognition model",
     "training": "text types memory resize data features periods maps recognition "
     "motion model_file model evaluation",

@@ -5,8 +5,10 @@ from __future__ import annotations
 import errno
 import importlib
 import itertools
+import math
 import os
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -93,19 +95,43 @@ def test_a_short_route_is_learned_from_all_of_it(tmp_path: Path, monkeypatch: py
     assert not (tmp_path / "m.part").exists()
 
 
+@contextmanager
+def two_threads() -> Iterator[None]:
+    """In the block torch computes in two threads; they must still be two at its end."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        yield
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(threads)
+
+
+def test_no_call_changes_the_number_of_threads() -> None:
+    """Nor one that is left in the middle, or fails."""
+    model = learned(route())
+    coder = ChunkCoder.like(model.map, model.describer, PLACES)  # type: ignore[arg-type]
+    with two_threads():
+        chunks = coder.chunks(ArrayTraverse(route()), range(coder.total))
+        next(chunks)
+        assert torch.get_num_threads() == 2
+    with two_threads(), refused("ended at frame 500"):
+        list(coder.chunks(ArrayTraverse(route()[:500]), range(coder.total)))
+    bad = route()
+    bad[::50] = math.nan
+    for call in (learned, lambda one: growth.append(model, one)):
+        with two_threads(), refused("NaN"):
+            call(bad)
+
+
 def test_bytes_do_not_hang_on_how_a_route_is_read(tmp_path: Path) -> None:
     whole = file_of(learned(route()), tmp_path)
     parts = route().split([333, 1, 696])
     assert file_of(learned(Stream(route())), tmp_path) == whole  # of unknown length, in odd batches
     assert file_of(learned(Chain([ArrayTraverse(part) for part in parts])), tmp_path) == whole
     assert file_of(learned(Chain([Stream(part) for part in parts])), tmp_path) == whole
-    threads = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
+    with two_threads():
         assert file_of(learned(route()), tmp_path) == whole
-        assert torch.get_num_threads() == 2
-    finally:
-        torch.set_num_threads(threads)
 
 
 def test_convention_the_sample_is_evenly_spaced_and_of_whole_chunks() -> None:

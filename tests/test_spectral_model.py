@@ -9,7 +9,7 @@ import torch
 from helpers import all_of, refused
 from torch import Tensor
 
-from dejavu_torch import HOG, DejaVu, open_source
+from dejavu_torch import HOG, DejaVu, ImposedPeriods, SequenceMatcher, TemplateMapper, open_source
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.frame_range import FrameRange
 from dejavu_torch.features.views import Views, augmented_route
@@ -17,7 +17,8 @@ from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.growth import second_traverse
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import SpectralMap
-from dejavu_torch.types import Traverse
+from dejavu_torch.recognition.filter import PlaceFilter
+from dejavu_torch.types import Match, Traverse
 
 FRAMES = 200
 
@@ -239,3 +240,33 @@ def test_frames_that_five_bytes_are_too_few_for(reference: Traverse) -> None:
     plain = DejaVu(HOG(), Whitening(views=0), SpectralMapper(5.0)).learn(few)
     assert plain.map.dimension == 60  # their rank, 59, and one constant number
     assert plain.summary().route_bytes <= 5 * 60
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float64])
+@pytest.mark.parametrize("kind", ["spectral", "templates"])
+def test_a_map_does_not_hang_on_the_default_type(dtype: torch.dtype, kind: str, tmp_path: Path) -> None:
+    """Neither its file nor its answers, with simulated routes, calibration and every way of matching."""
+
+    def made() -> tuple[bytes, list[Match]]:
+        route, query = (open_source(f"sim:aerial?frames=100&traverse={one}") for one in (0, 1))
+        mapper = SpectralMapper(chunk=50) if kind == "spectral" else TemplateMapper(ImposedPeriods((8, 13)))
+        DejaVu(mapper=mapper).learn(route).calibrate(route).save(tmp_path / "m.safetensors")
+        model = DejaVu.load(tmp_path / "m.safetensors")
+        ways = None, SequenceMatcher(5), PlaceFilter(), PlaceFilter(search_every=5)
+        found = [model.localize(query, sequence=way) for way in ways]
+        found += [model.localize(query, search=one) for one in ("coarse", "exact")]  # type: ignore[arg-type]
+        return (tmp_path / "m.safetensors").read_bytes(), found
+
+    before = torch.get_default_dtype()
+    expected = made()
+    torch.set_default_dtype(dtype)
+    try:
+        found = made()
+        assert torch.get_default_dtype() == dtype
+    finally:
+        torch.set_default_dtype(before)
+    assert found[0] == expected[0]
+    for one, other in zip(found[1], expected[1], strict=True):
+        assert one.score.dtype == torch.float32
+        assert torch.equal(one.index, other.index)
+        assert torch.equal(one.score, other.score)

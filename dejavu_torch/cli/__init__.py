@@ -67,11 +67,9 @@ def errors_of_one_line(given: Sequence[str]) -> Iterator[None]:
     """In the block, which imports torch, errors in the command line or in files end it with one line."""
     _log_to_stderr()
     try:
-        here = os.getcwd()
+        os.getcwd()
     except FileNotFoundError:  # which would crash some libraries
         fail("the current folder no longer exists; expected one that does")
-    if here not in sys.path:
-        sys.path.append(here)  # for a user's own classes, as with `python -m`
     from dejavu_torch.cli.parser import UsageError
     from dejavu_torch.data.output import remove_temporaries
     from dejavu_torch.types import InputError

@@ -222,7 +222,7 @@ def run_localize(
         query = model.resample(query, model.step, True, model.frame_shape)
         _print_steps(query)
     rule = model.matching(matcher).rule
-    matches = model.matches(query, "localizing", matcher, None, top, SUPPRESSION)
+    matches = model.matches(query, True, matcher, None, top, SUPPRESSION)
     if top is not None:
         matches = (part.map(Tensor.flatten) for part in matches)
     counts: Counter[str] = Counter()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import inspect
 import json
+import os
 import pydoc
 import re
 import sys
@@ -251,6 +252,16 @@ class Parser(jsonargparse.ArgumentParser):
         super().__init__(*args, formatter_class=HelpFormatter, allow_abbrev=False, **kwargs)
 
     def parse_args(self, args: Any = None, *rest: Any, **settings: Any) -> Any:
+        try:
+            return self._parsed(args, *rest, **settings)
+        except UsageError as error:
+            here = os.getcwd()
+            if here in sys.path or not any(isinstance(one, ModuleNotFoundError) for one in causes(error)):
+                raise
+        sys.path.append(here)  # only for a user's own classes: modules there have any name
+        return self._parsed(args, *rest, **settings)
+
+    def _parsed(self, args: Any, *rest: Any, **settings: Any) -> Any:
         for word in args or ():
             check_word(word)
         # a nested null reaches the parser of its part as None

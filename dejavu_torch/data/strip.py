@@ -63,7 +63,7 @@ def read_strip(path: Path, width: int, rows: str = "", halve: int = 0, grey: boo
     """
     strip = read_image(path)
     if grey and strip.shape[0] == 3:
-        strip = (strip * torch.tensor([0.299, 0.587, 0.114])[:, None, None]).sum(0, keepdim=True)
+        strip = (strip * strip.new_tensor([0.299, 0.587, 0.114])[:, None, None]).sum(0, keepdim=True)
     if halve < 0 or min(strip.shape[1:]) >> halve < 1:
         seen = f"{path} is {strip.shape[1]} x {strip.shape[2]} pixels, to be halved {halve} times"
         raise InputError(f"{seen}; expected at least 0 times, leaving at least one pixel")

@@ -21,7 +21,7 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import recipe_of
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.recognition.localizer import SINGLE, Localizer, Matching
-from dejavu_torch.text import bar
+from dejavu_torch.text import with_progress
 from dejavu_torch.types import InputError, Match, Traverse
 
 if TYPE_CHECKING:  # training needs the HOG baselines without matplotlib
@@ -51,7 +51,7 @@ def nearest_frames(
     query: Tensor,
     k: int = 1,
     metric: Metric = "l1",
-    progress: str | None = None,
+    progress: bool = False,
     matching: Matching = SINGLE,
 ) -> Match:
     """The nearest stored frame of each query, if every k-th reference frame is stored.
@@ -59,7 +59,7 @@ def nearest_frames(
     Args:
         reference: (N,D) features. query: (Q,D) features.
         k: 1 stores all frames. Other frames have the distance of the nearest stored one.
-        progress: text of a progress bar on a terminal; None shows no bar.
+        progress: show progress on stderr.
 
     Returns:
         Match of (Q,). Single queries find stored frames only, sequences also frames between these.
@@ -68,7 +68,8 @@ def nearest_frames(
     nearest = ((torch.arange(len(reference), device=reference.device) + k // 2) // k).clamp(
         max=len(stored) - 1
     )
-    batches = bar(query.split(max(1, BLOCK_DISTANCES // len(reference))), progress)
+    parts = query.split(max(1, BLOCK_DISTANCES // len(reference)))
+    batches = with_progress(parts, "baselines" if progress else None)
     scores = (phase_distances(batch.to(stored.device), stored, metric) for batch in batches)
     if k > 1:
         scores = (part[:, nearest] for part in scores)
@@ -116,7 +117,6 @@ def baselines_of(
     """
     model, reference, matching = run.model, run.reference_features, run.matching
     spectral = isinstance(model.map, SpectralMap)
-    text = "baselines: uncompressed" if progress else None
     one = "place" if len(model.map.positions) else "frame"
     summary, coarsest, (frames, dimension) = model.summary(), max(1, 2 * run.tolerance), reference.shape
     needed = ("backbone", "whitening") if spectral else ("backbone",)  # by every baseline
@@ -126,7 +126,7 @@ def baselines_of(
         metric = "cosine"
 
     def nearest(name: str, stored: Tensor, k: int, bytes: int, stride: int = 1) -> Baseline:
-        match = nearest_frames(stored, run.query_features, stride, metric, text, matching)
+        match = nearest_frames(stored, run.query_features, stride, metric, progress, matching)
         return Baseline(name, match, bytes + fixed, k, fixed)
 
     size, own = partial(stride_bytes, frames, dimension), reference.element_size()
@@ -162,7 +162,7 @@ def baselines_of(
     if run.sequence is not None:  # SeqSLAM compares the grey pixels of small frames by L1
         plain = DejaVu(PatchPixels(), "none", batch_size=batch, preprocess=Preprocess("grey"))
         names = {"seqslam": ("SeqSLAM's pixels: grey, patches normalised", 1)}
-        found |= _described_baselines(plain, "pixels", names, pair, progress, matching)
+        found |= _described_baselines(plain, names, pair, progress, matching)
     return found
 
 
@@ -172,9 +172,8 @@ def _null_controls(run: Localization, seed: int, one: str, progress: bool) -> di
     found = {}
 
     def null(name: str, same_plan: bool = False) -> Baseline:
-        text = "null control" if progress else None
         pair = run.reference_features, run.query_features
-        match = null_control(model, *pair, seed, same_plan, run.matching, text)
+        match = null_control(model, *pair, seed, same_plan, run.matching, progress)
         return Baseline(f"null: {name}", match)
 
     foreign = isinstance(model.mapper, TemplateMapper) and model.mapper.periods is None
@@ -251,12 +250,11 @@ def hog_baselines(
     strides = {"hog": 1, "hog_stride_coarsest": max(1, 2 * tolerance)}
     names = {key: (f"HOG, {every(k, one)}", k) for key, k in strides.items()}
     plain = DejaVu(whitening="none", batch_size=batch_size)
-    return _described_baselines(plain, "HOG", names, (reference, query), progress, matching)
+    return _described_baselines(plain, names, (reference, query), progress, matching)
 
 
 def _described_baselines(
     plain: DejaVu,
-    what: str,
     names: Mapping[str, tuple[str, int]],
     traverses: tuple[Traverse, Traverse],
     progress: bool,
@@ -265,15 +263,14 @@ def _described_baselines(
     """Baselines by L1 that store every k-th reference frame, described by `plain`."""
     if len(traverses[0].frame_shape) != 3:
         return {}
-    text = f"baselines: {what}" if progress else None
     try:
-        stored, queries = (plain.extract_all(traverse, text) for traverse in traverses)
+        stored, queries = (plain.extract_all(traverse, progress) for traverse in traverses)
     except InputError as error:
-        log.info("no %s to compare with: %s", what, error)
+        log.info("no %s to compare with: %s", type(plain.features).__name__, error)
         return {}
     size = partial(stride_bytes, len(stored), stored.shape[1], stored.element_size())
     return {
-        key: Baseline(name, nearest_frames(stored, queries, k, "l1", text, matching), size(k), k)
+        key: Baseline(name, nearest_frames(stored, queries, k, "l1", progress, matching), size(k), k)
         for key, (name, k) in names.items()
     }
 

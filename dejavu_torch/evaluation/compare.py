@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.arrays import UNNAMED, as_traverse
-from dejavu_torch.data.fitted import Fitted
+from dejavu_torch.data.fitted import fitted
 from dejavu_torch.data.ground_truth import (
     as_ground_truth,
     check_ground_truth,
@@ -34,6 +34,7 @@ from dejavu_torch.evaluation.report import Report, as_html
 from dejavu_torch.evaluation.storage import coded_at_sizes, noise_over_map
 from dejavu_torch.features.views import Views
 from dejavu_torch.growth import calibrate_if_possible
+from dejavu_torch.learning import is_ready
 from dejavu_torch.maps.distance import l1_backend
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.summary import MapSummary
@@ -134,13 +135,19 @@ def compare(
     check_candidates(top, tolerance)
     reference = model.fit(reference, model.frame_shape if has_map else None)
     query = model.fit(query, reference.frame_shape)
-    feature_shape = model.describer.check_sizes(reference, query)
+    off = [
+        one if is_ready(one) or is_ready(reference) else fitted(one, reference.frame_shape)
+        for one in distractors
+    ]
+    feature_shape = model.describer.check_sizes(reference, query, *off)
 
     seconds: dict[str, float] = defaultdict(float)
     with timed(seconds, "describe" if has_map else "learn"):
         reference = model.resample(reference, model.step if has_map else None, progress)
     with timed(seconds, "localize"):
-        query = model.resample(query, getattr(reference, "step", None), progress)
+        step = getattr(reference, "step", None)
+        query = model.resample(query, step, progress)
+        off = [model.resample(one, step, progress, reference.frame_shape) for one in off]
     check_candidates(top, tolerance, reference.length)
     if sequence is not None and reference.length is not None:
         sequence.check(None, reference.length)
@@ -152,16 +159,15 @@ def compare(
     counted = reference.length is not None and query.length is not None
     known = find_truth() if counted else None  # early, so that a bad truth is refused before the long work
 
-    text = "describing the reference" if progress else None
     with timed(seconds, "describe" if has_map else "learn"):
         if has_map:
             if reference.length is not None:
                 check_places(model, reference.length, reference.name)
             model.check_queries(reference.frame_shape, feature_shape, reference.name)
-            places = model.extract_all(reference, text)
+            places = model.extract_all(reference, progress)
             _check_given_map(model, places, reference.name, tolerance)
         else:
-            places = model.describe_reference(reference, second, text)
+            places = model.describe_reference(reference, second, progress)
             model.learn_features(places, reference)
         if isinstance(calibration, Views) or (calibration is None and not has_map):
             calibrate_if_possible(model, reference, calibration, progress=progress)
@@ -169,7 +175,7 @@ def compare(
     with timed(seconds, "localize"):
         rule = model.matching(sequence)
         model.check_queries(query.frame_shape, feature_shape, query.name)
-        queries = model.extract_all(query, "describing the query" if progress else None)
+        queries = model.extract_all(query, progress)
         if sequence is not None:
             sequence.check(len(queries), model.map.places)
         if ordered is None:
@@ -179,8 +185,8 @@ def compare(
         matching = Matching(sequence, models)
         ranks = max(top, min(max(RANKS), model.map.places))
         rule = rule._replace(beside=models, k=ranks, radius=tolerance)
-        candidates = model.localize_descriptors(queries, rule, progress="localizing" if progress else None)
-    off_map = _match_distractors(model, distractors, sequence, progress)
+        candidates = model.localize_descriptors(queries, rule, progress=progress)
+    off_map = _match_distractors(model, off, sequence, progress)
 
     model.cpu()
     known = known if counted else find_truth(len(places), len(queries))
@@ -221,9 +227,8 @@ def _other_contenders(
         contenders = {key: _score_baseline(run, key, baseline) for key, baseline in baselines.items()}
     for key, (name, other) in others.items() if known else ():
         other.learn(run.reference, progress)
-        queries = other.extract_all(run.query, f"describing the query for {name}" if progress else None)
-        text = f"localizing with {name}" if progress else None
-        found = other.localize_descriptors(queries, run.matching, progress=text)
+        queries = other.extract_all(run.query, progress)
+        found = other.localize_descriptors(queries, run.matching, progress=progress)
         contenders[key] = _contend(run, name, found, other)
     return contenders
 
@@ -268,9 +273,7 @@ def _match_distractors(
         return {}
     found = {}
     for one in distractors:
-        text = f"describing {one.name}" if progress else None
-        descriptors = model.extract_all(Fitted(one, model.frame_shape or ()), text)
-        probability = model.localize_descriptors(descriptors, sequence).probability
+        probability = model.localize_descriptors(model.extract_all(one, progress), sequence).probability
         assert probability is not None
         found[one.name] = probability
     return found

@@ -40,7 +40,7 @@ def null_control(
     seed: int = 0,
     same_plan: bool = False,
     sequence: Matching | SequenceModel | None = None,
-    progress: str | None = None,
+    progress: bool = False,
 ) -> Match:
     """Matches of a map learned from the reference in shuffled order.
 
@@ -51,7 +51,7 @@ def null_control(
         reference: (N,D) features. query: (Q,D) features.
         same_plan: keep the layers of the model's template map and learn only the templates. Otherwise
             the periods are searched again too; a finder that tests them finds none in noise.
-        sequence: as in `DejaVu.localize`. progress: text of a progress bar on a terminal; None shows no bar.
+        sequence: as in `DejaVu.localize`. progress: show progress on stderr.
 
     Returns:
         Match of (Q,) whose index is the reference frame *stored* at the reported place, or -1.

@@ -87,7 +87,7 @@ def evaluate_file(
             names = ", ".join(one.name for one in place_map.routes)
             raise InputError(f"{map} has the routes {names}; expected --route with the one of the truth")
         place_map = place_map.part(route)
-    positions = torch.zeros(0) if place_map is None else place_map.positions
+    positions = torch.zeros(0, dtype=torch.float32) if place_map is None else place_map.positions
     resampled = len(positions) > 0
     frames = places = None if reference is None else reference.length
     if place_map is not None:

@@ -58,7 +58,7 @@ def write_matches(
     """Write batches of matches as a csv; return the numbers of (queries, queries with an accepted match).
 
     Args:
-        matches: one per query, in order; with `ranks`, that many per query, as from `Found.ranked`.
+        matches: one per query, in order; with `ranks`, that many per query, the best first.
         query_frames: (Q,) int64, the source frame of each query; None: query i is frame i.
         frame_of: the reference frame of each place, as `PlaceMap.frame_of`; None: place i is frame i.
         query_name, place_name: the name of a frame, as `Traverse.frame_name`; None leaves the column empty.

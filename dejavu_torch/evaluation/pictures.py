@@ -20,8 +20,10 @@ from dejavu_torch.evaluation.score_plots import Stored, draw_curves, draw_sequen
 from dejavu_torch.evaluation.template_plots import draw_paper, draw_template_map
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.template_map import TemplateMap
+from dejavu_torch.memory import in_float32
 
 
+@in_float32()  # as the numbers that are drawn
 def draw_pictures(
     run: Localization,
     contenders: Mapping[str, Contender],

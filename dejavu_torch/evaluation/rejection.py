@@ -12,6 +12,7 @@ from torch import Tensor
 from dejavu_torch.data.ground_truth import GroundTruth, counted, is_right
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.plots import DARK, GREY, RIGHT, Pictures, canvas, picture
+from dejavu_torch.memory import in_float32
 from dejavu_torch.types import Match
 
 ASKED = (0.5, 0.8, 0.9, 0.95, 0.99)  # precisions in a report
@@ -68,6 +69,7 @@ def rejection_table(facts: Mapping[str, Any]) -> list[list[str]]:
     return rows
 
 
+@in_float32()
 def draw_reliability(match: Match, truth: GroundTruth | None, tolerance: int) -> Pictures:
     """The share of right answers over their probability; empty without probabilities or truth."""
     if match.probability is None or truth is None:

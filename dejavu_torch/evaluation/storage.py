@@ -18,7 +18,7 @@ from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.spectrum import from_spectrum, spectrum
 from dejavu_torch.recognition.localizer import SINGLE
-from dejavu_torch.text import bar
+from dejavu_torch.text import with_progress
 from dejavu_torch.types import InputError, Match
 
 BUDGETS = (1.0, 2.5, 5.0, 10.0, 20.0)  # route bytes per place
@@ -53,7 +53,7 @@ def coded_at_sizes(
     }
     found: dict[str, list[Stored]] = {key: [] for key in kinds}
     cases = [(key, budget) for key in kinds for budget in budgets]
-    for key, budget in bar(cases, "storage" if progress else None):
+    for key, budget in with_progress(cases, "storage" if progress else None):
         for answers, size in kinds[key](budget):
             answers = answers.renumbered(route.table.scored)
             scores = evaluate(answers, run.truth, run.tolerance)
@@ -70,10 +70,10 @@ def noise_over_map(route: SpectralMap, features: Tensor, seed: int = 0) -> float
     segment with less energy than others, saves bytes too. All other savings come from smoothness.
     """
     lines = spectrum((features.float() - route.means[0].float()).T, route.transform)
-    band = (2 * torch.arange(1, lines.shape[1] + 1, device=lines.device).log2()).long()
+    band = (2 * torch.arange(1, lines.shape[1] + 1, device=lines.device).float().log2()).long()
     sums = lines.new_zeros(len(lines), int(band[-1]) + 1).index_add(1, band, lines.square())
     energy = (sums / band.bincount().clamp(min=1))[:, band]
-    normal = torch.randn(lines.shape, generator=torch.Generator().manual_seed(seed))
+    normal = torch.randn(lines.shape, dtype=torch.float32, generator=torch.Generator().manual_seed(seed))
     noise = from_spectrum(energy.sqrt() * normal.to(energy), route.transform).T + route.means[0].float()
     settings = route.chunk, route.transform, route.metric, route.resolution
     mapper = SpectralMapper(None, float(route.steps.mean()), *settings)

@@ -110,12 +110,12 @@ class Augmentation(nn.Module):
             raise InputError(f"the frames are {shape} {dtype}; expected {expected} {radius} pixels a side")
         clips = frames if frames.ndim == 5 else frames[:, None]
         gain, offset = self.strengths["colour"]
-        draw = torch.rand(2, len(clips), 1, clips.shape[2], 1, 1, device=clips.device) * 2 - 1
+        draw = _random(clips, 2, len(clips), 1, clips.shape[2], 1, 1) * 2 - 1
         clips = (clips * (1 + gain * draw[0]) + offset * draw[1]).clamp_(0, 1)  # a copy, to change in place
         clips = self._lit(self._warped(clips))
         clips = self._occluded(_blurred(clips, blur, radius) if blur else clips)
         if noise:
-            clips = torch.randn_like(clips).mul_(noise * _happens(clips, NOISY)).add_(clips)
+            clips = torch.randn_like(clips).mul_(_happens(clips, NOISY)).mul_(noise).add_(clips)
         return clips.clamp_(0, 1).reshape(shape)
 
     def _warped(self, clips: Tensor) -> Tensor:
@@ -127,12 +127,12 @@ class Augmentation(nn.Module):
         height, width = clips.shape[-2:]
         longest = max(height, width)  # the unit of length
         sides = clips.new_tensor([width, height]) / longest
-        draw = (2 * torch.rand(6, len(clips), device=clips.device) - 1) * _happens(clips, WARPED).flatten()
+        draw = (2 * _random(clips, 6, len(clips)) - 1) * _happens(clips, WARPED).flatten()
         angle, tilts = (turn * draw[0]).deg2rad(), (slant * draw[1:3]).deg2rad()
         zooms, moves = 1 + zoom * draw[3], draw[4:] * sides[:, None] * clips.new_tensor(shift)[:, None]
-        u = torch.arange(1 - width, width, 2, device=clips.device) / (2 * longest)
-        v = torch.arange(1 - height, height, 2, device=clips.device)[:, None] / (2 * longest)
-        points = torch.stack(torch.broadcast_tensors(u, v, u.new_ones(()))).flatten(1)
+        u, v = (torch.arange(1 - n, n, 2, device=clips.device) for n in (width, height))
+        u, v = (pixels.to(clips) / (2 * longest) for pixels in (u, v))
+        points = torch.stack(torch.broadcast_tensors(u, v[:, None], u.new_ones(()))).flatten(1)
         source = _homography(angle, zooms, moves, tilts) @ points
         grid = (source[:, :2] / source[:, 2:]).mT * (2 / sides)
         images, grid = clips.flatten(1, 2), grid.view(-1, height, width, 2)
@@ -152,8 +152,8 @@ class Augmentation(nn.Module):
             clips = clips.log_().mul_(power).exp_()  # faster than pow; 0 stays 0
         if slope:
             height, width = clips.shape[-2:]
-            x = torch.linspace(0, 1, width, device=clips.device)
-            y = torch.linspace(0, 1, height, device=clips.device)[:, None]
+            x = torch.linspace(0, 1, width, dtype=clips.dtype, device=clips.device)
+            y = torch.linspace(0, 1, height, dtype=clips.dtype, device=clips.device)[:, None]
             ramps = torch.stack(torch.broadcast_tensors(x, 1 - x, y, 1 - y))
             side = torch.randint(4, (len(clips),), device=clips.device)
             most = _uniform(clips, -slope, slope) * _happens(clips, LIT)
@@ -165,7 +165,7 @@ class Augmentation(nn.Module):
         (most,) = self.strengths["occlusion"]
         if not most:
             return clips
-        area, ratio, y, x = torch.rand(4, len(clips), 1, 1, 1, 1, device=clips.device)
+        area, ratio, y, x = _random(clips, 4, len(clips), 1, 1, 1, 1)
         area, ratio = most * area, 3 ** (2 * ratio - 1)
 
         def inside(pixels: int, side: Tensor, where: Tensor) -> Tensor:
@@ -186,7 +186,11 @@ class Augmentation(nn.Module):
 
 def _uniform(clips: Tensor, low: float, high: float) -> Tensor:
     """A random number for each clip, (B,1,1,1,1)."""
-    return low + (high - low) * torch.rand(len(clips), 1, 1, 1, 1, device=clips.device)
+    return low + (high - low) * _random(clips, len(clips), 1, 1, 1, 1)
+
+
+def _random(clips: Tensor, *shape: int) -> Tensor:
+    return torch.rand(shape, dtype=clips.dtype, device=clips.device)
 
 
 def _happens(clips: Tensor, chance: float) -> Tensor:

@@ -228,4 +228,4 @@ def _per_channel(name: str, given: float | list[float] | None, channels: int, de
         expected = f"a number for each of {channels} channels, or one for all"
         expected += ", above 0" * (name == "std")
         raise InputError(f"Embedding got {name}={f'{given}':.80}; expected {expected}")
-    return torch.tensor(numbers).float().expand(channels).clone().view(channels, 1, 1)
+    return torch.tensor(numbers, dtype=torch.float32).expand(channels).clone().view(channels, 1, 1)

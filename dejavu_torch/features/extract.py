@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import logging
-import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import torch
 from torch import Tensor, nn
-from tqdm import tqdm
 
 from dejavu_torch.features.preprocess import check_frames
 from dejavu_torch.features.views import AugmentedTraverse
+from dejavu_torch.text import progress_of
 from dejavu_torch.types import InputError, Traverse
 
 log = logging.getLogger("dejavu_torch")
@@ -23,7 +21,6 @@ BATCH_TOLERANCE = 1e-3  # of their length: how much features may differ between 
 BATCH_ULPS = 4  # of the coarsest dtype: the same tolerance, if it is larger
 TF32 = 2**-10  # the rounding of this format
 READY = 256  # ready features at a time, at least: a search takes longer per query for fewer
-FIRST_LINE, LINE_EVERY = 30.0, 60.0  # seconds until the first line of progress, and between lines
 
 
 def feature_batches(
@@ -31,7 +28,7 @@ def feature_batches(
     module: nn.Module,
     batch_size: int = 64,
     device: torch.device | str = "cpu",
-    progress: str | None = None,
+    label: str | None = None,
     on_first: Callable[[Tensor, Tensor], None] | None = None,
 ) -> Iterator[Tensor]:
     """Features (B,D) of the frames of a traverse, in order, without gradients.
@@ -40,7 +37,7 @@ def feature_batches(
         traverse: frames (B,C,H,W), or ready features (B,D), which pass unchanged.
         module: (B,C,H,W) -> (B,D). It runs in eval mode; the modes of its parts are restored.
         batch_size: frames in memory at a time, fewer if they are large; at least 256 ready features.
-        progress: label of a progress bar on stderr, or of lines if it is no terminal; copies count once.
+        label: of a progress bar on stderr, or of lines if it is no terminal; copies count once.
         on_first: called with the first batch and its features.
 
     Raises:
@@ -49,7 +46,7 @@ def feature_batches(
     done, copies = 0, traverse.copies if isinstance(traverse, AugmentedTraverse) else 1
     total = traverse.length and traverse.length // copies
     size = max(batch_size, READY) if len(traverse.frame_shape) == 1 else batch_size
-    with _progress(progress, total) as update, in_mode(module, False):
+    with progress_of(label, total) as update, in_mode(module, False):
         for batch in traverse.batches(traverse.batch_size(size)):
             with torch.no_grad():
                 features = features_of(batch.to(device), module, traverse.name).detach()
@@ -67,29 +64,6 @@ def feature_batches(
             yield features
     if done == 0:
         raise InputError(f"{traverse.name} holds no frames; expected at least one")
-
-
-@contextmanager
-def _progress(text: str | None, total: int | None) -> Iterator[Callable[[int], object]]:
-    """A function to call with the number of frames newly done, which shows progress unless `text` is None."""
-    if text is not None and sys.stderr.isatty():
-        with tqdm(total=total, desc=text, unit="frame", leave=False) as bar:
-            yield bar.update
-        return
-    began, done = time.monotonic(), 0
-    due = began + FIRST_LINE
-
-    def update(more: int) -> None:
-        nonlocal done, due
-        done, now = done + more, time.monotonic()
-        if text is None or now < due or not done:
-            return
-        due = now + LINE_EVERY
-        of = f" of {total}" if total else ""
-        left = f", {max(0, total - done) * (now - began) / done:.0f} s left" if total else ""
-        tqdm.write(f"dejavu: {text}: {done}{of} frames{left}", file=sys.stderr)
-
-    yield update
 
 
 def features_of(batch: Tensor, describe: Callable[[Tensor], Tensor], name: str = "the input") -> Tensor:

@@ -160,9 +160,9 @@ class Whitening(nn.Module):
         self.strengths = {**STRENGTHS, **(strengths or {})}
         self.fixed = False  # whether it comes from elsewhere and is not learned again
         self.register_buffer("projection", torch.zeros(0, 0, dtype=torch.int8))  # (D,K), see `take`
-        self.register_buffer("scale", torch.zeros(0))  # (K,)
-        self.register_buffer("offset", torch.zeros(0))  # (K,), the projected mean
-        self.register_buffer("length", torch.zeros(0))  # (1,), the constant dimension, or (0,)
+        self.register_buffer("scale", torch.zeros(0).float())  # (K,)
+        self.register_buffer("offset", torch.zeros(0).float())  # (K,), the projected mean
+        self.register_buffer("length", torch.zeros(0).float())  # (1,), the constant dimension, or (0,)
         self.members = nn.ModuleList()  # a whitening per group, whose outputs the projection joins
 
     @property
@@ -378,7 +378,7 @@ def principal_components(
     centred = sample - mean
     width = min(count + SPARE, len(sample), rows.shape[1])
     generator = torch.Generator().manual_seed(seed)
-    basis = torch.randn(rows.shape[1], width, generator=generator).to(centred)
+    basis = torch.randn(rows.shape[1], width, generator=generator, dtype=torch.float32).to(centred)
     for _ in range(ROUNDS):
         basis = torch.linalg.qr(centred.T @ (centred @ basis)).Q
     inside = (centred @ basis).double()

@@ -4,27 +4,32 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from threading import Timer
 from typing import Any
 
 from dejavu_torch.text import one_line
 
 log = logging.getLogger("dejavu_torch")
 
+SILENCE = 2.0  # seconds, longer than a load from the cache takes
+
 
 def compiled(
     function: Callable[..., Any], signature: str, what: str, calls: Sequence[Any] = (), **options: Any
 ) -> Callable[..., Any] | None:
-    """The function, and its `calls`, compiled for one signature or loaded from numba's cache.
+    """The function, and its `calls`, compiled for one signature, which is told, or loaded from numba's cache.
 
     None, and a log line that `what` happens instead, if numba is missing, disabled or broken.
     """
     options |= {"nogil": True, "error_model": "numpy"}
+    told = Timer(SILENCE, log.warning, ("numba compiles a loop for later runs too; this takes about 20 s",))
     try:
         import numba
         from numba.extending import register_jitable
 
         for one in calls:
             register_jitable(one)
+        told.start()
         try:
             kernel: Callable[..., Any] = numba.njit(signature, cache=True, **options)(function)
         except Exception:  # the cache may have no folder
@@ -35,3 +40,5 @@ def compiled(
     except Exception as error:  # a broken compiler must not break what works without it
         log.info("%s, not by numba: %s", what, one_line(error))
         return None
+    finally:
+        told.cancel()

@@ -27,13 +27,14 @@ ZIP = b"PK\x03\x04"  # the first bytes of a checkpoint
 EXPECTED = "a map file, as DejaVu.save writes"
 HEADER = "header"  # key of the header and of its digest
 SHOWN = 60  # characters of a value in a message
+DIGEST = 8  # bytes
 
 
 def checksums(tensors: Mapping[str, Tensor], header: Any) -> dict[str, str]:
     """A digest of the header, and of each part's names, types, shapes and bytes."""
-    sums = {HEADER: blake2b(json.dumps(header).encode(), digest_size=8)}
+    sums = {HEADER: blake2b(json.dumps(header).encode(), digest_size=DIGEST)}
     for name, tensor in sorted(tensors.items()):
-        part = sums.setdefault(name.partition(".")[0], blake2b(digest_size=8))
+        part = sums.setdefault(name.partition(".")[0], blake2b(digest_size=DIGEST))
         part.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
         part.update(tensor.cpu().contiguous().view(-1).view(torch.uint8).numpy().data)
     return {part: digest.hexdigest() for part, digest in sums.items()}
@@ -45,8 +46,17 @@ def digests(**values: Any) -> dict[str, str]:
 
 
 def map_size(tensors: Mapping[str, Tensor], header: dict[str, Any]) -> int:
-    """Bytes of the file that `write_map` writes."""
-    return len(safetensors.torch.save(*_seal(tensors, header)))
+    """Bytes of the file that `write_map` writes, from names, types and shapes alone."""
+    sums = dict.fromkeys((HEADER, *(name.partition(".")[0] for name in tensors)), "0" * 2 * DIGEST)
+    empty = {name: torch.empty(0, dtype=one.dtype) for name, one in tensors.items()}
+    # of tensors without data, so that safetensors gives the order
+    entries, end = json.loads(safetensors.torch.save(empty, _metadata(sums, header))[8:]), 0
+    for name, entry in entries.items():
+        if name in tensors:
+            begin, end = end, end + tensors[name].nbytes
+            entry |= {"shape": tensors[name].shape, "data_offsets": (begin, end)}
+    text = json.dumps(entries, separators=(",", ":"), ensure_ascii=False)
+    return 8 + -(-len(text.encode()) // 8) * 8 + end
 
 
 def write_map(path: Path, tensors: Mapping[str, Tensor], header: dict[str, Any]) -> None:
@@ -54,19 +64,17 @@ def write_map(path: Path, tensors: Mapping[str, Tensor], header: dict[str, Any])
     tensors begin with a part of the model and a dot; the header is JSON."""
     with whole_file(path) as temporary:
         try:
-            plain, metadata = _seal(tensors, header)
-            safetensors.torch.save_file(plain, temporary, metadata)
+            layout = torch.contiguous_format  # with memory of its own, as safetensors needs
+            plain = {name: one.detach().cpu().clone(memory_format=layout) for name, one in tensors.items()}
+            safetensors.torch.save_file(plain, temporary, _metadata(checksums(plain, header), header))
         except (SafetensorError, ValueError) as error:
             raise InputError(f"{path} was not written: {error}") from error
 
 
-def _seal(tensors: Mapping[str, Tensor], header: dict[str, Any]) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Tensors with memory of their own, as safetensors needs, and metadata: one entry, for a fixed order."""
-    layout = torch.contiguous_format
-    plain = {name: one.detach().cpu().clone(memory_format=layout) for name, one in tensors.items()}
-    sealed = {"version": FORMAT, "checksums": checksums(plain, header), HEADER: header}
+def _metadata(sums: dict[str, str], header: dict[str, Any]) -> dict[str, str]:
+    """The metadata of the archive: one entry, for a fixed order."""
     try:
-        return plain, {NAME: json.dumps(sealed, allow_nan=False)}
+        return {NAME: json.dumps({"version": FORMAT, "checksums": sums, HEADER: header}, allow_nan=False)}
     except ValueError as error:
         raise InputError(f"the model cannot be written: {error}; expected finite numbers") from error
 

@@ -52,7 +52,7 @@ class PlaceMap(nn.Module, ABC):
     def __init__(self, places: int = 0, dimension: int = 0) -> None:
         super().__init__()
         self.places, self.dimension = places, dimension
-        self.register_buffer("positions", torch.zeros(0))
+        self.register_buffer("positions", torch.zeros(0).float())
         self.register_buffer("visits", torch.zeros(0, 2, dtype=torch.int32), persistent=False)
 
     @abstractmethod

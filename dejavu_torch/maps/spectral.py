@@ -137,7 +137,7 @@ class SpectralMapper(Mapper):
                 seen = f"positions of frames take {self.overhead / places:.3g} bytes per place"
                 left = f"what route_bytes_per_place={budget:g} leaves for them and the lines"
                 log.warning(f"{seen}, over half of {left}: they come on top of it")
-        step = float(torch.tensor(self._fitting_step(lines, fixed)))  # float32, as in the file
+        step = float(torch.tensor(self._fitting_step(lines, fixed), dtype=torch.float32))  # as in the file
         route = self.empty(lines.mean[None], step)
         even = lines.even()  # lines that `resolution` removes do not count as missing
         if self.share is None and even.held(step) < HALF:

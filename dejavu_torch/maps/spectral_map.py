@@ -190,7 +190,7 @@ class SpectralMap(PlaceMap):
         for name, column in zip(("counts", "feature", "level"), zip(*parts, strict=True), strict=True):
             append(name, *column)
         append("lengths", torch.tensor(places))
-        append("steps", torch.tensor([one.step for one in chunks]).to(self.steps))
+        append("steps", self.steps.new_tensor([one.step for one in chunks]))
         append("stream_table", torch.tensor([[len(c.stream.bytes), c.stream.checksum] for c in chunks]))
         append("streams", *(one.stream.bytes for one in chunks))
         if len(self.visits):
@@ -288,7 +288,7 @@ class SpectralMap(PlaceMap):
     def _features(self, chunk: int) -> Iterator[Tensor]:
         """The coded descriptors of a chunk, some of their features at a time: (F,W) each."""
         start, stop = self.chunks[chunk]
-        units = torch.eye(self.dimension, device=self.means.device)
+        units = torch.eye(self.dimension, dtype=torch.float32, device=self.means.device)
         for some in units.split(max(1, LONG // (stop - start))):
             yield self.products(some, range(chunk, chunk + 1))
 

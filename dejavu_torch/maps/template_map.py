@@ -122,12 +122,12 @@ class TemplateMap(PlaceMap):
         rows = [(*layer.period.as_integer_ratio(), layer.phases, layer.start, layer.stop) for layer in plan]
         index = [feature for layer in plan for feature in layer.features]
         pointer = [0, *accumulate(len(layer.features) for layer in plan)]
-        numbers = torch.cat([block.flatten() for block in templates]) if plan else torch.zeros(0)
+        numbers = torch.cat([block.flatten() for block in templates]) if plan else torch.zeros(0).float()
         self.register_buffer("layers", torch.tensor(rows, dtype=torch.int64).reshape(-1, 5))
         self.register_buffer("feature_ptr", torch.tensor(pointer))
         self.register_buffer("feature_index", torch.tensor(index, dtype=torch.int32))
         self.register_buffer("templates", numbers)
-        self.register_buffer("weights", torch.zeros(0) if weights is None else weights.float())
+        self.register_buffer("weights", (torch.zeros(0) if weights is None else weights).float())
         self.register_buffer("lap_phases", torch.zeros(0, dtype=torch.int64), persistent=False)
         self.to(numbers.device)
         self.check()

@@ -34,16 +34,14 @@ def flow_shift(first: Tensor, second: Tensor, method: str) -> tuple[Tensor, Tens
     Limits: |shift| up to about 0.4 h ("dis" 0.25 h, accurate to 0.1 pixels only). Lines along the way appear
         static: on a motorway both are worse than `phase_shifts`.
     """
-    track = tracker(method)
+    track = _tracker(method)
     found = [_shift(track, *pair) for pair in zip(_to_uint8(first), _to_uint8(second), strict=True)]
     shift, confidence = first.new_tensor(found).view(-1, 2).T
     return shift, confidence
 
 
-def tracker(method: str) -> Tracker:
+def _tracker(method: str) -> Tracker:
     """The function `track(first, second, start)` of a method, which follows points between two images."""
-    if method not in TRACKERS:
-        raise InputError(f"flow is {method!r}; expected phase, {', '.join(TRACKERS)}")
     try:
         import cv2
     except ImportError as error:

@@ -57,7 +57,7 @@ def ground_patch(frames: Tensor, corners: Corners = TRAPEZIUM, size: tuple[int, 
     # blurred, as the far rows are sampled coarsely
     grey = conv2d(pad(grey, (0, 0, 1, 1), mode="replicate"), grey.new_tensor([1, 2, 1]).view(1, 1, 3, 1) / 4)
     unit = grey.new_tensor([[[0, 0], [1, 0], [1, 1], [0, 1]]])
-    region = torch.tensor([corners]).to(grey) * grey.new_tensor([width - 1, height - 1])
+    region = grey.new_tensor([corners]) * grey.new_tensor([width - 1, height - 1])
     # the inverse would fail if the frame's first pixel lies on the patch's horizon
     from_patch = get_perspective_transform(unit * grey.new_tensor([columns - 1, rows - 1]), region)
     patch: Tensor = warp_perspective(grey, torch.linalg.inv(from_patch).expand(count, 3, 3), (rows, columns))

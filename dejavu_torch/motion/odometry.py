@@ -9,13 +9,12 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor, nn
-from tqdm import tqdm
 
 from dejavu_torch.data.frame_range import runs
-from dejavu_torch.motion.flow import flow_shift, tracker
+from dejavu_torch.motion.flow import TRACKERS, flow_shift
 from dejavu_torch.motion.ground_plane import TRAPEZIUM, Corners, check_corners, ground_patch
 from dejavu_torch.motion.phase_correlation import MIN_CONFIDENCE, phase_shifts, viterbi_path
-from dejavu_torch.text import settings_of
+from dejavu_torch.text import progress_of, settings_of
 from dejavu_torch.types import InputError, Traverse
 
 log = logging.getLogger("dejavu_torch")
@@ -53,7 +52,7 @@ class GroundOdometry(nn.Module):
     Convention: if periodic ground allows several shifts, the smoothest path is chosen (`viterbi_path`).
 
     Raises:
-        InputError: an argument out of range, OpenCV missing; forward: not (N,C,H,W) float, or N of 1.
+        InputError: an argument out of range; forward: OpenCV missing, not (N,C,H,W) float, or N of 1.
 
     Example:
         >>> shift, confidence = GroundOdometry()(torch.rand(1, 3, 120, 160).expand(5, 3, 120, 160))
@@ -80,8 +79,8 @@ class GroundOdometry(nn.Module):
             raise InputError(f"least is {least}; expected a confidence from 0 to 1")
         if not 0 <= still < math.inf:
             raise InputError(f"still is {still}; expected pixels of ground, at least 0")
-        if flow != "phase":
-            tracker(flow)  # refuses other names, and a missing OpenCV
+        if flow not in ("phase", *TRACKERS):
+            raise InputError(f"flow is {flow!r}; expected phase, {', '.join(TRACKERS)}")
         self.corners = tuple((float(x), float(y)) for x, y in corners)
         self.size = (int(size[0]), int(size[1]))
         self.step = None if step is None else float(step)
@@ -122,15 +121,14 @@ class GroundOdometry(nn.Module):
         """
         last: list[Tensor] = []  # the last patch of the previous batch
         parts: list[tuple[Tensor, Tensor]] = []
-        text, hidden = "measuring the ground", None if progress else True
-        with tqdm(total=traverse.length, desc=text, unit="frame", disable=hidden, leave=False) as bar:
+        with progress_of("measuring the ground" if progress else None, traverse.length) as update:
             for batch in traverse.batches(traverse.batch_size(batch_size)):
                 patches = torch.cat([*last, ground_patch(batch, self.corners, self.size)])
                 if not last:
                     self._warn_coarse(batch, traverse.name)
                 parts += self._shifts(patches)
                 last = [patches[-1:]]
-                bar.update(len(batch))
+                update(len(batch))
         shift, confidence = (part.cpu() for part in self._path(parts, traverse.name))
         shift = interpolated(shift.double(), confidence >= self.least, traverse.name)
         shift = torch.where(shift.abs() < self.still, 0.0, shift)

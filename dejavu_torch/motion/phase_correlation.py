@@ -33,7 +33,7 @@ def phase_shifts(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
     """
     count, _, height, _ = first.shape
     reach = int(MAX_SHIFT * (height // 2))  # coarse: all integer lags at half resolution
-    lags = torch.arange(-reach, reach + 1.0).to(first)
+    lags = torch.arange(-reach, reach + 1).to(first)
     one, other = (avg_pool2d(patch, 2)[:, 0] for patch in (first, second))
     score = _coherence(one, other, first.new_zeros(count), lags, SWAY // 2 + 1, 2 * BAND)
     padded = pad(score, (1, 1), value=-1)
@@ -42,7 +42,7 @@ def phase_shifts(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
     # fine: the neighbourhood of each peak
     one, other = (patch[:, 0].repeat_interleave(PEAKS, 0) for patch in (first, second))
     for span, step in ((4.0, 0.5), (1.0, 0.25)):
-        lags = torch.arange(-span, span + step / 2, step).to(first)
+        lags = torch.arange(-span, span + step / 2, step, dtype=torch.float32).to(first)
         score = _coherence(one, other, shift, lags, SWAY, BAND)
         best, at = score.max(1)
         shift = shift + lags[at] + step * _vertex(score, at)

@@ -71,7 +71,7 @@ def fit(confidence: Tensor, right: Tensor, weight: Tensor | None = None) -> Plat
     mean, spread = float(x.mean()), float(x.std(correction=0)) or 1.0
     columns = torch.stack([(x - mean) / spread, torch.ones_like(x)], 1)
     hits, misses = float(weight[y].sum()), float(weight[~y].sum())
-    target = torch.where(y, (hits + 1) / (hits + 2), 1 / (misses + 2)).double()
+    target = torch.where(y, x.new_tensor((hits + 1) / (hits + 2)), 1 / (misses + 2))
     params = x.new_tensor([0.0, math.log((hits + 1) / (misses + 1))])
 
     def loss(at: Tensor) -> Tensor:
@@ -171,6 +171,6 @@ def calibrated(
         confidences, right, on_the_map = map(torch.cat, zip(*rows, strict=True))
         wrong = int((on_the_map & ~right).sum())
         off_weight = max(0, MIN_WRONG - wrong) / max(1, int((~on_the_map).sum())) if another_visit else 1.0
-        weight = torch.where(on_the_map, 1.0, off_weight)
+        weight = torch.where(on_the_map, 1.0, confidences.new_tensor(off_weight))
         platts.append(fit(confidences, right, weight) if not platts or bool(right.any()) else None)
     return Calibration(*platts)

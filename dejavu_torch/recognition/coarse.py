@@ -272,7 +272,7 @@ class CoarseSearch:
 
     def _scores(self, units: Tensor, place: Tensor) -> Tensor:
         """Exact scores of places (Q,M) for each query; +inf for none."""
-        products = torch.full(place.shape, -math.inf, device=place.device)
+        products = torch.full(place.shape, -math.inf, dtype=torch.float32, device=place.device)
         chunk = torch.bucketize(place, self.starts, right=True) - 1
         for g in chunk.unique().tolist():
             if g >= 0:
@@ -331,7 +331,7 @@ class CoarseSearch:
     def _bounds(self) -> Tensor:
         """For each group of fine samples, its smallest norm times (cos a, sin a, `ROUNDING`), where a is the
         largest angle between a sample and a place near it: (S / GROUP, 3)."""
-        lowest = torch.ones(len(self.fine.norm) // GROUP, device=self.fine.norm.device)
+        lowest = self.fine.norm.new_ones(len(self.fine.norm) // GROUP)
         for chunk, (start, stop) in enumerate(self.route.chunks):
             nearest, units = self._nearest(chunk), F.normalize(self.route.decode(chunk))
             cosine = (self.fine.rows[nearest] * units).sum(1) / self.fine.norm[nearest]

@@ -107,12 +107,12 @@ class PlaceFilter(SequenceModel):
         self.move_logits = nn.Parameter(_logits(*moves))
         self.rate_logits = nn.Parameter(_logits(1 - jump - leave, jump, leave))
         self.enter_logit = nn.Parameter(_logits(enter)[0] - _logits(1 - enter)[0])
-        self.log_sharpness = nn.Parameter(torch.tensor(float(sharpness)).log())
-        self.off_map = nn.Parameter(torch.tensor(float(off_map)))
+        self.log_sharpness = nn.Parameter(torch.tensor(float(sharpness), dtype=torch.float32).log())
+        self.off_map = nn.Parameter(torch.tensor(float(off_map), dtype=torch.float32))
         self.within, self.threshold, self.search_every = within, threshold, search_every
 
     def start(self, places: int, fixed: bool = False) -> Tensor:
-        return torch.zeros(places + 1, device=self.off_map.device)
+        return self.off_map.new_zeros(places + 1)
 
     def forward(self, scores: Tensor, before: Tensor | None = None) -> Tensor:
         return self.near_scores(self.posterior(scores, before)[:, :-1], scores)
@@ -297,4 +297,4 @@ def _rest(belief: Tensor, others: int) -> Tensor:
 
 def _logits(*probabilities: float) -> Tensor:
     """Logarithms, finite for a probability of 0."""
-    return torch.tensor(probabilities).clamp(min=MIN_PROBABILITY).log()
+    return torch.tensor(probabilities, dtype=torch.float32).clamp(min=MIN_PROBABILITY).log()

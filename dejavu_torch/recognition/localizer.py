@@ -19,7 +19,7 @@ from dejavu_torch.recognition.filter import LocalSearch, PlaceFilter
 from dejavu_torch.recognition.search import SCORES_AT_ONCE, Find, Search, Wanted, num_needed, search
 from dejavu_torch.recognition.select import Acceptance, accept, best_candidates, best_match
 from dejavu_torch.recognition.sequence import SequenceMatcher
-from dejavu_torch.text import bar
+from dejavu_torch.text import with_progress
 from dejavu_torch.types import Match, SequenceModel, Together
 
 ROWS = 4096  # descriptors on the device at a time
@@ -85,7 +85,7 @@ class Localizer:
             self.local = LocalSearch(sequence, route, approximate or route.scores) if every > 1 else None
 
     @torch.no_grad()
-    def __call__(self, descriptors: Tensor, progress: str | None = None) -> Match:
+    def __call__(self, descriptors: Tensor, label: str | None = None) -> Match:
         route, matching = self.route, self.matching
         assert route is not None
         places = route.places
@@ -101,7 +101,7 @@ class Localizer:
         if not self.models and matching.on_scores is None and few:
             way, size = partial(self._by_search, wanted), max(PER_BEST * n, places // PLACES_PER_NUMBER)
         parts = descriptors.split(max(1, min(ROWS, SCORES_AT_ONCE // size)))
-        return Match.joined(way(part.to(route.positions.device)) for part in bar(parts, progress))
+        return Match.joined(way(part.to(route.positions.device)) for part in with_progress(parts, label))
 
     @torch.no_grad()
     def match(self, scores: Tensor) -> Match:

@@ -23,8 +23,7 @@ SCORES_AT_ONCE = 2**24  # numbers of Q x n in memory
 def check_search(method: str) -> None:
     """Refuse an unknown search method."""
     if method not in get_args(Search):
-        removed = " was removed" if method in ("bound", "ivf") else ""
-        raise InputError(f"search {method!r}{removed}; expected auto, coarse, exact or scan")
+        raise InputError(f"search {method!r}; expected auto, coarse, exact or scan")
 
 
 def num_needed(wanted: Wanted, places: int) -> int:

@@ -63,7 +63,7 @@ class SequenceMatcher(SequenceModel):
         return [math.floor(speed * k + 0.5) for k in range(self.length)]
 
     def start(self, places: int, fixed: bool = False) -> Tensor:
-        return torch.full((self.length - 1 if fixed else 0, places), math.nan)
+        return torch.full((self.length - 1 if fixed else 0, places), math.nan, dtype=torch.float32)
 
     def forward(self, scores: Tensor, state: Tensor | None = None) -> Tensor:
         return self.step(scores, self.start(scores.shape[-1]).to(scores) if state is None else state)[0]

@@ -23,6 +23,7 @@ from dejavu_torch.evaluation.controls import null_control, with_mapper
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.report import sequence_table, summary
 from dejavu_torch.features.pixels import PatchPixels
+from dejavu_torch.features.views import Views
 from dejavu_torch.maps.distance import phase_distances
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.recognition.filter import PlaceFilter
@@ -36,6 +37,12 @@ def route(seed: int, frames: int = 240) -> torch.Tensor:
     i = torch.arange(frames)
     parts = [torch.randn(p, 30, generator=profile)[i % p] for p in (12, 20)]
     return torch.cat(parts, 1) + 0.3 * torch.randn(frames, 60, generator=noise)
+
+
+def smooth(seed: int, frames: int = 200) -> Tensor:
+    """Features that change slowly, and never return."""
+    steps = torch.randn(frames + 9, 12, generator=torch.Generator().manual_seed(seed))
+    return steps.unfold(0, 10, 1).mean(2)
 
 
 @pytest.fixture
@@ -333,6 +340,39 @@ def test_each_long_step_has_a_bar_on_a_terminal(terminal: bool, monkeypatch: pyt
     monkeypatch.setattr(sys, "stderr", stream)
     pair = [open_source(f"sim:aerial?frames=200&traverse={one}") for one in (0, 1)]
     compare(*pair, distractors=[open_source("sim:outdoor?frames=40")], progress=True)
-    steps = "describing the reference", "calibrating", "describing the query", "localizing", "null control"
-    steps += "describing sim:outdoor", "baselines: HOG"
+    steps = "learning", "calibrating", f"describing {pair[1].name}", "localizing"
+    steps += "describing sim:outdoor", "baselines"
     assert [step for step in steps if step in stream.getvalue()] == ([*steps] if terminal else [])
+
+
+def test_routes_off_the_map_are_prepared_as_queries_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ready features are accepted for ready features, and frames are resampled at the map's step."""
+    monkeypatch.setattr("dejavu_torch.evaluation.compare.draw_pictures", lambda *_: {})
+    features = [ArrayTraverse(smooth(seed), str(seed)) for seed in (0, 0, 3)]
+    views = Views(ArrayTraverse(smooth(0) + 0.1), torch.arange(200))
+    found = compare(*features[:2], "0", distractors=features[2:], calibration=views).report.facts
+    assert found["rejection"]["off_map"]["3"]["frames"] == 200
+    drives = [ArrayTraverse(ground(at), name) for at, name in ((REFERENCE, "a"), (QUERY, "b"), (QUERY, "c"))]
+    model = DejaVu(velocity=camera(step=STEP))
+    found = compare(*drives[:2], model=model, distractors=drives[2:]).report.facts
+    assert found["queries"] == found["rejection"]["off_map"]["c"]["frames"]
+
+
+@pytest.mark.parametrize(
+    ("reference", "other", "facts"),
+    [
+        ((20, 1, 32, 32), (5, 7), ("7 features", "1 x 32 x 32", "same number")),
+        ((20, 8), (5, 7), ("8 features", "7 features", "same number")),
+        ((20, 8), (5, 1, 32, 32), ("8 features", "1 x 32 x 32")),
+    ],
+)
+def test_routes_of_another_kind_are_refused_before_learning(
+    reference: tuple[int, ...],
+    other: tuple[int, ...],
+    facts: tuple[str, ...],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(DejaVu, "describe_reference", None)
+    pair = ArrayTraverse(torch.rand(reference), "route"), ArrayTraverse(torch.rand(reference), "again")
+    with refused("route", "elsewhere", *facts):
+        compare(*pair, distractors=[ArrayTraverse(torch.rand(other), "elsewhere")])

@@ -176,7 +176,7 @@ def test_a_clip_alone_is_covered_with_black() -> None:
 def test_warps_are_those_of_kornia(drawn: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """Drawn to either end: kornia turns, scales and moves the frame by as much."""
     frames, sign = torch.rand(2, 3, 20, 30), -1 if drawn < 0.5 else 1
-    monkeypatch.setattr(torch, "rand", lambda *shape, device=None: torch.full(shape, drawn))
+    monkeypatch.setattr(torch, "rand", lambda shape, **_: torch.full(shape, drawn))
     monkeypatch.setattr("dejavu_torch.features.augmentation.WARPED", 1.0)
     centre, pixels = torch.tensor([[29 / 2, 19 / 2]]), sign * torch.tensor([[0.3 * 30, 0.2 * 20]])
     zoom, turn = torch.full((1, 2), 1 + 0.3 * sign), torch.tensor([-25.0 * sign])

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import sys
 import zlib
+from functools import partial
+from time import sleep
 from unittest import mock
 
 import numpy as np
@@ -15,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dejavu_torch.maps import codec
+from dejavu_torch.maps import codec, compiling
 from dejavu_torch.maps.codec import Stream, coded_bytes, decode, encode
 from dejavu_torch.types import InputError
 
@@ -180,3 +182,14 @@ def test_it_is_compiled_once_it_pays_if_it_can_be(
         assert codec._kernel(1) is codec._kernel(1) is codec._code
     codec._compiled.cache_clear()
     assert ["not by numba" in line for line in caplog.messages] == [True]
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.2])
+def test_a_long_compilation_is_told(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, seconds: float
+) -> None:
+    """A load from the cache is short, and silent."""
+    monkeypatch.setattr(compiling, "SILENCE", 0.1)
+    monkeypatch.setattr("numba.njit", lambda *_, **__: lambda one: sleep(seconds) or partial(one))
+    assert compiling.compiled(lambda: 1, "int64()", "") is not None
+    assert ["20 s" in line for line in caplog.messages] == [True] * (seconds > 0)

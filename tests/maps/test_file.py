@@ -14,6 +14,8 @@ import pytest
 import safetensors.torch
 import torch
 from helpers import Fixed, refused, template_model
+from hypothesis import given
+from hypothesis import strategies as st
 from safetensors import safe_open
 from torch import Tensor, nn
 
@@ -22,13 +24,23 @@ from dejavu_torch.data.names import encode_names
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.features.hog import HOG
-from dejavu_torch.maps.file import FORMAT, NAME, write_map
+from dejavu_torch.maps.file import FORMAT, NAME, map_size, write_map
 from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import read_place_map, recipe_of
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.types import FrequencyLayer, Training
 
+TYPES = (
+    torch.bool,
+    torch.uint8,
+    torch.int32,
+    torch.int64,
+    torch.float16,
+    torch.bfloat16,
+    torch.float32,
+    torch.float64,
+)
 WINDOW = SpectrogramAnalysis(window=64, strongest=1)
 
 
@@ -130,6 +142,27 @@ def test_a_map_of_frames_comes_back_with_its_features_and_periods(path: Path) ->
 
 
 # the file
+
+
+@given(
+    st.dictionaries(
+        st.text(max_size=4).map("part.{}".format),
+        st.tuples(st.sampled_from([*TYPES]), st.lists(st.integers(0, 12), max_size=3)),
+        max_size=9,
+    ),
+    st.dictionaries(
+        st.text(max_size=5), st.text(max_size=9) | st.floats(allow_nan=False, allow_infinity=False)
+    ),
+)
+def test_the_size_of_a_file_is_known_from_types_and_shapes(
+    tmp_path_factory: pytest.TempPathFactory,
+    kinds: dict[str, tuple[torch.dtype, list[int]]],
+    header: dict[str, Any],
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "any.safetensors"
+    tensors = {name: torch.zeros(shape, dtype=dtype) for name, (dtype, shape) in kinds.items()}
+    write_map(path, tensors, header)
+    assert map_size(tensors, header) == path.stat().st_size
 
 
 def test_one_file_of_the_size_the_map_claims(saved: Path) -> None:
@@ -425,9 +458,9 @@ def test_an_embedding_of_a_network_from_elsewhere_must_be_given(path: Path) -> N
     with refused(str(path), "Patch", "only the caller can load", "`features`"):
         DejaVu.load(path)
     torch.manual_seed(1)
-    for given in (embedding(Patch()), Patch()):  # or its network alone
-        again = DejaVu.load(path, given)
-        assert given in (again.features, again.features.network)
+    for own in (embedding(Patch()), Patch()):  # or its network alone
+        again = DejaVu.load(path, own)
+        assert own in (again.features, again.features.network)
         assert torch.equal(again.localize(query).score, model.localize(query).score)
         assert not again.training
 

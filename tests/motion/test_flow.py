@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import math
 import sys
+from pathlib import Path
 
 import pytest
 import torch
-from helpers import refused
+from footage import REFERENCE, STEP, camera, everything, footage
+from helpers import refused, template_model
 from torch import Tensor
 from torch.nn.functional import conv2d
 
+from dejavu_torch import DejaVu
+from dejavu_torch.cli import main
 from dejavu_torch.motion.flow import flow_shift
 from dejavu_torch.motion.odometry import GroundOdometry
 
@@ -102,5 +106,19 @@ def test_what_is_refused(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
         GroundOdometry(flow="farneback")
     monkeypatch.setitem(sys.modules, "cv2", None)
     with refused("OpenCV", "pip install 'dejavu_torch[flow]'"):
-        GroundOdometry(flow=method)
+        DejaVu(velocity=GroundOdometry(flow=method)).learn(torch.rand(20, 1, 240, 320))
     GroundOdometry()(torch.rand(2, 1, 240, 320))
+
+
+def test_a_map_opens_without_opencv_until_it_has_to_measure(
+    method: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = template_model(periods=everything(101), velocity=camera(step=STEP)).learn(footage(REFERENCE))
+    assert made.velocity is not None
+    made.velocity.flow = method
+    made.save(tmp_path / "m.safetensors")
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    main(["info", str(tmp_path / "m.safetensors")])
+    assert method in capsys.readouterr().out
+    with refused("OpenCV", "pip install 'dejavu_torch[flow]'"):
+        DejaVu.load(tmp_path / "m.safetensors").localize(footage(REFERENCE[:20]))

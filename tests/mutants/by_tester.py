@@ -198,8 +198,8 @@ MUTANTS = [
     Mutant(
         "Evidence that tells right from wrong wholly still gives probabilities short of 0 and 1.",
         "dejavu_torch/recognition/calibration.py",
-        "target = torch.where(y, (hits + 1) / (hits + 2), 1 / (misses + 2)).double()",
-        "target = torch.where(y, 1.0, 0.0).double()",
+        "target = torch.where(y, x.new_tensor((hits + 1) / (hits + 2)), 1 / (misses + 2))",
+        "target = y.double()",
         ("tests/recognition/test_calibration.py::-k most_likely or wholly",),
     ),
     Mutant(
@@ -363,8 +363,8 @@ MUTANTS = [
     Mutant(
         "A route that ends ahead of its last frame is refused, and no shorter map written.",
         "dejavu_torch/learning.py",
-        "if done < stop:",
-        "if done > stop:",
+        'raise InputError(f"{name} ended at frame {done}; expected its {self.frames} frames")',
+        "break",
         ("tests/test_learning.py::test_a_route_that_ends_early_is_refused",),
     ),
     Mutant(

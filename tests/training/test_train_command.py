@@ -121,10 +121,10 @@ def test_a_class_in_the_current_folder_is_found(tmp_path: Path, monkeypatch: pyt
     (tmp_path / "train.yaml").write_text(CONFIG)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [path for path in sys.path if path not in ("", str(tmp_path))])
-    monkeypatch.setattr(sys, "modules", dict(sys.modules))
     train("fit", "--model.backbone", "own_classes.Plain", "--trainer.enable_checkpointing", "false")
     assert "own_classes.Plain" in str(read_map(tmp_path / "run" / "map.safetensors")[1]["features"])
     assert not list(tmp_path.rglob("*.ckpt"))  # which can be switched off
+    del sys.modules["own_classes"]
 
 
 def test_a_users_own_checkpoints_decide_which_is_the_map(folder: Path, tmp_path: Path) -> None:

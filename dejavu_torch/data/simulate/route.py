@@ -16,6 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dejavu_torch.data.frame_range import IndexedTraverse
+from dejavu_torch.memory import in_float32
 from dejavu_torch.types import InputError
 
 _T = TypeVar("_T")
@@ -70,6 +71,7 @@ class SimulatedRoute(IndexedTraverse):
     def frame_shape(self) -> tuple[int, ...]:
         return super().frame_shape
 
+    @in_float32()
     def read(self, frames: range) -> Tensor:
         return self._frames(torch.arange(frames.start, frames.stop, frames.step))
 
@@ -94,13 +96,13 @@ class Random:
         self.generator = torch.Generator().manual_seed(int.from_bytes(digest, "big"))
 
     def uniform(self, low: float, high: float) -> float:
-        return low + (high - low) * float(torch.rand((), generator=self.generator))
+        return low + (high - low) * float(torch.rand((), dtype=torch.float32, generator=self.generator))
 
     def pick(self, items: Sequence[_T]) -> _T:
         return items[int(torch.randint(len(items), (), generator=self.generator))]
 
     def normal(self, *shape: int) -> Tensor:
-        return torch.randn(shape, generator=self.generator)
+        return torch.randn(shape, dtype=torch.float32, generator=self.generator)
 
     def texture(self, height: int, width: int, cell: float) -> Tensor:
         """Smooth noise (height, width) of unit variance: 4 octaves, the coarsest of `cell` pixels."""
