@@ -46,7 +46,6 @@ def test_matches_are_those_of_the_golden_run(ran: tuple[str, Path]) -> None:
     for column in ("query", "query_name", "rank"):
         assert [row.get(column) for row in seen] == [row.get(column) for row in golden]
     first = [row.get("rank", "1") == "1" for row in golden]
-    places = [[int(row["place"]) for row in rows] for rows in (seen, golden)]
     for column in ("place", "accepted", "place_name"):
         same = [one[column] == other[column] for one, other in zip(seen, golden, strict=True)]
         assert np.mean(same) >= runs.SAME, f"{column} differs"

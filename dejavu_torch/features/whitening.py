@@ -49,8 +49,9 @@ def learned_whitening(
     """The projection to directions that distinguish places but change little between two views of one.
 
     With d = (view - place) / 2, m = (view + place) / 2, C = E[d d^T], B = Cov[m], shrinkage a in (0, 1] (None
-    is `oracle_shrinkage` of `samples` views, n if None, at least 0.03) and W = (1 - a) C + a tr(C) / K I, P has the `kept` directions with
-    the largest p^T B p / p^T W p, scaled to p^T W p = 1 (Mikolajczyk and Matas, ICCV 2007).
+    is `oracle_shrinkage` of `samples` independent views, n if None, at least 0.03) and
+    W = (1 - a) C + a tr(C) / K I, P has the `kept` directions with the largest p^T B p / p^T W p, scaled to
+    p^T W p = 1 (Mikolajczyk and Matas, ICCV 2007).
 
     Shape: (n,K), (n,K) -> mean (K,), P (K,kept), float32.
     """

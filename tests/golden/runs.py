@@ -23,8 +23,8 @@ def _visits(route: str) -> tuple[str, str]:
     return f"sim:{route}", f"sim:{route}&traverse=1"
 
 
-# A whitening multiplies what another processor rounds otherwise, and turns directions of nearly equal variance:
-# the runs have none, or few large components.
+# A whitening multiplies what another processor rounds otherwise, and turns directions of nearly equal
+# variance: the runs have none, or few large components.
 PLAIN = ("--features", "[HOG,Distilled]", "--whitening", "none")
 CALM = (
     *("--whitening.views", "2", "--whitening.components", "40", "--whitening.numbers", "24"),
