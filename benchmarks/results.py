@@ -147,22 +147,26 @@ def rounded(value: Any) -> Any:
     return round(value, 4) if isinstance(value, float) else value
 
 
-def run_results(data: Path, *, out: Path, ways: Sequence[str] = (), jobs: int = 1) -> list[str]:
+def run_results(
+    data: Path, *, out: Path, ways: Sequence[str] = (), footage: Sequence[str] = (), jobs: int = 1
+) -> list[str]:
     """`dejavu compare` on footage of every kind, for the tables of the documentation.
 
     Args:
         data: folder of the footage, as for the tests
         out: folder for bench.json and the reports, which later runs reuse
         ways: names of ways to run; all if not given. "filter" and "sequence" use the maps of "default"
+        footage: names of footage; all if not given. Other rows of bench.json are kept
         jobs: commands that run in parallel, with one thread each
 
     Convention: commands in bench.json have data/, default/ and visits/ for the folders.
 
     Raises:
-        InputError: an unknown way, or less than one job.
+        InputError: an unknown way or footage, or less than one job.
     """
-    if unknown := [way for way in ways if way not in WAYS]:
-        raise InputError(f"{unknown[0]!r} is no way; expected one of {', '.join(map(repr, WAYS))}")
+    for kind, names, known in (("way", ways, WAYS), ("footage", footage, FOOTAGE)):
+        if unknown := [name for name in names if name not in known]:
+            raise InputError(f"{unknown[0]!r} is no {kind}; expected one of {', '.join(map(repr, known))}")
     if jobs < 1:
         raise InputError(f"bench results got {jobs} jobs; expected at least one")
     shown = {"{data}": "data", "{default}": "default", "{visits}": "visits"}
@@ -180,7 +184,7 @@ def run_results(data: Path, *, out: Path, ways: Sequence[str] = (), jobs: int = 
             return row | {"skipped": said}
         return row | kept(json.loads(report.read_text(encoding="utf-8")))
 
-    planned = list(runs(ways or list(WAYS)))
+    planned = [run for run in runs(ways or list(WAYS)) if not footage or run.footage in footage]
     if any(run.way == "visits" for run in planned):
         made = out / "visits" / "first.safetensors"
         if (said := done_once(placed(VISITS.split(), folders), made.parent, made)) is not None:
@@ -190,6 +194,11 @@ def run_results(data: Path, *, out: Path, ways: Sequence[str] = (), jobs: int = 
         part = [run for run in planned if (run.way == "default") == first]
         with ThreadPoolExecutor(jobs) as pool:
             rows += tqdm(pool.map(row_of, part), "results", len(part), disable=None, leave=False)
+    kept_file, new = out / "bench.json", {(row["case"], row["contender"]) for row in rows}
+    if footage and kept_file.exists():
+        before = json.loads(kept_file.read_text(encoding="utf-8"))
+        others = [row for row in before["rows"] if (row["case"], row["contender"]) not in new]
+        rows += [{"commit": before["commit"]} | row for row in others]
     write_bench(out, rounded(rows))
     failed = [f"{row['case']}, {row['contender']}: {row['skipped']}" for row in rows if "skipped" in row]
     return [*failed, f"{len(rows)} reports"]

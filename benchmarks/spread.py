@@ -54,9 +54,11 @@ def run_spread(
     """`dejavu compare` as on several processors, and with several seeds: the spread of its figures.
 
     Args:
-        reference, query: sources, as of `dejavu compare`
+        reference: traverse to learn, as of `dejavu compare`
+        query: traverse to localize, likewise
         out: folder for bench.json and the reports, which later runs reuse
-        tolerance, truth: as of `dejavu compare`
+        tolerance: places within which an answer is right
+        truth: ground truth, in the formats of `dejavu compare`
         seeds: number of seeds, from 1 on, on this processor; all processors run with seed 0
         options: further options of `dejavu compare`, in one string
 

@@ -26,7 +26,7 @@ VIEWS = 4  # of a frame, at least
 VIEWS_PER_COMPONENT = 30  # at least: as 4 views of each of 3000 frames
 INDEPENDENT = 4  # views of a frame; others are so much like these that they are no further samples
 MAX_VIEWS = 12  # of a frame, unless a short route has fewer than COPIES then
-COPIES, MOST_OF_SHORT = 6000, 60  # of all frames, of each: chance decides less on a short route
+COPIES, MOST_OF_SHORT = 4000, 36  # of all frames, of each: chance decides less on a short route
 BITS = (4, 8, 16)  # of a number of the projection
 FULL_BITS = 4 * DIMENSIONS  # per row of the projection of a long route
 SHRINKAGE = 0.03  # at least
@@ -96,7 +96,7 @@ class Whitening(nn.Module):
         components: principal components that are whitened, at least K.
         shrinkage: of `learned_whitening`. None is 0.03, or more if there are few views.
         views: augmented copies of each frame. None is 4, below 3000 frames up to 12: 30 per component; below
-            500 frames up to 60: 6000 in all.
+            330 frames up to 36: 4000 in all.
         most_views: copies in all; frames are drawn evenly if there would be more.
         strengths: arguments of `Augmentation`, instead of `STRENGTHS`.
         seed: of the copies.
