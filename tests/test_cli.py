@@ -305,7 +305,7 @@ WRONG = {  # a line of words behind `dejavu`, and what its one line holds
     "learn a.npy --map m --features.cel 3": ("--features.cel", "not accepted"),
     "learn a.npy --map m --whitening unc": ("class, none or a map file, not unc",),
     "learn a.npy --map m --whitening none --whitening.bits 4": ("--whitening.bits", "no settings"),
-    "learn a.npy --map m --whitening.bits 5": ("shrinkage=null", "bits=5"),
+    "learn a.npy --map m --whitening.bits 5": ("--whitening.bits is 5", "4, 8, 16"),
     "learn a.npy --map m --velocity.corners 3": ("--velocity.corners is 3", "Sequence"),
     "learn a.npy --map m --config local_maxima --mapper.periods.windw 3": ("--mapper.periods.windw",),
     "learn a.npy --map m --config local_maxima --mapper.periods.window 3": ("window=3",),

@@ -27,7 +27,7 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="limits, mounts 
 DEJAVU = (sys.executable, "-m", "dejavu_torch.cli")
 INTERRUPTED = b"dejavu: interrupted\n"
 REPORT = {"index.html", "report.json", "matches.csv", "map.safetensors", "pr.png", "coverage.png"}
-PLAIN = ("--whitening.views", "1")  # more would take most of the time
+PLAIN = ("--whitening.views", "1", "--whitening.bits", "4")  # little time, and small maps
 REPORT_OF_ARRAYS = ("compare", "a.npy", "b.npy", *PLAIN, "--truth", "0", "--out", "new/report")
 
 
