@@ -23,7 +23,7 @@ from dejavu_torch.resize import resize_frames
 
 collect_ignore = ["mutants"]  # it has no tests, and runs them
 
-# commands and notebooks run in processes of their own, beside each other
+# commands run in processes of their own, beside each other
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 # a shell has what runs in its background ignore Ctrl-C, and commands take over what they find
@@ -42,7 +42,7 @@ settings.load_profile("repeatable")
 SLOW = (
     *("training", "benchmarks", "motion", "cluster", "fuzz", "test_cli", "test_faults", "test_readme"),
     *("test_real_routes", "test_golden", "test_periods_on_real_data", "test_spectral_model"),
-    *("test_model_export", "data/test_simulate_railway", "evaluation/test_pictures"),
+    *("test_model_export", "test_notebooks", "data/test_simulate_railway", "evaluation/test_pictures"),
 )
 # modules that run whole commands again and again
 FEW_VIEWS = {
@@ -52,7 +52,7 @@ FEW_VIEWS = {
     *("test_routes", "test_spectral_training", "test_trainings", "test_compare"),
     *("test_cli_live", "test_cli_hub", "test_cli_streaming", "test_configs", "test_joined", "test_cluster"),
     *("test_storage_bench", "test_train_command", "test_held_out", "test_devices", "test_free_memory"),
-    "test_spectral_model",
+    *("test_spectral_model", "test_notebooks"),
 }
 DRAWN = ("test_simulate", "test_golden", "test_frame_range", "test_source")  # what simulated routes draw
 MOST_HELD = 40_000_000  # numbers of frames
@@ -65,7 +65,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     here = Path(__file__).parent
     for item in items:
         path = item.path.relative_to(here) if item.path.is_relative_to(here) else item.path
-        if str(path).startswith(SLOW) or path.suffix == ".ipynb":
+        if str(path).startswith(SLOW):
             item.add_marker("slow")
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     items.sort(key=lambda item: item.path not in slow)  # stable
