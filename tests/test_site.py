@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import ast
 import re
-import subprocess
-import sys
 from functools import cache
 from html import unescape
 from pathlib import Path
 from urllib.parse import unquote
 
+import processes
 import pytest
 
 import dejavu_torch
@@ -29,9 +28,10 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
         pytest.importorskip(needed)
     out = tmp_path_factory.mktemp("site")
     # without pages of source code, which take a third of the time
-    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-d", out / "trees"]
-    command += ["-D", "extensions=myst_nb,sphinx.ext.autodoc,pages", "docs", out / "html"]
-    ran = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    words = ["-W", "--keep-going", "-q", "-d", out / "trees"]
+    words += ["-D", "extensions=myst_nb,sphinx.ext.autodoc,pages", "docs", out / "html"]
+    code = "import sys; from sphinx.cmd.build import main; sys.exit(main(sys.argv[1:]))"
+    ran = processes.python(code, *words, cwd=ROOT, imports=processes.PACKAGE)
     assert (ran.returncode, ran.stdout, ran.stderr) == (0, "", "")
     return out / "html"
 
