@@ -10,8 +10,11 @@ import socket
 import subprocess
 import sys
 from functools import cache
+from threading import Lock
 from typing import Any
 
+Done = subprocess.CompletedProcess[str]
+run = subprocess.run  # tests put `forked` in its place
 TORCH, PACKAGE = "torch", "dejavu_torch.cli.commands"
 SERVER = """
 import importlib, json, os, socket, sys
@@ -44,6 +47,7 @@ class Asked:
     """The process that is forked, by a socket."""
 
     def __init__(self, imports: str) -> None:
+        self.lock = Lock()
         self.socket, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         if imports == TORCH:
             self.process = subprocess.Popen([sys.executable, "-c", SERVER, imports], stdin=there)
@@ -53,8 +57,9 @@ class Asked:
         atexit.register(self.end)
 
     def ask(self, question: dict[str, Any], streams: tuple[int, ...] = ()) -> Any:
-        socket.send_fds(self.socket, [json.dumps(question).encode()], streams)
-        return json.loads(self.socket.recv(100))
+        with self.lock:
+            socket.send_fds(self.socket, [json.dumps(question).encode()], streams)
+            return json.loads(self.socket.recv(100))
 
     def end(self) -> None:
         self.socket.close()
@@ -92,9 +97,19 @@ class Forked(subprocess.Popen[Any]):
         return self.returncode
 
 
-def python(code: str, *words: object, input: str = "", **settings: Any) -> subprocess.CompletedProcess[str]:
+def python(code: str, *words: object, input: str | None = None, **settings: Any) -> Done:
     """What such a process ends with and has printed."""
-    pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
-    with Forked(code, *words, text=True, **pipes, **settings) as process:
+    settings = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, **settings}
+    with Forked(code, *words, stdin=None if input is None else subprocess.PIPE, **settings) as process:
         printed = process.communicate(input)
     return subprocess.CompletedProcess(words, process.returncode, *printed)
+
+
+def forked(command: list[str], **settings: Any) -> Done:
+    """In the place of `subprocess.run`, for `python -m MODULE WORDS` with the package imported."""
+    if "-m" not in command:
+        return run(command, **settings)
+    at = command.index("-m")
+    code = f"import runpy; runpy.run_module({command[at + 1]!r}, run_name='__main__', alter_sys=True)"
+    settings = {name: value for name, value in settings.items() if name in ("stdout", "stderr", "cwd", "env")}
+    return python(code, *command[at + 2 :], imports=PACKAGE, **settings)
