@@ -57,6 +57,8 @@ FEW_VIEWS = {
 DRAWN = ("test_simulate", "test_golden", "test_frame_range", "test_source")  # what simulated routes draw
 MOST_HELD = 40_000_000  # numbers of frames
 PIXELS = FEW_VIEWS - {"test_demo", "test_compare"} | {"test_real_routes"}
+UNDRAWN = ("test_compare", "test_real_routes", "test_several_places", "test_other_data")
+UNDRAWN += ("test_pretrained", "test_joined", "test_cli_rejection", "test_cli_hub", "test_results")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -93,6 +95,8 @@ def _short_work(request: pytest.FixtureRequest) -> Iterator[None]:
             one = io.BytesIO()
             Image.new("L", (1, 1)).save(one, "png")
             patch.setattr("dejavu_torch.evaluation.report.as_png", lambda picture: one.getvalue())
+        if request.path.stem in UNDRAWN:  # nobody looks at the pictures of these comparisons
+            patch.setattr("dejavu_torch.evaluation.compare.draw_pictures", lambda *_: {})
         if request.path.stem in FEW_VIEWS:
             patch.setattr("dejavu_torch.features.whitening.VIEWS", 1)
             patch.setattr("dejavu_torch.features.whitening.VIEWS_PER_COMPONENT", 1)
