@@ -371,9 +371,9 @@ class DejaVu(nn.Module):
 
         Example:
             >>> from dejavu_torch import open_source
-            >>> route = open_source("sim:aerial?frames=200")
+            >>> route = open_source("sim:aerial?frames=80")
             >>> model = DejaVu(precision=0.99).learn(route).calibrate(route)
-            >>> match = model.localize(open_source("sim:aerial?frames=200&traverse=1"))
+            >>> match = model.localize(open_source("sim:aerial?frames=80&traverse=1"))
             >>> bool((match.accepted == (match.probability >= 0.99)).all())
             True
         """

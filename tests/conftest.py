@@ -23,7 +23,7 @@ from dejavu_torch.resize import resize_frames
 
 collect_ignore = ["mutants"]  # it has no tests, and runs them
 
-# commands and notebooks run in processes of their own, beside each other
+# commands run in processes of their own, beside each other
 THREADS = int(os.environ.get("DEJAVU_TEST_THREADS", "1"))
 os.environ.setdefault("OMP_NUM_THREADS", str(THREADS))
 
@@ -43,21 +43,23 @@ settings.load_profile("repeatable")
 SLOW = (
     *("training", "benchmarks", "motion", "cluster", "fuzz", "test_cli", "test_faults", "test_readme"),
     *("test_real_routes", "test_golden", "test_periods_on_real_data", "test_spectral_model"),
-    *("test_model_export", "data/test_simulate_railway", "evaluation/test_pictures"),
+    *("test_model_export", "test_notebooks", "data/test_simulate_railway", "evaluation/test_pictures"),
 )
 # modules that run whole commands again and again
 FEW_VIEWS = {
     *("test_cli", "test_cli_evaluate", "test_cli_spectral", "test_cli_resampling", "test_several_places"),
     *("test_cli_growth", "test_faults", "test_readme", "test_memory_bench", "test_scale", "test_demo"),
     *("test_cli_networks", "test_pretrained", "test_cli_rejection", "test_onnx_export", "test_reproduce"),
-    *("test_routes", "test_spectral_training", "test_trainings", "test_compare"),
+    *("test_routes", "test_spectral_training", "test_results", "test_trainings", "test_compare"),
     *("test_cli_live", "test_cli_hub", "test_cli_streaming", "test_configs", "test_joined", "test_cluster"),
     *("test_storage_bench", "test_train_command", "test_held_out", "test_devices", "test_free_memory"),
-    "test_spectral_model",
+    *("test_spectral_model", "test_notebooks"),
 }
 DRAWN = ("test_simulate", "test_golden", "test_frame_range", "test_source")  # what simulated routes draw
 MOST_HELD = 40_000_000  # numbers of frames
 PIXELS = FEW_VIEWS - {"test_demo", "test_compare"} | {"test_real_routes"}
+UNDRAWN = ("test_compare", "test_real_routes", "test_several_places", "test_other_data")
+UNDRAWN += ("test_pretrained", "test_joined", "test_cli_rejection", "test_cli_hub", "test_results")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -66,7 +68,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     here = Path(__file__).parent
     for item in items:
         path = item.path.relative_to(here) if item.path.is_relative_to(here) else item.path
-        if str(path).startswith(SLOW) or path.suffix == ".ipynb":
+        if str(path).startswith(SLOW):
             item.add_marker("slow")
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     items.sort(key=lambda item: item.path not in slow)  # stable
@@ -94,6 +96,8 @@ def _short_work(request: pytest.FixtureRequest) -> Iterator[None]:
             one = io.BytesIO()
             Image.new("L", (1, 1)).save(one, "png")
             patch.setattr("dejavu_torch.evaluation.report.as_png", lambda picture: one.getvalue())
+        if request.path.stem in UNDRAWN:  # nobody looks at the pictures of these comparisons
+            patch.setattr("dejavu_torch.evaluation.compare.draw_pictures", lambda *_: {})
         if request.path.stem in FEW_VIEWS:
             patch.setattr("dejavu_torch.features.whitening.VIEWS", 1)
             patch.setattr("dejavu_torch.features.whitening.VIEWS_PER_COMPONENT", 1)

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import inspect
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from processes import python
 
 import dejavu_torch
 
@@ -53,7 +52,6 @@ def test_importing_loads_nothing_heavy_until_it_is_asked_for_and_changes_no_glob
         "print(dejavu_torch.PlaceRecognitionTask.__name__, 'pytorch_lightning' in sys.modules)"
     )
     code = f"import io, sys; sys.stderr = io.StringIO(); {code}"
-    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert ran.stdout.split("\n")[:2] == ["[] 0", "PlaceRecognitionTask True"]
+    assert python(code).stdout.split("\n")[:2] == ["[] 0", "PlaceRecognitionTask True"]
     with pytest.raises(AttributeError, match="no attribute 'Certificate'"):
         dejavu_torch.Certificate  # noqa: B018

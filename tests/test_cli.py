@@ -220,11 +220,11 @@ def helped() -> tuple[str, str]:
         "import sys, dejavu_torch.cli as cli\n"
         "try: cli.main(['--help'])\n"
         "except SystemExit: assert 'torch' not in sys.modules\n"
-        f"for command in {[name for name in COMMANDS if name != 'train']}:\n"
+        f"for command in {[name for name in COMMANDS if name not in ('train', 'completion')]}:\n"
         "    try: cli.main([command, '--help'])\n"
         "    except SystemExit: pass\n"
         "heavy = 'kornia', 'matplotlib', 'pytorch_lightning', 'torchmetrics', 'av', 'numba', 'cv2', 'scipy'\n"
-        "print([name for name in heavy if name in sys.modules])"
+        "print([name for name in (*heavy, 'dejavu_torch.cli.completion', 'shtab') if name in sys.modules])"
     )
     kept = {name: value for name, value in os.environ.items() if not name.startswith("OMP_")}
     environment = {**kept, "OMP_DISPLAY_ENV": "true"}

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import re
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,6 +19,7 @@ import pytest
 import torch
 from command_line import fails, run
 from footage import REFERENCE, camera, footage
+from processes import PACKAGE, Forked
 from videos import H264, clip, piped
 
 from dejavu_torch import DejaVu, LiveLocalizer, SpectralMapper, Whitening, open_source
@@ -191,12 +190,11 @@ def test_a_map_of_even_steps_is_refused_but_as_it_is(
 
 
 @contextmanager
-def process(*words: str | Path) -> Iterator[subprocess.Popen[str]]:
+def process(*words: str | Path) -> Iterator[Forked]:
     """`dejavu live` of its own; its lines can be read as they come."""
-    command = [sys.executable, "-m", "dejavu_torch.cli", "live", *map(str, words)]
+    code = "from dejavu_torch.cli import main; main()"
     pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
-    with subprocess.Popen(command, text=True, env=environment, **pipes) as started:  # type: ignore[call-overload]
+    with Forked(code, "live", *words, imports=PACKAGE, text=True, **pipes) as started:
         yield started
 
 

@@ -5,16 +5,14 @@ from __future__ import annotations
 import csv
 import json
 import math
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from command_line import TEMPLATES, fails, frames, report_of, run
+from processes import PACKAGE, python
 
 from dejavu_torch import DejaVu, SequenceMatcher, SpectralMapper, open_source
 from dejavu_torch.cli.commands import run_learn
@@ -115,12 +113,12 @@ def test_two_processes_write_the_same_bytes(tmp_path: Path, monkeypatch: pytest.
     words = {name: ["learn", ROUTE, *kind, "--map"] for name, kind in kinds.items()}
     there = [[*line, f"{tmp_path}/{name}.there.safetensors"] for name, line in words.items()]
     code = (
-        "import json, sys; from dejavu_torch.cli import main; from dejavu_torch.features import views\n"
-        f"views.FEWEST = {views.FEWEST}\nfor line in json.load(sys.stdin): main(line)"  # as it is here
+        "import json, sys, torch\n"
+        "from dejavu_torch.cli import main; from dejavu_torch.features import views\n"
+        f"torch.set_num_threads({torch.get_num_threads()})\nviews.FEWEST = {views.FEWEST}\n"  # as it is here
+        "for line in json.load(sys.stdin): main(line)"
     )
-    environment = os.environ | {"OMP_NUM_THREADS": str(torch.get_num_threads())}
-    python, told = [sys.executable, "-c", code], json.dumps(there).encode()
-    subprocess.run(python, input=told, check=True, capture_output=True, env=environment)
+    assert python(code, input=json.dumps(there), imports=PACKAGE).returncode == 0
     for name, line in words.items():
         run(*line, tmp_path / f"{name}.here.safetensors")
         here, other = (tmp_path / f"{name}.{where}.safetensors" for where in ("here", "there"))

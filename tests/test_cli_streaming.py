@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from command_line import fails, frames, run, write_images
+from processes import PACKAGE, Forked
 
 from dejavu_torch.cli import main
 from dejavu_torch.learning import ChunkCoder
@@ -50,7 +50,7 @@ def test_a_killed_run_goes_on_where_it_was(
     words = ["learn", str(route), "--map", str(out), *CHUNKED]
     program = "import sys; from dejavu_torch import learning; learning.SAVE_INTERVAL = 0; "
     program += f"from dejavu_torch.cli import main; main({words!r})"
-    process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.DEVNULL)
+    process = Forked(program, imports=PACKAGE, stdout=subprocess.DEVNULL)
     stop = time.monotonic() + 120
     while not part.exists() and time.monotonic() < stop:
         time.sleep(0.001)

@@ -1,8 +1,6 @@
 from __future__ import annotations
 
 import errno
-import subprocess
-import sys
 import tempfile
 import weakref
 from collections.abc import Iterator
@@ -14,6 +12,7 @@ import torch
 from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
+from processes import python
 from torch import Tensor
 
 from dejavu_torch import memory
@@ -50,9 +49,8 @@ def test_what_fits_is_not_held_twice() -> None:
         "from dejavu_torch.memory import concatenate\n"
         "print(peak_memory(lambda: concatenate(torch.ones(64, 2048) for _ in range(700))))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     held = 700 * 64 * 2048 * 4  # 367 MB, over five blocks
-    assert held < int(done.stdout) < 1.5 * held
+    assert held < int(python(code).stdout) < 1.5 * held
 
 
 def test_memory_holds_no_more_than_its_share(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,12 +19,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import fails, frames, run, write_images
+from processes import PACKAGE, Forked
 
 from dejavu_torch import DejaVu
 from dejavu_torch.cli import main
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="limits, mounts and signals of Linux")
 DEJAVU = (sys.executable, "-m", "dejavu_torch.cli")
+PIPES = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
 INTERRUPTED = b"dejavu: interrupted\n"
 REPORT = {"index.html", "report.json", "matches.csv", "map.safetensors", "pr.png", "coverage.png"}
 PLAIN = ("--whitening.views", "1", "--whitening.bits", "4")  # little time, and small maps
@@ -48,9 +50,8 @@ def folder(made: Path, tmp_path: Path) -> Path:
     return tmp_path
 
 
-def start(folder: Path, *words: str | Path, **settings: object) -> subprocess.Popen[bytes]:
-    settings = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **settings}
-    return subprocess.Popen([*DEJAVU, *map(str, words)], cwd=folder, **settings)  # type: ignore[call-overload,no-any-return]
+def start(folder: Path, *words: str) -> Forked:
+    return Forked("from dejavu_torch.cli import main; main()", *words, imports=PACKAGE, cwd=folder, **PIPES)
 
 
 def wait_for(process: subprocess.Popen[bytes], there: Callable[[], object]) -> None:
@@ -101,7 +102,8 @@ def test_ctrl_c_at_any_moment_is_one_line_and_130(folder: Path) -> None:
     moments = [0, 0.7, 1.6]
     before = names_in(folder)
     for twice, moment in enumerate(moments):
-        process = start(folder, *REPORT_OF_ARRAYS)
+        # which imports torch, as the earlier moments find it
+        process = subprocess.Popen([*DEJAVU, *REPORT_OF_ARRAYS], cwd=folder, **PIPES)
         wait_for(process, lambda process=process: in_hand(process))
         time.sleep(moment)
         process.send_signal(signal.SIGINT)

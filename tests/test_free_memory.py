@@ -1,10 +1,9 @@
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from processes import python
 
 from dejavu_torch import memory
 from dejavu_torch.memory import check_room, free_memory
@@ -41,5 +40,4 @@ def test_the_limit_of_the_process_counts() -> None:
         "resource.setrlimit(resource.RLIMIT_AS, (2**36, resource.RLIM_INFINITY));"
         "assert free_memory() < 2**36; print(free_memory())"
     )
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert 0 < float(run.stdout) < 2**36
+    assert 0 < float(python(code).stdout) < 2**36

@@ -12,6 +12,7 @@ import sys
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import redirect_stdout, suppress
 from dataclasses import is_dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, NoReturn, cast, get_args, get_origin
 
@@ -268,8 +269,9 @@ class Parser(jsonargparse.ArgumentParser):
         words = with_made([f"{w[:-4]}null" if w.endswith("=None") else w for w in args or ()])
         start = 1 if self._subparsers is not None else 0  # after the subcommand
         configs, others = self._configs(words[start:])
-        if "--features" in self._option_string_actions and self._need_class(configs, others):
-            self.set_defaults({"features": {"class_path": _path_of("HOG")}})
+        if features := self._option_string_actions.get("--features"):  # of this command line alone
+            hog = {"class_path": _path_of("HOG")} if self._need_class(configs, others) else None
+            features.default = hog
         words[start:] = [*(f"--config={name}" for name in configs), *others]
         parsed = super().parse_args(words, *rest, **settings)
         for key, value in vars(parsed.as_flat()).items():
@@ -343,8 +345,9 @@ def _by_options(message: str, error: Exception | None, positional: Collection[st
     return f"{option} is {value[2]}; expected {value[1]}" if value else f"{option}: {text}"
 
 
+@cache
 def command_parser(name: str, function: Callable[..., None], program: str = "dejavu") -> Parser:
-    """The parser of one command of a program, made from its function.
+    """The parser of one command of a program, made from its function; once in a process.
 
     Args:
         function: positional parameters become positional arguments (optional with a default), keyword-only

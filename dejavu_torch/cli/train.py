@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Sequence
 from functools import partialmethod
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from jsonargparse import Namespace
@@ -112,6 +112,8 @@ class TrainCLI(LightningCLI):
     """fit writes DIR/map.safetensors, for several routes DIR/descriptor.safetensors; the others read a
     checkpoint."""
 
+    parsers: ClassVar[dict[str, tuple[LightningArgumentParser, list[str]]]] = {}  # with their arguments
+
     def __init__(self, args: list[str], **settings: Any) -> None:
         self.words = args
         super().__init__(args=args, **settings)
@@ -130,10 +132,14 @@ class TrainCLI(LightningCLI):
         return parser
 
     def _prepare_subcommand_parser(self, klass: type, subcommand: str, **kwargs: Any) -> Any:
-        """The options of the given subcommand only, which is faster than all four."""
+        """The options of the given subcommand only, which is faster than all four; once in a process."""
         if {*self.words[:1]} & ({*self.subcommands()} - {subcommand}):
             return self.init_parser(**kwargs)
-        return super()._prepare_subcommand_parser(klass, subcommand, **kwargs)
+        if subcommand not in self.parsers:
+            parser = super()._prepare_subcommand_parser(klass, subcommand, **kwargs)
+            self.parsers[subcommand] = parser, self._subcommand_method_arguments[subcommand]
+        parser, self._subcommand_method_arguments[subcommand] = self.parsers[subcommand]
+        return parser
 
     @staticmethod
     def add_core_arguments_to_parser(parser: LightningArgumentParser) -> None:
@@ -427,6 +433,7 @@ def run_train(arguments: Sequence[str]) -> None:
             parser_kwargs={"prog": "dejavu train", "description": "Train features that repeat, end to end."},
             seed_everything_default=0,
             save_config_callback=ConfigFile,
+            load_from_checkpoint_support=False,  # which would write out the config for each part
         )
     except InputError:
         if _get_rank():  # the first process reports it

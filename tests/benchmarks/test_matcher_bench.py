@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -14,6 +13,7 @@ import torch
 from command_line import benchmark as command
 from drawn import render, texts
 from matplotlib.colors import to_rgb
+from processes import python
 from torch import Tensor
 
 from benchmarks import matcher
@@ -134,8 +134,7 @@ def test_peak_memory_sees_what_is_freed_again() -> None:
         "    return large[0].clone()\n"
         "print(peak_memory(run))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert 60 * 2**20 < int(done.stdout) < 200 * 2**20
+    assert 60 * 2**20 < int(python(code).stdout) < 200 * 2**20
 
 
 def test_what_is_written_and_printed(

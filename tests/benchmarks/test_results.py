@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command_line import benchmark, benchmark_fails
+from command_line import benchmark, benchmark_fails, run_here
 
 from benchmarks import results, tables
 from benchmarks.results import FOOTAGE, SEEDS, WAYS, Footage, runs
@@ -33,11 +33,10 @@ def test_reports_are_kept_and_made_once(
     broken = flight._replace(query="{data}/nowhere.mp4")
     monkeypatch.setattr(results, "FOOTAGE", {"flight": flight, "broken": broken})
     given = ("results", tmp_path, "--out", tmp_path / "out", "--ways", "HOG", "--jobs", "2")
-    real = subprocess.run
 
-    def refusing(command: list[str], **settings: Any) -> subprocess.CompletedProcess[bytes]:
+    def refusing(command: list[str], **settings: Any) -> subprocess.CompletedProcess[str]:
         refused = ["sh", "-c", "echo 'dejavu: nowhere.mp4 is not there'; exit 2"]  # sooner than a command
-        return real(refused if any("nowhere" in word for word in command) else command, **settings)
+        return run_here(refused if any("nowhere" in word for word in command) else command, **settings)
 
     with monkeypatch.context() as patch:
         patch.setattr(subprocess, "run", refusing)

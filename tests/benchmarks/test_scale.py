@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,6 +16,7 @@ import torch
 import torch.nn.functional as F
 from command_line import benchmark
 from helpers import all_of, refused
+from processes import forked
 from safetensors.torch import save_file
 from torch import Tensor
 
@@ -225,7 +227,8 @@ def test_without_faiss_its_rows_say_so(monkeypatch: pytest.MonkeyPatch, tmp_path
     assert row["seconds"] is None
 
 
-def test_a_process_learns_and_another_localizes(tmp_path: Path) -> None:
+def test_a_process_learns_and_another_localizes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(subprocess, "run", forked)
     route = smooth(600, 16)
     np.save(tmp_path / "drawn.npy", route.numpy())
     asked = {"queries": route[::20].contiguous(), "truth": spread(600)[::20].contiguous()}

@@ -5,12 +5,11 @@ from __future__ import annotations
 import json
 import shlex
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
-from command_line import benchmark, benchmark_fails
+from command_line import benchmark, benchmark_fails, run_here
 
 from benchmarks import trainings
 from benchmarks.trainings import PRESETS, ROUTES, Route
@@ -25,11 +24,10 @@ def test_a_training_is_set_beside_the_untrained_map_and_made_once(
     broken = flight._replace(options="--model.lr 0")
     monkeypatch.setattr(trainings, "ROUTES", {"flight, short": flight, "broken": broken})
     given = ("trainings", tmp_path, "--out", tmp_path / "out", "--seeds", "3", "--jobs", "2")
-    real = subprocess.run
 
-    def refusing(command: list[str], **settings: Any) -> subprocess.CompletedProcess[bytes]:
+    def refusing(command: list[str], **settings: Any) -> subprocess.CompletedProcess[str]:
         refused = ["sh", "-c", "echo 'dejavu: lr is 0'; exit 2"]  # sooner than a training
-        return real(refused if "--model.lr" in command else command, **settings)
+        return run_here(refused if "--model.lr" in command else command, **settings)
 
     with monkeypatch.context() as patch:
         patch.setattr(subprocess, "run", refusing)
@@ -55,11 +53,11 @@ def test_a_training_is_set_beside_the_untrained_map_and_made_once(
     monkeypatch.setattr(trainings.Judge, "hog", lambda *_: row)
     calls: list[list[str]] = []
 
-    def counted(command: list[str], **settings: Any) -> subprocess.CompletedProcess[bytes]:
+    def counted(command: list[str], **settings: Any) -> subprocess.CompletedProcess[str]:
         if command[0] == "git":  # asks for the commit
-            return real(command, **settings)
+            return run_here(command, **settings)
         calls.append(command)
-        return real([sys.executable, "-c", "raise SystemExit(3)"], **settings)
+        return run_here(["sh", "-c", "exit 3"], **settings)
 
     monkeypatch.setattr(subprocess, "run", counted)
     monkeypatch.setattr(trainings, "ROUTES", {"flight, short": flight})

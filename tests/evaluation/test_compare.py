@@ -21,6 +21,7 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.evaluation.compare import compare
 from dejavu_torch.evaluation.controls import null_control, with_mapper
 from dejavu_torch.evaluation.curves import evaluate
+from dejavu_torch.evaluation.pictures import draw_pictures
 from dejavu_torch.evaluation.report import sequence_table, summary
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.views import Views
@@ -50,6 +51,13 @@ def model() -> DejaVu:
     return template_model(periods=SpectrogramAnalysis(window=240, min_period=4, strongest=1))
 
 
+@pytest.fixture
+def _drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures, and the facts that they tell, for the tests that look at them."""
+    monkeypatch.setattr("dejavu_torch.evaluation.compare.draw_pictures", draw_pictures)
+
+
+@pytest.mark.usefixtures("_drawn")
 def test_a_comparison_is_shown_in_a_few_lines_and_in_a_notebook_as_table_and_pictures(model: DejaVu) -> None:
     reference, query = ArrayTraverse(route(0), "<b>&one"), ArrayTraverse(route(1), "two")
     result = compare(reference, query, "0", model)
@@ -253,6 +261,7 @@ def test_sequences_of_every_contender(kind: str) -> None:
     assert list(short.report.as_json()["null"]["sequences"]) == ["1", "3", "5", "11"]
 
 
+@pytest.mark.usefixtures("_drawn")
 def test_a_filter_stands_beside_single_queries_in_order_and_changes_nothing_else() -> None:
     pair, model = (ArrayTraverse(passing(1)), ArrayTraverse(passing(2))), DejaVu(whitening="none")
 
@@ -280,7 +289,6 @@ def test_a_filter_stands_beside_single_queries_in_order_and_changes_nothing_else
 def test_many_queries_in_order_are_filtered_if_that_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     pair = [open_source(f"sim:aerial?frames=30&traverse={i}") for i in range(2)]
     found = []
-    monkeypatch.setattr("dejavu_torch.evaluation.compare.draw_pictures", lambda *_: {})
     for most in (900, 899):
         monkeypatch.setattr("dejavu_torch.evaluation.compare.MAX_FILTERED", most)
         found.append([bool(compare(*pair, ordered=ordered).run.matching.beside) for ordered in (None, True)])
@@ -302,7 +310,6 @@ def test_the_scores_of_single_queries_are_computed_once(monkeypatch: pytest.Monk
     monkeypatch.setattr(SpectralMap, "score_blocks", counting(SpectralMap.score_blocks, 1))
     stores = "dejavu_torch.evaluation.baselines.phase_distances"
     monkeypatch.setattr(stores, counting(phase_distances, 0))
-    monkeypatch.setattr("dejavu_torch.evaluation.compare.draw_pictures", lambda *_: {})
     totals = []
     for sequence in (None, SequenceMatcher(21), PlaceFilter()):
         asked.clear()
@@ -338,8 +345,8 @@ class Terminal(io.StringIO):
 def test_each_long_step_has_a_bar_on_a_terminal(terminal: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     stream = Terminal() if terminal else io.StringIO()
     monkeypatch.setattr(sys, "stderr", stream)
-    pair = [open_source(f"sim:aerial?frames=200&traverse={one}") for one in (0, 1)]
-    compare(*pair, distractors=[open_source("sim:outdoor?frames=40")], progress=True)
+    pair = [open_source(f"sim:aerial?frames=80&traverse={one}") for one in (0, 1)]
+    compare(*pair, distractors=[open_source("sim:outdoor?frames=10")], progress=True)
     steps = "learning", "calibrating", f"describing {pair[1].name}", "localizing"
     steps += "describing sim:outdoor", "baselines"
     assert [step for step in steps if step in stream.getvalue()] == ([*steps] if terminal else [])

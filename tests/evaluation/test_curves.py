@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable
 from itertools import pairwise
 from typing import Literal
@@ -13,6 +11,7 @@ import torch
 from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
+from processes import python
 from torch import Tensor
 
 from dejavu_torch.data.ground_truth import GroundTruth
@@ -184,7 +183,7 @@ def test_convention_7_curves_are_plain_tensors_without_torchmetrics() -> None:
         assert type(column) is Tensor
         assert (column.dtype, column.ndim) == (torch.float64, 1)
     code = "import sys, dejavu_torch.evaluation.curves; sys.exit('torchmetrics' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+    assert python(code).returncode == 0
 
 
 def test_convention_7_thresholds_are_the_scores_themselves() -> None:

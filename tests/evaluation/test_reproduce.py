@@ -138,12 +138,12 @@ def test_the_command_writes_an_index_over_the_reports(
 
 @pytest.fixture(scope="module")
 def outdoor() -> Comparison:
-    """The first 420 frames, from the start of the train on, in chunks of 64."""
-    return reproduce("outdoor", shorter("outdoor", 64), frames=420, lengths=(32, 64))
+    """The first 310 frames, from the start of the train on, in chunks of 64."""
+    return reproduce("outdoor", shorter("outdoor", 64), frames=310, lengths=(32, 64))
 
 
 def metres_of(result: Comparison, traverse: int, frames: torch.Tensor) -> torch.Tensor:
-    distance: torch.Tensor = open_source(f"sim:outdoor?frames=420&traverse={traverse}").distance[frames]
+    distance: torch.Tensor = open_source(f"sim:outdoor?frames=310&traverse={traverse}").distance[frames]
     return distance
 
 
@@ -151,13 +151,13 @@ def metres_of(result: Comparison, traverse: int, frames: torch.Tensor) -> torch.
 def test_train_footage_is_resampled_to_even_steps(outdoor: Comparison) -> None:
     facts, route = outdoor.report.facts, outdoor.run.model.map
     assert facts["unit"] != "frames"
-    assert facts["resampling"]["reference_frames"] == facts["resampling"]["query_frames"] == 420
+    assert facts["resampling"]["reference_frames"] == facts["resampling"]["query_frames"] == 310
     assert facts["frames"] == len(outdoor.run.reference_features) == route.places
 
     def bend(metres: torch.Tensor) -> float:
         return float((metres - torch.linspace(0, 1, len(metres)) * metres[-1]).abs().max())
 
-    assert bend(metres_of(outdoor, 0, torch.arange(420))) > 15  # the train speeds up all the time
+    assert bend(metres_of(outdoor, 0, torch.arange(310))) > 15  # the train speeds up all the time
     assert bend(metres_of(outdoor, 0, route.frame_of(torch.arange(route.places)))) < 2.5
     measured = facts["measured_distance"]
     assert list(measured.values()) == pytest.approx([1, 1], abs=0.05)
@@ -175,7 +175,7 @@ def test_train_footage_is_resampled_to_even_steps(outdoor: Comparison) -> None:
 
 @pytest.mark.slow
 def test_structures_cut_the_even_steps(outdoor: Comparison) -> None:
-    cuts = structure_cuts(open_source("sim:outdoor?frames=420"))
+    cuts = structure_cuts(open_source("sim:outdoor?frames=310"))
     assert cuts
     facts, route = outdoor.report.facts, outdoor.run.model.map
     places = route.place_of(torch.tensor(cuts)).unique()

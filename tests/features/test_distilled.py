@@ -110,7 +110,7 @@ def test_the_bench_makes_weights_that_the_class_reads(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("efficientnet_lite_pytorch")
-    for name, few in {"IMAGES": 16, "JUDGED_ON": 16, "FRAMES": 8, "BATCH": 16, "JUDGED": 2}.items():
+    for name, few in {"IMAGES": 16, "JUDGED_ON": 16, "FRAMES": 8, "BATCH": 8, "JUDGED": 2}.items():
         monkeypatch.setattr(distil, name, few)
     monkeypatch.setattr(distil, "ROUTES", {"underground": 1})
     benchmark("distil", "--out", tmp_path / "out", "--steps", "30")

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from processes import PACKAGE, python
 
 ROOT = Path(__file__).parents[2]
 PARTED = "and now the mistakes"
@@ -40,7 +38,7 @@ def well(case): case.begin(); Path("out/m").touch()
 found = runner.main(["--cases", "63"])
 print("status", found)
 print("{PARTED}")
-runner.CPU = 1
+runner.CPU = 0.3
 readers.READERS.clear()
 for name in sys.argv[1:]:
     readers.reader(name)(globals()[name])
@@ -57,9 +55,7 @@ EVERY = (*WRONG, "well", "replace")
 def told() -> tuple[str, str]:
     """What a run prints of the readers, and of the mistakes: in a process of its own, as one that has
     computed in threads cannot be forked."""
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-c", BOTH, *EVERY]
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    done = python(BOTH, *EVERY, cwd=ROOT, imports=PACKAGE)
     assert done.returncode == 1, done.stdout[-5000:] + done.stderr[-5000:]
     cases, parted, mistakes = done.stdout.partition(PARTED)
     assert parted, done.stdout[-5000:] + done.stderr[-5000:]

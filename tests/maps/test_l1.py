@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import multiprocessing
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
 
@@ -12,6 +11,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from processes import python
 from torch import Tensor
 from torch.autograd import forward_ad
 from torch.fx.experimental.proxy_tensor import make_fx
@@ -219,4 +219,4 @@ def test_numba_waits_until_it_is_needed() -> None:
         "import sys, torch, dejavu_torch as d; d.phase_distances(torch.rand(99, 9), torch.rand(99, 9));"
         "sys.exit('numba' in sys.modules)"
     )
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+    assert python(code).returncode == 0

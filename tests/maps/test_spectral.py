@@ -5,14 +5,13 @@ from __future__ import annotations
 import copy
 import math
 import re
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from helpers import refused
+from processes import python
 from torch import Tensor
 
 from dejavu_torch import DejaVu, PhaseTemplates
@@ -393,5 +392,4 @@ def test_a_copy_and_other_precisions_score_alike() -> None:
 def test_nothing_is_written_to_stderr_when_a_map_scores() -> None:
     program = "import torch; from dejavu_torch import SpectralMapper; w = torch.rand(90, 5).cumsum(0); "
     program += "SpectralMapper()(w).scores(w[:3])"
-    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert found.stderr == ""
+    assert python(program).stderr == ""

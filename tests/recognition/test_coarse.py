@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import math
+from functools import cache
 from typing import Any
 
 import pytest
@@ -32,6 +34,11 @@ def searched(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def smooth_model(places: int = 3000, seed: int = 0, **settings: Any) -> DejaVu:
+    return copy.deepcopy(_learned(places, seed, **settings))
+
+
+@cache
+def _learned(places: int, seed: int, **settings: Any) -> DejaVu:
     mapper = SpectralMapper(None, 0.1, 256, **settings)
     return DejaVu(whitening="none", mapper=mapper).learn(walk(places, 24, seed, 0.99))
 
