@@ -194,11 +194,11 @@ def run_results(
         part = [run for run in planned if (run.way == "default") == first]
         with ThreadPoolExecutor(jobs) as pool:
             rows += tqdm(pool.map(row_of, part), "results", len(part), disable=None, leave=False)
-    kept_file, new = out / "bench.json", {(row["case"], row["contender"]) for row in rows}
+    failed = [f"{row['case']}, {row['contender']}: {row['skipped']}" for row in rows if "skipped" in row]
+    count, kept_file, new = len(rows), out / "bench.json", {(row["case"], row["contender"]) for row in rows}
     if footage and kept_file.exists():
         before = json.loads(kept_file.read_text(encoding="utf-8"))
         others = [row for row in before["rows"] if (row["case"], row["contender"]) not in new]
         rows += [{"commit": before["commit"]} | row for row in others]
     write_bench(out, rounded(rows))
-    failed = [f"{row['case']}, {row['contender']}: {row['skipped']}" for row in rows if "skipped" in row]
-    return [*failed, f"{len(rows)} reports"]
+    return [*failed, f"{count} reports"]

@@ -26,7 +26,7 @@ from dejavu_torch.features.views import (
     augmented_route,
     augmented_segments,
 )
-from dejavu_torch.features.whitening import STRENGTHS, Whitening
+from dejavu_torch.features.whitening import INDEPENDENT, STRENGTHS, Whitening
 from dejavu_torch.maps.file import part_of, read_map, write_map
 from dejavu_torch.maps.place_map import Mapper, PlaceMap
 from dejavu_torch.maps.spectral import SpectralMapper, code_chunk
@@ -142,8 +142,10 @@ class Describer(NamedTuple):
         if second is None:
             whitening.learn(features, None, *groups)
         else:
+            samples = INDEPENDENT * len(features) if isinstance(second.traverse, AugmentedTraverse) else None
             batches = self.features(second.traverse, label and f"learning what changes: {source}")
-            whitening.learn(features, _with_places(batches, second.places.to(self.device)), *groups)
+            shown = _with_places(batches, second.places.to(self.device))
+            whitening.learn(features, shown, *groups, samples)
         whitening.to(self.device)
 
     def visits(self, views: Views, label: str | None = None) -> tuple[Tensor, Tensor]:
@@ -169,11 +171,10 @@ class Describer(NamedTuple):
         return Views(ArrayTraverse(features.cpu(), views.traverse.name), views.places)
 
     def check_sizes(self, reference: Traverse, *queries: Traverse) -> int:
-        """The number of features per frame; refuses queries in which it differs, or which are frames if the
-        reference is ready features, before any long work."""
+        """The number of features per frame; refuses queries in which it differs before any long work."""
         counts = [self.count_features(traverse) for traverse in (reference, *queries)]
         for query, count in zip(queries, counts[1:], strict=True):
-            if count != counts[0] or (is_ready(reference) and not is_ready(query)):
+            if count != counts[0]:
                 seen = " and ".join(
                     f"{traverse.name} gives {own} features per frame of "
                     f"{' x '.join(map(str, traverse.frame_shape))}"

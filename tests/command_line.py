@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import subprocess
+import threading
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
@@ -18,6 +19,7 @@ from benchmarks.__main__ import run as run_benchmark
 from dejavu_torch.cli import main
 
 started = subprocess.run
+ONE_AT_A_TIME = threading.Lock()  # as what is printed is that of the process
 TEMPLATES = ("--config", "local_maxima")  # the defaults are a spectral map
 
 
@@ -29,8 +31,11 @@ def run_here(command: list[str], **settings: Any) -> subprocess.CompletedProcess
     """In the place of `subprocess.run`: a process of `dejavu` is a command of this one, with its output."""
     if "dejavu_torch.cli" not in command:
         return started(command, **settings)
-    with redirect_stdout(settings["stdout"]), redirect_stderr(settings["stderr"]):
-        run(*command[command.index("dejavu_torch.cli") + 1 :])
+    with ONE_AT_A_TIME, redirect_stdout(settings["stdout"]), redirect_stderr(settings["stderr"]):
+        try:
+            run(*command[command.index("dejavu_torch.cli") + 1 :])
+        except SystemExit as stop:
+            return subprocess.CompletedProcess(command, int(stop.code or 0))
     return subprocess.CompletedProcess(command, 0)
 
 

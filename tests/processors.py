@@ -87,7 +87,7 @@ def main() -> int:
         for processor, threads in product(options.names or imitable(), options.threads):
             began = time.monotonic()
             done = run(processor, threads, Path(listed.name), more.split())
-            lines = (done.stdout.strip() or done.stderr.strip()).splitlines()
+            lines = (done.stdout.strip() or done.stderr.strip() or "nothing was printed").splitlines()
             took = f"{time.monotonic() - began:.0f} s"
             print(f"{processor}, {threads} thread{'s' * (threads > 1)}: {lines[-1]} ({took})")
             print(

@@ -260,7 +260,11 @@ class Parser(jsonargparse.ArgumentParser):
             if here in sys.path or not any(isinstance(one, ModuleNotFoundError) for one in causes(error)):
                 raise
         sys.path.append(here)  # only for a user's own classes: modules there have any name
-        return self._parsed(args, *rest, **settings)
+        try:
+            return self._parsed(args, *rest, **settings)
+        except UsageError:
+            sys.path.remove(here)
+            raise
 
     def _parsed(self, args: Any, *rest: Any, **settings: Any) -> Any:
         for word in args or ():

@@ -140,6 +140,9 @@ def compare(
         for one in distractors
     ]
     feature_shape = model.describer.check_sizes(reference, query, *off)
+    for one in off:
+        if is_ready(reference) and not is_ready(one):
+            raise InputError(f"{one.name} has frames; expected ready features, as of {reference.name}")
 
     seconds: dict[str, float] = defaultdict(float)
     with timed(seconds, "describe" if has_map else "learn"):
@@ -147,7 +150,7 @@ def compare(
     with timed(seconds, "localize"):
         step = getattr(reference, "step", None)
         query = model.resample(query, step, progress)
-        off = [model.resample(one, step, progress, reference.frame_shape) for one in off]
+    off = [model.resample(one, step, progress, reference.frame_shape) for one in off]
     check_candidates(top, tolerance, reference.length)
     if sequence is not None and reference.length is not None:
         sequence.check(None, reference.length)

@@ -61,7 +61,7 @@ class Coder(nn.Module):
         """Set `learned_whitening` of (n,K) views and the (n,K) places that they show."""
         mean, projection = learned_whitening(views, places, self.projection.shape[1])
         self.mean.copy_(mean)
-        # an eigenvector may have either sign, on which the layers behind it hang
+        # an eigenvector may have either sign, on which the layers behind it depend
         largest = projection.gather(0, projection.abs().argmax(0, keepdim=True))
         self.projection.copy_(projection * largest.sign())
         self.whitened.fill_(True)
@@ -71,7 +71,9 @@ class Coder(nn.Module):
         with torch.autocast(descriptors.device.type, enabled=False):
             components = to_length((descriptors.to(self.mean.dtype) - self.mean) @ self.projection)
             if self.training and self.noise:
-                noise = torch.randn(components.shape).to(components)  # the same on every device
+                noise = torch.randn(components.shape, dtype=torch.float32).to(
+                    components
+                )  # the same on every device
                 components = to_length(components + self.noise * noise)
         coded: Tensor = self.layers(components)
         return coded

@@ -24,7 +24,7 @@ PLACES_PER_DIMENSION = 2  # on a short route, at least
 COMPONENTS = 400  # principal components that are whitened, by default
 VIEWS = 4  # of a frame, at least
 VIEWS_PER_COMPONENT = 30  # at least: as 4 views of each of 3000 frames
-INDEPENDENT = 4  # views of a frame; others are so much like these that they are no further samples
+INDEPENDENT = 4  # copies of a frame; further ones are so much like these that they are no further samples
 MAX_VIEWS = 12  # of a frame, unless a short route has fewer than COPIES then
 COPIES, MOST_OF_SHORT = 4000, 36  # of all frames, of each: chance decides less on a short route
 BITS = (4, 8, 16)  # of a number of the projection
@@ -68,7 +68,7 @@ def learned_whitening(
         seen = f"the mean square difference of {n} views from their places is {scale.item():.2g}"
         raise InputError(f"{seen}; expected a finite one above rounding: augmentation or a second traverse")
     if shrinkage is None:
-        shrinkage = max(SHRINKAGE, oracle_shrinkage(within, samples or n))
+        shrinkage = max(SHRINKAGE, oracle_shrinkage(within, min(n, samples or n)))
     within = (1 - shrinkage) * within
     within.diagonal().add_(shrinkage * scale)
     # P = L^-T E, where W = L L^T and E holds the eigenvectors of L^-1 B L^-T
@@ -95,13 +95,14 @@ class Whitening(nn.Module):
         numbers: K, at most the rank. None is 128, but at most half the places; without views 256.
         components: principal components that are whitened, at least K.
         shrinkage: of `learned_whitening`. None is 0.03, or more if there are few views.
-        views: augmented copies of each frame. None is 4, below 3000 frames up to 12: 30 per component; below
-            330 frames up to 36: 4000 in all.
+        views: augmented copies of each frame. None is 4, on a shorter route up to 12, 30 per component, or
+            4000 in all if that is more, but at most 36 of each.
         most_views: copies in all; frames are drawn evenly if there would be more.
         strengths: arguments of `Augmentation`, instead of `STRENGTHS`.
         seed: of the copies.
-        bits: of each number of the projection: 4 (two to a byte), 8 or 16. None is 4, on a short route the
-            most with which its fewer dimensions take no more bytes than 128 of 4 bits.
+        bits: of each number of the projection: 4 (two to a byte), 8 or 16. None is 4, or more on a route of
+            under 130 places, whose fewer dimensions then take no more bytes than 128 of 4 bits, unless their
+            number is set.
         power: of each dimension's absolute value, above 0 and at most 1, to lower peaks, as of new objects.
         groups: D_1, D_2, .. of concatenated descriptors, each whitened by itself and scaled to length 1; then
             follow the K dimensions that best keep their inner products, the largest lowered a little. None
@@ -237,6 +238,14 @@ class Whitening(nn.Module):
             return self.numbers
         return min(DIMENSIONS, features, max(1, places // PLACES_PER_DIMENSION)) if views else WIDEST
 
+    def bits_of(self, places: int, views: bool) -> int:
+        """Bits of each number of the projection, if the constructor's are None."""
+        if self.numbers is not None or self.group_numbers is not None:
+            return BITS[0]
+        return max(
+            bits for bits in BITS if bits * self.kept(places, WIDEST, views) <= FULL_BITS or bits == BITS[0]
+        )
+
     @torch.no_grad()
     def learn(
         self,
@@ -244,6 +253,7 @@ class Whitening(nn.Module):
         views: Iterable[tuple[Tensor, Tensor]] | None = None,
         groups: Sequence[int] | None = None,
         shares: Sequence[float] | None = None,
+        samples: int | None = None,
     ) -> None:
         """Find the projection for one route.
 
@@ -251,12 +261,14 @@ class Whitening(nn.Module):
             places: (N,D), the descriptors of the route; they may be in a file.
             views: batches of descriptors (B,D) and the places (B,) that they show, if any.
             groups, shares: see `Joined`, if the constructor's groups are None.
+            samples: of the views, so many are independent; None is all.
         """
         groups, shares = (groups, shares) if self.groups is None else (self.groups, None)
         sizes = [places.shape[1]] if groups is None else [*groups]
         if sum(sizes) != places.shape[1]:
             seen = f"groups of {' + '.join(map(str, sizes))} dimensions, descriptors {tuple(places.shape)}"
             raise InputError(f"{seen}; expected (N, {sum(sizes)})")
+        bits = self.bits_of(len(places), views is not None)
         members = [self] if groups is None else [self._member() for _ in sizes]
         found = []
         shares = [1.0] * len(members) if groups is None or shares is None else shares
@@ -267,13 +279,12 @@ class Whitening(nn.Module):
             found.append(member._components(own, kept, kept if views is None else self.components))
         if views is None:
             for member, (mean, basis, variances, _) in zip(members, found, strict=True):
-                member.take(mean, basis, variances.mean().sqrt())
+                member.take(mean, basis, variances.mean().sqrt(), bits)
         else:
             pairs = _projected_views(places, views, found)
-            samples = min(pairs[0].shape[1], INDEPENDENT * len(places))
             for member, (mean, basis, _, kept), (shown, own) in zip(members, found, pairs, strict=True):
                 centre, projection = learned_whitening(shown, own, kept, self.shrinkage, samples)
-                member.take(mean + basis @ centre, basis @ projection, None)
+                member.take(mean + basis @ centre, basis @ projection, None, bits)
         if groups is not None:
             some = places[:: max(1, len(places) // SAMPLED)].to(self.scale.device).split(sizes, 1)
             weights = [math.sqrt(share) for share in shares]
@@ -285,7 +296,7 @@ class Whitening(nn.Module):
             if views is not None:
                 basis = basis / (squares / squares.mean()) ** (LEVELLING / 2)
             parts = zip(weights, basis.split([member.dimension for member in members]), strict=True)
-            self.take(mean, torch.cat([weight * part for weight, part in parts]), None)
+            self.take(mean, torch.cat([weight * part for weight, part in parts]), None, bits)
         self.members = nn.ModuleList([] if groups is None else members)
 
     def _member(self) -> Whitening:
@@ -304,13 +315,12 @@ class Whitening(nn.Module):
             log.warning("the descriptors of this route have rank %d: as many dimensions, not %d", rank, kept)
         return mean, basis[:, :rank], variances[:rank], min(kept, rank)
 
-    def take(self, mean: Tensor, projection: Tensor, length: Tensor | None) -> None:
-        """Set mean (D,), projection (D,K), rounded to `bits`, and the constant dimension, if any.
+    def take(self, mean: Tensor, projection: Tensor, length: Tensor | None, bits: int = BITS[0]) -> None:
+        """Set mean (D,), projection (D,K), rounded to `self.bits`, or to `bits`, and the constant, if any.
 
         With 4 bits two numbers share a byte; the first half of the columns are the low bits.
         """
-        fitting = (bits for bits in BITS[:0:-1] if bits * projection.shape[1] <= FULL_BITS)
-        bits = next(fitting, BITS[0]) if self.bits is None else self.bits
+        bits = self.bits or bits
         self.scale = projection.abs().amax(0) / (2 ** (bits - 1) - 1)
         whole = (projection / self.scale).round()
         self.projection = whole.to(torch.int8 if bits <= 8 else torch.int16)

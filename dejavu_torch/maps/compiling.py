@@ -17,12 +17,13 @@ SILENCE = 2.0  # seconds, longer than a load from the cache takes
 def compiled(
     function: Callable[..., Any], signature: str, what: str, calls: Sequence[Any] = (), **options: Any
 ) -> Callable[..., Any] | None:
-    """The function, and its `calls`, compiled for one signature, which is told, or loaded from numba's cache.
+    """The function, and its `calls`, compiled for one signature, or loaded from numba's cache; a long
+    compilation is logged.
 
     None, and a log line that `what` happens instead, if numba is missing, disabled or broken.
     """
     options |= {"nogil": True, "error_model": "numpy"}
-    told = Timer(SILENCE, log.warning, ("numba compiles a loop for later runs too; this takes about 20 s",))
+    told = Timer(SILENCE, log.warning, ("compiling a loop with numba, once; this may take 20 s",))
     try:
         import numba
         from numba.extending import register_jitable

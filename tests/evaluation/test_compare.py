@@ -370,7 +370,7 @@ def test_routes_off_the_map_are_prepared_as_queries_are(monkeypatch: pytest.Monk
     [
         ((20, 1, 32, 32), (5, 7), ("7 features", "1 x 32 x 32", "same number")),
         ((20, 8), (5, 7), ("8 features", "7 features", "same number")),
-        ((20, 8), (5, 1, 32, 32), ("8 features", "1 x 32 x 32")),
+        ((20, 8), (5, 1, 32, 32), ("frames", "expected ready features", "route")),
     ],
 )
 def test_routes_of_another_kind_are_refused_before_learning(

@@ -181,12 +181,15 @@ def test_short_routes_are_looked_at_more_often() -> None:
 
 
 def test_fewer_numbers_have_more_bits_in_as_many_bytes() -> None:
-    whitening, sizes = Whitening(), []
-    for numbers in (20, 32, 33, 64, 65, 128, 200):
-        whitening.take(torch.zeros(50), torch.randn(50, numbers), None)
-        sizes.append(whitening.projection.nbytes / (50 * numbers))
-    assert sizes[:6] == pytest.approx([2, 2, 1, 1, 0.5, 0.5], rel=0.02)
-    assert sizes[6] == 0.5
+    def size(places: int, views: bool = True, **settings: Any) -> float:
+        """Bytes of each number of the projection."""
+        shown = VIEWS[:places] if views else None
+        whitening = learned(PLACES[:places], shown, **settings)
+        return whitening.projection.nbytes / (40 * len(whitening.scale))
+
+    assert [size(places) for places in (20, 65, 66, 100, 129, 600)] == [2, 2, 1, 1, 1, 0.5]
+    assert size(20, numbers=4) == size(20, views=False) == 0.5
+    assert size(20, bits=8) == 1
 
 
 @pytest.mark.parametrize("bits", [4, 8, 16])

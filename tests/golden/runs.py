@@ -84,7 +84,7 @@ def run(name: str, out: Path, data: Path | None) -> None:
     """Run one of them; its pictures are of few pixels."""
     made = out.parent / f"{name}_made"
     if any("{made}" in word for word in RUNS[name]):
-        made.mkdir()
+        made.mkdir(exist_ok=True)
         for visit in range(3):
             np.save(made / f"{visit}.npy", descriptors(visit))
     words = [word.replace("{data}", str(data)).replace("{made}", str(made)) for word in RUNS[name]]
