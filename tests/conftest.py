@@ -19,6 +19,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from dejavu_torch.data.simulate.route import SimulatedRoute
 from dejavu_torch.features import distilled
+from dejavu_torch.maps import compiling
 from dejavu_torch.resize import resize_frames
 
 collect_ignore = ["mutants"]  # it has no tests, and runs them
@@ -26,6 +27,8 @@ collect_ignore = ["mutants"]  # it has no tests, and runs them
 # commands run in processes of their own, beside each other
 THREADS = int(os.environ.get("DEJAVU_TEST_THREADS", "1"))
 os.environ.setdefault("OMP_NUM_THREADS", str(THREADS))
+
+compiling.SILENCE = 1e6  # seconds; which test compiles first is chance
 
 # a shell has what runs in its background ignore Ctrl-C, and commands take over what they find
 if (

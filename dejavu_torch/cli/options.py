@@ -52,15 +52,16 @@ class Sequences:
         """
         settings = {"moves": self.moves, "search_every": getattr(self, "search_every", None)}
         given: dict[str, Any] = {name: value for name, value in settings.items() if value is not None}
+        if self.speeds is not None and self.sequence == 1:
+            expected = "expected --sequence T with them, in place of a filter"
+            raise InputError(f"--speeds {self.speeds} without --sequence; {expected}")
         if self.filter:
-            refuse_with("--filter", sequence=self.sequence > 1 and self.sequence, speeds=self.speeds)
+            refuse_with("--filter", sequence=self.sequence > 1 and self.sequence)
             chosen = PlaceFilter(within=within, **given)
             chosen.threshold = chosen.threshold if threshold is None else threshold
             return chosen
         for name, value in given.items():
             raise InputError(f"--{name} {value} without --filter; expected both")
-        if self.speeds is not None and self.sequence == 1:
-            raise InputError(f"--speeds {self.speeds} without --sequence; expected --sequence T with them")
         matcher = SequenceMatcher(self.sequence, (1.0,) if self.speeds is None else self.speeds)
         return None if self.sequence == 1 else matcher
 

@@ -139,10 +139,10 @@ def compare(
         one if is_ready(one) or is_ready(reference) else fitted(one, reference.frame_shape)
         for one in distractors
     ]
-    feature_shape = model.describer.check_sizes(reference, query, *off)
     for one in off:
         if is_ready(reference) and not is_ready(one):
             raise InputError(f"{one.name} has frames; expected ready features, as of {reference.name}")
+    feature_shape = model.describer.check_sizes(reference, query, *off)
 
     seconds: dict[str, float] = defaultdict(float)
     with timed(seconds, "describe" if has_map else "learn"):
