@@ -38,7 +38,7 @@ if (
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # the same examples on every machine, however slow it is
-settings.register_profile("repeatable", derandomize=True, deadline=None, database=None, max_examples=40)
+settings.register_profile("repeatable", derandomize=True, deadline=None, database=None, max_examples=25)
 settings.load_profile("repeatable")
 
 

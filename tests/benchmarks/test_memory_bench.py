@@ -95,11 +95,21 @@ def test_every_contender_finds_the_places(name: str, drives: Path, tmp_path: Pat
     assert ((found - shown).abs() <= TOLERANCE).double().mean() > 0.9
 
 
-def test_why_a_process_failed_that_does_not_import_from_the_current_folder(
-    drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+PROBE = """
+import importlib.util, json, sys
+(places,) = json.loads(sys.argv[1])
+if places > 100: raise SystemExit(f"no more than 100 places; got {places}")
+print("a line of a library", json.dumps({"found": importlib.util.find_spec("kornia").origin}), sep="\\n")
+"""
+
+
+def test_a_process_does_not_import_from_the_current_folder_and_says_why_it_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "kornia.py").write_text("raise SystemExit('the wrong module')")
+    (tmp_path / "kornia.py").touch()
+    (tmp_path / "there").mkdir()
+    (tmp_path / "there" / "probe.py").write_text(PROBE)
+    monkeypatch.syspath_prepend(tmp_path / "there")
     monkeypatch.chdir(tmp_path)
-    facts = in_process("benchmarks.memory", [HOG, 150, 10, 1, str(drives)])  # nothing learned so many
-    assert list(facts) == ["skipped"]
-    assert "150" in facts["skipped"]
+    assert not Path(in_process("probe", [50])["found"]).is_relative_to(tmp_path)
+    assert in_process("probe", [150]) == {"skipped": "no more than 100 places; got 150"}

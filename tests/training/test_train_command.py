@@ -7,6 +7,7 @@ import shlex
 import shutil
 import signal
 import sys
+from functools import wraps
 from importlib import import_module
 from pathlib import Path
 
@@ -72,7 +73,8 @@ def test_a_source_alone_is_enough(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     np.save("photos.npy", np.random.default_rng(0).integers(0, 255, (12, 120, 160, 3), dtype=np.uint8))
     seen: dict[str, object] = {}
 
-    def taken(self: Trainer, model: object, datamodule: RouteData) -> None:
+    @wraps(Trainer.fit)  # of which the parser takes its options
+    def taken(self: Trainer, model: object, datamodule: RouteData, **_: object) -> None:
         seen.update(steps=self.max_steps, every=self.val_check_interval, epochs=self.check_val_every_n_epoch)
         self.fit_loop.epoch_loop.max_steps = 2
         Trainer.fit(self, model, datamodule=datamodule)  # type: ignore[arg-type]
