@@ -218,7 +218,9 @@ def test_a_normal_run_prints_its_map_and_what_to_do_next(
     capfd: pytest.CaptureFixture[str],
     caplog: pytest.LogCaptureFixture,
     recwarn: pytest.WarningsRecorder,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr("dejavu_torch.cli.train.has_bf16", lambda: True)  # others are told
     for expected in ([], [f"{tmp_path} holds an earlier run, which this one replaces"]):
         caplog.clear()
         options = ["--trainer.precision=bf16-mixed", "--model.freeze=['']"]
