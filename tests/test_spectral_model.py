@@ -79,14 +79,15 @@ def test_scores_of_frames_and_of_their_features_agree(model: DejaVu, second: Tra
     frames = next(iter(second.batches(8)))
     scores = model(frames)
     descriptors = model.whitened(model.describe(frames))
-    assert torch.allclose(model.map.scores(descriptors), scores)
+    torch.testing.assert_close(model.map.scores(descriptors), scores, rtol=0, atol=1e-4)
     assert torch.equal(model.localize_descriptors(descriptors).index, scores.argmin(1))
     frames = frames[:4].clone().requires_grad_()
     model(frames).amin(1).sum().backward()
     assert frames.grad is not None
     assert frames.grad.isfinite().all()
     assert frames.grad.abs().max() > 0
-    assert torch.allclose(next(model.describer.descriptors(ArrayTraverse(frames, "four"))), descriptors[:4])
+    four = next(model.describer.descriptors(ArrayTraverse(frames, "four")))  # a batch of another size
+    assert (1 - (four * descriptors[:4]).sum(1)).abs().max() < 1e-4
 
 
 def test_save_and_load(model: DejaVu, second: Traverse, tmp_path: Path) -> None:
