@@ -71,9 +71,8 @@ class Coder(nn.Module):
         with torch.autocast(descriptors.device.type, enabled=False):
             components = to_length((descriptors.to(self.mean.dtype) - self.mean) @ self.projection)
             if self.training and self.noise:
-                noise = torch.randn(components.shape, dtype=torch.float32).to(
-                    components
-                )  # the same on every device
+                # drawn on the CPU: the same on every device
+                noise = torch.randn(components.shape, dtype=torch.float32).to(components)
                 components = to_length(components + self.noise * noise)
         coded: Tensor = self.layers(components)
         return coded

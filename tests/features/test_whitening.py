@@ -180,6 +180,19 @@ def test_short_routes_are_looked_at_more_often() -> None:
     assert Whitening(views=2).copies(60, 1764) == 2
 
 
+def test_views_that_are_no_samples_of_their_own_do_not_lower_the_shrinkage() -> None:
+    views, places = (
+        PLACES[:200] + torch.randn(200, 40, generator=torch.Generator().manual_seed(2)),
+        PLACES[:200],
+    )
+    change = ((views - places) / 2).double()
+    shrinkage = oracle_shrinkage(change.T @ change / 200, 50)
+    assert shrinkage > oracle_shrinkage(change.T @ change / 200, 200)
+    expected = learned_whitening(views, places, 5, shrinkage)
+    found = learned_whitening(views, places, 5, None, samples=50)
+    torch.testing.assert_close(found[1].abs(), expected[1].abs())
+
+
 def test_fewer_numbers_have_more_bits_in_as_many_bytes() -> None:
     def size(places: int, views: bool = True, **settings: Any) -> float:
         """Bytes of each number of the projection."""

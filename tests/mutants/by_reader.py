@@ -221,14 +221,14 @@ MUTANTS = [
         "Without views the constant number of a whitened descriptor is the root mean square of the kept "
         "ones.",
         "dejavu_torch/features/whitening.py",
-        "member.take(mean, basis, variances.mean().sqrt())",
-        "member.take(mean, basis, variances.sum().sqrt())",
+        "member.take(mean, basis, variances.mean().sqrt(), bits)",
+        "member.take(mean, basis, variances.sum().sqrt(), bits)",
         ("tests/features/test_whitening.py::test_without_views_components_keep_their_variances",),
     ),
     Mutant(
         "The shrinkage of a whitening that was not given one is at least 0.03, and more where views are few.",
         "dejavu_torch/features/whitening.py",
-        "shrinkage = max(SHRINKAGE, oracle_shrinkage(within, n))",
+        "shrinkage = max(SHRINKAGE, oracle_shrinkage(within, min(n, samples or n)))",
         "shrinkage = min(SHRINKAGE, oracle_shrinkage(within, n))",
         ("tests/features/test_whitening.py::-k shrink",),
     ),

@@ -563,7 +563,7 @@ MUTANTS = [
     Mutant(
         "The noise of a code is the same on every device.",
         "dejavu_torch/features/embedding.py",
-        "torch.randn(components.shape).to(components)",
+        "torch.randn(components.shape, dtype=torch.float32).to(components)",
         "torch.randn_like(components)",
         ("tests/training/test_training_on_gpu.py::-k stages",),
     ),
