@@ -135,13 +135,10 @@ def compare(
     check_candidates(top, tolerance)
     reference = model.fit(reference, model.frame_shape if has_map else None)
     query = model.fit(query, reference.frame_shape)
-    off = [
-        one if is_ready(one) or is_ready(reference) else fitted(one, reference.frame_shape)
-        for one in distractors
-    ]
-    for one in off:
+    for one in distractors:
         if is_ready(reference) and not is_ready(one):
             raise InputError(f"{one.name} has frames; expected ready features, as of {reference.name}")
+    off = [one if is_ready(one) else fitted(one, reference.frame_shape) for one in distractors]
     feature_shape = model.describer.check_sizes(reference, query, *off)
 
     seconds: dict[str, float] = defaultdict(float)

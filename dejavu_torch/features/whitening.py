@@ -261,7 +261,7 @@ class Whitening(nn.Module):
             places: (N,D), the descriptors of the route; they may be in a file.
             views: batches of descriptors (B,D) and the places (B,) that they show, if any.
             groups, shares: see `Joined`, if the constructor's groups are None.
-            samples: of the views, so many are independent; None is all.
+            samples: number of independent views, for the shrinkage; None is all of them.
         """
         groups, shares = (groups, shares) if self.groups is None else (self.groups, None)
         sizes = [places.shape[1]] if groups is None else [*groups]
