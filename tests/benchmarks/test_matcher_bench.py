@@ -6,6 +6,7 @@ import json
 import math
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -36,6 +37,15 @@ def small(*only: str) -> list[Row]:
     sizes |= {"filters": [(40, 3000)], "exports": [(3, 24, 16, 200)]}
     sizes = {name: size if not only or name in only else [] for name, size in sizes.items()}
     return list(bench_matcher(frames=70, repeats=1, torch_compile=False, **sizes))  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread() -> Iterator[None]:
+    """With more there are rows of ours with one as well."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")
