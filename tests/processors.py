@@ -48,9 +48,9 @@ def chosen() -> Iterator[tuple[Path, str]]:
     """The files and names of the tests."""
     for path in sorted(TESTS.rglob("test_*.py")):
         for node in ast.parse(path.read_text()).body:
-            if isinstance(node, ast.FunctionDef) and node.name.startswith("test"):
-                if path.name in WHOLE or compares_figures(node):
-                    yield path, node.name
+            test = isinstance(node, ast.FunctionDef) and node.name.startswith("test")
+            if test and (path.name in WHOLE or compares_figures(node)):
+                yield path, node.name
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Function]) -> None:

@@ -69,5 +69,5 @@ def test_tests_that_compare_figures_are_known(body: str, expected: bool) -> None
 
 
 def test_goldens_and_figures_of_readme_are_among_them() -> None:
-    names = {Path(one.partition("::")[0]).name for one in chosen()}
+    names = {path.name for path, _ in chosen()}
     assert {"test_golden.py", "test_readme_figures.py", "test_real_routes.py", "test_hog.py"} <= names
