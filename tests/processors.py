@@ -23,7 +23,10 @@ import pytest
 from benchmarks.spread import THREADS, environment_of, imitable
 
 TESTS = Path(__file__).parent
-WHOLE = ("test_golden.py", "test_readme_figures.py")  # files, the second although it is marked `figures`
+FIGURES = "test_readme_figures.py"  # of the whole demo, which takes minutes: once, on this processor
+WHOLE = ("test_golden.py", FIGURES)
+# a sixth of the time, for what one machine computes twice
+ALIKE = ("test_notebooks.py", "test_several_processes.py")
 CLOSE = re.compile(r"approx|allclose|assert_close|[ar]tol\b|close\(")
 
 
@@ -47,6 +50,8 @@ def compares_figures(test: ast.FunctionDef) -> bool:
 def chosen() -> Iterator[tuple[Path, str]]:
     """The files and names of the tests."""
     for path in sorted(TESTS.rglob("test_*.py")):
+        if path.name in ALIKE or path.parent.name == "benchmarks":
+            continue
         for node in ast.parse(path.read_text()).body:
             test = isinstance(node, ast.FunctionDef) and node.name.startswith("test")
             if test and (path.name in WHOLE or compares_figures(node)):
@@ -64,7 +69,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Func
 def run(processor: str, threads: int, more: list[str]) -> subprocess.CompletedProcess[str]:
     """Runs the chosen tests as one processor."""
     words = ["-n", str(os.cpu_count()), "--dist", "loadfile", "--tb", "line", "-m", "", "-rfE", *more]
-    files = sorted({str(path) for path, _ in chosen()})
+    once = (processor, threads) == ("this", 1)
+    files = sorted({str(path) for path, _ in chosen() if once or path.name != FIGURES})
     return subprocess.run(
         [sys.executable, "-m", "pytest", "-p", "tests.processors", *words, *files],
         cwd=TESTS.parent,
