@@ -505,7 +505,7 @@ def sparse_products(queries: Tensor, counts: Tensor, feature: Tensor, level: Ten
 
 @cache
 def _has_csr() -> bool:
-    """Whether torch multiplies CSR tensors by MKL. What it warns of once, beta state and checks, it does here."""
+    """Whether torch multiplies CSR tensors by MKL. What it warns of once, beta state and checks, is here."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         torch.sparse_csr_tensor([0, 1], [0], [1.0], (1, 1), check_invariants=False)
