@@ -77,6 +77,7 @@ def forked(work: Callable[[], None]) -> int:
     if child:
         return child
     try:
+        torch.set_num_threads(1)  # those of OpenMP do not survive a fork
         work()
     except SystemExit as stop:
         sys.stderr.flush()
