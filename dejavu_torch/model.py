@@ -19,7 +19,7 @@ from dejavu_torch.data.arrays import as_traverse
 from dejavu_torch.data.fitted import at_size, resize_like, size_like
 from dejavu_torch.data.names import names_of
 from dejavu_torch.features.distilled import Distilled
-from dejavu_torch.features.extract import features_of
+from dejavu_torch.features.extract import Pipeline, as_weights, features_of
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.preprocess import Preprocess
@@ -144,9 +144,16 @@ class DejaVu(nn.Module):
         self._warned: set[tuple[str, str]] = set()  # (traverse, line) of warnings that were logged
 
     def settings(self) -> dict[str, Any]:
-        """The constructor's arguments now: `DejaVu(**model.settings())` is the same model without a map."""
+        """The constructor's arguments now: `DejaVu(**model.settings())` is the same model without a map.
+
+        A whitening that is learned with each map is a copy, so that another model can learn; all other parts,
+        such as the features, are this model's own.
+        """
         own = {name: getattr(self, name) for name in inspect.signature(DejaVu).parameters}
-        return own | {"whitening": self.whitening or "none"}
+        whitening = self.whitening
+        if whitening is not None and not whitening.fixed:
+            whitening = copy.deepcopy(whitening)
+        return own | {"whitening": whitening or "none"}
 
     def learn(
         self,
@@ -239,7 +246,7 @@ class DejaVu(nn.Module):
         """Describes frames with the model's present settings."""
         pixels = math.prod(own_size(self.features) or (1,))  # larger frames, smaller batches
         batch = max(1, min(self.batch_size, BATCH_NUMBERS // (3 * pixels)))
-        pipeline = nn.Sequential(self.preprocess, self.features)
+        pipeline = Pipeline(self.preprocess, self.features)
         return learning.Describer(pipeline, self.whitening, batch, self.map.positions.device, self._warned)
 
     def _describer_of(self, traverse: Traverse) -> learning.Describer:
@@ -387,7 +394,7 @@ class DejaVu(nn.Module):
 
     def describe(self, frames: Tensor) -> Tensor:
         """Preprocess, then features: (B,C,H,W) -> (B,D)."""
-        features: Tensor = self.features(self.preprocess(frames))
+        features: Tensor = self.features(as_weights(self.preprocess(frames), self.features))
         return features
 
     def whitened(self, features: Tensor) -> Tensor:

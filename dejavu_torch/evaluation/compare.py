@@ -16,6 +16,7 @@ from torch import Tensor
 from dejavu_torch.data.arrays import UNNAMED, as_traverse
 from dejavu_torch.data.fitted import fitted
 from dejavu_torch.data.ground_truth import (
+    Truth,
     as_ground_truth,
     check_ground_truth,
     describe_ground_truth,
@@ -78,7 +79,7 @@ class Comparison(NamedTuple):
 def compare(
     reference: Traverse | Tensor,
     query: Traverse | Tensor,
-    truth: str | None = None,
+    truth: Truth | None = None,
     model: DejaVu | None = None,
     *,
     tolerance: int = 5,

@@ -6,6 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from dejavu_torch.memory import without_autocast
 from dejavu_torch.types import InputError
 
 # the largest strength of each change; two numbers if the argument is a pair
@@ -99,6 +100,7 @@ class Augmentation(nn.Module):
         return other
 
     @torch.no_grad()
+    @without_autocast
     def forward(self, frames: Tensor) -> Tensor:
         if not self.training:
             return frames
