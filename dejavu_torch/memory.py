@@ -45,6 +45,8 @@ def without_autocast(function: Callable[P, R]) -> Callable[P, R]:
     @functools.wraps(function)
     def exact(*args: P.args, **kwargs: P.kwargs) -> R:
         device = next(one.device.type for one in args if isinstance(one, Tensor))
+        if not torch.amp.is_autocast_available(device):
+            return function(*args, **kwargs)
         with torch.autocast(device, enabled=False):
             return function(*args, **kwargs)
 

@@ -17,7 +17,7 @@ from dejavu_torch.data.folder import ROUNDING, numbers_increase
 from dejavu_torch.data.frame_range import IndexedTraverse
 from dejavu_torch.memory import check_room
 from dejavu_torch.text import printable
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.types import InputError
 
 UNNAMED = "the array"
 EXPECTED = (
@@ -119,18 +119,3 @@ def read_array(path: Path) -> ArrayTraverse:
             raise InputError(f"{text} has {len(names)} names; expected {expected}")
         traverse.names, traverse.ordered = names, numbers_increase(names)
     return traverse
-
-
-def as_traverse(source: Traverse | Tensor | str | Path) -> Traverse:
-    """A tensor or array of frames or features, or what `open_source` opens, as a traverse; a traverse
-    unchanged."""
-    if isinstance(source, Tensor | np.ndarray):
-        return ArrayTraverse(source)
-    if isinstance(source, str | Path):
-        from dejavu_torch.data.source import open_source  # which knows this module
-
-        return open_source(str(source))
-    if isinstance(source, Traverse):
-        return source
-    seen = f"got a {type(source).__name__}"
-    raise InputError(f"{seen}; expected a Traverse, as from open_source, a tensor, or a path")

@@ -72,19 +72,20 @@ def as_ground_truth(truth: Truth, queries: int | None = None) -> GroundTruth:
         assert found is not None
         return found
     if not isinstance(truth, GroundTruth):
-        places = _table_of(truth)
-        judged = torch.ones(len(places), dtype=torch.bool, device=places.device)
-        truth = GroundTruth(places, judged, places.new_zeros(len(places), 0))
+        truth = _every(_table_of(truth))
     shapes = [tuple(part.shape) for part in truth]
     rows = len(truth.judged) if queries is None else queries
-    if shapes[1] != (rows,) or not all(
-        len(shape) == 2 and shape[0] == rows for shape in (shapes[0], shapes[2])
-    ):
-        raise InputError(
-            f"the truth is {shapes[0]}, judged and ignored {shapes[1]} and {shapes[2]}; expected "
-            f"({rows}, R), ({rows},) and ({rows}, S), a row for each query"
-        )
+    fits = shapes[1] == (rows,) and all(len(one) == 2 and one[0] == rows for one in shapes[::2])
+    if not fits:
+        seen = f"the truth is {shapes[0]}, with judged {shapes[1]} and ignored {shapes[2]}"
+        raise InputError(f"{seen}; expected ({rows}, R), ({rows},) and ({rows}, S), one row per query")
     return truth
+
+
+def _every(places: Tensor) -> GroundTruth:
+    """The places (Q,R) of queries that are all judged."""
+    judged = torch.ones(len(places), dtype=torch.bool, device=places.device)
+    return GroundTruth(places, judged, places.new_zeros(len(places), 0))
 
 
 def _table_of(truth: Any) -> Tensor:
@@ -271,23 +272,23 @@ def find_ground_truth(
         if reference is None or query is None:
             return None
         if reference.place is not None and query.place is not None:
-            return as_ground_truth(position_truth(reference.place, _rows_of(query.place, numbers)))
+            return _every(position_truth(reference.place, _rows_of(query.place, numbers)))
         count = len(numbers) if every else query.length
         same_length = not resampled and count is not None and count == frames
         if same_length and (aligned or are_aligned(reference, query, count or 0)):
-            return as_ground_truth(offset_truth(numbers, frames))
+            return _every(offset_truth(numbers, frames))
         return None
     parsed = check_ground_truth(truth, interpolate)
     if isinstance(parsed, GroundTruth):
         rows = (_rows_of(part, numbers) for part in as_ground_truth(parsed, len(numbers) if every else None))
         found = GroundTruth(*rows)
     elif isinstance(parsed, int):
-        found = as_ground_truth(offset_truth(numbers, frames, parsed))
+        found = _every(offset_truth(numbers, frames, parsed))
     elif isinstance(parsed, float):
         if reference is None or query is None:
             raise InputError(f"truth utm:{parsed:g} reads the names of images; expected reference and query")
         coordinates = _rows_of(utm_coordinates(query), numbers)
-        found = as_ground_truth(near_truth(utm_coordinates(reference), coordinates, parsed))
+        found = _every(near_truth(utm_coordinates(reference), coordinates, parsed))
     elif parsed.suffix.lower() == ".npz":
         found = _read_matrices(parsed, numbers, frames, every)
     else:
@@ -386,7 +387,7 @@ def _from_table(
         raise InputError(f"{path} lists queries from {first} to {last}; expected some of {wanted}")
     rows = [[_rounded(place) for place in places.get(query, ())] for query in queries]
     found = padded(torch.tensor(row, dtype=torch.int64) for row in rows)
-    return as_ground_truth(found)._replace(judged=judged)
+    return _every(found)._replace(judged=judged)
 
 
 def _to_queries(listed: Listed, frames: Tensor) -> Listed:
@@ -491,7 +492,7 @@ def _read_matrices(path: Path, numbers: Tensor, frames: int | None, every: bool)
     if not all(np.isfinite(matrix).all() for matrix in matrices):
         raise InputError(f"{path} contains values that are not finite; expected {expected}")
     hard, *soft = (torch.from_numpy(matrix[:, numbers.numpy()] != 0).T for matrix in matrices)
-    found = as_ground_truth(padded(row.nonzero()[:, 0] for row in hard))
+    found = _every(padded(row.nonzero()[:, 0] for row in hard))
     return found._replace(ignored=padded(row.nonzero()[:, 0] for row in soft[0] & ~hard)) if soft else found
 
 

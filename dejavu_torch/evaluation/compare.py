@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.arrays import UNNAMED, as_traverse
+from dejavu_torch.data.arrays import UNNAMED
 from dejavu_torch.data.fitted import fitted
 from dejavu_torch.data.ground_truth import (
     Truth,
@@ -23,6 +23,7 @@ from dejavu_torch.data.ground_truth import (
     ground_truth_in_places,
     offset_of,
 )
+from dejavu_torch.data.source import Source, as_traverse
 from dejavu_torch.evaluation.answers import own_facts
 from dejavu_torch.evaluation.baselines import Baseline, baselines_of
 from dejavu_torch.evaluation.contenders import Contender, contend, models_beside
@@ -77,8 +78,8 @@ class Comparison(NamedTuple):
 
 
 def compare(
-    reference: Traverse | Tensor,
-    query: Traverse | Tensor,
+    reference: Source,
+    query: Source,
     truth: Truth | None = None,
     model: DejaVu | None = None,
     *,

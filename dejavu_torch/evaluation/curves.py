@@ -37,11 +37,11 @@ class Scores(NamedTuple):
 
     auc: float
     auc_reported: float
-    average_precision: float
     recall_at_100_precision: float
     recall_at_100_precision_reported: float
     precision_at_100_recall: float
     recall_at_1: float
+    average_precision: float
 
 
 def pr_curve(
@@ -161,11 +161,11 @@ def evaluate(match: Match, truth: Truth, tolerance: int) -> Scores:
     return Scores(
         area(every),
         area(reported),
-        average_precision(every),
         recall_at_full_precision(every),
         recall_at_full_precision(reported),
         int(right.sum()) / max(1, int((match.index >= 0).sum())),
         int(right.sum()) / max(1, int(answerable.sum())),
+        average_precision(every),
     )
 
 

@@ -102,7 +102,7 @@ class Augmentation(nn.Module):
     @torch.no_grad()
     @without_autocast
     def forward(self, frames: Tensor) -> Tensor:
-        if not self.training:
+        if not self.training or not len(frames):
             return frames
         (blur,), (noise,) = self.strengths["blur"], self.strengths["noise"]
         radius = max(1, round(blur)) if blur else 0

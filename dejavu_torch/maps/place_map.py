@@ -170,10 +170,9 @@ class PlaceMap(nn.Module, ABC):
             raise
 
     def packed(self) -> dict[str, Tensor]:
-        """The tensors of a file: the state's, floats as float32, without visits if every place has one."""
+        """The tensors of a file: the state's, without visits if every place has one."""
         omitted = {EXTRA} if len(self.visits) else {EXTRA, "visits"}
-        state = {name: value for name, value in self.state_dict().items() if name not in omitted}
-        return {name: one.float() if one.is_floating_point() else one for name, one in state.items()}
+        return {name: value for name, value in self.state_dict().items() if name not in omitted}
 
     def load_packed(self, tensors: dict[str, Tensor], extra: dict[str, Any]) -> None:
         """Load the results of `packed` and `get_extra_state`; other tensors are an InputError."""

@@ -45,7 +45,8 @@ def weight_per_feature(metric: Metric, features: int) -> float:
 def log_posterior(scores: Tensor, temperature: float | Tensor) -> Tensor:
     """Negative log posterior of each place in nats, -log softmax(-S / T): (..., N) -> (..., N).
 
-    Lower is better. Scores of different queries become comparable: a shift of S at all places cancels. +inf stays +inf.
+    Lower is better. Scores of different queries become comparable: a shift of S at all places cancels.
+    +inf stays +inf.
 
     Example:
         >>> log_posterior(torch.tensor([[0.0, 0.0, torch.inf]]), 0.1).tolist()

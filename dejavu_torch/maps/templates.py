@@ -62,8 +62,8 @@ class PhaseTemplates(nn.Module):
     Shape: features (N,D), plan of L layers -> tuple of L tensors (P,F).
 
     Convention: the mean is over the layer's own chunk, in the features' own type under any autocast. A phase
-        without frames gets 0, which is never read.
-        Gradients reach the features. A layer beyond the N frames or the D features is an InputError.
+        without frames gets 0, which is never read. Gradients reach the features. A layer beyond the N frames
+        or the D features is an InputError.
 
     Example:
         >>> plan = (FrequencyLayer(Fraction(2), 2, 0, 4, (0,)),)

@@ -38,7 +38,8 @@ class Spectrum(NamedTuple):
 
 
 def chunk_power(chunk: Tensor) -> Tensor:
-    """Power of the Hann spectrum of one chunk: (n,D) -> (n // 2 + 1, D)."""
+    """Power of the Hann spectrum of one chunk, at least float32: (n,D) -> (n // 2 + 1, D)."""
+    chunk = chunk.to(torch.promote_types(chunk.dtype, torch.float32))
     centred = chunk - chunk.mean(0)
     # rounding leaves a constant feature some power, in which noise would choose a period: set it to zero
     constant = centred.abs().amax(0) <= 8 * torch.finfo(chunk.dtype).eps * chunk.abs().amax(0)
