@@ -308,8 +308,8 @@ class PlaceRecognitionTask(Trainee):
         except NothingLearned as error:
             if self.made:
                 raise
-            cure = "BatchNorm1d(D, affine=False) at its end, or a SpectralMapper, which needs no scale"
-            raise NothingLearned(f"{error}; if the backbone has none, expected {cure}") from error
+            cure = "BatchNorm1d(D, affine=False) at the end of the backbone, or a SpectralMapper"
+            raise NothingLearned(f"{error}; templates need features of equal scale: expected {cure}") from error
 
     on_train_end = _check_learned
 
