@@ -32,9 +32,9 @@ Supportive Feature Frequencies" (IROS 2017). From the paper's sections to the co
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from dejavu_torch.lazy import homes_of, lazily
 from dejavu_torch.version import __version__ as __version__
 
 if TYPE_CHECKING:
@@ -95,16 +95,6 @@ _NAMES = {
     "training.task": "PlaceRecognitionTask",
     "types": "FrequencyLayer InputError Match Traverse",
 }
-_HOMES = {name: module for module, names in _NAMES.items() for name in names.split()}
+_HOMES = homes_of(_NAMES)
 __all__ = sorted(_HOMES)
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = globals()[name] = getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+__getattr__, __dir__ = lazily(__name__, _NAMES)

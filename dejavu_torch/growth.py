@@ -12,11 +12,11 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dejavu_torch import learning
-from dejavu_torch.data.arrays import as_traverse
 from dejavu_torch.data.frame_range import chained
 from dejavu_torch.data.ground_truth import find_ground_truth
 from dejavu_torch.data.names import names_of
 from dejavu_torch.data.positions import positions_behind
+from dejavu_torch.data.source import Source, as_traverse
 from dejavu_torch.features.views import Views
 from dejavu_torch.maps.file import checksums, digests
 from dejavu_torch.maps.frame_table import FrameTable
@@ -36,7 +36,7 @@ LOGGED_DIFFERENCE = 0.1  # between two shares of variance
 @torch.no_grad()
 def append(
     model: DejaVu,
-    traverse: Traverse | Tensor,
+    traverse: Source,
     progress: bool = False,
     checkpoint: learning.Checkpoint | None = None,
     code: learning.Code = learning.ChunkCoder.chunks,
@@ -115,7 +115,7 @@ def _warn_held(before: SpectralMap, grown: SpectralMap, hold: float | None) -> N
 
 def learn_mean(
     model: DejaVu,
-    traverse: Traverse | Tensor,
+    traverse: Source,
     visits: Views,
     progress: bool = False,
     second: Views | None = None,

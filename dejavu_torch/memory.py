@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import os
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
+from typing import IO, ParamSpec, TypeVar
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch._C._functorch import is_functorch_wrapped_tensor
 
 from dejavu_torch.types import InputError
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 CGROUPS = Path("/sys/fs/cgroup")  # the limits of containers, jobs and services
 OWN_CGROUP = Path("/proc/self/cgroup")  # which of them the process is in
@@ -32,6 +37,27 @@ def in_float32() -> Iterator[None]:
         yield
     finally:
         torch.set_default_dtype(before)
+
+
+def without_autocast(function: Callable[P, R]) -> Callable[P, R]:
+    """The function of at least one tensor, computed in the tensors' own types under any autocast."""
+
+    @functools.wraps(function)
+    def exact(*args: P.args, **kwargs: P.kwargs) -> R:
+        device = next(one.device.type for one in args if isinstance(one, Tensor))
+        if not torch.amp.is_autocast_available(device):
+            return function(*args, **kwargs)
+        with torch.autocast(device, enabled=False):
+            return function(*args, **kwargs)
+
+    return exact
+
+
+def is_readable(tensor: Tensor) -> bool:
+    """Whether a number can be read from a tensor without waiting for a device: it is plain, on the CPU, and
+    neither traced nor transformed by torch.func."""
+    plain = type(tensor) in (Tensor, nn.Parameter) and tensor.device.type == "cpu"
+    return plain and not torch.compiler.is_compiling() and not is_functorch_wrapped_tensor(tensor)
 
 
 def free_memory() -> float:

@@ -15,11 +15,11 @@ from torch import Tensor, nn
 from torch.nn.parameter import is_lazy
 
 from dejavu_torch import learning, model_file
-from dejavu_torch.data.arrays import as_traverse
 from dejavu_torch.data.fitted import at_size, resize_like, size_like
 from dejavu_torch.data.names import names_of
+from dejavu_torch.data.source import Source, as_traverse
 from dejavu_torch.features.distilled import Distilled
-from dejavu_torch.features.extract import features_of
+from dejavu_torch.features.extract import Pipeline, as_weights, features_of
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.preprocess import Preprocess
@@ -144,13 +144,20 @@ class DejaVu(nn.Module):
         self._warned: set[tuple[str, str]] = set()  # (traverse, line) of warnings that were logged
 
     def settings(self) -> dict[str, Any]:
-        """The constructor's arguments now: `DejaVu(**model.settings())` is the same model without a map."""
+        """The constructor's arguments now: `DejaVu(**model.settings())` is the same model without a map.
+
+        A whitening that is learned with each map is a copy, so that another model can learn; all other parts,
+        such as the features, are this model's own.
+        """
         own = {name: getattr(self, name) for name in inspect.signature(DejaVu).parameters}
-        return own | {"whitening": self.whitening or "none"}
+        whitening = self.whitening
+        if whitening is not None and not whitening.fixed:
+            whitening = copy.deepcopy(whitening)
+        return own | {"whitening": whitening or "none"}
 
     def learn(
         self,
-        traverse: Traverse | Tensor,
+        traverse: Source,
         progress: bool = False,
         second: Views | None = None,
         checkpoint: learning.Checkpoint | None = None,
@@ -160,7 +167,8 @@ class DejaVu(nn.Module):
         """Section III-A: features, what repeats in them, and the map.
 
         Args:
-            traverse: the reference, a Traverse or a tensor: frames (N,C,H,W) or features (N,D).
+            traverse: the reference: a Traverse, what `open_source` opens, or an array or tensor of frames or
+                features, see `ArrayTraverse`.
             second: another traverse of the same places, from which whitening learns what changes between
                 visits, instead of from augmented copies; see `growth.second_traverse`.
             progress: show a progress bar on a terminal, elsewhere a line per minute, on stderr.
@@ -239,7 +247,7 @@ class DejaVu(nn.Module):
         """Describes frames with the model's present settings."""
         pixels = math.prod(own_size(self.features) or (1,))  # larger frames, smaller batches
         batch = max(1, min(self.batch_size, BATCH_NUMBERS // (3 * pixels)))
-        pipeline = nn.Sequential(self.preprocess, self.features)
+        pipeline = Pipeline(self.preprocess, self.features)
         return learning.Describer(pipeline, self.whitening, batch, self.map.positions.device, self._warned)
 
     def _describer_of(self, traverse: Traverse) -> learning.Describer:
@@ -341,13 +349,24 @@ class DejaVu(nn.Module):
         return self.replace_map(route)
 
     def replace_map(self, route: PlaceMap) -> DejaVu:
-        """Set another map of the same frames, without calibration; returns self in eval mode."""
+        """Set another map of the same frames, without calibration; returns self in eval mode.
+
+        Parameters of the present map, such as trainable templates, stay the same objects with the new values,
+        for an optimiser, if they have the new shapes.
+        """
+        for name, new in dict(route.named_parameters(recurse=False)).items():
+            own = getattr(self.map, name, None)
+            if isinstance(own, nn.Parameter) and own.shape == new.shape:
+                own.data, own.grad = new.data, None
+                setattr(route, name, own)
+            elif isinstance(own, nn.Parameter) and own.numel():
+                log.warning("the %s of the map are new parameters: an optimiser has to be made anew", name)
         self.map, self.find, self.calibration = route, None, None
         return self.eval()
 
     def calibrate(
         self,
-        reference: Traverse | Tensor | None,
+        reference: Source | None,
         views: Views | None = None,
         places: Tensor | None = None,
         progress: bool = False,
@@ -387,7 +406,7 @@ class DejaVu(nn.Module):
 
     def describe(self, frames: Tensor) -> Tensor:
         """Preprocess, then features: (B,C,H,W) -> (B,D)."""
-        features: Tensor = self.features(self.preprocess(frames))
+        features: Tensor = self.features(as_weights(self.preprocess(frames), self.features))
         return features
 
     def whitened(self, features: Tensor) -> Tensor:
@@ -405,7 +424,7 @@ class DejaVu(nn.Module):
 
     def localize(
         self,
-        queries: Traverse | Tensor,
+        queries: Source,
         progress: bool = False,
         sequence: SequenceModel | None = None,
         search: Search | None = None,
@@ -413,8 +432,7 @@ class DejaVu(nn.Module):
         """Section III-C: the best place of each query and whether it is accepted (eq. 5, eq. 6).
 
         Args:
-            queries: a Traverse or a tensor: frames (Q,C,H,W) or features (Q,D). They are resampled like the
-                map's frames, see `resample`.
+            queries: as in `learn`. They are resampled like the map's frames, see `resample`.
             progress: see `learn`.
             sequence: scores consecutive queries together, such as a `SequenceMatcher` or a `PlaceFilter`;
                 None matches each query by itself.
@@ -481,7 +499,7 @@ class DejaVu(nn.Module):
 
     def matches(
         self,
-        queries: Traverse | Tensor,
+        queries: Source,
         progress: bool = False,
         sequence: SequenceModel | None = None,
         search: Search | None = None,
@@ -509,7 +527,7 @@ class DejaVu(nn.Module):
 
     def candidates(
         self,
-        queries: Traverse | Tensor,
+        queries: Source,
         k: int,
         apart: int = 5,
         sequence: SequenceModel | None = None,

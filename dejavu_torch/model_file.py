@@ -187,7 +187,13 @@ def weights_of(model: Any, part: str) -> dict[str, Tensor]:
     module = getattr(model, part)
     state = {} if module is None else module.state_dict()
     weights = packed(module) if part == "features" and model.weight_bits == 8 else state
-    return {f"{part}.{name}": tensor for name, tensor in weights.items() if isinstance(tensor, Tensor)}
+    # features may be half precision by choice, a whitening only by `model.half()`
+    wide = (torch.float64,) if part == "features" else (torch.float64, torch.float16, torch.bfloat16)
+    return {
+        f"{part}.{name}": tensor.float() if tensor.dtype in wide else tensor
+        for name, tensor in weights.items()
+        if isinstance(tensor, Tensor)
+    }
 
 
 def model_state(model: Any) -> dict[str, Any]:

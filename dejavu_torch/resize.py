@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 
+import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from dejavu_torch.memory import without_autocast
 from dejavu_torch.types import InputError
 
 Size = tuple[int, int]  # height and width, pixels
@@ -26,7 +28,14 @@ def resize_frames(frames: Tensor, size: Size | None) -> Tensor:
     """Frames (B,C,H,W) resized to (height, width), bilinear and antialiased; None keeps their size."""
     if size is None or tuple(frames.shape[-2:]) == tuple(size):
         return frames
-    return interpolate(frames, (size[0], size[1]), mode="bilinear", antialias=True)
+    return _interpolated(frames, (size[0], size[1]))
+
+
+@without_autocast
+def _interpolated(frames: Tensor, size: Size) -> Tensor:
+    exact = frames.to(torch.promote_types(frames.dtype, torch.float32))  # a CPU has no antialiasing in less
+    resized: Tensor = interpolate(exact, size, mode="bilinear", antialias=True)
+    return resized.to(frames.dtype)
 
 
 def is_stretched(own: Size, size: Size) -> bool:

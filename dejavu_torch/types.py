@@ -186,6 +186,10 @@ class Match(_Columns):
     probability: Tensor | None = None
     sequences: Mapping[Together, Match] = MappingProxyType({})
 
+    def _asdict(self) -> dict[str, Any]:
+        """The columns by name, with the probability if there is one."""
+        return super()._asdict() | ({} if self.probability is None else {"probability": self.probability})
+
     def _replace(self, **changes: Any) -> Match:
         probability = changes.pop("probability", self.probability)
         sequences = changes.pop("sequences", self.sequences)

@@ -46,7 +46,13 @@ settings.load_profile("repeatable")
 SLOW = (
     *("training", "benchmarks", "motion", "cluster", "fuzz", "test_cli", "test_faults", "test_readme"),
     *("test_real_routes", "test_golden", "test_periods_on_real_data", "test_spectral_model"),
-    *("test_model_export", "test_notebooks", "data/test_simulate_railway", "evaluation/test_pictures"),
+    *(
+        "test_model_export",
+        "test_matrix",
+        "test_notebooks",
+        "data/test_simulate_railway",
+        "evaluation/test_pictures",
+    ),
 )
 # modules that run whole commands again and again
 FEW_VIEWS = {

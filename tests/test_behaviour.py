@@ -18,7 +18,7 @@ from dejavu_torch import (
     SpectralMapper,
     open_source,
 )
-from dejavu_torch.data.arrays import as_traverse
+from dejavu_torch.data.source import as_traverse
 from dejavu_torch.evaluation.controls import null_control
 from dejavu_torch.features.views import Views
 from dejavu_torch.growth import average, merge

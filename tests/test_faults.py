@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from command_line import fails, frames, run, write_images
 from processes import PACKAGE, Forked
 

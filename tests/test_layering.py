@@ -13,16 +13,17 @@ FILES = sorted(file.relative_to(PACKAGE) for file in PACKAGE.rglob("*.py"))
 SOURCES = {file: (PACKAGE / file).read_text(encoding="utf-8") for file in FILES}
 # what each room uses, all of it above: a new arrow between two rooms is a decision, and is written down here
 ARROWS = {
+    "lazy": "",
     "text": "",
     "version": "",
     "types": "text",
     "memory": "types",
-    "resize": "types",
-    "data": "text types memory resize",
-    "features": "text types resize",
+    "resize": "types memory",
+    "data": "lazy text types memory resize",
+    "features": "lazy text types memory resize",
     "periods": "text types memory",
-    "maps": "types text memory data periods",
-    "recognition": "text types data maps",
+    "maps": "lazy types text memory data periods",
+    "recognition": "text types memory data maps",
     "motion": "text types memory data",
     "learning": "types memory data features maps recognition motion",
     "model_file": "text version types memory data features periods maps recognition motion learning",
@@ -30,10 +31,10 @@ ARROWS = {
     "growth": "types data features maps motion learning model_file model",
     "cluster": "text types data maps recognition learning",
     "live": "types data features recognition model",
-    "evaluation": "text version types memory resize data features periods maps recognition motion learning "
-    "model_file model growth",
+    "evaluation": "lazy text version types memory resize data features periods maps recognition motion "
+    "learning model_file model growth",
     "export": "text version types data features maps recognition model",
-    "training": "text types memory resize data features periods maps recognition "
+    "training": "lazy text types memory resize data features periods maps recognition "
     "motion model_file model evaluation",
     "cli": "text types data features periods maps recognition motion learning model_file model "
     "growth cluster live export evaluation training",

@@ -193,7 +193,7 @@ def test_a_loaded_map_says_that_its_period_finder_is_missing(
 @pytest.mark.parametrize(
     "use",
     [
-        lambda: DejaVu().learn("sim:aerial"),
+        lambda: DejaVu().learn(7),
         lambda: compare("one/", "two/"),
         lambda: evaluate(torch.arange(3), torch.arange(3)[:, None], 0),
         lambda: best_match(np.zeros((2, 3))),

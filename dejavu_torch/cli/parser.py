@@ -87,8 +87,11 @@ def made(function: str, **arguments: Any) -> nn.Module:
     Args:
         function: its import path as the user typed it, never from a map or checkpoint.
     """
-    maker = _function_at(function)
-    if maker is None:
+    try:
+        maker: Any = pydoc.locate(function)
+    except pydoc.ErrorDuringImport as error:
+        raise InputError(f"{function} cannot be imported: {one_line(error.value)}") from error
+    if not callable(maker):
         raise InputError(f"{function} is no function that can be imported; expected one, or a class")
     try:
         with redirect_stdout(sys.stderr):  # keeps stdout to lines of JSON

@@ -30,7 +30,7 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.text import one_line
 from dejavu_torch.training.checkpoint import EXPECTED, CheckpointFiles, taking_over
 from dejavu_torch.training.datamodule import RouteData
-from dejavu_torch.training.export import DESCRIPTOR, TRAINED, LastCheckpoint, MapExport, StepBar, has_bf16
+from dejavu_torch.training.export import DESCRIPTOR, LastCheckpoint, MapExport, StepBar, has_bf16
 from dejavu_torch.training.losses import NothingLearned
 from dejavu_torch.training.task import TEMPERATURE, PlaceRecognitionTask, load_weights
 from dejavu_torch.types import InputError
@@ -373,11 +373,6 @@ def print_written(export: MapExport, data: RouteData, words: Sequence[str]) -> N
         print(f"written to {path}; on {on}, within {data.tolerance}:")
         for name, one in export.scores.items():
             print(f"  {name:20} AUC {one.auc:.3f}, recall@1 {one.recall_at_1:.3f}")
-        first = export.scores[TRAINED].auc
-        if beaten := [name for name, one in export.scores.items() if one.auc > first]:
-            source = shlex.quote(str(data.sources["source"]))
-            text = "the trained map is worse than %s; `dejavu learn %s --map FILE` makes a map untrained"
-            log.warning(text, " and ".join(beaten), source)
     elif model.map.places:
         seen, another = "augmented copies of its own frames", "a second"
         if data.sources["second"]:

@@ -17,19 +17,22 @@ from dejavu_torch.data.folder import ROUNDING, numbers_increase
 from dejavu_torch.data.frame_range import IndexedTraverse
 from dejavu_torch.memory import check_room
 from dejavu_torch.text import printable
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.types import InputError
 
 UNNAMED = "the array"
 EXPECTED = (
-    "frames (N,H,W) or (N,H,W,3) uint8, tensors also (N,C,H,W) float in [0, 1], or features (N,D) float"
+    "frames (N,H,W), (N,H,W,3) or (N,3,H,W) uint8, tensors also (N,C,H,W) float in [0, 1], or features (N,D) "
+    "float"
 )
+CHANNELS = (1, 3)  # of uint8 frames
 
 
 class ArrayTraverse(IndexedTraverse):
     """The frames or features of an array or tensor; a memory-mapped file is read only as needed.
 
     Args:
-        values: uint8 frames (N,H,W) or (N,H,W,3), float frames (N,C,H,W) in [0, 1], or float features (N,D).
+        values: uint8 frames (N,H,W), (N,H,W,3) or (N,3,H,W), colours last where both fit; float frames
+            (N,C,H,W) in [0, 1], read as float32; or float features (N,D).
         name: for messages.
 
     Raises:
@@ -43,9 +46,10 @@ class ArrayTraverse(IndexedTraverse):
     def __init__(self, values: Tensor | np.ndarray, name: str = UNNAMED) -> None:
         shape = tuple(values.shape)
         kind = str(values.dtype).removeprefix("torch.") if isinstance(values, Tensor) else values.dtype.name
-        pixels = kind == "uint8" and (len(shape) == 3 or (len(shape) == 4 and shape[3] in (1, 3)))
+        colours = [len(shape) == 4 and shape[axis] in CHANNELS for axis in (1, 3)]
+        pixels = kind == "uint8" and (len(shape) == 3 or any(colours))
         floats = kind in ("float16", "bfloat16", "float32", "float64") and len(shape) in (2, 4)
-        colours_last = floats and len(shape) == 4 and shape[3] in (1, 3) and shape[1] not in (1, 3)
+        colours_last = floats and colours == [False, True]
         if not (pixels or floats) or colours_last:
             raise InputError(f"{name} is {shape} {kind}; expected {EXPECTED}")
         if 0 in shape:
@@ -58,8 +62,9 @@ class ArrayTraverse(IndexedTraverse):
         part = self._slice(frames)
         if part.dtype == torch.uint8:
             part = part[..., None] if part.ndim == 3 else part
-            return part.permute(0, 3, 1, 2).float() / 255
-        batch = part if part.dtype == torch.float64 else part.float()
+            return (part.permute(0, 3, 1, 2) if part.shape[3] in CHANNELS else part).float() / 255
+        # features may need their double precision, frames do not
+        batch = part if part.dtype == torch.float64 and part.ndim == 2 else part.float()
         if batch.ndim == 4 and isinstance(self.values, np.memmap):  # tensors are not checked
             low, high = batch.flatten(1).aminmax(dim=1)
             bad = ~((low >= -ROUNDING) & (high <= 1 + ROUNDING))  # also True for NaN
@@ -114,12 +119,3 @@ def read_array(path: Path) -> ArrayTraverse:
             raise InputError(f"{text} has {len(names)} names; expected {expected}")
         traverse.names, traverse.ordered = names, numbers_increase(names)
     return traverse
-
-
-def as_traverse(source: Traverse | Tensor) -> Traverse:
-    """A tensor or array of frames or features as a traverse; a traverse unchanged."""
-    if isinstance(source, Tensor | np.ndarray):
-        return ArrayTraverse(source)
-    if isinstance(source, Traverse):
-        return source
-    raise InputError(f"got a {type(source).__name__}; expected a Traverse, as from open_source, or a tensor")

@@ -6,13 +6,14 @@ import json
 import math
 import re
 import zipfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
@@ -25,6 +26,7 @@ EXPECTED = (
     "an integer offset such as 0, a .csv of query,place, a .json with a list of places for each query, an "
     ".npz with GThard or utm:25 for coordinates in image names"
 )
+FORMS = "integer places (Q,) or (Q,R), or a boolean matrix (Q,N)"
 BYTES_PER_PLACE = 32  # of a table of right places, including temporaries
 Listed = dict[int, list[float]]  # the places of each query in a file
 
@@ -42,12 +44,74 @@ class GroundTruth(NamedTuple):
     ignored: Tensor
 
 
-def as_ground_truth(truth: Tensor | GroundTruth) -> GroundTruth:
-    """Correct places (Q,R), -1 as padding, as a GroundTruth in which every query is judged."""
-    if isinstance(truth, GroundTruth):
-        return truth
-    judged = torch.ones(len(truth), dtype=torch.bool, device=truth.device)
-    return GroundTruth(truth, judged, truth.new_zeros(len(truth), 0))
+Truth: TypeAlias = str | Tensor | NDArray[Any] | Sequence[int] | Sequence[Sequence[int]] | GroundTruth
+
+
+def as_ground_truth(truth: Truth, queries: int | None = None) -> GroundTruth:
+    """The correct places in any form as a GroundTruth; all but those that a file does not list are judged.
+
+    Args:
+        truth: integers (Q,), the place of each query, -1 for none, or (Q,R), all its places, -1 as padding; a
+            boolean matrix (Q,N), True for the correct places; arrays and lists likewise, also lists of
+            different lengths; text as in `find_ground_truth`, for which their number has to be known.
+        queries: their number, to be checked.
+
+    Raises:
+        InputError: another form or number of rows; a matrix of 0 and 1 that is not boolean.
+
+    Example:
+        >>> as_ground_truth([[3, 4], [], [0]]).positives.tolist()
+        [[3, 4], [-1, -1], [0, -1]]
+    """
+    if isinstance(truth, str):
+        if queries is None:
+            raise InputError(
+                f"the truth is {truth!r} for an unknown number of queries; expected their number"
+            )
+        found = find_ground_truth(truth, None, None, None, queries)
+        assert found is not None
+        return found
+    if not isinstance(truth, GroundTruth):
+        truth = _every(_table_of(truth))
+    shapes = [tuple(part.shape) for part in truth]
+    rows = len(truth.judged) if queries is None else queries
+    fits = shapes[1] == (rows,) and all(len(one) == 2 and one[0] == rows for one in shapes[::2])
+    if not fits:
+        seen = f"the truth is {shapes[0]}, with judged {shapes[1]} and ignored {shapes[2]}"
+        raise InputError(f"{seen}; expected ({rows}, R), ({rows},) and ({rows}, S), one row per query")
+    return truth
+
+
+def _every(places: Tensor) -> GroundTruth:
+    """The places (Q,R) of queries that are all judged."""
+    judged = torch.ones(len(places), dtype=torch.bool, device=places.device)
+    return GroundTruth(places, judged, places.new_zeros(len(places), 0))
+
+
+def _table_of(truth: Any) -> Tensor:
+    """Places in any form as a table (Q,R) int64, -1 as padding."""
+    try:
+        if isinstance(truth, Sequence) and any(
+            isinstance(row, Sequence | Tensor | np.ndarray) for row in truth
+        ):
+            return padded(torch.as_tensor(row, dtype=torch.int64).view(-1) for row in truth)
+        table = torch.as_tensor(truth)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InputError(f"the truth is a {type(truth).__name__}; expected {FORMS}") from error
+    if table.dtype == torch.bool and table.ndim == 2:
+        return padded(row.nonzero()[:, 0] for row in table)
+    if (
+        table.ndim not in (1, 2)
+        or table.is_floating_point()
+        or table.is_complex()
+        or table.dtype == torch.bool
+    ):
+        raise InputError(f"the truth is {tuple(table.shape)} {table.dtype}; expected {FORMS}")
+    table = table.long()
+    if table.ndim == 2 and table.shape[1] > 2 and bool(((table == 0) | (table == 1)).all()):
+        seen = f"the truth is {tuple(table.shape)} of 0 and 1, places that repeat in every row"
+        raise InputError(f"{seen}; expected truth.bool() if it is a matrix of queries and places")
+    return table if table.ndim == 2 else table[:, None]
 
 
 def padded(rows: Iterable[Tensor]) -> Tensor:
@@ -130,8 +194,17 @@ def ground_truth_in_places(truth: GroundTruth, place_of: Callable[[Tensor], Tens
     return truth._replace(positives=place_of(truth.positives), ignored=place_of(truth.ignored))
 
 
-def check_ground_truth(truth: str, interpolate: bool = False) -> int | float | Path:
+def is_given(truth: Truth | None) -> bool:
+    """Whether a ground truth is places themselves, not words or a file that tell of them."""
+    return truth is not None and not isinstance(truth, str | int | float)
+
+
+def check_ground_truth(truth: Truth, interpolate: bool = False) -> int | float | Path | GroundTruth:
     """Parse a ground truth as an offset, a radius in metres, or an existing file, before long work starts."""
+    if is_given(truth):
+        if interpolate:
+            raise InputError("the truth is given, not listed; expected a .csv of query,place to interpolate")
+        return as_ground_truth(truth)
     truth = str(truth)  # YAML gives an offset as a number
     path = Path(truth)
     suffix = path.suffix.lower()
@@ -150,7 +223,7 @@ def check_ground_truth(truth: str, interpolate: bool = False) -> int | float | P
 
 
 def find_ground_truth(
-    truth: str | None,
+    truth: Truth | None,
     reference: Traverse | None,
     query: Traverse | None,
     frames: int | None,
@@ -173,6 +246,7 @@ def find_ground_truth(
               GTsoft, if that is the only one); places in GTsoft only are ignored;
             - `utm:25`: every reference frame within 25 metres (inclusive; `utm` alone means 25) by the UTM
               coordinates in the names of both traverses' images, `@easting@northing@...@.jpg`;
+            - the places themselves, a row for each frame of the query, see `as_ground_truth`;
             - None: the positions that both traverses carry; else frame i is place i if they are of equal
               length, not resampled and aligned (see `are_aligned`); else there is no ground truth.
         reference, query: the sources, not resampled, or None.
@@ -198,20 +272,23 @@ def find_ground_truth(
         if reference is None or query is None:
             return None
         if reference.place is not None and query.place is not None:
-            return as_ground_truth(position_truth(reference.place, _rows_of(query.place, numbers)))
+            return _every(position_truth(reference.place, _rows_of(query.place, numbers)))
         count = len(numbers) if every else query.length
         same_length = not resampled and count is not None and count == frames
         if same_length and (aligned or are_aligned(reference, query, count or 0)):
-            return as_ground_truth(offset_truth(numbers, frames))
+            return _every(offset_truth(numbers, frames))
         return None
     parsed = check_ground_truth(truth, interpolate)
-    if isinstance(parsed, int):
-        found = as_ground_truth(offset_truth(numbers, frames, parsed))
+    if isinstance(parsed, GroundTruth):
+        rows = (_rows_of(part, numbers) for part in as_ground_truth(parsed, len(numbers) if every else None))
+        found = GroundTruth(*rows)
+    elif isinstance(parsed, int):
+        found = _every(offset_truth(numbers, frames, parsed))
     elif isinstance(parsed, float):
         if reference is None or query is None:
             raise InputError(f"truth utm:{parsed:g} reads the names of images; expected reference and query")
         coordinates = _rows_of(utm_coordinates(query), numbers)
-        found = as_ground_truth(near_truth(utm_coordinates(reference), coordinates, parsed))
+        found = _every(near_truth(utm_coordinates(reference), coordinates, parsed))
     elif parsed.suffix.lower() == ".npz":
         found = _read_matrices(parsed, numbers, frames, every)
     else:
@@ -251,25 +328,29 @@ def are_aligned(reference: Traverse, query: Traverse, frames: int) -> bool:
     return unique and all(query.frame_name(i) == name for i, name in enumerate(names))
 
 
-def describe_ground_truth(truth: str | None, interpolate: bool = False, positions: bool = False) -> str:
+def describe_ground_truth(truth: Truth | None, interpolate: bool = False, positions: bool = False) -> str:
     """What `find_ground_truth` uses, in words; `positions`: whether both traverses have them."""
     if truth is None:
         carried = "the positions that both traverses carry"
         return carried if positions else "place = query, as both sources are aligned"
     parsed = check_ground_truth(truth)
+    if isinstance(parsed, GroundTruth):
+        return "the places that the caller gave"
     if isinstance(parsed, int):
         return "place = query" + (f" {'-' if parsed < 0 else '+'} {abs(parsed)}" if parsed else "")
     if isinstance(parsed, float):
         return f"within {parsed:g} m by the coordinates in image names"
-    return f"{truth}, interpolated" if interpolate else truth
+    return f"{truth}, interpolated" if interpolate else str(truth)
 
 
-def offset_of(truth: str | None, positions: bool = False) -> int | None:
+def offset_of(truth: Truth | None, positions: bool = False) -> int | None:
     """The offset of a ground truth place = query + offset; None for others. See `describe_ground_truth`."""
     if truth is None:
         return None if positions else 0
+    if is_given(truth):
+        return None
     with suppress(ValueError):
-        return offset if abs(offset := int(truth)) < LARGEST else None
+        return offset if abs(offset := int(str(truth))) < LARGEST else None
     return None
 
 
@@ -306,7 +387,7 @@ def _from_table(
         raise InputError(f"{path} lists queries from {first} to {last}; expected some of {wanted}")
     rows = [[_rounded(place) for place in places.get(query, ())] for query in queries]
     found = padded(torch.tensor(row, dtype=torch.int64) for row in rows)
-    return as_ground_truth(found)._replace(judged=judged)
+    return _every(found)._replace(judged=judged)
 
 
 def _to_queries(listed: Listed, frames: Tensor) -> Listed:
@@ -411,7 +492,7 @@ def _read_matrices(path: Path, numbers: Tensor, frames: int | None, every: bool)
     if not all(np.isfinite(matrix).all() for matrix in matrices):
         raise InputError(f"{path} contains values that are not finite; expected {expected}")
     hard, *soft = (torch.from_numpy(matrix[:, numbers.numpy()] != 0).T for matrix in matrices)
-    found = as_ground_truth(padded(row.nonzero()[:, 0] for row in hard))
+    found = _every(padded(row.nonzero()[:, 0] for row in hard))
     return found._replace(ignored=padded(row.nonzero()[:, 0] for row in soft[0] & ~hard)) if soft else found
 
 

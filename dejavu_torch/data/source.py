@@ -8,10 +8,14 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 from urllib.parse import parse_qsl
 
-from dejavu_torch.data.arrays import read_array
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from dejavu_torch.data.arrays import ArrayTraverse, read_array
 from dejavu_torch.data.folder import IMAGE_SUFFIXES, ImageFolder, natural
 from dejavu_torch.data.frame_range import FrameRange
 from dejavu_torch.data.h5 import H5_SUFFIXES, DescriptorFile
@@ -20,6 +24,7 @@ from dejavu_torch.data.strip import read_strip
 from dejavu_torch.data.video import VIDEO_SUFFIXES, Video
 from dejavu_torch.types import InputError, Traverse
 
+Source: TypeAlias = Traverse | Tensor | NDArray[Any] | str | Path  # of frames or features
 READERS: dict[str, Callable[..., Traverse]] = {".npy": read_array}  # by suffix
 READERS |= dict.fromkeys(VIDEO_SUFFIXES, Video) | dict.fromkeys(H5_SUFFIXES, DescriptorFile)
 KINDS = {int: "integer", float: "floating-point number"}  # types of option values
@@ -29,6 +34,19 @@ EXPECTED = (
     "file of hloc, sim:aerial?seed=0&traverse=0&frames=3072, sim:outdoor, sim:underground, or "
     "strip:IMAGE?width=96"
 )
+
+
+def as_traverse(source: Source) -> Traverse:
+    """A tensor or array of frames or features, or what `open_source` opens, as a traverse; a traverse
+    unchanged."""
+    if isinstance(source, Tensor | np.ndarray):
+        return ArrayTraverse(source)
+    if isinstance(source, str | Path):
+        return open_source(source)
+    if isinstance(source, Traverse):
+        return source
+    seen = f"got a {type(source).__name__}"
+    raise InputError(f"{seen}; expected a Traverse, a tensor or array, or a path as of open_source")
 
 
 def open_source(source: str | Path, size: tuple[int, int] | None = None) -> Traverse:

@@ -13,15 +13,17 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.arrays import UNNAMED, as_traverse
+from dejavu_torch.data.arrays import UNNAMED
 from dejavu_torch.data.fitted import fitted
 from dejavu_torch.data.ground_truth import (
+    Truth,
     as_ground_truth,
     check_ground_truth,
     describe_ground_truth,
     ground_truth_in_places,
     offset_of,
 )
+from dejavu_torch.data.source import Source, as_traverse
 from dejavu_torch.evaluation.answers import own_facts
 from dejavu_torch.evaluation.baselines import Baseline, baselines_of
 from dejavu_torch.evaluation.contenders import Contender, contend, models_beside
@@ -76,9 +78,9 @@ class Comparison(NamedTuple):
 
 
 def compare(
-    reference: Traverse | Tensor,
-    query: Traverse | Tensor,
-    truth: str | None = None,
+    reference: Source,
+    query: Source,
+    truth: Truth | None = None,
     model: DejaVu | None = None,
     *,
     tolerance: int = 5,

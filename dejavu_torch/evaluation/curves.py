@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth, counted, is_right
+from dejavu_torch.data.ground_truth import GroundTruth, Truth, as_ground_truth, counted, is_right
 from dejavu_torch.types import InputError, Match
 
 RECALL_DEFINITION = (
@@ -29,6 +29,10 @@ class Scores(NamedTuple):
 
     recall = TP / all queries with a right answer; in the *_reported fields TP / (TP + FN), in which only
     a query that reports nothing is a false negative.
+
+    The areas begin at the curve's first point: n right answers of different scores have 1 - 1/n, and of equal
+    scores 0. `average_precision` does not depend on n: it is that of scikit-learn for whether the answers are
+    right, 1 if all right answers have better scores than all wrong ones; it does not say how many are right.
     """
 
     auc: float
@@ -37,6 +41,7 @@ class Scores(NamedTuple):
     recall_at_100_precision_reported: float
     precision_at_100_recall: float
     recall_at_1: float
+    average_precision: float
 
 
 def pr_curve(
@@ -88,6 +93,12 @@ def area(curve: PRCurve) -> float:
     return float(torch.trapezoid(curve.precision, curve.recall)) if len(curve.recall) else 0.0
 
 
+def average_precision(curve: PRCurve) -> float:
+    """The mean, over right answers, of the precision at which they are reported."""
+    gains = curve.recall.diff(prepend=curve.recall.new_zeros(1))
+    return float((curve.precision * gains).sum() / gains.sum()) if bool(gains.any()) else 0.0
+
+
 def recall_at_full_precision(curve: PRCurve) -> float:
     """The largest recall at which every report is right."""
     perfect = curve.recall[curve.precision == 1]
@@ -113,7 +124,7 @@ def threshold_of_full_precision(curve: PRCurve) -> float | None:
 
 
 def curve_of(
-    match: Match, truth: Tensor | GroundTruth, tolerance: int, recall: Literal["all", "reported"] = "all"
+    match: Match, truth: Truth, tolerance: int, recall: Literal["all", "reported"] = "all"
 ) -> PRCurve:
     """`pr_curve` of matches against a truth; see `evaluate`."""
     match, truth = _judged(match, truth, tolerance)
@@ -121,13 +132,13 @@ def curve_of(
     return pr_curve(match.score, right, (truth.positives >= 0).any(1), recall)
 
 
-def evaluate(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> Scores:
+def evaluate(match: Match, truth: Truth, tolerance: int) -> Scores:
     """All scores of matches against a truth.
 
     Args:
-        truth: (Q,R) int64, every right place of each query, -1 as padding; or a GroundTruth. Queries that are
-            not judged, or that report an ignored place, are excluded from precision, recall and the number of
-            queries.
+        match: (Q,), or candidates (Q,k), of which the first is the answer.
+        truth: in any form of `as_ground_truth`. Queries that are not judged, or that report an ignored place,
+            are excluded from precision, recall and the number of queries.
         tolerance: places, inclusive.
 
     Raises:
@@ -135,7 +146,7 @@ def evaluate(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> Score
 
     Example:
         >>> match = Match(torch.tensor([0, 7]), torch.tensor([0.1, 0.2]), torch.tensor([True, True]))
-        >>> evaluate(match, torch.tensor([[0], [1]]), tolerance=0).recall_at_1
+        >>> evaluate(match, [0, 1], tolerance=0).recall_at_1
         0.5
         >>> both = torch.tensor([True, True])
         >>> truth = GroundTruth(torch.tensor([[0], [1]]), both, torch.tensor([[-1], [7]]))
@@ -154,10 +165,50 @@ def evaluate(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> Score
         recall_at_full_precision(reported),
         int(right.sum()) / max(1, int((match.index >= 0).sum())),
         int(right.sum()) / max(1, int(answerable.sum())),
+        average_precision(every),
     )
 
 
-def recall_at(candidates: Tensor, truth: Tensor | GroundTruth, tolerance: int, first: int) -> float | None:
+class Judgement(NamedTuple):
+    """What `judge` finds.
+
+    scores: of the first candidates.
+    recalls: by K, the share of the queries with a right answer that have it among their first K candidates.
+    right: (Q,) bool, whether the first candidate is right; False for a query that is not judged.
+    judged: (Q,) bool, whether the truth judges the query.
+    """
+
+    scores: Scores
+    recalls: dict[int, float]
+    right: Tensor
+    judged: Tensor
+
+
+def judge(match: Match, truth: Truth, tolerance: int, recalls: Sequence[int] = (1, 5, 10)) -> Judgement:
+    """Which queries are right, the recall among their first candidates, and all scores of `evaluate`.
+
+    Args:
+        match, truth, tolerance: see `evaluate`.
+        recalls: numbers K of candidates; those above the k of the match are left out.
+
+    Example:
+        >>> wave = torch.arange(64)[:, None] % torch.tensor([8.0, 9.0])
+        >>> from dejavu_torch import DejaVu
+        >>> candidates = DejaVu().learn(wave).candidates(wave[20:22], k=5)
+        >>> found = judge(candidates, [20, 21], tolerance=0)
+        >>> found.recalls, found.right.tolist()
+        ({1: 1.0, 5: 1.0}, [True, True])
+    """
+    scores = evaluate(match, truth, tolerance)
+    known = _on_cpu(truth, len(match.index))
+    index = match.index.cpu() if match.index.ndim == 2 else match.index.cpu()[:, None]
+    judged = counted(index[:, 0], known, tolerance)
+    found = {first: recall_at(index, known, tolerance, first) for first in recalls}
+    right = judged & is_right(index[:, 0], known.positives, tolerance)
+    return Judgement(scores, {k: share for k, share in found.items() if share is not None}, right, judged)
+
+
+def recall_at(candidates: Tensor, truth: Truth, tolerance: int, first: int) -> float | None:
     """Share of the queries with a right answer that have it among their `first` candidates (Q,K).
 
     Example:
@@ -175,7 +226,7 @@ def recall_at(candidates: Tensor, truth: Tensor | GroundTruth, tolerance: int, f
 
 
 def recall_over_all(
-    candidates: Tensor, truth: Tensor | GroundTruth, tolerance: int, firsts: Sequence[int]
+    candidates: Tensor, truth: Truth, tolerance: int, firsts: Sequence[int]
 ) -> dict[str, float]:
     """Share of all judged queries that have a right answer among their first N candidates (Q,K), for each N.
 
@@ -199,7 +250,7 @@ def recall_over_all(
     return {str(first): int(found[:, first - 1].sum()) / max(1, len(found)) for first in firsts}
 
 
-def count_queries(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> dict[str, int]:
+def count_queries(match: Match, truth: Truth, tolerance: int) -> dict[str, int]:
     """The numbers of queries, by their keys in report.json.
 
     queries = judged + unknown (to the truth) + ignored (an ignored place is reported). Of the judged ones,
@@ -210,7 +261,8 @@ def count_queries(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> 
     """
     kept, right = _judged(match, truth, tolerance)
     good = is_right(kept.index, right.positives, tolerance)
-    queries, judged, unknown = len(match.index), len(kept.index), int((~as_ground_truth(truth).judged).sum())
+    queries, judged = len(match.index), len(kept.index)
+    unknown = int((~as_ground_truth(truth, queries).judged).sum())
     counts = {"queries": queries, "judged": judged, "unknown": unknown, "ignored": queries - judged - unknown}
     return counts | {
         "with_answer": int((right.positives >= 0).any(1).sum()),
@@ -219,28 +271,26 @@ def count_queries(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> 
     }
 
 
-def check_truth(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> None:
-    """Refuse a truth that does not fit the matches."""
-    if not isinstance(match, Match) or not isinstance(truth, Tensor | GroundTruth):
+def check_truth(match: Match, truth: Truth, tolerance: int) -> GroundTruth:
+    """The truth as a GroundTruth; an InputError if it does not fit the matches."""
+    if not isinstance(match, Match):
         seen = f"evaluate got a {type(match).__name__} and a {type(truth).__name__}"
-        raise InputError(f"{seen}; expected a Match of `localize`, and a tensor (Q,R) or a GroundTruth")
-    right, *others = (truth,) if isinstance(truth, Tensor) else (truth.positives, truth.judged, truth.ignored)
-    queries = len(match.index)
-    if right.ndim != 2 or len(right) != queries:
-        raise InputError(f"the truth is {tuple(right.shape)}; expected ({queries}, R), one row per query")
-    if others and (others[0].shape != (queries,) or others[1].ndim != 2 or len(others[1]) != queries):
-        shapes = " and ".join(str(tuple(other.shape)) for other in others)
-        raise InputError(f"judged and ignored are {shapes}; expected ({queries},) and ({queries}, S)")
+        raise InputError(f"{seen}; expected a Match of `localize`, and places")
     if tolerance < 0:
         raise InputError(f"the tolerance is {tolerance}; expected at least 0")
+    return as_ground_truth(truth, len(match.index))
 
 
-def _judged(match: Match, truth: Tensor | GroundTruth, tolerance: int) -> tuple[Match, GroundTruth]:
-    """Matches and truth of the queries that are scored, on the CPU."""
-    check_truth(match, truth, tolerance)
-    match, truth = match.map(Tensor.cpu), GroundTruth(*(part.cpu() for part in as_ground_truth(truth)))
-    kept = counted(match.index, truth, tolerance)
+def _on_cpu(truth: Truth, queries: int) -> GroundTruth:
+    return GroundTruth(*(part.cpu() for part in as_ground_truth(truth, queries)))
+
+
+def _judged(match: Match, truth: Truth, tolerance: int) -> tuple[Match, GroundTruth]:
+    """First candidates and truth of the queries that are scored, on the CPU."""
+    known = _on_cpu(check_truth(match, truth, tolerance), len(match.index))
+    match = match.map(lambda column: column.cpu() if column.ndim == 1 else column.cpu()[:, 0])
+    kept = counted(match.index, known, tolerance)
     if not kept.any():
-        seen = f"of {len(kept)} queries {int(truth.judged.sum())} are in the truth and none can be judged"
+        seen = f"of {len(kept)} queries {int(known.judged.sum())} are in the truth and none can be judged"
         raise InputError(f"{seen}; expected one in the truth that does not report an ignored place")
-    return match.map(lambda column: column[kept]), GroundTruth(*(column[kept] for column in truth))
+    return match.map(lambda column: column[kept]), GroundTruth(*(column[kept] for column in known))

@@ -6,6 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from dejavu_torch.memory import without_autocast
 from dejavu_torch.types import InputError
 
 # the largest strength of each change; two numbers if the argument is a pair
@@ -99,8 +100,9 @@ class Augmentation(nn.Module):
         return other
 
     @torch.no_grad()
+    @without_autocast
     def forward(self, frames: Tensor) -> Tensor:
-        if not self.training:
+        if not self.training or not len(frames):
             return frames
         (blur,), (noise,) = self.strengths["blur"], self.strengths["noise"]
         radius = max(1, round(blur)) if blur else 0

@@ -100,7 +100,7 @@ class SmallCNN(nn.Module):
         if self.cell:
             frames = local_contrast(frames, self.cell)
         features: Tensor = self.linear(self.convolutions(frames).flatten(1))
-        standardised: Tensor = self.standardise(features.float())
+        standardised: Tensor = self.standardise(features.to(self.standardise.running_mean))
         return standardised
 
     extra_repr = settings_of

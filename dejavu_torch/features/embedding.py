@@ -210,8 +210,11 @@ class Embedding(nn.Module):
 
     def code(self, descriptors: Tensor) -> Tensor:
         """Features of descriptors: (B,K) -> (B,D)."""
-        features: Tensor = self.standardise(self.linear(descriptors).float())
-        return features
+        features: Tensor = self.linear(descriptors)
+        own = next(self.standardise.buffers(), None)
+        dtype = torch.promote_types(features.dtype, torch.float32) if own is None else own.dtype
+        standardised: Tensor = self.standardise(features.to(dtype))
+        return standardised
 
     def forward(self, frames: Tensor) -> Tensor:
         return self.code(self.describe(frames))

@@ -66,6 +66,23 @@ def feature_batches(
         raise InputError(f"{traverse.name} holds no frames; expected at least one")
 
 
+def as_weights(frames: Tensor, module: nn.Module) -> Tensor:
+    """Frames in the type of a module's weights, which torch expects; `Joined` features do this for each."""
+    if hasattr(module, "members"):
+        return frames
+    dtypes = (weight.dtype for weight in module.parameters())
+    return frames.to(next((dtype for dtype in dtypes if dtype.is_floating_point), frames.dtype))
+
+
+class Pipeline(nn.Sequential):
+    """Preprocess, then features: (B,C,H,W) -> (B,D)."""
+
+    def forward(self, frames: Tensor) -> Tensor:
+        preprocess, module = self
+        features: Tensor = module(as_weights(preprocess(frames), module))
+        return features
+
+
 def features_of(batch: Tensor, describe: Callable[[Tensor], Tensor], name: str = "the input") -> Tensor:
     """Features of one batch: frames (B,C,H,W) are described, features (B,D) pass unchanged."""
     if isinstance(batch, Tensor) and batch.ndim == 2 and batch.is_floating_point():

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from dejavu_torch.features.extract import features_of
+from dejavu_torch.features.extract import as_weights, features_of
 from dejavu_torch.features.preprocess import check_frames
 from dejavu_torch.types import InputError
 
@@ -48,7 +48,7 @@ class Joined(nn.Module):
 
     def forward(self, frames: Tensor) -> Tensor:
         check_frames(frames, "Joined got")
-        made = [features_of(frames, member) for member in self.members]
+        made = [features_of(as_weights(frames, member), member) for member in self.members]
         if not torch.compiler.is_compiling():  # a graph has no side effects
             self.groups = tuple(one.shape[1] for one in made)
         return torch.cat(made, 1)

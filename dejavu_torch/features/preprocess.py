@@ -71,7 +71,7 @@ def box_mean(frames: Tensor, side: int) -> Tensor:
         return running[..., side:] - running[..., :-side]
 
     for _ in range(2):  # rows, then columns
-        frames = (sums(frames) / sums(torch.ones_like(frames[0, 0, 0]))).mT
+        frames = (sums(frames) / sums(frames.new_ones(frames.shape[-1]))).mT
     return frames
 
 
@@ -110,6 +110,8 @@ def equalise(frames: Tensor, clip_limit: float = 2.0, grid: tuple[int, int] = (8
     if height <= rows or width <= columns:
         seen = f"clahe got frames of {height} x {width} pixels for a grid of {rows} x {columns} tiles"
         raise InputError(f"{seen}; expected at least {rows + 1} x {columns + 1} pixels")
+    if not len(frames):
+        return frames
     detached = frames.detach()
     low, high = (one.item() for one in detached.aminmax())
     if not (low >= 0 and high <= 1):

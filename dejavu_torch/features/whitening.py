@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from dejavu_torch.features.augmentation import Augmentation
+from dejavu_torch.memory import without_autocast
 from dejavu_torch.text import settings_of
 from dejavu_torch.types import InputError
 
@@ -277,26 +278,27 @@ class Whitening(nn.Module):
             if groups is not None:
                 kept = math.ceil(share * (self.group_numbers or kept))
             found.append(member._components(own, kept, kept if views is None else self.components))
-        if views is None:
-            for member, (mean, basis, variances, _) in zip(members, found, strict=True):
-                member.take(mean, basis, variances.mean().sqrt(), bits)
-        else:
-            pairs = _projected_views(places, views, found)
-            for member, (mean, basis, _, kept), (shown, own) in zip(members, found, pairs, strict=True):
-                centre, projection = learned_whitening(shown, own, kept, self.shrinkage, samples)
-                member.take(mean + basis @ centre, basis @ projection, None, bits)
-        if groups is not None:
-            some = places[:: max(1, len(places) // SAMPLED)].to(self.scale.device).split(sizes, 1)
-            weights = [math.sqrt(share) for share in shares]
-            each = zip(weights, members, some, strict=True)
-            joined = torch.cat([weight * member(own) for weight, member, own in each], 1)
-            kept = self.kept(len(places), joined.shape[1], views is not None)
-            # about zero, not the mean, to keep the inner products of all pairs, as cosines need
-            mean, basis, squares, _ = self._components(joined, kept, kept, centre=False)
-            if views is not None:
-                basis = basis / (squares / squares.mean()) ** (LEVELLING / 2)
-            parts = zip(weights, basis.split([member.dimension for member in members]), strict=True)
-            self.take(mean, torch.cat([weight * part for weight, part in parts]), None, bits)
+        pairs = None if views is None else _projected_views(places, views, found)
+        with torch.autocast(self.scale.device.type, enabled=False):
+            if pairs is None:
+                for member, (mean, basis, variances, _) in zip(members, found, strict=True):
+                    member.take(mean, basis, variances.mean().sqrt(), bits)
+            else:
+                for member, (mean, basis, _, kept), (shown, own) in zip(members, found, pairs, strict=True):
+                    centre, projection = learned_whitening(shown, own, kept, self.shrinkage, samples)
+                    member.take(mean + basis @ centre, basis @ projection, None, bits)
+            if groups is not None:
+                some = places[:: max(1, len(places) // SAMPLED)].to(self.scale.device).split(sizes, 1)
+                weights = [math.sqrt(share) for share in shares]
+                each = zip(weights, members, some, strict=True)
+                joined = torch.cat([weight * member(own) for weight, member, own in each], 1)
+                kept = self.kept(len(places), joined.shape[1], views is not None)
+                # about zero, not the mean, to keep the inner products of all pairs, as cosines need
+                mean, basis, squares, _ = self._components(joined, kept, kept, centre=False)
+                if views is not None:
+                    basis = basis / (squares / squares.mean()) ** (LEVELLING / 2)
+                parts = zip(weights, basis.split([member.dimension for member in members]), strict=True)
+                self.take(mean, torch.cat([weight * part for weight, part in parts]), None, bits)
         self.members = nn.ModuleList([] if groups is None else members)
 
     def _member(self) -> Whitening:
@@ -365,12 +367,18 @@ def _projected_views(
             raise InputError(f"views have {view.shape[1]} features; expected {places.shape[1]}, the route's")
         both = (rows.split(sizes, 1) for rows in (view, places[place.to(places.device)]))
         for held, (mean, basis, *_), *parts in zip(pairs, found, *both, strict=True):
-            held.append(torch.stack([(part.to(mean) - mean) @ basis for part in parts]))
+            held.append(torch.stack([_projected(part, mean, basis) for part in parts]))
     if not pairs[0]:
         raise InputError("there are no views for whitening; expected at least one batch, or None")
     return [torch.cat(held, 1) for held in pairs]
 
 
+@without_autocast
+def _projected(rows: Tensor, mean: Tensor, basis: Tensor) -> Tensor:
+    return (rows.to(mean) - mean) @ basis
+
+
+@without_autocast
 def principal_components(
     rows: Tensor, count: int, seed: int = 0, centre: bool = True
 ) -> tuple[Tensor, Tensor, Tensor]:

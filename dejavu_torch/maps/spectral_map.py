@@ -21,6 +21,7 @@ from dejavu_torch.maps.frame_table import Route
 from dejavu_torch.maps.place_map import PlaceMap, ScoreBlocks, require
 from dejavu_torch.maps.spectrum import Transform, from_slots, half_cycles, slots
 from dejavu_torch.maps.summary import ChunkSummary, MapSummary
+from dejavu_torch.memory import is_readable
 from dejavu_torch.types import InputError
 
 SpectralMetric = Literal["cosine", "l2"]
@@ -373,6 +374,12 @@ class SpectralMap(PlaceMap):
         """See `PlaceMap`: blocks of consecutive chunks that fit into the processor's cache."""
         stop = self.places if stop is None else stop
         self.check_queries(queries)
+        if not queries.shape[0]:  # of which MKL has no transform
+            yield (
+                start,
+                queries.new_zeros(0, stop - start, dtype=torch.promote_types(queries.dtype, torch.float32)),
+            )
+            return
         queries = queries.to(torch.promote_types(queries.dtype, torch.float32))
         length: Tensor = torch.linalg.vector_norm(queries, dim=1, keepdim=True)
         if self.metric == "cosine":
@@ -449,7 +456,8 @@ class SpectralMap(PlaceMap):
     def packed(self) -> dict[str, Tensor]:
         """See `PlaceMap`; means that are all 0 are omitted."""
         packed = super().packed()
-        return packed if bool(self.means.any()) else packed | {"means": self.means[:0]}
+        packed = {name: one.to(FILE[name][0]) if name in FILE else one for name, one in packed.items()}
+        return packed if bool(self.means.any()) else packed | {"means": packed["means"][:0]}
 
     def summary(self) -> MapSummary:
         chunks = [ChunkSummary(start, stop, self._periods(g)) for g, (start, stop) in enumerate(self.chunks)]
@@ -485,10 +493,9 @@ def sparse_products(queries: Tensor, counts: Tensor, feature: Tensor, level: Ten
         counts: (S,) nonzero numbers of each row. feature, level: (L,) column and value of each of these.
 
     Convention: a CSR product on a CPU with MKL, whose matrix is made here since it neither compiles nor
-        exports; elsewhere, and for traced tensors, `scatter_add`. No autocast.
+        exports; elsewhere, and for traced tensors and those of torch.func, `scatter_add`. No autocast.
     """
-    plain = type(queries) is Tensor and queries.device.type == "cpu"
-    if plain and not torch.compiler.is_compiling() and _has_csr():
+    if is_readable(queries) and _has_csr():
         crow = torch.nn.functional.pad(counts.cumsum(0, dtype=torch.int32), (1, 0))
         shape = (len(counts), queries.shape[1])
         rows = torch.sparse_csr_tensor(crow, feature.int(), level.to(queries), shape, check_invariants=False)

@@ -43,19 +43,20 @@ def weight_per_feature(metric: Metric, features: int) -> float:
 
 
 def log_posterior(scores: Tensor, temperature: float | Tensor) -> Tensor:
-    """Negative log posterior of each place in nats, -log softmax(-S / T): (Q,N) -> (Q,N), lower is better.
+    """Negative log posterior of each place in nats, -log softmax(-S / T): (..., N) -> (..., N).
 
-    Scores of different queries become comparable: a shift of S at all places cancels. +inf stays +inf.
+    Lower is better. Scores of different queries become comparable: a shift of S at all places cancels.
+    +inf stays +inf.
 
     Example:
         >>> log_posterior(torch.tensor([[0.0, 0.0, torch.inf]]), 0.1).tolist()
         [[0.6931471824645996, 0.6931471824645996, inf]]
     """
     uncovered = scores.isinf()
-    reachable = ~uncovered.all(1, keepdim=True)
+    reachable = ~uncovered.all(-1, keepdim=True)
     # +inf / T would have a gradient of NaN
     logits = (-scores.masked_fill(uncovered, 0) / temperature).masked_fill(uncovered & reachable, -math.inf)
-    return -logits.log_softmax(1).masked_fill(uncovered, -math.inf)
+    return -logits.log_softmax(-1).masked_fill(uncovered, -math.inf)
 
 
 class TemplateMap(PlaceMap):

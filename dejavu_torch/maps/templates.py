@@ -8,6 +8,7 @@ from fractions import Fraction
 import torch
 from torch import Tensor, nn
 
+from dejavu_torch.memory import without_autocast
 from dejavu_torch.types import FrequencyLayer, InputError
 
 MASK_NUMBERS = 2**22  # values of a mask that are held at a time
@@ -60,8 +61,9 @@ class PhaseTemplates(nn.Module):
 
     Shape: features (N,D), plan of L layers -> tuple of L tensors (P,F).
 
-    Convention: the mean is over the layer's own chunk. A phase without frames gets 0, which is never read.
-        Gradients reach the features. A layer beyond the N frames or the D features is an InputError.
+    Convention: the mean is over the layer's own chunk, in the features' own type under any autocast. A phase
+        without frames gets 0, which is never read. Gradients reach the features. A layer beyond the N frames
+        or the D features is an InputError.
 
     Example:
         >>> plan = (FrequencyLayer(Fraction(2), 2, 0, 4, (0,)),)
@@ -84,6 +86,7 @@ def check_plan(plan: Sequence[FrequencyLayer], places: int, dimension: int) -> N
             raise InputError(f"{seen}; expected it inside {places} places of {dimension} features")
 
 
+@without_autocast
 def _means(features: Tensor, layer: FrequencyLayer) -> Tensor:
     """Eq. 1 for one layer, some frames of its chunk at a time: (N,D) -> (P,F)."""
     chosen = torch.tensor(layer.features, device=features.device)

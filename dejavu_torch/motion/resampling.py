@@ -9,7 +9,7 @@ from hashlib import blake2b
 from torch import Tensor
 
 from dejavu_torch.data.frame_range import Selection, pick_frames
-from dejavu_torch.data.ground_truth import GroundTruth, find_ground_truth
+from dejavu_torch.data.ground_truth import GroundTruth, Truth, find_ground_truth
 from dejavu_torch.data.positions import NEAR, shown_frames
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.types import InputError, Traverse
@@ -103,7 +103,7 @@ def source_of(traverse: Traverse) -> Traverse:
 
 
 def ground_truth_of(
-    truth: str | None,
+    truth: Truth | None,
     reference: Traverse,
     query: Traverse,
     places: int | None = None,

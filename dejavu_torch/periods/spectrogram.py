@@ -38,9 +38,8 @@ class Spectrum(NamedTuple):
 
 
 def chunk_power(chunk: Tensor) -> Tensor:
-    """Power of the Hann spectrum of one chunk: (n,D) -> (n // 2 + 1, D)."""
-    if not chunk.isfinite().all():
-        raise InputError("spectrogram got features that are not finite; expected finite numbers")
+    """Power of the Hann spectrum of one chunk, at least float32: (n,D) -> (n // 2 + 1, D)."""
+    chunk = chunk.to(torch.promote_types(chunk.dtype, torch.float32))
     centred = chunk - chunk.mean(0)
     # rounding leaves a constant feature some power, in which noise would choose a period: set it to zero
     constant = centred.abs().amax(0) <= 8 * torch.finfo(chunk.dtype).eps * chunk.abs().amax(0)
@@ -206,6 +205,8 @@ class SpectrogramAnalysis(PeriodFinder):
 
     def _strongest(self, chunk: Tensor) -> tuple[Tensor, Tensor]:
         """The strongest bins of each feature (count,D), and the largest share of its power in one (D,)."""
+        if not chunk.isfinite().all():
+            raise InputError("spectrogram got features that are not finite; expected finite numbers")
         power, last = chunk_power(chunk), len(chunk) // self.min_period
         bins = strongest_bins(power, min(self.strongest, len(power)), last, self.peaks)
         share = power.gather(0, bins.clamp(min=0)) / power[1:].sum(0)

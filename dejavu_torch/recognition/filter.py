@@ -11,6 +11,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from dejavu_torch.maps.place_map import PlaceMap
+from dejavu_torch.memory import is_readable
+from dejavu_torch.recognition.sequence import each
 from dejavu_torch.types import InputError, SequenceModel
 
 MIN_PROBABILITY = 1e-30  # a probability of 0, with a finite gradient
@@ -57,7 +59,8 @@ class PlaceFilter(SequenceModel):
             with nearly all of the probability is scored, if there is one. Probabilities then differ by up to
             about 0.02, and a jump is noticed at the next search.
 
-    Shape: scores (Q,N), the posterior (N+1,) before them or None -> (Q,N), -log of a probability in nats.
+    Shape: scores (..., Q, N), the posterior (..., N+1) before them or None -> (..., Q, N), -log of a
+        probability in nats.
 
     Convention: causal. exp(-score) is at most the probability that the right place is within `within` places.
         The state is the posterior, the off-map probability last, and all 0 before the first query. A place
@@ -115,6 +118,8 @@ class PlaceFilter(SequenceModel):
         return self.off_map.new_zeros(places + 1)
 
     def forward(self, scores: Tensor, before: Tensor | None = None) -> Tensor:
+        if scores.ndim > 2:
+            return each(self, scores, before)
         return self.near_scores(self.posterior(scores, before)[:, :-1], scores)
 
     def posterior(self, scores: Tensor, before: Tensor | None = None) -> Tensor:
@@ -124,7 +129,9 @@ class PlaceFilter(SequenceModel):
         """
         if before is None:
             before = self.start(scores.shape[-1])
-        elif not (bool((before >= 0).all()) and abs(float(before.detach().sum()) - 1) <= 1e-3):
+        elif is_readable(before) and not (
+            bool((before >= 0).all()) and abs(float(before.detach().sum()) - 1) <= 1e-3
+        ):
             seen = f"a posterior {tuple(before.shape)} that adds up to {float(before.detach().sum()):.4g}"
             raise InputError(f"{seen}; expected ({scores.shape[-1] + 1},) probabilities that add up to 1")
         return self._posteriors(scores, before)[1:]

@@ -49,7 +49,8 @@ def search(route: PlaceMap, queries: Tensor, n: int, scan: bool = False) -> Best
             if len(better):
                 scores = scores[better] if len(better) < len(scores) else scores
                 block, better = topk(scores, min(n, scores.shape[1]), start), better + first
-                score[better], place[better] = merge_topk((score[better], place[better]), block)
+                found, place[better] = merge_topk((score[better], place[better]), block)
+                score[better] = found.to(score)  # templates may be double
         first += len(part)
     return score, place
 

@@ -36,7 +36,7 @@ class Acceptance(NamedTuple):
 def best_match(scores: Tensor, threshold: float | None = None) -> Match:
     """b = argmin_i S(i) (eq. 5), accepted if S(b) < threshold (eq. 6); None accepts every finite score.
 
-    Shape: (Q,N) -> Match of (Q,).
+    Shape: (..., Q, N) -> Match of (..., Q).
 
     Convention: S is a difference, so a match is *below* the threshold, as the text of section III-C says, not
         the printed eq. 6. The lowest place wins among equal scores. A query whose best score is +inf
@@ -49,7 +49,9 @@ def best_match(scores: Tensor, threshold: float | None = None) -> Match:
         >>> best_match(torch.tensor([[3.0, 1.0, 1.0], [2.0, 4.0, 9.0]]), threshold=2.0)
         Match(index=tensor([1, 0]), score=tensor([1., 2.]), accepted=tensor([ True, False]))
     """
-    match = best_candidates(scores, 1, 0).map(lambda column: column[:, 0])
+    lead = scores.shape[:-1] if isinstance(scores, Tensor) and scores.ndim > 2 else ()
+    found = best_candidates(scores.flatten(0, -2) if lead else scores, 1, 0)
+    match = found.map(lambda column: column[:, 0].view(lead or -1))
     return match._replace(accepted=accept(match.score, threshold))
 
 

@@ -11,6 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from dejavu_torch.memory import is_readable
 from dejavu_torch.types import InputError, SequenceModel
 
 MAX_LENGTH = 2**16  # queries of a sequence
@@ -28,7 +29,7 @@ class SequenceMatcher(SequenceModel):
         length: T, queries of a sequence.
         speeds: each v in places per query: 1 for equally fast traverses, negative for the opposite direction.
 
-    Shape: scores (Q,N), state (R,N) or None -> (Q,N), lower is better.
+    Shape: scores (..., Q, N), state (..., R, N) or None -> (..., Q, N), lower is better.
 
     Convention: causal. The state holds the scores of the last R < T queries; rows of NaN are placeholders. A
         trajectory ends at the ends of its route, and the mean ignores places that nothing covers. The score
@@ -66,6 +67,8 @@ class SequenceMatcher(SequenceModel):
         return torch.full((self.length - 1 if fixed else 0, places), math.nan, dtype=torch.float32)
 
     def forward(self, scores: Tensor, state: Tensor | None = None) -> Tensor:
+        if scores.ndim > 2:
+            return each(self, scores, state)
         return self.step(scores, self.start(scores.shape[-1]).to(scores) if state is None else state)[0]
 
     def step(self, scores: Tensor, state: Tensor, firsts: Sequence[int] = (0,)) -> tuple[Tensor, Tensor]:
@@ -87,7 +90,7 @@ class SequenceMatcher(SequenceModel):
     def _best(self, rows: Tensor, used: Tensor) -> Tensor:
         """Scores on one route, (R,N) -> (Q,N); `used`: (Q,) rows that each query uses."""
         valid = rows.isfinite()
-        gaps = torch.compiler.is_exporting() or not bool(valid.all())
+        gaps = not is_readable(rows) or not bool(valid.all())
         known, counted = (torch.where(valid, rows, 0), valid.to(rows)) if gaps else (rows, None)
         means = (self._means(known, counted, used, speed) for speed in self.speeds)
         best = functools.reduce(torch.minimum, means)
@@ -126,6 +129,14 @@ class SequenceMatcher(SequenceModel):
 
     def extra_repr(self) -> str:
         return f"length={self.length}, speeds={list(self.speeds)}"
+
+
+def each(model: SequenceModel, scores: Tensor, state: Tensor | None) -> Tensor:
+    """A sequence model for each of several sequences: (..., Q, N) and their states -> (..., Q, N)."""
+    lead = scores.shape[:-2]
+    given = [one.flatten(0, len(lead) - 1) for one in (scores, state) if one is not None]
+    together: Tensor = torch.func.vmap(model)(*given)
+    return together.view(*lead, *together.shape[1:])
 
 
 def _along(rows: Tensor, shifts: list[int], queries: int) -> Tensor:

@@ -13,12 +13,11 @@ from pytorch_lightning import LightningDataModule
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
-from dejavu_torch.data.arrays import as_traverse
 from dejavu_torch.data.files import LARGEST
 from dejavu_torch.data.frame_range import runs as runs_of
 from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth, ground_truth_in_places
 from dejavu_torch.data.positions import place_of
-from dejavu_torch.data.source import open_source, routes_of
+from dejavu_torch.data.source import as_traverse, open_source, routes_of
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.views import STRETCH
 from dejavu_torch.memory import check_room, concatenate

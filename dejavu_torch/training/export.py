@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import logging
 import math
+import shlex
 import sys
 import time
 from pathlib import Path
@@ -88,6 +89,12 @@ class MapExport(Callback):
             figures = {f"unseen/auc_of_{n.replace(' ', '_')}": one.auc for n, one in self.scores.items()}
             for logger in trainer.loggers:
                 logger.log_metrics(figures, step)
+            first = self.scores[TRAINED].auc if self.scores else 0.0
+            if beaten := [name for name, one in self.scores.items() if one.auc > first]:
+                source = data.sources["source"]
+                anew = shlex.quote(source) if isinstance(source, str) else "SOURCE"
+                text = "the trained map is worse than %s; `dejavu learn %s --map FILE` makes a map untrained"
+                log.warning(text, " and ".join(beaten), anew)
 
     def on_exception(self, trainer: pl.Trainer, pl_module: Any, exception: BaseException) -> None:
         """Write the map of the last step if the user interrupts."""

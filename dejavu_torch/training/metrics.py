@@ -9,7 +9,7 @@ from torch import Tensor
 from torchmetrics import Metric
 from torchmetrics.utilities.data import dim_zero_cat
 
-from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth, counted, is_right
+from dejavu_torch.data.ground_truth import GroundTruth, Truth, counted, is_right
 from dejavu_torch.evaluation.curves import Scores, check_truth, evaluate
 from dejavu_torch.types import InputError, Match
 
@@ -54,13 +54,13 @@ class PlaceRecognition(Metric):
         self.set_dtype(torch.float64)
         self.add_state("rows", [], dist_reduce_fx="cat")
 
-    def update(self, match: Match, truth: Tensor | GroundTruth) -> None:
+    def update(self, match: Match, truth: Truth) -> None:
         """Add the queries of a batch."""
-        check_truth(match, truth, self.tolerance)
+        truth = check_truth(match, truth, self.tolerance)
         if match.score.isnan().any():
             raise InputError("a score is NaN; expected numbers or +inf")
         index, score = match.index.cpu(), match.score.detach().cpu()
-        truth = GroundTruth(*(part.cpu() for part in as_ground_truth(truth)))
+        truth = GroundTruth(*(part.cpu() for part in truth))
         good, answerable = is_right(index, truth.positives, self.tolerance), (truth.positives >= 0).any(1)
         kept = counted(index, truth, self.tolerance)
         # the same queries on a map of two places: the reported place is 0, and the right one is 0 or 1

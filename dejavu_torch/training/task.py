@@ -32,7 +32,7 @@ from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.training.checkpoint import EXPECTED, CheckpointFiles, read_checkpoint, taking_over
 from dejavu_torch.training.datamodule import MIN_FRAMES, Batch
-from dejavu_torch.training.losses import LastLosses, Objective
+from dejavu_torch.training.losses import LastLosses, NothingLearned, Objective
 from dejavu_torch.training.metrics import PlaceRecognition
 from dejavu_torch.training.processes import average_gradients, averaged, share
 from dejavu_torch.training.stages import CodeStage, DescriptorStage, RateStage, Stage, stages_of, unwhitened
@@ -303,7 +303,13 @@ class PlaceRecognitionTask(Trainee):
 
     def _check_learned(self) -> None:
         """Refuse a training that learned nothing."""
-        self.last.check(self.stage.chance(self))
+        try:
+            self.last.check(self.stage.chance(self))
+        except NothingLearned as error:
+            if self.made:
+                raise
+            cure = "BatchNorm1d(D, affine=False) at the end of the backbone, or a SpectralMapper"
+            raise NothingLearned(f"{error}; templates need features of equal scale: expected {cure}") from error
 
     on_train_end = _check_learned
 

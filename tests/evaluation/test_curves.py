@@ -122,6 +122,14 @@ def test_queries_with_equal_scores_report_together() -> None:
 # matches and truth
 
 
+def literal_average_precision(points: list[tuple[float, float, float]]) -> float:
+    """Precision times the gain of recall at each point, relative to all the recall that is reached."""
+    total, before = 0.0, 0.0
+    for precision, recall, _ in points:
+        total, before = total + precision * (recall - before), recall
+    return total / before if before else 0.0
+
+
 def match_of(index: list[int], score: list[float] | None = None) -> Match:
     scores = torch.arange(len(index)).float() if score is None else torch.tensor(score)
     places = torch.where(scores.isfinite(), torch.tensor(index), -1)
@@ -144,6 +152,7 @@ def test_judge_equals_literal_loops(rows: list[tuple[float, int, list[int]]], to
         recall_at_100_precision_reported=max((r for p, r, _ in reported if p == 1), default=0.0),
         precision_at_100_recall=right / max(1, sum(score < INF for score, _, _ in queries)),
         recall_at_1=right / max(1, sum(a for _, _, a in queries)),
+        average_precision=literal_average_precision(every),
     )
     assert evaluate(match, torch.tensor([truth for _, _, truth in rows]), tolerance) == pytest.approx(
         expected
@@ -262,12 +271,12 @@ THREE, TWO = torch.zeros(3), torch.zeros(2, 1, dtype=torch.int64)
     [
         (lambda: pr_curve(THREE, THREE[:2] < 1, THREE < 1), ["(3,), (2,), (3,)", "three of (Q,)"]),
         (lambda: pr_curve(THREE * torch.nan, THREE < 1, THREE < 1), ["a score is NaN"]),
-        (lambda: evaluate(match_of([0, 1]), TWO[0], 5), ["the truth is (1,)", "(2, R)"]),
+        (lambda: evaluate(match_of([0, 1]), TWO[0], 5), ["the truth is (1, 1)", "(2, R)"]),
         (lambda: evaluate(match_of([0]), TWO, 5), ["the truth is (2, 1)", "(1, R)"]),
         (lambda: evaluate(match_of([0, 1]), TWO, -1), ["the tolerance is -1", "at least 0"]),
         (
             lambda: evaluate(match_of([0, 1]), GroundTruth(TWO, THREE > 0, TWO), 5),
-            ["judged and ignored are (3,)", "(2,) and (2, S)"],
+            ["judged (3,)", "(2,) and (2, S)"],
         ),
     ],
 )

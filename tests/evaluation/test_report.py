@@ -28,7 +28,7 @@ from dejavu_torch.evaluation.report import (
 )
 from dejavu_torch.types import Match
 
-SCORES = Scores(0.5, 0.6, 0.1, 0.2, 0.7, 0.75)
+SCORES = Scores(0.5, 0.6, 0.1, 0.2, 0.7, 0.75, 0.8)
 FACTS = {"queries": 20, "tolerance": 3, "recall_definition": "TP / all", "version": "1", "torch": "2"}
 
 

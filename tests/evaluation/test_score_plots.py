@@ -24,7 +24,7 @@ from dejavu_torch.evaluation.score_plots import (
 
 def contender(name: str, auc: float, points: int = 4) -> Contender:
     curve = PRCurve(*torch.rand(3, points, dtype=torch.float64))
-    return Contender(name, Scores(auc, *torch.rand(5).tolist()), curve=curve)
+    return Contender(name, Scores(auc, *torch.rand(6).tolist()), curve=curve)
 
 
 def rgb(colour: str) -> tuple[float, ...]:
@@ -65,7 +65,7 @@ def points(*pairs: tuple[float, float]) -> list[Stored]:
 
 def test_the_storage_picture_shows_the_points_and_what_the_null_takes() -> None:
     storage = {"map": points((1, 0.5), (2, 0.8)), "null": points((4, 0.5), (16, 0.6)), "interpolated": []}
-    whole = Contender("all of them", Scores(0.9, 0.9, 0.1, 0.1, 0.9, 0.9), 100, 1)
+    whole = Contender("all of them", Scores(0.9, 0.9, 0.1, 0.1, 0.9, 0.9, 0.9), 100, 1)
     picture = draw_storage({"uncompressed": whole}, storage, "2 frames")["storage"]
     figure, axis = picture.plot
     lines = {line.get_label(): line for line in axis.lines}
@@ -81,7 +81,7 @@ def test_the_storage_picture_shows_the_points_and_what_the_null_takes() -> None:
 
 
 def at(*areas: float) -> dict[int, Scores]:
-    return {T: Scores(area, area, 0, 0, area, area) for T, area in zip((1, 5, 11), areas, strict=True)}
+    return {T: Scores(area, area, 0, 0, area, area, area) for T, area in zip((1, 5, 11), areas, strict=True)}
 
 
 def test_the_areas_of_sequences_of_all_contenders_and_of_the_map_at_other_sizes() -> None:

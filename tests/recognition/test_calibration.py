@@ -16,7 +16,7 @@ from test_filter import Watched
 from torch import Tensor
 
 from dejavu_torch import DejaVu, PlaceFilter, SequenceMatcher, SpectralMapper, export, open_source
-from dejavu_torch.data.arrays import as_traverse
+from dejavu_torch.data.source import as_traverse
 from dejavu_torch.evaluation.rejection import calibration_error
 from dejavu_torch.features.views import Views, augmented_segments
 from dejavu_torch.model import HIGHEST

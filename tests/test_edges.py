@@ -1,0 +1,320 @@
+"""Where a library meets the code around it: other types, other threads of autograd, other forms of input."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from command_line import fails
+from helpers import refused
+from torch import Tensor, nn
+
+from dejavu_torch import (
+    DejaVu,
+    ImposedPeriods,
+    Match,
+    PhaseTemplates,
+    PlaceFilter,
+    SequenceMatcher,
+    SpectralMapper,
+    TemplateMapper,
+    Whitening,
+    best_match,
+    compare,
+    evaluate,
+    open_source,
+)
+from dejavu_torch.data import GroundTruth
+from dejavu_torch.data.source import as_traverse
+from dejavu_torch.evaluation import judge
+from dejavu_torch.features import SmallCNN
+from dejavu_torch.maps import log_posterior
+from dejavu_torch.types import FrequencyLayer
+
+FRAMES = torch.rand(60, 3, 32, 24, generator=torch.Generator().manual_seed(0))
+SOME = torch.arange(0, 60, 9)
+
+
+def spectral(features: nn.Module | None = None, **settings: Any) -> DejaVu:
+    return DejaVu(features, Whitening(views=1), SpectralMapper(16.0), **settings)
+
+
+def templates(**settings: Any) -> DejaVu:
+    return DejaVu(mapper=TemplateMapper(ImposedPeriods([3, 4, 5], bin=4), **settings))
+
+
+def finds_itself(model: DejaVu, frames: Tensor = FRAMES) -> None:
+    assert model.localize(frames[SOME]).index.tolist() == SOME.tolist()
+
+
+@pytest.fixture(scope="module")
+def learned() -> DejaVu:
+    return spectral().learn(FRAMES)
+
+
+# one model beside another
+
+
+def test_learning_a_second_model_leaves_the_first_alone(learned: DejaVu) -> None:
+    before = learned(FRAMES[SOME])
+    other = DejaVu(**learned.settings())
+    assert other.features is learned.features
+    assert other.whitening is not None
+    assert learned.whitening is not None
+    assert torch.equal(other.whitening.projection, learned.whitening.projection)
+    other.learn(1 - FRAMES.flip(0))
+    assert torch.equal(learned(FRAMES[SOME]), before)
+
+
+def test_a_fixed_whitening_is_shared() -> None:
+    model = spectral().learn(FRAMES)
+    other = DejaVu(mapper=SpectralMapper(16.0))
+    other.take_whitening(model)
+    assert other.settings()["whitening"] is other.whitening
+
+
+def test_an_optimiser_goes_on_with_the_templates_of_a_map_made_anew(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    model = templates(trainable=True).learn(FRAMES)
+    kept, before = model.map.templates, model.map.templates.detach().clone()
+    kept.grad = torch.ones_like(kept)
+    model.learn(FRAMES.flip(0))
+    assert model.map.templates is kept
+    assert kept.grad is None
+    fresh = templates(trainable=True).learn(FRAMES.flip(0))
+    assert torch.equal(kept, fresh.map.templates)
+    assert not torch.equal(kept, before)
+    model.learn(FRAMES[:50, :, :24])
+    assert model.map.templates is not kept
+    assert "new parameters" in caplog.text
+
+
+# types
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_the_default_model_learns_and_localizes_under_autocast(dtype: torch.dtype) -> None:
+    with torch.autocast("cpu", dtype):
+        model = DejaVu(whitening=Whitening(views=1), mapper=SpectralMapper(16.0)).learn(FRAMES)
+        finds_itself(model)
+    assert model(FRAMES[:2]).dtype == torch.float32
+
+
+def test_phase_means_are_exact_under_autocast() -> None:
+    plan = (FrequencyLayer(4, 4, 0, 60, (0, 1)),)
+    features = 100 + torch.rand(60, 2)
+    with torch.autocast("cpu", torch.bfloat16):
+        found = PhaseTemplates()(features, plan)[0]
+    assert torch.equal(found, PhaseTemplates()(features, plan)[0])
+
+
+def network() -> nn.Module:
+    return nn.Sequential(nn.Conv2d(3, 4, 5, stride=3), nn.Flatten())
+
+
+@pytest.mark.parametrize(
+    "make",
+    [lambda: network().bfloat16(), lambda: network().double(), lambda: SmallCNN(8, 3, (16, 16)).double()],
+    ids=["bfloat16", "double", "SmallCNN"],
+)
+def test_frames_have_the_type_of_the_network(make: Callable[[], nn.Module]) -> None:
+    torch.manual_seed(0)
+    finds_itself(spectral(make()).learn(FRAMES))
+
+
+def test_joined_networks_have_types_of_their_own() -> None:
+    from dejavu_torch.features import Joined
+
+    model = spectral(Joined([network().bfloat16(), network()])).learn(FRAMES)
+    finds_itself(model)
+    assert model(FRAMES[:2]).dtype == torch.float32
+
+
+def test_frames_in_double_precision_are_learned() -> None:
+    finds_itself(spectral().learn(FRAMES.numpy() / 1.0), FRAMES.double())
+    finds_itself(spectral().learn(FRAMES.double()), FRAMES.double())
+
+
+@pytest.mark.parametrize("to", ["double", "half", "bfloat16"])
+def test_a_converted_model_is_saved_as_maps_are(to: str, tmp_path: Path) -> None:
+    model = spectral().learn(FRAMES)
+    getattr(model, to)().save(tmp_path / "map.safetensors")
+    finds_itself(DejaVu.load(tmp_path / "map.safetensors"))
+
+
+def test_templates_in_double_precision_are_saved_and_searched(tmp_path: Path) -> None:
+    model = templates().learn(FRAMES)
+    expected = model.localize(FRAMES).index
+    model.double().save(tmp_path / "map.safetensors")
+    assert torch.equal(model.localize(FRAMES).index, expected)
+    assert torch.equal(DejaVu.load(tmp_path / "map.safetensors").localize(FRAMES).index, expected)
+
+
+# forms of input
+
+
+def test_what_holds_a_route() -> None:
+    shades = (255 * FRAMES).round().byte()
+    for held in (shades, shades.numpy(), shades.permute(0, 2, 3, 1)):
+        assert torch.equal(next(as_traverse(held).batches(60)), shades / 255)
+        finds_itself(spectral().learn(held))
+    both = torch.zeros(20, 3, 16, 3, dtype=torch.uint8)
+    assert next(as_traverse(both).batches(2)).shape == (2, 3, 3, 16)  # colours are last
+    with refused("(60, 4, 32, 24)", "(N,3,H,W) uint8"):
+        spectral().learn(torch.zeros(60, 4, 32, 24, dtype=torch.uint8))
+
+
+def test_a_path_is_opened() -> None:
+    source = "sim:aerial?frames=60&size=32"
+    model = spectral().learn(source).calibrate(source)
+    expected = spectral().learn(open_source(source)).localize(open_source(source + "&traverse=1"))
+    assert torch.equal(model.localize(source + "&traverse=1").index, expected.index)
+    with refused("nowhere is not there"):
+        spectral().learn("nowhere")
+
+
+def test_no_queries_have_no_scores(learned: DejaVu) -> None:
+    assert learned(FRAMES[:0]).shape == (0, 60)
+    assert templates().learn(FRAMES)(FRAMES[:0]).shape == (0, 60)
+    with refused("empty"):
+        learned.localize(FRAMES[:0])
+
+
+# sequences side by side
+
+
+@pytest.mark.parametrize("model", [SequenceMatcher(3, (1, 0.5)), PlaceFilter()], ids=["matcher", "filter"])
+def test_several_sequences_are_each_as_alone(model: Any) -> None:
+    scores = torch.rand(2, 3, 7, 20)
+    scores[0, 1, 4, 3] = math.inf
+    state = scores[..., :2, :] if isinstance(model, SequenceMatcher) else torch.rand(2, 3, 21).softmax(-1)
+    for given in (None, state):
+        alone = [
+            model(scores[i, j], None if given is None else given[i, j]) for i in range(2) for j in range(3)
+        ]
+        torch.testing.assert_close(model(scores, given), torch.stack(alone).view(2, 3, 7, 20))
+    run = torch.compile(model, fullgraph=True, backend="eager")
+    torch.testing.assert_close(run(scores[0, 0], state[0, 0]), model(scores[0, 0], state[0, 0]))
+
+
+def test_leading_dimensions_of_scores() -> None:
+    scores = torch.rand(2, 3, 7, 20)
+    match = best_match(scores)
+    assert torch.equal(match.index, scores.argmin(-1))
+    torch.testing.assert_close(log_posterior(scores, 0.5)[1, 2], log_posterior(scores[1, 2], 0.5))
+
+
+# truth in any form
+
+
+def test_every_form_of_truth_gives_the_same_scores(learned: DejaVu) -> None:
+    match, places = learned.localize(FRAMES[SOME]), SOME.tolist()
+    expected = evaluate(match, SOME[:, None], 2)
+    forms: dict[str, Any] = {
+        "places": SOME,
+        "list": places,
+        "array": SOME.numpy(),
+        "lists": [[place, place + 1] for place in places],
+        "ragged": [[place] * (1 + i) for i, place in enumerate(places)],
+        "matrix": torch.eye(60, dtype=torch.bool)[SOME],
+        "array of a matrix": np.eye(60, dtype=bool)[places],
+        "truth": GroundTruth(SOME[:, None], torch.ones(7, dtype=torch.bool), SOME.new_zeros(7, 0)),
+    }
+    for name, truth in forms.items():
+        assert evaluate(match, truth, 2) == expected, name
+    assert evaluate(learned.candidates(FRAMES[SOME], 3), places, 2) == expected
+    every = learned.localize(FRAMES)
+    assert evaluate(every, "0", 2) == evaluate(every, range(60), 2)
+
+
+@pytest.mark.parametrize(
+    ("truth", "facts"),
+    [
+        (torch.eye(60)[SOME].long(), ("(7, 60) of 0 and 1", "truth.bool()")),
+        (SOME.float(), ("(7,) torch.float32", "integer places")),
+        ([0, 1], ("(2, 1)", "(7, R)")),
+        ({"a": 1}, ("a dict", "integer places")),
+        (torch.zeros(7, 2, 2, dtype=torch.int64), ("(7, 2, 2)", "integer places")),
+    ],
+)
+def test_another_truth_is_refused(learned: DejaVu, truth: Any, facts: tuple[str, ...]) -> None:
+    with refused(*facts):
+        evaluate(learned.localize(FRAMES[SOME]), truth, 2)
+
+
+def test_judged_queries_and_recalls() -> None:
+    """By hand: right at rank 1, at rank 2, never."""
+    index = torch.tensor([[5, 40], [40, 9], [40, 50]])
+    match = Match(index, torch.tensor([[0.1, 0.5], [0.3, 0.4], [0.2, 0.6]]), index >= 0)
+    found = judge(match, [[5], [9], [7]], tolerance=0, recalls=(1, 2, 5))
+    assert found.right.tolist() == [True, False, False]
+    assert found.recalls == {1: 1 / 3, 2: 2 / 3}
+    assert found.scores == evaluate(match, [5, 9, 7], 0)
+    assert found.scores.average_precision == 1.0
+
+
+def test_average_precision_is_that_of_scikit_learn() -> None:
+    metrics = pytest.importorskip("sklearn.metrics")
+    score, right = torch.rand(40).mul(10).round(), torch.rand(40) < 0.6
+    match = Match(torch.where(right, 0, 9), score, right | ~right)
+    expected = metrics.average_precision_score(right.numpy(), -score.numpy())
+    assert evaluate(match, torch.zeros(40, 1).long(), 0).average_precision == pytest.approx(expected)
+    perfect = Match(torch.arange(5), torch.ones(5), torch.ones(5) > 0)  # of tied scores
+    assert evaluate(perfect, range(5), 0).average_precision == 1.0
+
+
+def test_a_comparison_takes_places_as_truth() -> None:
+    route = "sim:aerial?frames=60&size=32"
+    settings: dict[str, Any] = {"model": spectral(), "calibration": "none", "ordered": False}
+    found = compare(route, route + "&traverse=1", torch.arange(60), **settings)
+    expected = compare(route, route + "&traverse=1", "0", **settings)
+    assert found.report.ours.scores == expected.report.ours.scores
+    assert found.report.facts["truth"] == "the places that the caller gave"
+
+
+def test_a_match_by_name_has_its_probability() -> None:
+    match = Match(torch.tensor([1]), torch.tensor([0.5]), torch.tensor([True]))
+    assert match._asdict().keys() == {"index", "score", "accepted"}
+    told = match._replace(probability=torch.tensor([0.9]))
+    assert told._asdict()["probability"].item() == pytest.approx(0.9)
+
+
+# torch.func through a whole model
+
+
+def test_a_slope_through_frames_descriptors_and_map(learned: DejaVu) -> None:
+    frames = FRAMES[:2].clone().requires_grad_()
+    (expected,) = torch.autograd.grad(learned(frames).sum(), frames)
+    found = torch.func.grad(lambda some: learned(some).sum())(FRAMES[:2])
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-6)
+    lines = copy.deepcopy(learned.map)
+    rows = torch.rand(3, lines.dimension)
+    assert torch.func.jacrev(lines)(rows).shape == (3, 60, 3, lines.dimension)
+    assert torch.func.jvp(lines, (rows,), (rows,))[1].shape == (3, 60)
+
+
+# what a saved config names
+
+
+def test_why_a_module_of_a_config_cannot_be_imported_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "own_networks.py").write_text("import missing_library\n")
+    made = "dejavu_torch.cli.parser.made"
+    (tmp_path / "saved.yaml").write_text(
+        f"features:\n  class_path: {made}\n  init_args:\n    function: own_networks.Net\n"
+    )
+    error = fails(
+        capsys, "learn", "sim:aerial?frames=60", "--map", "map.safetensors", "--config", "saved.yaml"
+    )
+    assert "own_networks.Net cannot be imported" in error
+    assert "missing_library" in error

@@ -1,0 +1,24 @@
+"""The page that tells what holds of each module is right."""
+
+from __future__ import annotations
+
+import warnings
+
+import matrix
+import pytest
+
+
+@pytest.mark.parametrize("aspect", matrix.ASPECTS)
+@pytest.mark.parametrize("name", matrix.MODULES)
+def test_a_cell_says_what_holds(name: str, aspect: str) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of operations that vmap runs one after another
+        why = matrix.fails(name, aspect)
+    if aspect in matrix.WITHOUT.get(name, "").split():
+        assert why
+    else:
+        assert why == ""
+
+
+def test_the_page_is_written_anew() -> None:
+    assert matrix.PAGE.read_text() == matrix.table()
