@@ -33,7 +33,8 @@ from dejavu_torch import (
 from dejavu_torch.data import GroundTruth
 from dejavu_torch.data.source import as_traverse
 from dejavu_torch.evaluation import judge
-from dejavu_torch.features import SmallCNN
+from dejavu_torch.features.cnn import SmallCNN
+from dejavu_torch.features.joined import Joined
 from dejavu_torch.maps import log_posterior
 from dejavu_torch.types import FrequencyLayer
 
@@ -130,8 +131,6 @@ def test_frames_have_the_type_of_the_network(make: Callable[[], nn.Module]) -> N
 
 
 def test_joined_networks_have_types_of_their_own() -> None:
-    from dejavu_torch.features import Joined
-
     model = spectral(Joined([network().bfloat16(), network()])).learn(FRAMES)
     finds_itself(model)
     assert model(FRAMES[:2]).dtype == torch.float32

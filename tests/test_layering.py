@@ -20,7 +20,7 @@ ARROWS = {
     "memory": "types",
     "resize": "types memory",
     "data": "lazy text types memory resize",
-    "features": "lazy text types memory resize",
+    "features": "text types memory resize",
     "periods": "text types memory",
     "maps": "lazy types text memory data periods",
     "recognition": "text types memory data maps",

@@ -5,12 +5,10 @@ from typing import TYPE_CHECKING
 from dejavu_torch.lazy import lazily
 
 if TYPE_CHECKING:
-    from dejavu_torch.maps.place_map import Mapper as Mapper
     from dejavu_torch.maps.spectral_map import SpectralMap as SpectralMap
     from dejavu_torch.maps.template_map import log_posterior as log_posterior
 
 _NAMES = {
-    "place_map": "Mapper",
     "spectral_map": "SpectralMap",
     "template_map": "log_posterior",
 }

@@ -14,7 +14,7 @@ from torch import nn
 
 from dejavu_torch import DejaVu, PlaceRecognitionTask, RouteData, SpectralMapper, evaluate
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.training import MapExport
+from dejavu_torch.training.export import MapExport
 from dejavu_torch.training.losses import NothingLearned
 
 PAGE = Path(__file__).parents[2] / "docs" / "howto" / "own_loop.md"
@@ -22,7 +22,9 @@ SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.figures) for seed in (1, 2))]
 
 
 @pytest.mark.figures
-@pytest.mark.parametrize("route", ["sim:aerial?frames=300&size=32", "sim:outdoor?frames=300&height=32&width=32"])
+@pytest.mark.parametrize(
+    "route", ["sim:aerial?frames=300&size=32", "sim:outdoor?frames=300&height=32&width=32"]
+)
 @pytest.mark.parametrize("seed", range(3))
 def test_the_loop_of_the_page_beats_its_untrained_network(
     seed: int, route: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
