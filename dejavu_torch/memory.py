@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 from torch._C._functorch import is_functorch_wrapped_tensor
+from torch.autograd import forward_ad
 
 from dejavu_torch.types import InputError
 
@@ -40,12 +41,12 @@ def in_float32() -> Iterator[None]:
 
 
 def without_autocast(function: Callable[P, R]) -> Callable[P, R]:
-    """The function of at least one tensor, computed in the tensors' own types under any autocast."""
+    """A function of tensors, computed in their own types under any autocast."""
 
     @functools.wraps(function)
     def exact(*args: P.args, **kwargs: P.kwargs) -> R:
-        device = next(one.device.type for one in args if isinstance(one, Tensor))
-        if not torch.amp.is_autocast_available(device):
+        device = next((one.device.type for one in (*args, *kwargs.values()) if isinstance(one, Tensor)), "")
+        if not device or not torch.amp.is_autocast_available(device):
             return function(*args, **kwargs)
         with torch.autocast(device, enabled=False):
             return function(*args, **kwargs)
@@ -53,11 +54,17 @@ def without_autocast(function: Callable[P, R]) -> Callable[P, R]:
     return exact
 
 
-def is_readable(tensor: Tensor) -> bool:
-    """Whether a number can be read from a tensor without waiting for a device: it is plain, on the CPU, and
-    neither traced nor transformed by torch.func."""
-    plain = type(tensor) in (Tensor, nn.Parameter) and tensor.device.type == "cpu"
-    return plain and not torch.compiler.is_compiling() and not is_functorch_wrapped_tensor(tensor)
+def is_plain(tensor: Tensor) -> bool:
+    """Whether a number can be read from a tensor: it is neither traced nor transformed by torch.func, and has
+    no tangent."""
+    if torch.compiler.is_compiling() or type(tensor) not in (Tensor, nn.Parameter):
+        return False
+    return not is_functorch_wrapped_tensor(tensor) and forward_ad.unpack_dual(tensor).tangent is None
+
+
+def is_readable(*tensors: Tensor) -> bool:
+    """Whether all are plain and on the CPU, so that nothing waits for a device."""
+    return all(is_plain(one) and one.device.type == "cpu" for one in tensors)
 
 
 def free_memory() -> float:

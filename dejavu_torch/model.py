@@ -52,7 +52,8 @@ class DejaVu(nn.Module):
     """Learn a compressed map of a route from what repeats along it, and find places on it (section III).
 
     Args:
-        features: any nn.Module (B,C,H,W) -> (B,D); None is HOG with `Distilled`, HOG alone if unwhitened.
+        features: any nn.Module (B,C,H,W) -> (B,D), given frames in the type of its weights; None is HOG with
+            `Distilled`, HOG alone if unwhitened.
         whitening: reduces features to few dimensions, learned with each map unless it is `fixed`; None is
             Whitening for a SpectralMapper and "none" for templates. "none" keeps the features, except that a
             SpectralMapper reduces ready features of over 256 dimensions to principal components.
@@ -179,7 +180,8 @@ class DejaVu(nn.Module):
 
         Returns:
             self, in eval mode, with the map in `self.map`. If nothing repeats along the route, a template map
-            has no layers, and every place scores +inf.
+            has no layers, and every place scores +inf. Trainable templates stay the same parameters, for an
+            optimiser, if they have the former shapes.
 
         Convention: the descriptors (N,K) and a few copies of them are in memory. On a route longer than
             `SAMPLE` frames and one chunk, a spectral map learns whitening, mean and step from a sample, see
@@ -346,21 +348,26 @@ class DejaVu(nn.Module):
         frames = len(positions) or route.places
         self.frame_names = [] if traverse is None else names_of(source_of(traverse), frames)
         self.frame_shape, self.trained = shape or None, None
+        self._hand_on(route)
         return self.replace_map(route)
 
-    def replace_map(self, route: PlaceMap) -> DejaVu:
-        """Set another map of the same frames, without calibration; returns self in eval mode.
-
-        Parameters of the present map, such as trainable templates, stay the same objects with the new values,
-        for an optimiser, if they have the new shapes.
-        """
+    @torch.no_grad()
+    def _hand_on(self, route: PlaceMap) -> None:
+        """Let the parameters of a new map be those of the present one, for an optimiser, with the new values;
+        the present map keeps a copy of its own."""
         for name, new in dict(route.named_parameters(recurse=False)).items():
             own = getattr(self.map, name, None)
-            if isinstance(own, nn.Parameter) and own.shape == new.shape:
-                own.data, own.grad = new.data, None
-                setattr(route, name, own)
-            elif isinstance(own, nn.Parameter) and own.numel():
+            if not isinstance(own, nn.Parameter) or not own.numel():
+                continue
+            if (own.shape, own.dtype, own.device) == (new.shape, new.dtype, new.device):
+                setattr(self.map, name, nn.Parameter(own.clone()))
+                own.grad = None
+                setattr(route, name, own.copy_(new))
+            else:
                 log.warning("the %s of the map are new parameters: an optimiser has to be made anew", name)
+
+    def replace_map(self, route: PlaceMap) -> DejaVu:
+        """Set another map of the same frames, without calibration; returns self in eval mode."""
         self.map, self.find, self.calibration = route, None, None
         return self.eval()
 

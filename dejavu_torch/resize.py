@@ -33,7 +33,8 @@ def resize_frames(frames: Tensor, size: Size | None) -> Tensor:
 
 @without_autocast
 def _interpolated(frames: Tensor, size: Size) -> Tensor:
-    exact = frames.to(torch.promote_types(frames.dtype, torch.float32))  # a CPU has no antialiasing in less
+    half = frames.dtype in (torch.float16, torch.bfloat16)
+    exact = frames.float() if half else frames  # a CPU has no antialiasing in less
     resized: Tensor = interpolate(exact, size, mode="bilinear", antialias=True)
     return resized.to(frames.dtype)
 

@@ -42,14 +42,15 @@ Every cell is tested. The page is written by `python -m tests.matrix`.
 
 - **gradient**: `gradcheck` in double precision, with respect to the input;
 - **torch.func**: `grad` and `vmap` give what autograd and a loop do;
-- **float64**, **bfloat16**: the module and its input converted;
-- **autocast**: the same within 2 % of the largest value under bfloat16 autocast;
+- **float64**, **bfloat16**: the module and its input converted; in bfloat16 within 5 % of the largest value;
+- **autocast**: the same under bfloat16 autocast, networks within 2 % of the largest value;
 - **empty**: a batch of 0 gives 0 rows;
-- **compile**: `torch.compile(fullgraph=True)`; **export**: `torch.export` for any number of rows.
+- **compile**: `torch.compile(fullgraph=True)`, without the compilation to machine code;
+- **export**: `torch.export` for any number of rows.
 
-Where it says no: an augmentation draws random numbers and passes no gradient; periods and templates are of
-one route, not of a batch, and the periods of a plan are exact fractions; a sequence is exported
-[step by step, with its state](../howto/export.md).
+Where it says no: an augmentation is float32, draws random numbers and passes no gradient; periods and
+templates are of one route, not of a batch, and the periods of a plan are exact fractions; a sequence is
+exported [step by step, with its state](../howto/export.md).
 
 """
 ROUTE = 24
@@ -88,8 +89,15 @@ def distances(values: Tensor, templates: Tensor) -> Tensor:
 
 
 def augmented(module: nn.Module, values: Tensor) -> Tensor:
+    module.training = True
+    made: Tensor = module(values)
+    return made
+
+
+def seeded(module: nn.Module, values: Tensor) -> Tensor:
+    """The output with the same random numbers each time."""
     torch.manual_seed(0)
-    made: Tensor = module.train()(values)
+    made: Tensor = module(values)
     return made
 
 
@@ -114,7 +122,7 @@ MODULES: dict[str, tuple[Callable[[], nn.Module], Callable[[], Tensor]]] = {
             lambda module, values: torch.cat([one.flatten() for one in module(values, PLAN)]),
             module=PhaseTemplates(),
         ),
-        lambda: rows(3)[:5],
+        lambda: 100 + rows(3)[:5],  # means whose difference is small
     ),
     "phase_distances": (
         lambda: Calls(partial(distances, templates=rows(6)[7:11])),
@@ -169,15 +177,17 @@ def float64(module: nn.Module, values: Tensor) -> None:
 
 
 def bfloat16(module: nn.Module, values: Tensor) -> None:
-    found = module.bfloat16()(values.bfloat16())
-    assert found.is_floating_point()
-    assert not found.isnan().any()
+    rounded = values.bfloat16()
+    expected = module(rounded.float())
+    close(module.bfloat16()(rounded).float(), expected, 0.05)
 
 
 def autocast(module: nn.Module, values: Tensor) -> None:
-    expected = module(values)
+    """Networks are rounded, everything else is exact."""
+    learned = any(isinstance(one, nn.Conv2d | Distilled) for one in module.modules())
+    expected = seeded(module, values)
     with torch.autocast("cpu", torch.bfloat16):
-        close(module(values), expected, 0.02)
+        close(seeded(module, values), expected, 0.02 if learned else 1e-5)
 
 
 def empty(module: nn.Module, values: Tensor) -> None:
@@ -188,7 +198,7 @@ def compiled(module: nn.Module, values: Tensor) -> None:
     torch.compiler.reset()
     run = torch.compile(module, fullgraph=True, backend="eager")
     for some in (values, values[1:]):
-        close(run(some), module(some), 1e-5)
+        close(seeded(run, some), seeded(module, some), 1e-5)
 
 
 def exported(module: nn.Module, values: Tensor) -> None:
@@ -210,12 +220,17 @@ ASPECTS: dict[str, Callable[[nn.Module, Tensor], None]] = {
     "compile": compiled,
     "export": exported,
 }
-WITHOUT = {
-    "Augmentation": "gradient torch.func float64 bfloat16 compile export",
-    "SpectrogramAnalysis": "empty export",
-    "PhaseTemplates": "empty compile export",
-    "SequenceMatcher": "export",
-    "PlaceFilter": "export",
+# what does not hold, and the error that says so
+WITHOUT: dict[str, dict[str, str]] = {
+    "Augmentation": {
+        **dict.fromkeys(("gradient", "float64", "bfloat16"), "expected float32"),
+        "torch.func": "broadcast shape",
+        "export": "specialized|Constraints|guard|rows|Not equal|close",
+    },
+    "SpectrogramAnalysis": {"empty": "at least 8", "export": "rows"},
+    "PhaseTemplates": {"empty": "inside 0 places", "compile": "super", "export": "rows"},
+    "SequenceMatcher": {"export": "rows"},
+    "PlaceFilter": {"export": "rows"},
 }
 
 
@@ -234,7 +249,7 @@ def table() -> str:
     """The page: a row for each module."""
     lines = [f"| module | {' | '.join(ASPECTS)} |", f"|---|{'---|' * len(ASPECTS)}"]
     for name in MODULES:
-        without = WITHOUT.get(name, "").split()
+        without = WITHOUT.get(name, {})
         lines.append(f"| {name} | {' | '.join('no' if one in without else 'yes' for one in ASPECTS)} |")
     return HEAD + "\n".join(lines) + "\n"
 

@@ -14,6 +14,7 @@ import torch
 from command_line import fails
 from helpers import refused
 from torch import Tensor, nn
+from torch.autograd import forward_ad
 
 from dejavu_torch import (
     DejaVu,
@@ -36,6 +37,8 @@ from dejavu_torch.evaluation import judge
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.joined import Joined
 from dejavu_torch.maps import log_posterior
+from dejavu_torch.resize import resize_frames
+from dejavu_torch.training.metrics import PlaceRecognition
 from dejavu_torch.types import FrequencyLayer
 
 FRAMES = torch.rand(60, 3, 32, 24, generator=torch.Generator().manual_seed(0))
@@ -85,13 +88,13 @@ def test_an_optimiser_goes_on_with_the_templates_of_a_map_made_anew(
 ) -> None:
     model = templates(trainable=True).learn(FRAMES)
     kept, before = model.map.templates, model.map.templates.detach().clone()
-    kept.grad = torch.ones_like(kept)
+    kept.grad, former = torch.ones_like(kept), model.map
     model.learn(FRAMES.flip(0))
     assert model.map.templates is kept
     assert kept.grad is None
     fresh = templates(trainable=True).learn(FRAMES.flip(0))
     assert torch.equal(kept, fresh.map.templates)
-    assert not torch.equal(kept, before)
+    assert torch.equal(former.templates, before)  # who holds the former map has it as it was
     model.learn(FRAMES[:50, :, :24])
     assert model.map.templates is not kept
     assert "new parameters" in caplog.text
@@ -139,6 +142,45 @@ def test_joined_networks_have_types_of_their_own() -> None:
 def test_frames_in_double_precision_are_learned() -> None:
     finds_itself(spectral().learn(FRAMES.numpy() / 1.0), FRAMES.double())
     finds_itself(spectral().learn(FRAMES.double()), FRAMES.double())
+
+
+def test_a_default_type_of_double_precision() -> None:
+    torch.set_default_dtype(torch.float64)
+    try:
+        finds_itself(spectral(SmallCNN(8, 3, (16, 16))).learn(FRAMES))
+        finds_itself(spectral().learn(FRAMES.double()), FRAMES.double())
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
+class Ensemble(nn.Module):
+    """With parts of a common name, and weights that are no parameters."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.members = nn.ModuleList([nn.Flatten()])
+        self.register_buffer("mixing", torch.rand(3 * 32 * 24, 8, dtype=torch.float64))
+
+    def forward(self, frames: Tensor) -> Tensor:
+        return self.members[0](frames) @ self.mixing
+
+
+def test_a_network_of_buffers_gets_frames_of_their_type() -> None:
+    finds_itself(spectral(Ensemble()).learn(FRAMES))
+
+
+def test_bytes_are_resized_as_torch_does() -> None:
+    frames = (255 * FRAMES).byte()
+    expected = nn.functional.interpolate(frames, (20, 20), mode="bilinear", antialias=True)
+    assert torch.equal(resize_frames(frames, (20, 20)), expected)
+
+
+@pytest.mark.parametrize("to", ["double", "half", "bfloat16"])
+def test_frame_positions_keep_their_type(to: str) -> None:
+    route = SpectralMapper(16.0)(torch.rand(60, 8))
+    route.positions = torch.linspace(0, 3000, 60)
+    getattr(route, to)()
+    assert torch.equal(route.positions, torch.linspace(0, 3000, 60))
 
 
 @pytest.mark.parametrize("to", ["double", "half", "bfloat16"])
@@ -203,6 +245,16 @@ def test_several_sequences_are_each_as_alone(model: Any) -> None:
     torch.testing.assert_close(run(scores[0, 0], state[0, 0]), model(scores[0, 0], state[0, 0]))
 
 
+def test_states_have_to_fit_several_sequences() -> None:
+    scores = torch.rand(3, 7, 20)
+    for model, state in ((SequenceMatcher(3), torch.rand(2, 20)), (PlaceFilter(), torch.rand(21).softmax(0))):
+        assert model(scores[:0]).shape == (0, 7, 20)
+        with refused("(3, 7, 20)", "a state for each"):
+            model(scores, state)
+    with refused("adds up to 21", "probabilities"):
+        PlaceFilter()(scores, torch.ones(3, 21))
+
+
 def test_leading_dimensions_of_scores() -> None:
     scores = torch.rand(2, 3, 7, 20)
     match = best_match(scores)
@@ -213,7 +265,7 @@ def test_leading_dimensions_of_scores() -> None:
 # truth in any form
 
 
-def test_every_form_of_truth_gives_the_same_scores(learned: DejaVu) -> None:
+def test_every_form_of_truth_gives_the_same_scores(learned: DejaVu, tmp_path: Path) -> None:
     match, places = learned.localize(FRAMES[SOME]), SOME.tolist()
     expected = evaluate(match, SOME[:, None], 2)
     forms: dict[str, Any] = {
@@ -223,6 +275,9 @@ def test_every_form_of_truth_gives_the_same_scores(learned: DejaVu) -> None:
         "lists": [[place, place + 1] for place in places],
         "ragged": [[place] * (1 + i) for i, place in enumerate(places)],
         "matrix": torch.eye(60, dtype=torch.bool)[SOME],
+        "lists of a matrix": torch.eye(60, dtype=torch.bool)[SOME].tolist(),
+        "rows of a matrix": [*torch.eye(60, dtype=torch.bool)[SOME]],
+        "array backwards": SOME.flip(0).numpy()[::-1],
         "array of a matrix": np.eye(60, dtype=bool)[places],
         "truth": GroundTruth(SOME[:, None], torch.ones(7, dtype=torch.bool), SOME.new_zeros(7, 0)),
     }
@@ -230,22 +285,41 @@ def test_every_form_of_truth_gives_the_same_scores(learned: DejaVu) -> None:
         assert evaluate(match, truth, 2) == expected, name
     assert evaluate(learned.candidates(FRAMES[SOME], 3), places, 2) == expected
     every = learned.localize(FRAMES)
-    assert evaluate(every, "0", 2) == evaluate(every, range(60), 2)
+    (tmp_path / "truth.json").write_text(str([[i] for i in range(60)]))
+    for told in ("0", tmp_path / "truth.json"):
+        assert evaluate(every, told, 2) == evaluate(every, range(60), 2)
+    assert evaluate(every, [[0, 1, 1]] * 60, 2).recall_at_1 == 4 / 60  # no matrix
+    metric = PlaceRecognition(2)
+    metric.update(learned.candidates(FRAMES[SOME], 3), SOME)
+    assert float(metric.compute()["recall_at_1"]) == expected.recall_at_1
 
 
 @pytest.mark.parametrize(
     ("truth", "facts"),
     [
         (torch.eye(60)[SOME].long(), ("(7, 60) of 0 and 1", "truth.bool()")),
-        (SOME.float(), ("(7,) torch.float32", "integer places")),
+        (torch.eye(60)[SOME].long().tolist(), ("(7, 60) of 0 and 1", "truth.bool()")),
+        (SOME.float(), ("torch.float32", "integer places")),
+        ([[0.5]] * 7, ("torch.float32", "integer places")),
+        (SOME > 3, ("one truth value", "integer places")),
         ([0, 1], ("(2, 1)", "(7, R)")),
         ({"a": 1}, ("a dict", "integer places")),
-        (torch.zeros(7, 2, 2, dtype=torch.int64), ("(7, 2, 2)", "integer places")),
+        (torch.zeros(7, 2, 2, dtype=torch.int64), ("(2, 2)", "integer places")),
     ],
 )
 def test_another_truth_is_refused(learned: DejaVu, truth: Any, facts: tuple[str, ...]) -> None:
     with refused(*facts):
         evaluate(learned.localize(FRAMES[SOME]), truth, 2)
+
+
+def test_what_cannot_be_judged_is_refused() -> None:
+    for shape in ((2, 3, 4), (2, 0)):
+        index = torch.zeros(shape).long()
+        with refused(str(shape), "candidates (Q,k)"):
+            evaluate(Match(index, index.float(), index > 0), [0, 1], 0)
+    index = torch.zeros(2).long()
+    with refused("[0, 1]", "at least 1"):
+        judge(Match(index, index.float(), index > 0), [0, 1], 0, recalls=(0, 1))
 
 
 def test_judged_queries_and_recalls() -> None:
@@ -297,6 +371,9 @@ def test_a_slope_through_frames_descriptors_and_map(learned: DejaVu) -> None:
     rows = torch.rand(3, lines.dimension)
     assert torch.func.jacrev(lines)(rows).shape == (3, 60, 3, lines.dimension)
     assert torch.func.jvp(lines, (rows,), (rows,))[1].shape == (3, 60)
+    with forward_ad.dual_level():
+        dual = lines(forward_ad.make_dual(rows, rows))
+        assert forward_ad.unpack_dual(dual).tangent.shape == (3, 60)
 
 
 # what a saved config names

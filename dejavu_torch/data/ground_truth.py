@@ -8,8 +8,9 @@ import re
 import zipfile
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from numbers import Real
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias, TypeGuard
 
 import numpy as np
 import torch
@@ -19,6 +20,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from dejavu_torch.data.files import LARGEST, as_number, check_regular, read_rows, read_text, reading
 from dejavu_torch.memory import check_room
+from dejavu_torch.text import one_line
 from dejavu_torch.types import InputError, Traverse
 
 PAIRS_PER_BLOCK = 2**20
@@ -44,7 +46,7 @@ class GroundTruth(NamedTuple):
     ignored: Tensor
 
 
-Truth: TypeAlias = str | Tensor | NDArray[Any] | Sequence[int] | Sequence[Sequence[int]] | GroundTruth
+Truth: TypeAlias = str | Path | Tensor | NDArray[Any] | Sequence[int] | Sequence[Sequence[int]] | GroundTruth
 
 
 def as_ground_truth(truth: Truth, queries: int | None = None) -> GroundTruth:
@@ -63,7 +65,7 @@ def as_ground_truth(truth: Truth, queries: int | None = None) -> GroundTruth:
         >>> as_ground_truth([[3, 4], [], [0]]).positives.tolist()
         [[3, 4], [-1, -1], [0, -1]]
     """
-    if isinstance(truth, str):
+    if not is_given(truth):
         if queries is None:
             raise InputError(
                 f"the truth is {truth!r} for an unknown number of queries; expected their number"
@@ -90,28 +92,41 @@ def _every(places: Tensor) -> GroundTruth:
 
 def _table_of(truth: Any) -> Tensor:
     """Places in any form as a table (Q,R) int64, -1 as padding."""
+    if isinstance(truth, Tensor) and truth.dtype in (torch.int32, torch.int64) and truth.ndim == 2:
+        return _checked(truth.long())
     try:
-        if isinstance(truth, Sequence) and any(
-            isinstance(row, Sequence | Tensor | np.ndarray) for row in truth
-        ):
-            return padded(torch.as_tensor(row, dtype=torch.int64).view(-1) for row in truth)
-        table = torch.as_tensor(truth)
+        rows = _rows(truth)
     except (TypeError, ValueError, RuntimeError) as error:
-        raise InputError(f"the truth is a {type(truth).__name__}; expected {FORMS}") from error
-    if table.dtype == torch.bool and table.ndim == 2:
-        return padded(row.nonzero()[:, 0] for row in table)
-    if (
-        table.ndim not in (1, 2)
-        or table.is_floating_point()
-        or table.is_complex()
-        or table.dtype == torch.bool
-    ):
-        raise InputError(f"the truth is {tuple(table.shape)} {table.dtype}; expected {FORMS}")
-    table = table.long()
-    if table.ndim == 2 and table.shape[1] > 2 and bool(((table == 0) | (table == 1)).all()):
-        seen = f"the truth is {tuple(table.shape)} of 0 and 1, places that repeat in every row"
+        seen = f"the truth is a {type(truth).__name__} ({one_line(error)})"
+        raise InputError(f"{seen}; expected {FORMS}") from error
+    odd = [row for row in rows if row.ndim != 1 or row.is_floating_point() or row.is_complex()]
+    kinds = {row.dtype == torch.bool for row in rows}
+    if odd or len(kinds) > 1:
+        seen = f"{tuple(odd[0].shape)} {odd[0].dtype}" if odd else "truth values and places"
+        raise InputError(f"a query of the truth has {seen}; expected {FORMS}")
+    if kinds == {True}:
+        return padded(row.nonzero()[:, 0] for row in rows)
+    return _checked(padded(row.long() for row in rows))
+
+
+def _checked(table: Tensor) -> Tensor:
+    """Refuse what is a matrix of queries and places rather than a table of places."""
+    matrix = len(table) > 1 and table.shape[1] > 3
+    if matrix and bool(((table == 0) | (table == 1)).all()):
+        seen = f"the truth is {tuple(table.shape)} of 0 and 1, in which places repeat"
         raise InputError(f"{seen}; expected truth.bool() if it is a matrix of queries and places")
-    return table if table.ndim == 2 else table[:, None]
+    return table
+
+
+def _rows(truth: Any) -> list[Tensor]:
+    """What a truth says of each query, (R,)."""
+    if isinstance(truth, Sequence) and any(isinstance(row, Sequence | Tensor | np.ndarray) for row in truth):
+        rows = [torch.as_tensor(row) for row in truth]
+        return [row if row.numel() else row.long().view(-1) for row in rows]
+    values = torch.as_tensor(np.ascontiguousarray(truth) if isinstance(truth, np.ndarray) else truth)
+    if values.ndim == 1 and values.dtype == torch.bool:
+        raise TypeError("one truth value for each query")
+    return list(values[:, None] if values.ndim == 1 else values)
 
 
 def padded(rows: Iterable[Tensor]) -> Tensor:
@@ -194,9 +209,9 @@ def ground_truth_in_places(truth: GroundTruth, place_of: Callable[[Tensor], Tens
     return truth._replace(positives=place_of(truth.positives), ignored=place_of(truth.ignored))
 
 
-def is_given(truth: Truth | None) -> bool:
+def is_given(truth: Truth | None) -> TypeGuard[Tensor | NDArray[Any] | Sequence[Any] | GroundTruth]:
     """Whether a ground truth is places themselves, not words or a file that tell of them."""
-    return truth is not None and not isinstance(truth, str | int | float)
+    return truth is not None and not isinstance(truth, str | Path | Real)
 
 
 def check_ground_truth(truth: Truth, interpolate: bool = False) -> int | float | Path | GroundTruth:
@@ -280,7 +295,8 @@ def find_ground_truth(
         return None
     parsed = check_ground_truth(truth, interpolate)
     if isinstance(parsed, GroundTruth):
-        rows = (_rows_of(part, numbers) for part in as_ground_truth(parsed, len(numbers) if every else None))
+        count = len(numbers) if every else None if query is None else query.length
+        rows = (_rows_of(part, numbers) for part in as_ground_truth(parsed, count))
         found = GroundTruth(*rows)
     elif isinstance(parsed, int):
         found = _every(offset_truth(numbers, frames, parsed))

@@ -136,7 +136,8 @@ def evaluate(match: Match, truth: Truth, tolerance: int) -> Scores:
     """All scores of matches against a truth.
 
     Args:
-        match: (Q,), or candidates (Q,k), of which the first is the answer.
+        match: (Q,), or candidates (Q,k), of which the first is the answer. One of several sequences at once,
+            (R,Q), has to be flattened.
         truth: in any form of `as_ground_truth`. Queries that are not judged, or that report an ignored place,
             are excluded from precision, recall and the number of queries.
         tolerance: places, inclusive.
@@ -199,6 +200,8 @@ def judge(match: Match, truth: Truth, tolerance: int, recalls: Sequence[int] = (
         >>> found.recalls, found.right.tolist()
         ({1: 1.0, 5: 1.0}, [True, True])
     """
+    if min(recalls, default=1) < 1:
+        raise InputError(f"recalls are {[*recalls]}; expected numbers of candidates, at least 1")
     scores = evaluate(match, truth, tolerance)
     known = _on_cpu(truth, len(match.index))
     index = match.index.cpu() if match.index.ndim == 2 else match.index.cpu()[:, None]
@@ -216,7 +219,7 @@ def recall_at(candidates: Tensor, truth: Truth, tolerance: int, first: int) -> f
         >>> [recall_at(places, right, 0, first) for first in (1, 2, 3)]
         [0.0, 0.5, None]
     """
-    truth = as_ground_truth(truth)
+    truth = as_ground_truth(truth, len(candidates))
     kept = counted(candidates[:, 0], truth, tolerance)
     if candidates.shape[1] < first or not kept.any():
         return None
@@ -240,7 +243,7 @@ def recall_over_all(
         >>> recall_over_all(places, right, 0, [1, 2]), recall_at(places, right, 0, 2)
         ({'1': 0.0, '2': 0.5}, 1.0)
     """
-    truth, ranks = as_ground_truth(truth), candidates.shape[1]
+    truth, ranks = as_ground_truth(truth, len(candidates)), candidates.shape[1]
     for first in firsts:
         if not 1 <= first <= ranks:
             more = f", or matches written with --top {first}" * (first > ranks)
@@ -278,6 +281,9 @@ def check_truth(match: Match, truth: Truth, tolerance: int) -> GroundTruth:
         raise InputError(f"{seen}; expected a Match of `localize`, and places")
     if tolerance < 0:
         raise InputError(f"the tolerance is {tolerance}; expected at least 0")
+    shape = tuple(match.index.shape)
+    if len(shape) not in (1, 2) or shape[1:] == (0,):
+        raise InputError(f"the match is {shape}; expected (Q,), or candidates (Q,k) with k of at least 1")
     return as_ground_truth(truth, len(match.index))
 
 

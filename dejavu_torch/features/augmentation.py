@@ -102,14 +102,21 @@ class Augmentation(nn.Module):
     @torch.no_grad()
     @without_autocast
     def forward(self, frames: Tensor) -> Tensor:
-        if not self.training or not len(frames):
+        if not self.training:
             return frames
         (blur,), (noise,) = self.strengths["blur"], self.strengths["noise"]
         radius = max(1, round(blur)) if blur else 0
         shape, dtype = tuple(frames.shape), frames.dtype
-        if len(shape) not in (4, 5) or dtype != torch.float32 or min(shape) < 1 or min(shape[-2:]) <= radius:
-            expected = "at least one, float32 (B,C,H,W) or clips (B,T,C,H,W), of more than"
+        if (
+            len(shape) not in (4, 5)
+            or dtype != torch.float32
+            or min(shape[1:]) < 1
+            or min(shape[-2:]) <= radius
+        ):
+            expected = "float32 (B,C,H,W) or clips (B,T,C,H,W), of more than"
             raise InputError(f"the frames are {shape} {dtype}; expected {expected} {radius} pixels a side")
+        if not len(frames):
+            return frames
         clips = frames if frames.ndim == 5 else frames[:, None]
         gain, offset = self.strengths["colour"]
         draw = _random(clips, 2, len(clips), 1, clips.shape[2], 1, 1) * 2 - 1

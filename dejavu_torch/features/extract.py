@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import chain
 
 import torch
 from torch import Tensor, nn
@@ -67,10 +68,10 @@ def feature_batches(
 
 
 def as_weights(frames: Tensor, module: nn.Module) -> Tensor:
-    """Frames in the type of a module's weights, which torch expects; `Joined` features do this for each."""
-    if hasattr(module, "members"):
+    """Frames in the type of a module's weights, else of its buffers, which torch expects."""
+    if getattr(module, "casts", False):
         return frames
-    dtypes = (weight.dtype for weight in module.parameters())
+    dtypes = (one.dtype for one in chain(module.parameters(), module.buffers()))
     return frames.to(next((dtype for dtype in dtypes if dtype.is_floating_point), frames.dtype))
 
 

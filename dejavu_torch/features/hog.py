@@ -63,11 +63,12 @@ class HOG(nn.Module):
         return in_parts(self._describe, frames)
 
     def _describe(self, frames: Tensor) -> Tensor:
-        rows, columns = gradients(resize_frames(frames, self.resize))
+        exact = frames.to(torch.promote_types(frames.dtype, torch.float32))
+        rows, columns = gradients(resize_frames(exact, self.resize))
         histograms = cell_histograms(rows, columns, self.orientations, self.cell, self.bins)
         blocks = histograms.unfold(1, self.block, 1).unfold(2, self.block, 1)  # (B,by,bx,O,block,block)
         blocks = _unit(blocks.permute(0, 1, 2, 4, 5, 3).flatten(3)).clamp(max=0.2)
-        return _unit(blocks).flatten(1)
+        return _unit(blocks).flatten(1).to(frames.dtype)
 
     extra_repr = settings_of
 

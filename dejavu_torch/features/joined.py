@@ -35,6 +35,8 @@ class Joined(nn.Module):
         (torch.Size([2, 3812]), (1764, 2048))
     """
 
+    casts = True  # gives each member frames in the type of its weights, see `as_weights`
+
     def __init__(self, members: list[nn.Module], shares: list[float] | None = None) -> None:
         super().__init__()
         modules = [*members] if isinstance(members, (Sequence, nn.ModuleList)) else [members]

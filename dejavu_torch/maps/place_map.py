@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
@@ -45,6 +45,7 @@ class PlaceMap(nn.Module, ABC):
 
     kind: ClassVar[str]
     state: ClassVar[Any] = dict[str, Any]
+    kept: ClassVar[tuple[str, ...]] = ("positions",)  # tensors that are always of the type of a file
     routes: tuple[Route, ...] = ()
     positions: Tensor
     visits: Tensor
@@ -72,6 +73,15 @@ class PlaceMap(nn.Module, ABC):
 
     def forward(self, queries: Tensor) -> Tensor:
         return self.scores(queries)
+
+    def _apply(self, *args: Any, **kwargs: Any) -> Self:
+        """As in nn.Module, but what `double()` and the like would change for files keeps its type."""
+        before: dict[str, Tensor] = {name: getattr(self, name) for name in self.kept}
+        super()._apply(*args, **kwargs)  # type: ignore[no-untyped-call]
+        for name, own in before.items():
+            if own.dtype != (now := getattr(self, name)).dtype:
+                setattr(self, name, own.to(now.device))
+        return self
 
     def check_queries(self, queries: Tensor) -> None:
         """Refuse queries that are not (Q,D)."""

@@ -112,6 +112,7 @@ class SpectralMap(PlaceMap):
 
     kind = "spectral"
     state = SpectralState
+    kept = ("positions", "steps", "means", "norms")
 
     lengths: Tensor
     steps: Tensor
@@ -456,7 +457,6 @@ class SpectralMap(PlaceMap):
     def packed(self) -> dict[str, Tensor]:
         """See `PlaceMap`; means that are all 0 are omitted."""
         packed = super().packed()
-        packed = {name: one.to(FILE[name][0]) if name in FILE else one for name, one in packed.items()}
         return packed if bool(self.means.any()) else packed | {"means": packed["means"][:0]}
 
     def summary(self) -> MapSummary:
@@ -495,7 +495,7 @@ def sparse_products(queries: Tensor, counts: Tensor, feature: Tensor, level: Ten
     Convention: a CSR product on a CPU with MKL, whose matrix is made here since it neither compiles nor
         exports; elsewhere, and for traced tensors and those of torch.func, `scatter_add`. No autocast.
     """
-    if is_readable(queries) and _has_csr():
+    if is_readable(queries, counts, feature, level) and _has_csr():
         crow = torch.nn.functional.pad(counts.cumsum(0, dtype=torch.int32), (1, 0))
         shape = (len(counts), queries.shape[1])
         rows = torch.sparse_csr_tensor(crow, feature.int(), level.to(queries), shape, check_invariants=False)

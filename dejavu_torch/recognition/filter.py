@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from dejavu_torch.maps.place_map import PlaceMap
-from dejavu_torch.memory import is_readable
+from dejavu_torch.memory import is_plain, without_autocast
 from dejavu_torch.recognition.sequence import each
 from dejavu_torch.types import InputError, SequenceModel
 
@@ -119,6 +119,7 @@ class PlaceFilter(SequenceModel):
 
     def forward(self, scores: Tensor, before: Tensor | None = None) -> Tensor:
         if scores.ndim > 2:
+            check_posterior(before, scores.shape[-1])
             return each(self, scores, before)
         return self.near_scores(self.posterior(scores, before)[:, :-1], scores)
 
@@ -127,19 +128,16 @@ class PlaceFilter(SequenceModel):
 
         Shape: (Q,N), (N+1,) or None -> (Q,N+1), off the map last; rows add up to 1.
         """
+        check_posterior(before, scores.shape[-1])
         if before is None:
             before = self.start(scores.shape[-1])
-        elif is_readable(before) and not (
-            bool((before >= 0).all()) and abs(float(before.detach().sum()) - 1) <= 1e-3
-        ):
-            seen = f"a posterior {tuple(before.shape)} that adds up to {float(before.detach().sum()):.4g}"
-            raise InputError(f"{seen}; expected ({scores.shape[-1] + 1},) probabilities that add up to 1")
         return self._posteriors(scores, before)[1:]
 
     def step(self, scores: Tensor, state: Tensor, firsts: Sequence[int] = (0,)) -> tuple[Tensor, Tensor]:
         posteriors = self._posteriors(scores, state)
         return self.near_scores(posteriors[1:, :-1], scores), posteriors[-1]
 
+    @without_autocast
     def _posteriors(self, scores: Tensor, state: Tensor) -> Tensor:
         """The state before the first and after each query, (Q+1,N+1)."""
         if scores.ndim != 2 or scores.shape[1] < 1 or not scores.is_floating_point():
@@ -186,6 +184,7 @@ class PlaceFilter(SequenceModel):
         off = stay * (on.sum() - moved.sum()) + leave * (1 - off) + (1 - enter) * off
         return torch.cat([stay * moved + anywhere, off[None]])
 
+    @without_autocast
     def near_scores(self, posterior: Tensor, scores: Tensor, lowest: Tensor | None = None) -> Tensor:
         """-log of the probability, at least `lowest`, of each place and its neighbours, (Q,W) -> (Q,W); +inf
         if the place's score is."""
@@ -287,6 +286,17 @@ class LocalSearch:
         whole = (_rest(self.belief, others) / max(1, others)).repeat(places + 1)
         whole[self.start : self.start + len(on)], whole[-1] = on, self.belief[-1]
         return whole
+
+
+def check_posterior(before: Tensor | None, places: int) -> None:
+    """Refuse what are no probabilities (..., N+1), unless their numbers cannot be read."""
+    if before is None or not is_plain(before) or not before.numel():
+        return
+    total = before.detach().sum(-1)
+    if not bool((before >= 0).all()) or not bool(((total - 1).abs() <= 1e-3).all()):
+        worst = float(total.flatten()[(total - 1).abs().argmax()])
+        seen = f"a posterior {tuple(before.shape)} that adds up to {worst:.4g}"
+        raise InputError(f"{seen}; expected ({places + 1},) probabilities that add up to 1")
 
 
 def updated(expected: Tensor, likelihood: Tensor, rest: Tensor | float = 0) -> Tensor:

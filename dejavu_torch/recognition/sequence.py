@@ -134,6 +134,11 @@ class SequenceMatcher(SequenceModel):
 def each(model: SequenceModel, scores: Tensor, state: Tensor | None) -> Tensor:
     """A sequence model for each of several sequences: (..., Q, N) and their states -> (..., Q, N)."""
     lead = scores.shape[:-2]
+    if state is not None and state.shape[: len(lead)] != lead:
+        seen = f"the scores are {tuple(scores.shape)}, the states {tuple(state.shape)}"
+        raise InputError(f"{seen}; expected a state for each sequence, {tuple(lead)}")
+    if not lead.numel():
+        return scores.clone()
     given = [one.flatten(0, len(lead) - 1) for one in (scores, state) if one is not None]
     together: Tensor = torch.func.vmap(model)(*given)
     return together.view(*lead, *together.shape[1:])

@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
+import numpy as np
 import torch
 from pytorch_lightning import LightningDataModule
 from torch import Tensor
@@ -17,7 +18,7 @@ from dejavu_torch.data.files import LARGEST
 from dejavu_torch.data.frame_range import runs as runs_of
 from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth, ground_truth_in_places
 from dejavu_torch.data.positions import place_of
-from dejavu_torch.data.source import as_traverse, open_source, routes_of
+from dejavu_torch.data.source import as_traverse, routes_of
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.views import STRETCH
 from dejavu_torch.memory import check_room, concatenate
@@ -186,9 +187,13 @@ class RouteData(LightningDataModule):
             "query": self._one_each("truth", truth),
         }
         for name, one in ((name, one) for name, every in self.listed.items() for one in every):
-            if not isinstance(one, (str, Path, Traverse, Tensor)) and (one is not None or name == "source"):
+            if not isinstance(one, (str, Path, Traverse, Tensor, np.ndarray)) and (
+                one is not None or name == "source"
+            ):
                 seen = f"{name} is of type {type(one).__name__}"
-                raise InputError(f"{seen}; expected a path, a Traverse, or a tensor of frames or features")
+                raise InputError(
+                    f"{seen}; expected a path, a Traverse, or a tensor or array of frames or features"
+                )
         paths = [str(one) for one in self.listed["source"] if isinstance(one, (str, Path))]
         for one in (one for one in paths if paths.count(one) > 1):
             raise InputError(f"{one} is given twice; expected each route once, other traverses as second")
@@ -301,7 +306,7 @@ class RouteData(LightningDataModule):
 
     def _open(self, source: Any, shape: tuple[int, ...] | None = None) -> Traverse:
         """A traverse, at the size of `DejaVu.fit` of the task's model unless `resize` is given."""
-        traverse = as_traverse(source) if isinstance(source, (Traverse, Tensor)) else open_source(source)
+        traverse = as_traverse(source)
         model = self._of_task("dejavu")
         return traverse if model is None or self.resize is not None else model.fit(traverse, shape)
 

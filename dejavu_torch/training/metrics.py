@@ -57,6 +57,8 @@ class PlaceRecognition(Metric):
     def update(self, match: Match, truth: Truth) -> None:
         """Add the queries of a batch."""
         truth = check_truth(match, truth, self.tolerance)
+        if match.index.ndim == 2:
+            match = match.map(lambda column: column[:, 0])
         if match.score.isnan().any():
             raise InputError("a score is NaN; expected numbers or +inf")
         index, score = match.index.cpu(), match.score.detach().cpu()

@@ -220,13 +220,19 @@ def test_a_wrong_strength_is_refused(name: str) -> None:
         only(**{name: 0.1 if pair else (0.1, 0.1)})
 
 
+def test_frames_by_name_and_none_at_all() -> None:
+    assert Augmentation()(frames=torch.rand(0, 3, 16, 16)).shape == (0, 3, 16, 16)
+    with refused("float64"):
+        Augmentation()(frames=torch.rand(0, 3, 16, 16).double())
+
+
 @pytest.mark.parametrize(
     ("frames", "facts"),
     [
         (torch.rand(3, 16, 16), ("(3, 16, 16) torch.float32", "(B,C,H,W)", "(B,T,C,H,W)")),
         (torch.rand(2, 3, 16, 16, dtype=torch.float64), ("torch.float64", "float32 (B,C,H,W)")),
         (torch.rand(2, 3, 4, 16), ("(2, 3, 4, 16)", "more than 4 pixels")),
-        (torch.rand(2, 0, 16, 16), ("(2, 0, 16, 16)", "expected at least one")),
+        (torch.rand(2, 0, 16, 16), ("(2, 0, 16, 16)", "float32 (B,C,H,W)")),
     ],
 )
 def test_wrong_frames_are_refused(frames: Tensor, facts: tuple[str, ...]) -> None:

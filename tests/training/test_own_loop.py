@@ -9,11 +9,12 @@ from typing import Any
 import pytest
 import pytorch_lightning as pl
 import torch
-from small_training import FRAMES, footage, mapper
+from small_training import FRAMES, footage, mapper, warned
 from torch import nn
 
 from dejavu_torch import DejaVu, PlaceRecognitionTask, RouteData, SpectralMapper, evaluate
 from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.evaluation import Scores
 from dejavu_torch.training.export import MapExport
 from dejavu_torch.training.losses import NothingLearned
 
@@ -43,28 +44,28 @@ def test_the_loop_of_the_page_beats_its_untrained_network(
 def ordinary() -> nn.Module:
     """Convolutions, batch norm and ReLU, then a linear layer."""
     layers: list[nn.Module] = []
-    for before, after in ((1, 8), (8, 16), (16, 16)):
-        layers += [nn.Conv2d(before, after, 3, 2, 1), nn.BatchNorm2d(after), nn.ReLU()]
+    for before, after, stride in ((1, 8, 2), (8, 16, 2), (16, 16, 2), (16, 16, 1)):
+        layers += [nn.Conv2d(before, after, 3, stride, 1), nn.BatchNorm2d(after), nn.ReLU()]
     return nn.Sequential(*layers, nn.Flatten(), nn.Linear(64, 32))
 
 
-def trained(task: PlaceRecognitionTask, folder: Path, steps: int) -> MapExport:
+def trained(task: PlaceRecognitionTask, folder: Path, steps: int, **given: Any) -> MapExport:
     export = MapExport()
     silent: dict[str, Any] = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False}
     settings = silent | {"enable_checkpointing": False, "accelerator": "cpu", "limit_val_batches": 0}
     running = pl.Trainer(max_steps=steps, callbacks=[export], default_root_dir=folder, **settings)
-    running.fit(task, datamodule=RouteData(ArrayTraverse(footage()), held_out=0.0, batch_size=16))
+    running.fit(task, datamodule=RouteData(footage().numpy(), held_out=0.0, batch_size=16, **given))
     return export
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_recipe_learns_with_an_ordinary_backbone(seed: int, tmp_path: Path) -> None:
     torch.manual_seed(seed)
-    task = PlaceRecognitionTask(ordinary(), mapper=SpectralMapper(16.0), rate=0.1)
+    task = PlaceRecognitionTask(ordinary(), mapper=SpectralMapper(8.0), rate=0.3)  # as on the page
     export = trained(task, tmp_path, 200)
     assert export.written is not None
     torch.manual_seed(seed)
-    untrained = DejaVu(ordinary(), "none", mapper=SpectralMapper(16.0)).learn(ArrayTraverse(footage()))
+    untrained = DejaVu(ordinary(), "none", mapper=SpectralMapper(8.0)).learn(ArrayTraverse(footage()))
     found, before = (
         evaluate(model.localize(ArrayTraverse(footage(0.3))), range(FRAMES), tolerance=2).recall_at_1
         for model in (export.written[1], untrained)
@@ -79,3 +80,15 @@ def test_templates_of_features_without_scale_name_the_cure(
     task = PlaceRecognitionTask(ordinary(), mapper=mapper())
     with pytest.raises(NothingLearned, match=r"BatchNorm1d\(D, affine=False\).*SpectralMapper"):
         trained(task, tmp_path, 120)
+
+
+def test_python_is_warned_of_a_map_that_lost_to_the_untrained_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    lost, won = (Scores(area, area, 1, 1, 1, 1, 1) for area in (0.5, 0.75))
+    scores = {"the trained map": lost, "the untrained map": won}
+    monkeypatch.setattr("dejavu_torch.training.export.compare_with_untrained", lambda *_: scores)
+    given = {"validation": ArrayTraverse(footage(0.1)), "validation_truth": "0"}
+    trained(PlaceRecognitionTask(ordinary(), mapper=SpectralMapper(8.0), rate=0.3), tmp_path, 2, **given)
+    (line,) = [one for one in warned(caplog) if "worse" in one]
+    assert "the trained map is worse than the untrained map" in line
