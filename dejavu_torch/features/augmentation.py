@@ -107,12 +107,8 @@ class Augmentation(nn.Module):
         (blur,), (noise,) = self.strengths["blur"], self.strengths["noise"]
         radius = max(1, round(blur)) if blur else 0
         shape, dtype = tuple(frames.shape), frames.dtype
-        if (
-            len(shape) not in (4, 5)
-            or dtype != torch.float32
-            or min(shape[1:]) < 1
-            or min(shape[-2:]) <= radius
-        ):
+        fits = len(shape) in (4, 5) and dtype == torch.float32 and min(shape[1:]) >= 1
+        if not fits or min(shape[-2:]) <= radius:
             expected = "float32 (B,C,H,W) or clips (B,T,C,H,W), of more than"
             raise InputError(f"the frames are {shape} {dtype}; expected {expected} {radius} pixels a side")
         if not len(frames):

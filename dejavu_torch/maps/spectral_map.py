@@ -375,13 +375,10 @@ class SpectralMap(PlaceMap):
         """See `PlaceMap`: blocks of consecutive chunks that fit into the processor's cache."""
         stop = self.places if stop is None else stop
         self.check_queries(queries)
-        if not queries.shape[0]:  # of which MKL has no transform
-            yield (
-                start,
-                queries.new_zeros(0, stop - start, dtype=torch.promote_types(queries.dtype, torch.float32)),
-            )
-            return
         queries = queries.to(torch.promote_types(queries.dtype, torch.float32))
+        if not queries.shape[0]:  # of which MKL has no transform
+            yield start, queries.new_zeros(0, stop - start)
+            return
         length: Tensor = torch.linalg.vector_norm(queries, dim=1, keepdim=True)
         if self.metric == "cosine":
             queries = queries / torch.where(length > 0, length, 1)
@@ -457,7 +454,7 @@ class SpectralMap(PlaceMap):
     def packed(self) -> dict[str, Tensor]:
         """See `PlaceMap`; means that are all 0 are omitted."""
         packed = super().packed()
-        return packed if bool(self.means.any()) else packed | {"means": packed["means"][:0]}
+        return packed if bool(self.means.any()) else packed | {"means": self.means[:0]}
 
     def summary(self) -> MapSummary:
         chunks = [ChunkSummary(start, stop, self._periods(g)) for g, (start, stop) in enumerate(self.chunks)]
