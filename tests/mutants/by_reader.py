@@ -206,7 +206,7 @@ MUTANTS = [
     Mutant(
         "Patch normalisation at the border of a frame counts only pixels inside it.",
         "dejavu_torch/features/preprocess.py",
-        "(sums(frames) / sums(torch.ones_like(frames[0, 0, 0]))).mT",
+        "(sums(frames) / sums(frames.new_ones(frames.shape[-1]))).mT",
         "(sums(frames) / side).mT",
         ("tests/features/test_preprocess.py::test_patches_equal_a_literal_loop",),
     ),

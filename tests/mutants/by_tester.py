@@ -6,6 +6,27 @@ from .mutant import Mutant
 
 MUTANTS = [
     Mutant(
+        "A second model made of the settings of a first learns a whitening of its own.",
+        "dejavu_torch/model.py",
+        "            whitening = copy.deepcopy(whitening)\n        return own",
+        "            pass\n        return own",
+        ("tests/test_edges.py::-k leaves_the_first_alone",),
+    ),
+    Mutant(
+        "Phase means are exact under autocast.",
+        "dejavu_torch/maps/templates.py",
+        "@without_autocast\ndef _means",
+        "def _means",
+        ("tests/test_edges.py::-k phase_means", "tests/test_matrix.py::-k PhaseTemplates-autocast"),
+    ),
+    Mutant(
+        "The positions of frames keep their type.",
+        "dejavu_torch/maps/place_map.py",
+        "                setattr(self, name, own.to(now.device))",
+        "                pass",
+        ("tests/test_edges.py::-k positions_keep",),
+    ),
+    Mutant(
         "A layer covers the last place of its chunk.",
         "dejavu_torch/maps/template_map.py",
         "if layer.start <= start < layer.stop",
@@ -22,8 +43,8 @@ MUTANTS = [
     Mutant(
         "With a temperature a query that no place covers scores +inf everywhere.",
         "dejavu_torch/maps/template_map.py",
-        "return -logits.log_softmax(1).masked_fill(uncovered, -math.inf)",
-        "return -logits.log_softmax(1)",
+        "return -logits.log_softmax(-1).masked_fill(uncovered, -math.inf)",
+        "return -logits.log_softmax(-1)",
         ("tests/maps/test_scores.py::-k temperature or log_posterior",),
     ),
     Mutant(
