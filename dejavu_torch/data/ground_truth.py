@@ -67,9 +67,7 @@ def as_ground_truth(truth: Truth, queries: int | None = None) -> GroundTruth:
     """
     if not is_given(truth):
         if queries is None:
-            raise InputError(
-                f"the truth is {truth!r} for an unknown number of queries; expected their number"
-            )
+            raise InputError(f"the truth is {truth} for an unknown number of queries; expected the number")
         found = find_ground_truth(truth, None, None, None, queries)
         assert found is not None
         return found

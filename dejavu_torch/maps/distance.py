@@ -11,12 +11,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.autograd import forward_ad
-from torch.nn import Parameter
 from torch.nn.functional import normalize
 from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 
 from dejavu_torch.maps.compiling import compiled
+from dejavu_torch.memory import is_readable
 from dejavu_torch.types import InputError
 
 Metric = Literal["l1", "l2", "cosine"]
@@ -97,19 +96,17 @@ def compiled_l1(query: Tensor, templates: Tensor) -> Tensor | None:
 def _floats(tensor: Tensor) -> Floats | None:
     """The data of a float32 tensor on the CPU, or None if autograd or a tracer records its operations."""
     if (
-        torch.compiler.is_compiling()
+        not is_readable(tensor)
         or torch.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
         or is_in_torch_dispatch_mode()
-        or type(tensor) not in (Tensor, Parameter)
-        or (tensor.device.type, tensor.dtype) != ("cpu", torch.float32)
+        or tensor.dtype != torch.float32
         or (tensor.requires_grad and torch.is_grad_enabled())
-        or forward_ad.unpack_dual(tensor).tangent is not None
     ):
         return None
     try:
         floats: Floats = tensor.detach().contiguous().numpy()
         return floats
-    except (RuntimeError, TypeError):  # tensors of vmap have no memory, sparse tensors no rows
+    except (RuntimeError, TypeError):  # sparse tensors have no rows
         return None
 
 

@@ -124,7 +124,8 @@ class SpectrogramAnalysis(PeriodFinder):
         if fewer than 2 * min_period. Constant features have no power. Chunks too short to pass are logged.
 
     Raises:
-        InputError: an argument out of range; features that are not finite floats (N,D); a route too short.
+        InputError: an argument out of range; features that are not floats (N,D), or in `plan` not finite; a
+            route too short.
 
     Example:
         >>> wave = torch.sin(torch.arange(256) * 2 * torch.pi / 32)[:, None]

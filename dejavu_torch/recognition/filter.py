@@ -70,7 +70,8 @@ class PlaceFilter(SequenceModel):
         motion model and the likelihood are ours.
 
     Raises:
-        InputError: settings, scores or a posterior of another shape or out of range.
+        InputError: settings, scores or a posterior of another shape or out of range; compiled, and within
+            torch.func, the numbers of a posterior are not looked at.
 
     Example:
         >>> scores = torch.tensor([[0.0, 5, 5, 5, 5, 5], [5, 0, 5, 5, 0, 5], [5, 5, 0, 5, 5, 5]])

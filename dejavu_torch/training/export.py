@@ -92,7 +92,7 @@ class MapExport(Callback):
             first = self.scores[TRAINED].auc if self.scores else 0.0
             if beaten := [name for name, one in self.scores.items() if one.auc > first]:
                 source = data.sources["source"]
-                anew = shlex.quote(source) if isinstance(source, str) else "SOURCE"
+                anew = shlex.quote(str(source)) if isinstance(source, str | Path) else "SOURCE"
                 text = "the trained map is worse than %s; `dejavu learn %s --map FILE` makes a map untrained"
                 log.warning(text, " and ".join(beaten), anew)
 

@@ -309,9 +309,8 @@ class PlaceRecognitionTask(Trainee):
             if self.made:
                 raise
             cure = "BatchNorm1d(D, affine=False) at the end of the backbone, or a SpectralMapper"
-            raise NothingLearned(
-                f"{error}; templates need features of equal scale: expected {cure}"
-            ) from error
+            seen = f"{error}; templates need features of equal scale"
+            raise NothingLearned(f"{seen}: expected {cure}") from error
 
     on_train_end = _check_learned
 
