@@ -14,7 +14,7 @@ import numpy as np
 from benchmarks.measure import Column, Contender, Row, bars, new_row, table, threads, with_ratios, write_bench
 from dejavu_torch.cluster import Cluster, code_on
 from dejavu_torch.data.arrays import read_array
-from dejavu_torch.data.frame_range import FrameRange
+from dejavu_torch.data.traverse import FrameRange
 from dejavu_torch.data.simulate.aerial import AerialRoad
 from dejavu_torch.learning import ChunkCoder
 from dejavu_torch.maps.spectral import SpectralMapper
@@ -53,7 +53,7 @@ def run_cluster(*, out: Path) -> list[str]:
         route = read_array(path)
         model = DejaVu(mapper=SpectralMapper(4.0, chunk=CHUNK)).learn(FrameRange(route, stop=SAMPLE))
         assert isinstance(model.map, SpectralMap)
-        coder = ChunkCoder.like(model.map, model.describer, route.count())
+        coder = ChunkCoder.like(model.map, model.descriptor, route.count())
         rows = timed(contenders_of(coder, route, cluster))
     write_bench(out, rows, bars(rows))
     faster = [row | {"faster": rows[0]["seconds"] / row["seconds"]} for row in rows]

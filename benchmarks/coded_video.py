@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.frame_range import IndexedTraverse
+from dejavu_torch.data.traverse import IndexedTraverse
 from dejavu_torch.resize import resize_frames
 from dejavu_torch.types import InputError, Traverse
 

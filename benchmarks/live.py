@@ -140,7 +140,7 @@ def long_model(video: Video, places: int, numbers: int) -> tuple[DejaVu, int]:
     """A model whose map holds the frames of a video among many places, and the place of the first one."""
     model = DejaVu(HOG(), Whitening(numbers=numbers)).eval()
     assert model.whitening is not None
-    features = torch.cat([model.describe(batch) for batch in video.batches(16)])
+    features = torch.cat([model.descriptor.describe(batch) for batch in video.batches(16)])
     generator = torch.Generator().manual_seed(0)
     noise = NOISE * features.std(0) * torch.randn(features.shape, generator=generator)
     model.whitening.learn(features, [(features + noise, torch.arange(len(features)))])
@@ -164,11 +164,11 @@ def parts_of(model: DejaVu, video: Video, every: int) -> dict[str, float]:
     decoded = sum(1 for _ in video.batches(1))
     seconds = {"decoding": (time.perf_counter() - began) / decoded}
     (frame,) = video.between(0, 1)
-    features, unpacked = model.describe(frame), whitening.unpacked()
+    features, unpacked = model.descriptor.describe(frame), whitening.unpacked()
     descriptor = whitening(features, unpacked)
     scores, state = model.map.scores(descriptor), filter.start(model.map.places)
     works: dict[str, Callable[[], object]] = {
-        "features": lambda: model.describe(frame),
+        "features": lambda: model.descriptor.describe(frame),
         "whitening": lambda: whitening(features, unpacked),
         "search": lambda: model.localize_descriptors(descriptor),
     }

@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dejavu_torch.data.frame_range import IndexedTraverse
+from dejavu_torch.data.traverse import IndexedTraverse
 from dejavu_torch.types import InputError
 
 REACH = 2048  # places on either side that influence a made descriptor, at most

@@ -229,7 +229,7 @@ def random_model(frames: Tensor, route: Tensor, generator: torch.Generator) -> D
     """HOG with a whitening and a map of random numbers, which take as long as learned ones."""
     whitening = Whitening(numbers=NUMBERS)
     model = DejaVu(HOG(), whitening, SpectralMapper(None, step=0.05))
-    features = model.describe(frames[:1]).shape[1]
+    features = model.descriptor.describe(frames[:1]).shape[1]
     projection = torch.randn(features, NUMBERS, generator=generator)
     whitening.take(torch.rand(features, generator=generator), projection, None)
     model.learn_features(F.normalize(route, dim=1))

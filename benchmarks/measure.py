@@ -28,7 +28,7 @@ from tqdm import tqdm
 
 import dejavu_torch
 from benchmarks.plots import plot_ratios
-from dejavu_torch.data.frame_range import IndexedTraverse
+from dejavu_torch.data.traverse import IndexedTraverse
 from dejavu_torch.data.ground_truth import GroundTruth
 from dejavu_torch.data.output import whole_folder
 from dejavu_torch.evaluation.plots import Plot

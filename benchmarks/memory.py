@@ -37,7 +37,7 @@ from benchmarks.measure import (
     write_bench,
 )
 from benchmarks.scale_contenders import Mapped
-from dejavu_torch.data.frame_range import IndexedTraverse
+from dejavu_torch.data.traverse import IndexedTraverse
 from dejavu_torch.data.output import temporary_folder
 from dejavu_torch.data.simulate.aerial import HEIGHT, VIEW, paint_route
 from dejavu_torch.features.hog import HOG
@@ -74,9 +74,9 @@ class Held(Store):
     def learn(self, route: IndexedTraverse, path: Path) -> int:
         model, fixed = self.model, {}
         if model.whitening is None:
-            held = model.extract_all(route)
+            held = model.descriptor.all_of(route)
         else:
-            held, fixed = model.describe_reference(route), model.whitening.state_dict()
+            held, fixed = model.descriptor.learn(route), model.whitening.state_dict()
         save_file({"held": held, **fixed}, path)
         return held.nbytes
 
@@ -88,7 +88,7 @@ class Held(Store):
         lengths = torch.linalg.vector_norm(held, dim=1).square()
 
         def find(frames: Tensor) -> tuple[Tensor, Tensor]:
-            score, place = (lengths - 2 * model.whitened(model.describe(frames)) @ held.T).min(1)
+            score, place = (lengths - 2 * model.descriptor.whitened(model.descriptor.describe(frames)) @ held.T).min(1)
             return score, place
 
         return find
@@ -102,10 +102,10 @@ class Faiss(scale_contenders.Faiss):
         self.model = DejaVu(whitening="none").eval()
 
     def parts(self, route: IndexedTraverse) -> Iterable[Tensor]:
-        return self.model.describer.descriptors(route)
+        return self.model.descriptor.batches(route)
 
     def describe(self, queries: Tensor) -> Tensor:
-        return self.model.describe(queries)
+        return self.model.descriptor.describe(queries)
 
 
 CONTENDERS: dict[str, Store] = {

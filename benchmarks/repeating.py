@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dejavu_torch.data.frame_range import IndexedTraverse
+from dejavu_torch.data.traverse import IndexedTraverse
 from dejavu_torch.data.simulate.aerial import TILES, AerialRoad
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.maps.quantisation import quantise
@@ -30,7 +30,7 @@ def tiles_of(model: DejaVu) -> dict[str, Tensor]:
     assert isinstance(model.features, HOG)
     assert model.whitening is not None
     whitening, road = model.whitening, AerialRoad(frames=max(TILES), ground="repeat", noise=0, drift=0, yaw=0)
-    features = torch.cat([model.describe(part) for part in road.batches(64)])
+    features = torch.cat([model.descriptor.describe(part) for part in road.batches(64)])
     middle = features.shape[1] // 7 * 3  # rows of blocks: three see the first tile
     (whole,), scale = whitening.unpacked(), whitening.scale
     first = features[: TILES[0], :middle] @ whole[:middle] * scale - whitening.offset

@@ -42,7 +42,7 @@ from benchmarks.scale_report import RECALL, exponents, pictured, scale_row, scal
 from benchmarks.template_search import PLACES as TEMPLATES
 from benchmarks.template_search import bench_templates
 from dejavu_torch.cli.device import device_of
-from dejavu_torch.data.frame_range import FrameRange, IndexedTraverse
+from dejavu_torch.data.traverse import FrameRange, IndexedTraverse
 from dejavu_torch.data.output import temporary_folder
 from dejavu_torch.data.simulate.aerial import LONGEST, AerialRoad
 from dejavu_torch.evaluation.curves import evaluate
@@ -223,7 +223,7 @@ class Folder:
     def __init__(self, path: Path, drawn: int) -> None:
         self.path, self.model = path, DejaVu(HOG())  # `tiles_of` splits it
         first, self.second = AerialRoad(frames=drawn), AerialRoad(frames=drawn, traverse=1)
-        self.model.describe_reference(FrameRange(first, 0, min(drawn, DESCRIBED)))
+        self.model.descriptor.learn(FrameRange(first, 0, min(drawn, DESCRIBED)))
         self.keep("drawn", drawn, self.seen(first, range(drawn)))
         shown, places = spread(drawn), torch.from_numpy(np.load(path / "drawn.npy"))
         self.like: Likeness = likeness(places, self.described(self.second, shown), shown)
@@ -256,7 +256,7 @@ class Folder:
     @torch.no_grad()
     def seen(self, road: AerialRoad, frames: range) -> Iterator[Tensor]:
         for part in road.select(frames, 64):
-            yield self.model.whitened(self.model.describe(part))
+            yield self.model.descriptor.whitened(self.model.descriptor.describe(part))
 
     def keep(self, name: str, places: int, parts: Iterator[Tensor]) -> None:
         """Write descriptors as they are made.

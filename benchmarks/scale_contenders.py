@@ -14,7 +14,7 @@ from torch import Tensor
 
 from benchmarks.measure import OURS, Find, Store
 from benchmarks.repeating import step_that_holds
-from dejavu_torch.data.frame_range import IndexedTraverse
+from dejavu_torch.data.traverse import IndexedTraverse
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import DejaVu

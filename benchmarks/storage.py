@@ -120,7 +120,7 @@ class Route(NamedTuple):
         """The other route, to learn something on."""
         if self.other is None:
             raise InputError(f"no other route to {what}; expected --codebooks SOURCE")
-        self.model.describer.check_sizes(self.reference, self.other)
+        self.model.descriptor.check_sizes(self.reference, self.other)
         return self.other
 
 
@@ -229,13 +229,13 @@ def model_by(whitening: DejaVu | None) -> DejaVu:
     """A default model, with the whitening of another if given."""
     model = DejaVu()
     if whitening is not None:
-        model.take_whitening(whitening)
+        model.descriptor.take(whitening.descriptor, whitening=True)
     return model
 
 
 def check(model: DejaVu, reference: Traverse, query: Traverse, truth: str | None = None) -> None:
     """Refuse early a pair that does not fit the model or each other."""
-    features, whitening = model.describer.check_sizes(reference, query), model.whitening
+    features, whitening = model.descriptor.check_sizes(reference, query), model.whitening
     if whitening is not None and whitening.learned and sum(whitening.sizes) != features:
         raise InputError(
             f"the whitening is of {sum(whitening.sizes)} features and {reference.name} gives {features} "
@@ -265,8 +265,8 @@ def described(
 
 def both(model: DejaVu, reference: Traverse, query: Traverse) -> tuple[Tensor, Tensor]:
     """Descriptors of the reference, from which a missing whitening is learned, and of the query."""
-    places = model.describe_reference(reference, None, True)
-    return places.float(), model.extract_all(query, True).float()
+    places = model.descriptor.learn(reference, None, True)
+    return places.float(), model.descriptor.all_of(query, True).float()
 
 
 def contenders_of(route: Route, given: Mapping[str, DejaVu] | None = None) -> Iterator[Contender]:
@@ -317,7 +317,7 @@ def stores_of(route: Route) -> Iterator[Contender]:
 
     @cache
     def elsewhere() -> Tensor:
-        return route.model.extract_all(route.another("train codebooks on")).float()
+        return route.model.descriptor.all_of(route.another("train codebooks on")).float()
 
     @cache  # one training for all strides
     def quantiser(key: str, multiple: int, own: bool) -> Quantiser:
@@ -355,7 +355,7 @@ def named(code: str, k: int) -> str:
 def video(route: Route, codec: str, crf: int, k: int) -> Kept:
     """Every k-th frame, coded, decoded and described, with interpolated descriptors."""
     coded = CodedVideo(route.reference, codec, crf, step=k)
-    keys, count = route.model.extract_all(coded).float(), len(route.places)
+    keys, count = route.model.descriptor.all_of(coded).float(), len(route.places)
     if k > 1 and (count - 1) % k:  # the last place is decoded as the last one stored
         keys = torch.cat([keys, keys[-1:]])
     return Kept(between_keyframes(keys, count, k) if k > 1 else keys, coded.bytes)
@@ -366,8 +366,8 @@ def by_other_whitening(route: Route, name: str) -> Answer:
     model = DejaVu(whitening=Whitening(**WHITENINGS.get(name, {})))
     if name not in WHITENINGS:
         source = DejaVu()
-        source.describe_reference(route.another("learn a whitening on"))
-        model.take_whitening(source)
+        source.descriptor.learn(route.another("learn a whitening on"))
+        model.descriptor.take(source.descriptor, whitening=True)
     places, queries = both(model, route.reference, route.query)
     again = route._replace(model=model, places=places, queries=queries)
     return among(again, partial(spectral, places, WHITENED))
@@ -383,7 +383,7 @@ def among(route: Route, keep: Callable[[], Kept]) -> Answer:
 def by_map(route: Route, made: Callable[[], DejaVu]) -> Answer:
     """A map with its own descriptors."""
     model = made()
-    found = model.localize_descriptors(model.extract_all(route.query), route.matching)
+    found = model.localize_descriptors(model.descriptor.all_of(route.query), route.matching)
     summary = model.summary()
     return found.renumbered(model.map.table.scored), summary.route_bytes, summary.fixed_bytes
 

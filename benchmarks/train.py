@@ -93,7 +93,7 @@ def trained(
             default_root_dir=folder,
         ).fit(task, datamodule=data)
     model = task.deployed()
-    places, queries = model.extract_all(reference), model.extract_all(query)
+    places, queries = model.descriptor.all_of(reference), model.descriptor.all_of(query)
     auc, recall = {}, {}
     for budget in BUDGETS:
         model.mapper = SpectralMapper(budget)

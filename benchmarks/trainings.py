@@ -130,7 +130,7 @@ class Judge:
 
     def of(self, contender: str, model: DejaVu, seed: int | None = None) -> list[Row]:
         """Rows for maps of a model's descriptors by size, or for its templates, and for their nulls."""
-        places, queries = model.extract_all(self.reference), model.extract_all(self.query)
+        places, queries = model.descriptor.all_of(self.reference), model.descriptor.all_of(self.query)
         rows = []
         for name, mapper in SIZES.items() if isinstance(model.map, SpectralMap) else [("", None)]:
             if mapper is not None:

@@ -11,7 +11,7 @@ import sys
 import sysconfig
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from functools import lru_cache
 from itertools import pairwise
@@ -23,13 +23,12 @@ import torch
 from torch import Tensor, nn
 
 from dejavu_torch.data.output import SIGNALS
-from dejavu_torch.learning import ChunkCoder
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.maps.spectral_map import Chunk, SpectralMap
 from dejavu_torch.recognition.coarse import coarse_search
 from dejavu_torch.recognition.search import Best, Search, Wanted, num_needed, search
-from dejavu_torch.text import one_line, progress_of
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.text import one_line
+from dejavu_torch.types import InputError
 
 AUTO = "auto"
 RETRIES = 3  # of a task whose worker died
@@ -75,27 +74,35 @@ class Cluster:
     def __exit__(self, *_: object) -> None:
         self.ray.shutdown()  # with the workers that `auto` started
 
-    def code(
-        self, coder: ChunkCoder, traverse: Traverse, tasks: Sequence[range]
-    ) -> Iterator[tuple[range, list[Chunk], str]]:
-        """Code chunks of a traverse, in tasks that are ranges of chunks. Yields each finished task with its
-        chunks and the error that ended it early, or "". The task of a dead worker runs again."""
-        remote = self.ray.remote(num_cpus=1, max_retries=RETRIES)(_code)
-        with _by_value(self.ray, (coder, traverse)):
-            sent = [self.ray.put((coder, traverse))]
-        waiting, running = deque(tasks), dict[Any, range]()
+    def map(self, encode: Callable[[range], Chunk], tasks: list[range]) -> Iterator[Chunk]:
+        """As `map`: the same bytes in the same order. Short chunks are encoded several at a time, and the
+        task of a dead worker runs again.
+
+        Raises:
+            InputError: a chunk failed; all chunks before it have been yielded.
+        """
+        together = max(1, TASK // max(len(task) for task in tasks))
+        remote = self.ray.remote(num_cpus=1, max_retries=RETRIES)(_encode)
+        with _by_value(self.ray, vars(encode).values()):
+            sent = [self.ray.put(encode)]
+        waiting = deque(tasks[i : i + together] for i in range(0, len(tasks), together))
+        running: deque[tuple[list[range], Any]] = deque()
         try:
             while waiting or running:
                 while waiting and len(running) < AHEAD * self.workers:
                     task = waiting.popleft()
-                    running[remote.remote(sent, task, os.getcwd())] = task
-                done, _ = self.ray.wait(list(running))
-                for one in done:
-                    yield running.pop(one), *self._result(one)
+                    running.append((task, remote.remote(sent, task, os.getcwd())))
+                task, reference = running[0]
+                done, failure = self._result(reference)
+                running.popleft()
+                yield from done
+                if failure:
+                    frames = task[len(done)]
+                    raise InputError(f"frames {frames.start} to {frames.stop - 1}{failure}")
         finally:
-            for one in running:
+            for _, reference in running:
                 with suppress(Exception):
-                    self.ray.cancel(one, force=True)
+                    self.ray.cancel(reference, force=True)
 
     def _result(self, reference: Any) -> tuple[list[Chunk], str]:
         try:
@@ -105,45 +112,6 @@ class Cluster:
         except self.ray.exceptions.RayError as error:
             seen = f"its worker died, {RETRIES + 1} times ({one_line(error)[:100]})"
             return [], f": {seen}; expected workers that stay alive, with enough memory"
-
-
-def code_on(
-    cluster: Cluster,
-    coder: ChunkCoder,
-    traverse: Traverse,
-    wanted: range,
-    label: str | None = None,
-    together: int = 0,
-) -> Iterator[Chunk]:
-    """As `ChunkCoder.chunks`, on a cluster: the same bytes in the same order.
-
-    Every worker reads a traverse that cannot seek from its beginning, so its chunks form few tasks.
-
-    Args:
-        together: chunks of a task; 0 is those of `TASK` places.
-
-    Raises:
-        InputError: a chunk failed; all chunks before it have been yielded.
-    """
-    together = together or max(1, TASK // coder.chunk)
-    if not traverse.seeks:
-        together = max(together, -(-len(wanted) // cluster.workers))
-    tasks = [wanted[i : i + together] for i in range(0, len(wanted), together)]
-    done: dict[int, Chunk] = {}
-    failed: dict[int, str] = {}
-    following = wanted.start
-    with progress_of(label, len(range(*coder.span(wanted)))) as update:
-        for task, chunks, failure in cluster.code(coder, traverse, tasks):
-            done |= zip(task, chunks, strict=False)
-            update(sum(chunk.places for chunk in chunks))
-            if failure:
-                start, stop = coder.span(task[len(chunks) :])
-                failed[task[len(chunks)]] = f"frames {start} to {stop - 1}{failure}"
-            while following in done:
-                yield done.pop(following)
-                following += 1
-            if following in failed:
-                raise InputError(failed[following])
 
 
 class ClusterSearch:
@@ -226,19 +194,18 @@ def _processors() -> int:
 
 @lru_cache(1)
 def _received(reference: Any) -> Any:
-    """Coder and traverse, unpacked once by each worker process instead of for each task."""
+    """The encoder, unpacked once by each worker process instead of for each task."""
     return check_installed().get(reference)
 
 
-def _code(sent: list[Any], task: range, folder: str) -> tuple[list[Chunk], str]:
-    """In a worker: the chunks of a task, and the error that ended it early, or ""."""
+def _encode(sent: list[Any], tasks: list[range], folder: str) -> tuple[list[Chunk], str]:
+    """In a worker: the chunks of some tasks, and the error that ended them early, or ""."""
     with suppress(OSError):
         os.chdir(folder)
-    coder, traverse = _received(sent[0])
+    encode: Callable[[range], Chunk] = _received(sent[0])
     chunks: list[Chunk] = []
     try:
-        for chunk in coder.chunks(traverse, task):
-            chunks.append(chunk)
+        chunks.extend(map(encode, tasks))
     except (InputError, OSError, RuntimeError, MemoryError) as error:
         kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
         return chunks, f", read on {socket.gethostname()}: {kind}{one_line(error)}"

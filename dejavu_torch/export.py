@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from dejavu_torch.data.output import check_output_file, whole_file
 from dejavu_torch.features.extract import in_mode
 from dejavu_torch.maps.spectral_map import SpectralMap
-from dejavu_torch.model import DejaVu
+from dejavu_torch.model import DejaVu, require_map
 from dejavu_torch.recognition.calibration import MARGIN
 from dejavu_torch.recognition.calibration import TOLERANCE as TOLERANCE_OF_MARGIN
 from dejavu_torch.recognition.sequence import SequenceMatcher
@@ -147,7 +147,7 @@ def export_onnx(model: DejaVu, path: str | Path, sequence: SequenceModel | None 
         except ImportError as error:
             seen = f"an export needs {name}, which cannot be imported ({one_line(error)})"
             raise InputError(f"{seen}; expected it: pip install 'dejavu_torch[export]'") from error
-    model.require_map()
+    require_map(model)
     if model.map.routes:
         routes = ", ".join(route.name for route in model.map.routes)
         raise InputError(f"the map has the routes {routes}; expected to export the map of each")

@@ -12,18 +12,17 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dejavu_torch import learning
-from dejavu_torch.data.frame_range import chained
 from dejavu_torch.data.ground_truth import find_ground_truth
-from dejavu_torch.data.names import names_of
 from dejavu_torch.data.positions import positions_behind
 from dejavu_torch.data.source import Source, as_traverse
+from dejavu_torch.data.traverse import chained
 from dejavu_torch.features.views import Views
 from dejavu_torch.maps.file import checksums, digests
 from dejavu_torch.maps.frame_table import FrameTable
 from dejavu_torch.maps.spectral import HALF, SpectralMapper, code_chunk
 from dejavu_torch.maps.spectral_map import LARGEST, Chunk, SpectralMap
-from dejavu_torch.model import DejaVu
-from dejavu_torch.model_file import Recipe, difference, recipe_of, run_key, weights_of
+from dejavu_torch.model import DejaVu, features_per_frame, require_map
+from dejavu_torch.model_file import ModelState, Recipe, difference, recipe_of, run_key, weights_of
 from dejavu_torch.motion.resampling import ResampledTraverse, source_of
 from dejavu_torch.types import InputError, Traverse
 
@@ -39,7 +38,7 @@ def append(
     traverse: Source,
     progress: bool = False,
     checkpoint: learning.Checkpoint | None = None,
-    code: learning.Code = learning.ChunkCoder.chunks,
+    map_tasks: learning.MapTasks = map,
     visits: Views | None = None,
 ) -> DejaVu:
     """Append the places of a traverse to a model's map, whose own places stay unchanged.
@@ -48,7 +47,7 @@ def append(
         model: with a spectral map of one route.
         traverse: frames like the map's. If the map's places are even steps along the ground, the traverse is
             resampled likewise, and its first frame is the next place.
-        progress, checkpoint, code: see `DejaVu.learn`.
+        progress, checkpoint, map_tasks: see `DejaVu.learn`.
         visits: frames of another traverse of the new places, averaged in before coding, see `learn_mean`.
 
     Returns:
@@ -72,7 +71,7 @@ def append(
     route = one_route(model, "append to")
     added = model.resample(as_traverse(traverse), model.step, progress, model.frame_shape)
     _check_compatible(model, added)
-    places = added.count()
+    places = len(added)
     positions = learning.positions_of(added).to(route.positions.device)
     _check_count(route.places + places, model.step is not None)
     counts = None
@@ -83,9 +82,9 @@ def append(
     grown.positions = route.positions[:0]  # set when all places are appended
     if checkpoint is not None:
         own = digests(base=checksums(route.packed(), route.get_extra_state()))
-        checkpoint.open(run_key(model, added, visits=visits) | own, added, grown, model.whitening)
-    label = "learning" if progress else None
-    learning.append_places(grown, model.describer, added, route.places, visits, label, checkpoint, code)
+        checkpoint.open(run_key(model, added, visits=visits) | own, grown, model.descriptor)
+    settings = visits, progress, checkpoint, map_tasks
+    learning.append_places(grown, model.descriptor, added, route.places, *settings)
     if counts is not None:
         before = grown.visit_counts
         grown.count_visits(before + F.pad(counts.to(before), (route.places, 0)))
@@ -94,7 +93,7 @@ def append(
     grown.check()
     _warn_held(route, grown, getattr(model.mapper, "hold", None))
     frames = len(positions) or places
-    names = [model.frame_names, names_of(source_of(added), frames)]
+    names = [model.frame_names, [*source_of(added).names]]
     model.frame_names = _joined_names(names, [route.table.frames, frames])
     return model.replace_map(grown)
 
@@ -120,15 +119,15 @@ def learn_mean(
     progress: bool = False,
     second: Views | None = None,
     checkpoint: learning.Checkpoint | None = None,
-    code: learning.Code = learning.ChunkCoder.chunks,
+    map_tasks: learning.MapTasks = map,
 ) -> DejaVu:
     """As `DejaVu.learn`, from the mean of several visits to each place, which cancels what changes.
 
     Args:
         visits: frames of another traverse and their places, see `associate`. A place with k of these frames
             becomes the mean of k + 1 descriptors, see `map.visit_counts`.
-        traverse, progress, second, checkpoint, code: see `DejaVu.learn`. Whitening learns from these, not
-            from `visits`.
+        traverse, progress, second, checkpoint, map_tasks: see `DejaVu.learn`. Whitening
+            learns from these, not from `visits`.
 
     Raises:
         InputError: as `DejaVu.learn`, a mapper of templates, which are means already, or visits that do not
@@ -144,7 +143,7 @@ def learn_mean(
     if not isinstance(model.mapper, SpectralMapper):
         seen = f"{type(model.mapper).__name__} makes templates, which are means of many places already"
         raise InputError(f"{seen}; expected a SpectralMapper to average visits")
-    return model.learn(traverse, progress, second, checkpoint, code, visits)
+    return model.learn(traverse, progress, second, checkpoint, map_tasks, visits)
 
 
 @torch.no_grad()
@@ -167,7 +166,7 @@ def average(model: DejaVu, visits: Views, progress: bool = False) -> int:
     route = one_route(model, "average visits into")
     _check_compatible(model, visits.traverse)
     counts, seen = route.visit_counts.cpu(), learning.observation_counts(visits, route.places)
-    descriptors, places = model.describer.visits(visits, "averaging" if progress else None)
+    descriptors, places = learning.descriptors_of(model.descriptor, visits, progress)
 
     def averaged(g: int, chunk: Chunk) -> Chunk:
         start, stop = route.chunks[g]
@@ -201,11 +200,11 @@ def associate(model: DejaVu, reference: Traverse | None, second: Traverse, truth
         table, shape, step = one_route(model, "average visits into").table, model.frame_shape, model.step
         name, source = "the map", None
     else:
-        table = FrameTable(reference.count(), learning.positions_of(reference))
-        shape = model.fit(reference, model.frame_shape if model.map.places else None).frame_shape
+        table = FrameTable(len(reference), learning.positions_of(reference))
+        shape = model.at_map_size(reference, model.frame_shape if model.map.places else None).frame_shape
         step, name, source = getattr(reference, "step", None), reference.name, source_of(reference)
     second = model.resample(second, step, shape=shape)
-    frames = second.count()
+    frames = len(second)
     numbers = second.frame if isinstance(second, ResampledTraverse) else frames
     found = find_ground_truth(
         truth, source, source_of(second), table.frames, numbers, resampled=step is not None, aligned=True
@@ -235,7 +234,7 @@ def second_traverse(
         InputError: no whitening that learns, another number of truths, other frame sizes, or as `associate`.
     """
     visits = [second] if isinstance(second, Traverse) else [*second]
-    model.describer.require_learning(" + ".join(one.name for one in visits))
+    model.descriptor.require_learning(" + ".join(one.name for one in visits))
     truths = [truth] if isinstance(truth, str | None) else [*truth]
     truths *= len(visits) if len(truths) == 1 else 1
     if len(truths) != len(visits):
@@ -264,7 +263,7 @@ def calibrate_if_possible(
 
 def one_route(model: DejaVu, verb: str) -> SpectralMap:
     """The spectral map of a model; InputError if it has none, another kind, or one of several routes."""
-    model.require_map(f" to {verb}")
+    require_map(model, f" to {verb}")
     route = model.map
     if route.routes:
         names = ", ".join(one.name for one in route.routes)
@@ -320,10 +319,10 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
         | {"threshold": first.threshold if len(thresholds) == 1 else None}
     )
     merged.weight_bits = first.weight_bits
-    merged.frame_shape, merged.step = first.frame_shape, first.step
-    merged.trained = first.trained if all(model.trained == first.trained for model in models) else None
     frames = [model.map.table.frames for model in models]
-    merged.frame_names = _joined_names([model.frame_names for model in models], frames)
+    trained = first.trained if all(model.trained == first.trained for model in models) else None
+    names = _joined_names([model.frame_names for model in models], frames)
+    merged.state = ModelState(first.frame_shape, first.step, trained, names)
     dropped = [
         *["thresholds"] * (len(thresholds) > 1),
         *["calibration"] * any(model.calibration is not None for model in models),
@@ -394,7 +393,7 @@ def _check_compatible(model: DejaVu, added: Traverse) -> None:
             for one in (shape, own)
         )
         raise InputError(f"{added.name} has {seen}, the map was learned from {known}; expected the same")
-    count, expected = model.describer.count_features(added), model.features_per_frame
+    count, expected = model.descriptor.count_features(added), features_per_frame(model)
     if count != expected:
         raise InputError(f"{added.name} gives {count} features per frame; expected {expected}, as in the map")
 

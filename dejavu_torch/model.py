@@ -7,33 +7,29 @@ import inspect
 import logging
 import math
 from collections.abc import Iterator
+from dataclasses import fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn.parameter import is_lazy
 
 from dejavu_torch import learning, model_file
-from dejavu_torch.data.fitted import at_size, resize_like, size_like
-from dejavu_torch.data.names import names_of
 from dejavu_torch.data.source import Source, as_traverse
-from dejavu_torch.features.distilled import Distilled
-from dejavu_torch.features.extract import Pipeline, as_weights, features_of
-from dejavu_torch.features.hog import HOG
-from dejavu_torch.features.joined import Joined
+from dejavu_torch.data.traverse import at_size, resize_like, size_like
+from dejavu_torch.features.descriptor import Descriptor, own_size
+from dejavu_torch.features.extract import features_of
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import Views
-from dejavu_torch.features.whitening import WIDEST, Whitening
+from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.maps.file import checked_fields
 from dejavu_torch.maps.place_map import Mapper, PlaceMap
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.maps.weights import BITS, round_weights
-from dejavu_torch.memory import concatenate
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse, resampled, source_of
-from dejavu_torch.recognition.calibration import Calibration
 from dejavu_torch.recognition.coarse import CoarseSearch, coarse_search
 from dejavu_torch.recognition.localizer import Localizer, Matching
 from dejavu_torch.recognition.sample_file import check_searches, kept_search
@@ -41,11 +37,17 @@ from dejavu_torch.recognition.search import SCORES_AT_ONCE, Find, Search, check_
 from dejavu_torch.recognition.select import HIGHEST, PROBABLE, Acceptance, check_candidates
 from dejavu_torch.resize import reduced_size
 from dejavu_torch.text import with_progress
-from dejavu_torch.types import BATCH_NUMBERS, InputError, Match, SequenceModel, Training, Traverse
+from dejavu_torch.types import InputError, Match, SequenceModel, Traverse
+
+if TYPE_CHECKING:
+    from dejavu_torch.recognition.calibration import Calibration
+    from dejavu_torch.types import Training
 
 log = logging.getLogger("dejavu_torch")
 
 MANY_FEATURES = 50_000  # per frame: more are warned of
+DESCRIBES = ("preprocess", "features", "whitening", "batch_size", "weight_bits")  # of the descriptor
+STATE = [field.name for field in fields(model_file.ModelState)]
 
 
 class DejaVu(nn.Module):
@@ -71,6 +73,13 @@ class DejaVu(nn.Module):
 
     Shape: forward: frames (Q,C,H,W) or features (Q,D) -> scores (Q,N), lower is better.
 
+    Attributes:
+        descriptor: makes descriptors of frames: preprocess, features and whitening, which are attributes of
+            the model too.
+        map: the `PlaceMap`, empty before `learn`.
+        state: what else is known of the route, whose fields are attributes of the model too; see
+            `ModelState`.
+
     Convention: a match counts places; `map.frame_of` gives the reference frame of a place. `forward` is a
         fixed sequence of tensor operations without host synchronisation: it supports `torch.export` with a
         dynamic batch and `torch.compile(fullgraph=True)`.
@@ -84,6 +93,17 @@ class DejaVu(nn.Module):
         >>> DejaVu().learn(wave).localize(wave[20:22]).index  # the spectral map
         tensor([20, 21])
     """
+
+    preprocess: Preprocess
+    features: nn.Module
+    whitening: Whitening | None
+    batch_size: int
+    weight_bits: int
+    frame_shape: tuple[int, ...] | None
+    step: float | None
+    trained: Training | None
+    frame_names: list[str]
+    calibration: Calibration | None
 
     def __init__(
         self,
@@ -111,10 +131,11 @@ class DejaVu(nn.Module):
         check_precision(precision)
         if precision is not None and threshold is not None:
             raise InputError(f"threshold is {threshold} and precision is {precision}; expected one of them")
-        self.preprocess = Preprocess() if preprocess is None else preprocess
         self.mapper = SpectralMapper() if mapper is None else mapper
-        whitens = (whitening is None and self.mapper.whitens) or isinstance(whitening, Whitening)
-        self.features = default_features(whitens) if features is None else features
+        if whitening is None and self.mapper.whitens:
+            whitening = Whitening()
+        whitening = whitening if isinstance(whitening, Whitening) else None
+        self.descriptor = Descriptor(preprocess, features, whitening, batch_size, weight_bits)
         for module in self.features.modules():  # a file cannot be loaded into expanded buffers
             for name, buffer in module.named_buffers(recurse=False):
                 if not is_lazy(buffer):
@@ -122,27 +143,29 @@ class DejaVu(nn.Module):
         if weight_bits == 8 and not round_weights(self.features):
             seen = f"weight_bits is 8, but {type(self.features).__name__} has no float32 weights of 2 or more"
             raise InputError(f"{seen} dimensions (lazy layers: not yet); expected 32")
-        self.weight_bits = weight_bits
-        if whitening is None and whitens:
-            whitening = Whitening()
-        self.whitening = whitening if isinstance(whitening, Whitening) else None
-        self._whitens = self.whitening is not None  # if not, wide features are whitened nevertheless
         self.threshold = None if threshold is None else float(min(threshold, HIGHEST))
         self.precision = precision
-        self.batch_size = batch_size
         self.velocity = velocity
         self.map: PlaceMap = self.mapper.empty()
-        self.step: float | None = None  # pixels of ground from one place of the map to the next
-        self.frame_shape: tuple[int, ...] | None = None  # of the reference, or (D,) of ready features
-        self.frame_names: list[str] = []  # of the reference; empty if it has none
-        self.trained: Training | None = None
-        self.calibration: Calibration | None = None
+        self.state = model_file.ModelState()
         self.search: Search = "auto"  # for single queries, see `localize`
         self.search_memory: int | None = None  # bytes of the samples, see `coarse.plan`
         self.search_file: Path | str | None = None  # keeps the samples for other processes
         self.find: Find | None = None  # replaces the search, such as by a cluster
         self._coarse: tuple[tuple[Any, ...], CoarseSearch | None] = (), None  # a search and its key
-        self._warned: set[tuple[str, str]] = set()  # (traverse, line) of warnings that were logged
+
+    def __getattr__(self, name: str) -> Any:
+        if name in DESCRIBES:
+            return getattr(self._modules["descriptor"], name)
+        return getattr(self.__dict__["state"], name) if name in STATE else super().__getattr__(name)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in DESCRIBES:
+            setattr(self.descriptor, name, value)
+        elif name in STATE:
+            setattr(self.state, name, value)
+        else:
+            super().__setattr__(name, value)
 
     def settings(self) -> dict[str, Any]:
         """The constructor's arguments now: `DejaVu(**model.settings())` is the same model without a map.
@@ -151,7 +174,7 @@ class DejaVu(nn.Module):
         such as the features, are this model's own.
         """
         own = {name: getattr(self, name) for name in inspect.signature(DejaVu).parameters}
-        whitening = self.whitening
+        whitening = None if self.descriptor.reduces else self.whitening
         if whitening is not None and not whitening.fixed:
             whitening = copy.deepcopy(whitening)
         return own | {"whitening": whitening or "none"}
@@ -162,20 +185,20 @@ class DejaVu(nn.Module):
         progress: bool = False,
         second: Views | None = None,
         checkpoint: learning.Checkpoint | None = None,
-        code: learning.Code = learning.ChunkCoder.chunks,
+        map_tasks: learning.MapTasks = map,
         visits: Views | None = None,
     ) -> DejaVu:
         """Section III-A: features, what repeats in them, and the map.
 
         Args:
-            traverse: the reference: a Traverse, what `open_source` opens, or an array or tensor of frames or
-                features, see `ArrayTraverse`.
+            traverse: the reference: a Traverse, what `open_source` opens, an array or tensor of frames or
+                features (see `ArrayTraverse`), or a list or dataset of frames (see `Frames`).
             second: another traverse of the same places, from which whitening learns what changes between
                 visits, instead of from augmented copies; see `growth.second_traverse`.
             progress: show a progress bar on a terminal, elsewhere a line per minute, on stderr.
             checkpoint: keeps the partial map of a long route, so that learning can resume after a kill; the
                 caller removes it.
-            code: codes the chunks of a long route: in this process, or on a cluster.
+            map_tasks: encodes the chunks of a long route, as `map` in this process, or on a cluster.
             visits: see `growth.learn_mean`.
 
         Returns:
@@ -185,40 +208,36 @@ class DejaVu(nn.Module):
 
         Convention: the descriptors (N,K) and a few copies of them are in memory. On a route longer than
             `SAMPLE` frames and one chunk, a spectral map learns whitening, mean and step from a sample, see
-            `learning.Sample`, and only a chunk, the sample and the map are in memory.
+            `Sample`, and only a chunk, the sample and the map are in memory.
 
         Raises:
             InputError: no frames, too few, NaN, or mixed sizes; features that depend on other frames. The
                 model stays unchanged.
         """
         traverse = self.resample(as_traverse(traverse), progress=progress)
-        describer, label = self._describer_of(traverse), "learning" if progress else None
-        mapper = self.mapper.with_overhead(learning.positions_of(traverse).nbytes)
-        route: PlaceMap
-        counts: Tensor | None = None
+        descriptor, mapper, counts = self.descriptor, self.mapper, None
         if visits is not None:
-            describer.check_sizes(traverse, visits.traverse)
-            counts = learning.observation_counts(visits, traverse.count())
-        if isinstance(mapper, SpectralMapper) and learning.is_long(traverse, mapper.chunk):
-            route = mapper.empty().to(describer.device)
-            resumed = checkpoint is not None and checkpoint.open(
-                model_file.run_key(self, traverse, second, visits), traverse, route, describer.whitening
-            )
-            if not resumed:
-                route = learning.fit(mapper, describer, traverse, second, visits, label)
-            learning.append_places(route, describer, traverse, 0, visits, label, checkpoint, code)
-            learning.log_reached(route, mapper)
-        else:
-            if checkpoint is not None:
-                checkpoint.check_unused()
-            rows = describer.reference(traverse, second, label, isinstance(mapper, SpectralMapper))
-            if visits is not None:
-                rows = describer.averaged(rows, visits, label)
-            route = learning.learn_descriptors(mapper, rows)
-        if counts is not None:
-            route.count_visits(1 + counts)
-        self._keep_whitening(describer.whitening)
-        return self._keep_map(route, traverse)
+            descriptor.check_sizes(traverse, visits.traverse)
+            counts = learning.observation_counts(visits, len(traverse))
+        with descriptor.unchanged_by_errors():
+            if isinstance(mapper, SpectralMapper) and learning.is_long(traverse, mapper.chunk):
+                route = mapper.empty().to(descriptor.device)
+                key = checkpoint and model_file.run_key(self, traverse, second, visits)
+                if not (checkpoint and key and checkpoint.open(key, route, descriptor)):
+                    route = learning.fit(mapper, descriptor, traverse, second, visits, progress)
+                settings = visits, progress, checkpoint, map_tasks
+                learning.append_places(route, descriptor, traverse, 0, *settings)
+                learned: PlaceMap = route
+            else:
+                if checkpoint is not None:
+                    checkpoint.check_unused()
+                rows = descriptor.learn(traverse, second, progress, isinstance(mapper, SpectralMapper))
+                if visits is not None:
+                    rows = learning.averaged(descriptor, rows, visits, progress)
+                learned = learning.learn_descriptors(mapper, rows)
+            if counts is not None:
+                learned.count_visits(1 + counts)
+        return self._keep_map(learned, traverse)
 
     def learn_features(self, features: Tensor, traverse: Traverse | None = None) -> DejaVu:
         """As `learn`, from ready descriptors.
@@ -228,69 +247,7 @@ class DejaVu(nn.Module):
             traverse: their source, if known: it tells the map which frames to expect, and the frame of each
                 resampled place.
         """
-        mapper = self.mapper.with_overhead(learning.positions_of(traverse).nbytes)
-        return self._keep_map(learning.learn_descriptors(mapper, features), traverse)
-
-    def describe_reference(
-        self, traverse: Traverse, second: Views | None = None, progress: bool = False
-    ) -> Tensor:
-        """Descriptors (N,K) of the reference for `learn_features`; the whitening is learned from it.
-
-        Args:
-            second, progress: see `learn`; InputError if no whitening learns from the second.
-        """
-        describer, label = self._describer_of(traverse), "learning" if progress else None
-        rows = describer.reference(traverse, second, label, isinstance(self.mapper, SpectralMapper))
-        self._keep_whitening(describer.whitening)
-        return rows
-
-    @property
-    def describer(self) -> learning.Describer:
-        """Describes frames with the model's present settings."""
-        pixels = math.prod(own_size(self.features) or (1,))  # larger frames, smaller batches
-        batch = max(1, min(self.batch_size, BATCH_NUMBERS // (3 * pixels)))
-        pipeline = Pipeline(self.preprocess, self.features)
-        return learning.Describer(pipeline, self.whitening, batch, self.map.positions.device, self._warned)
-
-    def _describer_of(self, traverse: Traverse) -> learning.Describer:
-        """As `describer`, for learning from a traverse: with a copy of a whitening that is not fixed, or with
-        principal components of ready features that are too wide for a spectral map."""
-        whitening = self.whitening if self._whitens else None
-        if whitening is not None and not whitening.fixed:
-            whitening = copy.deepcopy(whitening)
-        wide = learning.is_ready(traverse) and traverse.frame_shape[0] > WIDEST
-        if whitening is None and wide and isinstance(self.mapper, SpectralMapper):
-            whitening = Whitening(views=0).to(self.map.positions.device)
-        return self.describer._replace(whitening=whitening)
-
-    def _keep_whitening(self, learned: Whitening | None) -> None:
-        if self._whitens and self.whitening is not None and learned is not None:
-            self.whitening.load_state_dict(learned.state_dict())  # the caller may hold the module too
-        else:
-            self.whitening = learned
-
-    def take_whitening(self, other: DejaVu) -> None:
-        """Use the preprocess, features and whitening of another model; the whitening becomes fixed. Raises
-        InputError if there is none."""
-        if other.whitening is None or not other.whitening.learned:
-            raise InputError("its map was learned without whitening; expected one learned with whitening")
-        self.take_descriptor(other)
-        self.whitening, self._whitens = other.whitening, True
-        self.whitening.fixed = True
-
-    def take_descriptor(self, other: DejaVu) -> None:
-        """Use the preprocess and features of another model, such as one trained on many routes, but not its
-        whitening.
-
-        Example:
-            >>> base = DejaVu(features=HOG(cell=16))
-            >>> model = DejaVu(mapper=SpectralMapper(2.5))
-            >>> model.take_descriptor(base)
-            >>> model.features.cell
-            16
-        """
-        self.preprocess, self.features = other.preprocess, other.features
-        self.weight_bits = other.weight_bits
+        return self._keep_map(learning.learn_descriptors(self.mapper, features), traverse)
 
     def resample(
         self,
@@ -299,11 +256,11 @@ class DejaVu(nn.Module):
         progress: bool = False,
         shape: tuple[int, ...] | None = None,
     ) -> Traverse:
-        """A traverse as the model learns or localizes it: `fit`, then `resampled` by `velocity`. For queries,
-        `step` and `shape` are `self.step` and `self.frame_shape`; for a reference, None."""
-        return resampled(self.fit(traverse, shape), self.velocity, self.batch_size, step, progress)
+        """A traverse as the model learns or localizes it: `at_map_size`, then `resampled` by `velocity`. For
+        queries, `step` and `shape` are `self.step` and `self.frame_shape`; for a reference, None."""
+        return resampled(self.at_map_size(traverse, shape), self.velocity, self.batch_size, step, progress)
 
-    def fit(self, traverse: Traverse, shape: tuple[int, ...] | None = None) -> Traverse:
+    def at_map_size(self, traverse: Traverse, shape: tuple[int, ...] | None = None) -> Traverse:
         """Frames at the size of the map's, or at `preprocess.size`; images and videos are decoded at it.
 
         Args:
@@ -326,9 +283,9 @@ class DejaVu(nn.Module):
         if size == own:
             return traverse
         line = f"frames of {own[0]} x {own[1]} pixels are resized to {size[0]} x {size[1]}, {why}"
-        if (traverse.name, line) not in self._warned:
+        if (traverse.name, line) not in self.descriptor.warned:
             log.warning("%s: %s", traverse.name, line)
-            self._warned.add((traverse.name, line))
+            self.descriptor.warned.add((traverse.name, line))
         return at_size(traverse, size)
 
     def _keep_map(self, route: PlaceMap, traverse: Traverse | None) -> DejaVu:
@@ -344,10 +301,9 @@ class DejaVu(nn.Module):
         if len(positions):
             route.positions = positions.to(device)
             route.check()
-        self.step = traverse.step if isinstance(traverse, ResampledTraverse) else None
-        frames = len(positions) or route.places
-        self.frame_names = [] if traverse is None else names_of(source_of(traverse), frames)
-        self.frame_shape, self.trained = shape or None, None
+        step = traverse.step if isinstance(traverse, ResampledTraverse) else None
+        names = [] if traverse is None else [*source_of(traverse).names]
+        self.state = model_file.ModelState(shape or None, step, None, names)
         self._hand_on(route)
         return self.replace_map(route)
 
@@ -403,31 +359,21 @@ class DejaVu(nn.Module):
             >>> bool((match.accepted == (match.probability >= 0.99)).all())
             True
         """
-        self.require_map()
+        require_map(self)
         own = None
         if reference is not None and views is None:
-            own = self.fit(as_traverse(reference), self.frame_shape or ())
-        label = "calibrating" if progress else None
-        self.calibration = learning.calibration_of(self.describer, self.map, own, views, places, label)
+            own = self.at_map_size(as_traverse(reference), self.frame_shape or ())
+        self.calibration = learning.calibration_of(self.descriptor, self.map, own, views, places, progress)
         return self
-
-    def describe(self, frames: Tensor) -> Tensor:
-        """Preprocess, then features: (B,C,H,W) -> (B,D)."""
-        features: Tensor = self.features(as_weights(self.preprocess(frames), self.features))
-        return features
-
-    def whitened(self, features: Tensor) -> Tensor:
-        """Features (B,D) -> descriptors (B,K); without whitening they are the same."""
-        return self.describer.whitened(features)
 
     def forward(self, queries: Tensor) -> Tensor:
         """Section III-B: scores of all places, differentiable (eq. 3, eq. 4)."""
-        self.require_map()
+        require_map(self)
         if isinstance(queries, Tensor):
-            queries = resize_like(queries, self.frame_shape)
-        features = features_of(queries, self.describe, "the query")
-        self.check_queries(tuple(queries.shape[1:]), features.shape[1], "the query")
-        return self.map.scores(self.whitened(features))
+            queries = resize_like(queries, self.state.frame_shape)
+        features = features_of(queries, self.descriptor.describe, "the query")
+        check_queries(self, tuple(queries.shape[1:]), features.shape[1], "the query")
+        return self.map.scores(self.descriptor.whitened(features))
 
     def localize(
         self,
@@ -480,7 +426,7 @@ class DejaVu(nn.Module):
 
     def localizer(self, matching: Matching) -> Localizer:
         """A matcher of descriptors, for consecutive batches of queries."""
-        self.require_map()
+        require_map(self)
         check_search(matching.search)
         sequence, coarse = matching.sequence, None
         if sequence is not None:
@@ -514,23 +460,23 @@ class DejaVu(nn.Module):
         apart: int = 5,
     ) -> Iterator[Match]:
         """As `localize`, or with k as `candidates`, one batch of queries at a time, in constant memory."""
-        self.require_map()
+        require_map(self)
         if k is not None:
             check_candidates(k, apart, self.map.places)
         localizer = self.localizer(self.matching(sequence, search)._replace(k=k, radius=apart))
-        queries = self.fit(as_traverse(queries), self.frame_shape or ())
+        queries = self.at_map_size(as_traverse(queries), self.frame_shape or ())
         if sequence is not None:
-            sequence.check(queries.length, self.map.places)
+            sequence.check(len(queries), self.map.places)
         if self.step is not None:
             queries = self.resample(queries, self.step, progress, self.frame_shape)
         shape, name = queries.frame_shape, queries.name
 
         def on_first(frames: Tensor, features: Tensor) -> None:
-            self.check_queries(shape, features.shape[1], name)
-            self.describer.warn_of_bright(frames, name)
+            check_queries(self, shape, features.shape[1], name)
+            self.descriptor.warn_of_bright(frames, name)
 
         label = "localizing" if progress else None
-        yield from map(localizer, self.describer.descriptors(queries, label, on_first))
+        yield from map(localizer, self.descriptor.batches(queries, label, on_first))
 
     def candidates(
         self,
@@ -583,44 +529,6 @@ class DejaVu(nn.Module):
             return Acceptance(precision=PROBABLE, given=False)
         return Acceptance(None if sequence is None else sequence.likely, given=False)
 
-    def extract_all(self, traverse: Traverse, progress: bool = False) -> Tensor:
-        """Descriptors (N,K) of a whole traverse; many are kept in a temporary file, see `concatenate`."""
-        label = f"describing {traverse.name}" if progress else None
-        return concatenate(self.describer.descriptors(traverse, label))
-
-    @property
-    def features_per_frame(self) -> int:
-        """D, the number of features per frame that the map was learned from."""
-        learned = self.whitening is not None and self.whitening.learned
-        return sum(self.whitening.sizes) if learned and self.whitening else self.map.dimension
-
-    def check_queries(self, shape: tuple[int, ...], dimension: int, name: str) -> None:
-        """Refuse queries that do not fit the map, and warn if their frames have another size.
-
-        Args:
-            shape: of one query, (C,H,W) or (D,). dimension: D, its features. name: for the message.
-        """
-        reference, expected = self.frame_shape, self.features_per_frame
-        if len(shape) == 1 and dimension != expected:
-            learned = f", as frames of {' x '.join(map(str, reference or ()))} give"
-            seen = f"{name} gives {dimension} features; the map expects {expected}"
-            raise InputError(f"{seen}{learned * (len(reference or ()) == 3)}")
-        if reference is None or len(shape) != 3:
-            return
-        if len(reference) == 1:
-            seen = f"{name} has frames, but the map was learned from ready features"
-            raise InputError(f"{seen}; expected features (Q, {expected})")
-        own, other = (" x ".join(map(str, one)) for one in (shape, reference))
-        if dimension != expected:
-            seen = f"{name}: frames of {own} give {dimension} features"
-            raise InputError(f"{seen}; the map expects {expected}, as frames of {other} give")
-        if shape[1:] != reference[1:] and getattr(self.features, "resize", None) is None:
-            log.warning("%s has frames of %s, the map was learned from %s", name, own, other)
-
-    def frame_name(self, frame: int) -> str:
-        """The name of a reference frame, such as its file name; empty if it has none."""
-        return self.frame_names[frame] if self.frame_names else ""
-
     def save(self, path: str | Path) -> None:
         """Write the map, or a trained descriptor without a map, and the weights of the features as one
         safetensors file.
@@ -630,7 +538,7 @@ class DejaVu(nn.Module):
                 cannot be written.
         """
         if self.trained is None:
-            self.require_map()
+            require_map(self)
         model_file.write_model(Path(path), self)
 
     @classmethod
@@ -652,37 +560,51 @@ class DejaVu(nn.Module):
 
     def get_extra_state(self) -> dict[str, Any]:
         """The state apart from tensors and the map's own state."""
-        return model_file.model_state(self)
+        return model_file.state_to_json(self.state)
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore the result of `get_extra_state`; InputError if its entries or types differ."""
-        model_file.set_state(self, checked_fields(state, model_file.STATE, "the model's state"))
-
-    def require_map(self, purpose: str = "") -> None:
-        """Refuse a model without a map; `purpose` is for the message, such as " to append to"."""
-        if not self.map.places:
-            if self.trained is None:
-                raise InputError(f"there is no map yet{purpose}; expected learn(...) or load(...) first")
-            seen = f"this is a descriptor without a map{purpose}"
-            raise InputError(f"{seen}; expected learn(...) with it first")
+        values = checked_fields(state, model_file.STATE, "the model's state")
+        self.state = model_file.state_from_json(values)
 
 
-def default_features(whitens: bool = True) -> nn.Module:
-    """HOG and the package's network side by side; without whitening HOG alone, as in the paper."""
-    return Joined([HOG(), Distilled()]) if whitens else HOG()
+def require_map(model: DejaVu, purpose: str = "") -> None:
+    """Refuse a model without a map; `purpose` is for the message, such as " to append to"."""
+    if not model.map.places:
+        if model.trained is None:
+            raise InputError(f"there is no map yet{purpose}; expected learn(...) or load(...) first")
+        seen = f"this is a descriptor without a map{purpose}"
+        raise InputError(f"{seen}; expected learn(...) with it first")
 
 
-def own_size(features: nn.Module, block: bool = False) -> tuple[int, int] | None:
-    """The size (height, width) to which features of this package resize frames, the largest of joined ones;
-    None if they do not. With `block`, also the size of a block of HOG."""
-    if isinstance(features, Joined):
-        sizes = [one for one in (own_size(member, block) for member in features.members) if one is not None]
-        return (max(height for height, _ in sizes), max(width for _, width in sizes)) if sizes else None
-    known = type(features) in model_file.CLASSES
-    size: tuple[int, int] | None = getattr(features, "resize", None) if known else None
-    if size is None and block and type(features) is HOG:
-        size = (features.cell * features.block,) * 2
-    return size
+def features_per_frame(model: DejaVu) -> int:
+    """D, the number of features per frame that the map was learned from."""
+    whitening = model.descriptor.whitening
+    return sum(whitening.sizes) if whitening is not None and whitening.learned else model.map.dimension
+
+
+def check_queries(model: DejaVu, shape: tuple[int, ...], dimension: int, name: str) -> None:
+    """Refuse queries that do not fit the map, and warn if their frames have another size.
+
+    Args:
+        shape: of one query, (C,H,W) or (D,). dimension: D, its features. name: for the message.
+    """
+    reference, expected = model.state.frame_shape, features_per_frame(model)
+    if len(shape) == 1 and dimension != expected:
+        learned = f", as frames of {' x '.join(map(str, reference or ()))} give"
+        seen = f"{name} gives {dimension} features; the map expects {expected}"
+        raise InputError(f"{seen}{learned * (len(reference or ()) == 3)}")
+    if reference is None or len(shape) != 3:
+        return
+    if len(reference) == 1:
+        seen = f"{name} has frames, but the map was learned from ready features"
+        raise InputError(f"{seen}; expected features (Q, {expected})")
+    own, other = (" x ".join(map(str, one)) for one in (shape, reference))
+    if dimension != expected:
+        seen = f"{name}: frames of {own} give {dimension} features"
+        raise InputError(f"{seen}; the map expects {expected}, as frames of {other} give")
+    if shape[1:] != reference[1:] and getattr(model.descriptor.features, "resize", None) is None:
+        log.warning("%s has frames of %s, the map was learned from %s", name, own, other)
 
 
 def check_precision(precision: float | None) -> None:

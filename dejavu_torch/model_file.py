@@ -11,23 +11,24 @@ import json
 import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar, get_type_hints
+from typing import Any, NamedTuple, Protocol, TypeVar, get_type_hints
 
 import torch
 from torch import Tensor, nn
 
 from dejavu_torch.data.names import decode_names, encode_names
 from dejavu_torch.features.cnn import SmallCNN
+from dejavu_torch.features.descriptor import Descriptor
 from dejavu_torch.features.distilled import Distilled
 from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.preprocess import Preprocess
-from dejavu_torch.features.views import Views
+from dejavu_torch.features.views import SAMPLE, AugmentedFrames, Views
 from dejavu_torch.features.whitening import Whitening
-from dejavu_torch.learning import SAMPLE
 from dejavu_torch.maps.file import HEADER as FILE_HEADER
 from dejavu_torch.maps.file import (
     checked,
@@ -54,6 +55,7 @@ from dejavu_torch.types import FRAME_NUMBERS, InputError, Training, Traverse
 from dejavu_torch.version import __version__
 
 M = TypeVar("M", bound=nn.Module)
+R = TypeVar("R", bound="Model")
 MAX_PARTS = 16  # of a recipe
 NO_MAP = "a descriptor without a map; expected a map, as from `dejavu learn SOURCE --descriptor FILE`"
 
@@ -81,6 +83,37 @@ class Recipe(NamedTuple):
 
     class_path: str
     init_args: dict[str, Any]
+
+
+@dataclass
+class ModelState:
+    """What a model knows of its map's route, apart from tensors.
+
+    Attributes:
+        frame_shape: of the reference, (C,H,W), or (D,) of ready features; None if unknown.
+        step: pixels of ground from one place of the map to the next; None if frames are places.
+        trained: how the features or the map were trained, if they were.
+        frame_names: of the reference; empty if it has none.
+        calibration: probabilities of right answers.
+    """
+
+    frame_shape: tuple[int, ...] | None = None
+    step: float | None = None
+    trained: Training | None = None
+    frame_names: list[str] = field(default_factory=list)
+    calibration: Calibration | None = None
+
+
+class Model(Protocol):
+    """What a file keeps of `DejaVu`."""
+
+    descriptor: Descriptor
+    mapper: Mapper
+    velocity: GroundOdometry | None
+    threshold: float | None
+    precision: float | None
+    map: PlaceMap
+    state: ModelState
 
 
 # the header of a map file: a model's parts, settings and state, and the state of its map
@@ -116,10 +149,17 @@ def recipe_of(module: nn.Module) -> Recipe:
     return Recipe(cls.__name__, json.loads(json.dumps(arguments)))  # compares equal to one from a file
 
 
-def recipes_of(model: Any) -> dict[str, Any]:
+def parts_of(model: Model) -> dict[str, nn.Module | None]:
+    """The parts of a model that its file has recipes of."""
+    own = model.descriptor
+    described = {"preprocess": own.preprocess, "features": own.features, "whitening": own.whitening}
+    return described | {"mapper": model.mapper, "velocity": model.velocity}
+
+
+def recipes_of(model: Model) -> dict[str, Any]:
     """The recipe of each part of a model, as JSON values."""
-    parts = {name: getattr(model, name) for name in PARTS}
-    return {name: None if part is None else recipe_of(part)._asdict() for name, part in parts.items()}
+    parts = parts_of(model).items()
+    return {name: None if part is None else recipe_of(part)._asdict() for name, part in parts}
 
 
 def with_parts(recipe: Recipe) -> list[Recipe]:
@@ -182,11 +222,13 @@ def build(recipe: Recipe, kind: type[M], given: nn.Module | None = None) -> M:
     return module  # type: ignore[no-any-return]
 
 
-def weights_of(model: Any, part: str) -> dict[str, Tensor]:
+def weights_of(model: Model, part: str) -> dict[str, Tensor]:
     """The tensors of a part of a model, such as "features", as stored in a file."""
-    module = getattr(model, part)
-    state = {} if module is None else module.state_dict()
-    weights = packed(module) if part == "features" and model.weight_bits == 8 else state
+    module = parts_of(model)[part]
+    if module is None:
+        return {}
+    rounded = part == "features" and model.descriptor.weight_bits == 8
+    weights = packed(module) if rounded else module.state_dict()
     # features may be half precision by choice, a whitening only by `model.half()`
     wide = (torch.float64,) if part == "features" else (torch.float64, torch.float16, torch.bfloat16)
     return {
@@ -196,34 +238,35 @@ def weights_of(model: Any, part: str) -> dict[str, Tensor]:
     }
 
 
-def model_state(model: Any) -> dict[str, Any]:
-    """A model's state apart from tensors and the map's own state, as JSON values."""
-    names = encode_names(model.frame_names) if model.frame_names else None
-    return {name: _json(names if name == "names" else getattr(model, name)) for name in STATE}
+def state_to_json(state: ModelState) -> dict[str, Any]:
+    """A model's state as JSON values."""
+    names = encode_names(state.frame_names) if state.frame_names else None
+    calibration = state.calibration and {
+        name: platt and platt._asdict() for name, platt in state.calibration._asdict().items()
+    }
+    trained = state.trained and state.trained._asdict()
+    known = {"frame_shape": state.frame_shape, "step": state.step, "trained": trained, "names": names}
+    return known | {"calibration": calibration}
 
 
-def _json(value: Any) -> Any:
-    return {key: _json(one) for key, one in value._asdict().items()} if hasattr(value, "_asdict") else value
+def state_from_json(values: Mapping[str, Any], frames: int | None = None) -> ModelState:
+    """The state from the result of `state_to_json`, whose types are checked."""
+    names = [] if values["names"] is None else decode_names(values["names"], frames)
+    known = values["frame_shape"], values["step"], values["trained"]
+    return ModelState(*known, names, values["calibration"])
 
 
-def set_state(model: Any, state: Mapping[str, Any], frames: int | None = None) -> None:
-    """Restore the result of `model_state`, whose types are checked."""
-    for name in STATE.keys() - {"names"}:
-        setattr(model, name, state[name])
-    names = state["names"]
-    model.frame_names = [] if names is None else decode_names(names, frames)
-
-
-def contents(model: Any) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def contents(model: Model) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """The tensors and the header of a model's map file."""
-    header = recipes_of(model) | {name: getattr(model, name) for name in SETTINGS} | model_state(model)
-    header["map"] = model.map.get_extra_state()
+    settings = {"threshold": model.threshold, "precision": model.precision}
+    header = recipes_of(model) | settings | {"batch_size": model.descriptor.batch_size}
+    header |= state_to_json(model.state) | {"map": model.map.get_extra_state()}
     route = model.map.packed() if model.map.places else {}
     tensors = {f"map.{name}": tensor for name, tensor in route.items()}
     return tensors | weights_of(model, "features") | weights_of(model, "whitening"), header
 
 
-def summary_of(model: Any) -> MapSummary:
+def summary_of(model: Model) -> MapSummary:
     """The resolution of a model's map, and the bytes of its file by part."""
     tensors, header = contents(model)
     fixed = {
@@ -231,21 +274,21 @@ def summary_of(model: Any) -> MapSummary:
         for name, part in (("backbone", "features"), ("whitening", "whitening"))
     }
     fixed["names"] = len(header["names"] or "")
-    summary: MapSummary = model.map.summary()
+    summary = model.map.summary()
     fixed["header"] = map_size(tensors, header) - summary.route_bytes - sum(fixed.values())
     return summary.with_parts(fixed=fixed)
 
 
-def write_model(path: Path, model: Any) -> None:
+def write_model(path: Path, model: Model) -> None:
     """See `DejaVu.save`."""
-    _check_rounded(model)
+    check_rounded(model.descriptor)
     tensors, header = contents(model)
     checked_fields(header, HEADER, "the model")  # as reading will
     checked(header["map"], model.map.state, "the map")
     write_map(path, tensors, header)
 
 
-def read_model(make: Callable[..., M], path: Path, features: nn.Module | None) -> M:
+def read_model(make: Callable[..., R], path: Path, features: nn.Module | None) -> R:
     """See `DejaVu.load`; `make` is `DejaVu`."""
     with opened(path) as (tensors, header):
         if features is not None and (given := recipe_of(features)) != (whole := header["features"]):
@@ -256,25 +299,25 @@ def read_model(make: Callable[..., M], path: Path, features: nn.Module | None) -
         weights = unpacked(tensors, "features.")
         if features is None:
             with torch.device("meta"):  # large layers in a bad header allocate nothing
-                probe = nn.ModuleDict({"features": _part(header, "features", None)})
-                own = {name: one for name, one in weights.items() if name.startswith("features.")}
-                probe.load_state_dict(own, assign=True)
+                probe = build(header["features"], nn.Module)
+                probe.load_state_dict(part_of(weights, "features"), assign=True)
         with in_float32():
             parts = {name: _part(header, name, features) for name in PARTS}
         parts["whitening"] = parts["whitening"] or "none"
-        model: Any = make(**parts, **{name: header[name] for name in SETTINGS})
+        model = make(**parts, **{name: header[name] for name in SETTINGS})
         _fill(model.map, tensors, header["map"])
-        check_types(weights, model.features)
-        rest = {name: weight for name, weight in weights.items() if not name.startswith("map.")}
-        loaded = model.load_state_dict(rest, strict=False)
-        missing = [name for name in loaded.missing_keys if name.startswith(("features.", "whitening."))]
-        if missing or loaded.unexpected_keys:
-            raise InputError(f"it does not fit: missing {missing}, unexpected {loaded.unexpected_keys}")
-        model.weight_bits = 8 if len(weights) < len(tensors) else 32
-        _check_rounded(model)
-        set_state(model, header, model.map.table.frames)
+        check_types(weights, model.descriptor.features)
+        for name in ("features", "whitening"):
+            part = parts_of(model)[name]
+            if part is not None:
+                part.load_state_dict(part_of(weights, name))
+            elif part_of(weights, name):
+                raise InputError(f"it does not fit: unexpected {name}")
+        model.descriptor.weight_bits = 8 if len(weights) < len(tensors) else 32
+        check_rounded(model.descriptor)
+        model.state = state_from_json(header, model.map.table.frames)
         _check(model)
-        return model  # type: ignore[no-any-return]
+        return model
 
 
 def read_place_map(path: Path) -> PlaceMap:
@@ -329,18 +372,21 @@ def check_types(tensors: Mapping[str, Tensor], features: nn.Module) -> None:
             raise InputError(f"it does not fit: features.{name} is {kind}; expected a float type")
 
 
-def _check_rounded(model: Any) -> None:
-    if model.weight_bits == 8 and not is_rounded(model.features):
-        seen = f"weights of {type(model.features).__name__} are not rounded to 8 bits, or changed since then"
+def check_rounded(descriptor: Descriptor) -> None:
+    """Refuse a descriptor of 8-bit weights that are not rounded."""
+    if descriptor.weight_bits == 8 and not is_rounded(descriptor.features):
+        name = type(descriptor.features).__name__
+        seen = f"weights of {name} are not rounded to 8 bits, or changed since then"
         raise InputError(f"{seen}; expected a DejaVu constructed from them with weight_bits=8")
 
 
-def _check(model: Any) -> None:
+def _check(model: Model) -> None:
     """Refuse inconsistent parts of a model."""
-    positions, step, shape, whitening = model.map.positions, model.step, model.frame_shape, model.whitening
+    positions, step, shape = model.map.positions, model.state.step, model.state.frame_shape
     resampled = model.velocity is not None and step is not None and step > 0
     if (len(positions) > 0) != resampled or (step is not None) != resampled:
         raise InputError(f"it has step {step} and {len(positions)} frame positions")
+    whitening = model.descriptor.whitening
     if whitening is not None and whitening.learned:
         found, expected = whitening.dimension, model.map.dimension
         if found != (expected or found):
@@ -350,23 +396,28 @@ def _check(model: Any) -> None:
 
 
 def run_key(
-    model: Any, traverse: Traverse, second: Views | None = None, visits: Views | None = None
+    model: Model, traverse: Traverse, second: Views | None = None, visits: Views | None = None
 ) -> dict[str, str]:
     """Digests of everything that affects the chunks of a traverse, see `learning.Checkpoint`."""
-    header = recipes_of(model)
-    header["code"] = sorted(filter(None, map(_code_of, {type(one) for one in model.modules()})))
-    header |= {"batch_size": model.describer.batch_size, "sample": SAMPLE}
-    header |= {"version": __version__, "torch": torch.__version__, "device": model.describer.device.type}
-    fixed = model.whitening is not None and model.whitening.fixed
+    descriptor, header = model.descriptor, recipes_of(model)
+    parts = [*descriptor.modules(), *model.mapper.modules()]
+    header["code"] = sorted(filter(None, map(_code_of, {type(part) for part in parts})))
+    header |= {"batch_size": descriptor.batch_size, "sample": SAMPLE}
+    header |= {"version": __version__, "torch": torch.__version__, "device": descriptor.device.type}
+    fixed = descriptor.whitening is not None and descriptor.whitening.fixed
     weights = weights_of(model, "features") | (weights_of(model, "whitening") if fixed else {})
     sums = checksums(weights, header)
     sources = {
-        name: views
-        and [views.traverse.identity(), views.traverse.state(0, len(views.places)), views.places.tolist()]
+        name: views and [*_source(views.traverse), views.places.tolist()]
         for name, views in (("second", second), ("visits", visits))
     }
-    source = [traverse.identity(), traverse.count()]
-    return digests(source=source, **sources) | {"settings": sums.pop(FILE_HEADER), **sums}
+    return digests(source=_source(traverse), **sources) | {"settings": sums.pop(FILE_HEADER), **sums}
+
+
+def _source(traverse: Traverse | AugmentedFrames) -> list[Any]:
+    """What identifies the source of a traverse, without its frames."""
+    names = [*traverse.names] if isinstance(traverse, Traverse) else []
+    return [traverse.name, len(traverse), [*traverse.frame_shape], names]
 
 
 def _code_of(cls: type[nn.Module]) -> str:

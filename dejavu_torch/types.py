@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import copy
 import math
+import operator
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cached_property
 from itertools import pairwise
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, Self, cast
 
 import torch
 from torch import Tensor, nn
+from torch.utils.data import Dataset
 
 from dejavu_torch.text import printable
 
@@ -34,91 +38,115 @@ class InputError(ValueError):
         super().__init__(text)
 
 
-class Traverse(ABC):
-    """Frames along a route, in order, read in batches: never all of them in memory.
+class Traverse(Dataset[Tensor], ABC):
+    """Frames along a route, in order: a sequence that is read as needed, never all of it in memory.
 
-    It can be iterated any number of times, and yields the same values for any batch size.
+    `len(t)` is the number of frames. `t[i]` is one, (C,H,W) float32 in [0, 1], or (D,) of ready features;
+    slices, ranges, lists and tensors of numbers, or a mask (N,), give several, (n,C,H,W). Negative numbers
+    count from the end. `torch.utils.data.DataLoader(t)` works as it is, with worker processes too: files are
+    opened in each process when they are first read.
+
+    A subclass has `__len__` and `read`, and what is known of its frames:
+
+    Attributes:
+        name: in messages: a path or a `sim:` address.
+        names: of the frames, such as file names or times in a video, "" for none; empty if all have none.
+        times: (N,) float64, when each was taken, in seconds; None if unknown.
+        places: (N,) float64, the true position of each in reference frames; None if unknown.
+        ordered: whether they are known to be consecutive, as in a video.
+        sized: whether the user asked for their size, as with `width=` of a video.
+        cut: how they were cut from one long image, and which cuts they are; equal: the same places.
+
+    Raises:
+        IndexError: a number beyond the frames. InputError: no frames, or frames that cannot be read.
+
+    Example:
+        >>> from dejavu_torch import open_source
+        >>> traverse = open_source("sim:aerial?frames=40")
+        >>> len(traverse), traverse[-1].shape, traverse[10:20:2].shape
+        (40, torch.Size([3, 96, 96]), torch.Size([5, 3, 96, 96]))
     """
 
-    name: str = "traverse"  # in messages: a path or a `sim:` address
-    length: int | None = None  # number of frames N, None if it is only known after reading to the end
-    place: Tensor | None = None  # (N,) float64, the true position of each frame in reference frames
-    # how the frames were cut from one long image, and which of these cuts they are; equal: the same places
+    name: str = "traverse"
+    names: Sequence[str] = ()
+    times: Tensor | None = None
+    places: Tensor | None = None
+    ordered: bool = False
+    sized: bool = False
     cut: tuple[tuple[int, ...], range] | None = None
-    seeks: bool = False  # whether `between` can skip earlier frames without reading them
-    sized: bool = False  # whether the user asked for a frame size, as with `width=` of a video
-    ordered: bool = False  # whether the frames are known to be consecutive, as in a video
 
     @abstractmethod
-    def batches(self, size: int) -> Iterator[Tensor]:
-        """Yield the frames in order, at most `size` at a time.
+    def __len__(self) -> int: ...
 
-        Shape: each batch is (B,C,H,W) float32 in [0,1], or (B,D) float if the traverse holds features.
-        """
+    @abstractmethod
+    def read(self, frames: range | list[int]) -> Tensor:
+        """Existing frames, at least one: (n,C,H,W) or (n,D)."""
 
-    def between(self, start: int, stop: int) -> Iterator[Tensor]:
-        """The frames [start, stop), as `batches` yields them; earlier frames may be read as well."""
-        seen = 0
-        for batch in self.batches(self.batch_size()):
-            if seen >= stop:
-                return
-            part = batch[max(0, start - seen) : stop - seen]
-            if len(part):
-                yield part
-            seen += len(batch)
+    def __getitem__(self, index: int | slice | range | Sequence[int] | Tensor) -> Tensor:
+        if isinstance(index, Tensor) and index.dtype == torch.bool and index.shape == (len(self),):
+            index = index.nonzero()[:, 0]
+        if isinstance(index, slice):
+            index = range(*index.indices(len(self)))
+        if not hasattr(index, "__len__") or getattr(index, "ndim", 1) == 0:
+            return self.read(self._existing([index]))[0]
+        numbers = self._existing(index.tolist() if isinstance(index, Tensor) else cast(Iterable[Any], index))
+        return self.read(numbers) if len(numbers) else torch.zeros(0, *self.frame_shape)
 
-    def select(self, frames: range, size: int) -> Iterator[Tensor]:
-        """The frames of an increasing range, `size` at a time; the traverse may end first.
+    def __getitems__(self, indices: list[int]) -> list[Tensor]:
+        """The frames of a batch of a DataLoader, read together."""
+        return list(self[indices])
 
-        Only the last batch is smaller: random numbers drawn per batch must not depend on how frames are read.
-        """
-        offset = 0  # of the next selected frame in the next part
-        held: list[Tensor] = []
-        for part in self.between(frames.start, frames.stop):
-            held.append(part[offset :: frames.step])
-            offset = (offset - len(part)) % frames.step
-            if sum(map(len, held)) >= size:
-                *whole, last = torch.cat(held).split(size)
-                yield from whole
-                held = [last]
-        if any(map(len, held)):
-            yield torch.cat(held)
+    def __iter__(self) -> Iterator[Tensor]:
+        for batch in self.batches():
+            yield from batch
 
-    @property
+    def _existing(self, index: Iterable[Any]) -> range | list[int]:
+        """Numbers from 0, as a range where they are one."""
+        count = len(self)
+        numbers = [operator.index(i) for i in index]  # refuses floats
+        numbers = [i + count if -count <= i < 0 else i for i in numbers]
+        for i in (i for i in numbers if not 0 <= i < count):
+            raise IndexError(f"there is no frame {i} of {self.name}, which has {count}")
+        return as_range(numbers)
+
+    def batches(self, size: int = BATCH_SIZE) -> Iterator[Tensor]:
+        """All frames in order, `size` at a time, or fewer if they are large."""
+        at_once = self.at_once(size)
+        for start in range(0, len(self), at_once):
+            yield self.read(range(start, min(start + at_once, len(self))))
+
+    @cached_property
     def frame_shape(self) -> tuple[int, ...]:
-        """Shape of one frame: (C,H,W), or (D,) if the traverse holds features."""
-        for batch in self.batches(1):
-            return tuple(batch.shape[1:])
-        raise InputError(f"{self.name} holds no frames; expected at least one")
+        """Shape of a frame: (C,H,W), or (D,) of ready features."""
+        if not len(self):
+            raise InputError(f"{self.name} holds no frames; expected at least one")
+        return tuple(self.read(range(1)).shape[1:])
 
-    def frame_name(self, i: int) -> str:
-        """Name of frame i in its source, such as a file name or the time in a video; "" if it has none."""
-        return ""
-
-    def frame_time(self, i: int) -> float:
-        """When frame i was taken, in seconds; NaN if unknown."""
-        return math.nan
-
-    def identity(self) -> str:
-        """Identifies the source and its options; no frame is read."""
-        return f"{self.name} {self.length}"
-
-    def state(self, start: int, stop: int) -> str:
-        """Changes if the frames [start, stop) change, as far as file times and the like show it."""
-        return ""
-
-    def count(self) -> int:
-        """Number of frames; reads all of them if the length is not known."""
-        return sum(map(len, self.batches(self.batch_size()))) if self.length is None else self.length
-
-    def batch_size(self, most: int = BATCH_SIZE) -> int:
+    def at_once(self, most: int = BATCH_SIZE) -> int:
         """How many frames to read at a time: `most`, or fewer if they are large; refuses too large ones."""
-        shape = self.frame_shape
-        values = math.prod(shape)
+        if most < 1:
+            raise InputError(f"a batch holds {most} frames; expected at least 1")
+        values = math.prod(self.frame_shape)
         if values > FRAME_NUMBERS:
-            seen = f"{self.name} has frames of {' x '.join(map(str, shape))} numbers"
+            seen = f"{self.name} has frames of {' x '.join(map(str, self.frame_shape))} numbers"
             raise InputError(f"{seen}; expected at most {FRAME_NUMBERS}, for images by ?width=640")
         return max(1, min(most, BATCH_NUMBERS // max(1, values)))
+
+    def changed(self, **attributes: Any) -> Self:
+        """A copy with other attributes."""
+        other = copy.copy(self)
+        other.__dict__.pop("frame_shape", None)
+        other.__dict__.update(attributes)
+        return other
+
+
+def as_range(numbers: list[int]) -> range | list[int]:
+    """Numbers as a range if they increase evenly, else as they are."""
+    step = numbers[1] - numbers[0] if len(numbers) > 1 else 1
+    if not numbers or step < 1:
+        return numbers
+    run = range(numbers[0], numbers[-1] + 1, step)
+    return run if len(run) == len(numbers) and all(map(operator.eq, run, numbers)) else numbers
 
 
 @dataclass(frozen=True)

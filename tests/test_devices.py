@@ -81,7 +81,7 @@ def test_a_frame_stays_on_its_device(kind: str, frames: Tensor, monkeypatch: pyt
     model = models()[kind].learn(frames).to("meta")
     with torch.no_grad():
         scores = model(torch.empty(4, 3, 32, 32, device="meta"))
-        descriptors = model.whitened(model.describe(torch.empty(4, 3, 32, 32, device="meta")))
+        descriptors = model.descriptor.whitened(model.descriptor.describe(torch.empty(4, 3, 32, 32, device="meta")))
         together = PlaceFilter()(model.map.scores(descriptors))
         assert (together.device.type, together.shape) == ("meta", (4, 40))
         assert best_candidates(scores, 3, 5).index.device.type == "meta"
@@ -219,7 +219,7 @@ def test_a_map_learned_on_a_gpu_scores_as_that_of_the_cpu(kind: str, device: str
 def test_a_whitening_learned_on_a_gpu_is_that_of_the_cpu(device: str, frames: Tensor) -> None:
     whitening = Whitening(numbers=8, views=2, bits=16)
     models = [DejaVu(whitening=copy.deepcopy(whitening)).to(one).learn(frames) for one in ("cpu", device)]
-    known = [model.whitened(model.describe(frames.to(model.map.positions.device))).cpu() for model in models]
+    known = [model.descriptor.whitened(model.descriptor.describe(frames.to(model.map.positions.device))).cpu() for model in models]
     # up to the signs of its numbers, and what 16 bits round
     torch.testing.assert_close(known[1] @ known[1].T, known[0] @ known[0].T, rtol=1e-3, atol=1e-3)
 
@@ -329,7 +329,7 @@ def test_even_steps_are_learned_on_a_gpu(device: str) -> None:
 
 def test_controls_and_scores_are_computed_on_a_gpu(device: str, visits: Visits) -> None:
     model = small(mapper=LEARNED["templates"]).to(device).learn(visits[0])
-    features = model.describe(next(visits[0].batches(40)).to(device))
+    features = model.descriptor.describe(next(visits[0].batches(40)).to(device))
     for same in (True, False):
         assert null_control(model, features, features, same_plan=same).index.shape == (40,)
     assert leave_out_match(model, features, 2).index.shape == (40,)

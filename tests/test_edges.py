@@ -79,7 +79,7 @@ def test_learning_a_second_model_leaves_the_first_alone(learned: DejaVu) -> None
 def test_a_fixed_whitening_is_shared() -> None:
     model = spectral().learn(FRAMES)
     other = DejaVu(mapper=SpectralMapper(16.0))
-    other.take_whitening(model)
+    other.descriptor.take(model.descriptor, whitening=True)
     assert other.settings()["whitening"] is other.whitening
 
 

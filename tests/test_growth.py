@@ -306,7 +306,7 @@ def test_a_merged_map_scores_as_its_parts_do(metric: str, tmp_path: Path) -> Non
     fresh = DejaVu(whitening=merged.whitening, mapper=merged.mapper)
     fresh.load_state_dict(merged.state_dict())
     queries = walk(40, seed=9)
-    descriptors = merged.whitened(queries)
+    descriptors = merged.descriptor.whitened(queries)
     expected = torch.cat([model.map.scores(descriptors) for model in models], 1)
     for one in (merged, loaded, fresh):
         assert torch.allclose(one(queries), expected, atol=1e-6)
@@ -368,13 +368,13 @@ def test_a_sequence_does_not_run_from_one_route_into_the_next() -> None:
         assert not torch.equal(whole, expected)  # as one route's places they would count
         assert torch.equal(merged.localize(queries, sequence=matcher).index, expected.argmin(1))
         seen: list[Tensor] = []
-        merged.localizer(merged.matching(matcher)._replace(on_scores=seen.append))(merged.whitened(queries))
+        merged.localizer(merged.matching(matcher)._replace(on_scores=seen.append))(merged.descriptor.whitened(queries))
         torch.testing.assert_close(torch.cat(seen), expected, atol=1e-5, rtol=0)
     assert merged.localize(queries, sequence=PlaceFilter()).index.shape == (30,)
 
 
 def queries_of(model: DejaVu, queries: Tensor) -> Iterator[Tensor]:
-    return (model.whitened(part) for part in queries.split(8))
+    return (model.descriptor.whitened(part) for part in queries.split(8))
 
 
 def test_merging_merged_maps_and_names_that_are_there(caplog: pytest.LogCaptureFixture) -> None:

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from dejavu_torch import growth, learning
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.frame_range import Chain
+from dejavu_torch.data.traverse import Chain
 from dejavu_torch.data.source import open_source
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.views import Views
@@ -90,7 +90,7 @@ def test_chunks_are_those_of_their_own_descriptors() -> None:
 def test_a_short_route_is_learned_from_all_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(learning, "SAMPLE", PLACES)
     model = DejaVu(mapper=SpectralMapper(3.0, chunk=CHUNK))
-    whole = model.learn_features(model.describe_reference(ArrayTraverse(route())), ArrayTraverse(route()))
+    whole = model.learn_features(model.descriptor.learn(ArrayTraverse(route())), ArrayTraverse(route()))
     assert resumed(tmp_path) == file_of(whole, tmp_path)
     assert not (tmp_path / "m.part").exists()
 
@@ -110,7 +110,7 @@ def two_threads() -> Iterator[None]:
 def test_no_call_changes_the_number_of_threads() -> None:
     """Nor one that is left in the middle, or fails."""
     model = learned(route())
-    coder = ChunkCoder.like(model.map, model.describer, PLACES)  # type: ignore[arg-type]
+    coder = ChunkCoder.like(model.map, model.descriptor, PLACES)  # type: ignore[arg-type]
     with two_threads():
         chunks = coder.chunks(ArrayTraverse(route()), range(coder.total))
         next(chunks)
@@ -370,7 +370,7 @@ def test_an_image_that_cannot_be_read_is_named_and_the_rest_kept(tmp_path: Path,
 
 def test_a_route_that_ends_early_is_refused() -> None:
     model = learned(route())
-    coder = ChunkCoder.like(model.map, model.describer, PLACES + 60)
+    coder = ChunkCoder.like(model.map, model.descriptor, PLACES + 60)
     with refused("1030", "1090"):
         list(coder.chunks(ArrayTraverse(route()), range(coder.total)))
 
@@ -380,12 +380,12 @@ def test_descriptors_of_a_long_route_in_one_chunk_lie_in_a_file(monkeypatch: pyt
     monkeypatch.setattr(learning, "IN_MEMORY", PLACES * 160 - 1)
     monkeypatch.setattr(learning, "DESCRIPTOR_MEMORY", PLACES * 100)
     model = DejaVu(whitening=Whitening(numbers=32))
-    found = model.describe_reference(ArrayTraverse(values))
+    found = model.descriptor.learn(ArrayTraverse(values))
     assert found.dtype == torch.float16
     assert found.shape == (PLACES, 33)
     assert model.whitening is not None
     other = DejaVu(whitening=Whitening(numbers=32))
-    other.describe_reference(ArrayTraverse(values[Sample.of(PLACES, learning.SAMPLE).frame]))
+    other.descriptor.learn(ArrayTraverse(values[Sample.of(PLACES, learning.SAMPLE).frame]))
     for name, value in other.whitening.state_dict().items():  # type: ignore[union-attr]
         assert torch.equal(value, model.whitening.state_dict()[name])
     assert torch.allclose(found.float(), model.whitening(values), rtol=1e-3, atol=1e-3)

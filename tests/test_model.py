@@ -308,15 +308,15 @@ def test_frames_keep_their_size_where_it_was_asked_for(tmp_path: Path) -> None:
     for i in range(3):
         Image.new("L", (400, 200), 40 * i).save(images / f"{i}.png")
     model = DejaVu()
-    assert model.fit(open_source(images)).frame_shape == (1, 80, 160)
-    assert model.fit(open_source(f"{images}?start=1")).frame_shape == (1, 80, 160)
-    assert model.fit(open_source(f"{images}?width=300&start=1")).frame_shape == (1, 150, 300)
-    assert DejaVu(HOG()).fit(open_source(images)).frame_shape == (1, 80, 160)
-    block = DejaVu(HOG()).fit(ArrayTraverse(torch.rand(1, 1, 20, 500)))
+    assert model.at_map_size(open_source(images)).frame_shape == (1, 80, 160)
+    assert model.at_map_size(open_source(f"{images}?start=1")).frame_shape == (1, 80, 160)
+    assert model.at_map_size(open_source(f"{images}?width=300&start=1")).frame_shape == (1, 150, 300)
+    assert DejaVu(HOG()).at_map_size(open_source(images)).frame_shape == (1, 80, 160)
+    block = DejaVu(HOG()).at_map_size(ArrayTraverse(torch.rand(1, 1, 20, 500)))
     assert block.frame_shape == (1, 16, 400)
-    assert DejaVu(HOG(resize=(100, 100))).fit(open_source(images)).frame_shape == (1, 100, 200)
-    assert DejaVu(preprocess=Preprocess(size=None)).fit(open_source(images)).frame_shape == (1, 200, 400)
-    assert DejaVu(preprocess=Preprocess(size=50)).fit(open_source(images)).frame_shape == (1, 25, 50)
+    assert DejaVu(HOG(resize=(100, 100))).at_map_size(open_source(images)).frame_shape == (1, 100, 200)
+    assert DejaVu(preprocess=Preprocess(size=None)).at_map_size(open_source(images)).frame_shape == (1, 200, 400)
+    assert DejaVu(preprocess=Preprocess(size=50)).at_map_size(open_source(images)).frame_shape == (1, 25, 50)
     for size in (0, 1.5):
         with refused("size=", "at least 1"):
             Preprocess(size=size)  # type: ignore[arg-type]
@@ -433,7 +433,7 @@ def test_queries_are_read_as_they_are_matched_in_constant_memory(largest_tensor:
 def test_a_flat_image_has_finite_gradients_and_no_graph_is_left() -> None:
     model = wave_model().learn(pictures().requires_grad_())
     frames = torch.full((2, 1, SIZE, 2 * SIZE), 0.5, requires_grad=True)
-    features = model.describe(frames).detach()
+    features = model.descriptor.describe(frames).detach()
     with torch.autocast("cpu", torch.bfloat16):
         scores = model(features)
     assert torch.equal(scores, model(features))  # which ignore it

@@ -73,7 +73,7 @@ def test_nordland_beside_hog(data_dir: Path, network: nn.Module) -> None:
     both = DejaVu(net, Whitening(numbers=192))
     both.learn(summer, second=second_traverse(both, summer, winter))
     summer, winter = (open_source(f"{one}?start=900&stop=1800") for one in seasons)
-    places, queries = both.extract_all(summer), both.extract_all(winter)
+    places, queries = both.descriptor.all_of(summer), both.descriptor.all_of(winter)
     nearest = (queries @ places.T).argmax(1)
     right = (nearest - torch.arange(900)).abs() <= 5
     assert 0.66 < right.float().mean() < 0.74

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dejavu_torch import HOG, DejaVu, ImposedPeriods, SequenceMatcher, TemplateMapper, open_source
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.frame_range import FrameRange
+from dejavu_torch.data.traverse import FrameRange
 from dejavu_torch.features.views import Views, augmented_route
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.growth import second_traverse
@@ -60,7 +60,7 @@ def test_a_second_traverse_is_found_at_five_bytes_a_place(
     model: DejaVu, reference: Traverse, second: Traverse
 ) -> None:
     few = DejaVu(mapper=SpectralMapper(5.0))
-    few.take_whitening(model)
+    few.descriptor.take(model.descriptor, whitening=True)
     assert near_share(few.learn(reference), second) > 0.95
     assert 4.8 * FRAMES <= few.summary().route_bytes <= 5 * FRAMES
 
@@ -78,7 +78,7 @@ def test_two_runs_give_the_same_map(model: DejaVu, reference: Traverse) -> None:
 def test_scores_of_frames_and_of_their_features_agree(model: DejaVu, second: Traverse) -> None:
     frames = next(iter(second.batches(8)))
     scores = model(frames)
-    descriptors = model.whitened(model.describe(frames))
+    descriptors = model.descriptor.whitened(model.descriptor.describe(frames))
     torch.testing.assert_close(model.map.scores(descriptors), scores, rtol=0, atol=1e-4)
     assert torch.equal(model.localize_descriptors(descriptors).index, scores.argmin(1))
     frames = frames[:4].clone().requires_grad_()
@@ -86,7 +86,7 @@ def test_scores_of_frames_and_of_their_features_agree(model: DejaVu, second: Tra
     assert frames.grad is not None
     assert frames.grad.isfinite().all()
     assert frames.grad.abs().max() > 0
-    four = next(model.describer.descriptors(ArrayTraverse(frames, "four")))  # a batch of another size
+    four = next(model.descriptor.batches(ArrayTraverse(frames, "four")))  # a batch of another size
     assert (1 - (four * descriptors[:4]).sum(1)).abs().max() < 1e-4
 
 
@@ -150,8 +150,8 @@ def test_the_whitening_of_another_model(model: DejaVu, reference: Traverse, tmp_
     known, other = DejaVu.load(tmp_path / "m.safetensors"), DejaVu(mapper=SpectralMapper(3.0))
     for without in (DejaVu(), spectral()):
         with refused("without whitening"):
-            other.take_whitening(without)
-    other.take_whitening(known)
+            other.descriptor.take(without.descriptor, whitening=True)
+    other.descriptor.take(known.descriptor, whitening=True)
     other.learn(open_source(f"sim:aerial?frames={FRAMES}&traverse=1"))
     states = [one.state_dict()["whitening.projection"] for one in (model, other)]
     assert torch.equal(*states)  # fixed

@@ -5,6 +5,7 @@ Only what every command needs is imported here; the rest, such as matplotlib, is
 
 from __future__ import annotations
 
+import builtins
 import copy
 import json
 import shlex
@@ -22,15 +23,14 @@ from torch import Tensor, nn
 from dejavu_torch import growth
 from dejavu_torch.cli import options
 from dejavu_torch.cli.device import device_of
-from dejavu_torch.data.frame_range import chained
-from dejavu_torch.data.names import names_of
 from dejavu_torch.data.output import check_output_file, check_output_folder, whole_folder
 from dejavu_torch.data.source import check_not_read, open_source
+from dejavu_torch.data.traverse import chained
 from dejavu_torch.evaluation.answers import next_steps, probable_counts, told_line, told_probable
 from dejavu_torch.features.joined import Joined
+from dejavu_torch.features.views import SAMPLE as SHORT
 from dejavu_torch.features.views import Views
-from dejavu_torch.learning import SAMPLE as SHORT
-from dejavu_torch.learning import Checkpoint, ChunkCoder, Code
+from dejavu_torch.learning import Checkpoint, MapTasks
 from dejavu_torch.maps.place_map import Mapper
 from dejavu_torch.maps.spectral import HELD, SpectralMapper
 from dejavu_torch.maps.spectral_map import SpectralMap
@@ -131,27 +131,27 @@ def run_learn(
     traverse, known = learning.with_calibration(model, traverse)
     places: Tensor | None = None  # that the traverse shows; None: all, from the first on
     done, start, checkpoint = "", model.map.places, Checkpoint(map)
-    code: Code = ChunkCoder.chunks
+    map_tasks: MapTasks = builtins.map
     with ExitStack() as stack:
         if cluster is not None:
-            from dejavu_torch.cluster import Cluster, code_on
+            from dejavu_torch.cluster import Cluster
 
             # started only when there are chunks: that takes seconds
-            code = lambda *work: code_on(stack.enter_context(Cluster(cluster)), *work)  # noqa: E731
+            map_tasks = lambda *work: stack.enter_context(Cluster(cluster)).map(*work)  # noqa: E731
         if traverse is None:
             assert visits is not None
             checkpoint.check_unused()
             count, traverse, places = growth.average(model, visits, progress=True), *visits
             done = f"{count} of the {start} places of {append}: averaged and coded again at the same step"
         elif append is not None:
-            growth.append(model, traverse, progress=True, checkpoint=checkpoint, code=code, visits=visits)
+            growth.append(model, traverse, True, checkpoint, map_tasks, visits)
             places = torch.arange(start, model.map.places)
             known = known and known._replace(places=known.places + torch.where(known.places >= 0, start, 0))
             done = f"{len(places)} places appended to the {start} of {append}; written to {map}"
         elif visits is not None:
-            growth.learn_mean(model, traverse, visits, True, views, checkpoint, code)
+            growth.learn_mean(model, traverse, visits, True, views, checkpoint, map_tasks)
         else:
-            model.learn(traverse, progress=True, second=views, checkpoint=checkpoint, code=code)
+            model.learn(traverse, True, views, checkpoint, map_tasks)
     if cluster is not None and append is None and model.map.places <= SHORT:
         print(f"--cluster {cluster} is not used for {model.map.places} frames, only for more than {SHORT}")
     if learning.calibration != options.NO_CALIBRATION:
@@ -214,10 +214,10 @@ def run_localize(
     acceptance.of(model)
     if top is not None:
         check_candidates(top, SUPPRESSION, model.map.places)
-    query = model.fit(open_source(source), model.frame_shape or ())
+    query = model.at_map_size(open_source(source), model.frame_shape or ())
     if pairs is not None:
         check_pair_names(model.frame_names, f"the map {map}")
-        check_pair_names(names_of(query, query.length or 1), query.name)
+        check_pair_names(query.names, query.name)
     if model.step is not None:
         query = model.resample(query, model.step, True, model.frame_shape)
         _print_steps(query)
@@ -628,7 +628,7 @@ def _check_report_folder(
 
 def _print_steps(traverse: Traverse) -> None:
     if isinstance(traverse, ResampledTraverse):
-        steps = f"{traverse.length} even steps of {traverse.step:.4g} pixels of ground"
+        steps = f"{len(traverse)} even steps of {traverse.step:.4g} pixels of ground"
         print(f"{len(traverse.positions)} frames resampled to {steps}")
 
 
@@ -719,7 +719,7 @@ def _write_matches(
     frames, source = None, query
     if isinstance(query, ResampledTraverse):
         frames, source = query.frame, query.traverse
-    names = source.frame_name, model.frame_name
+    names = source.names, model.frame_names
     return write_matches(path, matches, frames, model.map.frame_of, *names, ranks, model.map.routes, pairs)
 
 

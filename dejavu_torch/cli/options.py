@@ -11,10 +11,11 @@ from torch import nn
 
 from dejavu_torch import growth
 from dejavu_torch.cli.device import device_of
-from dejavu_torch.data.frame_range import parts_of
 from dejavu_torch.data.source import open_source
+from dejavu_torch.data.traverse import parts_of
+from dejavu_torch.features.descriptor import default_features
 from dejavu_torch.features.views import Views
-from dejavu_torch.model import DejaVu, check_precision, default_features
+from dejavu_torch.model import DejaVu, check_precision
 from dejavu_torch.model_file import NO_MAP, recipe_of
 from dejavu_torch.motion.resampling import source_of
 from dejavu_torch.recognition.filter import PlaceFilter
@@ -262,8 +263,8 @@ class Learning:
         traverse = open_another("calibration", str(source), others)
         if reference is not None:
             reference = model.resample(reference, model.step, True, model.frame_shape)
-            traverse = model.fit(traverse, reference.frame_shape)
-            model.describer.check_sizes(reference, traverse)
+            traverse = model.at_map_size(traverse, reference.frame_shape)
+            model.descriptor.check_sizes(reference, traverse)
         return reference, growth.associate(model, reference, traverse, truth)
 
     def check_calibrated(

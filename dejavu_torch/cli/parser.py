@@ -468,7 +468,7 @@ def _model_of(name: str, arguments: dict[str, Any], words: Sequence[str]) -> Dej
         model = DejaVu(**settings | {"whitening": None})
         file = DejaVu.load(Path(whitening), named_features(model))
         try:
-            model.take_whitening(file)
+            model.descriptor.take(file.descriptor, whitening=True)
         except InputError as error:
             raise InputError(f"--whitening {whitening}: {error}") from error
         return model

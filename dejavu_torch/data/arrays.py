@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.files import read_text, reading, state_of
+from dejavu_torch.data.files import read_text, reading
 from dejavu_torch.data.folder import ROUNDING, numbers_increase
-from dejavu_torch.data.frame_range import IndexedTraverse
 from dejavu_torch.memory import check_room
 from dejavu_torch.text import printable
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, Traverse
 
 UNNAMED = "the array"
 EXPECTED = (
@@ -27,7 +24,7 @@ EXPECTED = (
 CHANNELS = (1, 3)  # of uint8 frames
 
 
-class ArrayTraverse(IndexedTraverse):
+class ArrayTraverse(Traverse):
     """The frames or features of an array or tensor; a memory-mapped file is read only as needed.
 
     Args:
@@ -41,7 +38,6 @@ class ArrayTraverse(IndexedTraverse):
     """
 
     path: Path | None = None  # of the file that holds exactly these values
-    names: Sequence[str] = ()  # of the images, if a file next to the features lists them
 
     def __init__(self, values: Tensor | np.ndarray, name: str = UNNAMED) -> None:
         shape = tuple(values.shape)
@@ -55,10 +51,12 @@ class ArrayTraverse(IndexedTraverse):
         if 0 in shape:
             raise InputError(f"{name} is {shape}, which is empty; expected {EXPECTED}")
         self.name = name
-        self.length = shape[0]
         self.values = values
 
-    def read(self, frames: range) -> Tensor:
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def read(self, frames: range | list[int]) -> Tensor:
         part = self._slice(frames)
         if part.dtype == torch.uint8:
             part = part[..., None] if part.ndim == 3 else part
@@ -76,21 +74,13 @@ class ArrayTraverse(IndexedTraverse):
             batch.clamp_(0, 1)
         return batch
 
-    def _slice(self, frames: range) -> Tensor:
+    def _slice(self, frames: range | list[int]) -> Tensor:
         """The values of frames, in their stored type."""
-        part = self.values[frames.start : frames.stop : frames.step]
+        some = slice(frames.start, frames.stop, frames.step) if isinstance(frames, range) else frames
+        part = self.values[some]
         if isinstance(part, Tensor):
             return part
         return torch.from_numpy(np.array(part, dtype=part.dtype.newbyteorder("=")))  # a writable copy
-
-    def frame_name(self, i: int) -> str:
-        return self.names[i] if self.names else ""
-
-    def state(self, start: int, stop: int) -> str:
-        if self.path is not None:
-            return state_of(self.path)
-        part = self._slice(range(start, stop)).detach().cpu().contiguous()
-        return blake2b(part.view(-1).view(torch.uint8).numpy().data, digest_size=8).hexdigest()
 
     def __reduce__(self) -> Any:
         # a file is pickled as its path: the other process opens it

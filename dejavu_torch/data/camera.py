@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import stat
@@ -129,5 +130,6 @@ def stretched(name: str, own: tuple[int, int], size: tuple[int, int] | None) -> 
 
 def shots_of(traverse: Traverse) -> Iterator[Frame]:
     """The frames of a traverse one by one, with timestamps if it is a video."""
-    for i, batch in enumerate(traverse.batches(1)):
-        yield Frame(i, traverse.frame_time(i), batch[0])
+    times = traverse.times
+    for i in range(len(traverse)):
+        yield Frame(i, math.nan if times is None else float(times[i]), traverse[i])

@@ -14,12 +14,11 @@ import torch
 from PIL import Image, ImageOps
 from torch import Tensor
 
-from dejavu_torch.data.files import reading, state_of
-from dejavu_torch.data.frame_range import IndexedTraverse
+from dejavu_torch.data.files import reading
 from dejavu_torch.memory import check_room
 from dejavu_torch.resize import MOST_PIXELS, is_stretched, resize_frames
 from dejavu_torch.text import printable
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, Traverse
 
 log = logging.getLogger("dejavu_torch")
 
@@ -31,7 +30,7 @@ FORMATS = "PNG", "JPEG", "BMP", "DIB", "TIFF", "WEBP", "PPM", "GIF"  # none that
 BYTES_PER_PIXEL = 24  # peak while reading: decoded, as an array, and as floats
 
 
-class ImageFolder(IndexedTraverse):
+class ImageFolder(Traverse):
     """The images of a folder, sorted by name; numbers in names compare as numbers (9 before 10). If all names
     end in increasing numbers, such as frame_0001.png, the images are assumed to be in order along the route.
 
@@ -54,31 +53,27 @@ class ImageFolder(IndexedTraverse):
             raise InputError(f"{folder} is not there; expected a folder of images")
         inside = list(folder.iterdir())
         images = [file for file in inside if file.suffix.lower() in IMAGE_SUFFIXES and file.name[0] != "."]
-        names = sort_names([file.name for file in images if file.is_file()], order, printable(folder))
-        self.files = [folder / name for name in names]
-        if not names:
+        self.names = sort_names([file.name for file in images if file.is_file()], order, printable(folder))
+        if not self.names:
             folders = sorted((file.name for file in inside if file.is_dir()), key=natural)
             inner = f" but folders such as {folders[0]}" if folders else ""
             raise InputError(f"{folder} contains no images{inner}; expected files such as .png or .jpg")
         self.width, self.height, self.sized = width, height, bool(width or height)
         self.path, self.name = folder, printable(folder)
-        self.length, self.order, self.ordered = len(names), order, numbers_increase(names)
+        self.ordered = numbers_increase(self.names)
         self.same_aspect = False  # whether to refuse images of another aspect ratio, such as portraits
         self._first: tuple[str, str, tuple[int, int]] | None = None  # image read: name, shape, original size
 
-    def read(self, frames: range) -> Tensor:
-        images = [self._image(self.files[i]) for i in frames]
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def read(self, frames: range | list[int]) -> Tensor:
+        images = [self._image(self.path / self.names[i]) for i in frames]
         return images[0][None] if len(images) == 1 else torch.stack(images)
 
-    def frame_name(self, i: int) -> str:
-        return self.files[i].name
-
-    def identity(self) -> str:
-        by_text = " by text" * (self.order == LEXICOGRAPHIC)
-        return f"{super().identity()} {self.width} x {self.height}{by_text}"
-
-    def state(self, start: int, stop: int) -> str:
-        return state_of(*self.files[start:stop])
+    def decoded_at(self, height: int, width: int) -> ImageFolder:
+        """The images at a size in pixels that the user did not ask for."""
+        return self.changed(height=height, width=width, sized=True, same_aspect=True, _first=None)
 
     def _image(self, file: Path) -> Tensor:
         image = read_image(file, max(self.width, self.height))

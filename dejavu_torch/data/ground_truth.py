@@ -284,16 +284,15 @@ def find_ground_truth(
     if truth is None:
         if reference is None or query is None:
             return None
-        if reference.place is not None and query.place is not None:
-            return _every(position_truth(reference.place, _rows_of(query.place, numbers)))
-        count = len(numbers) if every else query.length
-        same_length = not resampled and count is not None and count == frames
-        if same_length and (aligned or are_aligned(reference, query, count or 0)):
+        if reference.places is not None and query.places is not None:
+            return _every(position_truth(reference.places, _rows_of(query.places, numbers)))
+        same_length = not resampled and len(query) == frames
+        if same_length and (aligned or are_aligned(reference, query)):
             return _every(offset_truth(numbers, frames))
         return None
     parsed = check_ground_truth(truth, interpolate)
     if isinstance(parsed, GroundTruth):
-        count = len(numbers) if every else None if query is None else query.length
+        count = len(numbers) if every else None if query is None else len(query)
         rows = (_rows_of(part, numbers) for part in as_ground_truth(parsed, count))
         found = GroundTruth(*rows)
     elif isinstance(parsed, int):
@@ -306,7 +305,7 @@ def find_ground_truth(
     elif parsed.suffix.lower() == ".npz":
         found = _read_matrices(parsed, numbers, frames, every)
     else:
-        length = query.length if query is not None and resampled else None
+        length = len(query) if query is not None and resampled else None
         if parsed.suffix.lower() == ".csv":
             places = _read_csv(parsed, frames, interpolate)
         else:
@@ -327,19 +326,17 @@ def _rows_of(table: Tensor, numbers: Tensor) -> Tensor:
     return table[numbers]
 
 
-def are_aligned(reference: Traverse, query: Traverse, frames: int) -> bool:
-    """Whether frame i of both traverses is known to show the same place.
+def are_aligned(reference: Traverse, query: Traverse) -> bool:
+    """Whether frame i of both traverses, of equal length, is known to show the same place.
 
     True for the same cuts of two long images, and for equal and unique names of all frames. Times of video
     frames are not names: any two recordings share them.
     """
     if reference.cut is not None:
         return reference.cut == query.cut
-    if not math.isnan(reference.frame_time(0)):
-        return False
-    names = [reference.frame_name(i) for i in range(frames)]
-    unique = all(names) and len({*names}) == frames
-    return unique and all(query.frame_name(i) == name for i, name in enumerate(names))
+    names = reference.names
+    unique = reference.times is None and bool(names) and all(names) and len({*names}) == len(names)
+    return unique and [*names] == [*query.names]
 
 
 def describe_ground_truth(truth: Truth | None, interpolate: bool = False, positions: bool = False) -> str:
@@ -370,8 +367,8 @@ def offset_of(truth: Truth | None, positions: bool = False) -> int | None:
 
 def utm_coordinates(traverse: Traverse) -> Tensor:
     """Easting and northing in the names of a traverse's images, metres: (N,2) float64."""
-    names = [traverse.frame_name(i) for i in range(traverse.length or 0)]
-    if not any(names):
+    names = traverse.names
+    if not names:
         raise InputError(f"{traverse.name} has no image names; expected a folder of images for truth utm")
     rows = [[as_number(part) for part in name.split("@")[1:3]] for name in names]
     for name, row in zip(names, rows, strict=True):

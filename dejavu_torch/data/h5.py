@@ -12,19 +12,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.files import reading, state_of
-from dejavu_torch.data.folder import LEXICOGRAPHIC, numbers_increase, sort_names
-from dejavu_torch.data.frame_range import IndexedTraverse
+from dejavu_torch.data.files import reading
+from dejavu_torch.data.folder import numbers_increase, sort_names
 from dejavu_torch.memory import check_room
 from dejavu_torch.text import one_line, printable
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, Traverse
 
 H5_SUFFIXES = {".h5", ".hdf5"}
 KEY = "global_descriptor"
 EXPECTED = f"a group for each image with a dataset {KEY} (D,) of floats, as hloc writes it"
 
 
-class DescriptorFile(IndexedTraverse):
+class DescriptorFile(Traverse):
     """The global descriptors in an HDF5 file of hloc (Hierarchical-Localization), sorted as in `ImageFolder`.
 
     Args:
@@ -68,9 +67,12 @@ class DescriptorFile(IndexedTraverse):
                 expected = f"{width} like {self.names[0]}" if width else "at least 1"
                 raise InputError(f"{self.name}: {seen}; expected {expected}")
         check_room(24.0 * width, f"a descriptor of {self.name}")
-        self.length, self.order, self.ordered = len(self.names), order, numbers_increase(self.names)
+        self.ordered = numbers_increase(self.names)
 
-    def read(self, frames: range) -> Tensor:
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def read(self, frames: range | list[int]) -> Tensor:
         with self._open() as file:
             rows = np.stack([file[f"{self.names[i]}/{KEY}"][()] for i in frames])
             batch = torch.from_numpy(rows.astype(np.float32))
@@ -79,15 +81,6 @@ class DescriptorFile(IndexedTraverse):
             image = self.names[frames[int(bad.nonzero()[0])]]
             raise InputError(f"{self.name}: {KEY} of {image} has NaN or infinite values; expected none")
         return batch
-
-    def frame_name(self, i: int) -> str:
-        return self.names[i]
-
-    def identity(self) -> str:
-        return f"{super().identity()}{' by text' * (self.order == LEXICOGRAPHIC)}"
-
-    def state(self, start: int, stop: int) -> str:
-        return state_of(self.path)
 
     @contextmanager
     def _open(self) -> Iterator[Any]:

@@ -11,17 +11,11 @@ from itertools import accumulate, pairwise
 from typing import Any
 
 from dejavu_torch.memory import check_room
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.types import InputError
 
 MAX_NAME_LENGTH = 4096  # characters, as of a path
 MAX_DIGITS = 18  # of a number in a name
 MAX_DECODED_BYTES = 2**30
-
-
-def names_of(traverse: Traverse, frames: int) -> list[str]:
-    """The names of the first `frames` frames of a traverse; [] if they have none."""
-    names = [traverse.frame_name(i) for i in range(frames)]
-    return names if any(names) else []
 
 
 def encode_names(names: Sequence[str]) -> str:

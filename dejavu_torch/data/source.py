@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -14,21 +14,23 @@ from urllib.parse import parse_qsl
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.utils.data import Dataset
 
 from dejavu_torch.data.arrays import ArrayTraverse, read_array
 from dejavu_torch.data.folder import IMAGE_SUFFIXES, ImageFolder, natural
-from dejavu_torch.data.frame_range import FrameRange
 from dejavu_torch.data.h5 import H5_SUFFIXES, DescriptorFile
 from dejavu_torch.data.simulate import SIMULATORS
 from dejavu_torch.data.strip import read_strip
+from dejavu_torch.data.traverse import Frames, frame_range
 from dejavu_torch.data.video import VIDEO_SUFFIXES, Video
 from dejavu_torch.types import InputError, Traverse
 
-Source: TypeAlias = Traverse | Tensor | NDArray[Any] | str | Path  # of frames or features
+# of frames or features: see `as_traverse`
+Source: TypeAlias = Traverse | Tensor | NDArray[Any] | str | Path | Sequence[Any] | Dataset[Any]
 READERS: dict[str, Callable[..., Traverse]] = {".npy": read_array}  # by suffix
 READERS |= dict.fromkeys(VIDEO_SUFFIXES, Video) | dict.fromkeys(H5_SUFFIXES, DescriptorFile)
 KINDS = {int: "integer", float: "floating-point number"}  # types of option values
-PART = {"start": 0, "stop": 0, "step": 1}  # options of every source, see `FrameRange`
+PART = {"start": 0, "stop": 0, "step": 1}  # options of every source, see `frame_range`
 EXPECTED = (
     "a folder of images or a video, such as clip.mp4?width=160, an .npy file of frames or features, an .h5 "
     "file of hloc, sim:aerial?seed=0&traverse=0&frames=3072, sim:outdoor, sim:underground, or "
@@ -37,16 +39,19 @@ EXPECTED = (
 
 
 def as_traverse(source: Source) -> Traverse:
-    """A tensor or array of frames or features, or what `open_source` opens, as a traverse; a traverse
-    unchanged."""
+    """A traverse unchanged; a tensor or array of frames or features, a list or dataset of frames (see
+    `Frames`), or what `open_source` opens, as one."""
+    if isinstance(source, Traverse):
+        return source
     if isinstance(source, Tensor | np.ndarray):
         return ArrayTraverse(source)
     if isinstance(source, str | Path):
         return open_source(source)
-    if isinstance(source, Traverse):
-        return source
+    if hasattr(source, "__len__") and hasattr(source, "__getitem__") and not isinstance(source, Mapping):
+        return Frames(source)
     seen = f"got a {type(source).__name__}"
-    raise InputError(f"{seen}; expected a Traverse, a tensor or array, or a path as of open_source")
+    expected = "a tensor or array, a list or dataset of frames, or a path as of open_source"
+    raise InputError(f"{seen}; expected a Traverse, {expected}")
 
 
 def open_source(source: str | Path, size: tuple[int, int] | None = None) -> Traverse:
@@ -66,9 +71,9 @@ def open_source(source: str | Path, size: tuple[int, int] | None = None) -> Trav
         InputError: missing, empty, or unreadable.
 
     Example:
-        >>> open_source("sim:aerial?frames=40&traverse=1").length
+        >>> len(open_source("sim:aerial?frames=40&traverse=1"))
         40
-        >>> open_source("sim:aerial?frames=40&start=10&step=3").length
+        >>> len(open_source("sim:aerial?frames=40&start=10&step=3"))
         10
     """
     text = str(source)
@@ -79,7 +84,7 @@ def open_source(source: str | Path, size: tuple[int, int] | None = None) -> Trav
     resizes = getattr(reader, "func", None) in (ImageFolder, Video)
     if size is not None and resizes and not {"height", "width"} & arguments.keys():
         arguments["height"], arguments["width"] = size
-    return FrameRange(reader(**arguments), **part) if part else reader(**arguments)
+    return frame_range(reader(**arguments), **part) if part else reader(**arguments)
 
 
 def routes_of(source: str | Path) -> list[str]:
@@ -139,7 +144,7 @@ def _reader(text: str, address: str) -> Callable[..., Traverse]:
 
 
 def _arguments(text: str, query: str, reader: Callable[..., Traverse]) -> dict[str, Any]:
-    """`a=1&b=2` as keyword arguments of the reader and of `FrameRange`, each of the type of its default."""
+    """`a=1&b=2` as keyword arguments of the reader and of `frame_range`, each of the type of its default."""
     empty = inspect.Parameter.empty
     defaults = {name: option.default for name, option in inspect.signature(reader).parameters.items()} | PART
     given: dict[str, Any] = {}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from hashlib import blake2b
 from pathlib import Path
 
 import torch
@@ -10,12 +9,11 @@ from torch import Tensor
 
 from dejavu_torch.data.files import as_number
 from dejavu_torch.data.folder import read_image
-from dejavu_torch.data.frame_range import IndexedTraverse
 from dejavu_torch.text import printable
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, Traverse
 
 
-class SlidingWindow(IndexedTraverse):
+class SlidingWindow(Traverse):
     """Frame i is the window [i * step, i * step + width) of a strip.
 
     Args:
@@ -27,7 +25,7 @@ class SlidingWindow(IndexedTraverse):
 
     Example:
         >>> traverse = SlidingWindow(torch.rand(1, 96, 200), width=96)
-        >>> traverse.length, next(traverse.batches(64)).shape
+        >>> len(traverse), traverse[:64].shape
         (105, torch.Size([64, 1, 96, 96]))
     """
 
@@ -39,17 +37,15 @@ class SlidingWindow(IndexedTraverse):
         if not 1 <= width <= strip.shape[2] or step < 1:
             seen = f"{name} is {strip.shape[2]} pixels long, window {width}, step {step}"
             raise InputError(f"{seen}; expected a window of 1 to {strip.shape[2]}, and a step of at least 1")
-        self.name, self.strip, self.step = name, strip, step
+        self.name = name
         self.windows = strip.unfold(2, width, step).permute(2, 0, 1, 3)  # (N,C,H,width), a view
-        self.length = len(self.windows)
-        self.cut = (strip.shape[2], width, step), range(self.length)
+        self.cut = (strip.shape[2], width, step), range(len(self.windows))
 
-    def read(self, frames: range) -> Tensor:
-        return self.windows[frames.start : frames.stop : frames.step].contiguous()
+    def __len__(self) -> int:
+        return len(self.windows)
 
-    def identity(self) -> str:
-        pixels = blake2b(self.strip.contiguous().numpy().data, digest_size=8).hexdigest()
-        return f"{super().identity()} by {self.step} of {pixels}"
+    def read(self, frames: range | list[int]) -> Tensor:
+        return self.windows[torch.as_tensor(frames)]
 
 
 def read_strip(path: Path, width: int, rows: str = "", halve: int = 0, grey: bool = False) -> SlidingWindow:

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import logging
 import math
+import os
+from bisect import bisect_right
 from collections.abc import Generator, Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from fractions import Fraction
+from functools import cache
+from itertools import islice
 from pathlib import Path
+from time import monotonic
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.files import check_regular, reading, state_of, why
+from dejavu_torch.data.files import check_regular, reading, why
 from dejavu_torch.data.folder import check_pixels, check_size, fitted_size
 from dejavu_torch.data.names import clock_time
 from dejavu_torch.resize import MOST_PIXELS
@@ -36,7 +41,12 @@ VIDEO_SUFFIXES = {
 FORMATS = "mov,mp4,matroska,webm,avi,mpeg,mpegts,mpegvideo,m4v,h264,hevc,asf,flv,live_flv,ogg,mjpeg"
 EBML, SEGMENT, CLUSTER = b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67", b"\x1f\x43\xb6\x75"  # of Matroska
 BOXES = {b"ftyp", b"free", b"skip", b"wide", b"moov", b"moof", b"mdat", b"mfra", b"sidx", b"styp", b"uuid"}
+LONG = 3.0  # seconds of reading the times that are told
+VP8_SHOWN = 16  # the bit of a packet's first byte that says whether its frame is shown
 UNEVEN_RATIO = 1.5  # of the longest to the median interval; rounding to half a frame stays below it
+
+Index = tuple[list[Any], list[int], Fraction | None]  # time stamps, key frames, seconds of a stamp
+_FORKED: list[object] = []  # decoders of parent processes
 
 
 class Video(Traverse):
@@ -48,7 +58,10 @@ class Video(Traverse):
 
     Shape: frames (B,3,H,W), always RGB, rotated upright as the file says.
 
-    Convention: a frame's name is its time, as 0:01:23.480. Reading to the end warns of a variable frame rate.
+    Convention: a frame's name is its time, as 0:01:23.480. Opening reads the times of all frames, without
+        decoding them where the file lists them (.mp4, .mov, .mkv, .webm, .avi); a variable frame rate is
+        warned of. Any frame can be read: decoding starts at the key frame before it, or goes on from the
+        last one read. .avi files whose frames are not stored in order are decoded from their beginning.
 
     Raises:
         InputError: width or height out of range; not a video, or a truncated one; while reading, a damaged
@@ -64,115 +77,139 @@ class Video(Traverse):
         check_size(self.path, width, height)
         self.width, self.height, self.sized = width, height, bool(width or height)
         check_regular(self.path, "a video file")
-        self._seconds: list[float] = []  # of the frames read so far
-        self._complete = False  # whether all frames have been read
         with self._open() as (container, stream):
-            whole = _is_whole(self.path)
+            whole, kind = _is_whole(self.path), container.format.name
             # only this family lists every frame, and which ones an edit list hides
-            if container.format.name.startswith("mov") and stream.frames:
+            if kind.startswith("mov") and stream.frames:
                 entries = stream.index_entries
-                self.length = sum(not entry.is_discard for entry in entries)
                 whole = whole and all(entry.pos + entry.size <= container.size for entry in entries)
+            self._sought = kind != "avi" or not stream.codec_context.has_b_frames
+            listed = kind.startswith(("mov", "matroska", "avi")) and self._sought
         if not whole:
             raise InputError(f"{path} is cut off or damaged; expected a complete video file")
+        began = monotonic()
+        self._stamps, self._keys, base = self._listed() if listed else self._decoded()
+        if (took := monotonic() - began) > LONG:
+            log.warning("%s: reading the times of its %d frames took %.0f s", self.name, len(self), took)
+        self.times = torch.tensor([seconds_of(stamp, base) for stamp in self._stamps], dtype=torch.float64)
+        self.names = [clock_time(time) if math.isfinite(time) else "" for time in self.times.tolist()]
+        self._warn_uneven()
+        self._decoder: Generator[VideoFrame, None, None] | None = None  # of the process `_owner`
+        self._owner, self._next = 0, 0  # the frame that the decoder gives next
 
-    def batches(self, size: int) -> Iterator[Tensor]:
-        yield from self.select(range(2**62), size)
+    def __len__(self) -> int:
+        return len(self._stamps)
 
-    def between(self, start: int, stop: int) -> Iterator[Tensor]:
-        yield from self.select(range(start, stop), self.batch_size())
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_decoder": None}
 
-    def select(self, frames: range, size: int) -> Iterator[Tensor]:
-        first: tuple[int, int] | None = None
-        batch: list[np.ndarray] = []
-        with closing(self._frames()) as decoded:
-            for i, frame in enumerate(decoded):
-                first = first or (frame.height, frame.width)
-                check_same_size(self.name, i, frame, first)
-                if i in frames:
-                    with reading(self.path, "cannot be resized", "a smaller size"):
-                        batch.append(pixels_of(frame, self.path, self.width, self.height))
-                if len(batch) == size:
-                    yield _as_tensor(batch)
-                    batch = []
-                if i + 1 >= frames.stop:
+    def decoded_at(self, height: int, width: int) -> Video:
+        """The frames at another size in pixels."""
+        return self.changed(height=height, width=width, sized=True, _decoder=None)
+
+    def read(self, frames: range | list[int]) -> Tensor:
+        pictures = {i: self._picture(i) for i in sorted({*frames})}
+        return _as_tensor([pictures[i] for i in frames])
+
+    def _picture(self, i: int) -> np.ndarray:
+        """Frame i in the size of all frames, (H,W,3) uint8."""
+        key = self._keys[bisect_right(self._keys, i) - 1]
+        if self._owner != os.getpid():
+            _FORKED.append(self._decoder)  # closing it would wait for threads that are not in this process
+            self._decoder = None
+        if self._decoder is None or not key <= self._next <= i:
+            self._decoder, self._owner, self._next = self._frames(key), os.getpid(), key
+        decoder, self._decoder = self._decoder, None  # after an error or the last frame
+        for frame in decoder:
+            self._next += 1
+            if self._next > i:
+                with reading(self.path, "cannot be resized", "a smaller size"):
+                    picture = pixels_of(frame, self.path, self.width, self.height)
+                if self._next < len(self):
+                    self._decoder = decoder
+                else:
+                    decoder.close()
+                return picture
+        raise self._broken(self._next, "frames are missing")
+
+    def _frames(self, first: int) -> Generator[VideoFrame, None, None]:
+        """The frames from a key frame on."""
+        i, size = first, None
+        with self._decoding() as (container, stream):
+            if first:
+                container.seek(self._stamps[first], stream=stream)
+            for frame in _decode(container, stream):
+                if i == first > 0 and frame.pts < self._stamps[first]:
+                    continue  # frames that precede the key frame
+                if i == first > 0 and frame.pts > self._stamps[first]:
                     break
-        if batch:
-            yield _as_tensor(batch)
+                if frame.is_corrupt:
+                    raise self._broken(i, "the picture is damaged")
+                if i >= len(self) or (self._sought and frame.pts != self._stamps[i]):
+                    raise self._broken(i, "frames are missing")
+                size = size or (frame.height, frame.width)
+                check_same_size(self.name, i, frame, size)
+                i += 1
+                yield frame
+        if i == first > 0:  # the container cannot seek exactly
+            yield from islice(self._frames(0), first, None)
 
-    def identity(self) -> str:
-        return f"{self.name} {self.width} x {self.height}"
+    def _listed(self) -> Index:
+        """The frames that the file lists, without decoding them."""
+        with self._decoding() as (container, stream):
+            packets = [one for one in container.demux(stream) if one.size and not one.is_discard]
+            if container.format.name == "avi" and len(packets) < len(stream.index_entries):
+                raise self._broken(len(packets), "frames are missing")
+            if stream.codec_context.name == "vp8":
+                packets = [one for one in packets if bytes(one)[0] & VP8_SHOWN]
+            packets.sort(key=lambda one: (one.pts is None, one.pts))
+            return self._index([one.pts for one in packets], [one.is_keyframe for one in packets], stream)
 
-    def state(self, start: int, stop: int) -> str:
-        return state_of(self.path)
+    def _decoded(self) -> Index:
+        """All frames, by decoding them once."""
+        with self._decoding() as (container, stream):
+            size, stamps, keys = None, list[Any](), list[bool]()
+            for i, frame in enumerate(_decode(container, stream)):
+                size = size or (frame.height, frame.width)
+                check_same_size(self.name, i, frame, size)
+                if frame.is_corrupt:
+                    raise self._broken(i, "the picture is damaged")
+                stamps.append(frame.pts)
+                keys.append(bool(frame.key_frame))
+            if container.format.name == "avi" and len(stamps) < len(stream.index_entries):
+                raise self._broken(len(stamps), "frames are missing")
+            self._sought = self._sought and None not in stamps and stamps == sorted({*stamps})
+            if None not in stamps:  # .avi stores no times of presentation
+                stamps.sort()
+            return self._index(stamps, keys, stream)
 
-    def frame_name(self, i: int) -> str:
-        seconds = self.frame_time(i)
-        return clock_time(seconds) if math.isfinite(seconds) else ""
+    def _index(self, stamps: list[Any], keys: list[bool], stream: VideoStream) -> Index:
+        if not stamps:
+            raise InputError(f"{self.name} has no frames; expected a video")
+        starts = [i for i, key in enumerate(keys) if key and i and self._sought]
+        return stamps, [0, *starts], stream.time_base
 
-    def frame_time(self, i: int) -> float:
-        if not self._complete and i >= len(self._seconds):
-            self._read_times()
-        return self._seconds[i]
-
-    def count(self) -> int:
-        if self.length is None and not self._complete:
-            self._read_times()
-        return len(self._seconds) if self.length is None else self.length
-
-    def _read_times(self) -> None:
-        for _ in self._frames(decode=self.length is None):
-            pass
-
-    def _frames(self, decode: bool = True) -> Generator[VideoFrame, None, None]:
-        """Every frame, or none without `decode`, which reads only times; missing frames raise at the end."""
-        seconds: list[float] = []
-        packets = 0
+    @contextmanager
+    def _decoding(self) -> Iterator[tuple[InputContainer, VideoStream]]:
+        """The opened file; errors of FFmpeg, which are of many types, become an InputError."""
         try:
-            with self._open() as (container, stream):
-                base = stream.time_base
-                avi = container.format.name == "avi"
-                # packets are in decoding order; .avi stores no other, so its frames get wrong times
-                in_order = decode and not avi
-                if in_order and not self._complete:
-                    self._seconds = seconds
-                for packet in container.demux(stream):
-                    packets += packet.size > 0
-                    if packet.is_corrupt:
-                        raise self._broken(len(seconds), "the data are incomplete")
-                    if not decode:
-                        if packet.size and not packet.is_discard:
-                            seconds.append(seconds_of(packet.pts, base))
-                        continue
-                    for frame in packet.decode():
-                        if frame.is_corrupt:
-                            raise self._broken(len(seconds), "the picture is damaged")
-                        seconds.append(seconds_of(frame.pts, base))
-                        yield frame
-                if (avi and packets < len(stream.index_entries)) or len(seconds) < (self.length or 0):
-                    raise self._broken(len(seconds), "frames are missing")
-                if not seconds:
-                    raise InputError(f"{self.name} has no frames; expected a video")
+            with self._open() as opened:
+                yield opened
         except InputError:
             raise
-        except Exception as error:  # FFmpeg raises many types
-            raise self._broken(len(seconds), why(error)) from error
-        if not self._complete:
-            self._seconds = seconds if in_order else sorted(seconds)
-            self._complete = True
-            self._warn_uneven()
+        except Exception as error:
+            raise self._broken(getattr(self, "_next", 0), why(error)) from error
 
     def _warn_uneven(self) -> None:
-        intervals = 1e3 * torch.tensor(self._seconds, dtype=torch.float64).diff()
+        assert self.times is not None
+        intervals = 1e3 * self.times.diff()
         if not len(intervals) or not (intervals >= 0).all():
             return
         shortest, middle, longest = map(float, (intervals.min(), intervals.median(), intervals.max()))
         if longest > UNEVEN_RATIO * middle + 1e-3:
-            log.warning(
-                "%s: the frame rate varies, %.0f to %.0f ms per frame (median %.0f): periods in frames are "
-                "meaningless unless the footage is resampled by distance",
-                *(self.name, shortest, longest, middle),
-            )
+            seen = f"{shortest:.0f} to {longest:.0f} ms per frame (median {middle:.0f})"
+            why = "periods in frames are meaningless unless the footage is resampled by distance"
+            _warn_once(f"{self.name}: the frame rate varies, {seen}: {why}")
 
     @contextmanager
     def _open(self) -> Iterator[tuple[InputContainer, VideoStream]]:
@@ -188,6 +225,18 @@ class Video(Traverse):
 
     def _broken(self, frame: int, why: str) -> InputError:
         return InputError(f"{self.name} is broken near frame {frame}: {why}; expected a complete video file")
+
+
+def _decode(container: InputContainer, stream: VideoStream) -> Iterator[VideoFrame]:
+    for packet in container.demux(stream):
+        if packet.is_corrupt:
+            raise ValueError("the data are incomplete")
+        yield from packet.decode()
+
+
+@cache  # a command may open a video several times
+def _warn_once(text: str) -> None:
+    log.warning("%s", text)
 
 
 def stream_of(container: InputContainer, name: str, expected: str, threads: str) -> Any:

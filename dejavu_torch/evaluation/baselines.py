@@ -264,7 +264,7 @@ def _described_baselines(
     if len(traverses[0].frame_shape) != 3:
         return {}
     try:
-        stored, queries = (plain.extract_all(traverse, progress) for traverse in traverses)
+        stored, queries = (plain.descriptor.all_of(traverse, progress) for traverse in traverses)
     except InputError as error:
         log.info("no %s to compare with: %s", type(plain.features).__name__, error)
         return {}

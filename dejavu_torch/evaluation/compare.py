@@ -7,14 +7,12 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from dejavu_torch.data.arrays import UNNAMED
-from dejavu_torch.data.fitted import fitted
 from dejavu_torch.data.ground_truth import (
     Truth,
     as_ground_truth,
@@ -24,6 +22,7 @@ from dejavu_torch.data.ground_truth import (
     offset_of,
 )
 from dejavu_torch.data.source import Source, as_traverse
+from dejavu_torch.data.traverse import fitted
 from dejavu_torch.evaluation.answers import own_facts
 from dejavu_torch.evaluation.baselines import Baseline, baselines_of
 from dejavu_torch.evaluation.contenders import Contender, contend, models_beside
@@ -34,14 +33,15 @@ from dejavu_torch.evaluation.plots import Pictures
 from dejavu_torch.evaluation.rejection import draw_reliability
 from dejavu_torch.evaluation.report import Report, as_html
 from dejavu_torch.evaluation.storage import coded_at_sizes, noise_over_map
+from dejavu_torch.features.descriptor import is_ready
 from dejavu_torch.features.views import Views
 from dejavu_torch.growth import calibrate_if_possible
-from dejavu_torch.learning import is_ready
 from dejavu_torch.maps.distance import l1_backend
+from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.maps.template_map import TemplateMapper
-from dejavu_torch.model import DejaVu
+from dejavu_torch.model import DejaVu, check_queries
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, source_of
 from dejavu_torch.periods.spectrogram import BACKEND
 from dejavu_torch.recognition.filter import PlaceFilter
@@ -135,13 +135,13 @@ def compare(
     if truth is not None:
         check_ground_truth(truth, interpolate)
     check_candidates(top, tolerance)
-    reference = model.fit(reference, model.frame_shape if has_map else None)
-    query = model.fit(query, reference.frame_shape)
+    reference = model.at_map_size(reference, model.frame_shape if has_map else None)
+    query = model.at_map_size(query, reference.frame_shape)
     for one in distractors:
         if is_ready(reference) and not is_ready(one):
             raise InputError(f"{one.name} has frames; expected ready features, as of {reference.name}")
     off = [one if is_ready(one) else fitted(one, reference.frame_shape) for one in distractors]
-    feature_shape = model.describer.check_sizes(reference, query, *off)
+    feature_shape = model.descriptor.check_sizes(reference, query, *off)
 
     seconds: dict[str, float] = defaultdict(float)
     with timed(seconds, "describe" if has_map else "learn"):
@@ -150,39 +150,38 @@ def compare(
         step = getattr(reference, "step", None)
         query = model.resample(query, step, progress)
     off = [model.resample(one, step, progress, reference.frame_shape) for one in off]
-    check_candidates(top, tolerance, reference.length)
-    if sequence is not None and reference.length is not None:
-        sequence.check(None, reference.length)
+    check_candidates(top, tolerance, len(reference))
+    if sequence is not None:
+        sequence.check(None, len(reference))
     if itself or (reference.name == query.name != UNNAMED):
         log.warning(
             "%s is matched with itself, each frame with its own copy; expected a second traverse", query.name
         )
-    find_truth = partial(ground_truth_of, truth, reference, query, interpolate=interpolate)
-    counted = reference.length is not None and query.length is not None
-    known = find_truth() if counted else None  # early, so that a bad truth is refused before the long work
+    # early, so that a bad truth is refused before the long work
+    known = ground_truth_of(truth, reference, query, interpolate=interpolate)
 
     with timed(seconds, "describe" if has_map else "learn"):
         if has_map:
-            if reference.length is not None:
-                check_places(model, reference.length, reference.name)
-            model.check_queries(reference.frame_shape, feature_shape, reference.name)
-            places = model.extract_all(reference, progress)
+            check_places(model, len(reference), reference.name)
+            check_queries(model, reference.frame_shape, feature_shape, reference.name)
+            places = model.descriptor.all_of(reference, progress)
             _check_given_map(model, places, reference.name, tolerance)
         else:
-            places = model.describe_reference(reference, second, progress)
+            spectral = isinstance(model.mapper, SpectralMapper)
+            places = model.descriptor.learn(reference, second, progress, spectral)
             model.learn_features(places, reference)
         if isinstance(calibration, Views) or (calibration is None and not has_map):
             calibrate_if_possible(model, reference, calibration, progress=progress)
 
     with timed(seconds, "localize"):
         rule = model.matching(sequence)
-        model.check_queries(query.frame_shape, feature_shape, query.name)
-        queries = model.extract_all(query, progress)
+        check_queries(model, query.frame_shape, feature_shape, query.name)
+        queries = model.descriptor.all_of(query, progress)
         if sequence is not None:
             sequence.check(len(queries), model.map.places)
         if ordered is None:
             ordered = source_of(query).ordered and len(queries) * model.map.places <= MAX_FILTERED
-        ordered = ordered and (known is not None or not counted)  # without truth it has no scores
+        ordered = ordered and known is not None  # without truth it has no scores
         models = models_beside(sequence, ordered, len(queries), model.map.places, tolerance)
         matching = Matching(sequence, models)
         ranks = max(top, min(max(RANKS), model.map.places))
@@ -191,7 +190,6 @@ def compare(
     off_map = _match_distractors(model, off, sequence, progress)
 
     model.cpu()
-    known = known if counted else find_truth(len(places), len(queries))
     if known is not None:
         known = ground_truth_in_places(known, model.map.place_of)
     match = candidates.map(lambda column: column[:, 0])
@@ -204,7 +202,7 @@ def compare(
     storage = coded_at_sizes(run, seed=seed, progress=progress) if storage_curve and scored else None
     pictures = draw_pictures(run, {"map": ours, **contenders}, storage)
     pictures |= draw_reliability(run.scored, known, tolerance)
-    carried = all(source_of(one).place is not None for one in (reference, query))
+    carried = all(source_of(one).places is not None for one in (reference, query))
     described = describe_ground_truth(truth, interpolate, carried)
     shown, ranked = match._replace(index=route.frame_of(match.index)), route.table.scored(candidates.index)
     facts = {
@@ -229,7 +227,7 @@ def _other_contenders(
         contenders = {key: _score_baseline(run, key, baseline) for key, baseline in baselines.items()}
     for key, (name, other) in others.items() if known else ():
         other.learn(run.reference, progress)
-        queries = other.extract_all(run.query, progress)
+        queries = other.descriptor.all_of(run.query, progress)
         found = other.localize_descriptors(queries, run.matching, progress=progress)
         contenders[key] = _contend(run, name, found, other)
     return contenders
@@ -275,7 +273,7 @@ def _match_distractors(
         return {}
     found = {}
     for one in distractors:
-        probability = model.localize_descriptors(model.extract_all(one, progress), sequence).probability
+        probability = model.localize_descriptors(model.descriptor.all_of(one, progress), sequence).probability
         assert probability is not None
         found[one.name] = probability
     return found

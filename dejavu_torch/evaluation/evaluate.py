@@ -89,7 +89,7 @@ def evaluate_file(
         place_map = place_map.part(route)
     positions = torch.zeros(0, dtype=torch.float32) if place_map is None else place_map.positions
     resampled = len(positions) > 0
-    frames = places = None if reference is None else reference.length
+    frames = places = None if reference is None else len(reference)
     if place_map is not None:
         places = place_map.places
         frames = len(positions) if resampled else places
@@ -100,7 +100,7 @@ def evaluate_file(
     known = find_ground_truth(truth, reference, query, frames, queries, interpolate, resampled)
     if known is None:
         raise InputError("there is no ground truth; expected one, or traverses that carry positions")
-    carried = all(one is not None and one.place is not None for one in (reference, query))
+    carried = all(one is not None and one.places is not None for one in (reference, query))
     own = own_facts(match, queries, tolerance, True, offset_of(truth, carried))
     if place_map is not None:
         known = ground_truth_in_places(known, place_map.place_of)

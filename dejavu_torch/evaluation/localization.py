@@ -92,4 +92,4 @@ def nearest_query(truth: GroundTruth, place: float) -> int:
 
 def frame_at(traverse: Traverse, number: int) -> Tensor:
     """One frame of a traverse, (C,H,W)."""
-    return next(traverse.between(number, number + 1))[0].float().cpu()
+    return traverse[number].float().cpu()

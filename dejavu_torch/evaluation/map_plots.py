@@ -208,7 +208,7 @@ def draw_motion(run: Localization) -> plots.Pictures:
     reference = run.reference
     if not isinstance(reference, ResampledTraverse):
         return {}
-    frame, odometry = frame_at(reference, reference.length // 2), reference.odometry
+    frame, odometry = frame_at(reference, len(reference) // 2), reference.odometry
     corners, (height, width) = odometry.corners, frame.shape[-2:]
     figure, (left, right) = plots.canvas(0.65 * plots.WIDTH * height / width + 0.4, 1, 2, width_ratios=(2, 1))
     plots.show_frame(left, frame, "the ground in a frame")

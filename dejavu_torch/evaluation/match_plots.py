@@ -39,7 +39,8 @@ def draw_pairs(run: Localization) -> plots.Pictures:
         return {}
 
     def named(role: str, traverse: Traverse, frame: Tensor) -> str:
-        name = source_of(traverse).frame_name(int(frame))
+        names = source_of(traverse).names
+        name = names[int(frame)] if names else ""
         return f"{role}:\n{plots.label(f'frame {frame} {name}'.strip())}"
 
     rows = []

@@ -49,8 +49,8 @@ def write_matches(
     matches: Iterable[Match],
     query_frames: Tensor | None = None,
     frame_of: Callable[[Tensor], Tensor] | None = None,
-    query_name: Callable[[int], str] | None = None,
-    place_name: Callable[[int], str] | None = None,
+    query_names: Sequence[str] = (),
+    place_names: Sequence[str] = (),
     ranks: int | None = None,
     routes: Sequence[Route] = (),
     pairs: Path | None = None,
@@ -61,11 +61,11 @@ def write_matches(
         matches: one per query, in order; with `ranks`, that many per query, the best first.
         query_frames: (Q,) int64, the source frame of each query; None: query i is frame i.
         frame_of: the reference frame of each place, as `PlaceMap.frame_of`; None: place i is frame i.
-        query_name, place_name: the name of a frame, as `Traverse.frame_name`; None leaves the column empty.
-            Unprintable characters, such as line breaks, are escaped.
+        query_names, place_names: of the frames; () leaves the column empty. Unprintable characters, such as
+            line breaks, are escaped.
         ranks: matches per query; None is one, without a column for the rank.
         routes: of a merged map: their names get a column, and the place is a frame of that route. `frame_of`
-            and `place_name` count through all routes.
+            and `place_names` count through all routes.
         pairs: another file, with a line `query_name place_name` for each reported place: the image pairs
             that hloc and COLMAP read.
 
@@ -106,8 +106,8 @@ def write_matches(
                     "probability": "" if math.isnan(p) else f"{p:.6g}",
                     "rank": at,
                     "route": printable(routes[on].name) if on >= 0 else "",
-                    "query_name": _name(query_name, query),
-                    "place_name": _name(place_name, place),
+                    "query_name": _name(query_names, query),
+                    "place_name": _name(place_names, place),
                 }
                 writer.writerow(row)
                 if paired and place >= 0:
@@ -124,8 +124,8 @@ def check_pair_names(names: Sequence[str], whose: str) -> None:
             raise InputError(f"{whose} has {seen}; expected names without spaces for --pairs")
 
 
-def _name(name_of: Callable[[int], str] | None, frame: int) -> str:
-    return "" if name_of is None or frame < 0 else printable(name_of(frame))
+def _name(names: Sequence[str], frame: int) -> str:
+    return printable(names[frame]) if names and frame >= 0 else ""
 
 
 def read_matches(path: Path, route: str | None = None) -> Matches:

@@ -13,6 +13,7 @@ from matplotlib.colors import PowerNorm
 from torch import Tensor
 from torch.nn.functional import max_pool1d
 
+from dejavu_torch.data.traverse import Part
 from dejavu_torch.evaluation import plots
 from dejavu_torch.evaluation.activation import activation_rates, layer_distances
 from dejavu_torch.evaluation.localization import Localization, frame_at
@@ -333,5 +334,6 @@ def slit_scan(traverse: Traverse, start: int, stop: int) -> Tensor | None:
     if len(traverse.frame_shape) == 1:
         return None
     # clones, as a view would keep the whole frames
-    columns = [batch[..., batch.shape[-1] // 2].clone() for batch in traverse.between(start, stop)]
+    part = Part(traverse, range(start, stop))
+    columns = [batch[..., batch.shape[-1] // 2].clone() for batch in part.batches()]
     return torch.cat(columns).permute(1, 2, 0).float() if columns else None

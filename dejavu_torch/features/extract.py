@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from dejavu_torch.features.preprocess import check_frames
-from dejavu_torch.features.views import AugmentedTraverse
+from dejavu_torch.features.views import AugmentedFrames
 from dejavu_torch.text import progress_of
 from dejavu_torch.types import InputError, Traverse
 
@@ -25,12 +25,13 @@ READY = 256  # ready features at a time, at least: a search takes longer per que
 
 
 def feature_batches(
-    traverse: Traverse,
+    traverse: Traverse | AugmentedFrames,
     module: nn.Module,
     batch_size: int = 64,
     device: torch.device | str = "cpu",
     label: str | None = None,
     on_first: Callable[[Tensor, Tensor], None] | None = None,
+    describe: Callable[[Tensor], Tensor] | None = None,
 ) -> Iterator[Tensor]:
     """Features (B,D) of the frames of a traverse, in order, without gradients.
 
@@ -40,17 +41,17 @@ def feature_batches(
         batch_size: frames in memory at a time, fewer if they are large; at least 256 ready features.
         label: of a progress bar on stderr, or of lines if it is no terminal; copies count once.
         on_first: called with the first batch and its features.
+        describe: a method of the module; None is its forward.
 
     Raises:
         InputError: features that are not (B,D) or not finite, or no frames at all.
     """
-    done, copies = 0, traverse.copies if isinstance(traverse, AugmentedTraverse) else 1
-    total = traverse.length and traverse.length // copies
+    done, copies = 0, traverse.copies if isinstance(traverse, AugmentedFrames) else 1
     size = max(batch_size, READY) if len(traverse.frame_shape) == 1 else batch_size
-    with progress_of(label, total) as update, in_mode(module, False):
-        for batch in traverse.batches(traverse.batch_size(size)):
+    with progress_of(label, len(traverse) // copies) as update, in_mode(module, False):
+        for batch in traverse.batches(size):
             with torch.no_grad():
-                features = features_of(batch.to(device), module, traverse.name).detach()
+                features = features_of(batch.to(device), describe or module, traverse.name).detach()
             if features.dtype in (torch.float16, torch.bfloat16):  # too coarse for sums and transforms
                 features = features.float()
             bad = ~features.isfinite().all(1)
@@ -63,8 +64,6 @@ def feature_batches(
             update((done + len(features)) // copies - done // copies)
             done += len(features)
             yield features
-    if done == 0:
-        raise InputError(f"{traverse.name} holds no frames; expected at least one")
 
 
 def as_weights(frames: Tensor, module: nn.Module) -> Tensor:
@@ -73,15 +72,6 @@ def as_weights(frames: Tensor, module: nn.Module) -> Tensor:
         return frames
     dtypes = (one.dtype for one in chain(module.parameters(), module.buffers()))
     return frames.to(next((dtype for dtype in dtypes if dtype.is_floating_point), frames.dtype))
-
-
-class Pipeline(nn.Sequential):
-    """Preprocess, then features: (B,C,H,W) -> (B,D)."""
-
-    def forward(self, frames: Tensor) -> Tensor:
-        preprocess, module = self
-        features: Tensor = module(as_weights(preprocess(frames), module))
-        return features
 
 
 def features_of(batch: Tensor, describe: Callable[[Tensor], Tensor], name: str = "the input") -> Tensor:
@@ -110,13 +100,15 @@ def warn_of_bright(frames: Tensor, name: str) -> bool:
     return most > BRIGHTEST
 
 
-def check_alone(module: nn.Module, frames: Tensor, features: Tensor, name: str) -> None:
+def check_alone(
+    module: nn.Module, describe: Callable[[Tensor], Tensor], frames: Tensor, features: Tensor, name: str
+) -> None:
     """Refuse a network in eval mode whose features of a frame depend on its batch beyond 1e-3 or rounding."""
     if frames.ndim != 4 or len(frames) < 2:
         return
     device = features.device.type
     with torch.no_grad():
-        alone = features_of(frames[:1].to(features.device), module, name).to(features)
+        alone = features_of(frames[:1].to(features.device), describe, name).to(features)
     difference = float((alone[0] - features[0]).norm() / features[0].norm().clamp(min=1e-12))
     dtypes = {one.dtype for one in module.parameters() if one.is_floating_point()}
     if torch.is_autocast_enabled(device):

@@ -3,21 +3,52 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import chain, islice
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor
 
+from dejavu_torch.data.traverse import Part
 from dejavu_torch.features.augmentation import LARGEST, Augmentation
 from dejavu_torch.types import InputError, Traverse
 
+SAMPLE = 10_000  # frames that a longer route is fitted on
+MIN_SEGMENTS = 4  # of a sample
 BLOCK = 64  # frames augmented together
 STRETCH, EVERY = 20, 10  # frames of a segment; every 10th segment is used
 STRONGER = 1.5  # factor on the strengths for whitening, which has seen the frames themselves
 FEWEST, MOST = 600, 1200  # frames of all segments together
 MAX_COPIES = 2  # frames of all segments, relative to the frames of a short route
 LEAST, SCORES = 240, 2**27  # frames of a long route at least; their scores at all places at most
+
+
+class Sample(NamedTuple):
+    """Evenly spaced segments of a route: whole chunks, if these are short enough."""
+
+    frame: Tensor  # (n,) int64
+    segment: int  # frames of each segment
+
+    @classmethod
+    def of(cls, frames: int, chunk: int) -> Sample:
+        """The sample of a route longer than `SAMPLE`, coded in chunks of `chunk` places.
+
+        Example:
+            >>> sample = Sample.of(100_000, chunk=1000)
+            >>> len(sample.frame), sample.frame[::1000].tolist()
+            (10000, [0, 11000, 22000, 33000, 44000, 55000, 66000, 77000, 88000, 99000])
+        """
+        segment = min(chunk, SAMPLE // MIN_SEGMENTS)
+        count, last = SAMPLE // segment, frames // segment - 1
+        starts = torch.arange(count) * last // (count - 1) * segment
+        return cls((starts[:, None] + torch.arange(segment)).flatten(), segment)
+
+    def views(self, second: Views) -> Views:
+        """The views of the sample in a second traverse; InputError if there are none."""
+        views = views_of(second, self.frame)
+        if not len(views.places):
+            seen = f"{second.traverse.name} shows none of the {len(self.frame)} frames that are learned from"
+            raise InputError(f"{seen}, in segments of {self.segment} along the route; expected some")
+        return views
 
 
 class Views(NamedTuple):
@@ -27,8 +58,17 @@ class Views(NamedTuple):
     places: Tensor
 
 
-class AugmentedTraverse(Traverse):
-    """Augmented copies of frames, the same for any batch size: each block of frames `copies` times.
+def views_of(views: Views, frames: Tensor) -> Views:
+    """The views of some frames (n,) of a route, increasing; their places are indices into these frames."""
+    places = views.places.cpu()
+    at = torch.searchsorted(frames, places).clamp(max=len(frames) - 1)
+    shown = (frames[at] == places).nonzero().flatten()
+    return Views(Part(views.traverse, shown), at[shown])
+
+
+class AugmentedFrames:
+    """Augmented copies of frames, the same for any batch size: each block of frames `copies` times. They are
+    drawn in order, so that this is no `Traverse`, but stands for one where frames are read once.
 
     Args:
         traverse: frames (B,C,H,W). runs: the frames, increasing. block: most frames augmented together.
@@ -58,12 +98,17 @@ class AugmentedTraverse(Traverse):
         self.traverse, self.runs, self.block, self.copies, self.seed = traverse, runs, block, copies, seed
         blocks = (part for run in runs for part in torch.tensor(run).split(block))
         self.places = torch.cat([part.repeat(copies) for part in blocks])
-        self.length = len(self.places)
-        self.name = f"augmented copies of {traverse.name}"
+        self.name, self.frame_shape = f"augmented copies of {traverse.name}", traverse.frame_shape
+
+    def __len__(self) -> int:
+        return len(self.places)
 
     def batches(self, size: int) -> Iterator[Tensor]:
+        """All copies, at most `size` at a time."""
         state = torch.Generator().manual_seed(self.seed).get_state()
-        for frames in self._blocks():
+        size = self.traverse.at_once(size)
+        for block in (run[i : i + self.block] for run in self.runs for i in range(0, len(run), self.block)):
+            frames = self.traverse[block]
             for _ in range(self.copies):
                 with torch.random.fork_rng(devices=[]):
                     torch.set_rng_state(state)
@@ -71,31 +116,15 @@ class AugmentedTraverse(Traverse):
                     state = torch.get_rng_state()
                 yield from copies.split(size)
 
-    def _blocks(self) -> Iterator[Tensor]:
-        """The frames of each block; a traverse that cannot seek is read only once."""
-        if self.traverse.seeks or len(self.runs) == 1:
-            for run in self.runs:
-                yield from self.traverse.select(run, self.block)
-            return
-        frames = chain.from_iterable(self.traverse.between(0, self.runs[-1].stop))
-        done = 0
-        for run in self.runs:
-            yield torch.stack(list(islice(frames, run.start - done, run.stop - done)))
-            done = run.stop
-
-    @property
-    def frame_shape(self) -> tuple[int, ...]:
-        return self.traverse.frame_shape
-
 
 def augmented_route(
     traverse: Traverse, frames: int, copies: int, most: int, strengths: Mapping[str, Any], seed: int = 0
 ) -> tuple[Views, str]:
     """At most `most` augmented copies of N `frames`, evenly drawn, and a phrase for the log about them."""
     shown = range(0, frames, max(1, -(-frames * copies // most)))
-    views = AugmentedTraverse(traverse, [shown], traverse.batch_size(BLOCK), copies, strengths, seed)
+    views = AugmentedFrames(traverse, [shown], traverse.at_once(BLOCK), copies, strengths, seed)
     each = "each frame" if shown.step == 1 else f"{len(shown)} of the frames"
-    return Views(views, views.places), f"{copies} look{'s' * (copies > 1)} at {each}"
+    return Views(cast(Traverse, views), views.places), f"{copies} look{'s' * (copies > 1)} at {each}"
 
 
 def augmented_segments(
@@ -104,7 +133,7 @@ def augmented_segments(
     strengths: Mapping[str, Any],
     places: int | None = None,
     starts: Sequence[int] | None = None,
-) -> AugmentedTraverse:
+) -> AugmentedFrames:
     """Augmented segments of a traverse, as another visit may show them, to calibrate a map.
 
     Every 10th segment of 20 frames, or of fewer in a short traverse. Short traverses are used several times,
@@ -120,4 +149,4 @@ def augmented_segments(
     most = min(MOST, max(LEAST, SCORES // (places or frames)))
     runs = [range(one, one + length) for one in starts[:: max(1, -(-len(starts) * length // most))]]
     copies = max(1, -(-min(FEWEST, MAX_COPIES * frames, most) // (len(runs) * length)))
-    return AugmentedTraverse(traverse, runs, length, copies, strengths, factor=STRONGER)
+    return AugmentedFrames(traverse, runs, length, copies, strengths, factor=STRONGER)

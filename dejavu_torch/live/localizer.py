@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.fitted import resize_like
+from dejavu_torch.data.traverse import resize_like
 from dejavu_torch.features.extract import features_of, in_mode
-from dejavu_torch.model import DejaVu
+from dejavu_torch.model import DejaVu, check_queries
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.types import InputError, SequenceModel
 
@@ -77,7 +77,6 @@ class LiveLocalizer:
             raise InputError(f"{seen}; expected a SequenceModel such as PlaceFilter, 'filter' or None")
         self.keep_scores = keep_scores
         self.model, self.sequence = model, PlaceFilter() if isinstance(sequence, str) else sequence
-        self._pipeline = model.describer.pipeline
         self._shape: tuple[int, ...] | None = None  # of the latest valid frame
         whitening = model.whitening
         self._projection = whitening.unpacked() if whitening is not None and whitening.learned else None
@@ -104,7 +103,7 @@ class LiveLocalizer:
         return LiveMatch(
             place=place,
             frame=int(table.own_frame_of(match.index)) if routes else shown,
-            name=model.frame_name(shown) if shown >= 0 else "",
+            name=model.frame_names[shown] if model.frame_names and shown >= 0 else "",
             score=score,
             posterior=math.exp(-score) if isinstance(self.sequence, PlaceFilter) else math.nan,
             probability=math.nan if match.probability is None else float(match.probability),
@@ -122,10 +121,10 @@ class LiveLocalizer:
         """The descriptor (1,K) of a frame, which has to fit the map."""
         whitening, dimension = self.model.whitening, self.model.map.dimension
         batch = resize_like(batch, self.model.frame_shape)
-        with in_mode(self._pipeline, False):
-            features = features_of(batch, self._pipeline, "the frame")
+        with in_mode(self.model.descriptor, False):
+            features = features_of(batch, self.model.descriptor.describe, "the frame")
         if batch.shape[1:] != self._shape:
-            self.model.check_queries(tuple(batch.shape[1:]), features.shape[1], "the frame")
+            check_queries(self.model, tuple(batch.shape[1:]), features.shape[1], "the frame")
             self._shape = batch.shape[1:]
         features = features.to(torch.promote_types(features.dtype, torch.float32))
         descriptor = features if whitening is None else whitening(features, self._projection)

@@ -21,7 +21,6 @@ from PIL import Image
 from torch import Tensor
 
 from dejavu_torch.data.camera import Frame
-from dejavu_torch.data.frame_range import IndexedTraverse
 from dejavu_torch.live.localizer import LiveMatch
 from dejavu_torch.types import InputError, Traverse
 
@@ -29,7 +28,6 @@ HOST = "127.0.0.1"
 PORT = 8765  # default
 COLUMNS = 512  # of the curve
 WIDTH = 640  # maximum, of pictures in pixels
-MAX_PICTURES, SMALL_WIDTH = 20_000, 160  # of a reference that can only be read in order
 PAGE = Path(__file__).with_name("page.html")
 
 
@@ -172,34 +170,17 @@ def as_picture(pixels: np.ndarray | Tensor, width: int = WIDTH) -> str | None:
 
 
 class ReferencePictures:
-    """Pictures of the frames of the map's reference, for `Page`.
-
-    If the reference can only be read in order, like a video, a thread makes small pictures of at most
-    `MAX_PICTURES` frames, and the nearest one is shown.
-    """
+    """Pictures of the frames of the map's reference, for `Page`, read as they are asked for."""
 
     def __init__(self, reference: Traverse, frames: int) -> None:
-        if reference.length not in (None, frames):
-            seen = f"{reference.name} has {reference.length} frames"
+        if len(reference) != frames:
+            seen = f"{reference.name} has {len(reference)} frames"
             raise InputError(f"{seen}; the map's reference has {frames}")
         if len(reference.frame_shape) != 3:
             raise InputError(f"{reference.name} holds features; expected frames to show")
-        self.reference, self.step = reference, max(1, math.ceil(frames / MAX_PICTURES))
-        self._small: list[str | None] = []
-        if not isinstance(reference, IndexedTraverse):
-            threading.Thread(target=self._read, daemon=True).start()
+        self.reference, self._one_at_a_time = reference, threading.Lock()  # requests come in threads
 
     def __call__(self, frame: int) -> str | None:
-        if isinstance(self.reference, IndexedTraverse):
-            try:
-                return as_picture(next(self.reference.between(frame, frame + 1))[0])
-            except InputError:  # the image was removed
-                return None
-        near = round(frame / self.step)
-        return self._small[near] if near < len(self._small) else None
-
-    def _read(self) -> None:
-        with suppress(InputError):  # keeps the pictures so far
-            for i, batch in enumerate(self.reference.batches(1)):
-                if i % self.step == 0:
-                    self._small.append(as_picture(batch[0], SMALL_WIDTH))
+        with suppress(InputError), self._one_at_a_time:  # the image was removed
+            return as_picture(self.reference[frame])
+        return None

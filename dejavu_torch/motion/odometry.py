@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from dejavu_torch.data.frame_range import runs
+from dejavu_torch.data.traverse import runs
 from dejavu_torch.motion.flow import TRACKERS, flow_shift
 from dejavu_torch.motion.ground_plane import TRAPEZIUM, Corners, check_corners, ground_patch
 from dejavu_torch.motion.phase_correlation import MIN_CONFIDENCE, phase_shifts, viterbi_path
@@ -121,8 +121,8 @@ class GroundOdometry(nn.Module):
         """
         last: list[Tensor] = []  # the last patch of the previous batch
         parts: list[tuple[Tensor, Tensor]] = []
-        with progress_of("measuring the ground" if progress else None, traverse.length) as update:
-            for batch in traverse.batches(traverse.batch_size(batch_size)):
+        with progress_of("measuring the ground" if progress else None, len(traverse)) as update:
+            for batch in traverse.batches(batch_size):
                 patches = torch.cat([*last, ground_patch(batch, self.corners, self.size)])
                 if not last:
                     self._warn_coarse(batch, traverse.name)

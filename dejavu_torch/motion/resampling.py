@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
-from hashlib import blake2b
 
 from torch import Tensor
 
-from dejavu_torch.data.frame_range import Selection, pick_frames
 from dejavu_torch.data.ground_truth import GroundTruth, Truth, find_ground_truth
 from dejavu_torch.data.positions import NEAR, shown_frames
+from dejavu_torch.data.traverse import Part
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.types import InputError, Traverse
 
@@ -20,7 +18,7 @@ MAX_STEPS_PER_FRAME = 20  # on average
 MAX_BACKWARD = 0.2  # steps backwards for each one forward
 
 
-class ResampledTraverse(Selection):
+class ResampledTraverse(Part):
     """A traverse resampled by distance, at even steps along the ground; it is read once to measure them.
 
     Args:
@@ -29,7 +27,7 @@ class ResampledTraverse(Selection):
         step: pixels of ground, overrides the odometry's, as for the queries of a map.
 
     Shape: positions: (F,) float32, the distance of each original frame from frame 0 in steps.
-        frame: (M,) int64, the original frame nearest to each step. place: (M,) float64, or None.
+        frame: (M,) int64, the original frame nearest to each step. places: (M,) float64, or None.
 
     Convention: distances are measured from frame 0, positive in the main direction of travel. Each step uses
         the frames that first reach it: stops and reversals add no frames.
@@ -38,9 +36,7 @@ class ResampledTraverse(Selection):
         InputError: footage that does not move, moves less than a step, or over 20 steps per frame.
     """
 
-    length: int
     frame: Tensor
-    skips = False  # gaps are short
 
     def __init__(
         self,
@@ -71,14 +67,6 @@ class ResampledTraverse(Selection):
             expected = f"at least one step of {self.step:g}, and at most {MAX_STEPS_PER_FRAME} per frame"
             raise InputError(f"{seen}; expected {expected}")
         super().__init__(traverse, shown_frames(self.positions))
-        self.place = None if self.place is None else self.place.double()
-
-    def identity(self) -> str:
-        digest = blake2b(self.positions.numpy().tobytes(), digest_size=8).hexdigest()
-        return f"{self.traverse.identity()} at steps {digest}"
-
-    def batches(self, size: int) -> Iterator[Tensor]:
-        return pick_frames(self.traverse.batches(size), range(len(self.positions)), self.frame, size)
 
 
 def resampled(
@@ -92,7 +80,7 @@ def resampled(
     `step`, that of a map for its queries, a single frame and features are returned unchanged too."""
     if odometry is None or isinstance(traverse, ResampledTraverse):
         return traverse
-    if step is not None and (traverse.length == 1 or len(traverse.frame_shape) == 1):
+    if step is not None and (len(traverse) == 1 or len(traverse.frame_shape) == 1):
         return traverse
     return ResampledTraverse(traverse, odometry, batch_size, step, progress)
 
@@ -106,18 +94,11 @@ def ground_truth_of(
     truth: Truth | None,
     reference: Traverse,
     query: Traverse,
-    places: int | None = None,
-    queries: int | None = None,
     interpolate: bool = False,
     aligned: bool = False,
 ) -> GroundTruth | None:
-    """`find_ground_truth` for traverses that may be resampled, in frames of the reference's source; places,
-    queries: the numbers of frames read, required if the traverses do not know their lengths."""
-    frames = reference.length if places is None else places
-    if moved := isinstance(reference, ResampledTraverse):
-        frames = len(reference.positions)
-    numbers = query.frame if isinstance(query, ResampledTraverse) else queries or query.length
-    if numbers is None:
-        raise InputError(f"the number of frames of {query.name} is unknown; expected it as an argument")
+    """`find_ground_truth` for traverses that may be resampled, in frames of the reference's source."""
+    moved = isinstance(reference, ResampledTraverse)
+    numbers = query.frame if isinstance(query, ResampledTraverse) else len(query)
     sources = source_of(reference), source_of(query)
-    return find_ground_truth(truth, *sources, frames, numbers, interpolate, moved, aligned)
+    return find_ground_truth(truth, *sources, len(sources[0]), numbers, interpolate, moved, aligned)

@@ -15,10 +15,10 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
 from dejavu_torch.data.files import LARGEST
-from dejavu_torch.data.frame_range import runs as runs_of
 from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth, ground_truth_in_places
 from dejavu_torch.data.positions import place_of
 from dejavu_torch.data.source import as_traverse, routes_of
+from dejavu_torch.data.traverse import runs as runs_of
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.views import STRETCH
 from dejavu_torch.memory import check_room, concatenate
@@ -305,7 +305,7 @@ class RouteData(LightningDataModule):
         """A traverse, at the size of `DejaVu.fit` of the task's model unless `resize` is given."""
         traverse = as_traverse(source)
         model = self._of_task("dejavu")
-        return traverse if model is None or self.resize is not None else model.fit(traverse, shape)
+        return traverse if model is None or self.resize is not None else model.at_map_size(traverse, shape)
 
     def _opened(self, name: str, i: int = 0) -> Traverse:
         """Another traverse of route i, resampled with the steps of the route."""
@@ -343,8 +343,7 @@ class RouteData(LightningDataModule):
         if values.shape[1:] != reference.shape[1:]:
             raise _shape_error(traverse.name, tuple(values.shape[1:]), tuple(reference.shape[1:]))
         aligned = name == "second"  # by definition of the same places
-        counts = len(reference), len(values)
-        known = ground_truth_of(self.truths[name][i], route, traverse, *counts, aligned=aligned)
+        known = ground_truth_of(self.truths[name][i], route, traverse, aligned=aligned)
         if known is None:
             option = "data.truth" if name == "query" else f"data.{name}_truth"
             seen = f"no truth for {traverse.name}: {len(values)} frames, {len(reference)} places"

@@ -9,14 +9,14 @@ import shlex
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytorch_lightning as pl
 from pytorch_lightning.callbacks import Callback, Checkpoint, ModelCheckpoint, ProgressBar
 from tqdm import tqdm
 
-from dejavu_torch.data.fitted import fitted
 from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth
+from dejavu_torch.data.traverse import fitted
 from dejavu_torch.evaluation.baselines import hog_baselines
 from dejavu_torch.evaluation.contenders import contend
 from dejavu_torch.evaluation.curves import Scores
@@ -127,7 +127,7 @@ def held_frames(
     strengths = STRENGTHS if model.whitening is None else model.whitening.strengths
     reference = data.reference if shape is None else fitted(data.reference, shape)
     found = augmented_segments(reference, len(data.sets["reference"].values), strengths, starts=starts)
-    return found, as_ground_truth(found.places[:, None])
+    return cast(Traverse, found), as_ground_truth(found.places[:, None])
 
 
 def calibrate(model: DejaVu, data: RouteData, starts: list[int]) -> None:
@@ -199,7 +199,7 @@ def compare_with_untrained(
     try:
         preprocess = Preprocess(size=model.preprocess.size)
         untrained = DejaVu(mapper=mapper, batch_size=model.batch_size, preprocess=preprocess)
-        reference = untrained.fit(reference)
+        reference = untrained.at_map_size(reference)
         untrained.learn(reference)
         found[UNTRAINED] = _match(untrained, _of_shape(query, reference.frame_shape))
     except InputError as error:
@@ -213,7 +213,7 @@ def _of_shape(query: Traverse, shape: tuple[int, ...] | None) -> Traverse:
 
 
 def _match(model: DejaVu, query: Traverse) -> Match:
-    descriptors = model.extract_all(_of_shape(query, model.frame_shape))
+    descriptors = model.descriptor.all_of(_of_shape(query, model.frame_shape))
     return model.localize_descriptors(descriptors, SINGLE).renumbered(model.map.table.scored)
 
 

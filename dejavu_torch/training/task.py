@@ -228,9 +228,9 @@ class PlaceRecognitionTask(Trainee):
     def forward(self, frames: Tensor) -> Tensor:
         """Scores of all places, equal to those of the exported map. (B,C,H,W) or (B,D) -> (B,N)."""
         with in_bits(self.features, self.weight_bits):
-            features = features_of(frames, self.dejavu.describe, "the batch")
+            features = features_of(frames, self.dejavu.descriptor.describe, "the batch")
         if self.made:
-            return self.map.scores(self.dejavu.whitened(features))
+            return self.map.scores(self.dejavu.descriptor.whitened(features))
         return self.scores(self.route.distances(features))
 
     def deployed(self) -> DejaVu:

@@ -80,7 +80,7 @@ class Trainee(pl.LightningModule):
         """Descriptors of frames, without a code: (B,C,H,W) -> (B,K)."""
         embedding = coded(self.features)
         if embedding is None:
-            return self.dejavu.describe(frames)
+            return self.dejavu.descriptor.describe(frames)
         return embedding.describe(self.dejavu.preprocess(frames))
 
     def scores(self, distances: Sequence[Tensor]) -> Tensor:
@@ -182,7 +182,7 @@ class Trainee(pl.LightningModule):
                 shown = None if whitening.views == 0 else pairs
                 whitening.learn(features, shown, *groups_of(self.features), INDEPENDENT * len(features))
             alone = self.data.reference if len(self.data.routes) == 1 else None
-            model.learn_features(model.whitened(features), alone)
+            model.learn_features(model.descriptor.whitened(features), alone)
 
     def check_budget(self, places: int, dimension: int) -> None:
         """Refuse a map of too few bytes; if the user did not choose them, raise them instead."""

@@ -85,13 +85,13 @@ def test_descriptors_of_tiles_are_those_of_the_frames() -> None:
     model = DejaVu(HOG(), Whitening(numbers=16))
     assert model.whitening is not None
     still = {"ground": "repeat", "noise": 0, "drift": 0, "yaw": 0}
-    features = torch.cat([model.describe(part) for part in AerialRoad(frames=200, **still).batches(64)])  # type: ignore[arg-type]
+    features = torch.cat([model.descriptor.describe(part) for part in AerialRoad(frames=200, **still).batches(64)])  # type: ignore[arg-type]
     noise = torch.randn(features.shape, generator=torch.Generator().manual_seed(0))
     model.whitening.learn(features, [(features + 0.02 * noise, torch.arange(200))])
     road = AerialRoad(frames=math.lcm(*TILES), **still)  # type: ignore[arg-type]
     at = range(100, 10**6, 99_991)
     own = TiledRoute(**tiles_of(model), length=road.length).read(at)
-    drawn = model.whitened(model.describe(road.read(at)))
+    drawn = model.descriptor.whitened(model.descriptor.describe(road.read(at)))
     assert (own * drawn).sum(1).min() > 0.97  # the light moves a few gradients to another bin
     assert (own @ drawn.T).fill_diagonal_(0).max() < (own * drawn).sum(1).min()
 

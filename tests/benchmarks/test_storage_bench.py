@@ -157,7 +157,7 @@ def test_a_whitening_that_is_given_describes_all(
     monkeypatch.setattr(storage, "stores_of", first)
     benchmark("storage", *pair, "--whitening", tmp_path / "map.safetensors", "--out", tmp_path / "out")
     model = DejaVu.load(tmp_path / "map.safetensors")
-    assert torch.equal(whitened[0], model.whitened(series(0)))
+    assert torch.equal(whitened[0], model.descriptor.whitened(series(0)))
     written = json.loads((tmp_path / "out" / "bench.json").read_text())["rows"]
     assert [row["family"] for row in written] == ["dejavu", "the paper"]
     DejaVu(whitening="none").learn(series(0)).save(tmp_path / "raw.safetensors")

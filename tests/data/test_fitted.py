@@ -11,7 +11,7 @@ from helpers import all_of, refused
 from PIL import Image
 from videos import clip, numbers, pictures
 
-from dejavu_torch.data.fitted import at_size
+from dejavu_torch.data.traverse import at_size
 from dejavu_torch.data.source import open_source
 from dejavu_torch.resize import is_stretched, reduced_size, resize_frames
 

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from dejavu_torch import memory
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.frame_range import FrameRange
+from dejavu_torch.data.traverse import FrameRange
 from dejavu_torch.data.ground_truth import (
     GroundTruth,
     check_ground_truth,

@@ -16,7 +16,7 @@ from PIL import Image
 
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.folder import ImageFolder
-from dejavu_torch.data.frame_range import FrameRange
+from dejavu_torch.data.traverse import FrameRange
 from dejavu_torch.data.names import MAX_NAME_LENGTH, clock_time, decode_names, encode_names, names_of
 
 

@@ -15,7 +15,7 @@ from videos import H264, clip, pictures
 
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.folder import ImageFolder
-from dejavu_torch.data.frame_range import Chain
+from dejavu_torch.data.traverse import Chain
 from dejavu_torch.data.ground_truth import position_truth
 from dejavu_torch.data.simulate.aerial import AerialRoad
 from dejavu_torch.data.source import open_source

@@ -47,7 +47,7 @@ def frames(seed: int, length: int = 120) -> Tensor:
 
 def localized(model: DejaVu, reference: Tensor, query: Tensor, truth: GroundTruth | None) -> Localization:
     traverses = ArrayTraverse(reference), ArrayTraverse(query)
-    stored, seen = (model.extract_all(traverse) for traverse in traverses)
+    stored, seen = (model.descriptor.all_of(traverse) for traverse in traverses)
     model.learn_features(stored)
     return Localization(model, *traverses, stored, seen, model.localize(seen), truth, 2)
 
@@ -168,7 +168,7 @@ def test_the_frame_under_the_features_is_what_hog_sees() -> None:
     model, frame = DejaVu(hog, preprocess=Preprocess(channel="R-B", contrast="patch")), torch.rand(3, 50, 60)
     seen = as_hog_sees(model, frame)
     assert seen.shape == (1, 17, 41)
-    assert torch.equal(HOG(cell=4)(seen[None]), model.describe(frame[None]))
+    assert torch.equal(HOG(cell=4)(seen[None]), model.descriptor.describe(frame[None]))
 
 
 def test_the_feature_that_is_shown_is_the_one_that_its_templates_explain() -> None:
@@ -198,7 +198,7 @@ def resampled() -> Localization:
     periods = SpectrogramAnalysis(window=50, min_period=4, false_alarm=None)
     model = template_model(HOG(), periods, velocity=camera())
     reference, query = (model.resample(ArrayTraverse(footage(w)), STEP) for w in (REFERENCE, QUERY))
-    stored, seen = (model.extract_all(traverse) for traverse in (reference, query))
+    stored, seen = (model.descriptor.all_of(traverse) for traverse in (reference, query))
     model.learn_features(stored, reference)
     nearest = (REFERENCE - QUERY[query.frame, None]).abs().argmin(1, keepdim=True)
     truth = as_ground_truth(place_of(reference.positions, nearest))

@@ -135,7 +135,7 @@ def test_a_whitening_takes_the_groups_of_the_features(flights: list[Tensor], tmp
     assert model.whitening is not None
     assert model.whitening.sizes == [324, 384]
     assert model.whitening.dimension == 60  # half of the places, as without groups
-    assert model.features_per_frame == 708
+    assert features_per_frame(model) == 708
     found = model.localize(flights[1])
     assert float(((found.index - torch.arange(120)).abs() <= 5).float().mean()) > 0.9
     model.save(tmp_path / "map.safetensors")
@@ -144,7 +144,7 @@ def test_a_whitening_takes_the_groups_of_the_features(flights: list[Tensor], tmp
     assert torch.equal(again.localize(flights[1]).score, found.score)
     assert torch.equal(again(flights[1][:3]), model(flights[1][:3]))
     other = DejaVu()
-    other.take_whitening(again)
+    other.descriptor.take(again.descriptor, whitening=True)
     assert other.learn(flights[1]).whitening is again.whitening
 
 
@@ -241,7 +241,7 @@ def test_one_module_is_not_two_members(flights: list[Tensor], tmp_path: Path) ->
     with refused("several members of the features are", "Means", "as a list"):
         DejaVu.load(tmp_path / "map", features=Means())
     again = DejaVu.load(tmp_path / "map", features=Joined([Means(), Means()]))
-    torch.testing.assert_close(again.describe(flights[1]), model.describe(flights[1]))
+    torch.testing.assert_close(again.describe(flights[1]), model.descriptor.describe(flights[1]))
 
 
 # the command line -------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from helpers import refused, template_model
 
 from dejavu_torch import DejaVu
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.frame_range import FrameRange
+from dejavu_torch.data.traverse import FrameRange
 from dejavu_torch.data.positions import place_of
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.maps.spectral import SpectralMapper

@@ -78,7 +78,7 @@ def test_neither_stretches_nor_the_tolerance_cross_from_one_route_to_the_next(tm
     torch.manual_seed(1)
     loss = stage.losses(task, batch).total
     torch.manual_seed(1)
-    described = to_length(task.dejavu.describe(batch.frames).float())
+    described = to_length(task.dejavu.descriptor.describe(batch.frames).float())
     noisy = described + 0.5 * torch.randn_like(described)
     distance = 1 - nn.functional.cosine_similarity(noisy[:, None], stage.proxies[None], dim=2)
     surprise = []
@@ -149,12 +149,12 @@ def test_a_training_leaves_a_descriptor_with_which_another_route_is_learned(tmp_
     assert base.trained.steps == 30
     other = footage(frames=60).flip(2)
     model, shared = (DejaVu(mapper=SpectralMapper(20.0)) for _ in range(2))
-    model.take_descriptor(base)
+    model.descriptor.take(base.descriptor)
     model.learn(ArrayTraverse(other))
     assert model.whitening is not None
     assert not torch.equal(model.whitening.scale[:2], base.whitening.scale[:2])  # of this route
     assert recall(model, other) > 0.9
-    shared.take_whitening(DejaVu.load(tmp_path / "descriptor.safetensors"))
+    shared.descriptor.take(DejaVu.load(tmp_path / "descriptor.safetensors").descriptor, whitening=True)
     shared.learn(ArrayTraverse(other))
     assert shared.whitening is not None
     assert torch.equal(shared.whitening.projection, base.whitening.projection)

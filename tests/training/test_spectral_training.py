@@ -101,7 +101,7 @@ def test_the_file_holds_the_network_alone(tmp_path: Path) -> None:
 def test_the_map_is_of_the_last_features_not_of_those_validated_before(tmp_path: Path) -> None:
     every = {"val_check_interval": 2, "check_val_every_n_epoch": None}
     model = fit(tmp_path, spectral(), data_of(), max_steps=3, **every)
-    features = model.extract_all(ArrayTraverse(footage()))
+    features = model.descriptor.all_of(ArrayTraverse(footage()))
     assert torch.equal(levels(model), SpectralMapper(20.0)(features).level)
 
 

@@ -50,7 +50,7 @@ def test_the_map_is_of_the_rounded_network_and_the_training_is_not(
         assert torch.equal(task.deployed()(frames), model(frames))
     assert not is_rounded(task.dejavu.features)
     if settings:
-        made = SpectralMapper(20.0)(model.extract_all(ArrayTraverse(footage())))
+        made = SpectralMapper(20.0)(model.descriptor.all_of(ArrayTraverse(footage())))
         assert torch.equal(made.streams, model.map.streams)  # type: ignore[arg-type]
     _, wide, large = trained(tmp_path / "32", weight_bits=32, **settings)
     assert torch.equal(torch.stack(narrow), torch.stack(wide))

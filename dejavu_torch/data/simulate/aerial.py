@@ -263,7 +263,7 @@ class AerialRoad(SimulatedRoute):
             every `TILES[0]` frames, the lower every `TILES[1]`, without traffic: two phases identify a place.
 
     Example:
-        >>> next(AerialRoad(traverse=1, frames=3).batches(8)).shape
+        >>> AerialRoad(traverse=1, frames=3)[:].shape
         torch.Size([3, 3, 64, 64])
     """
 
@@ -283,7 +283,7 @@ class AerialRoad(SimulatedRoute):
         if self.frames > LONGEST[self.ground]:
             expected = f"1 <= frames <= {LONGEST[self.ground]}, with ground=repeat {LONGEST['repeat']}"
             raise InputError(f"{self.name} has frames={self.frames}; expected {expected}")
-        self.length, self.place = self.frames, torch.arange(self.frames, dtype=torch.float64)
+        self.length, self.places = self.frames, torch.arange(self.frames, dtype=torch.float64)
         random, swing = Random("flight", self.seed, self.traverse), 1.0 if self.traverse else 0.4
         looks = [random.pick(values) for values in ((0.78, 0.84, 1.16), (0.86, 1.16), (-0.06, 0.06))]
         level, gamma, tint = looks if self.traverse else (1.0, 1.0, 0.0)

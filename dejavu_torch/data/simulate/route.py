@@ -6,7 +6,6 @@ import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import field, fields
-from functools import cached_property
 from hashlib import blake2b
 from numbers import Integral, Real
 from typing import Any, ClassVar, TypeVar
@@ -15,9 +14,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dejavu_torch.data.frame_range import IndexedTraverse
 from dejavu_torch.memory import in_float32
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, Traverse
 
 _T = TypeVar("_T")
 
@@ -32,17 +30,17 @@ def choice(*names: str) -> Any:
     return field(default=names[0], metadata={"names": names})
 
 
-class SimulatedRoute(IndexedTraverse):
+class SimulatedRoute(Traverse):
     """A simulated route: the true place of every frame is known.
 
     A subclass is a dataclass of `option` and `choice` fields, including `seed` and `traverse`. It sets
-    `length` and `place`, and draws each frame in `_frames` from its number and the options only.
+    `length` and `places`, and draws each frame in `_frames` from its number and the options only.
     """
 
     kind: ClassVar[str]  # as in `sim:KIND?seed=0`
     ordered: ClassVar[bool] = True  # type: ignore[misc]
     length: int
-    place: Tensor
+    places: Tensor
 
     def __post_init__(self) -> None:
         """Check the options, and name the route by those that differ from their defaults."""
@@ -67,13 +65,12 @@ class SimulatedRoute(IndexedTraverse):
         # without the scenery drawn so far
         return type(self), tuple(getattr(self, entry.name) for entry in fields(self))  # type: ignore[arg-type]
 
-    @cached_property  # drawing a frame is slow
-    def frame_shape(self) -> tuple[int, ...]:
-        return super().frame_shape
+    def __len__(self) -> int:
+        return self.length
 
     @in_float32()
-    def read(self, frames: range) -> Tensor:
-        return self._frames(torch.arange(frames.start, frames.stop, frames.step))
+    def read(self, frames: range | list[int]) -> Tensor:
+        return self._frames(torch.as_tensor(frames))
 
 
 def _expected(key: str, value: object, default: object, allowed: Mapping[str, Any]) -> str:

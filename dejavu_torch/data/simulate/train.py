@@ -82,7 +82,7 @@ class Railway(SimulatedRoute):
         self.length = self.frames or len(distance)
         self.distance = distance[: self.length]
         numbers = torch.arange(self.length).double()
-        self.place = reference_place(reference, self.distance) if self.traverse else numbers
+        self.places = reference_place(reference, self.distance) if self.traverse else numbers
         self._step = distance.diff(append=distance[-1:])[: self.length] * EXPOSURE
         self._paths = self._wander(len(distance))
         view = View(*self.size)

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from dejavu_torch import types
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.frame_range import Chain, FrameRange, Selection, chained, runs
+from dejavu_torch.data.traverse import Chain, FrameRange, Selection, chained, runs
 from dejavu_torch.data.source import open_source
 from dejavu_torch.types import Traverse
 

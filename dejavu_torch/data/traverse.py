@@ -1,0 +1,258 @@
+"""Parts of a traverse, frames of another size, several traverses as one, and any user's frames as one."""
+
+from __future__ import annotations
+
+import logging
+from bisect import bisect_right
+from collections.abc import Sequence
+from functools import cached_property
+from itertools import accumulate, groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dejavu_torch.data.files import LARGEST
+from dejavu_torch.resize import is_stretched, resize_frames
+from dejavu_torch.types import InputError, Traverse
+
+log = logging.getLogger("dejavu_torch")
+
+
+class Part(Traverse):
+    """The frames of a traverse with these numbers, which may repeat, renumbered from 0.
+
+    Args:
+        frame: (n,) int64, or a range.
+    """
+
+    def __init__(self, traverse: Traverse, frame: Tensor | range) -> None:
+        self.traverse, self.frame, self.name = traverse, frame, traverse.name
+        self.sized, self.ordered = traverse.sized, traverse.ordered
+        self.times, self.places = (
+            None if known is None else known[torch.as_tensor(frame)]
+            for known in (traverse.times, traverse.places)
+        )
+        if traverse.cut is not None and isinstance(frame, range):
+            image, cuts = traverse.cut
+            self.cut = image, cuts[frame.start : frame.stop : frame.step]
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def read(self, frames: range | list[int]) -> Tensor:
+        if isinstance(self.frame, range):
+            return self.traverse[[self.frame[i] for i in frames]]
+        numbers = self.frame[torch.as_tensor(frames)].tolist()
+        if len({*numbers}) == len(numbers):
+            return self.traverse[numbers]
+        distinct, index = torch.tensor(numbers).unique(return_inverse=True)  # each is read once
+        return self.traverse[distinct][index]
+
+    @cached_property
+    def names(self) -> Sequence[str]:  # type: ignore[override]
+        names = self.traverse.names
+        return [names[int(i)] for i in self.frame] if names else ()
+
+    @cached_property
+    def frame_shape(self) -> tuple[int, ...]:
+        return self.traverse.frame_shape
+
+
+def frame_range(traverse: Traverse, start: int = 0, stop: int = 0, step: int = 1) -> Part:
+    """Every step-th of the frames [start, stop) of a traverse; a stop of 0 is its end.
+
+    Raises:
+        InputError: start, stop or step out of range.
+
+    Example:
+        >>> from dejavu_torch.data.arrays import ArrayTraverse
+        >>> frame_range(ArrayTraverse(torch.arange(6.0)[:, None]), start=1, stop=6, step=2)[:].flatten()
+        tensor([1., 3., 5.])
+    """
+    length = len(traverse)
+    if start < 0 or step < 1 or not (stop == 0 or start < stop) or max(start + 1, stop) > length:
+        expected = "a step of at least 1" if step < 1 else f"a part of its {length} frames"
+        raise InputError(f"{traverse.name}: start={start}, stop={stop}, step={step}; expected {expected}")
+    part = Part(traverse, range(start, stop or length, min(step, LARGEST)))
+    part.name = f"{traverse.name}[{start}:{stop or ''}{f':{step}' if step > 1 else ''}]"
+    return part
+
+
+class Chain(Traverse):
+    """Several traverses with frames of one shape, concatenated: parts of one route.
+
+    Convention: frame names start with the name of their traverse: `morning/0001.png`. `places` is None, as
+        each traverse has its own numbering.
+    """
+
+    def __init__(self, traverses: Sequence[Traverse]) -> None:
+        self.traverses = list(traverses)
+        if not self.traverses:
+            raise InputError("a chain of no traverses; expected at least one")
+        first = self.traverses[0]
+        for other in self.traverses:
+            if other.frame_shape != first.frame_shape:
+                own, expected = (" x ".join(map(str, one.frame_shape)) for one in (other, first))
+                raise InputError(f"{other.name} has frames of {own}; expected {expected} like {first.name}")
+        self.name = " + ".join(one.name for one in self.traverses)
+        self.sized = any(one.sized for one in self.traverses)
+        self.ordered = all(one.ordered for one in self.traverses)
+        self.starts = list(accumulate(map(len, self.traverses), initial=0))
+        if any(one.times is not None for one in self.traverses):
+            unknown = (torch.full((len(one),), torch.nan, dtype=torch.float64) for one in self.traverses)
+            times = zip(self.traverses, unknown, strict=True)
+            self.times = torch.cat([nan if one.times is None else one.times for one, nan in times])
+
+    def __len__(self) -> int:
+        return self.starts[-1]
+
+    def read(self, frames: range | list[int]) -> Tensor:
+        owners = groupby(frames, lambda i: bisect_right(self.starts, i, hi=len(self.traverses)) - 1)
+        parts = [self.traverses[k][[i - self.starts[k] for i in own]] for k, own in owners]
+        return parts[0] if len(parts) == 1 else torch.cat(parts)
+
+    @cached_property
+    def frame_shape(self) -> tuple[int, ...]:
+        return self.traverses[0].frame_shape
+
+    @cached_property
+    def names(self) -> Sequence[str]:  # type: ignore[override]
+        each = ((Path(one.name).name, one.names or [""] * len(one)) for one in self.traverses)
+        names = [name and f"{folder}/{name}" for folder, own in each for name in own]
+        return names if any(names) else ()
+
+
+def chained(traverses: Sequence[Traverse]) -> Traverse:
+    """Several traverses as one route; a single one unchanged."""
+    return traverses[0] if len(traverses) == 1 else Chain(traverses)
+
+
+def parts_of(traverse: Traverse) -> list[Traverse]:
+    """The traverses of a chain; [traverse] of any other."""
+    return traverse.traverses if isinstance(traverse, Chain) else [traverse]
+
+
+class Fitted(Part):
+    """Frames converted to another shape (C,H,W): resized, turned grey, or the grey channel repeated."""
+
+    def __init__(self, traverse: Traverse, shape: tuple[int, ...]) -> None:
+        if len(traverse.frame_shape) != 3 or len(shape) != 3:
+            raise InputError(f"{traverse.name} and the map differ in kind; expected frames, not features")
+        super().__init__(traverse, range(len(traverse)))
+        self.shape, self.sized = shape, True
+
+    def read(self, frames: range | list[int]) -> Tensor:
+        channels, height, width = self.shape
+        parts, at_once = [], self.traverse.at_once(len(frames))  # these may be larger
+        for start in range(0, len(frames), at_once):
+            part = resize_frames(super().read(frames[start : start + at_once]), (height, width))
+            if part.shape[1] == 3 and channels == 1:
+                from kornia.color import rgb_to_grayscale  # slow to import
+
+                part = rgb_to_grayscale(part)
+            parts.append(part.expand(-1, channels, -1, -1))
+        return parts[0] if len(parts) == 1 else torch.cat(parts)
+
+    @cached_property
+    def frame_shape(self) -> tuple[int, ...]:
+        return self.shape
+
+
+def fitted(traverse: Traverse, shape: tuple[int, ...]) -> Traverse:
+    """The traverse with frames of this shape (C,H,W)."""
+    return traverse if tuple(traverse.frame_shape) == tuple(shape) else Fitted(traverse, shape)
+
+
+def at_size(traverse: Traverse, size: tuple[int, int]) -> Traverse:
+    """The frames of a traverse at another size (height, width); images and videos are decoded at it."""
+    if isinstance(traverse, Chain):
+        each = [at_size(one, size) for one in traverse.traverses]
+        return traverse.changed(traverses=each, sized=True)
+    if type(traverse) is Part:
+        return traverse.changed(traverse=at_size(traverse.traverse, size), sized=True)
+    if (decoded := getattr(traverse, "decoded_at", None)) is not None:
+        return decoded(*size)  # type: ignore[no-any-return]
+    return Fitted(traverse, (traverse.frame_shape[0], *size))
+
+
+def size_like(own: tuple[int, ...], shape: tuple[int, ...]) -> tuple[int, int]:
+    """(H,W) of a shape (C,H,W) if frames of size `own` have the same aspect ratio, else `own`."""
+    height, width = own
+    same = len(shape) == 3 and not is_stretched((height, width), (shape[1], shape[2]))
+    return (shape[1], shape[2]) if same else (height, width)
+
+
+def resize_like(frames: Tensor, shape: tuple[int, ...] | None) -> Tensor:
+    """Frames (B,C,H,W) resized by `size_like`; features unchanged."""
+    if frames.ndim != 4 or shape is None:
+        return frames
+    return resize_frames(frames, size_like(frames.shape[2:], shape))
+
+
+class Frames(Traverse):
+    """A list of frames, or any dataset with `__len__` and `__getitem__`, such as those of torchvision.
+
+    Args:
+        dataset: its items are frames (C,H,W) or features (D,) as tensors or arrays, (H,W) or (H,W,3) uint8
+            arrays, or PIL images; of a pair such as (image, label), the first. A line tells what was
+            converted.
+
+    Shape: frames (n,C,H,W) float32, or features (n,D).
+
+    Raises:
+        InputError: no items; while reading, an item of another kind or shape than the first.
+    """
+
+    def __init__(self, dataset: Any, name: str = "the dataset") -> None:
+        self.dataset, self.name = dataset, name
+        if not len(dataset):
+            raise InputError(f"{name} is empty; expected at least one frame")
+        first = self._item(0)
+        self.shape, how = tuple(first.shape), []
+        if isinstance(dataset[0], tuple | list):
+            how.append("of each pair the first part is taken")
+        if hasattr(_first_of(dataset[0]), "convert"):
+            how.append("PIL images are converted to floats in [0, 1]")
+        if how:
+            log.warning("%s: %s", name, ", ".join(how))
+
+    def __len__(self) -> int:
+        return len(self.dataset)
+
+    def read(self, frames: range | list[int]) -> Tensor:
+        return torch.stack([self._item(i) for i in frames])
+
+    def _item(self, i: int) -> Tensor:
+        item = _first_of(self.dataset[i])
+        if hasattr(item, "convert"):  # a PIL image
+            item = np.asarray(item if item.mode in ("L", "RGB") else item.convert("RGB"))
+        item = torch.from_numpy(item.copy()) if isinstance(item, np.ndarray) else item
+        expected = getattr(self, "shape", None)
+        if isinstance(item, Tensor) and item.dtype == torch.uint8 and item.ndim in (2, 3):
+            item = item[None] if item.ndim == 2 else item if len(item) in (1, 3) else item.permute(2, 0, 1)
+            item = item.float() / 255
+        elif isinstance(item, Tensor) and item.is_floating_point() and item.ndim in (1, 3):
+            item = item.float() if item.ndim == 3 else item
+        else:
+            kind = f"{tuple(item.shape)} {item.dtype}" if isinstance(item, Tensor) else type(item).__name__
+            raise InputError(
+                f"item {i} of {self.name} is {kind}; expected a frame (C,H,W), features (D,) or an image"
+            )
+        if expected not in (None, tuple(item.shape)):
+            seen = f"item {i} of {self.name} has shape {tuple(item.shape)}"
+            raise InputError(f"{seen}; expected {expected} as item 0")
+        return item
+
+
+def _first_of(item: Any) -> Any:
+    return item[0] if isinstance(item, tuple | list) and item else item
+
+
+def runs(numbers: Tensor) -> list[range]:
+    """Increasing whole numbers as contiguous ranges: 1, 2, 3, 7 as 1 to 3 and 7."""
+    last = torch.cat([numbers.diff() != 1, numbers.new_ones(min(1, len(numbers)), dtype=torch.bool)])
+    first = last.roll(1)  # a run starts after the end of the previous one
+    return [range(a, b + 1) for a, b in zip(numbers[first].tolist(), numbers[last].tolist(), strict=True)]

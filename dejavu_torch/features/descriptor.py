@@ -1,0 +1,280 @@
+"""Frames -> descriptors: preprocessing, features and whitening, as one module (section IV-A)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import torch
+from torch import Tensor, nn
+
+from dejavu_torch.data.traverse import Part
+from dejavu_torch.features.distilled import Distilled
+from dejavu_torch.features.extract import (
+    as_weights,
+    check_alone,
+    feature_batches,
+    features_of,
+    warn_of_bright,
+)
+from dejavu_torch.features.hog import HOG
+from dejavu_torch.features.joined import Joined, groups_of
+from dejavu_torch.features.preprocess import Preprocess
+from dejavu_torch.features.views import SAMPLE, AugmentedFrames, Sample, Views, augmented_route
+from dejavu_torch.features.whitening import INDEPENDENT, WIDEST, Whitening
+from dejavu_torch.memory import IN_MEMORY, concatenate
+from dejavu_torch.types import BATCH_NUMBERS, BATCH_SIZE, InputError, Traverse
+
+ROWS = 4096  # descriptors on the device at a time
+DESCRIPTOR_MEMORY = IN_MEMORY // 4  # bytes of descriptors kept in memory
+
+OnFirst = Callable[[Tensor, Tensor], None]  # receives the first batch of frames and its features
+
+
+class Descriptor(nn.Module):
+    """What describes a frame: preprocess, features, whitening.
+
+    Args:
+        preprocess, features, whitening: see `DejaVu`; without whitening the features are the descriptors.
+        batch_size: frames in memory at a time, fewer if the features enlarge them.
+        weight_bits: of each weight of the features in a map file.
+
+    Shape: frames (B,C,H,W), or ready features (B,D) -> descriptors (B,K), differentiable.
+
+    Raises:
+        InputError: neither frames nor features, or features of another dimension than the whitening's.
+
+    Example:
+        >>> from dejavu_torch import open_source
+        >>> descriptor, route = Descriptor(whitening=Whitening(4)), open_source("sim:aerial?frames=40")
+        >>> descriptor.learn(route).shape, descriptor(route[:2]).shape
+        (torch.Size([40, 4]), torch.Size([2, 4]))
+    """
+
+    _where: Tensor
+
+    def __init__(
+        self,
+        preprocess: Preprocess | None = None,
+        features: nn.Module | None = None,
+        whitening: Whitening | None = None,
+        batch_size: int = BATCH_SIZE,
+        weight_bits: int = 32,
+    ) -> None:
+        super().__init__()
+        self.preprocess = Preprocess() if preprocess is None else preprocess
+        self.features = default_features(whitening is not None) if features is None else features
+        self.whitening = whitening
+        self.batch_size, self.weight_bits = batch_size, weight_bits
+        self.reduces = False  # whether the whitening was added for ready features that are too wide for a map
+        self.warned: set[tuple[str, str]] = set()  # (traverse, line) of warnings that were logged
+        self.register_buffer("_where", torch.zeros(0), persistent=False)
+
+    @property
+    def device(self) -> torch.device:
+        """The device that computes."""
+        return self._where.device
+
+    def describe(self, frames: Tensor) -> Tensor:
+        """Preprocess, then features: (B,C,H,W) -> (B,D)."""
+        features: Tensor = self.features(as_weights(self.preprocess(frames), self.features))
+        return features
+
+    def whitened(self, features: Tensor) -> Tensor:
+        """Features (B,D) -> descriptors (B,K)."""
+        return features if self.whitening is None else self.whitening(features)
+
+    def forward(self, frames: Tensor) -> Tensor:
+        return self.whitened(features_of(frames, self.describe, "the input"))
+
+    def features_in(
+        self, traverse: Traverse | AugmentedFrames, label: str | None = None, on_first: OnFirst | None = None
+    ) -> Iterator[Tensor]:
+        """Batches (B,D) of features, without gradients; see `feature_batches`."""
+        height, width = own_size(self.features) or (1, 1)
+        size = max(1, min(self.batch_size, BATCH_NUMBERS // (3 * height * width)))
+        return feature_batches(traverse, self, size, self.device, label, on_first, self.describe)
+
+    def batches(
+        self, traverse: Traverse | AugmentedFrames, label: str | None = None, on_first: OnFirst | None = None
+    ) -> Iterator[Tensor]:
+        """Batches (B,K) of the descriptors of a traverse, in order, without gradients.
+
+        Args:
+            label: of a progress bar on stderr, or of lines if it is no terminal.
+            on_first: called with the first batch of frames and its features.
+        """
+        return map(self.whitened, self.features_in(traverse, label, on_first))
+
+    def all_of(self, traverse: Traverse, progress: bool = False) -> Tensor:
+        """Descriptors (N,K) of a whole traverse; many are kept in a temporary file, see `concatenate`."""
+        return concatenate(self.batches(traverse, f"describing {traverse.name}" if progress else None))
+
+    def learn(
+        self,
+        traverse: Traverse,
+        second: Views | None = None,
+        progress: bool = False,
+        spectral: bool = True,
+        label: str = "learning",
+    ) -> Tensor:
+        """Descriptors (N,K) of a reference, from which the whitening is learned first, unless it is fixed.
+
+        Args:
+            second: another traverse of the same places, from which the whitening learns what changes between
+                visits, instead of from augmented copies; see `growth.second_traverse`.
+            spectral: for a spectral map: ready features of over 256 dimensions are reduced to principal
+                components if there is no whitening, whitening learns from a sample if the features exceed
+                the memory, and many descriptors are kept in a temporary file, as float16 if they are
+                whitened, which is finer than any step.
+
+        Raises:
+            InputError: no whitening that learns from `second`; frames that cannot be described, or whose
+                features depend on other frames. The whitening stays as it was.
+        """
+        if second is not None:
+            self.require_learning(second.traverse.name)
+        label_if = label if progress else None
+
+        def check_first(frames: Tensor, features: Tensor) -> None:
+            self.warn_of_bright(frames, traverse.name)
+            check_alone(self, self.describe, frames, features, traverse.name)
+
+        with self.unchanged_by_errors():
+            if self.reduces or self.whitening is None:
+                wide = spectral and is_ready(traverse) and traverse.frame_shape[0] > WIDEST
+                self.whitening = Whitening(views=0).to(self.device) if wide else None
+                self.reduces = wide
+            whitening = self.whitening
+            if whitening is not None and not whitening.fixed:
+                if not (spectral and self._exceeds_memory(traverse)):
+                    features = concatenate(self.features_in(traverse, label_if, check_first))
+                    self._learn_whitening(whitening, features, traverse, second, label_if)
+                    parts = features.split(ROWS)
+                    return concatenate(self.whitened(part.to(self.device)) for part in parts)
+                sample = Sample.of(len(traverse), SAMPLE)
+                own = second and sample.views(second)
+                self.learn(Part(traverse, sample.frame), own, progress, label="sampling")
+            storage = (DESCRIPTOR_MEMORY, self.whitening is not None) if spectral else ()
+            return concatenate(self.batches(traverse, label_if, check_first), *storage)
+
+    def _exceeds_memory(self, traverse: Traverse) -> bool:
+        """Whether the float32 features of a traverse longer than `SAMPLE` exceed the memory."""
+        frames = len(traverse)
+        return frames > SAMPLE and 4 * frames * self.count_features(traverse) > IN_MEMORY
+
+    def _learn_whitening(
+        self,
+        whitening: Whitening,
+        features: Tensor,
+        traverse: Traverse,
+        second: Views | None,
+        label: str | None,
+    ) -> None:
+        if len(features) < 2:
+            raise InputError(f"{traverse.name} has 1 frame; expected at least 2")
+        source = "" if second is None else f"by {second.traverse.name}"
+        if second is None and not is_ready(traverse) and whitening.views != 0:
+            copies = whitening.copies(*features.shape)
+            settings = copies, whitening.most_views, whitening.strengths, whitening.seed
+            second, source = augmented_route(traverse, len(features), *settings)
+        groups = (None, None) if is_ready(traverse) else groups_of(self.features)
+        if second is None:
+            whitening.learn(features, None, *groups)
+        else:
+            samples = INDEPENDENT * len(features) if isinstance(second.traverse, AugmentedFrames) else None
+            batches = self.features_in(second.traverse, label and f"learning what changes: {source}")
+            shown = _with_places(batches, second.places.to(self.device))
+            whitening.learn(features, shown, *groups, samples)
+        whitening.to(self.device)
+
+    @contextmanager
+    def unchanged_by_errors(self) -> Iterator[None]:
+        """Restores the whitening if the block raises."""
+        before = self.whitening, self.reduces, None if self.whitening is None else self.whitening.state_dict()
+        try:
+            yield
+        except BaseException:
+            self.whitening, self.reduces, state = before
+            if self.whitening is not None and state is not None:
+                self.whitening.load_state_dict(state)
+            raise
+
+    def take(self, other: Descriptor, whitening: bool = False) -> None:
+        """Use the preprocess and features of another descriptor, such as one trained on many routes, and its
+        whitening too if asked for, which becomes fixed. Raises InputError if it has none.
+
+        Example:
+            >>> descriptor = Descriptor(features=HOG())
+            >>> descriptor.take(Descriptor(features=HOG(cell=16)))
+            >>> descriptor.features.cell
+            16
+        """
+        if whitening:
+            if other.whitening is None or not other.whitening.learned:
+                raise InputError("its map was learned without whitening; expected one learned with whitening")
+            self.whitening, self.reduces = other.whitening, False
+            self.whitening.fixed = True
+        self.preprocess, self.features = other.preprocess, other.features
+        self.weight_bits = other.weight_bits
+
+    def require_learning(self, name: str) -> None:
+        """Refuse a second traverse of this name if no whitening learns from it."""
+        if self.whitening is None or self.whitening.fixed or self.reduces:
+            fixed = self.whitening is not None and self.whitening.fixed
+            seen = "the whitening is another map's" if fixed else "there is no whitening"
+            raise InputError(f"{seen} to learn from {name}; expected a whitening that is learned")
+
+    def warn_of_bright(self, frames: Tensor, name: str) -> None:
+        """`warn_of_bright`, once for each traverse."""
+        if (name, "bright") not in self.warned and warn_of_bright(frames, name):
+            self.warned.add((name, "bright"))
+
+    def count_features(self, traverse: Traverse) -> int:
+        """D, from the first frame."""
+        return next(self.features_in(Part(traverse, range(1)))).shape[1]
+
+    def check_sizes(self, reference: Traverse, *queries: Traverse) -> int:
+        """The number of features per frame; refuses queries in which it differs before any long work."""
+        counts = [self.count_features(traverse) for traverse in (reference, *queries)]
+        for query, count in zip(queries, counts[1:], strict=True):
+            if count != counts[0]:
+                seen = " and ".join(
+                    f"{traverse.name} gives {own} features per frame of "
+                    f"{' x '.join(map(str, traverse.frame_shape))}"
+                    for traverse, own in ((reference, counts[0]), (query, count))
+                )
+                raise InputError(f"{seen}; expected the same number, from frames of the same size")
+        return counts[0]
+
+
+def is_ready(traverse: Traverse | AugmentedFrames | None) -> bool:
+    """Whether a traverse holds ready features, not frames."""
+    return traverse is not None and len(traverse.frame_shape) == 1
+
+
+def default_features(whitens: bool = True) -> nn.Module:
+    """HOG and the package's network side by side; without whitening HOG alone, as in the paper."""
+    return Joined([HOG(), Distilled()]) if whitens else HOG()
+
+
+def own_size(features: nn.Module, block: bool = False) -> tuple[int, int] | None:
+    """The size (height, width) to which features of this package resize frames, the largest of joined ones;
+    None if they do not. With `block`, also the size of a block of HOG."""
+    if isinstance(features, Joined):
+        sizes = [one for one in (own_size(member, block) for member in features.members) if one is not None]
+        return (max(height for height, _ in sizes), max(width for _, width in sizes)) if sizes else None
+    known = type(features).__module__.startswith("dejavu_torch.")
+    size: tuple[int, int] | None = getattr(features, "resize", None) if known else None
+    if size is None and block and type(features) is HOG:
+        size = (features.cell * features.block,) * 2
+    return size
+
+
+def _with_places(batches: Iterator[Tensor], places: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    """Batches of features with their places (B,), without frames that show none."""
+    done = 0
+    for batch in batches:
+        shown = places[done : done + len(batch)]
+        yield batch[shown >= 0], shown[shown >= 0]
+        done += len(batch)
