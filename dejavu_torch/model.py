@@ -487,12 +487,10 @@ class DejaVu(nn.Module):
             sequence.check(None, self.map.places)
         if self.search_file is not None:
             check_searches(self.search_file, matching, self.find is not None)
-        searches = getattr(sequence, "search_every", 1) > 1 if sequence else matching.on_scores is None
+        searches = sequence is None and matching.on_scores is None
         if searches and self.find is None and matching.search != "scan":
             coarse = self._coarse_search(matching.search == "exact")
-        if coarse is None:
-            return Localizer(self.map, matching, self.find)
-        return Localizer(self.map, matching, coarse, coarse.approximate)
+        return Localizer(self.map, matching, coarse or self.find)
 
     def _coarse_search(self, exact: bool) -> CoarseSearch | None:
         """The coarse search of the present map, made on first use; None if the map has to be scanned."""
@@ -564,7 +562,7 @@ class DejaVu(nn.Module):
         precision lacks this calibration."""
         platt = self.calibration and self.calibration.of(sequence)
         if self.precision is not None and platt is None:
-            only = "calibrated for single queries and for a filter with search_every 1 only"
+            only = "calibrated for single queries and for a filter only"
             seen = f"the precision is {self.precision}, but the map is "
             raise InputError(f"{seen}{only if self.calibration else 'not calibrated'}; expected a threshold")
         return Matching(sequence, rule=self.acceptance(sequence), platt=platt, search=search or self.search)

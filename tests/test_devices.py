@@ -51,7 +51,7 @@ from dejavu_torch.maps.place_map import Mapper
 from dejavu_torch.recognition import coarse
 from dejavu_torch.recognition.select import best_candidates, best_match
 
-SEQUENCES = [PlaceFilter(), PlaceFilter(search_every=5), SequenceMatcher(3), None]
+SEQUENCES = [PlaceFilter(), SequenceMatcher(3), None]
 ELSEWHERE = f"cuda:{torch.cuda.device_count()}"  # the first that is not there
 
 

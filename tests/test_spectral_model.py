@@ -253,7 +253,7 @@ def test_a_map_does_not_hang_on_the_default_type(dtype: torch.dtype, kind: str, 
         mapper = SpectralMapper(chunk=50) if kind == "spectral" else TemplateMapper(ImposedPeriods((8, 13)))
         DejaVu(mapper=mapper).learn(route).calibrate(route).save(tmp_path / "m.safetensors")
         model = DejaVu.load(tmp_path / "m.safetensors")
-        ways = None, SequenceMatcher(5), PlaceFilter(), PlaceFilter(search_every=5)
+        ways = None, SequenceMatcher(5), PlaceFilter()
         found = [model.localize(query, sequence=way) for way in ways]
         found += [model.localize(query, search=one) for one in ("coarse", "exact")]  # type: ignore[arg-type]
         return (tmp_path / "m.safetensors").read_bytes(), found

@@ -50,8 +50,7 @@ class Sequences:
         Args:
             within, threshold: of the filter; None keeps the filter's own threshold.
         """
-        settings = {"moves": self.moves, "search_every": getattr(self, "search_every", None)}
-        given: dict[str, Any] = {name: value for name, value in settings.items() if value is not None}
+        given: dict[str, Any] = {} if self.moves is None else {"moves": self.moves}
         if self.speeds is not None and self.sequence == 1:
             expected = "expected --sequence T with them, in place of a filter"
             raise InputError(f"--speeds {self.speeds} without --sequence; {expected}")
@@ -60,26 +59,14 @@ class Sequences:
             chosen = PlaceFilter(within=within, **given)
             chosen.threshold = chosen.threshold if threshold is None else threshold
             return chosen
-        for name, value in given.items():
-            raise InputError(f"--{name} {value} without --filter; expected both")
+        if self.moves is not None:
+            raise InputError(f"--moves {self.moves} without --filter; expected both")
         matcher = SequenceMatcher(self.sequence, (1.0,) if self.speeds is None else self.speeds)
         return None if self.sequence == 1 else matcher
 
 
 @dataclass
-class Searches(Sequences):
-    """Also how often the filter searches all places.
-
-    Args:
-        search_every: let the filter search all places only at every n-th query, and in between score those
-            near the last place; 1 if not given
-    """
-
-    search_every: int | None = None
-
-
-@dataclass
-class LiveSearches(Searches):
+class LiveSequences(Sequences):
     """The filter unless a sequence is given.
 
     Args:
@@ -122,8 +109,7 @@ class KeptSearching(Searching):
 
     Args:
         search_file: file for the samples of a coarse or exact search: written if it does not exist, else
-            read. It is refused for another map, --search or --search_memory. A filter uses it only with
-            --search_every above 1
+            read. It is refused for another map, --search or --search_memory
     """
 
     search_file: Path | None = None
@@ -182,16 +168,11 @@ class Acceptance:
         if self.threshold is not None:
             refuse_with(f"--threshold {self.threshold:g}", precision=self.precision)
         check_precision(self.precision)
-        if isinstance(sequence, PlaceFilter):
-            without = f"--search_every {sequence.search_every}" if sequence.search_every > 1 else ""
-        else:
-            without = f"--sequence {sequence.length}" if isinstance(sequence, SequenceMatcher) else ""
         for name, value in (("--precision", self.precision), ("--distractors", distractors)):
-            if without and value:
-                why = (
-                    "only single queries, and a filter that searches all places each time, have probabilities"
-                )
-                raise InputError(f"{without} and {name} {value}: {why}; expected one of the two options")
+            if value and isinstance(sequence, SequenceMatcher):
+                seen = f"--sequence {sequence.length} and {name} {value}"
+                why = "only single queries and a filter have probabilities"
+                raise InputError(f"{seen}: {why}; expected one of the two options")
 
     def of(self, model: DejaVu) -> None:
         """Set what a model accepts, if one of the two is given."""

@@ -228,22 +228,6 @@ class CoarseSearch:
             found[1][rest, : place.shape[1]] = place
         return found
 
-    @torch.no_grad()
-    def approximate(self, queries: Tensor) -> Tensor:
-        """Scores of all places, (Q,K) -> (Q,N): exact around the best places, elsewhere those of the nearest
-        fine samples."""
-        units = F.normalize(queries.float())
-        small = to_int8(units)
-        size = torch.linalg.vector_norm(small.float(), dim=1).clamp(min=1)
-        cosines = torch.cat([*self.fine.products(small)]) / size / self.fine.norm[:, None]
-        nearest = torch.cat([self._nearest(chunk) for chunk in range(len(self.starts))])
-        scores: Tensor = (1 - cosines)[nearest].T.contiguous()
-        place = self._windows(units, self.coarse.best_of_groups(small), [(1, 0)])
-        own = self._scores(units, place)
-        query, column = own.isfinite().nonzero().T
-        scores[query, place[query, column]] = own[query, column]
-        return scores
-
     def _windows(self, units: Tensor, best: Tensor, wanted: Wanted) -> Tensor:
         """Places near the best fine samples of each query, (Q,M), by place; -1 for none. A window is wide
         enough for all candidates on one peak."""

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.recognition.calibration import TOLERANCE, Platt, Track, confidence, confidence_of
-from dejavu_torch.recognition.filter import LocalSearch, PlaceFilter
+from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.search import SCORES_AT_ONCE, Find, Search, Wanted, num_needed, search
 from dejavu_torch.recognition.select import Acceptance, accept, best_candidates, best_match
 from dejavu_torch.recognition.sequence import SequenceMatcher
@@ -51,8 +51,6 @@ class Localizer:
     Args:
         route: the map; None if only `match` is used, with scores from elsewhere.
         find: finds candidates of single queries instead of `search`, such as a `CoarseSearch` or a cluster.
-        approximate: approximate scores of all places, for a `PlaceFilter` with search_every > 1; None uses
-            the map's exact ones.
 
     Shape: descriptors (B,K) of the next queries -> Match of (B,), or (B,k), on the CPU, without gradients.
 
@@ -71,7 +69,6 @@ class Localizer:
         route: PlaceMap | None = None,
         matching: Matching = SINGLE,
         find: Find | None = None,
-        approximate: Callable[[Tensor], Tensor] | None = None,
     ) -> None:
         self.route, self.matching, self.find, self.track = route, matching, find, Track()
         sequence, routes = matching.sequence, () if route is None else route.routes
@@ -79,10 +76,6 @@ class Localizer:
         self.models = {**matching.beside, **({} if sequence is None else {self.own: sequence})}
         self.states: dict[Together, Tensor] = {}  # of the models; empty before the first query
         self.firsts = (0, *accumulate(one.places for one in routes[:-1]))  # the first place of each route
-        self.local: LocalSearch | None = None
-        if route is not None and isinstance(sequence, PlaceFilter) and not matching.beside:
-            every = sequence.search_every
-            self.local = LocalSearch(sequence, route, approximate or route.scores) if every > 1 else None
 
     @torch.no_grad()
     def __call__(self, descriptors: Tensor, label: str | None = None) -> Match:
@@ -115,17 +108,14 @@ class Localizer:
     def skip(self, queries: int) -> None:
         """Skip queries: a `PlaceFilter` moves once more for each."""
         filter = self.matching.sequence
-        if self.local is not None:
-            self.local.skipped += queries
-        elif isinstance(filter, PlaceFilter) and self.states:
+        if isinstance(filter, PlaceFilter) and self.states:
             for _ in range(queries):
-                state = self.states["filter"]
-                self.states = self.states | {"filter": filter.moved(state, len(state) - 1)}
+                self.states = self.states | {"filter": filter.moved(self.states["filter"])}
 
     @property
     def posterior(self) -> Tensor | None:
         """(N+1,) of a filter after the latest query; None without a filter, or before the first query."""
-        return self.states.get("filter") if self.local is None else self.local.posterior
+        return self.states.get("filter")
 
     def _in_sequence(self, scores: Tensor) -> Match:
         states = self.states or {T: one.start(scores.shape[1]).to(scores) for T, one in self.models.items()}
@@ -158,14 +148,7 @@ class Localizer:
 
     def _by_scores(self, descriptors: Tensor) -> Match:
         assert self.route is not None
-        if self.local is None:
-            return self.match(self.route.scores(descriptors))
-        whole, matches = self.matching.k is not None or self.matching.on_scores is not None, []
-        for descriptor in descriptors.split(1):
-            scores, start = self.local(descriptor, whole)
-            match = self._candidates(scores)
-            matches.append(match._replace(index=match.index + start))
-        return self._answer(Match.joined(matches))
+        return self.match(self.route.scores(descriptors))
 
     def _by_search(self, wanted: Wanted, descriptors: Tensor) -> Match:
         """Candidates from the lowest scores alone; `wanted` has those of the answer first."""

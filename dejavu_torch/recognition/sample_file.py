@@ -26,11 +26,13 @@ def check_searches(path: Any, matching: Matching, elsewhere: bool) -> None:
     """
     if not isinstance(path, str | Path):
         raise InputError(f"search_file is {path!r:.{SHOWN}}; expected the path of a file")
-    single, every = matching.sequence is None, getattr(matching.sequence, "search_every", 0)
-    all_places = f"a {'filter' if every else 'sequence'} scores all places of every query"
-    others = "a filter with search_every above 1, or single queries (--sequence 1)"
+    single = matching.sequence is None
     for refused, seen, expected in (
-        (not single and every <= 1, all_places, others),
+        (
+            not single,
+            "a sequence or filter scores all places of every query",
+            "single queries (--sequence 1)",
+        ),
         (single and matching.on_scores, "scores of all places are kept", "none kept (no --page)"),
         (elsewhere, "places are found elsewhere, such as by a cluster", "only one of the two"),
         (matching.search == "scan", "search scan scores all places", "search auto, coarse or exact"),

@@ -148,13 +148,6 @@ MUTANTS = [
         ("tests/recognition/test_filter.py::-k literal_loop or drives_off",),
     ),
     Mutant(
-        "With search_every n, a PlaceFilter scores all places for every n-th query.",
-        "dejavu_torch/recognition/filter.py",
-        "since >= filter.search_every",
-        "since > filter.search_every",
-        ("tests/test_behaviour.py::test_a_filter_searches_every_nth_query",),
-    ),
-    Mutant(
         "A trajectory of which just half lies on the map still gives its place a finite score.",
         "dejavu_torch/recognition/sequence.py",
         "torch.where(2 * count >= used[:, None],",

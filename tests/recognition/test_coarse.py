@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_search import walk
 
-from dejavu_torch import DejaVu, PlaceFilter, SpectralMapper
+from dejavu_torch import DejaVu, SpectralMapper
 from dejavu_torch.growth import append
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.spectrum import Transform
@@ -116,18 +116,6 @@ def test_coarse_probabilities_are_those_of_a_scan() -> None:
         assert found is not None
         assert expected is not None
         assert float((found - expected).abs().quantile(0.99)) < 0.01
-
-
-@pytest.mark.usefixtures("searched")
-def test_a_filter_that_does_not_always_search_takes_samples() -> None:
-    model, queries = smooth_model(), walk(3000, 24, 0, 0.99)[1000:1100]
-    found = [
-        model.localize(queries, sequence=PlaceFilter(search_every=10), search=search)  # type: ignore[arg-type]
-        for search in ("auto", "scan")
-    ]
-    assert torch.equal(found[0].index, found[1].index)
-    probability = [(-match.score).exp() for match in found]
-    torch.testing.assert_close(probability[0], probability[1], rtol=0, atol=0.02)
 
 
 @pytest.mark.usefixtures("searched")
