@@ -36,7 +36,6 @@ from dejavu_torch.motion.resampling import ResampledTraverse, resampled, source_
 from dejavu_torch.recognition.calibration import Calibration
 from dejavu_torch.recognition.coarse import CoarseSearch, coarse_search
 from dejavu_torch.recognition.localizer import Localizer, Matching
-from dejavu_torch.recognition.sample_file import check_searches, kept_search
 from dejavu_torch.recognition.search import SCORES_AT_ONCE, Find, Search, check_search
 from dejavu_torch.recognition.select import HIGHEST, PROBABLE, Acceptance, check_candidates
 from dejavu_torch.resize import reduced_size
@@ -139,7 +138,6 @@ class DejaVu(nn.Module):
         self.calibration: Calibration | None = None
         self.search: Search = "auto"  # for single queries, see `localize`
         self.search_memory: int | None = None  # bytes of the samples, see `coarse.plan`
-        self.search_file: Path | str | None = None  # keeps the samples for other processes
         self.find: Find | None = None  # replaces the search, such as by a cluster
         self._coarse: tuple[tuple[Any, ...], CoarseSearch | None] = (), None  # a search and its key
         self._warned: set[tuple[str, str]] = set()  # (traverse, line) of warnings that were logged
@@ -450,8 +448,7 @@ class DejaVu(nn.Module):
         Shape: -> Match of (Q,) on the CPU.
 
         Raises:
-            InputError: no map, no frames, NaN, or features of another dimension than the map's; a
-                `self.search_file` of another map, or for a search without samples.
+            InputError: no map, no frames, NaN, or features of another dimension than the map's.
         """
         return Match.joined(self.matches(queries, progress, sequence, search))
 
@@ -485,8 +482,6 @@ class DejaVu(nn.Module):
         sequence, coarse = matching.sequence, None
         if sequence is not None:
             sequence.check(None, self.map.places)
-        if self.search_file is not None:
-            check_searches(self.search_file, matching, self.find is not None)
         searches = sequence is None and matching.on_scores is None
         if searches and self.find is None and matching.search != "scan":
             coarse = self._coarse_search(matching.search == "exact")
@@ -496,10 +491,10 @@ class DejaVu(nn.Module):
         """The coarse search of the present map, made on first use; None if the map has to be scanned."""
         norms = getattr(self.map, "norms", None)  # identifies the map
         known, found = self._coarse
-        file, how = self.search_file, (self.search_memory, exact)
-        if not known or known[0] is not norms or known[1:] != (file, *how):
-            found = coarse_search(self.map, *how) if file is None else kept_search(Path(file), self.map, *how)
-            self._coarse = (norms, file, *how), found
+        how = self.search_memory, exact
+        if not known or known[0] is not norms or known[1:] != how:
+            found = coarse_search(self.map, *how)
+            self._coarse = (norms, *how), found
         return found
 
     def matches(

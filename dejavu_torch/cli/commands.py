@@ -175,7 +175,7 @@ def run_localize(
     pairs: Path | None = None,
     corners: list[list[float]] | None = None,
     sequences: options.Sequences,
-    searching: options.KeptSearching,
+    searching: options.Searching,
     cluster: str | None = None,
     loading: options.Loading,
 ) -> None:
@@ -196,7 +196,7 @@ def run_localize(
     device_of(loading.device)
     for written in filter(None, (out, pairs)):
         check_output_file(written)
-        check_not_read(written, map, source, searching.search_file)
+        check_not_read(written, map, source)
     if pairs is not None and pairs.resolve() == out.resolve():
         raise InputError(f"--pairs {pairs} is --out as well; expected another name")
     matcher = sequences.matcher(SUPPRESSION, acceptance.threshold)
@@ -204,8 +204,7 @@ def run_localize(
     if cluster is not None:
         _check_cluster(cluster, loading.device)
         length = sequences.sequence != 1 and sequences.sequence
-        others = {"filter": sequences.filter, "sequence": length, "search_file": searching.search_file}
-        options.refuse_with(f"--cluster {cluster}", **others)
+        options.refuse_with(f"--cluster {cluster}", filter=sequences.filter, sequence=length)
     model = loading.model(map)
     searching.of(model)
     if corners is not None:
@@ -265,7 +264,7 @@ def run_live(
     source: str,
     *,
     sequences: options.LiveSequences,
-    searching: options.KeptSearching,
+    searching: options.Searching,
     acceptance: options.Acceptance,
     page: int | None = None,
     reference: str | None = None,

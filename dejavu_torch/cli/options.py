@@ -100,19 +100,6 @@ class Searching:
             raise InputError(f"--search_memory {memory:g}; expected a number above 0, in MB")
         check_search(self.search)
         model.search, model.search_memory = self.search, None if memory is None else int(1e6 * memory)
-        model.search_file = getattr(self, "search_file", None)
-
-
-@dataclass
-class KeptSearching(Searching):
-    """Also a file that keeps the samples for the next command.
-
-    Args:
-        search_file: file for the samples of a coarse or exact search: written if it does not exist, else
-            read. It is refused for another map, --search or --search_memory
-    """
-
-    search_file: Path | None = None
 
 
 @dataclass

@@ -7,9 +7,8 @@ Only places near the best of these samples are scored.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from functools import cache
-from types import MappingProxyType
 from typing import NamedTuple
 
 import torch
@@ -120,29 +119,24 @@ class Samples:
     """Low-passed descriptors of a map, about every `spacing` places, padded to whole groups in each chunk and
     to whole blocks of groups in the map.
 
-    Args:
-        rows: as computed before; None computes them.
-
     Attributes:
         rows: (S,K) int8, unit vectors on one scale. norm: (S,) of the rows. place: (S,) nearest to each, in
             order.
     """
 
-    def __init__(self, route: SpectralMap, spacing: int, rows: Tensor | None = None) -> None:
+    def __init__(self, route: SpectralMap, spacing: int) -> None:
         places = []
         for chunk, (start, stop) in enumerate(route.chunks):
             at = route.sampled(chunk, -(-(stop - start) // spacing))
             places.append(F.pad(at, (0, -len(at) % GROUP), value=stop - start - 1) + start)
         place = torch.cat(places)
         self.place = F.pad(place, (0, -len(place) % (GROUP * GROUPS_PER_BLOCK)), value=route.places - 1)
-        shape = len(self.place), route.dimension
-        if rows is None:  # padding is 0, which is never the best
-            rows, first = self.place.new_zeros(shape, dtype=torch.int8), 0
-            for chunk, (start, stop) in enumerate(route.chunks):
-                row = route.samples(chunk, -(-(stop - start) // spacing))
-                rows[first : first + len(row)] = to_int8(F.normalize(row))
-                first += len(places[chunk])
-        self.rows = checked(rows, shape, torch.int8).to(self.place.device)
+        # padding is 0, which is never the best
+        self.rows, first = self.place.new_zeros(len(self.place), route.dimension, dtype=torch.int8), 0
+        for chunk, (start, stop) in enumerate(route.chunks):
+            row = route.samples(chunk, -(-(stop - start) // spacing))
+            self.rows[first : first + len(row)] = to_int8(F.normalize(row))
+            first += len(places[chunk])
         norms = [torch.linalg.vector_norm(block.float(), dim=1) for block in self.rows.split(BLOCK)]
         self.norm = torch.cat(norms).clamp(min=1)
 
@@ -170,40 +164,24 @@ class CoarseSearch:
     """Finds the best places of queries: coarse samples choose regions, fine samples choose windows in them,
     and the places of these windows are scored.
 
-    If every place has a fine sample, the result is exact: bounds exclude all places that cannot be as good as
-    the best of the windows.
-
     Args:
-        chosen: see `plan`. kept: `tensors` of a search with the same map and plan; computed if empty.
+        chosen: see `plan`.
 
     Shape: queries (Q,K), wanted -> scores and places (Q,M), by place, +inf for none. They include the wanted
         candidates, see `Wanted`.
 
     Convention: scores are those of a scan. A query of norm 0, or one that is similar to no place, is scanned.
-
-    Raises:
-        InputError: the kept tensors have other shapes or types.
     """
 
-    def __init__(
-        self, route: SpectralMap, chosen: Plan, kept: Mapping[str, Tensor] = MappingProxyType({})
-    ) -> None:
+    def __init__(self, route: SpectralMap, chosen: Plan) -> None:
         self.route, self.plan, self.exact = route, chosen, chosen.fine == 1
         self.starts = torch.tensor([start for start, _ in route.chunks], device=route.norms.device)
-        self.fine = Samples(route, chosen.fine, kept.get("fine"))
-        self.coarse = self.fine if self.exact else Samples(route, chosen.coarse, kept.get("coarse"))
+        self.fine = Samples(route, chosen.fine)
+        self.coarse = self.fine if self.exact else Samples(route, chosen.coarse)
         self.middle = torch.searchsorted(self.fine.place, self.coarse.place, out_int32=True)
         self.bounds = None
         if self.exact:
-            bounds, shape = kept.get("bounds"), (len(self.fine.norm) // GROUP, 3)
-            bounds = checked(self._bounds() if bounds is None else bounds, shape, torch.float32)
-            self.bounds = bounds.to(self.starts.device)
-
-    @property
-    def tensors(self) -> dict[str, Tensor]:
-        """What is slow to compute: the rows of samples, and the bounds of an exact search."""
-        coarse = {"coarse": self.coarse.rows} if self.bounds is None else {"bounds": self.bounds}
-        return {"fine": self.fine.rows, **coarse}
+            self.bounds = self._bounds()
 
     @torch.no_grad()
     def __call__(self, queries: Tensor, wanted: Wanted) -> Best:
@@ -352,13 +330,6 @@ def to_int8(units: Tensor) -> Tensor:
     scale = 127 * max(1.0, math.sqrt(units.shape[1]) / CLIP)
     rounded: Tensor = (units * scale).round().clamp(-127, 127)
     return rounded.to(torch.int8)
-
-
-def checked(kept: Tensor, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-    """The tensor itself; InputError if its shape or type differs."""
-    if kept.shape != shape or kept.dtype != dtype:
-        raise InputError(f"samples are {tuple(kept.shape)} {kept.dtype}; expected {shape} {dtype}")
-    return kept
 
 
 @cache
