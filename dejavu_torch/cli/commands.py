@@ -236,7 +236,7 @@ def run_localize(
             from dejavu_torch.cluster import Cluster, ClusterSearch
 
             workers = stack.enter_context(Cluster(cluster))
-            model.find = ClusterSearch(workers, model.map, model.search, model.search_memory)
+            model.searcher = ClusterSearch(workers, model.map, searching.search, searching.bytes)
         total, accepted = _write_matches(out, counted(), query, model, top, pairs)
     if not model.map.summary().covered:
         print("the map has no layers, so no place can be reported")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,6 +18,7 @@ from dejavu_torch.features.views import Views
 from dejavu_torch.model import DejaVu, check_precision, default_features
 from dejavu_torch.model_file import NO_MAP, recipe_of
 from dejavu_torch.motion.resampling import source_of
+from dejavu_torch.recognition.coarse import searcher
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.search import Search, check_search
 from dejavu_torch.recognition.sequence import SequenceMatcher
@@ -85,21 +87,25 @@ class Searching:
     """How places are searched for single queries.
 
     Args:
-        search: coarse scores only the places near the best samples of a long spectral map, exact also all
-            that may be better, scan all; auto is the faster of coarse and scan
+        search: coarse scores only the places near the best samples of a long spectral map, exact and scan
+            all; auto is the faster of coarse and scan
         search_memory: MB for these samples; if not given 100, or 100 bytes per place above 10^6 places
     """
 
     search: Search = "auto"
     search_memory: float | None = None
 
+    @property
+    def bytes(self) -> int | None:
+        """Of the samples."""
+        return None if self.search_memory is None else int(1e6 * self.search_memory)
+
     def of(self, model: DejaVu) -> None:
         """Set how a model searches."""
-        memory = self.search_memory
-        if memory is not None and not memory > 0:
-            raise InputError(f"--search_memory {memory:g}; expected a number above 0, in MB")
+        if self.search_memory is not None and not self.search_memory > 0:
+            raise InputError(f"--search_memory {self.search_memory:g}; expected a number above 0, in MB")
         check_search(self.search)
-        model.search, model.search_memory = self.search, None if memory is None else int(1e6 * memory)
+        model.make_searcher = partial(searcher, method=self.search, memory=self.bytes)
 
 
 @dataclass

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from functools import partial
 from itertools import accumulate
 from types import MappingProxyType
 from typing import NamedTuple
@@ -16,7 +15,7 @@ from torch import Tensor
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.recognition.calibration import TOLERANCE, Platt, Track, confidence, confidence_of
 from dejavu_torch.recognition.filter import PlaceFilter
-from dejavu_torch.recognition.search import SCORES_AT_ONCE, Find, Search, Wanted, num_needed, search
+from dejavu_torch.recognition.search import SCORES_AT_ONCE, NmsSpec, Scan, Search, Searcher, num_needed
 from dejavu_torch.recognition.select import Acceptance, accept, best_candidates, best_match
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.text import with_progress
@@ -39,7 +38,7 @@ class Matching(NamedTuple):
     rule: Acceptance = Acceptance()
     platt: Platt | None = None  # gives probabilities
     on_scores: Callable[[Tensor], None] | None = None  # receives the final scores (B,N)
-    search: Search = "auto"  # of single queries
+    search: Search = "auto"  # of single queries, see `DejaVu.localize`
 
 
 SINGLE = Matching()  # each query by itself
@@ -50,7 +49,7 @@ class Localizer:
 
     Args:
         route: the map; None if only `match` is used, with scores from elsewhere.
-        find: finds candidates of single queries instead of `search`, such as a `CoarseSearch` or a cluster.
+        searcher: finds the best places of single queries; None is a `Scan`.
 
     Shape: descriptors (B,K) of the next queries -> Match of (B,), or (B,k), on the CPU, without gradients.
 
@@ -68,9 +67,10 @@ class Localizer:
         self,
         route: PlaceMap | None = None,
         matching: Matching = SINGLE,
-        find: Find | None = None,
+        searcher: Searcher | None = None,
     ) -> None:
-        self.route, self.matching, self.find, self.track = route, matching, find, Track()
+        self.route, self.matching, self.track = route, matching, Track()
+        self.searcher = Scan(route) if searcher is None and route is not None else searcher
         sequence, routes = matching.sequence, () if route is None else route.routes
         self.own: Together = sequence.length if isinstance(sequence, SequenceMatcher) else "filter"
         self.models = {**matching.beside, **({} if sequence is None else {self.own: sequence})}
@@ -88,13 +88,14 @@ class Localizer:
         if matching.platt is not None:
             wanted.append((min(2, places), TOLERANCE))
         n = num_needed(wanted, places)
-        few = n <= max(1, MAX_SHARE * min(places, route.block_places))
-        few = few or self.find is not None or places > SCORES_AT_ONCE
-        way, size = self._by_scores, places
-        if not self.models and matching.on_scores is None and few:
-            way, size = partial(self._by_search, wanted), max(PER_BEST * n, places // PLACES_PER_NUMBER)
+        few = n <= max(1, MAX_SHARE * min(places, route.block_places)) or places > SCORES_AT_ONCE
+        searches = not self.models and matching.on_scores is None and (few or type(self.searcher) is not Scan)
+        size = max(PER_BEST * n, places // PLACES_PER_NUMBER) if searches else places
         parts = descriptors.split(max(1, min(ROWS, SCORES_AT_ONCE // size)))
-        return Match.joined(way(part.to(route.positions.device)) for part in with_progress(parts, label))
+        moved = (part.to(route.positions.device) for part in with_progress(parts, label))
+        if searches:
+            return Match.joined(self._search(part, wanted) for part in moved)
+        return Match.joined(self.match(route.scores(part)) for part in moved)
 
     @torch.no_grad()
     def match(self, scores: Tensor) -> Match:
@@ -146,17 +147,9 @@ class Localizer:
             match = match._replace(probability=probability)
         return match if matching.k is not None else match.map(lambda column: column[:, 0])
 
-    def _by_scores(self, descriptors: Tensor) -> Match:
-        assert self.route is not None
-        return self.match(self.route.scores(descriptors))
-
-    def _by_search(self, wanted: Wanted, descriptors: Tensor) -> Match:
+    def _search(self, descriptors: Tensor, wanted: list[NmsSpec]) -> Match:
         """Candidates from the lowest scores alone; `wanted` has those of the answer first."""
-        if self.find is not None:
-            score, place = self.find(descriptors, wanted)
-        else:
-            assert self.route is not None
-            n, scan = num_needed(wanted, self.route.places), self.matching.search == "scan"
-            score, place = search(self.route, descriptors, n, scan)
+        assert self.searcher is not None
+        score, place = self.searcher(descriptors, wanted)
         match, *second = (best_candidates(score, *one, places=place) for one in wanted)
         return self._answer(match, *map(confidence, second))

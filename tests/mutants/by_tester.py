@@ -502,13 +502,6 @@ MUTANTS = [
         ("tests/test_learning.py::test_the_partial_map_of_another_run_is_refused",),
     ),
     Mutant(
-        "An exact search rules out no place that may be better than those it found.",
-        "dejavu_torch/recognition/coarse.py",
-        "reach = angle(1 - score) +",
-        "reach = angle(1 - score) * 0.9 +",
-        ("tests/recognition/test_coarse.py::test_exact_finds_what_a_scan_finds",),
-    ),
-    Mutant(
         "Recall over all queries counts those without a right answer.",
         "dejavu_torch/evaluation/curves.py",
         "found = right[truth.judged].cumsum(1) > 0",
