@@ -97,11 +97,6 @@ class PlaceMap(nn.Module, ABC):
         """About how many numbers the largest block of `score_blocks` needs per query."""
         return self.places
 
-    def lowest(self, queries: Tensor) -> tuple[Tensor, Tensor] | None:
-        """The lowest score of each query and its first place, (Q,) each, -1 if none is finite; without
-        gradient. None if this is not faster than all scores."""
-        return None
-
     @property
     def table(self) -> FrameTable:
         """The frame and route of each place."""

@@ -15,7 +15,6 @@ from torch import Tensor, nn
 
 from dejavu_torch.maps.distance import Metric, phase_distances
 from dejavu_torch.maps.file import checked
-from dejavu_torch.maps.layer_search import lowest
 from dejavu_torch.maps.place_map import Mapper, PlaceMap, ScoreBlocks, require
 from dejavu_torch.maps.summary import ChunkSummary, MapSummary
 from dejavu_torch.maps.templates import PhaseTemplates, check_plan
@@ -26,8 +25,6 @@ from dejavu_torch.types import FrequencyLayer, InputError, Plan
 
 Reduction = Literal["mean", "sum"]
 MAX_PLACES = 2**26  # in all layers, since a file of a few bytes can claim any number
-PHASE_COST = 8  # time per phase to search two layers, in units of the time to score a place
-SEARCH_COST = 2**15  # time of any search, in the same unit
 
 
 def segments(plan: Plan, places: int) -> Iterator[tuple[int, int, tuple[int, ...]]]:
@@ -251,20 +248,6 @@ class TemplateMap(PlaceMap):
     @property
     def block_places(self) -> int:
         return self.places * max([1, *(len(layers) for _, _, layers in self.segments)])
-
-    @torch.no_grad()
-    def lowest(self, queries: Tensor) -> tuple[Tensor, Tensor] | None:
-        """See `PlaceMap`: for two layers that cover the same places, if there are many."""
-        chunks = {(layer.start, layer.stop) for layer in self.plan}
-        if self.temperature is not None or len(self.plan) != 2 or len(chunks) != 1:
-            return None
-        ((start, stop),) = chunks
-        if SEARCH_COST + PHASE_COST * sum(layer.period.numerator for layer in self.plan) >= stop - start:
-            return None
-        pairs = zip(self.distances(queries), self.lap_phases.split(self.laps), strict=True)
-        one, other = (distances.index_select(1, lap) for distances, lap in pairs)
-        score, place = lowest(one, other, stop - start, self.divisor([0, 1]))
-        return score, torch.where(score.isfinite(), start + place, -1)
 
     def trainable(self, templates: bool = True, weights: bool = False, start: Tensor | None = None) -> None:
         """Turn the templates, the weights, or both, into parameters, until `freeze`; `start`: (D,) initial
