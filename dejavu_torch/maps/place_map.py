@@ -88,9 +88,9 @@ class PlaceMap(nn.Module, ABC):
         if queries.ndim != 2 or queries.shape[1] != self.dimension:
             raise InputError(f"the queries are {tuple(queries.shape)}; the map expects (Q, {self.dimension})")
 
-    def score_blocks(self, queries: Tensor, start: int = 0, stop: int | None = None) -> ScoreBlocks:
-        """The columns [start, stop) of `scores`, block by block."""
-        yield start, self.scores(queries)[:, start:stop]
+    def score_blocks(self, queries: Tensor) -> ScoreBlocks:
+        """The columns of `scores`, block by block."""
+        yield 0, self.scores(queries)
 
     @property
     def block_places(self) -> int:

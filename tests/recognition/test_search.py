@@ -48,10 +48,10 @@ class Scored(PlaceMap):
     def scores(self, queries: Tensor) -> Tensor:
         return self.rows[queries[:, 0].long()]
 
-    def score_blocks(self, queries: Tensor, start: int = 0, stop: int | None = None) -> Any:
+    def score_blocks(self, queries: Tensor) -> Any:
         self.batches.append(len(queries))
         scores = self.scores(queries)
-        for first in range(start, self.places if stop is None else stop, self.size):
+        for first in range(0, self.places, self.size):
             yield first, scores[:, first : first + self.size]
 
 
