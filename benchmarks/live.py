@@ -42,7 +42,6 @@ COLUMNS: dict[str, Column] = {
     "found": ("recall_at_1", ".3f"),
 }
 WARM = 10  # frames before timing starts
-SEARCHED = (1, 50)  # the filter's search_every
 
 
 def bench_live(
@@ -72,12 +71,12 @@ def bench_live(
         for height, width in shown:
             video = Video(path, width=width, height=height)
             model, first = long_model(video, places, numbers)
-            rows += [live_row(video, camera, model, first, every) for every in SEARCHED]
+            rows.append(live_row(video, camera, model, first))
         return rows
 
 
-def live_row(video: Video, camera: tuple[int, int], model: DejaVu, first: int, every: int) -> Row:
-    localizer = LiveLocalizer(model, PlaceFilter(search_every=every), keep_scores=every == 1)
+def live_row(video: Video, camera: tuple[int, int], model: DejaVu, first: int) -> Row:
+    localizer = LiveLocalizer(model)
     found, milliseconds = 0, []
     with FrameReader(shots_of(video)) as reader:
         for frame in reader:
@@ -97,7 +96,7 @@ def live_row(video: Video, camera: tuple[int, int], model: DejaVu, first: int, e
     (height, width), places = video.frame_shape[1:], model.map.places
     return {
         "case": f"{camera[0]} x {camera[1]} on a map of {height} x {width}",
-        "contender": "dejavu" if every == 1 else f"dejavu, search_every {every}",
+        "contender": "dejavu",
         "seconds": p50,
         "seconds_p99": p99,
         "rate": rate,
@@ -108,7 +107,7 @@ def live_row(video: Video, camera: tuple[int, int], model: DejaVu, first: int, e
         "places": places,
         "route_bytes_per_place": model.map.summary().route_bytes / places,
         "threads": torch.get_num_threads(),
-        "parts": parts_of(model, video, every),
+        "parts": parts_of(model, video),
     }
 
 
@@ -156,9 +155,9 @@ def long_model(video: Video, places: int, numbers: int) -> tuple[DejaVu, int]:
     return model, middle * len(own)
 
 
-def parts_of(model: DejaVu, video: Video, every: int) -> dict[str, float]:
+def parts_of(model: DejaVu, video: Video) -> dict[str, float]:
     """Median seconds of each part of the processing of a frame."""
-    whitening, filter = model.whitening, PlaceFilter(search_every=every)
+    whitening, filter = model.whitening, PlaceFilter()
     assert whitening is not None
     began = time.perf_counter()
     decoded = sum(1 for _ in video.batches(1))
@@ -171,14 +170,9 @@ def parts_of(model: DejaVu, video: Video, every: int) -> dict[str, float]:
         "features": lambda: model.descriptor.describe(frame),
         "whitening": lambda: whitening(features, unpacked),
         "search": lambda: model.localize_descriptors(descriptor),
+        "scores": lambda: model.map.scores(descriptor),
+        "filter": lambda: filter.step(scores, state),
     }
-    if every == 1:
-        works["scores"] = lambda: model.map.scores(descriptor)
-        works["filter"] = lambda: filter.step(scores, state)
-    else:  # together, after other frames
-        near = model.localizer(model.matching(filter))
-        near(descriptor.expand(WARM, -1))
-        works["scores and filter"] = lambda: near(descriptor)
     for name, work in works.items():
         timer = Timer("work()", globals={"work": work}, num_threads=torch.get_num_threads())
         seconds[name] = timer.blocked_autorange().median
@@ -194,7 +188,7 @@ def run_live(*, out: Path) -> list[str]:
     rows = bench_live()
     drawn = {}
     for row in rows:  # all have the same camera
-        name = f"{row['case'].partition(' on ')[2]}: {row['contender']}"
+        name = row["case"].partition(" on ")[2]
         parts = {"dejavu": row["seconds"]} | row["parts"]
         drawn[name] = {part: 1e3 * seconds for part, seconds in parts.items()}
     picture = plot_ratios(drawn, "milliseconds per frame (p50), and of each part by itself")

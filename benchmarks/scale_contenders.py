@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,6 +19,7 @@ from dejavu_torch.data.traverse import IndexedTraverse
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import DejaVu
+from dejavu_torch.recognition.coarse import searcher
 from dejavu_torch.recognition.search import Search
 
 ROWS = 8192  # descriptors read together
@@ -63,7 +65,7 @@ class Mapped(Store):
 
     def load(self, path: Path, device: str = "cpu") -> Find:
         self.model = DejaVu.load(path).to(device)
-        self.model.search = self.search
+        self.model.make_searcher = partial(searcher, method=self.search)
         locate = self.model.localize_descriptors if self.whitening else self.model.localize
         order = torch.from_numpy(np.load(path.with_suffix(".npy"))) if self.shuffled else None
 
@@ -220,10 +222,8 @@ FLOWN = f"{OURS}, one chunk, of noisy frames"
 # same. "np" skips the training of faiss's filter by Hamming distances, which is slow and not used here
 PLACED: dict[str, Callable[[float, float], Store]] = {
     f"{OURS} 1 B": lambda *_: Mapped(SpectralMapper(1.0, chunk=CHUNK)),
-    f"{OURS} 1 B, exact": lambda *_: Mapped(SpectralMapper(1.0, chunk=CHUNK), search="exact"),
     f"{OURS} 1 B, scan": lambda *_: Mapped(SpectralMapper(1.0, chunk=CHUNK), search="scan"),
     f"{OURS} 4 B": lambda *_: Mapped(SpectralMapper(4.0, chunk=CHUNK)),
-    f"{OURS} 4 B, exact": lambda *_: Mapped(SpectralMapper(4.0, chunk=CHUNK), search="exact"),
     f"{OURS} 4 B, scan": lambda *_: Mapped(SpectralMapper(4.0, chunk=CHUNK), search="scan"),
     f"{OURS} 1 B, one chunk": lambda *_: Mapped(SpectralMapper(1.0, chunk=WHOLE)),
     f"{OURS} 4 B, one chunk": lambda *_: Mapped(SpectralMapper(4.0, chunk=WHOLE)),
@@ -249,7 +249,7 @@ REPEATED: dict[str, Callable[[float, float], Store]] = {
 }
 CONTENDERS = PLACED | REPEATED
 REQUESTED = ("usearch int8",)  # only measured if named: it is slow to learn 10^6 places
-SEARCHED = ("exact", "scan", "64 probes")  # ways to search the file of the contender without them in its name
+SEARCHED = ("scan", "64 probes")  # ways to search the file of the contender without them in its name
 GIVEN = CONTENDERS.keys() - {
     ONE_CHUNK,
     FIXED,

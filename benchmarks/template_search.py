@@ -10,8 +10,8 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from benchmarks.layer_search import lowest
 from benchmarks.measure import Contender, Row, benchmark
-from dejavu_torch.maps.layer_search import lowest
 from dejavu_torch.maps.template_map import TemplateMap
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.types import FrequencyLayer
@@ -33,7 +33,7 @@ def bench_templates(places: Sequence[int], queries: int = 8, repeats: int = 5) -
         asked = torch.rand(queries, route.dimension, generator=generator).split(1)
         contenders = [
             Contender(name, partial(partial, each, partial(find, route), asked))
-            for name, find in ((OURS, in_layers), (SCAN, scan))
+            for name, find in ((OURS, lambda *given: in_layers(*given)[1]), (SCAN, scan))
         ]
         with torch.no_grad():
             rows = benchmark(f"templates={count}", contenders, repeats)
@@ -54,9 +54,14 @@ def random_map(places: int, generator: torch.Generator) -> TemplateMap:
     return TemplateMap(tuple(plan), blocks, places, 2 * FEATURES)
 
 
-def in_layers(route: TemplateMap, query: Tensor) -> Tensor:
-    one, other = route.distances(query)
-    return lowest(one, other, route.places, route.divisor([0, 1]))[1]
+def in_layers(route: TemplateMap, queries: Tensor) -> tuple[Tensor, Tensor]:
+    """The lowest score of each query and its first place, -1 if none is finite, on a map of two layers that
+    cover the same places."""
+    ((start, stop),) = {(layer.start, layer.stop) for layer in route.plan}
+    pairs = zip(route.distances(queries), route.lap_phases.split(route.laps), strict=True)
+    one, other = (distances.index_select(1, lap) for distances, lap in pairs)
+    score, place = lowest(one, other, stop - start, route.divisor([0, 1]))
+    return score, torch.where(score.isfinite(), start + place, -1)
 
 
 def scan(route: TemplateMap, query: Tensor) -> Tensor:

@@ -25,8 +25,8 @@ from torch import Tensor, nn
 from dejavu_torch.data.output import SIGNALS
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.maps.spectral_map import Chunk, SpectralMap
-from dejavu_torch.recognition.coarse import coarse_search
-from dejavu_torch.recognition.search import Best, Search, Wanted, num_needed, search
+from dejavu_torch.recognition.coarse import searcher
+from dejavu_torch.recognition.search import NmsSpec, Search, TopK
 from dejavu_torch.text import one_line
 from dejavu_torch.types import InputError
 
@@ -115,13 +115,11 @@ class Cluster:
 
 
 class ClusterSearch:
-    """As `search`, with each worker scoring consecutive chunks of a spectral map.
+    """A `Searcher` of a spectral map, with consecutive chunks on each worker.
 
     Args:
         cluster: its workers hold the chunks; a worker that dies is started again.
         method: of each worker on its part. memory: bytes for the samples of all workers together.
-
-    Shape: queries (Q,K), wanted -> (Q,n) scores and places; see `Wanted`.
 
     Convention: places equal those of a search in this process; scores may differ by the processor's rounding.
 
@@ -146,7 +144,7 @@ class ClusterSearch:
                 self.actors.append(actor.remote(self.parts[-1], starts[first], *how))
 
     @torch.no_grad()
-    def __call__(self, queries: Tensor, wanted: Wanted) -> Best:
+    def __call__(self, queries: Tensor, wanted: list[NmsSpec]) -> TopK:
         """Scores and places that include the wanted candidates."""
         try:
             answers = self.cluster.ray.get(
@@ -165,16 +163,12 @@ class _Searcher:
 
     def __init__(self, part: SpectralMap, first: int, method: Search, memory: int | None) -> None:
         torch.set_num_threads(1)
-        self.part, self.first = part, first
-        self.find = None if method == "scan" else coarse_search(part, memory, method == "exact")
+        self.first = first
+        self.searcher = searcher(part, method, memory)
 
-    def search(self, queries: Any, wanted: Wanted) -> tuple[Any, Any]:
+    def search(self, queries: Any, wanted: list[NmsSpec]) -> tuple[Any, Any]:
         """Scores and places that include the wanted candidates of the part, as arrays."""
-        tensor = torch.from_numpy(queries.copy())
-        if self.find is None:
-            score, place = search(self.part, tensor, num_needed(wanted, self.part.places), scan=True)
-        else:
-            score, place = self.find(tensor, wanted)
+        score, place = self.searcher(torch.from_numpy(queries.copy()), wanted)
         return score.numpy(), torch.where(score.isfinite(), place + self.first, place).numpy()
 
 

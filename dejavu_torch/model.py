@@ -6,7 +6,7 @@ import copy
 import inspect
 import logging
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -30,10 +30,9 @@ from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.maps.weights import BITS, round_weights
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse, resampled, source_of
-from dejavu_torch.recognition.coarse import CoarseSearch, coarse_search
+from dejavu_torch.recognition.coarse import searcher
 from dejavu_torch.recognition.localizer import Localizer, Matching
-from dejavu_torch.recognition.sample_file import check_searches, kept_search
-from dejavu_torch.recognition.search import SCORES_AT_ONCE, Find, Search, check_search
+from dejavu_torch.recognition.search import SCORES_AT_ONCE, Scan, Search, Searcher, check_search
 from dejavu_torch.recognition.select import HIGHEST, PROBABLE, Acceptance, check_candidates
 from dejavu_torch.resize import reduced_size
 from dejavu_torch.text import with_progress
@@ -148,11 +147,8 @@ class DejaVu(nn.Module):
         self.velocity = velocity
         self.map: PlaceMap = self.mapper.empty()
         self.state = model_file.ModelState()
-        self.search: Search = "auto"  # for single queries, see `localize`
-        self.search_memory: int | None = None  # bytes of the samples, see `coarse.plan`
-        self.search_file: Path | str | None = None  # keeps the samples for other processes
-        self.find: Find | None = None  # replaces the search, such as by a cluster
-        self._coarse: tuple[tuple[Any, ...], CoarseSearch | None] = (), None  # a search and its key
+        self.make_searcher: Callable[[PlaceMap], Searcher] = searcher  # of each map, for single queries
+        self.searcher: Searcher | None = None  # of this map; None is made at the first search
 
     def __getattr__(self, name: str) -> Any:
         if name in DESCRIBES:
@@ -324,7 +320,7 @@ class DejaVu(nn.Module):
 
     def replace_map(self, route: PlaceMap) -> DejaVu:
         """Set another map of the same frames, without calibration; returns self in eval mode."""
-        self.map, self.find, self.calibration = route, None, None
+        self.map, self.searcher, self.calibration = route, None, None
         return self.eval()
 
     def calibrate(
@@ -389,15 +385,14 @@ class DejaVu(nn.Module):
             progress: see `learn`.
             sequence: scores consecutive queries together, such as a `SequenceMatcher` or a `PlaceFilter`;
                 None matches each query by itself.
-            search: for single queries: "coarse" scores the places near the best samples of a long spectral
-                map, "exact" also excludes all others by bounds, "scan" scores all places, "auto" is coarse if
-                that is faster. None is `self.search`.
+            search: for single queries: "scan" and "exact" score all places; "auto", "coarse" and None take
+                `self.searcher`, by default one that scores the places near the best samples of a long
+                spectral map, if that is faster.
 
         Shape: -> Match of (Q,) on the CPU.
 
         Raises:
-            InputError: no map, no frames, NaN, or features of another dimension than the map's; a
-                `self.search_file` of another map, or for a search without samples.
+            InputError: no map, no frames, NaN, or features of another dimension than the map's.
         """
         return Match.joined(self.matches(queries, progress, sequence, search))
 
@@ -428,27 +423,18 @@ class DejaVu(nn.Module):
         """A matcher of descriptors, for consecutive batches of queries."""
         require_map(self)
         check_search(matching.search)
-        sequence, coarse = matching.sequence, None
-        if sequence is not None:
-            sequence.check(None, self.map.places)
-        if self.search_file is not None:
-            check_searches(self.search_file, matching, self.find is not None)
-        searches = getattr(sequence, "search_every", 1) > 1 if sequence else matching.on_scores is None
-        if searches and self.find is None and matching.search != "scan":
-            coarse = self._coarse_search(matching.search == "exact")
-        if coarse is None:
-            return Localizer(self.map, matching, self.find)
-        return Localizer(self.map, matching, coarse, coarse.approximate)
+        if matching.sequence is not None:
+            matching.sequence.check(None, self.map.places)
+        single = matching.sequence is None and matching.on_scores is None
+        chosen = self._searcher() if single and matching.search in ("auto", "coarse") else None
+        return Localizer(self.map, matching, chosen)
 
-    def _coarse_search(self, exact: bool) -> CoarseSearch | None:
-        """The coarse search of the present map, made on first use; None if the map has to be scanned."""
-        norms = getattr(self.map, "norms", None)  # identifies the map
-        known, found = self._coarse
-        file, how = self.search_file, (self.search_memory, exact)
-        if not known or known[0] is not norms or known[1:] != (file, *how):
-            found = coarse_search(self.map, *how) if file is None else kept_search(Path(file), self.map, *how)
-            self._coarse = (norms, file, *how), found
-        return found
+    def _searcher(self) -> Searcher:
+        """`searcher`, made anew if the map is another one."""
+        known = self.searcher
+        if known is None or (isinstance(known, Scan) and not known.fits(self.map)):
+            self.searcher = known = self.make_searcher(self.map)
+        return known
 
     def matches(
         self,
@@ -510,10 +496,10 @@ class DejaVu(nn.Module):
         precision lacks this calibration."""
         platt = self.calibration and self.calibration.of(sequence)
         if self.precision is not None and platt is None:
-            only = "calibrated for single queries and for a filter with search_every 1 only"
+            only = "calibrated for single queries and for a filter only"
             seen = f"the precision is {self.precision}, but the map is "
             raise InputError(f"{seen}{only if self.calibration else 'not calibrated'}; expected a threshold")
-        return Matching(sequence, rule=self.acceptance(sequence), platt=platt, search=search or self.search)
+        return Matching(sequence, rule=self.acceptance(sequence), platt=platt, search=search or "auto")
 
     def acceptance(self, sequence: SequenceModel | None = None) -> Acceptance:
         """Which answers are accepted, for single queries or for a sequence (convention 4).
@@ -566,6 +552,7 @@ class DejaVu(nn.Module):
         """Restore the result of `get_extra_state`; InputError if its entries or types differ."""
         values = checked_fields(state, model_file.STATE, "the model's state")
         self.state = model_file.state_from_json(values)
+        self.searcher = None  # of the map before
 
 
 def require_map(model: DejaVu, purpose: str = "") -> None:

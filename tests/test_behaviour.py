@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import pytest
 import torch
@@ -36,20 +35,6 @@ def smooth(places: int, numbers: int = 8) -> Tensor:
 
 def of_features(mapper: SpectralMapper, route: Tensor) -> DejaVu:
     return DejaVu(whitening="none", mapper=mapper).learn(route)
-
-
-def searches(model: DejaVu, queries: Tensor, every: int, monkeypatch: pytest.MonkeyPatch) -> int:
-    """How often a filter asks for the scores of all places."""
-    score: Callable[[Tensor], Tensor] = model.map.scores
-    asked = []
-
-    def counted(rows: Tensor) -> Tensor:
-        asked.append(len(rows))
-        return score(rows)
-
-    monkeypatch.setattr(model.map, "scores", counted)
-    model.localize(queries, sequence=PlaceFilter(search_every=every, sharpness=6.0))
-    return sum(asked)
 
 
 def test_templates_of_a_long_chunk_are_means() -> None:
@@ -113,20 +98,6 @@ def test_of_equal_scores_in_several_chunks_the_lowest_place_wins() -> None:
     assert torch.equal(model.localize(once).index, torch.arange(50))
     candidates = model.candidates(once, 3, apart=3)
     assert torch.equal(candidates.index, torch.arange(50)[:, None] + 50 * torch.arange(3))
-
-
-def test_a_filter_searches_every_nth_query(monkeypatch: pytest.MonkeyPatch) -> None:
-    route = noise(400, 16)
-    model = of_features(SpectralMapper(step=0.2, chunk=20), route)
-    assert searches(model, route[100:113], 4, monkeypatch) == 4  # the queries 0, 4, 8 and 12
-
-
-def test_a_search_that_tells_nothing_is_made_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    route = noise(400, 16)
-    model = of_features(SpectralMapper(step=0.2, chunk=20), route)
-    queries = route[100:108].clone()
-    queries[4] = 0  # scores all places alike
-    assert searches(model, queries, 4, monkeypatch) == 3  # the queries 0, 4 and 5
 
 
 def test_a_filter_counts_neighbours_up_to_within() -> None:

@@ -136,7 +136,7 @@ def test_frames_are_dropped_in_real_time_only(
     assert "8 frames, 0 dropped" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("options", [(), ("--search_every", "5"), ("--sequence", "1")], ids=" ".join)
+@pytest.mark.parametrize("options", [(), ("--sequence", "1")], ids=" ".join)
 def test_the_page_shows_frame_reference_and_answer(
     options: tuple[str, ...],
     folder: Path,

@@ -93,13 +93,12 @@ def test_no_calibration_where_none_is_wanted_or_can_be(
     [
         ("localize m a --out c --sequence 5 --precision .9", ("--sequence 5", "--precision 0.9")),
         ("localize m a --out c --threshold 1 --precision .9", ("--threshold 1", "--precision 0.9")),
-        ("localize m a --out c --search_every 9", ("--search_every 9", "--filter")),
+        ("localize m a --out c --moves [1]", ("--moves [1.0]", "--filter")),
         ("localize m a --out c --speeds [2]", ("--speeds [2.0]", "--sequence")),
         ("compare a b --out c --filter --speeds [2]", ("--speeds [2.0]", "--sequence")),
         ("live m a --speeds [2]", ("--speeds [2.0]", "--sequence")),
         ("localize m a --out c --precision 1", ("precision is 1", "below 1")),
         ("live m a --sequence 5 --filter", ("--sequence 5", "--filter")),
-        ("live m a --filter --search_every 9 --precision .9", ("--search_every 9", "--precision 0.9")),
         ("compare a b --out c --sequence 5 --distractors sim:outdoor", ("--sequence 5", "--distractors")),
     ],
 )

@@ -66,36 +66,7 @@ def test_searches_of_localize(
         found.append(places(out))
     assert found[0] == found[1]
     assert sum(a == b for a, b in zip(found[0], found[2], strict=True)) > 90
-    run("localize", path, SECOND, "--filter", "--out", out)
-    always = places(out)
-    run("localize", path, SECOND, "--filter", "--search_every", "8", "--out", out)
-    assert sum(a == b for a, b in zip(places(out), always, strict=True)) > 90
     assert "scan" in fails(capsys, "localize", path, SECOND, "--search", "ivf", "--out", out)
-    kept = tmp_path / "route.samples"
-    (tmp_path / "link").symlink_to(tmp_path)
-    for new in (kept, tmp_path / "link" / kept.name):  # before it is there
-        assert "is an input" in fails(capsys, "localize", path, SECOND, "--search_file", kept, "--out", new)
-    assert not kept.exists()
-    for _ in range(2):  # written, read
-        run("localize", path, SECOND, "--search_file", kept, "--out", out)
-        assert places(out) == found[2]
-    written = kept.read_bytes()
-    scored = "a filter scores all places of every query; expected a filter with search_every above 1, or "
-    for words, said in (
-        (("--filter",), scored),
-        (("--search", "scan"), "search scan scores all places"),
-        (("--cluster", "auto"), "expected one of them"),
-    ):
-        assert said in fails(capsys, "localize", path, SECOND, "--search_file", kept, *words, "--out", out)
-    assert scored in fails(capsys, "live", path, SECOND, "--search_file", kept)
-    assert "is an input" in fails(capsys, "localize", path, SECOND, "--search_file", kept, "--out", kept)
-    assert "complete file" in fails(capsys, "localize", path, SECOND, "--search_file", path, "--out", out)
-    capsys.readouterr()
-    run("live", path, f"{SECOND}&stop=3", "--sequence", "1", "--search_file", kept)
-    assert [json.loads(line)["place"] for line in capsys.readouterr().out.splitlines()] == [
-        *map(int, found[2][:3])
-    ]
-    assert kept.read_bytes() == written
     for memory, words in (("0", "search_memory 0"), ("1e-4", "expected at least")):
         assert words in fails(capsys, "localize", path, SECOND, "--search_memory", memory, "--out", out)
     run("info", path)

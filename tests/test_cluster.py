@@ -183,7 +183,7 @@ def test_chunks_made_together_before_a_bad_frame_are_kept(cluster: Cluster, tmp_
 
 def found_by(model: DejaVu, queries: Tensor, search: ClusterSearch | None = None) -> list[Tensor]:
     if search is not None:
-        model.find = search
+        model.searcher = search
     match, best = model.localize(queries), model.candidates(queries, 4, apart=3)
     return [match.index, match.score, *best, match.accepted]
 
@@ -225,7 +225,7 @@ def test_probabilities_are_those_of_the_whole_map_whatever_happens_to_a_worker(c
     queries = route()[::5] + 0.4 * torch.randn(PLACES // 5, 8)
     whole = model.localize(queries)
     search = ClusterSearch(cluster, model.map)
-    model.find = search
+    model.searcher = search
     assert whole.probability is not None
     for killed in (False, True):
         found = model.localize(queries)

@@ -29,7 +29,6 @@ from dejavu_torch import (
     SequenceMatcher,
     SpectralMapper,
     SpectrogramAnalysis,
-    TemplateMap,
     TemplateMapper,
     Whitening,
     compare,
@@ -51,7 +50,7 @@ from dejavu_torch.maps.place_map import Mapper
 from dejavu_torch.recognition import coarse
 from dejavu_torch.recognition.select import best_candidates, best_match
 
-SEQUENCES = [PlaceFilter(), PlaceFilter(search_every=5), SequenceMatcher(3), None]
+SEQUENCES = [PlaceFilter(), SequenceMatcher(3), None]
 ELSEWHERE = f"cuda:{torch.cuda.device_count()}"  # the first that is not there
 
 
@@ -236,20 +235,6 @@ def test_a_map_calibrated_on_a_gpu_is_as_sure_as_that_of_the_cpu(device: str, vi
     assert found.filter == pytest.approx(expected.filter, rel=1e-2)
 
 
-def test_two_layers_are_searched_on_a_gpu(device: str) -> None:
-    plan = tuple(FrequencyLayer(Fraction(p), p, 5, 60_000, (j,)) for j, p in enumerate((210, 286)))
-    generator = torch.Generator().manual_seed(0)
-    blocks = [torch.rand(layer.phases, 1, generator=generator) for layer in plan]
-    queries = torch.rand(4, 2, generator=generator).to(device)
-    route = TemplateMap(plan, blocks, 60_000, 2).to(device)
-    found = route.lowest(queries)
-    assert found is not None
-    score, place = found
-    assert place.device.type == device
-    assert torch.equal(score, route.scores(queries).amin(1))
-    assert torch.equal(route.scores(queries).gather(1, place[:, None])[:, 0], score)
-
-
 @pytest.mark.parametrize("kind", models())
 def test_a_gpu_finds_what_the_cpu_finds(kind: str, device: str, frames: Tensor) -> None:
     here = models()[kind].learn(frames)
@@ -312,9 +297,8 @@ def test_a_long_route_is_learned_and_searched_on_a_gpu(device: str, monkeypatch:
     model = DejaVu(mapper=SpectralMapper(8.0, chunk=200)).to(device).learn(wave)
     queries = wave[::50] + 0.01
     expected = model.localize(queries, search="scan")
-    for search in ("coarse", "exact"):
-        assert torch.equal(model.localize(queries, search=search).index, expected.index)
-        assert model._coarse[1] is not None
+    assert torch.equal(model.localize(queries).index, expected.index)
+    assert isinstance(model.searcher, coarse.CoarseSearch)
 
 
 def test_even_steps_are_learned_on_a_gpu(device: str) -> None:

@@ -23,7 +23,7 @@ ARROWS = {
     "features": "text types memory resize",
     "periods": "text types memory",
     "maps": "lazy types text memory data periods",
-    "recognition": "text types memory data maps",
+    "recognition": "text types memory maps",
     "motion": "text types memory data",
     "learning": "types memory data features maps recognition motion",
     "model_file": "text version types memory data features periods maps recognition motion learning",

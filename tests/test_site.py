@@ -84,7 +84,7 @@ def test_every_command_has_its_help(site: Path) -> None:
         assert f"usage dejavu {name} " in text
     for name in BENCHES:
         assert f"usage python m benchmarks {name} " in text
-    for option in ("search_every", "mapper route_bytes_per_place", "model rate", "codebooks"):
+    for option in ("search_memory", "mapper route_bytes_per_place", "model rate", "codebooks"):
         assert option in text
 
 

@@ -174,8 +174,8 @@ def run_localize(
     top: int | None = None,
     pairs: Path | None = None,
     corners: list[list[float]] | None = None,
-    sequences: options.Searches,
-    searching: options.KeptSearching,
+    sequences: options.Sequences,
+    searching: options.Searching,
     cluster: str | None = None,
     loading: options.Loading,
 ) -> None:
@@ -196,7 +196,7 @@ def run_localize(
     device_of(loading.device)
     for written in filter(None, (out, pairs)):
         check_output_file(written)
-        check_not_read(written, map, source, searching.search_file)
+        check_not_read(written, map, source)
     if pairs is not None and pairs.resolve() == out.resolve():
         raise InputError(f"--pairs {pairs} is --out as well; expected another name")
     matcher = sequences.matcher(SUPPRESSION, acceptance.threshold)
@@ -204,8 +204,7 @@ def run_localize(
     if cluster is not None:
         _check_cluster(cluster, loading.device)
         length = sequences.sequence != 1 and sequences.sequence
-        others = {"filter": sequences.filter, "sequence": length, "search_file": searching.search_file}
-        options.refuse_with(f"--cluster {cluster}", **others)
+        options.refuse_with(f"--cluster {cluster}", filter=sequences.filter, sequence=length)
     model = loading.model(map)
     searching.of(model)
     if corners is not None:
@@ -237,7 +236,7 @@ def run_localize(
             from dejavu_torch.cluster import Cluster, ClusterSearch
 
             workers = stack.enter_context(Cluster(cluster))
-            model.find = ClusterSearch(workers, model.map, model.search, model.search_memory)
+            model.searcher = ClusterSearch(workers, model.map, searching.search, searching.bytes)
         total, accepted = _write_matches(out, counted(), query, model, top, pairs)
     if not model.map.summary().covered:
         print("the map has no layers, so no place can be reported")
@@ -264,8 +263,8 @@ def run_live(
     map: Path,
     source: str,
     *,
-    sequences: options.LiveSearches,
-    searching: options.KeptSearching,
+    sequences: options.LiveSequences,
+    searching: options.Searching,
     acceptance: options.Acceptance,
     page: int | None = None,
     reference: str | None = None,

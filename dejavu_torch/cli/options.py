@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,6 +19,7 @@ from dejavu_torch.features.views import Views
 from dejavu_torch.model import DejaVu, check_precision
 from dejavu_torch.model_file import NO_MAP, recipe_of
 from dejavu_torch.motion.resampling import source_of
+from dejavu_torch.recognition.coarse import searcher
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.search import Search, check_search
 from dejavu_torch.recognition.sequence import SequenceMatcher
@@ -51,8 +53,7 @@ class Sequences:
         Args:
             within, threshold: of the filter; None keeps the filter's own threshold.
         """
-        settings = {"moves": self.moves, "search_every": getattr(self, "search_every", None)}
-        given: dict[str, Any] = {name: value for name, value in settings.items() if value is not None}
+        given: dict[str, Any] = {} if self.moves is None else {"moves": self.moves}
         if self.speeds is not None and self.sequence == 1:
             expected = "expected --sequence T with them, in place of a filter"
             raise InputError(f"--speeds {self.speeds} without --sequence; {expected}")
@@ -61,26 +62,14 @@ class Sequences:
             chosen = PlaceFilter(within=within, **given)
             chosen.threshold = chosen.threshold if threshold is None else threshold
             return chosen
-        for name, value in given.items():
-            raise InputError(f"--{name} {value} without --filter; expected both")
+        if self.moves is not None:
+            raise InputError(f"--moves {self.moves} without --filter; expected both")
         matcher = SequenceMatcher(self.sequence, (1.0,) if self.speeds is None else self.speeds)
         return None if self.sequence == 1 else matcher
 
 
 @dataclass
-class Searches(Sequences):
-    """Also how often the filter searches all places.
-
-    Args:
-        search_every: let the filter search all places only at every n-th query, and in between score those
-            near the last place; 1 if not given
-    """
-
-    search_every: int | None = None
-
-
-@dataclass
-class LiveSearches(Searches):
+class LiveSequences(Sequences):
     """The filter unless a sequence is given.
 
     Args:
@@ -99,35 +88,25 @@ class Searching:
     """How places are searched for single queries.
 
     Args:
-        search: coarse scores only the places near the best samples of a long spectral map, exact also all
-            that may be better, scan all; auto is the faster of coarse and scan
+        search: coarse scores only the places near the best samples of a long spectral map, exact and scan
+            all; auto is the faster of coarse and scan
         search_memory: MB for these samples; if not given 100, or 100 bytes per place above 10^6 places
     """
 
     search: Search = "auto"
     search_memory: float | None = None
 
+    @property
+    def bytes(self) -> int | None:
+        """Of the samples."""
+        return None if self.search_memory is None else int(1e6 * self.search_memory)
+
     def of(self, model: DejaVu) -> None:
         """Set how a model searches."""
-        memory = self.search_memory
-        if memory is not None and not memory > 0:
-            raise InputError(f"--search_memory {memory:g}; expected a number above 0, in MB")
+        if self.search_memory is not None and not self.search_memory > 0:
+            raise InputError(f"--search_memory {self.search_memory:g}; expected a number above 0, in MB")
         check_search(self.search)
-        model.search, model.search_memory = self.search, None if memory is None else int(1e6 * memory)
-        model.search_file = getattr(self, "search_file", None)
-
-
-@dataclass
-class KeptSearching(Searching):
-    """Also a file that keeps the samples for the next command.
-
-    Args:
-        search_file: file for the samples of a coarse or exact search: written if it does not exist, else
-            read. It is refused for another map, --search or --search_memory. A filter uses it only with
-            --search_every above 1
-    """
-
-    search_file: Path | None = None
+        model.make_searcher = partial(searcher, method=self.search, memory=self.bytes)
 
 
 @dataclass
@@ -183,16 +162,11 @@ class Acceptance:
         if self.threshold is not None:
             refuse_with(f"--threshold {self.threshold:g}", precision=self.precision)
         check_precision(self.precision)
-        if isinstance(sequence, PlaceFilter):
-            without = f"--search_every {sequence.search_every}" if sequence.search_every > 1 else ""
-        else:
-            without = f"--sequence {sequence.length}" if isinstance(sequence, SequenceMatcher) else ""
         for name, value in (("--precision", self.precision), ("--distractors", distractors)):
-            if without and value:
-                why = (
-                    "only single queries, and a filter that searches all places each time, have probabilities"
-                )
-                raise InputError(f"{without} and {name} {value}: {why}; expected one of the two options")
+            if value and isinstance(sequence, SequenceMatcher):
+                seen = f"--sequence {sequence.length} and {name} {value}"
+                why = "only single queries and a filter have probabilities"
+                raise InputError(f"{seen}: {why}; expected one of the two options")
 
     def of(self, model: DejaVu) -> None:
         """Set what a model accepts, if one of the two is given."""

@@ -88,19 +88,14 @@ class PlaceMap(nn.Module, ABC):
         if queries.ndim != 2 or queries.shape[1] != self.dimension:
             raise InputError(f"the queries are {tuple(queries.shape)}; the map expects (Q, {self.dimension})")
 
-    def score_blocks(self, queries: Tensor, start: int = 0, stop: int | None = None) -> ScoreBlocks:
-        """The columns [start, stop) of `scores`, block by block."""
-        yield start, self.scores(queries)[:, start:stop]
+    def score_blocks(self, queries: Tensor) -> ScoreBlocks:
+        """The columns of `scores`, block by block."""
+        yield 0, self.scores(queries)
 
     @property
     def block_places(self) -> int:
         """About how many numbers the largest block of `score_blocks` needs per query."""
         return self.places
-
-    def lowest(self, queries: Tensor) -> tuple[Tensor, Tensor] | None:
-        """The lowest score of each query and its first place, (Q,) each, -1 if none is finite; without
-        gradient. None if this is not faster than all scores."""
-        return None
 
     @property
     def table(self) -> FrameTable:

@@ -254,7 +254,8 @@ class SpectralMap(PlaceMap):
         r = names.index(name)
         start, frame = (sum(one[i] for one in self.routes[:r]) for i in (1, 2))  # type: ignore[misc]
         _, places, frames = self.routes[r]
-        made = self.between(*self._span(start, start + places))
+        starts = [first for first, _ in self.chunks]
+        made = self.between(bisect.bisect_left(starts, start), bisect.bisect_left(starts, start + places))
         made.routes = ()
         made.positions = self.positions[frame : frame + frames]
         made.count_visits(self.visit_counts[start : start + places])
@@ -350,34 +351,27 @@ class SpectralMap(PlaceMap):
         lines[..., 0] += means * (math.sqrt(length) * factor[0])
         return from_slots(lines, length, self.transform).flatten(1)
 
-    def _runs(self, first: int, last: int, rows: int) -> Iterator[range]:
+    def _runs(self, rows: int) -> Iterator[range]:
         """Consecutive chunks of equal length, with at most `BLOCK` numbers in this many rows."""
-        while first < last:
+        first = 0
+        while first < len(self.chunks):
             start, stop = self.chunks[first]
-            most = min(last, first + max(1, BLOCK // (rows * (stop - start))))
+            most = min(len(self.chunks), first + max(1, BLOCK // (rows * (stop - start))))
             end = first + 1
             while end < most and self.chunks[end][1] - self.chunks[end][0] == stop - start:
                 end += 1
             yield range(first, end)
             first = end
 
-    def _span(self, start: int, stop: int) -> tuple[int, int]:
-        """The chunks [first, last) that contain the places [start, stop)."""
-        if (start, stop) == (0, self.places):  # torch.compile does not support bisect
-            return 0, len(self.chunks)
-        first = bisect.bisect_right(self.chunks, start, key=lambda chunk: chunk[1])
-        return first, bisect.bisect_left(self.chunks, stop, key=lambda chunk: chunk[0])
-
     def scores(self, queries: Tensor) -> Tensor:
         return torch.cat([scores for _, scores in self.score_blocks(queries)], 1)
 
-    def score_blocks(self, queries: Tensor, start: int = 0, stop: int | None = None) -> ScoreBlocks:
+    def score_blocks(self, queries: Tensor) -> ScoreBlocks:
         """See `PlaceMap`: blocks of consecutive chunks that fit into the processor's cache."""
-        stop = self.places if stop is None else stop
         self.check_queries(queries)
         queries = queries.to(torch.promote_types(queries.dtype, torch.float32))
         if not queries.shape[0]:  # of which MKL has no transform
-            yield start, queries.new_zeros(0, stop - start)
+            yield 0, queries.new_zeros(0, self.places)
             return
         length: Tensor = torch.linalg.vector_norm(queries, dim=1, keepdim=True)
         if self.metric == "cosine":
@@ -385,17 +379,16 @@ class SpectralMap(PlaceMap):
         rows = self.dimension
         if not torch.compiler.is_compiling():  # a compiled program has the same blocks for any Q
             rows = max(1, queries.shape[0] + len(self.level) // max(1, self.places))
-        for run in self._runs(*self._span(start, stop), rows):
-            begin, end = self.chunks[run.start][0], self.chunks[run.stop - 1][1]
+        for run in self._runs(rows):
+            start, stop = self.chunks[run.start][0], self.chunks[run.stop - 1][1]
             products = self.products(queries, run)
             if self.metric == "cosine":
-                inverse = self.inverse_norms(begin, end).to(queries)
+                inverse = self.inverse_norms(start, stop).to(queries)
                 scores = torch.addcmul(queries.new_ones(()), products, inverse, value=-1)
             else:
-                square = self.norms[begin:end].to(queries).square()
+                square = self.norms[start:stop].to(queries).square()
                 scores = (square - 2 * products + length.square()).clamp(min=0)
-            low, high = max(start, begin), min(stop, end)
-            yield low, scores[:, low - begin : high - begin]
+            yield start, scores
 
     @property
     def block_places(self) -> int:

@@ -15,8 +15,7 @@ from torch import Tensor, nn
 
 from dejavu_torch.maps.distance import Metric, phase_distances
 from dejavu_torch.maps.file import checked
-from dejavu_torch.maps.layer_search import lowest
-from dejavu_torch.maps.place_map import Mapper, PlaceMap, ScoreBlocks, require
+from dejavu_torch.maps.place_map import Mapper, PlaceMap, require
 from dejavu_torch.maps.summary import ChunkSummary, MapSummary
 from dejavu_torch.maps.templates import PhaseTemplates, check_plan
 from dejavu_torch.periods.finder import PeriodFinder
@@ -26,8 +25,6 @@ from dejavu_torch.types import FrequencyLayer, InputError, Plan
 
 Reduction = Literal["mean", "sum"]
 MAX_PLACES = 2**26  # in all layers, since a file of a few bytes can claim any number
-PHASE_COST = 8  # time per phase to search two layers, in units of the time to score a place
-SEARCH_COST = 2**15  # time of any search, in the same unit
 
 
 def segments(plan: Plan, places: int) -> Iterator[tuple[int, int, tuple[int, ...]]]:
@@ -214,57 +211,31 @@ class TemplateMap(PlaceMap):
             return 1.0
         return sum(weight_per_feature(self.metric, len(self.plan[j].features)) for j in layers)
 
-    def combine(self, distances: Sequence[Tensor], start: int = 0, stop: int | None = None) -> Tensor:
-        """S of the places [start, stop) (eq. 4), +inf if uncovered: L tensors (Q,P) -> (Q,stop - start)."""
-        stop = self.places if stop is None else stop
+    def combine(self, distances: Sequence[Tensor]) -> Tensor:
+        """S of all places (eq. 4), +inf if uncovered: L tensors (Q,P) -> (Q,N)."""
         laps, parts = self.lap_phases.split(self.laps), []
-        for begin, end, layers in self.segments:
-            first, count = max(start, begin), min(stop, end) - max(start, begin)
-            if count > 0 and layers:
-                rows = [_at_places(distances[j], laps[j], first - self.plan[j].start, count) for j in layers]
+        for start, stop, layers in self.segments:
+            if layers:
+                count, plan = stop - start, self.plan
+                rows = [_at_places(distances[j], laps[j], start - plan[j].start, count) for j in layers]
                 parts.append(reduce(torch.add, rows) / self.divisor(layers))
-            elif count > 0:
-                parts.append(torch.full_like(distances[0][:, :1], math.inf).expand(-1, count))
+            else:
+                parts.append(torch.full_like(distances[0][:, :1], math.inf).expand(-1, stop - start))
         return torch.cat(parts, 1) if parts else distances[0][:, :0]
 
     def scores(self, queries: Tensor) -> Tensor:
         """S(i) of all places (eq. 3, eq. 4): (Q,D) -> (Q,N)."""
-        scores = self._sums(queries, 0, self.places)
-        return scores if self.temperature is None else log_posterior(scores, self.temperature)
-
-    def score_blocks(self, queries: Tensor, start: int = 0, stop: int | None = None) -> ScoreBlocks:
-        """See `PlaceMap`: one block, from the layers that cover these places."""
-        if self.temperature is not None:  # the softmax needs all places
-            yield start, self.scores(queries)[:, start:stop]
+        distances = self.distances(queries)
+        if distances:
+            scores = self.combine(distances)
         else:
-            yield start, self._sums(queries, start, self.places if stop is None else stop)
-
-    def _sums(self, queries: Tensor, start: int, stop: int) -> Tensor:
-        members = [j for j, layer in enumerate(self.plan) if layer.start < stop and layer.stop > start]
-        found = dict(zip(members, self.distances(queries, members), strict=True))
-        if not found:
             dtype = torch.promote_types(queries.dtype, torch.float32)
-            return queries.new_full((queries.shape[0], stop - start), math.inf, dtype=dtype)
-        distances = [found.get(j, found[members[0]]) for j in range(len(self.plan))]  # others are not read
-        return self.combine(distances, start, stop)
+            scores = queries.new_full((len(queries), self.places), math.inf, dtype=dtype)
+        return scores if self.temperature is None else log_posterior(scores, self.temperature)
 
     @property
     def block_places(self) -> int:
         return self.places * max([1, *(len(layers) for _, _, layers in self.segments)])
-
-    @torch.no_grad()
-    def lowest(self, queries: Tensor) -> tuple[Tensor, Tensor] | None:
-        """See `PlaceMap`: for two layers that cover the same places, if there are many."""
-        chunks = {(layer.start, layer.stop) for layer in self.plan}
-        if self.temperature is not None or len(self.plan) != 2 or len(chunks) != 1:
-            return None
-        ((start, stop),) = chunks
-        if SEARCH_COST + PHASE_COST * sum(layer.period.numerator for layer in self.plan) >= stop - start:
-            return None
-        pairs = zip(self.distances(queries), self.lap_phases.split(self.laps), strict=True)
-        one, other = (distances.index_select(1, lap) for distances, lap in pairs)
-        score, place = lowest(one, other, stop - start, self.divisor([0, 1]))
-        return score, torch.where(score.isfinite(), start + place, -1)
 
     def trainable(self, templates: bool = True, weights: bool = False, start: Tensor | None = None) -> None:
         """Turn the templates, the weights, or both, into parameters, until `freeze`; `start`: (D,) initial

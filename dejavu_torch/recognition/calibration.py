@@ -42,13 +42,13 @@ class Calibration(NamedTuple):
     """The Platt scaling of each way of matching that is calibrated."""
 
     single: Platt | None = None  # single queries
-    filter: Platt | None = None  # a `PlaceFilter` with search_every = 1
+    filter: Platt | None = None  # a `PlaceFilter`
 
     def of(self, sequence: SequenceModel | None) -> Platt | None:
         """The scaling for a way of matching; None if that is not calibrated."""
         if sequence is None:
             return self.single
-        return self.filter if isinstance(sequence, PlaceFilter) and sequence.search_every == 1 else None
+        return self.filter if isinstance(sequence, PlaceFilter) else None
 
 
 def fit(confidence: Tensor, right: Tensor, weight: Tensor | None = None) -> Platt:

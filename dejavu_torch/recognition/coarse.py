@@ -7,9 +7,8 @@ Only places near the best of these samples are scored.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from functools import cache
-from types import MappingProxyType
 from typing import NamedTuple
 
 import torch
@@ -19,7 +18,7 @@ from torch import Tensor
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.spectrum import half_cycles
-from dejavu_torch.recognition.search import Best, Wanted, empty_topk, num_needed, search
+from dejavu_torch.recognition.search import NmsSpec, Scan, Search, TopK, check_search, empty_topk
 from dejavu_torch.recognition.select import best_candidates
 from dejavu_torch.types import InputError
 
@@ -37,7 +36,6 @@ MIN_COSINE = 0.02  # a query whose best cosine is lower is scanned: places of no
 QUERIES_AT_ONCE = 16  # whose fine samples are compared at a time, in the cache
 BLOCK, PRODUCTS = 8192, 2**20  # samples, and products with them, at a time: these stay in the cache
 CLIP = 6  # standard deviations at which a component of a unit vector is clipped in 8 bits
-ROUNDING = 1e-5  # error of products of unit vectors in float32
 MEASURED_CHUNKS = 16  # evenly along the map, for the energy of the lines
 
 
@@ -57,14 +55,13 @@ class Plan(NamedTuple):
         )
 
 
-def plan(route: PlaceMap, limit: int | None = None, exact: bool = False) -> Plan | None:
+def plan(route: PlaceMap, limit: int | None = None) -> Plan | None:
     """The widest spacings at which samples hold enough energy. None if the map has to be scanned: another
     kind or metric, few places, a single chunk, or mainly high frequencies.
 
     Args:
         limit: bytes; None is 100 MB, or 100 bytes per place if that is more. Samples that exceed it get wider
             spacings, and more of them are refined.
-        exact: a sample of every place, whatever the limit.
 
     Raises:
         InputError: the limit is below the samples of a single chunk.
@@ -82,8 +79,6 @@ def plan(route: PlaceMap, limit: int | None = None, exact: bool = False) -> Plan
     minimum = size(longest, SPACINGS[0], SPACINGS[1])
     if limit < minimum:
         raise InputError(f"search_memory is {limit} bytes; expected at least {minimum}, for a chunk")
-    if exact:
-        return Plan(1, 1, 1, 1.0, size(route.places, 1))
     held = energy_held(route)
     widest_coarse = next((d for d in SPACINGS if held[d] >= COARSE), 0)
     widest_fine = next((d for d in SPACINGS if held[d] >= FINE), 2)
@@ -110,39 +105,40 @@ def energy_held(route: SpectralMap) -> dict[int, float]:
     return {d: energy / whole for d, energy in held.items()}
 
 
-def coarse_search(route: PlaceMap, limit: int | None = None, exact: bool = False) -> CoarseSearch | None:
-    """The coarse search of a map; None if it has to be scanned, see `plan`."""
-    chosen = plan(route, limit, exact)
-    return CoarseSearch(route, chosen) if isinstance(route, SpectralMap) and chosen is not None else None
+def searcher(route: PlaceMap, method: Search = "auto", memory: int | None = None) -> Scan:
+    """The searcher of a map.
+
+    Args:
+        method: "auto" and "coarse" are a `CoarseSearch` if `plan` has one; "exact" and "scan" a `Scan`.
+        memory: bytes of the samples, see `plan`.
+    """
+    check_search(method)
+    chosen = plan(route, memory) if method in ("auto", "coarse") else None
+    return CoarseSearch(route, chosen) if isinstance(route, SpectralMap) and chosen else Scan(route)
 
 
 class Samples:
     """Low-passed descriptors of a map, about every `spacing` places, padded to whole groups in each chunk and
     to whole blocks of groups in the map.
 
-    Args:
-        rows: as computed before; None computes them.
-
     Attributes:
         rows: (S,K) int8, unit vectors on one scale. norm: (S,) of the rows. place: (S,) nearest to each, in
             order.
     """
 
-    def __init__(self, route: SpectralMap, spacing: int, rows: Tensor | None = None) -> None:
+    def __init__(self, route: SpectralMap, spacing: int) -> None:
         places = []
         for chunk, (start, stop) in enumerate(route.chunks):
             at = route.sampled(chunk, -(-(stop - start) // spacing))
             places.append(F.pad(at, (0, -len(at) % GROUP), value=stop - start - 1) + start)
         place = torch.cat(places)
         self.place = F.pad(place, (0, -len(place) % (GROUP * GROUPS_PER_BLOCK)), value=route.places - 1)
-        shape = len(self.place), route.dimension
-        if rows is None:  # padding is 0, which is never the best
-            rows, first = self.place.new_zeros(shape, dtype=torch.int8), 0
-            for chunk, (start, stop) in enumerate(route.chunks):
-                row = route.samples(chunk, -(-(stop - start) // spacing))
-                rows[first : first + len(row)] = to_int8(F.normalize(row))
-                first += len(places[chunk])
-        self.rows = checked(rows, shape, torch.int8).to(self.place.device)
+        # padding is 0, which is never the best
+        self.rows, first = self.place.new_zeros(len(self.place), route.dimension, dtype=torch.int8), 0
+        for chunk, (start, stop) in enumerate(route.chunks):
+            row = route.samples(chunk, -(-(stop - start) // spacing))
+            self.rows[first : first + len(row)] = to_int8(F.normalize(row))
+            first += len(places[chunk])
         norms = [torch.linalg.vector_norm(block.float(), dim=1) for block in self.rows.split(BLOCK)]
         self.norm = torch.cat(norms).clamp(min=1)
 
@@ -166,85 +162,47 @@ class Samples:
         return best
 
 
-class CoarseSearch:
+class CoarseSearch(Scan):
     """Finds the best places of queries: coarse samples choose regions, fine samples choose windows in them,
     and the places of these windows are scored.
 
-    If every place has a fine sample, the result is exact: bounds exclude all places that cannot be as good as
-    the best of the windows.
-
     Args:
-        chosen: see `plan`. kept: `tensors` of a search with the same map and plan; computed if empty.
+        chosen: see `plan`.
 
-    Shape: queries (Q,K), wanted -> scores and places (Q,M), by place, +inf for none. They include the wanted
-        candidates, see `Wanted`.
+    Shape: queries (Q,K), wanted -> scores and places (Q,M), by place, +inf for none.
 
     Convention: scores are those of a scan. A query of norm 0, or one that is similar to no place, is scanned.
-
-    Raises:
-        InputError: the kept tensors have other shapes or types.
     """
 
-    def __init__(
-        self, route: SpectralMap, chosen: Plan, kept: Mapping[str, Tensor] = MappingProxyType({})
-    ) -> None:
-        self.route, self.plan, self.exact = route, chosen, chosen.fine == 1
-        self.starts = torch.tensor([start for start, _ in route.chunks], device=route.norms.device)
-        self.fine = Samples(route, chosen.fine, kept.get("fine"))
-        self.coarse = self.fine if self.exact else Samples(route, chosen.coarse, kept.get("coarse"))
-        self.middle = torch.searchsorted(self.fine.place, self.coarse.place, out_int32=True)
-        self.bounds = None
-        if self.exact:
-            bounds, shape = kept.get("bounds"), (len(self.fine.norm) // GROUP, 3)
-            bounds = checked(self._bounds() if bounds is None else bounds, shape, torch.float32)
-            self.bounds = bounds.to(self.starts.device)
+    route: SpectralMap
 
-    @property
-    def tensors(self) -> dict[str, Tensor]:
-        """What is slow to compute: the rows of samples, and the bounds of an exact search."""
-        coarse = {"coarse": self.coarse.rows} if self.bounds is None else {"bounds": self.bounds}
-        return {"fine": self.fine.rows, **coarse}
+    def __init__(self, route: SpectralMap, chosen: Plan) -> None:
+        super().__init__(route)
+        self.plan = chosen
+        self.starts = torch.tensor([start for start, _ in route.chunks], device=route.norms.device)
+        self.fine, self.coarse = Samples(route, chosen.fine), Samples(route, chosen.coarse)
+        self.middle = torch.searchsorted(self.fine.place, self.coarse.place, out_int32=True)
 
     @torch.no_grad()
-    def __call__(self, queries: Tensor, wanted: Wanted) -> Best:
+    def __call__(self, queries: Tensor, wanted: list[NmsSpec]) -> TopK:
         if not len(queries):
             return empty_topk(queries, max(k for k, _ in wanted))
         units = F.normalize(queries.to(torch.promote_types(queries.dtype, torch.float32))).float()
-        best = self.coarse.best_of_groups(to_int8(units))
-        place = self._windows(units, best, wanted)
-        found = self._scores(units, place), place
-        worst = self._worst(found, wanted)
-        if self.exact:
-            found = self._below(units, best, worst.masked_fill(worst.isinf(), -1))  # +inf is scanned below
-            worst = self._worst(found, wanted)
-        rest = (worst.isinf() | ~(found[0].amin(1) <= 1 - MIN_COSINE)).nonzero()[:, 0]
+        place = self._windows(units, self.coarse.best_of_groups(to_int8(units)), wanted)
+        score = self._scores(units, place)
+        far = self._incomplete(score, place, wanted) | ~(score.amin(1) <= 1 - MIN_COSINE)
+        rest = far.nonzero()[:, 0]
         if len(rest):
-            scanned = search(self.route, queries[rest], num_needed(wanted, self.route.places))
-            place, order = scanned[1].sort(1)
-            more = max(0, place.shape[1] - found[0].shape[1])
-            found = F.pad(found[0], (0, more), value=math.inf), F.pad(found[1], (0, more))
-            found[0][rest] = math.inf
-            found[0][rest, : place.shape[1]] = scanned[0].gather(1, order)
-            found[1][rest, : place.shape[1]] = place
-        return found
+            scanned = super().__call__(queries[rest], wanted)
+            at, order = scanned[1].sort(1)
+            more = max(0, at.shape[1] - score.shape[1])
+            score, place = F.pad(score, (0, more), value=math.inf), F.pad(place, (0, more))
+            score[rest] = math.inf
+            score[rest, : at.shape[1]] = scanned[0].gather(1, order)
+            place[rest, : at.shape[1]] = at
+        return score, place
 
-    @torch.no_grad()
-    def approximate(self, queries: Tensor) -> Tensor:
-        """Scores of all places, (Q,K) -> (Q,N): exact around the best places, elsewhere those of the nearest
-        fine samples."""
-        units = F.normalize(queries.float())
-        small = to_int8(units)
-        size = torch.linalg.vector_norm(small.float(), dim=1).clamp(min=1)
-        cosines = torch.cat([*self.fine.products(small)]) / size / self.fine.norm[:, None]
-        nearest = torch.cat([self._nearest(chunk) for chunk in range(len(self.starts))])
-        scores: Tensor = (1 - cosines)[nearest].T.contiguous()
-        place = self._windows(units, self.coarse.best_of_groups(small), [(1, 0)])
-        own = self._scores(units, place)
-        query, column = own.isfinite().nonzero().T
-        scores[query, place[query, column]] = own[query, column]
-        return scores
-
-    def _windows(self, units: Tensor, best: Tensor, wanted: Wanted) -> Tensor:
+    def _windows(self, units: Tensor, best: Tensor, wanted: list[NmsSpec]) -> Tensor:
         """Places near the best fine samples of each query, (Q,M), by place; -1 for none. A window is wide
         enough for all candidates on one peak."""
         plan, places = self.plan, self.route.places
@@ -284,73 +242,12 @@ class CoarseSearch:
         inverse = torch.where(norms > 0, 1 / norms, 0).masked_fill(place < 0, 1)
         return torch.addcmul(products.new_ones(()), products, inverse, value=-1)
 
-    def _worst(self, found: Best, wanted: Wanted) -> Tensor:
-        """The highest score of the wanted candidates, (Q,); +inf if not all were found."""
-        score, place = found
+    def _incomplete(self, score: Tensor, place: Tensor, wanted: list[NmsSpec]) -> Tensor:
+        """Which queries lack some of the wanted candidates, (Q,)."""
         if score.shape[1] < max(k for k, _ in wanted):
-            return score.new_full((len(score),), math.inf)
-        worst = [best_candidates(score, *one, place).score[:, -1] for one in wanted]
-        return torch.stack(worst).amax(0)
-
-    def _below(self, units: Tensor, best: Tensor, score: Tensor) -> Best:
-        """The places of each query with at most this score (Q,), up to rounding.
-
-        For unit vectors q, s and x, angle(q, x) >= angle(q, s) - angle(s, x). Here s are the fine samples of
-        a group, and x the places near them.
-        """
-        assert self.bounds is not None
-        small = to_int8(units).float()
-        size = torch.linalg.vector_norm(small, dim=1)
-        reach = angle(1 - score) + angle((units * small).sum(1) / size.clamp(min=1))
-        reach = reach.clamp(max=math.pi / 2)
-        turned = GROUP * size * torch.stack([reach.cos(), -reach.sin(), -torch.ones_like(reach)])
-        parts = []
-        for start in range(0, len(best), BLOCK // GROUP):  # a block stays in the cache
-            block = slice(start, start + BLOCK // GROUP)
-            # the cosine of a sum of two angles; one below 0 excludes nothing
-            minimum = F.threshold(self.bounds[block] @ turned, 0, -math.inf)
-            pairs = (best[block] >= minimum).nonzero()
-            parts.append(pairs + pairs.new_tensor([start, 0]))
-        group, query = torch.cat(parts).T.contiguous()
-        chunk = torch.bucketize(self.fine.place[group * GROUP], self.starts, right=True) - 1
-        found = [(query[:0], query[:0], score[:0])]
-        for g in chunk.unique().tolist():
-            own = query[chunk == g].unique()
-            for first, scores in self.route.score_blocks(units[own], *self.route.chunks[g]):
-                row, at = (scores <= score[own, None] + ROUNDING).nonzero().T
-                found.append((own[row], at + first, scores[row, at]))
-        query, place, score = (torch.cat(column) for column in zip(*found, strict=True))
-        query, order = query.sort(stable=True)  # keeps the order of places
-        counts = torch.bincount(query, minlength=len(units))
-        column = torch.arange(len(query), device=query.device) - (counts.cumsum(0) - counts)[query]
-        table = score.new_full((len(units), max(1, int(counts.max()))), math.inf)
-        places = torch.full_like(table, -1, dtype=torch.int64)
-        table[query, column], places[query, column] = score[order], place[order]
-        return table, places
-
-    def _bounds(self) -> Tensor:
-        """For each group of fine samples, its smallest norm times (cos a, sin a, `ROUNDING`), where a is the
-        largest angle between a sample and a place near it: (S / GROUP, 3)."""
-        lowest = self.fine.norm.new_ones(len(self.fine.norm) // GROUP)
-        for chunk, (start, stop) in enumerate(self.route.chunks):
-            nearest, units = self._nearest(chunk), F.normalize(self.route.decode(chunk))
-            cosine = (self.fine.rows[nearest] * units).sum(1) / self.fine.norm[nearest]
-            cosine = cosine.where(self.route.norms[start:stop] > 0, 1)  # these score 1
-            lowest.scatter_reduce_(0, nearest // GROUP, cosine, "amin")
-        lowest -= ROUNDING
-        lowest = lowest.where(lowest > 0, -1)  # angles of 90 degrees and more exclude nothing
-        sine, norm = (1 - lowest.square()).sqrt(), self.fine.norm.view(-1, GROUP).amin(1)
-        bounds: Tensor = norm[:, None] * torch.stack([lowest, sine, torch.full_like(lowest, ROUNDING)], 1)
-        return bounds
-
-    def _nearest(self, chunk: int) -> Tensor:
-        """The nearest fine sample of each place of a chunk, (W,)."""
-        start, stop = self.route.chunks[chunk]
-        at = torch.arange(start, stop, device=self.starts.device)
-        first, last = torch.searchsorted(self.fine.place, torch.stack([at[0], at[-1] + 1])).tolist()
-        place = self.fine.place[first:last]
-        nearest: Tensor = first + torch.bucketize(at, (place[1:] + place[:-1]) / 2)
-        return nearest
+            return score.new_ones(len(score), dtype=torch.bool)
+        last = [best_candidates(score, *one, place).score[:, -1] for one in wanted]
+        return torch.stack(last).isinf().any(0)
 
 
 def topk_groups(best: Tensor, count: int) -> tuple[Tensor, Tensor]:
@@ -370,19 +267,7 @@ def to_int8(units: Tensor) -> Tensor:
     return rounded.to(torch.int8)
 
 
-def checked(kept: Tensor, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-    """The tensor itself; InputError if its shape or type differs."""
-    if kept.shape != shape or kept.dtype != dtype:
-        raise InputError(f"samples are {tuple(kept.shape)} {kept.dtype}; expected {shape} {dtype}")
-    return kept
-
-
 @cache
 def has_int8_products() -> bool:
     """Whether torch multiplies 8-bit integers fast on this CPU."""
     return torch.backends.mkldnn.is_available() and torch.cpu._is_vnni_supported()
-
-
-def angle(cosine: Tensor) -> Tensor:
-    """The largest angle whose cosine rounds to this."""
-    return (cosine - ROUNDING).clamp(-1, 1).acos()

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.memory import is_plain, without_autocast
 from dejavu_torch.recognition.sequence import each
 from dejavu_torch.types import InputError, SequenceModel
 
 MIN_PROBABILITY = 1e-30  # a probability of 0, with a finite gradient
-LOCAL_MASS = 0.99  # minimum probability of a range of places that is scored alone
-LOCAL_EDGE = 1e-4  # places with less probability are cut off the ends of that range
 
 
 class Moments(NamedTuple):
@@ -55,9 +52,6 @@ class PlaceFilter(SequenceModel):
         within: places; the score of a place includes its neighbours up to this distance, with weights that
             decrease with it.
         threshold: accept a match if its score is below; None leaves it to `DejaVu.acceptance`.
-        search_every: queries from one search of all places to the next. Between them, only a range of places
-            with nearly all of the probability is scored, if there is one. Probabilities then differ by up to
-            about 0.02, and a jump is noticed at the next search.
 
     Shape: scores (..., Q, N), the posterior (..., N+1) before them or None -> (..., Q, N), -log of a
         probability in nats.
@@ -91,7 +85,6 @@ class PlaceFilter(SequenceModel):
         off_map: float = 1.25,
         within: int = 5,
         threshold: float | None = None,
-        search_every: int = 1,
     ) -> None:
         super().__init__()
         moves = tuple(float(move) for move in moves)
@@ -103,9 +96,8 @@ class PlaceFilter(SequenceModel):
         if not 0 < sharpness < math.inf or not math.isfinite(off_map):
             seen = f"sharpness {sharpness}, off_map {off_map}"
             raise InputError(f"{seen}; expected finite numbers, the sharpness above 0")
-        for name, value, minimum in (("within", within, 0), ("search_every", search_every, 1)):
-            if not isinstance(value, int) or value < minimum:
-                raise InputError(f"{name} is {value}; expected a whole number, at least {minimum}")
+        if not isinstance(within, int) or within < 0:
+            raise InputError(f"within is {within}; expected a whole number, at least 0")
         if threshold is not None and math.isnan(threshold):
             raise InputError("the threshold is NaN; expected a number, or None")
         self.move_logits = nn.Parameter(_logits(*moves))
@@ -113,7 +105,7 @@ class PlaceFilter(SequenceModel):
         self.enter_logit = nn.Parameter(_logits(enter)[0] - _logits(1 - enter)[0])
         self.log_sharpness = nn.Parameter(torch.tensor(float(sharpness), dtype=torch.float32).log())
         self.off_map = nn.Parameter(torch.tensor(float(off_map), dtype=torch.float32))
-        self.within, self.threshold, self.search_every = within, threshold, search_every
+        self.within, self.threshold = within, threshold
 
     def start(self, places: int, fixed: bool = False) -> Tensor:
         return self.off_map.new_zeros(places + 1)
@@ -148,19 +140,19 @@ class PlaceFilter(SequenceModel):
             raise InputError(f"the posterior is {tuple(state.shape)}; expected ({places + 1},) for this map")
         rows = [state.to(scores)]
         for likelihood in self.likelihoods(scores, moments_of(scores)):
-            expected = self.moved(rows[-1], places)
+            expected = self.moved(rows[-1])
             if len(rows) == 1:
                 expected = torch.where((state == 0).all(), self.anywhere(places).to(scores), expected)
             rows.append(updated(expected, likelihood))
         return torch.stack(rows)
 
     def likelihoods(self, scores: Tensor, moments: Moments) -> Tensor:
-        """Likelihoods of W places, of being off the map, and of a place with the mean score, (Q,W) ->
-        (Q,W+2), scaled to a maximum of 1 in each row."""
+        """Likelihoods of the places and of being off the map, (Q,N) -> (Q,N+1), scaled to a maximum of 1 in
+        each row."""
         valid, sharpness = scores.isfinite(), self.log_sharpness.to(scores).exp()
         z = torch.where(valid, moments.mean - scores, 0) / moments.spread
-        off_and_mean = torch.stack([self.off_map.to(z), z.new_zeros(())]).expand(len(z), 2)
-        logits = torch.cat([(sharpness * z).masked_fill(~valid, -math.inf), sharpness * off_and_mean], 1)
+        off = self.off_map.to(z).expand(len(z), 1)
+        logits = torch.cat([(sharpness * z).masked_fill(~valid, -math.inf), sharpness * off], 1)
         logits = torch.where(moments.varied, logits, 0)
         return (logits - logits.amax(1, keepdim=True)).exp()
 
@@ -170,32 +162,26 @@ class PlaceFilter(SequenceModel):
         off = (leave / (leave + enter)).clamp(max=0.5)
         return torch.cat([((1 - off) / places).expand(places), off[None]])
 
-    def moved(self, belief: Tensor, places: int, start: int = 0) -> Tensor:
-        """The belief before the next query, extended by up to V places.
-
-        A belief (W+1,) holds the probability of each of the places [start, start + W) and of being off the
-        map; the other places share the rest.
-        """
+    def moved(self, belief: Tensor) -> Tensor:
+        """The belief (N+1,) before the next query."""
         moves, rates = (logits.to(belief).softmax(0) for logits in (self.move_logits, self.rate_logits))
         (stay, jump, leave), enter = rates, self.enter_logit.sigmoid().to(belief)
         on, off, furthest = belief[:-1], belief[-1], len(moves) - 1
-        ahead = min(furthest, places - start - len(on))
-        moved = F.pad(on, (furthest, ahead)).unfold(0, furthest + 1, 1) @ moves.flip(0)
-        anywhere = (jump * (1 - off) + enter * off) / places
+        moved = F.pad(on, (furthest, 0)).unfold(0, furthest + 1, 1) @ moves.flip(0)
+        anywhere = (jump * (1 - off) + enter * off) / len(on)
         off = stay * (on.sum() - moved.sum()) + leave * (1 - off) + (1 - enter) * off
         return torch.cat([stay * moved + anywhere, off[None]])
 
     @without_autocast
-    def near_scores(self, posterior: Tensor, scores: Tensor, lowest: Tensor | None = None) -> Tensor:
-        """-log of the probability, at least `lowest`, of each place and its neighbours, (Q,W) -> (Q,W); +inf
-        if the place's score is."""
+    def near_scores(self, posterior: Tensor, scores: Tensor) -> Tensor:
+        """-log of the probability of each place and its neighbours, (Q,N) -> (Q,N); +inf if the place's score
+        is."""
         within = min(self.within, posterior.shape[1])
         side = within + 1  # two box filters make a triangle
         padded = F.pad(posterior[:, None], (within, within))
         mass = side * F.avg_pool1d(F.avg_pool1d(padded, side, 1), side, 1)[:, 0]
         mass = mass.clamp(torch.finfo(mass.dtype).tiny, 1.0)  # an exporter promotes no types
-        score = -(mass if lowest is None else torch.maximum(mass, lowest)).log()
-        return score.masked_fill(~scores.isfinite(), math.inf)
+        return (-mass.log()).masked_fill(~scores.isfinite(), math.inf)
 
     def check(self, queries: int | None, places: int) -> None:
         furthest = len(self.move_logits) - 1
@@ -217,78 +203,6 @@ class PlaceFilter(SequenceModel):
         )
 
 
-class LocalSearch:
-    """A filter that scores only the likely range of places between two searches, and keeps its state.
-
-    All other places get the mean score; mean and spread are those of the last search.
-
-    Args:
-        scores: of all places, (1,K) -> (1,N), for a search.
-    """
-
-    def __init__(self, filter: PlaceFilter, route: PlaceMap, scores: Callable[[Tensor], Tensor]) -> None:
-        self.filter, self.route, self.all_scores = filter, route, scores
-        self.belief: Tensor | None = None  # of the places from `start` on, and of being off the map
-        self.start = self.skipped = 0  # skipped: queries since the last
-        self.search: Moments | None = None  # of the last search
-        self.since = 0  # queries since then
-
-    def __call__(self, query: Tensor, whole: bool = False) -> tuple[Tensor, int]:
-        """Scores (1,W) of a range that includes the best place of the next query (1,K), or of all places if
-        `whole`; and the first of these places."""
-        filter, places, moments, since = self.filter, self.route.places, self.search, self.since
-        near = None if moments is None or since >= filter.search_every else self._likely()
-        belief, start = (self.posterior, 0) if near is None else near
-        expected = filter.anywhere(places) if belief is None else belief
-        for _ in range(0 if belief is None else 1 + self.skipped):
-            expected = filter.moved(expected, places, start)
-        if moments is None or near is None:
-            scores = self.all_scores(query)
-            moments = moments_of(scores)
-        else:
-            blocks = self.route.score_blocks(query, start, start + len(expected) - 1)
-            scores = torch.cat([block for _, block in blocks], 1)
-        others = places - scores.shape[1]  # places that are not scored
-        expected = expected.to(scores)
-        belief = updated(expected, filter.likelihoods(scores, moments)[0], _rest(expected, others))
-        if near is None and moments.varied:  # a query with equal scores is not a search
-            self.search, since = moments, 0
-        self.belief, self.start, self.since, self.skipped = belief, start, since + 1, 0
-        lowest = (filter.within + 1) * _rest(belief, others) / max(1, others)
-        lowest = lowest.clamp(torch.finfo(belief.dtype).tiny, 1)
-        local, elsewhere = filter.near_scores(belief[None, :-1], scores, lowest), -lowest.log()
-        if not others or (not whole and bool(local.amin() < elsewhere)):
-            return local, start
-        row = elsewhere.repeat(1, places).masked_fill_(~moments.valid, math.inf)
-        row[:, start : start + local.shape[1]] = local
-        return row, 0
-
-    def _likely(self) -> tuple[Tensor, int] | None:
-        """The belief in a range with nearly all of the probability, plus a margin, and its first place; None
-        if there is no such range."""
-        assert self.belief is not None
-        on, within = self.belief[:-1], self.filter.within
-        (likely,) = (on > LOCAL_EDGE).nonzero(as_tuple=True)
-        first, last = (int(likely[0]), int(likely[-1])) if len(likely) else (0, -1)
-        on = on[first : last + 1]
-        if float(on.sum()) <= LOCAL_MASS:
-            return None
-        first += self.start
-        left, right = min(within, first), min(within, self.route.places - first - len(on))
-        return torch.cat([F.pad(on, (left, right)), self.belief[-1:]]), first - left
-
-    @property
-    def posterior(self) -> Tensor | None:
-        """(N+1,), None before the first query."""
-        if self.belief is None:
-            return None
-        on, places = self.belief[:-1], self.route.places
-        others = places - len(on)
-        whole = (_rest(self.belief, others) / max(1, others)).repeat(places + 1)
-        whole[self.start : self.start + len(on)], whole[-1] = on, self.belief[-1]
-        return whole
-
-
 def check_posterior(before: Tensor | None, places: int) -> None:
     """Refuse what are no probabilities (..., N+1), unless their numbers cannot be read."""
     if before is None or not is_plain(before) or not before.numel():
@@ -300,17 +214,12 @@ def check_posterior(before: Tensor | None, places: int) -> None:
         raise InputError(f"{seen}; expected ({places + 1},) probabilities that add up to 1")
 
 
-def updated(expected: Tensor, likelihood: Tensor, rest: Tensor | float = 0) -> Tensor:
-    """Bayes' rule for a belief (W+1,) and the rest; the belief stays if the query rules it out."""
-    joint = expected * likelihood[:-1]
-    total = joint.sum() + rest * likelihood[-1]
+def updated(expected: Tensor, likelihood: Tensor) -> Tensor:
+    """Bayes' rule for a belief (N+1,), which stays if the query rules it out."""
+    joint = expected * likelihood
+    total = joint.sum()
     possible = total > MIN_PROBABILITY
     return torch.where(possible, joint / torch.where(possible, total, 1), expected)
-
-
-def _rest(belief: Tensor, others: int) -> Tensor:
-    """The total probability of the other places."""
-    return (1 - belief.sum()).clamp(min=0) * (others > 0)
 
 
 def _logits(*probabilities: float) -> Tensor:

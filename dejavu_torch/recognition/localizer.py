@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from functools import partial
 from itertools import accumulate
 from types import MappingProxyType
 from typing import NamedTuple
@@ -15,8 +14,8 @@ from torch import Tensor
 
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.recognition.calibration import TOLERANCE, Platt, Track, confidence, confidence_of
-from dejavu_torch.recognition.filter import LocalSearch, PlaceFilter
-from dejavu_torch.recognition.search import SCORES_AT_ONCE, Find, Search, Wanted, num_needed, search
+from dejavu_torch.recognition.filter import PlaceFilter
+from dejavu_torch.recognition.search import SCORES_AT_ONCE, NmsSpec, Scan, Search, Searcher, num_needed
 from dejavu_torch.recognition.select import Acceptance, accept, best_candidates, best_match
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.text import with_progress
@@ -39,7 +38,7 @@ class Matching(NamedTuple):
     rule: Acceptance = Acceptance()
     platt: Platt | None = None  # gives probabilities
     on_scores: Callable[[Tensor], None] | None = None  # receives the final scores (B,N)
-    search: Search = "auto"  # of single queries
+    search: Search = "auto"  # of single queries, see `DejaVu.localize`
 
 
 SINGLE = Matching()  # each query by itself
@@ -50,9 +49,7 @@ class Localizer:
 
     Args:
         route: the map; None if only `match` is used, with scores from elsewhere.
-        find: finds candidates of single queries instead of `search`, such as a `CoarseSearch` or a cluster.
-        approximate: approximate scores of all places, for a `PlaceFilter` with search_every > 1; None uses
-            the map's exact ones.
+        searcher: finds the best places of single queries; None is a `Scan`.
 
     Shape: descriptors (B,K) of the next queries -> Match of (B,), or (B,k), on the CPU, without gradients.
 
@@ -70,19 +67,15 @@ class Localizer:
         self,
         route: PlaceMap | None = None,
         matching: Matching = SINGLE,
-        find: Find | None = None,
-        approximate: Callable[[Tensor], Tensor] | None = None,
+        searcher: Searcher | None = None,
     ) -> None:
-        self.route, self.matching, self.find, self.track = route, matching, find, Track()
+        self.route, self.matching, self.track = route, matching, Track()
+        self.searcher = Scan(route) if searcher is None and route is not None else searcher
         sequence, routes = matching.sequence, () if route is None else route.routes
         self.own: Together = sequence.length if isinstance(sequence, SequenceMatcher) else "filter"
         self.models = {**matching.beside, **({} if sequence is None else {self.own: sequence})}
         self.states: dict[Together, Tensor] = {}  # of the models; empty before the first query
         self.firsts = (0, *accumulate(one.places for one in routes[:-1]))  # the first place of each route
-        self.local: LocalSearch | None = None
-        if route is not None and isinstance(sequence, PlaceFilter) and not matching.beside:
-            every = sequence.search_every
-            self.local = LocalSearch(sequence, route, approximate or route.scores) if every > 1 else None
 
     @torch.no_grad()
     def __call__(self, descriptors: Tensor, label: str | None = None) -> Match:
@@ -95,13 +88,14 @@ class Localizer:
         if matching.platt is not None:
             wanted.append((min(2, places), TOLERANCE))
         n = num_needed(wanted, places)
-        few = n <= max(1, MAX_SHARE * min(places, route.block_places))
-        few = few or self.find is not None or places > SCORES_AT_ONCE
-        way, size = self._by_scores, places
-        if not self.models and matching.on_scores is None and few:
-            way, size = partial(self._by_search, wanted), max(PER_BEST * n, places // PLACES_PER_NUMBER)
+        few = n <= max(1, MAX_SHARE * min(places, route.block_places)) or places > SCORES_AT_ONCE
+        searches = not self.models and matching.on_scores is None and (few or type(self.searcher) is not Scan)
+        size = max(PER_BEST * n, places // PLACES_PER_NUMBER) if searches else places
         parts = descriptors.split(max(1, min(ROWS, SCORES_AT_ONCE // size)))
-        return Match.joined(way(part.to(route.positions.device)) for part in with_progress(parts, label))
+        moved = (part.to(route.positions.device) for part in with_progress(parts, label))
+        if searches:
+            return Match.joined(self._search(part, wanted) for part in moved)
+        return Match.joined(self.match(route.scores(part)) for part in moved)
 
     @torch.no_grad()
     def match(self, scores: Tensor) -> Match:
@@ -115,17 +109,14 @@ class Localizer:
     def skip(self, queries: int) -> None:
         """Skip queries: a `PlaceFilter` moves once more for each."""
         filter = self.matching.sequence
-        if self.local is not None:
-            self.local.skipped += queries
-        elif isinstance(filter, PlaceFilter) and self.states:
+        if isinstance(filter, PlaceFilter) and self.states:
             for _ in range(queries):
-                state = self.states["filter"]
-                self.states = self.states | {"filter": filter.moved(state, len(state) - 1)}
+                self.states = self.states | {"filter": filter.moved(self.states["filter"])}
 
     @property
     def posterior(self) -> Tensor | None:
         """(N+1,) of a filter after the latest query; None without a filter, or before the first query."""
-        return self.states.get("filter") if self.local is None else self.local.posterior
+        return self.states.get("filter")
 
     def _in_sequence(self, scores: Tensor) -> Match:
         states = self.states or {T: one.start(scores.shape[1]).to(scores) for T, one in self.models.items()}
@@ -156,24 +147,9 @@ class Localizer:
             match = match._replace(probability=probability)
         return match if matching.k is not None else match.map(lambda column: column[:, 0])
 
-    def _by_scores(self, descriptors: Tensor) -> Match:
-        assert self.route is not None
-        if self.local is None:
-            return self.match(self.route.scores(descriptors))
-        whole, matches = self.matching.k is not None or self.matching.on_scores is not None, []
-        for descriptor in descriptors.split(1):
-            scores, start = self.local(descriptor, whole)
-            match = self._candidates(scores)
-            matches.append(match._replace(index=match.index + start))
-        return self._answer(Match.joined(matches))
-
-    def _by_search(self, wanted: Wanted, descriptors: Tensor) -> Match:
+    def _search(self, descriptors: Tensor, wanted: list[NmsSpec]) -> Match:
         """Candidates from the lowest scores alone; `wanted` has those of the answer first."""
-        if self.find is not None:
-            score, place = self.find(descriptors, wanted)
-        else:
-            assert self.route is not None
-            n, scan = num_needed(wanted, self.route.places), self.matching.search == "scan"
-            score, place = search(self.route, descriptors, n, scan)
+        assert self.searcher is not None
+        score, place = self.searcher(descriptors, wanted)
         match, *second = (best_candidates(score, *one, places=place) for one in wanted)
         return self._answer(match, *map(confidence, second))

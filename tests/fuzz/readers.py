@@ -47,15 +47,12 @@ from dejavu_torch.features.hog import HOG
 from dejavu_torch.live.localizer import LiveLocalizer
 from dejavu_torch.maps import file as map_file
 from dejavu_torch.maps.codec import Stream, decode, encode
-from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import contents as contents_of
 from dejavu_torch.model_file import read_place_map
 from dejavu_torch.periods.imposed import ImposedPeriods
-from dejavu_torch.recognition.coarse import CoarseSearch, Plan
 from dejavu_torch.recognition.filter import PlaceFilter
-from dejavu_torch.recognition.sample_file import key_of, read_samples
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.training.export import load_weights
 from dejavu_torch.types import InputError, Match, Traverse
@@ -247,25 +244,6 @@ def crafted_map(case: Case) -> None:
     model.save("out/again.safetensors")
     if not same_model(model, DejaVu.load("out/again.safetensors")):
         raise Wrong("a map that was saved loads as another")
-
-
-@reader("samples of a search", maps, share=0.5)
-def samples_of_a_search(case: Case) -> None:
-    model = DejaVu.load(case.made(maps) / "chunked.safetensors")
-    route, chosen = model.map, case.random.choice((Plan(1, 1, 2, 1.0, 0), Plan(4, 2, 2, 1.0, 0)))
-    assert isinstance(route, SpectralMap)
-    data, search, queries = Path("in/route.samples"), CoarseSearch(route, chosen), route.decode(0)[:5]
-    map_file.write_map(data, search.tensors, key_of(route, chosen))
-    sealed_again = case.random.random() < 0.5
-    whole = data.read_bytes()
-    data.write_bytes(crafted(case.random, data) if sealed_again else damaged(case.random, whole))
-    case.begin()
-    read = read_samples(data, route, chosen)
-    score, place = read(queries, [(2, 1)])
-    if not bool(((place >= -1) & (place < route.places) | score.isinf()).all()):
-        raise Wrong(f"places {place.tolist()} of {route.places}")
-    if not sealed_again and not all(map(torch.equal, read.tensors.values(), search.tensors.values())):
-        raise Wrong("damaged samples are read as others")
 
 
 @reader("map of matches", maps, share=0.5)

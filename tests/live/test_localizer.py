@@ -58,7 +58,6 @@ SEQUENCES: dict[str, SequenceModel | None] = {
     "sequence": SequenceMatcher(5),
     "speeds": SequenceMatcher(4, (1.0, 0.5)),
     "filter": PlaceFilter(),
-    "rare searches": PlaceFilter(search_every=7),
 }
 
 

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dejavu_torch import FrequencyLayer, PhaseTemplates, PlaceMap, SpectralMapper, TemplateMap, best_match
+from dejavu_torch import FrequencyLayer, PhaseTemplates, TemplateMap, best_match
 from dejavu_torch.features.extract import READY
 from dejavu_torch.maps.template_map import log_posterior, segments
 from dejavu_torch.periods.support import common_period
@@ -322,40 +322,3 @@ def test_places_at_inf_leave_gradients_finite() -> None:
     assert scores.grad[0, 0] != 0
     assert scores.grad[0, 1] == 0
     assert scores.grad[1].tolist() == [0, 0, 0]
-
-
-# -------------------------------------------- a stretch of places, of every kind of map
-
-
-def templates(**settings: float) -> TemplateMap:
-    blocks = [torch.rand(layer.phases, len(layer.features)) for layer in MIXED]
-    return TemplateMap(MIXED, blocks, 64, 4, **settings)  # type: ignore[arg-type]
-
-
-ROUTES = {
-    "templates": templates(),
-    "templates with a temperature": templates(temperature=0.5),
-    "one chunk": SpectralMapper(None, 0.01)(torch.rand(64, 4)),
-    "chunks": SpectralMapper(None, 0.01, chunk=16)(torch.rand(64, 4)),
-    "chunks, l2": SpectralMapper(None, 0.01, chunk=16, metric="l2")(torch.rand(64, 4)),
-}
-
-
-@pytest.mark.parametrize("kind", list(ROUTES))
-@given(st.integers(0, 63), st.integers(1, 64), st.integers(1, 40))
-def test_scores_of_a_stretch_are_those_of_all(kind: str, start: int, length: int, queries: int) -> None:
-    route, rows = ROUTES[kind], torch.rand(queries, 4)
-    stop = min(start + length, route.places)
-    found = torch.cat([scores for _, scores in route.score_blocks(rows, start, stop)], 1)
-    expected = route.scores(rows)[:, start:stop]
-    assert found.shape == expected.shape
-    assert torch.allclose(found, expected, atol=1e-5)
-
-
-@pytest.mark.parametrize(("kind", "part"), [("templates", 0.5), ("chunks", 0.3)])
-def test_other_chunks_are_not_looked_at(kind: str, part: float, largest_tensor: type) -> None:
-    route: PlaceMap = ROUTES[kind]
-    queries: Tensor = torch.rand(1000, 4)
-    with largest_tensor() as seen:
-        list(route.score_blocks(queries, 36, 44))
-    assert seen.numel <= max(part * 64, 32) * 1000

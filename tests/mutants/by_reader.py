@@ -29,14 +29,6 @@ MUTANTS = [
         ("tests/maps/test_template_map.py::test_trained_weights_freeze_to_none_below_0",),
     ),
     Mutant(
-        "Among equal scores the lowest place wins, also if the fast search of a template map finds "
-        "the same score at several phases.",
-        "dejavu_torch/maps/layer_search.py",
-        'place.masked_fill(missed, places).amin(1), "amin")',
-        'place.masked_fill(missed, places).amin(1), "amax", include_self=False)',
-        ("tests/maps/test_layer_search.py::test_equals_the_scan_in_random_cases",),
-    ),
-    Mutant(
         "A place whose rebuilt descriptor has next to no length (1e-6 of the map's RMS) has cosine 0, "
         "so score 1, with every query.",
         "dejavu_torch/maps/spectral_map.py",
@@ -148,13 +140,6 @@ MUTANTS = [
         ("tests/recognition/test_filter.py::-k literal_loop or drives_off",),
     ),
     Mutant(
-        "With search_every n, a PlaceFilter scores all places for every n-th query.",
-        "dejavu_torch/recognition/filter.py",
-        "since >= filter.search_every",
-        "since > filter.search_every",
-        ("tests/test_behaviour.py::test_a_filter_searches_every_nth_query",),
-    ),
-    Mutant(
         "A trajectory of which just half lies on the map still gives its place a finite score.",
         "dejavu_torch/recognition/sequence.py",
         "torch.where(2 * count >= used[:, None],",
@@ -253,7 +238,7 @@ MUTANTS = [
     Mutant(
         "Appending places drops the calibration of the map, which was made for fewer places.",
         "dejavu_torch/model.py",
-        "self.map, self.find, self.calibration = route, None, None",
+        "self.map, self.searcher, self.calibration = route, None, None",
         "self.map = route",
         ("tests/test_growth.py::test_a_calibration_goes_and_comes_again_from_the_new_places",),
     ),

@@ -200,16 +200,6 @@ MUTANTS = [
         ("tests/recognition/test_filter.py::test_equals_a_literal_loop",),
     ),
     Mutant(
-        "A filter's search that tells nothing is made again for the next query.",
-        "dejavu_torch/recognition/filter.py",
-        "if near is None and moments.varied:  # a query",
-        "if near is None:  # a query",
-        (
-            "tests/test_behaviour.py::test_a_search_that_tells_nothing_is_made_again",
-            "tests/recognition/test_filter.py::test_a_search_that_says_nothing_is_made_again",
-        ),
-    ),
-    Mutant(
         "A filter's score of a place counts its neighbours up to `within` places away.",
         "dejavu_torch/recognition/filter.py",
         "side = within + 1  # two",
@@ -510,27 +500,6 @@ MUTANTS = [
         "if self.opened:",
         "if True:",
         ("tests/test_learning.py::test_the_partial_map_of_another_run_is_refused",),
-    ),
-    Mutant(
-        "An exact search rules out no place that may be better than those it found.",
-        "dejavu_torch/recognition/coarse.py",
-        "reach = angle(1 - score) +",
-        "reach = angle(1 - score) * 0.9 +",
-        ("tests/recognition/test_coarse.py::test_exact_finds_what_a_scan_finds",),
-    ),
-    Mutant(
-        "Samples in a file are of this very map.",
-        "dejavu_torch/recognition/sample_file.py",
-        "if header[name] != key[name]",
-        'if name != "map" and header[name] != key[name]',
-        ("tests/recognition/test_sample_file.py::-k another_map",),
-    ),
-    Mutant(
-        "A file of samples that would not be used is refused.",
-        "dejavu_torch/model.py",
-        "if self.search_file is not None:",
-        "if False:",
-        ("tests/recognition/test_sample_file.py::-k no_samples_are_searched",),
     ),
     Mutant(
         "Recall over all queries counts those without a right answer.",

@@ -247,7 +247,6 @@ def test_convention_4_without_a_threshold_a_calibrated_map_accepts_from_a_half_o
         assert 0 < int(match.accepted.sum()) < len(queries)
     assert model.acceptance() == model.acceptance(PlaceFilter()) == (None, 0.5, False)
     assert model.acceptance(PlaceFilter(threshold=3.0)) == (3.0, None, True)
-    assert model.acceptance(PlaceFilter(search_every=9)) == (math.log(2), None, False)  # not calibrated for
     assert model.acceptance(SequenceMatcher(5)) == (None, None, False)
     for settings, single, filtered, sequence in (
         ({"threshold": 0.2}, (0.2, None, True), (None, 0.5, False), (0.2, None, True)),

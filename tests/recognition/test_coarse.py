@@ -1,30 +1,26 @@
-"""A coarse search finds nearly always what a scan finds, an exact one always."""
+"""A coarse search finds nearly always what a scan finds."""
 
 from __future__ import annotations
 
 import copy
-import math
+from collections.abc import Callable
 from functools import cache
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 import torch
 from helpers import refused
-from hypothesis import given
-from hypothesis import strategies as st
 from test_search import walk
+from torch import Tensor
 
-from dejavu_torch import DejaVu, PlaceFilter, SpectralMapper
+from dejavu_torch import DejaVu, SpectralMapper
 from dejavu_torch.growth import append
 from dejavu_torch.maps.spectral_map import SpectralMap
-from dejavu_torch.maps.spectrum import Transform
 from dejavu_torch.recognition import coarse
 from dejavu_torch.recognition.calibration import Calibration, Platt
-from dejavu_torch.recognition.coarse import CoarseSearch, Plan, coarse_search, plan
-from dejavu_torch.recognition.search import Wanted
+from dejavu_torch.recognition.coarse import CoarseSearch, Plan, plan, searcher
+from dejavu_torch.recognition.search import NmsSpec, Scan, Search, TopK
 from dejavu_torch.recognition.select import best_candidates
-
-EXACT = Plan(1, 1, 4, 1.0, 0)
 
 
 @pytest.fixture
@@ -48,49 +44,6 @@ def queries_of(places: int = 3000, noise: float = 0.3) -> torch.Tensor:
     return route + noise * torch.randn(route.shape, generator=torch.Generator().manual_seed(9))
 
 
-@given(
-    places=st.integers(3, 150),
-    chunk=st.integers(2, 60),
-    transform=st.sampled_from(["dft", "dct"]),
-    smooth=st.sampled_from([0.0, 0.9, 0.99]),
-    k=st.integers(1, 4),
-    radius=st.integers(0, 6),
-    step=st.sampled_from([0.2, 3.0]),
-    seed=st.integers(0, 99),
-)
-def test_exact_finds_what_a_scan_finds(
-    places: int, chunk: int, transform: Transform, smooth: float, k: int, radius: int, step: float, seed: int
-) -> None:
-    """Of any map: with places without length, with chunks that are alike, of rough descriptors."""
-    route = walk(places, 8, seed, smooth)
-    route[places // 2 : places // 2 + chunk] = 0
-    route[-(places // 3) :] = route[: places // 3]
-    learned = SpectralMapper(None, step, chunk, transform=transform)(route)
-    queries = torch.cat([route[::5] + 0.2 * walk(len(route[::5]), 8, seed + 1), torch.zeros(1, 8)])
-    scores = learned.scores(queries)
-    wanted: Wanted = [(min(k, places), radius), (min(2, places), 5)]
-    search = CoarseSearch(learned, EXACT)
-    if seed % 2:  # whatever was found first
-        some = torch.rand(len(queries), places, generator=torch.Generator().manual_seed(seed)) < 0.3
-        anywhere = torch.where(some, torch.arange(places), -1)
-        search._windows = lambda *_: anywhere  # type: ignore[method-assign]
-    found = search(queries, wanted)
-    for one in wanted:
-        match, expected = best_candidates(found[0], *one, found[1]), best_candidates(scores, *one)
-        torch.testing.assert_close(match.score, expected.score, rtol=0, atol=1e-5)
-        there = match.index >= 0
-        assert torch.equal(there, expected.index >= 0)
-        row = torch.arange(len(queries))[:, None].expand(match.index.shape)[there]
-        torch.testing.assert_close(scores[row, match.index[there]], match.score[there], rtol=0, atol=1e-5)
-
-
-def test_of_identical_chunks_exact_finds_the_first() -> None:
-    period = walk(64, 8, 0, 0.9)
-    learned = SpectralMapper(None, 0.2, 64)(period.repeat(5, 1))
-    score, place = CoarseSearch(learned, EXACT)(period, [(1, 0)])
-    assert (best_candidates(score, 1, 0, place).index[:, 0] < 64).all()
-
-
 @pytest.mark.usefixtures("searched")
 @pytest.mark.parametrize("settings", [{}, {"transform": "dct"}], ids=str)
 def test_coarse_finds_nearly_what_a_scan_finds(settings: dict[str, Any]) -> None:
@@ -111,30 +64,17 @@ def test_coarse_probabilities_are_those_of_a_scan() -> None:
     model, queries = smooth_model(), queries_of()
     model.calibration = Calibration(Platt(4.0, 1.0), None)
     expected = model.localize(queries, search="scan").probability
-    for search in ("coarse", "exact"):
-        found = model.localize(queries, search=search).probability  # type: ignore[arg-type]
-        assert found is not None
-        assert expected is not None
-        assert float((found - expected).abs().quantile(0.99)) < 0.01
-
-
-@pytest.mark.usefixtures("searched")
-def test_a_filter_that_does_not_always_search_takes_samples() -> None:
-    model, queries = smooth_model(), walk(3000, 24, 0, 0.99)[1000:1100]
-    found = [
-        model.localize(queries, sequence=PlaceFilter(search_every=10), search=search)  # type: ignore[arg-type]
-        for search in ("auto", "scan")
-    ]
-    assert torch.equal(found[0].index, found[1].index)
-    probability = [(-match.score).exp() for match in found]
-    torch.testing.assert_close(probability[0], probability[1], rtol=0, atol=0.02)
+    found = model.localize(queries).probability
+    assert found is not None
+    assert expected is not None
+    assert float((found - expected).abs().quantile(0.99)) < 0.01
 
 
 @pytest.mark.usefixtures("searched")
 def test_a_query_that_is_like_no_place_is_scanned() -> None:
     learned = SpectralMapper(None, 0.1, 256)(walk(1000, 24, 0, 0.99).abs() + 1)
-    search = coarse_search(learned)
-    assert search is not None
+    search = searcher(learned)
+    assert isinstance(search, CoarseSearch)
     queries = torch.stack([torch.zeros(24), -torch.ones(24)])
     score, place = search(queries, [(1, 0)])
     expected = best_candidates(learned.scores(queries), 1, 0)
@@ -192,16 +132,66 @@ def test_what_is_scanned() -> None:
     one_chunk = SpectralMapper(None, 0.1, 1000)(walk(1000, 24, 0, 0.99))
     distances = SpectralMapper(None, 0.1, 256, metric="l2")(walk(1000, 24, 0, 0.99))
     assert [plan(route) for route in (rough, one_chunk, distances, SpectralMap())] == [None] * 4
-    assert plan(rough, exact=True) is not None
+    smooth = smooth_model(1000).map
+    ways = {method: type(searcher(smooth, method)) for method in get_args(Search)}
+    assert ways == {"auto": CoarseSearch, "coarse": CoarseSearch, "exact": Scan, "scan": Scan}
+    assert type(searcher(rough)) is Scan
+
+
+def appended(model: DejaVu, more: Tensor) -> None:
+    append(model, more)
+
+
+def learned_anew(model: DejaVu, more: Tensor) -> None:
+    model.learn(torch.cat([walk(1000, 24, 0, 0.99), more]))
+
+
+def loaded(model: DejaVu, more: Tensor) -> None:
+    model.load_state_dict(append(copy.deepcopy(model), more).state_dict())
+
+
+def map_loaded(model: DejaVu, more: Tensor) -> None:
+    model.map.load_state_dict(append(copy.deepcopy(model), more).map.state_dict())
+
+
+def map_set(model: DejaVu, more: Tensor) -> None:
+    model.map = append(copy.deepcopy(model), more).map
 
 
 @pytest.mark.usefixtures("searched")
-def test_a_map_that_grew_is_sampled_anew() -> None:
-    model = smooth_model(1000)
-    more = walk(1000, 24, 5, 0.99)
+@pytest.mark.parametrize("change", [appended, learned_anew, loaded, map_loaded, map_set])
+def test_samples_are_made_once_for_a_map_and_anew_for_another(
+    change: Callable[[DejaVu, Tensor], None],
+) -> None:
+    model, more = smooth_model(1000), walk(1000, 24, 5, 0.99)
     model.localize(more[:3])
-    append(model, more)
+    first = model.searcher
+    assert isinstance(first, CoarseSearch)
+    model.candidates(more[:3], 2)
+    model.to("cpu").localize(more[:3], search="scan")
+    assert model.searcher is first
+    change(model, more)
     assert model.localize(more[500:501]).index.tolist() == [1500]
+    assert isinstance(model.searcher, CoarseSearch)
+    assert model.searcher is not first
+
+
+def test_a_searcher_of_the_user_finds_the_places_until_the_map_is_another() -> None:
+    model, asked = smooth_model(700), list[list[NmsSpec]]()
+
+    def own(queries: Tensor, wanted: list[NmsSpec]) -> TopK:
+        asked.append(wanted)
+        return torch.zeros(len(queries), 1), torch.full((len(queries), 1), 7)
+
+    model.searcher = own
+    queries = queries_of(700, noise=0.0)[:5]
+    assert model.localize(queries).index.tolist() == [7] * 5
+    assert asked == [[(1, 5)]]
+    for search in ("scan", "exact"):
+        assert model.localize(queries, search=search).index.tolist() == [0, 13, 26, 39, 52]  # type: ignore[arg-type]
+    model.load_state_dict(model.state_dict())
+    assert model.localize(queries).index.tolist() == [0, 13, 26, 39, 52]
+    assert len(asked) == 1
 
 
 def test_the_cosine_of_samples_is_near_that_of_places() -> None:
@@ -218,15 +208,11 @@ def test_the_cosine_of_samples_is_near_that_of_places() -> None:
             torch.testing.assert_close(same, own[at], rtol=0, atol=1e-4)
 
 
-def test_angles_are_not_understated() -> None:
-    assert math.isclose(float(coarse.angle(torch.tensor(1.0))), math.acos(1 - coarse.ROUNDING), rel_tol=0.1)
-
-
 @pytest.mark.usefixtures("searched")
 def test_many_candidates_are_those_of_a_scan_and_no_query_has_none() -> None:
     learned, queries = smooth_model().map, queries_of()[:5]
-    search, wanted = coarse_search(learned), [(40, 5)]
-    assert search is not None
+    search, wanted = searcher(learned), [(40, 5)]
+    assert isinstance(search, CoarseSearch)
     score, place = search(queries, wanted)
     assert score.shape[1] <= learned.places
     found = best_candidates(score, *wanted[0], place)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 import torch
@@ -163,7 +162,6 @@ def test_gradients_are_finite_where_something_is_impossible() -> None:
 def test_no_graph_grows_from_batch_to_batch() -> None:
     scores = standing_out(50, [*range(40)])
     assert not followed(PlaceFilter(), scores, Watched(50), 4).requires_grad
-    assert not followed(PlaceFilter(search_every=10), scores, Watched(50), 4).requires_grad
 
 
 @pytest.mark.parametrize(
@@ -182,7 +180,6 @@ def test_no_graph_grows_from_batch_to_batch() -> None:
         (lambda: PlaceFilter()(torch.rand(2, 4), torch.rand(6)), ["posterior (6,)", "(5,)"]),
         (lambda: PlaceFilter()(torch.rand(2, 4), torch.ones(5)), ["adds up to 5", "to 1"]),
         (lambda: PlaceFilter(within=2.5), ["within is 2.5", "whole"]),  # type: ignore[arg-type]
-        (lambda: PlaceFilter(search_every=2.5), ["search_every is 2.5"]),  # type: ignore[arg-type]
         (lambda: PlaceFilter(threshold=math.nan), ["threshold is NaN"]),
         (lambda: PlaceFilter().check(10, 2), ["up to 2 places on a map of 2"]),
     ],
@@ -193,22 +190,16 @@ def test_bad_input_is_refused(make: Callable[[], object], told: list[str]) -> No
 
 
 class Watched(PlaceMap):
-    """A route that counts the places that it scores; a query is the row of scores itself."""
+    """A route on which a query is the row of scores itself."""
 
     kind = "watched"
     settings = summary = lambda self: {}  # type: ignore[assignment]
 
     def __init__(self, places: int) -> None:
         super().__init__(places, places)
-        self.scored = 0
 
     def scores(self, queries: Tensor) -> Tensor:
-        return torch.cat([block for _, block in self.score_blocks(queries)], 1)
-
-    def score_blocks(self, queries: Tensor, start: int = 0, stop: int | None = None) -> Any:
-        for first, rows in zip((start, start + 9), queries[:, start:stop].tensor_split([9], 1), strict=True):
-            self.scored += rows.numel()
-            yield first, rows
+        return queries
 
 
 def followed(model: SequenceModel | None, scores: Tensor, route: PlaceMap, size: int = 33) -> Tensor:
@@ -220,52 +211,16 @@ def followed(model: SequenceModel | None, scores: Tensor, route: PlaceMap, size:
     return torch.cat(rows)
 
 
-def test_where_the_camera_is_known_only_its_neighbourhood_is_scored() -> None:
-    shown = [*range(100, 300), *range(700, 900)]
-    scores, route = standing_out(1000, shown), Watched(1000)
-    scores[torch.arange(len(shown)), torch.tensor(shown)] -= 3
-    found = followed(PlaceFilter(search_every=20), scores, route)
-    everything = PlaceFilter()(scores)
-    assert route.scored < 0.2 * scores.numel()
-    assert torch.equal(found.argmin(1)[:200], everything.argmin(1)[:200])
-    after = slice(200 + 20, None)  # a jump is noticed at the next search
-    assert torch.equal(found.argmin(1)[after], everything.argmin(1)[after])
-    difference = ((-found).exp() - (-everything).exp()).abs()
-    assert difference[:200].max() < 0.02
-
-
-def test_a_search_that_says_nothing_is_made_again() -> None:
-    """A dark frame just where all places are searched."""
-    shown = [100] * 60
-    scores = standing_out(300, shown)
-    scores[torch.arange(60), torch.tensor(shown)] -= 4
-    scores[20] = 0.7
-    found = followed(PlaceFilter(search_every=20), scores, Watched(300)).argmin(1)
-    assert ((found - 100).abs()[5:] <= 2).all()
-
-
 def test_convention_2_a_place_that_nothing_covers_is_not_reported_by_a_filter() -> None:
     scores = standing_out(300, [*range(20, 80)])
     scores[:, 200:220] = math.inf
-    for filter_ in (PlaceFilter(), PlaceFilter(search_every=20)):
-        found = followed(filter_, scores, Watched(300), 7)
-        assert torch.equal(found.isinf(), scores.isinf())
-
-
-def test_the_best_place_of_a_neighbourhood_is_that_of_all_scores() -> None:
-    for shown in ([*range(20, 120)], [-1] * 60, [*range(240, 299)], [*range(0, 40), *range(150, 190)]):
-        scores = standing_out(300, shown)
-        scores[torch.arange(len(shown)), torch.tensor(shown).clamp(min=0)] -= 3
-        scores[:, 200:220] = math.inf
-        rows = followed(PlaceFilter(search_every=20), scores, Watched(300))
-        found = Localizer(Watched(300), Matching(PlaceFilter(search_every=20)))(scores)
-        assert torch.equal(found.score, rows.amin(1))
-        assert torch.equal(found.index, rows.argmin(1))
+    found = followed(PlaceFilter(), scores, Watched(300), 7)
+    assert torch.equal(found.isinf(), scores.isinf())
     closed = torch.full((5, 30), math.inf)
-    assert Localizer(Watched(30), Matching(PlaceFilter(search_every=3)))(closed).index.tolist() == [-1] * 5
+    assert Localizer(Watched(30), Matching(PlaceFilter()))(closed).index.tolist() == [-1] * 5
 
 
-@pytest.mark.parametrize("model", [PlaceFilter(), PlaceFilter(search_every=5), SequenceMatcher(3), None])
+@pytest.mark.parametrize("model", [PlaceFilter(), SequenceMatcher(3), None])
 def test_an_empty_batch_changes_nothing(model: SequenceModel | None) -> None:
     scores = standing_out(50, [*range(12)])
     localizer = Localizer(Watched(50), Matching(model))

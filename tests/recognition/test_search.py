@@ -18,7 +18,7 @@ from dejavu_torch.recognition import localizer
 from dejavu_torch.recognition import search as searching
 from dejavu_torch.recognition.calibration import Calibration, Platt, confidence_of
 from dejavu_torch.recognition.localizer import Localizer, Matching
-from dejavu_torch.recognition.search import Best, merge_topk, search, topk
+from dejavu_torch.recognition.search import Scan, TopK, merge_topk, topk
 from dejavu_torch.recognition.select import best_candidates
 
 
@@ -48,10 +48,10 @@ class Scored(PlaceMap):
     def scores(self, queries: Tensor) -> Tensor:
         return self.rows[queries[:, 0].long()]
 
-    def score_blocks(self, queries: Tensor, start: int = 0, stop: int | None = None) -> Any:
+    def score_blocks(self, queries: Tensor) -> Any:
         self.batches.append(len(queries))
         scores = self.scores(queries)
-        for first in range(start, self.places if stop is None else stop, self.size):
+        for first in range(0, self.places, self.size):
             yield first, scores[:, first : first + self.size]
 
 
@@ -67,7 +67,7 @@ def table(rows: int, places: int, values: int, seed: int) -> Tensor:
     return scores
 
 
-def assert_equal(found: Best, expected: Best) -> None:
+def assert_equal(found: TopK, expected: TopK) -> None:
     assert torch.equal(found[0], expected[0])
     finite = expected[0].isfinite()
     assert torch.equal(found[1][finite], expected[1][finite])
@@ -89,7 +89,7 @@ def test_the_best_of_blocks_are_those_of_all_scores(
     expected = score[:, :n], index[:, :n]
     assert_equal(topk(scores, n), expected)
     route = Scored(scores, block)
-    assert_equal(search(route, rows_of(route), n), expected)
+    assert_equal(Scan(route)(rows_of(route), [(n, 0)]), expected)
     order = torch.randperm(n, generator=torch.Generator().manual_seed(seed))
     first, second = order[: (n + 1) // 2], order[(n + 1) // 2 :]
     parts = [(expected[0][:, part], expected[1][:, part]) for part in (first, second)]
@@ -108,7 +108,7 @@ def test_candidates_are_those_of_all_scores(places: int, k: int, radius: int, va
     scores, k = table(3, places, values, seed), min(k, places)
     route = Scored(scores, 7)
     found = Localizer(
-        route, Matching(k=k, radius=radius), lambda queries, wanted: search(route, queries, places)
+        route, Matching(k=k, radius=radius), lambda queries, wanted: Scan(route)(queries, [(places, 0)])
     )
     match, expected = found(rows_of(route)), best_candidates(scores, k, radius)
     assert all(map(torch.equal, match, expected))
@@ -145,7 +145,7 @@ def test_many_of_the_best_are_taken_from_all_scores(monkeypatch: pytest.MonkeyPa
     assert Localizer(route, Matching(k=3, radius=5))(rows_of(route)).index.shape == (21, 3)
     assert route.batches == [8, 8, 5]
     monkeypatch.setattr(searching, "SCORES_AT_ONCE", 4 * 1000)
-    search(route, rows_of(route), 2)
+    Scan(route)(rows_of(route), [(2, 0)])
     assert route.batches[3:] == [4, 4, 4, 4, 4, 1]
 
 
@@ -154,8 +154,8 @@ def test_convention_10_scores_are_float32_whatever_the_autocast(metric: Any) -> 
     route = SpectralMapper(None, 0.5, 32, metric=metric)(walk(300))
     for queries in (walk(300)[:1], walk(300)[::5]):
         with torch.autocast("cpu", torch.bfloat16):
-            found = search(route, queries, 3)
-        assert_equal(found, search(route, queries, 3))
+            found = Scan(route)(queries, [(3, 0)])
+        assert_equal(found, Scan(route)(queries, [(3, 0)]))
 
 
 def test_what_cannot_be_searched_so_is_refused() -> None:

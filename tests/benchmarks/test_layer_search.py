@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import random
-from dataclasses import replace
 from fractions import Fraction
 from unittest.mock import patch
 
-import pytest
 import torch
-from helpers import Fixed, template_model
 from torch import Tensor
 
-from dejavu_torch import FrequencyLayer, SequenceMatcher, TemplateMap
-from dejavu_torch.maps import layer_search, template_map
-from dejavu_torch.maps.layer_search import _circles
-from dejavu_torch.recognition.localizer import Matching
+from benchmarks import layer_search
+from benchmarks.template_search import in_layers
+from dejavu_torch import FrequencyLayer, TemplateMap
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.types import Plan
 
@@ -48,22 +44,12 @@ def random_map(draw: random.Random, generator: torch.Generator) -> TemplateMap:
     return TemplateMap(tuple(plan), blocks, stop + draw.choice([0, 0, 5]), 3, metric, reduction)
 
 
-@pytest.fixture
-def always(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Maps of any size are searched."""
-    monkeypatch.setattr(template_map, "PHASE_COST", 0)
-    monkeypatch.setattr(template_map, "SEARCH_COST", 0)
-
-
 def check(route: TemplateMap, queries: Tensor) -> None:
-    found = route.lowest(queries)
-    assert found is not None
-    expected = best_match(route.scores(queries))
+    found, expected = in_layers(route, queries), best_match(route.scores(queries))
     assert torch.equal(found[0], expected.score)
     assert torch.equal(found[1], expected.index)
 
 
-@pytest.mark.usefixtures("always")
 def test_equals_the_scan_in_random_cases() -> None:
     for seed in range(3):
         draw, generator = random.Random(seed), torch.Generator().manual_seed(seed)
@@ -83,50 +69,7 @@ def test_a_distance_that_is_not_finite_means_what_it_means_in_a_scan() -> None:
         rows[0][0, 5], rows[1][1] = value, value
         expected = best_match(route.combine(rows))
         with patch.object(TemplateMap, "distances", return_value=rows):
-            found = route.lowest(torch.rand(3, 2))
-        assert found is not None
-        score, place = found
+            score, place = in_layers(route, torch.rand(3, 2))
         assert torch.equal(place, expected.index)
         assert torch.equal(score.nan_to_num(-1, -2), expected.score.nan_to_num(-1, -2))
         assert place[1] == -1
-
-
-def test_localize_takes_it_and_gives_what_the_scan_gives() -> None:
-    features = (torch.arange(60_000)[:, None] % torch.tensor([210, 286])).float()
-    model = template_model(periods=Fixed(*LONG)).learn(features)
-    queries = features[torch.tensor([17, 30_029, 4000])] + torch.tensor([[0.1], [0.2], [0.3]])
-    with patch.object(TemplateMap, "scores", side_effect=AssertionError("all scores")):
-        found = model.localize(queries)
-    assert found.index.tolist() == [17, 30_029, 4000]
-    scores = model.map.scores(queries)
-    assert torch.equal(found.score, scores.amin(1))
-    # everything that needs other scores makes them
-    seen: list[tuple[int, ...]] = []
-    model.localize_descriptors(queries, Matching(on_scores=lambda scores: seen.append(tuple(scores.shape))))
-    assert seen == [(3, 60_000)]
-    assert torch.equal(model.candidates(queries, k=2).index[:, 0], found.index)
-    assert model.localize(queries, sequence=SequenceMatcher(1)).index.tolist() == found.index.tolist()
-
-
-def test_a_map_it_is_not_worth_for_has_no_such_way() -> None:
-    one, other = LONG
-
-    def lowest_of(*plan: FrequencyLayer, **settings: float) -> object:
-        blocks = [torch.rand(layer.phases, len(layer.features)) for layer in plan]
-        return TemplateMap(plan, blocks, 60_000, 2, **settings).lowest(torch.rand(2, 2))  # type: ignore[arg-type]
-
-    assert lowest_of(one, other) is not None
-    assert lowest_of(one, other, temperature=1.0) is None
-    assert lowest_of() is None
-    assert lowest_of(one, replace(other, start=1)) is None
-    assert lowest_of(replace(one, stop=1024), replace(other, stop=1024)) is None
-    assert lowest_of(one, other, FrequencyLayer(Fraction(289), 289, 0, 60_000, (0, 1))) is None
-
-
-def test_a_map_of_ten_million_places_holds_its_templates_alone() -> None:
-    plan = tuple(FrequencyLayer(Fraction(p), p, 0, 10**7, (j,)) for j, p in enumerate((3163, 3164)))
-    route = TemplateMap(plan, [torch.rand(layer.phases, 1) for layer in plan], 10**7, 2)
-    assert route.lowest(torch.rand(1, 2)) is not None
-    assert route.summary().covered == 10**7
-    held = [*route.buffers(), *_circles(3164, 3163, route.layers.device)]
-    assert sum(tensor.nbytes for tensor in held) < 300_000
