@@ -26,7 +26,7 @@ from dejavu_torch.features.views import (
     augmented_route,
     augmented_segments,
 )
-from dejavu_torch.features.whitening import INDEPENDENT, STRENGTHS, Whitening
+from dejavu_torch.features.whitening import INDEPENDENT, MOST_VIEWS, STRENGTHS, Whitening
 from dejavu_torch.maps.file import part_of, read_map, write_map
 from dejavu_torch.maps.place_map import Mapper, PlaceMap
 from dejavu_torch.maps.spectral import SpectralMapper, code_chunk
@@ -136,16 +136,16 @@ class Describer(NamedTuple):
         source = "" if second is None else f"by {second.traverse.name}"
         if second is None and not is_ready(traverse) and whitening.views != 0:
             copies = whitening.copies(*features.shape)
-            settings = copies, whitening.most_views, whitening.strengths, whitening.seed
+            settings = copies, MOST_VIEWS, whitening.strengths, whitening.seed
             second, source = augmented_route(traverse, len(features), *settings)
-        groups = (None, None) if is_ready(traverse) else groups_of(self.pipeline)
+        groups = None if is_ready(traverse) else groups_of(self.pipeline)
         if second is None:
-            whitening.learn(features, None, *groups)
+            whitening.learn(features, None, groups)
         else:
             samples = INDEPENDENT * len(features) if isinstance(second.traverse, AugmentedTraverse) else None
             batches = self.features(second.traverse, label and f"learning what changes: {source}")
             shown = _with_places(batches, second.places.to(self.device))
-            whitening.learn(features, shown, *groups, samples)
+            whitening.learn(features, shown, groups, samples)
         whitening.to(self.device)
 
     def visits(self, views: Views, label: str | None = None) -> tuple[Tensor, Tensor]:

@@ -211,13 +211,6 @@ MUTANTS = [
         ("tests/features/test_preprocess.py::test_patches_equal_a_literal_loop",),
     ),
     Mutant(
-        "A power of the whitening acts on the size of each number and keeps its sign.",
-        "dejavu_torch/features/whitening.py",
-        "whitened = whitened.sign() * whitened.abs().clamp(min=LEAST) ** self.power",
-        "whitened = whitened.abs().clamp(min=LEAST) ** self.power",
-        ("tests/features/test_whitening.py::test_a_power_of_whitened_numbers",),
-    ),
-    Mutant(
         "Without views the constant number of a whitened descriptor is the root mean square of the kept "
         "ones.",
         "dejavu_torch/features/whitening.py",

@@ -291,30 +291,16 @@ MUTANTS = [
     Mutant(
         "A whitening learns each member of joined features by itself.",
         "dejavu_torch/learning.py",
-        "groups = (None, None) if is_ready(traverse) else groups_of(self.pipeline)",
-        "groups = (None, None)",
+        "groups = None if is_ready(traverse) else groups_of(self.pipeline)",
+        "groups = None",
         ("tests/features/test_joined.py::test_a_whitening_takes_the_groups_of_the_features",),
     ),
     Mutant(
         "Ready features do not have the groups of features that are not run.",
         "dejavu_torch/learning.py",
-        "groups = (None, None) if is_ready(traverse) else groups_of(self.pipeline)",
+        "groups = None if is_ready(traverse) else groups_of(self.pipeline)",
         "groups = groups_of(self.pipeline)",
         ("tests/features/test_joined.py::test_ready_features_have_no_groups_but_those_that_are_asked_for",),
-    ),
-    Mutant(
-        "A share is the part of its numbers that a whitening keeps of a member.",
-        "dejavu_torch/features/whitening.py",
-        "kept = math.ceil(share * (self.group_numbers or kept))",
-        "kept = math.ceil(self.group_numbers or kept)",
-        ("tests/features/test_joined.py::-k share",),
-    ),
-    Mutant(
-        "A share is a member's squared length beside the others.",
-        "dejavu_torch/features/whitening.py",
-        "weights = [math.sqrt(share) for share in shares]",
-        "weights = [share for share in shares]",
-        ("tests/features/test_joined.py::-k squared_length",),
     ),
     Mutant(
         "By default a map holds what 5 bytes per place hold, if that is more than .85.",
