@@ -20,7 +20,7 @@ from dejavu_torch.data.source import Source, as_traverse
 from dejavu_torch.features.views import Views
 from dejavu_torch.maps.file import checksums, digests
 from dejavu_torch.maps.frame_table import FrameTable
-from dejavu_torch.maps.spectral import HALF, SpectralMapper, code_chunk
+from dejavu_torch.maps.spectral import SpectralMapper, code_chunk
 from dejavu_torch.maps.spectral_map import LARGEST, Chunk, SpectralMap
 from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import Recipe, difference, recipe_of, run_key, weights_of
@@ -30,7 +30,6 @@ from dejavu_torch.types import InputError, Traverse
 log = logging.getLogger("dejavu_torch")
 
 EXACT = 2**24  # maximum number of even steps, with exact positions in float32
-LOGGED_DIFFERENCE = 0.1  # between two shares of variance
 
 
 @torch.no_grad()
@@ -92,25 +91,10 @@ def append(
     if len(positions):
         grown.positions = torch.cat([route.positions, positions_behind(positions, route.places)])
     grown.check()
-    _warn_held(route, grown, getattr(model.mapper, "hold", None))
     frames = len(positions) or places
     names = [model.frame_names, names_of(source_of(added), frames)]
     model.frame_names = _joined_names(names, [route.table.frames, frames])
     return model.replace_map(grown)
-
-
-def _warn_held(before: SpectralMap, grown: SpectralMap, hold: float | None) -> None:
-    """Warn if the appended places hold another share of their variance in the map's step than those before.
-    A file does not store that share: `hold` of the mapper then replaces it, or else one half."""
-    energy, error = grown.energy - before.energy, grown.error - before.error
-    if energy <= 0:  # all equal the mean
-        return
-    held = 1 - error / energy
-    usual = hold if before.held is None and not before.resolution else before.held
-    if held < HALF if usual is None else abs(held - usual) > LOGGED_DIFFERENCE:
-        earlier = "" if usual is None else f", those before {usual:.2g}"
-        line = "the %d places appended hold %.2g of their variance in the map's step%s"
-        log.warning(line, grown.places - before.places, held, earlier)
 
 
 def learn_mean(

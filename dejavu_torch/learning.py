@@ -42,7 +42,6 @@ SAMPLE = 10_000  # frames that a longer route is fitted on
 MIN_SEGMENTS = 4  # of a sample
 ROWS = 4096  # descriptors on the device at a time
 DESCRIPTOR_MEMORY = IN_MEMORY // 4  # bytes of descriptors kept in memory
-LOGGED_DEVIATION = 0.02  # from the bytes per place, or the share, that the user set
 MAX_SEGMENT = 512  # consecutive queries in a calibration
 SEGMENT_SCORES = 2**22  # maximum, queries of a segment x places
 CALIBRATION_SCORES = 2**30  # maximum, frames of a calibration x places
@@ -367,7 +366,6 @@ class Checkpoint:
         if whitening is not None:
             whitening.load_state_dict(part_of(tensors, "whitening"))
         route.load_packed(part_of(tensors, "map"), state["map"])
-        route.needed, route.energy, route.error = state["needed"], state["energy"], state["error"]
         return True
 
     def check_unused(self) -> None:
@@ -386,8 +384,7 @@ class Checkpoint:
         tensors = {f"map.{name}": tensor for name, tensor in route.packed().items()}
         if whitening is not None:
             tensors |= {f"whitening.{name}": tensor for name, tensor in whitening.state_dict().items()}
-        state = {name: getattr(route, name) for name in ("needed", "energy", "error")}
-        state |= {"map": route.get_extra_state(), "seen": traverse.state(0, places)}
+        state = {"map": route.get_extra_state(), "seen": traverse.state(0, places)}
         write_map(self.path, tensors, {"run": dict(self.key), "state": state})
         self.written, self.kept = monotonic(), places
 
@@ -422,9 +419,8 @@ def fit(
     rows = describer.reference(Selection(traverse, sample.frame), own, label and "sampling")
     if visits is not None:
         rows = describer.averaged(rows, views_of(visits, sample.frame))
-    share = len(rows) / frames  # of the fixed bytes, charged to the sample
-    fitted = mapper.with_overhead(round(share * mapper.overhead)).fit(rows, sample.segment, share)
-    return fitted.to(describer.device)
+    # the sample is charged its share of the fixed bytes
+    return mapper.fit(rows, sample.segment, len(rows) / frames).to(describer.device)
 
 
 def append_places(
@@ -483,26 +479,6 @@ def learn_descriptors(mapper: Mapper, descriptors: Tensor) -> PlaceMap:
         seen = f"{type(mapper).__name__} made a map of {route.places} places and {route.dimension} features"
         raise InputError(f"{seen} from features {tuple(descriptors.shape)}; expected the same numbers")
     return route
-
-
-def log_reached(route: SpectralMap, mapper: SpectralMapper) -> None:
-    """Warn if the bytes of a long route, or the variance that it holds, differ from what was set."""
-    hold, held = mapper.share, route.held or 0
-    more = mapper.hold is None and held > (hold or 0)  # the default may hold more
-    if hold is not None and not mapper.resolution and abs(held - hold) > LOGGED_DEVIATION and not more:
-        seen = "hold is %g, but the lines hold %.3g of the variance: the step is fitted on %d of %d places"
-        log.warning(seen, *(hold, held, SAMPLE, route.places))
-    wanted, places, summary = mapper.route_bytes_per_place, route.places, route.summary()
-    if wanted is None or summary.route_bytes - summary.route["lines"] >= wanted * places:
-        return
-    overhead = mapper.overhead if 2 * mapper.overhead <= wanted * places else 0
-    reached = (summary.route_bytes + overhead) / places
-    if abs(reached / wanted - 1) > LOGGED_DEVIATION:
-        log.warning(
-            "route_bytes_per_place is %g, but the route takes %.3g, for %.0f %% of its variance: the step is "
-            "fitted on %d of its %d places",
-            *(wanted, reached, 100 * held, SAMPLE, places),
-        )
 
 
 def with_visits(means: Tensor, counts: Tensor, rows: Tensor, places: Tensor) -> Tensor:

@@ -193,7 +193,7 @@ class DejaVu(nn.Module):
         """
         traverse = self.resample(as_traverse(traverse), progress=progress)
         describer, label = self._describer_of(traverse), "learning" if progress else None
-        mapper = self.mapper.with_overhead(learning.positions_of(traverse).nbytes)
+        mapper = self.mapper
         route: PlaceMap
         counts: Tensor | None = None
         if visits is not None:
@@ -207,7 +207,6 @@ class DejaVu(nn.Module):
             if not resumed:
                 route = learning.fit(mapper, describer, traverse, second, visits, label)
             learning.append_places(route, describer, traverse, 0, visits, label, checkpoint, code)
-            learning.log_reached(route, mapper)
         else:
             if checkpoint is not None:
                 checkpoint.check_unused()
@@ -228,8 +227,7 @@ class DejaVu(nn.Module):
             traverse: their source, if known: it tells the map which frames to expect, and the frame of each
                 resampled place.
         """
-        mapper = self.mapper.with_overhead(learning.positions_of(traverse).nbytes)
-        return self._keep_map(learning.learn_descriptors(mapper, features), traverse)
+        return self._keep_map(learning.learn_descriptors(self.mapper, features), traverse)
 
     def describe_reference(
         self, traverse: Traverse, second: Views | None = None, progress: bool = False

@@ -212,7 +212,3 @@ class Mapper(nn.Module, ABC):
     @abstractmethod
     def empty(self) -> PlaceMap:
         """A map without places, which can load any map of this mapper."""
-
-    def with_overhead(self, overhead: int) -> Mapper:
-        """A mapper whose budget, if it has one, includes this many other bytes that grow with the places."""
-        return self

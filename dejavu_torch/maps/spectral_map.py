@@ -44,16 +44,11 @@ CHUNK_BYTES = 8 + 4 + 8 + 8  # a chunk's length, step, stream length and checksu
 
 
 class Chunk(NamedTuple):
-    """Consecutive places as a file stores them.
-
-    energy, error: the sums of squares of all lines and of the quantisation errors; 0 if not known.
-    """
+    """Consecutive places as a file stores them."""
 
     places: int
     step: float
     stream: Stream
-    energy: float = 0.0
-    error: float = 0.0
 
 
 class SpectralState(NamedTuple):
@@ -94,8 +89,7 @@ class SpectralMap(PlaceMap):
         norms: (N,) float32, of the coded descriptors; tiny ones are 0 (`MIN_NORM`).
 
     Attributes:
-        chunks: the places [start, stop) of each. energy, error: see `Chunk`, summed over added chunks.
-        needed: bytes per place to hold .85 of the variance, if the map was learned and holds less than half.
+        chunks: the places [start, stop) of each.
 
     Args:
         means: as above; None makes a map that can load any state.
@@ -123,7 +117,6 @@ class SpectralMap(PlaceMap):
     feature: Tensor
     level: Tensor
     norms: Tensor
-    needed: float | None = None
 
     def __init__(
         self,
@@ -161,7 +154,7 @@ class SpectralMap(PlaceMap):
         self.level, self.norms = self.lengths.to(torch.int8), self.lengths.float()
         self.chunks: list[tuple[int, int]] = []
         self._bounds = [0]  # of each chunk's coefficients
-        self.places, self.energy, self.error = 0, 0.0, 0.0
+        self.places = 0
 
     def extend(self, chunks: Iterable[Chunk], levels: Iterable[Tensor] | None = None) -> None:
         """Add the places of coded chunks; the scores of the others do not change.
@@ -201,7 +194,6 @@ class SpectralMap(PlaceMap):
             self.chunks.append((self.places, self.places + chunk.places))
             self._bounds.append(self._bounds[-1] + len(level))
             self.places += chunk.places
-            self.energy, self.error = self.energy + chunk.energy, self.error + chunk.error
         append("norms", *map(self._norms_of, range(len(self.chunks) - len(chunks), len(self.chunks))))
         if not self.norms.isfinite().all():
             raise InputError("the map does not fit together: its descriptors are not finite")
@@ -216,11 +208,6 @@ class SpectralMap(PlaceMap):
         """The route of each chunk."""
         starts = torch.tensor([self.chunks[g][0] for g in chunks], device=self.means.device)
         return self.table.route_of(starts) if self.routes else torch.zeros_like(starts)
-
-    @property
-    def held(self) -> float | None:
-        """The share of the variance that the lines hold, over added chunks; None if there are none."""
-        return 1 - self.error / self.energy if self.energy else None
 
     def coded(self) -> list[Chunk]:
         """The chunks as a file stores them, for `extend`."""

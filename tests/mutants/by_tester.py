@@ -107,20 +107,6 @@ MUTANTS = [
         ("tests/test_behaviour.py::test_a_frequency_is_one_period_of_a_summary",),
     ),
     Mutant(
-        "Positions that take over half of what the budget leaves for the lines come on top of it.",
-        "dejavu_torch/maps/spectral.py",
-        "if self.overhead <= max(0, budget * places - fixed) / 2:",
-        "if self.overhead <= max(0, budget * places - fixed):",
-        ("tests/maps/test_spectral.py::test_positions_leave_the_lines_half_of_what_mean_and_chunks_leave",),
-    ),
-    Mutant(
-        "A map whose bytes hold under half of its route tells what would hold .85 of it, and no other does.",
-        "dejavu_torch/maps/spectral.py",
-        "if self.share is None and even.held(step) < HALF:",
-        "if self.share is None and even.held(step) > HALF:",
-        ("tests/maps/test_spectral.py::test_noise_tells_what_would_hold_its_variance",),
-    ),
-    Mutant(
         "The lines hold at least the share that is asked for.",
         "dejavu_torch/maps/quantisation.py",
         "self._bisect(self.held, math.nextafter(share, 0))[0]",
@@ -133,13 +119,6 @@ MUTANTS = [
         "lines.even().step_that_holds(self.hold or HELD)",
         "lines.step_that_holds(self.hold or HELD)",
         ("tests/maps/test_spectral.py::test_the_lines_hold_the_share_that_is_asked_for",),
-    ),
-    Mutant(
-        "Where no share is known, it is told if places behind hold less than half.",
-        "dejavu_torch/growth.py",
-        "held < HALF if usual is None",
-        "False if usual is None",
-        ("tests/test_growth.py::-k unlike_before",),
     ),
     Mutant(
         "Levels that are altered are noticed by their checksum.",
