@@ -397,7 +397,7 @@ class SpectralMap(PlaceMap):
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         super().set_extra_state(state)
-        self.routes = checked(state.get("routes", ()), tuple[Route, ...], "the map's routes")
+        self.routes = checked(state["routes"], tuple[Route, ...], "the map's routes")
 
     def check(self) -> None:
         for name, (dtype, ndim) in FILE.items():

@@ -89,10 +89,10 @@ MUTANTS = [
         ("tests/maps/test_codec.py::-k too_many or anything",),
     ),
     Mutant(
-        "A map file of an older format is refused with a line that says to learn the route again.",
+        "A map file of an older format is refused.",
         "dejavu_torch/maps/file.py",
-        "if version != FORMAT:",
-        "if version > FORMAT:",
+        'if (version := sealed["version"]) != FORMAT:',
+        'if (version := sealed["version"]) > FORMAT:',
         ("tests/maps/test_file.py::test_what_is_no_map_is_refused",),
     ),
     Mutant(
