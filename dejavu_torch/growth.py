@@ -72,7 +72,7 @@ def append(
     added = model.resample(as_traverse(traverse), model.step, progress, model.frame_shape)
     _check_compatible(model, added)
     places = added.count()
-    positions = learning.positions_of(added).to(route.positions.device)
+    positions = learning.positions_of(added).to(route.device)
     _check_count(route.places + places, model.step is not None)
     counts = None
     if visits is not None:
@@ -158,7 +158,7 @@ def average(model: DejaVu, visits: Views, progress: bool = False) -> int:
         inside = ((places >= start) & (places < stop)).nonzero()[:, 0]
         if not len(inside):
             return chunk
-        rows = descriptors[inside].to(route.means.device)
+        rows = descriptors[inside].to(route.device)
         means = learning.with_visits(route.decode(g), counts[start:stop], rows, places[inside] - start)
         return code_chunk(means, route.means[0], chunk.step, route.transform, route.resolution)
 

@@ -248,7 +248,7 @@ class DejaVu(nn.Module):
         pixels = math.prod(own_size(self.features) or (1,))  # larger frames, smaller batches
         batch = max(1, min(self.batch_size, BATCH_NUMBERS // (3 * pixels)))
         pipeline = Pipeline(self.preprocess, self.features)
-        return learning.Describer(pipeline, self.whitening, batch, self.map.positions.device, self._warned)
+        return learning.Describer(pipeline, self.whitening, batch, self.map.device, self._warned)
 
     def _describer_of(self, traverse: Traverse) -> learning.Describer:
         """As `describer`, for learning from a traverse: with a copy of a whitening that is not fixed, or with
@@ -258,7 +258,7 @@ class DejaVu(nn.Module):
             whitening = copy.deepcopy(whitening)
         wide = learning.is_ready(traverse) and traverse.frame_shape[0] > WIDEST
         if whitening is None and wide and isinstance(self.mapper, SpectralMapper):
-            whitening = Whitening(views=0).to(self.map.positions.device)
+            whitening = Whitening(views=0).to(self.map.device)
         return self.describer._replace(whitening=whitening)
 
     def _keep_whitening(self, learned: Whitening | None) -> None:
@@ -337,7 +337,7 @@ class DejaVu(nn.Module):
             log.warning(line, route.dimension)
         if len(shape) == 1 and (self.preprocess.channel or self.preprocess.contrast):
             log.warning("these are ready features: channel and contrast have no effect")
-        device, positions = self.map.positions.device, learning.positions_of(traverse)
+        device, positions = self.map.device, learning.positions_of(traverse)
         route = route.to(device)  # many descriptors are in a file, on the CPU
         if len(positions):
             route.positions = positions.to(device)
@@ -472,7 +472,7 @@ class DejaVu(nn.Module):
             return localizer(descriptors, label)
         matcher, place = Localizer(None, matching), order.argsort()
         parts = descriptors.split(max(1, SCORES_AT_ONCE // self.map.places))
-        scores = (self.map.scores(part.to(self.map.positions.device)) for part in with_progress(parts, label))
+        scores = (self.map.scores(part.to(self.map.device)) for part in with_progress(parts, label))
         with torch.no_grad():
             return Match.joined(matcher.match(part[:, place.to(part.device)]) for part in scores)
 

@@ -12,7 +12,7 @@ from matplotlib.colors import LogNorm
 from torch import Tensor
 from torch.nn.functional import max_pool1d
 
-from dejavu_torch.data.ground_truth import GroundTruth, counted, is_right
+from dejavu_torch.data.ground_truth import GroundTruth, scored_and_right
 from dejavu_torch.data.positions import look_up
 from dejavu_torch.evaluation import plots
 from dejavu_torch.evaluation.contenders import COLOURS
@@ -70,9 +70,8 @@ def example_queries(match: Match, truth: GroundTruth | None, tolerance: int) -> 
     if truth is None:
         groups = {"surest answer": reported}
     else:
-        scored = reported & counted(match.index, truth, tolerance)
-        right = is_right(match.index, truth.positives, tolerance)
-        groups = {"surest right answer": scored & right, "surest wrong answer": scored & ~right}
+        scored, right = scored_and_right(match.index, truth, tolerance)
+        groups = {"surest right answer": right, "surest wrong answer": reported & scored & ~right}
     if rejected.any():
         groups["surest not accepted"] = rejected
     else:
@@ -135,8 +134,7 @@ def draw_coverage(
     probability = match.probability if truth is None and reported.any() else None
     missing, groups = ~reported, []
     if truth is not None:
-        scored = counted(match.index, truth, tolerance)
-        right = scored & is_right(match.index, truth.positives, tolerance)
+        scored, right = scored_and_right(match.index, truth, tolerance)
         wrong = scored & reported & ~right
         groups.append((reported & ~scored, plots.GREY, 3, f"{(~scored).sum()} not scored"))
         groups.append((wrong, plots.WRONG, 3, f"{wrong.sum()} wrong"))

@@ -116,10 +116,15 @@ class PlaceMap(nn.Module, ABC):
         return self.table.place_of(frames)
 
     @property
+    def device(self) -> torch.device:
+        """Where the buffers are."""
+        return self.positions.device
+
+    @property
     def visit_counts(self) -> Tensor:
         """(N,) int64, number of visits that each place averages."""
         if not len(self.visits):
-            return torch.ones(self.places, dtype=torch.int64, device=self.visits.device)
+            return torch.ones(self.places, dtype=torch.int64, device=self.device)
         runs, counts = self.visits.long().unbind(1)
         return counts.repeat_interleave(runs)
 

@@ -168,7 +168,7 @@ class SpectralMap(PlaceMap):
         chunks = [*chunks]
         if not chunks:
             return
-        places, device = [one.places for one in chunks], self.means.device
+        places, device = [one.places for one in chunks], self.device
         if levels is None:
             with ThreadPoolExecutor(torch.get_num_threads()) as pool:
                 parts = [*pool.map(lambda c: _nonzero(decode(c.stream, c.places, self.dimension)), chunks)]
@@ -206,7 +206,7 @@ class SpectralMap(PlaceMap):
 
     def _routes_of(self, chunks: range) -> Tensor:
         """The route of each chunk."""
-        starts = torch.tensor([self.chunks[g][0] for g in chunks], device=self.means.device)
+        starts = torch.tensor([self.chunks[g][0] for g in chunks], device=self.device)
         return self.table.route_of(starts) if self.routes else torch.zeros_like(starts)
 
     def coded(self) -> list[Chunk]:
@@ -277,7 +277,7 @@ class SpectralMap(PlaceMap):
     def _features(self, chunk: int) -> Iterator[Tensor]:
         """The coded descriptors of a chunk, some of their features at a time: (F,W) each."""
         start, stop = self.chunks[chunk]
-        units = torch.eye(self.dimension, dtype=torch.float32, device=self.means.device)
+        units = torch.eye(self.dimension, dtype=torch.float32, device=self.device)
         for some in units.split(max(1, LONG // (stop - start))):
             yield self.products(some, range(chunk, chunk + 1))
 
@@ -300,13 +300,8 @@ class SpectralMap(PlaceMap):
         """The places in a chunk nearest to M = `count` even positions, (M,) int64."""
         start, stop = self.chunks[chunk]
         half = 0.5 if self.transform == "dct" else 0.0  # DCT places are in the middle of a step
-        at = (torch.arange(count, device=self.norms.device) + half) * ((stop - start) / count) - half
+        at = (torch.arange(count, device=self.device) + half) * ((stop - start) / count) - half
         return at.round().long().clamp(max=stop - start - 1)
-
-    def inverse_norms(self, start: int = 0, stop: int | None = None) -> Tensor:
-        """1 / norm of the places [start, stop), 0 for a norm of 0."""
-        norms = self.norms[start:stop]
-        return torch.where(norms > 0, 1 / norms, 0)
 
     def products(self, queries: Tensor, chunks: range) -> Tensor:
         """Inner products with all descriptors of G chunks of equal length W: (Q,K) -> (Q,W G).
@@ -375,12 +370,7 @@ class SpectralMap(PlaceMap):
         for run in self._runs(*self._span(start, stop), rows):
             begin, end = self.chunks[run.start][0], self.chunks[run.stop - 1][1]
             products = self.products(queries, run)
-            if self.metric == "cosine":
-                inverse = self.inverse_norms(begin, end).to(queries)
-                scores = torch.addcmul(queries.new_ones(()), products, inverse, value=-1)
-            else:
-                square = self.norms[begin:end].to(queries).square()
-                scores = (square - 2 * products + length.square()).clamp(min=0)
+            scores = scores_of(products, self.norms[begin:end], length, self.metric)
             low, high = max(start, begin), min(stop, end)
             yield low, scores[:, low - begin : high - begin]
 
@@ -468,6 +458,17 @@ class SpectralMap(PlaceMap):
             f"places={self.places}, dimension={self.dimension}, lines={len(self.level)}, "
             f"chunks={len(self.chunks)}, metric={self.metric!r}, transform={self.transform!r}"
         )
+
+
+def scores_of(products: Tensor, norms: Tensor, length: Tensor, metric: SpectralMetric) -> Tensor:
+    """Scores of places from their inner products with queries, for "cosine" with queries of length 1 or 0.
+
+    Shape: products (Q,N); norms of the places, (N,) or (Q,N); length of the queries (Q,1), for "l2" -> (Q,N).
+    """
+    if metric == "cosine":
+        inverse = torch.where(norms > 0, 1 / norms, 0).to(products)
+        return torch.addcmul(products.new_ones(()), products, inverse, value=-1)
+    return (norms.to(products).square() - 2 * products + length.square()).clamp(min=0)
 
 
 def sparse_products(queries: Tensor, counts: Tensor, feature: Tensor, level: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dejavu_torch.maps.place_map import PlaceMap
-from dejavu_torch.maps.spectral_map import SpectralMap
+from dejavu_torch.maps.spectral_map import SpectralMap, scores_of
 from dejavu_torch.maps.spectrum import half_cycles
 from dejavu_torch.recognition.search import Best, Wanted, empty_topk, num_needed, search
 from dejavu_torch.recognition.select import best_candidates
@@ -189,7 +189,7 @@ class CoarseSearch:
         self, route: SpectralMap, chosen: Plan, kept: Mapping[str, Tensor] = MappingProxyType({})
     ) -> None:
         self.route, self.plan, self.exact = route, chosen, chosen.fine == 1
-        self.starts = torch.tensor([start for start, _ in route.chunks], device=route.norms.device)
+        self.starts = torch.tensor([start for start, _ in route.chunks], device=route.device)
         self.fine = Samples(route, chosen.fine, kept.get("fine"))
         self.coarse = self.fine if self.exact else Samples(route, chosen.coarse, kept.get("coarse"))
         self.middle = torch.searchsorted(self.fine.place, self.coarse.place, out_int32=True)
@@ -280,9 +280,8 @@ class CoarseSearch:
                 own, row = query.unique_consecutive(return_inverse=True)
                 here = self.route.products(units[own], range(g, g + 1))
                 products[query, column] = here[row, place[query, column] - self.route.chunks[g][0]]
-        norms = self.route.norms[place]
-        inverse = torch.where(norms > 0, 1 / norms, 0).masked_fill(place < 0, 1)
-        return torch.addcmul(products.new_ones(()), products, inverse, value=-1)
+        norms = self.route.norms[place].masked_fill(place < 0, 1)
+        return scores_of(products, norms, norms, "cosine")
 
     def _worst(self, found: Best, wanted: Wanted) -> Tensor:
         """The highest score of the wanted candidates, (Q,); +inf if not all were found."""

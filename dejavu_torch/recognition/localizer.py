@@ -101,7 +101,7 @@ class Localizer:
         if not self.models and matching.on_scores is None and few:
             way, size = partial(self._by_search, wanted), max(PER_BEST * n, places // PLACES_PER_NUMBER)
         parts = descriptors.split(max(1, min(ROWS, SCORES_AT_ONCE // size)))
-        return Match.joined(way(part.to(route.positions.device)) for part in with_progress(parts, label))
+        return Match.joined(way(part.to(route.device)) for part in with_progress(parts, label))
 
     @torch.no_grad()
     def match(self, scores: Tensor) -> Match:

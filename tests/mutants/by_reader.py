@@ -70,8 +70,8 @@ MUTANTS = [
     Mutant(
         "A score of metric l2, the square of a distance, is never below 0, whatever rounding does.",
         "dejavu_torch/maps/spectral_map.py",
-        "scores = (square - 2 * products + length.square()).clamp(min=0)",
-        "scores = square - 2 * products + length.square()",
+        "return (norms.to(products).square() - 2 * products + length.square()).clamp(min=0)",
+        "return norms.to(products).square() - 2 * products + length.square()",
         ("tests/test_behaviour.py::test_a_squared_distance_is_never_below_0",),
     ),
     Mutant(

@@ -342,8 +342,8 @@ MUTANTS = [
     Mutant(
         "A long route is learned from a sample of all of its length.",
         "dejavu_torch/learning.py",
-        "starts = torch.arange(count) * last // (count - 1) * segment",
-        "starts = torch.arange(count) * segment",
+        "starts = torch.arange(count) * (frames // length - 1) // max(1, count - 1) * length",
+        "starts = torch.arange(count) * length",
         ("tests/test_learning.py::test_convention_the_sample_is_evenly_spaced_and_of_whole_chunks",),
     ),
     Mutant(
@@ -363,8 +363,8 @@ MUTANTS = [
     Mutant(
         "An ignored place that is within the tolerance of a right one is right.",
         "dejavu_torch/data/ground_truth.py",
-        "return truth.judged & (is_right(index, truth.positives, tolerance) | ~ignored)",
-        "return truth.judged & ~ignored",
+        "return right | truth.judged & ~is_right(index, truth.ignored, 0), right",
+        "return truth.judged & ~is_right(index, truth.ignored, 0), right",
         ("tests/evaluation/test_curves.py::test_a_soft_place_within_the_tolerance_of_a_right_one_is_right",),
     ),
     Mutant(
