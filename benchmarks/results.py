@@ -78,17 +78,11 @@ IN_ORDER = (  # a route of each kind, long enough for sequences of 21
     *("city 1", "city 2", "laps", "railway, first half", "railway, second half", "road, second half"),
     *("sim:aerial, seed 0", "sim:outdoor, seed 0", "sim:underground, seed 0"),
 )
-SEEDED = ("default", "HOG and pixels")  # run with all seeds, the others with the first
+SEEDED = ("default",)  # run with all seeds, the others with the first
 SECOND = "railway, second half"
-PIXELS = (
-    "{class_path: dejavu_torch.features.joined.Joined, init_args: {shares: [1, .5], members: "
-    "[{class_path: dejavu_torch.HOG}, {class_path: PatchPixels, init_args: "
-    "{size: [24, 48], channel: grey}}]}}"
-)
 WAYS = {  # options of `dejavu compare`; {default} and {visits} are folders of maps
     "default": "--storage_curve",
     "HOG": "--features HOG --calibration none",
-    "HOG and pixels": f"--features {shlex.quote(PIXELS)} --calibration none",
     "filter": "--map {default}/{footage}/map.safetensors --filter",
     "sequence": "--map {default}/{footage}/map.safetensors --sequence 21",
     "visits": "--whitening {visits}/first.safetensors --sequence 21 --storage_curve",

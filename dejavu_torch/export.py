@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from dejavu_torch.data.output import check_output_file, whole_file
 from dejavu_torch.features.extract import in_mode
-from dejavu_torch.maps.spectral_map import SpectralMap
+from dejavu_torch.maps.spectral_map import SpectralMap, scores_of
 from dejavu_torch.model import DejaVu, require_map
 from dejavu_torch.recognition.calibration import MARGIN
 from dejavu_torch.recognition.calibration import TOLERANCE as TOLERANCE_OF_MARGIN
@@ -56,7 +56,6 @@ class Decoded(nn.Module):
 
     descriptors: Tensor
     norms: Tensor
-    inverse_norms: Tensor
 
     def __init__(self, route: SpectralMap) -> None:
         super().__init__()
@@ -64,15 +63,12 @@ class Decoded(nn.Module):
         decoded = torch.cat([route.decode(g) for g in range(len(route.chunks))])
         self.register_buffer("descriptors", decoded.T.contiguous())
         self.register_buffer("norms", route.norms)
-        self.register_buffer("inverse_norms", route.inverse_norms())
 
     def forward(self, queries: Tensor) -> Tensor:
         length: Tensor = torch.linalg.vector_norm(queries, dim=1, keepdim=True)
         if self.metric == "cosine":
             queries = queries / torch.where(length > 0, length, 1)
-            return 1 - queries @ self.descriptors * self.inverse_norms
-        products = queries @ self.descriptors
-        return (length.square() - 2 * products + self.norms.square()).clamp(min=0)
+        return scores_of(queries @ self.descriptors, self.norms, length, self.metric)
 
 
 class Resized(nn.Module):
@@ -159,7 +155,7 @@ def export_onnx(model: DejaVu, path: str | Path, sequence: SequenceModel | None 
     if size > MAX_BYTES:
         seen = f"{model.map.places} places of {model.map.dimension} dimensions need {size / 1e9:.1f} GB"
         raise InputError(f"{seen}; expected at most {MAX_BYTES / 1e9:.1f} GB in an ONNX file")
-    device = model.map.positions.device
+    device = model.map.device
     graph = Graph(model, sequence)
     shape, generator = (TRIED, *model.frame_shape), torch.Generator().manual_seed(0)
     noise = torch.rand(shape, generator=generator, dtype=torch.float32).to(device)

@@ -19,7 +19,7 @@ from dejavu_torch.data.traverse import chained
 from dejavu_torch.features.views import Views
 from dejavu_torch.maps.file import checksums, digests
 from dejavu_torch.maps.frame_table import FrameTable
-from dejavu_torch.maps.spectral import HALF, SpectralMapper, code_chunk
+from dejavu_torch.maps.spectral import SpectralMapper, code_chunk
 from dejavu_torch.maps.spectral_map import LARGEST, Chunk, SpectralMap
 from dejavu_torch.model import DejaVu, features_per_frame, require_map
 from dejavu_torch.model_file import ModelState, Recipe, difference, recipe_of, run_key, weights_of
@@ -29,7 +29,6 @@ from dejavu_torch.types import InputError, Traverse
 log = logging.getLogger("dejavu_torch")
 
 EXACT = 2**24  # maximum number of even steps, with exact positions in float32
-LOGGED_DIFFERENCE = 0.1  # between two shares of variance
 
 
 @torch.no_grad()
@@ -72,7 +71,7 @@ def append(
     added = model.resample(as_traverse(traverse), model.step, progress, model.frame_shape)
     _check_compatible(model, added)
     places = len(added)
-    positions = learning.positions_of(added).to(route.positions.device)
+    positions = learning.positions_of(added).to(route.device)
     _check_count(route.places + places, model.step is not None)
     counts = None
     if visits is not None:
@@ -91,25 +90,10 @@ def append(
     if len(positions):
         grown.positions = torch.cat([route.positions, positions_behind(positions, route.places)])
     grown.check()
-    _warn_held(route, grown, getattr(model.mapper, "hold", None))
     frames = len(positions) or places
     names = [model.frame_names, [*source_of(added).names]]
     model.frame_names = _joined_names(names, [route.table.frames, frames])
     return model.replace_map(grown)
-
-
-def _warn_held(before: SpectralMap, grown: SpectralMap, hold: float | None) -> None:
-    """Warn if the appended places hold another share of their variance in the map's step than those before.
-    A file does not store that share: `hold` of the mapper then replaces it, or else one half."""
-    energy, error = grown.energy - before.energy, grown.error - before.error
-    if energy <= 0:  # all equal the mean
-        return
-    held = 1 - error / energy
-    usual = hold if before.held is None and not before.resolution else before.held
-    if held < HALF if usual is None else abs(held - usual) > LOGGED_DIFFERENCE:
-        earlier = "" if usual is None else f", those before {usual:.2g}"
-        line = "the %d places appended hold %.2g of their variance in the map's step%s"
-        log.warning(line, grown.places - before.places, held, earlier)
 
 
 def learn_mean(
@@ -173,7 +157,7 @@ def average(model: DejaVu, visits: Views, progress: bool = False) -> int:
         inside = ((places >= start) & (places < stop)).nonzero()[:, 0]
         if not len(inside):
             return chunk
-        rows = descriptors[inside].to(route.means.device)
+        rows = descriptors[inside].to(route.device)
         means = learning.with_visits(route.decode(g), counts[start:stop], rows, places[inside] - start)
         return code_chunk(means, route.means[0], chunk.step, route.transform, route.resolution)
 

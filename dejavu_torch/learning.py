@@ -22,6 +22,7 @@ from dejavu_torch.features.views import (
     Sample,
     Views,
     augmented_segments,
+    evenly_spaced,
     views_of,
 )
 from dejavu_torch.features.whitening import STRENGTHS
@@ -174,8 +175,8 @@ def fit(
     rows = descriptor.learn(Part(traverse, sample.frame), own, progress, label="sampling")
     if visits is not None:
         rows = averaged(descriptor, rows, views_of(visits, sample.frame), progress)
-    share = len(rows) / len(traverse)  # of the fixed bytes, charged to the sample
-    return mapper.fit(rows, sample.segment, share).to(descriptor.device)
+    # the sample is charged its share of the fixed bytes
+    return mapper.fit(rows, sample.segment, len(rows) / len(traverse)).to(descriptor.device)
 
 
 def append_places(
@@ -320,6 +321,5 @@ def _segments_of(views: Views, length: int, frames: int) -> Views:
     count, wanted = len(views.places) // length, max(1, frames // length)
     if count <= wanted:
         return views
-    starts = torch.arange(wanted) * (count - 1) // max(1, wanted - 1) * length
-    frame = (starts[:, None] + torch.arange(length)).flatten()
+    frame = evenly_spaced(len(views.places), length, wanted)
     return Views(Part(views.traverse, frame), views.places[frame.to(views.places.device)])

@@ -292,7 +292,7 @@ class DejaVu(nn.Module):
             log.warning(line, route.dimension)
         if len(shape) == 1 and (self.preprocess.channel or self.preprocess.contrast):
             log.warning("these are ready features: channel and contrast have no effect")
-        device, positions = self.map.positions.device, learning.positions_of(traverse)
+        device, positions = self.map.device, learning.positions_of(traverse)
         route = route.to(device)  # many descriptors are in a file, on the CPU
         if len(positions):
             route.positions = positions.to(device)
@@ -415,7 +415,7 @@ class DejaVu(nn.Module):
             return localizer(descriptors, label)
         matcher, place = Localizer(None, matching), order.argsort()
         parts = descriptors.split(max(1, SCORES_AT_ONCE // self.map.places))
-        scores = (self.map.scores(part.to(self.map.positions.device)) for part in with_progress(parts, label))
+        scores = (self.map.scores(part.to(self.map.device)) for part in with_progress(parts, label))
         with torch.no_grad():
             return Match.joined(matcher.match(part[:, place.to(part.device)]) for part in scores)
 

@@ -76,6 +76,11 @@ CLASSES: tuple[type[nn.Module], ...] = (
     GroundOdometry,
 )
 REGISTRY = {cls.__name__: cls for cls in CLASSES}
+# arguments that older files name and no class takes, with the only value that they may have
+GONE: Mapping[str, Mapping[str, Any]] = {
+    "Joined": {"shares": None},
+    "Whitening": {"most_views": 20_000, "power": 1.0, "group_numbers": None},
+}
 
 
 class Recipe(NamedTuple):
@@ -176,6 +181,19 @@ def _parts(recipe: Recipe) -> dict[str, list[Recipe]]:
         for name, ones in named.items()
         if any(isinstance(one, dict) and "class_path" in one for one in ones)
     }
+
+
+def without_gone(recipe: Recipe) -> Recipe:
+    """The recipe, and those nested in it, without the arguments in `GONE`; InputError for another value."""
+    name, gone = recipe.class_path, GONE.get(recipe.class_path, {})
+    arguments = {key: value for key, value in recipe.init_args.items() if key not in gone}
+    for key in gone.keys() & recipe.init_args.keys():
+        if (seen := recipe.init_args[key]) != gone[key]:
+            raise InputError(f"the map's {name} has {key} {seen!r:.40}; expected {gone[key]}")
+    for key, parts in _parts(recipe).items():
+        built = [without_gone(part)._asdict() for part in parts]
+        arguments[key] = built if isinstance(arguments[key], list) else built[0]
+    return Recipe(name, arguments)
 
 
 def difference(stored: Recipe, given: Recipe) -> str:
@@ -336,6 +354,7 @@ def opened(path: Path) -> Iterator[tuple[dict[str, Tensor], dict[str, Any]]]:
     tensors, values = read_map(path)
     try:
         header = checked_fields(values, HEADER, "its header")
+        header |= {name: without_gone(header[name]) for name in PARTS if header[name] is not None}
         known = [cls.kind for cls in REGISTRY.values() if issubclass(cls, Mapper)]
         if header["map"].get("kind") not in known:
             seen = f"a map of kind {header['map'].get('kind')!r:.40}"

@@ -170,23 +170,17 @@ def routes(draw: Callable, most_layers: int = 4) -> Route:
     return Route(values, tuple(plan))
 
 
-def joined_rows(
-    places: Sequence[Table],
-    queries: Sequence[Table],
-    kept: int,
-    level: float,
-    shares: Sequence[float] = (1, 1),
-) -> Tensor:
-    """Cosines (Q,N) of queries and places from their whitened members: each to the root of its share, side by
-    side, turned to the `kept` directions with the largest mean square over the places, and each number
-    divided by that power of its root mean square."""
+def joined_rows(places: Sequence[Table], queries: Sequence[Table], kept: int, level: float) -> Tensor:
+    """Cosines (Q,N) of queries and places from their whitened members: side by side, each of length 1, turned
+    to the `kept` directions with the largest mean square over the places, and each number divided by that
+    power of its root mean square."""
 
     def side_by_side(members: Sequence[Table]) -> list[list[float]]:
         rows = []
         for parts in zip(*members, strict=True):
             row: list[float] = []
-            for part, share in zip(parts, shares, strict=False):
-                length = math.sqrt(sum(number**2 for number in part) / share)
+            for part in parts:
+                length = math.sqrt(sum(number**2 for number in part))
                 row += [number / length for number in part]
             rows.append(row)
         return rows

@@ -179,19 +179,6 @@ def test_whitening_learns_from_several_visits(folder: Path) -> None:
     assert report_of(folder / "of_both")["recall_at_1"] > 0.9
 
 
-def test_a_route_of_noise_says_what_it_needs(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    source, options = folder / "noise.npy", ("--whitening", "none")
-    budget = "--mapper.route_bytes_per_place", "1"
-    run("learn", source, "--map", folder / "noise.safetensors", *options, *budget)
-    (line,) = [told for told in capsys.readouterr().out.splitlines() if "less than half" in told]
-    (needed,) = re.findall(r"about ([\d.]+) bytes per place would hold 0.85", line)
-    assert 15 < float(needed) < 30
-    run("compare", source, source, *options, *budget, "--out", folder / "noise")
-    assert line in capsys.readouterr().out.splitlines()
-    run("learn", source, "--map", folder / "n.safetensors", *options, *budget[:1], needed)
-    assert "less than half" not in capsys.readouterr().out
-
-
 def test_a_map_that_holds_a_share(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """By a word or a file; the map knows it, and a budget beside it is refused."""
     path, config = folder / "held.safetensors", folder / "hold.yaml"

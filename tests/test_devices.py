@@ -206,7 +206,7 @@ Visits = tuple[ArrayTraverse, ArrayTraverse]
 def test_a_map_learned_on_a_gpu_scores_as_that_of_the_cpu(kind: str, device: str, frames: Tensor) -> None:
     maps = [DejaVu(whitening="none", mapper=LEARNED[kind]).to(one).learn(frames) for one in ("cpu", device)]
     query = frames[3::4] * 0.9 + 0.02
-    scores, found = (model(query.to(model.map.positions.device)) for model in maps)
+    scores, found = (model(query.to(model.map.device)) for model in maps)
     assert found.device.type == device
     assert scores.isfinite().all()
     torch.testing.assert_close(found.cpu(), scores, rtol=1e-4, atol=1e-4)
@@ -218,7 +218,7 @@ def test_a_map_learned_on_a_gpu_scores_as_that_of_the_cpu(kind: str, device: str
 def test_a_whitening_learned_on_a_gpu_is_that_of_the_cpu(device: str, frames: Tensor) -> None:
     whitening = Whitening(numbers=8, views=2, bits=16)
     models = [DejaVu(whitening=copy.deepcopy(whitening)).to(one).learn(frames) for one in ("cpu", device)]
-    known = [model.descriptor.whitened(model.descriptor.describe(frames.to(model.map.positions.device))).cpu() for model in models]
+    known = [model.descriptor.whitened(model.descriptor.describe(frames.to(model.map.device))).cpu() for model in models]
     # up to the signs of its numbers, and what 16 bits round
     torch.testing.assert_close(known[1] @ known[1].T, known[0] @ known[0].T, rtol=1e-3, atol=1e-3)
 
@@ -305,7 +305,7 @@ def test_even_steps_are_learned_on_a_gpu(device: str) -> None:
     strip = nn.functional.interpolate(torch.rand(1, 1, 60, 16), scale_factor=4)[0]
     frames = torch.stack([strip[:, 2 * i : 2 * i + 64] for i in range(40)]).flip(0)
     model = small(velocity=GroundOdometry(step=3.0, size=(32, 32))).to(device).learn(frames)
-    assert model.map.positions.device.type == device
+    assert model.map.device.type == device
     shown = model.map.frame_of(model.localize(frames).index)
     assert (shown.device.type, int(shown.diff().min()) >= 0) == ("cpu", True)
     assert GroundOdometry().to(device)(frames[:3].to(device))[0].device.type == device

@@ -115,30 +115,6 @@ def test_the_old_places_stay_and_the_new_ones_are_found() -> None:
     assert (model.threshold, model.summary().places) == (0.25, 500)
 
 
-@pytest.mark.parametrize("settings", [{"hold": 0.9}, {"route_bytes_per_place": 3.0}])
-@pytest.mark.parametrize("stored", [True, False])
-def test_what_the_new_places_hold_is_told_where_it_is_unlike_before(
-    settings: dict[str, float], stored: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    """At the same step smaller numbers hold less. A file tells no share, but for that of `hold`."""
-    route = walk(400)
-
-    def grown(more: Tensor) -> str:
-        caplog.clear()
-        model = DejaVu(whitening="none", mapper=SpectralMapper(chunk=64, **settings)).learn(route)
-        if stored:
-            model.save(tmp_path / "m.safetensors")
-            model = DejaVu.load(tmp_path / "m.safetensors")
-        step = spectral(model).step
-        assert spectral(append(model, more)).steps.tolist() == [step] * 8
-        return caplog.text
-
-    assert grown(route[:64]) == ""
-    faint = grown(route.mean(0) + 0.01 * torch.randn(64, NUMBERS))
-    assert "the 64 places appended hold 0" in faint
-    assert ("those before" in faint) == ("hold" in settings or not stored)
-
-
 def test_names_follow_and_parts_without_names_stay_without() -> None:
     route = walk(192)
     model = learned(route[:64])

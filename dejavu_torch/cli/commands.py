@@ -32,7 +32,7 @@ from dejavu_torch.features.views import SAMPLE as SHORT
 from dejavu_torch.features.views import Views
 from dejavu_torch.learning import Checkpoint, MapTasks
 from dejavu_torch.maps.place_map import Mapper
-from dejavu_torch.maps.spectral import HELD, SpectralMapper
+from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import REGISTRY, recipe_of, with_parts
@@ -651,9 +651,6 @@ def print_map(model: DejaVu) -> None:
     if whitening is not None:
         sizes = " + ".join(map(str, whitening.sizes))
         print(f"Whitening, {sizes} to {len(whitening.scale)} dimensions: {whitening.extra_repr()}")
-    if isinstance(model.map, SpectralMap) and model.map.needed is not None:
-        more = f"about {model.map.needed:.3g} bytes per place would hold {HELD}, as --mapper.hold {HELD} does"
-        print(f"the lines hold less than half of the descriptors' variance: {more}")
 
 
 def _print_localize(map: Path, model: DejaVu, command: str, query: str = "QUERY", lead: str = "next") -> None:

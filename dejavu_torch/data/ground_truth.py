@@ -198,8 +198,13 @@ def is_right(index: Tensor, truth: Tensor, tolerance: int) -> Tensor:
 
 def counted(index: Tensor, truth: GroundTruth, tolerance: int) -> Tensor:
     """Which queries are scored: judged ones that do not report an ignored place. (Q,) -> (Q,) bool."""
-    ignored = is_right(index, truth.ignored, 0)
-    return truth.judged & (is_right(index, truth.positives, tolerance) | ~ignored)
+    return scored_and_right(index, truth, tolerance)[0]
+
+
+def scored_and_right(index: Tensor, truth: GroundTruth, tolerance: int) -> tuple[Tensor, Tensor]:
+    """Which queries are `counted`, and which of these are right. (Q,) -> two (Q,) bool."""
+    right = truth.judged & is_right(index, truth.positives, tolerance)
+    return right | truth.judged & ~is_right(index, truth.ignored, 0), right
 
 
 def ground_truth_in_places(truth: GroundTruth, place_of: Callable[[Tensor], Tensor]) -> GroundTruth:

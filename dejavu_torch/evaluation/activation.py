@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.ground_truth import GroundTruth, counted, is_right
+from dejavu_torch.data.ground_truth import GroundTruth, scored_and_right
 from dejavu_torch.maps.template_map import TemplateMap
 from dejavu_torch.types import FrequencyLayer
 
@@ -58,7 +58,7 @@ def activation_rates(
         near, far = (in_phase(layer, best, which, tolerance) for which in (here, right))
         chance = (2 * _phases_within(layer, tolerance) + 1) / layer.phases
         rates.append(Rate(_share(near, inside), _share(far, outside), min(1.0, chance)))
-    found, judged = is_right(index, right, tolerance), counted(index, truth, tolerance)
+    judged, found = scored_and_right(index, truth, tolerance)
     shares = _share(found, inside & judged), _share(found, outside & judged)
     return [*rates, Rate(*shares, min(1.0, (2 * tolerance + 1) / route.places))]
 
@@ -75,7 +75,7 @@ def best_phases(route: TemplateMap, queries: Tensor, j: int) -> Tensor:
 def layer_distances(route: TemplateMap, queries: Tensor, j: int) -> Tensor:
     """Eq. 3 for one layer of the map, on the CPU: (Q,D) -> (Q,P)."""
     with torch.no_grad():
-        (distances,) = route.distances(queries.to(route.templates.device), [j])
+        (distances,) = route.distances(queries.to(route.device), [j])
     return distances.cpu()
 
 

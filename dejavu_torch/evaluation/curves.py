@@ -8,7 +8,14 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.ground_truth import GroundTruth, Truth, as_ground_truth, counted, is_right
+from dejavu_torch.data.ground_truth import (
+    GroundTruth,
+    Truth,
+    as_ground_truth,
+    counted,
+    is_right,
+    scored_and_right,
+)
 from dejavu_torch.types import InputError, Match
 
 RECALL_DEFINITION = (
@@ -127,9 +134,8 @@ def curve_of(
     match: Match, truth: Truth, tolerance: int, recall: Literal["all", "reported"] = "all"
 ) -> PRCurve:
     """`pr_curve` of matches against a truth; see `evaluate`."""
-    match, truth = _judged(match, truth, tolerance)
-    right = is_right(match.index, truth.positives, tolerance)
-    return pr_curve(match.score, right, (truth.positives >= 0).any(1), recall)
+    match, right, answerable = _judged(match, truth, tolerance)
+    return pr_curve(match.score, right, answerable, recall)
 
 
 def evaluate(match: Match, truth: Truth, tolerance: int) -> Scores:
@@ -154,9 +160,7 @@ def evaluate(match: Match, truth: Truth, tolerance: int) -> Scores:
         >>> evaluate(match, truth, tolerance=0).recall_at_1
         1.0
     """
-    match, truth = _judged(match, truth, tolerance)
-    right = is_right(match.index, truth.positives, tolerance)
-    answerable = (truth.positives >= 0).any(1)
+    match, right, answerable = _judged(match, truth, tolerance)
     every = pr_curve(match.score, right, answerable, "all")
     reported = pr_curve(match.score, right, answerable, "reported")
     return Scores(
@@ -205,9 +209,8 @@ def judge(match: Match, truth: Truth, tolerance: int, recalls: Sequence[int] = (
     scores = evaluate(match, truth, tolerance)
     known = _on_cpu(truth, len(match.index))
     index = match.index.cpu() if match.index.ndim == 2 else match.index.cpu()[:, None]
-    judged = counted(index[:, 0], known, tolerance)
+    judged, right = scored_and_right(index[:, 0], known, tolerance)
     found = {first: recall_at(index, known, tolerance, first) for first in recalls}
-    right = judged & is_right(index[:, 0], known.positives, tolerance)
     return Judgement(scores, {k: share for k, share in found.items() if share is not None}, right, judged)
 
 
@@ -262,15 +265,14 @@ def count_queries(match: Match, truth: Truth, tolerance: int) -> dict[str, int]:
     Raises:
         InputError: as `evaluate`.
     """
-    kept, right = _judged(match, truth, tolerance)
-    good = is_right(kept.index, right.positives, tolerance)
+    kept, right, answerable = _judged(match, truth, tolerance)
     queries, judged = len(match.index), len(kept.index)
     unknown = int((~as_ground_truth(truth, queries).judged).sum())
     counts = {"queries": queries, "judged": judged, "unknown": unknown, "ignored": queries - judged - unknown}
     return counts | {
-        "with_answer": int((right.positives >= 0).any(1).sum()),
+        "with_answer": int(answerable.sum()),
         "accepted": int(kept.accepted.sum()),
-        "accepted_right": int((kept.accepted & good).sum()),
+        "accepted_right": int((kept.accepted & right).sum()),
     }
 
 
@@ -291,12 +293,12 @@ def _on_cpu(truth: Truth, queries: int) -> GroundTruth:
     return GroundTruth(*(part.cpu() for part in as_ground_truth(truth, queries)))
 
 
-def _judged(match: Match, truth: Truth, tolerance: int) -> tuple[Match, GroundTruth]:
-    """First candidates and truth of the queries that are scored, on the CPU."""
+def _judged(match: Match, truth: Truth, tolerance: int) -> tuple[Match, Tensor, Tensor]:
+    """First candidates of the queries that are scored, whether they are right, and can be, on the CPU."""
     known = _on_cpu(check_truth(match, truth, tolerance), len(match.index))
     match = match.map(lambda column: column.cpu() if column.ndim == 1 else column.cpu()[:, 0])
-    kept = counted(match.index, known, tolerance)
+    kept, right = scored_and_right(match.index, known, tolerance)
     if not kept.any():
         seen = f"of {len(kept)} queries {int(known.judged.sum())} are in the truth and none can be judged"
         raise InputError(f"{seen}; expected one in the truth that does not report an ignored place")
-    return match.map(lambda column: column[kept]), GroundTruth(*(column[kept] for column in known))
+    return match.map(lambda column: column[kept]), right[kept], (known.positives >= 0).any(1)[kept]

@@ -1,10 +1,8 @@
-"""Pictures of a spectral map, of its answer to a query, and of the ground motion used for resampling."""
+"""Pictures of a spectral map, of the answer to a query, and of the ground motion used for resampling."""
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from fractions import Fraction
 from textwrap import fill
 from typing import NamedTuple
 
@@ -15,13 +13,12 @@ from dejavu_torch.evaluation import plots
 from dejavu_torch.evaluation.contenders import COLOURS
 from dejavu_torch.evaluation.localization import Localization, frame_at
 from dejavu_torch.maps.spectral_map import SpectralMap
-from dejavu_torch.maps.spectrum import from_spectrum, period_of, spectrum
+from dejavu_torch.maps.spectrum import period_of, spectrum
 from dejavu_torch.motion.ground_plane import ground_patch
 from dejavu_torch.motion.resampling import ResampledTraverse
 
 BLUE = COLOURS["map"]
 STRONGEST = 3  # descriptor dimensions whose spectrum is shown
-COUNTS = (1, 4, 16)  # strongest periods that are added up, besides all
 FAINTEST = 0.02  # of a step: smaller lines are drawn at this size
 
 
@@ -89,78 +86,6 @@ def plot_spectrum(features: Mapping[int, Lines], periods: Tensor, step: float, u
     return figure, axes[:, 0]
 
 
-def draw_components(run: Localization, route: SpectralMap) -> plots.Pictures:
-    """One query's scores with its strongest periods only, and with all; empty if no period is kept."""
-    chunk = longest_chunk(route)
-    start, stop = route.chunks[chunk]
-    query, places = run.example_query(start, stop)
-    sums = components(route, run.query_features[query], chunk)
-    if not sums[-1][0]:
-        return {}
-    curves, better = [], []
-    for number, (periods, scores) in enumerate(sums, 1):
-        title = f"{len(periods)} strongest periods"
-        if number == len(sums):
-            title = f"all {len(periods)} periods"
-        elif len(periods) == 1:
-            title = f"strongest period, {float(periods[0]):.4g} {run.unit}"
-        if places:
-            right = [place - start for place in places]
-            better.append(better_places(scores, right, run.tolerance))
-            title += f": {better[-1]} places fit better"
-        curves.append((fill(title, plots.LETTERS), scores, BLUE if number == len(sums) else plots.DARK))
-    numbers = {"places_that_fit_better": better} if places else {}
-    plot = plot_answers(run, query, (start, stop), places, curves, sharey=True)
-    return plots.picture("components", plot, numbers, truth=places)
-
-
-@torch.no_grad()
-def components(
-    route: SpectralMap, query: Tensor, chunk: int = 0
-) -> list[tuple[tuple[Fraction, ...], Tensor]]:
-    """Scores of a query with its 1, 4 and 16 strongest periods only, and with all (the map's own scores).
-
-    The product of a query with all descriptors of a chunk is a constant plus one wave for each period. The
-    strongest periods have the largest energy, cosine and sine together.
-
-    Shape: query (K,) -> for each sum its periods, the strongest first, and scores (W,) of the chunk's places.
-
-    Convention: every sum includes the constant and follows the metric.
-    """
-    start, stop = route.chunks[chunk]
-    kept_lines = route.lines(chunk)
-    query = query.to(kept_lines.value)
-    length = torch.linalg.vector_norm(query)
-    if route.metric == "cosine":
-        query = query / torch.where(length > 0, length, 1)
-    terms = query[kept_lines.feature] * kept_lines.value
-    lines = query.new_zeros(stop - start).index_add(0, kept_lines.line, terms)
-    lines_of: dict[Fraction, list[int]] = defaultdict(list)
-    for line in range(1, stop - start):
-        if lines[line]:
-            lines_of[period_of(line, stop - start, route.transform)].append(line)
-    strongest = sorted(lines_of, key=lambda period: -float(lines[lines_of[period]].square().sum()))
-    sums = []
-    for count in (*(count for count in COUNTS if count < len(strongest)), len(strongest)):
-        kept = torch.zeros_like(lines)
-        for chosen in ([0], *(lines_of[period] for period in strongest[:count])):
-            kept[chosen] = lines[chosen]
-        products = from_spectrum(kept, route.transform) + query @ route.means[0].to(query)
-        if route.metric == "cosine":
-            scores = 1 - products * route.inverse_norms(start, stop)
-        else:
-            scores = length.square() - 2 * products + route.norms[start:stop].square()
-        sums.append((tuple(strongest[:count]), scores.cpu()))
-    return sums
-
-
-def better_places(scores: Tensor, right: Sequence[int], tolerance: int) -> int:
-    """The number of places that score lower than every place within the tolerance of a right one."""
-    distance = (torch.arange(len(scores))[:, None] - torch.tensor(right)).abs().amin(1)
-    inside = distance <= tolerance
-    return int((scores[~inside] < scores[inside].min()).sum())
-
-
 def plot_answers(
     run: Localization,
     query: int,
@@ -168,16 +93,15 @@ def plot_answers(
     places: Sequence[int],
     curves: Sequence[tuple[str, Tensor, str]],
     strip: Tensor | None = None,
-    sharey: bool = False,
 ) -> plots.Plot:
     """Scores of one query over the places of a chunk, a row for each (title, scores, colour).
 
-    places: the right ones. strip: (C,H,W), drawn along the chunk at the top. sharey: rows share one scale.
+    places: the right ones. strip: (C,H,W), drawn along the chunk at the top.
     """
     begin, end = (int(run.borders[edge]) for edge in chunk)
     above = strip is not None
     count = len(curves) + above
-    figure, rows = plots.canvas(1.4 + 0.9 * count, count, squeeze=False, sharex=True, sharey=sharey)
+    figure, rows = plots.canvas(1.4 + 0.9 * count, count, squeeze=False, sharex=True)
     rows = rows[:, 0]
     if strip is not None:
         rows[0].imshow(plots.pixels(strip), extent=(begin, end, 0, 1), aspect="auto")

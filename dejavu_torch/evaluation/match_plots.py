@@ -9,18 +9,16 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.colors import LogNorm
-from matplotlib.patches import Rectangle
 from torch import Tensor
 from torch.nn.functional import max_pool1d
 
-from dejavu_torch.data.ground_truth import GroundTruth, counted, is_right
+from dejavu_torch.data.ground_truth import GroundTruth, scored_and_right
 from dejavu_torch.data.positions import look_up
 from dejavu_torch.evaluation import plots
 from dejavu_torch.evaluation.contenders import COLOURS
 from dejavu_torch.evaluation.localization import Localization, frame_at, nearest_query
 from dejavu_torch.motion.resampling import source_of
 from dejavu_torch.recognition.filter import PlaceFilter
-from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.types import Match, Traverse
 
 CELLS = 400  # rows and columns of a score matrix, at most
@@ -73,9 +71,8 @@ def example_queries(match: Match, truth: GroundTruth | None, tolerance: int) -> 
     if truth is None:
         groups = {"surest answer": reported}
     else:
-        scored = reported & counted(match.index, truth, tolerance)
-        right = is_right(match.index, truth.positives, tolerance)
-        groups = {"surest right answer": scored & right, "surest wrong answer": scored & ~right}
+        scored, right = scored_and_right(match.index, truth, tolerance)
+        groups = {"surest right answer": right, "surest wrong answer": reported & scored & ~right}
     if rejected.any():
         groups["surest not accepted"] = rejected
     else:
@@ -138,8 +135,7 @@ def draw_coverage(
     probability = match.probability if truth is None and reported.any() else None
     missing, groups = ~reported, []
     if truth is not None:
-        scored = counted(match.index, truth, tolerance)
-        right = scored & is_right(match.index, truth.positives, tolerance)
+        scored, right = scored_and_right(match.index, truth, tolerance)
         wrong = scored & reported & ~right
         groups.append((reported & ~scored, plots.GREY, 3, f"{(~scored).sum()} not scored"))
         groups.append((wrong, plots.WRONG, 3, f"{wrong.sum()} wrong"))
@@ -169,7 +165,7 @@ def draw_coverage(
 
 
 def draw_scores(run: Localization, cells: int = CELLS) -> plots.Pictures:
-    """The scores of all queries at all places, and the cells that a sequence adds up; empty if all are +inf.
+    """The scores of all queries at all places; empty if all are +inf.
 
     Convention: at most `cells` queries and blocks of neighbouring places are drawn. Each query is scaled
         from its best score (0) to its median (1), since content that is in no place raises all its scores.
@@ -181,28 +177,20 @@ def draw_scores(run: Localization, cells: int = CELLS) -> plots.Pictures:
     values = torch.cat(parts)
     if values.isinf().all():
         return {}
-    found = (run.match.index >= 0).nonzero()[:, 0]
-    zoomed = isinstance(run.sequence, SequenceMatcher) and len(found) > 0
-    figure, axes = plots.canvas(6.9, 2) if zoomed else plots.canvas(3.8, squeeze=False)
-    above, below = axes.flat[0], axes.flat[-1]
-    below.set(xlabel=plots.QUERY)
+    figure, axis = plots.canvas(3.8)
     x = torch.cat([queries[chosen], queries[-1:] + 1])
-    image = _show_scores(above, run, x, torch.cat([borders[:-1:block], borders[-1:]]), values)
-    bar = figure.colorbar(image, ax=above, pad=0.01, aspect=30, ticks=[0, 1], label="score of the query")
+    image = _show_scores(axis, run, x, torch.cat([borders[:-1:block], borders[-1:]]), values)
+    bar = figure.colorbar(image, ax=axis, pad=0.01, aspect=30, ticks=[0, 1], label="score of the query")
     bar.ax.set_yticklabels(["best", "median"])
-    facts: dict[str, Any] = {"sequence": run.sequence}
-    if zoomed:
-        query = int(found[(found - len(queries) // 2).abs().argmin()])
-        facts |= {"query": int(queries[query]), "cells": _show_added_up(above, below, run, query)}
-    handles, names = below.get_legend_handles_labels()
-    style = {"ncols": len(names), "markerscale": 1 if zoomed else 4, "handlelength": 1.5, "columnspacing": 1}
+    handles, names = axis.get_legend_handles_labels()
+    style = {"ncols": len(names), "markerscale": 4, "handlelength": 1.5, "columnspacing": 1}
     figure.legend(handles, names, loc="outside lower left", frameon=False, **style)
     shown = []
     if len(chosen) < len(queries):
         shown.append(f"{len(chosen)} of {len(queries)} queries")
     if block > 1:
         shown.append(f"the best of every {block} neighbouring places")
-    return plots.picture("scores", (figure, axes), drawn="; ".join(shown), **facts)
+    return plots.picture("scores", (figure, axis), drawn="; ".join(shown), sequence=run.sequence)
 
 
 def _score_rows(run: Localization, indices: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
@@ -219,7 +207,7 @@ def _scaled(scores: Tensor) -> Tensor:
     return scaled.masked_fill(uncovered, torch.inf)
 
 
-def _show_scores(axis: Any, run: Localization, x: Tensor, y: Tensor, values: Tensor, dots: float = 2) -> Any:
+def _show_scores(axis: Any, run: Localization, x: Tensor, y: Tensor, values: Tensor) -> Any:
     """Draw scores (h,w) between the frames x (h+1,) and y (w+1,), with the reported and right places."""
     axis.set_facecolor(plots.GREY)  # uncovered places
     values = values.masked_fill(values.isinf(), torch.nan)
@@ -227,38 +215,14 @@ def _show_scores(axis: Any, run: Localization, x: Tensor, y: Tensor, values: Ten
     image = axis.pcolorfast(x.numpy(), y.numpy(), values.T.numpy(), cmap="gray", vmin=0, vmax=1)
     index, queries = run.scored.index, run.query_frames
     found = index >= 0
-    style: dict[str, Any] = {"color": COLOURS["map"], "markersize": dots, "label": "reported place"}
+    style: dict[str, Any] = {"color": COLOURS["map"], "markersize": 2, "label": "reported place"}
     axis.plot(queries[found], run.borders[index[found]], ".", **style)
     if run.truth is not None:
         style = {"color": plots.RIGHT, "linewidth": 1, "dashes": (4, 4)}
         axis.plot(queries, _right_frames(run.truth, run.borders), **style)
         axis.plot([], [], label="right place", **style)
-    axis.set(xlim=x[[0, -1]].tolist(), ylim=y[[0, -1]].tolist(), ylabel=plots.PLACE)
+    axis.set(xlim=x[[0, -1]].tolist(), ylim=y[[0, -1]].tolist(), xlabel=plots.QUERY, ylabel=plots.PLACE)
     return image
-
-
-def _show_added_up(above: Any, below: Any, run: Localization, query: int) -> int:
-    """Draw the cells that a sequence adds up for a query, and a margin of its length; return their number."""
-    assert isinstance(run.sequence, SequenceMatcher)
-    margin, place = run.sequence.length, int(run.match.index[query])
-    back = [round(speed * (margin - 1)) for speed in run.sequence.speeds]
-    top, bottom = max(0, query - 2 * margin + 1), min(len(run.query_frames), query + margin + 1)
-    left, right = max(0, place - max(0, *back) - margin), place - min(0, *back) + margin + 1
-    window, scaled = [], []
-    for _, rows in _score_rows(run, torch.arange(top, bottom)):
-        window.append(rows[:, left:right].clone())  # a view would keep the whole rows
-        scaled.append(_scaled(rows)[:, left:right].clone())
-    cells = run.sequence.trajectory(torch.cat(window)[: query - top + 1], place - left)
-    x = torch.cat([run.query_frames, run.query_frames[-1:] + 1])[top : bottom + 1]
-    y = run.borders[left : right + 1]
-    _show_scores(below, run, x, y, torch.cat(scaled), dots=4)
-    corner, width, height = (int(x[0]), int(y[0])), int(x[-1] - x[0]), int(y[-1] - y[0])
-    above.add_patch(Rectangle(corner, width, height, fill=False, color=plots.LAYERS[0], linewidth=1))
-    style = {"color": plots.LAYERS[0], "markersize": min(5, 60 / len(cells)), "mfc": "none", "linewidth": 0.8}
-    added = run.query_frames[cells[:, 0] + top], run.borders[cells[:, 1] + left]
-    below.plot(*added, "o-", label="added up", **style)
-    below.set_title("the marked region", loc="left", fontsize=10)
-    return len(cells)
 
 
 def _right_frames(truth: GroundTruth, borders: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dejavu_torch.evaluation.contenders import Contender
 from dejavu_torch.evaluation.controls import template_map_of
 from dejavu_torch.evaluation.localization import Localization
-from dejavu_torch.evaluation.map_plots import draw_components, draw_motion, draw_spectrum
+from dejavu_torch.evaluation.map_plots import draw_motion, draw_spectrum
 from dejavu_torch.evaluation.match_plots import (
     draw_coverage,
     draw_frames,
@@ -39,7 +39,7 @@ def draw_pictures(
     pictures |= draw_sequences(contenders, storage.get("map", ()), route.places, tolerance)
     pictures |= draw_motion(run)
     if isinstance(route, SpectralMap):
-        pictures |= draw_spectrum(run, route) | draw_components(run, route)
+        pictures |= draw_spectrum(run, route)
     if isinstance(route, TemplateMap):
         pictures |= draw_template_map(run, route)
     return pictures

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.ground_truth import GroundTruth, counted, is_right
+from dejavu_torch.data.ground_truth import GroundTruth, scored_and_right
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.plots import DARK, GREY, RIGHT, Pictures, canvas, picture
 from dejavu_torch.memory import in_float32
@@ -49,8 +49,8 @@ def rejection_facts(
 def judged(match: Match, truth: GroundTruth, tolerance: int) -> tuple[Tensor, Tensor]:
     """Probability (n,) of the queries that are scored, and whether they are right (n,) bool."""
     assert match.probability is not None
-    kept = counted(match.index, truth, tolerance)
-    return match.probability[kept], is_right(match.index[kept], truth.positives[kept], tolerance)
+    kept, right = scored_and_right(match.index, truth, tolerance)
+    return match.probability[kept], right[kept]
 
 
 def rejection_table(facts: Mapping[str, Any]) -> list[list[str]]:

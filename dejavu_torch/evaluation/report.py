@@ -27,7 +27,7 @@ PICTURES = (
     *("frames", "pairs", "coverage", "scores", "pr", "auc", "storage", "sequences"),
     *("ground", "velocity", "chunks"),
     *("spectrogram", "templates", "features", "activations", "autocorrelogram", "layers"),
-    *("spectrum", "components", "posterior", "reliability"),
+    *("spectrum", "posterior", "reliability"),
 )
 LATE = 0.1  # a curve that starts at a higher recall starts late
 HEADING = 11  # letters in a line of a heading

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.ground_truth import GroundTruth, counted, is_right
+from dejavu_torch.data.ground_truth import GroundTruth, scored_and_right
 from dejavu_torch.data.source import open_source
 from dejavu_torch.evaluation.compare import Comparison, compare
 from dejavu_torch.evaluation.contenders import Contender, contend
@@ -193,8 +193,8 @@ def boundary_effect(
     """Recall@1 near the cuts, places at which a structure starts or stops, and far from them."""
     if not cuts:
         raise InputError("there are no cuts; expected at least one place where a structure starts or stops")
-    answered = counted(match.index, truth, tolerance) & (truth.positives >= 0).any(1)
-    right = is_right(match.index, truth.positives, tolerance)
+    scored, right = scored_and_right(match.index, truth, tolerance)
+    answered = scored & (truth.positives >= 0).any(1)
     distance = (truth.positives[:, :, None] - torch.tensor(list(cuts))).abs().amin(2)
     close = ((distance <= near) & (truth.positives >= 0)).any(1)
 

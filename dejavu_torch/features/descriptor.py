@@ -21,7 +21,7 @@ from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.joined import Joined, groups_of
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import SAMPLE, AugmentedFrames, Sample, Views, augmented_route
-from dejavu_torch.features.whitening import INDEPENDENT, WIDEST, Whitening
+from dejavu_torch.features.whitening import INDEPENDENT, MOST_VIEWS, WIDEST, Whitening
 from dejavu_torch.memory import IN_MEMORY, concatenate
 from dejavu_torch.types import BATCH_NUMBERS, BATCH_SIZE, InputError, Traverse
 
@@ -176,16 +176,16 @@ class Descriptor(nn.Module):
         source = "" if second is None else f"by {second.traverse.name}"
         if second is None and not is_ready(traverse) and whitening.views != 0:
             copies = whitening.copies(*features.shape)
-            settings = copies, whitening.most_views, whitening.strengths, whitening.seed
+            settings = copies, MOST_VIEWS, whitening.strengths, whitening.seed
             second, source = augmented_route(traverse, len(features), *settings)
-        groups = (None, None) if is_ready(traverse) else groups_of(self.features)
+        groups = None if is_ready(traverse) else groups_of(self.features)
         if second is None:
-            whitening.learn(features, None, *groups)
+            whitening.learn(features, None, groups)
         else:
             samples = INDEPENDENT * len(features) if isinstance(second.traverse, AugmentedFrames) else None
             batches = self.features_in(second.traverse, label and f"learning what changes: {source}")
             shown = _with_places(batches, second.places.to(self.device))
-            whitening.learn(features, shown, *groups, samples)
+            whitening.learn(features, shown, groups, samples)
         whitening.to(self.device)
 
     @contextmanager

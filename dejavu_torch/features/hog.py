@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -46,29 +46,12 @@ class HOG(nn.Module):
         bins: Bins = "hard",
     ) -> None:
         super().__init__()
+        self.resize = _checked(orientations, cell, block, resize, bins)
         self.orientations, self.cell, self.block = orientations, cell, block
-        self.resize = None if resize is None else check_size(resize, cell * block, "HOG got resize")
         self.bins: Bins = bins
-        least, most = min(orientations, cell, block), MOST_ORIENTATIONS
-        if least < 1 or orientations > most or bins not in get_args(Bins):
-            expected = f"at least 1 each, at most {most} orientations, bins 'hard' or 'linear'"
-            raise InputError(f"HOG got {settings_of(self)}; expected {expected}")
 
     def forward(self, frames: Tensor) -> Tensor:
-        check_frames(frames, "HOG got")
-        height, width = frames.shape[-2:] if self.resize is None else self.resize
-        least = self.cell * self.block
-        if min(height, width) < least:
-            raise InputError(f"HOG got frames of {height} x {width}; expected at least {least} x {least}")
-        return in_parts(self._describe, frames)
-
-    def _describe(self, frames: Tensor) -> Tensor:
-        exact = frames.to(torch.promote_types(frames.dtype, torch.float32))
-        rows, columns = gradients(resize_frames(exact, self.resize))
-        histograms = cell_histograms(rows, columns, self.orientations, self.cell, self.bins)
-        blocks = histograms.unfold(1, self.block, 1).unfold(2, self.block, 1)  # (B,by,bx,O,block,block)
-        blocks = _unit(blocks.permute(0, 1, 2, 4, 5, 3).flatten(3)).clamp(max=0.2)
-        return _unit(blocks).flatten(1).to(frames.dtype)
+        return hog(frames, self.orientations, self.cell, self.block, self.resize, self.bins)
 
     extra_repr = settings_of
 
@@ -87,7 +70,34 @@ def hog(
         >>> hog(torch.rand(5, 1, 64, 64)).shape
         torch.Size([5, 1764])
     """
-    return HOG(orientations, cell, block, resize, bins).forward(frames)
+    resize = _checked(orientations, cell, block, resize, bins)
+    check_frames(frames, "HOG got")
+    height, width = frames.shape[-2:] if resize is None else resize
+    if min(height, width) < cell * block:
+        least = f"{cell * block} x {cell * block}"
+        raise InputError(f"HOG got frames of {height} x {width}; expected at least {least}")
+
+    def described(part: Tensor) -> Tensor:
+        exact = part.to(torch.promote_types(part.dtype, torch.float32))
+        rows, columns = gradients(resize_frames(exact, resize))
+        histograms = cell_histograms(rows, columns, orientations, cell, bins)
+        blocks = histograms.unfold(1, block, 1).unfold(2, block, 1)  # (B,by,bx,O,block,block)
+        blocks = _unit(blocks.permute(0, 1, 2, 4, 5, 3).flatten(3)).clamp(max=0.2)
+        return _unit(blocks).flatten(1).to(part.dtype)
+
+    return in_parts(described, frames)
+
+
+def _checked(
+    orientations: int, cell: int, block: int, resize: tuple[int, int] | None, bins: str
+) -> tuple[int, int] | None:
+    """The size to resize to, if all settings of `HOG` are in range."""
+    least, most = min(orientations, cell, block), MOST_ORIENTATIONS
+    if least < 1 or orientations > most or bins not in ("hard", "linear"):
+        seen = f"orientations={orientations}, cell={cell}, block={block}, bins={bins!r}"
+        expected = f"at least 1 each, at most {most} orientations, bins 'hard' or 'linear'"
+        raise InputError(f"HOG got {seen}; expected {expected}")
+    return None if resize is None else check_size(resize, cell * block, "HOG got resize")
 
 
 def gradients(frames: Tensor) -> tuple[Tensor, Tensor]:

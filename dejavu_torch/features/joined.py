@@ -17,7 +17,6 @@ class Joined(nn.Module):
 
     Args:
         members: modules (B,C,H,W) -> (B,D_i); all see the same frames.
-        shares: factor in (0, 1] on the whitened dimensions and the squared length of each; None is 1.
 
     Attributes:
         groups: number of features of each member, for the last frames; whitening treats each by itself.
@@ -25,7 +24,7 @@ class Joined(nn.Module):
     Shape: (B,C,H,W) -> (B, D_1 + D_2 + ..).
 
     Raises:
-        InputError: no members, or not modules; shares that do not fit; forward: a member's other output.
+        InputError: no members, or not modules; forward: a member's other output.
 
     Example:
         >>> from dejavu_torch.features.hog import HOG
@@ -37,15 +36,13 @@ class Joined(nn.Module):
 
     casts = True  # gives each member frames in the type of its weights, see `as_weights`
 
-    def __init__(self, members: list[nn.Module], shares: list[float] | None = None) -> None:
+    def __init__(self, members: list[nn.Module]) -> None:
         super().__init__()
         modules = [*members] if isinstance(members, (Sequence, nn.ModuleList)) else [members]
         if not modules or not all(isinstance(one, nn.Module) for one in modules):
             seen = ", ".join(type(one).__name__ for one in modules) or "none"
             raise InputError(f"the members of the features are {seen}; expected modules, at least one")
-        if shares is not None and not (len(shares) == len(modules) and all(0 < one <= 1 for one in shares)):
-            raise InputError(f"shares of {len(modules)} members are {shares}; expected (0, 1] for each")
-        self.members, self.shares = nn.ModuleList(modules), shares
+        self.members = nn.ModuleList(modules)
         self.groups: tuple[int, ...] | None = None
 
     def forward(self, frames: Tensor) -> Tensor:
@@ -56,7 +53,6 @@ class Joined(nn.Module):
         return torch.cat(made, 1)
 
 
-def groups_of(features: nn.Module) -> tuple[tuple[int, ...] | None, list[float] | None]:
-    """The `groups` and `shares` of `Joined` features, or of the last module of a pipeline; else None."""
-    last = features[-1] if isinstance(features, nn.Sequential) and len(features) else features
-    return (last.groups, last.shares) if isinstance(last, Joined) else (None, None)
+def groups_of(features: nn.Module) -> tuple[int, ...] | None:
+    """The `groups` of `Joined` features, else None."""
+    return features.groups if isinstance(features, Joined) else None

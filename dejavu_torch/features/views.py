@@ -38,9 +38,7 @@ class Sample(NamedTuple):
             (10000, [0, 11000, 22000, 33000, 44000, 55000, 66000, 77000, 88000, 99000])
         """
         segment = min(chunk, SAMPLE // MIN_SEGMENTS)
-        count, last = SAMPLE // segment, frames // segment - 1
-        starts = torch.arange(count) * last // (count - 1) * segment
-        return cls((starts[:, None] + torch.arange(segment)).flatten(), segment)
+        return cls(evenly_spaced(frames, segment, SAMPLE // segment), segment)
 
     def views(self, second: Views) -> Views:
         """The views of the sample in a second traverse; InputError if there are none."""
@@ -56,6 +54,12 @@ class Views(NamedTuple):
 
     traverse: Traverse
     places: Tensor
+
+
+def evenly_spaced(frames: int, length: int, count: int) -> Tensor:
+    """The frames (count * length,) of evenly spaced segments, from the first whole one to the last."""
+    starts = torch.arange(count) * (frames // length - 1) // max(1, count - 1) * length
+    return (starts[:, None] + torch.arange(length)).flatten()
 
 
 def views_of(views: Views, frames: Tensor) -> Views:

@@ -26,6 +26,7 @@ COMPONENTS = 400  # principal components that are whitened, by default
 VIEWS = 4  # of a frame, at least
 VIEWS_PER_COMPONENT = 30  # at least: as 4 views of each of 3000 frames
 INDEPENDENT = 4  # copies of a frame; further ones are so much like these that they are no further samples
+MOST_VIEWS = 20_000  # in all: of more, frames are drawn evenly
 MAX_VIEWS = 12  # of a frame, unless a short route has fewer than COPIES then
 COPIES, MOST_OF_SHORT = 4000, 36  # of all frames, of each: chance decides less on a short route
 BITS = (4, 8, 16)  # of a number of the projection
@@ -39,7 +40,6 @@ STRENGTHS: Mapping[str, Any] = {  # defaults of `Augmentation`
     if max(strength)
 }
 LEVELLING = 0.25  # joined dimensions are divided by this power of their root mean square
-LEAST = 1e-12  # absolute value to which a power is applied, for finite gradients
 ROUNDING = 1e-7  # of the largest variance: smaller ones count as 0
 _Components: TypeAlias = tuple[Tensor, Tensor, Tensor, int]  # mean, basis, variances, dimensions to keep
 
@@ -98,17 +98,14 @@ class Whitening(nn.Module):
         shrinkage: of `learned_whitening`. None is 0.03, or more if there are few views.
         views: augmented copies of each frame. None is 4, on a shorter route up to 12, 30 per component, or
             4000 in all if that is more, but at most 36 of each.
-        most_views: copies in all; frames are drawn evenly if there would be more.
         strengths: arguments of `Augmentation`, instead of `STRENGTHS`.
         seed: of the copies.
         bits: of each number of the projection: 4 (two to a byte), 8 or 16. None is 4, or more on a route of
             under 130 places, whose fewer dimensions then take no more bytes than 128 of 4 bits, unless their
             number is set.
-        power: of each dimension's absolute value, above 0 and at most 1, to lower peaks, as of new objects.
         groups: D_1, D_2, .. of concatenated descriptors, each whitened by itself and scaled to length 1; then
             follow the K dimensions that best keep their inner products, the largest lowered a little. None
             is the groups of `Joined` features, or one group.
-        group_numbers: dimensions of each group, at most its rank; None is chosen like `numbers`.
 
     Shape: (B,D) -> (B,K).
 
@@ -137,26 +134,20 @@ class Whitening(nn.Module):
         components: int = COMPONENTS,
         shrinkage: float | None = None,
         views: int | None = None,
-        most_views: int = 20000,
         strengths: Mapping[str, Any] | None = None,
         seed: int = 0,
         bits: Literal[4, 8, 16] | None = None,
-        power: float = 1.0,
         groups: list[int] | None = None,
-        group_numbers: int | None = None,
     ) -> None:
         super().__init__()
         if not isinstance(strengths, Mapping | None):
             raise InputError(f"the strengths are {strengths!r}; expected arguments of Augmentation by name")
         self.numbers, self.components, self.shrinkage, self.views = numbers, components, shrinkage, views
-        self.most_views, self.seed, self.bits, self.power = most_views, seed, bits, power
-        self.groups, self.group_numbers = None if groups is None else [*groups], group_numbers
-        kept = [1, *(one for one in (numbers, group_numbers) if one is not None)]
-        shares = power, 1 if shrinkage is None else shrinkage
-        counts = 1 <= min(kept) <= max(kept) <= components and (views or 0) >= 0 and most_views >= 1
-        if not counts or bits not in (None, *BITS) or not all(0 < share <= 1 for share in shares):
-            expected = "1 <= numbers <= components, views >= 0, most_views >= 1, shrinkage and power above 0 "
-            expected += "and at most 1, bits of 4, 8 or 16, or None"
+        self.seed, self.bits, self.groups = seed, bits, None if groups is None else [*groups]
+        counts = 1 <= (1 if numbers is None else numbers) <= components and (views or 0) >= 0
+        if not counts or bits not in (None, *BITS) or not 0 < (1 if shrinkage is None else shrinkage) <= 1:
+            expected = "1 <= numbers <= components, views >= 0, shrinkage above 0 and at most 1, "
+            expected += "bits of 4, 8 or 16, or None"
             raise InputError(f"Whitening got {settings_of(self, 'strengths', 'seed')}; expected {expected}")
         if groups is not None and min(groups, default=0) < 1:
             raise InputError(f"the groups are {self.groups}; expected a dimension of at least 1 for each")
@@ -221,8 +212,6 @@ class Whitening(nn.Module):
         whitened = (exact @ whole.to(exact)) * self.scale.to(exact) - self.offset.to(exact)
         if len(self.length):
             whitened = torch.cat([whitened, self.length.to(whitened).expand(whitened.shape[0], 1)], 1)
-        elif self.power < 1 and not self.members:
-            whitened = whitened.sign() * whitened.abs().clamp(min=LEAST) ** self.power
         return nn.functional.normalize(whitened, dim=1)
 
     def copies(self, frames: int, features: int) -> int:
@@ -241,7 +230,7 @@ class Whitening(nn.Module):
 
     def bits_of(self, places: int, views: bool) -> int:
         """Bits of each number of the projection, if the constructor's are None."""
-        if self.numbers is not None or self.group_numbers is not None:
+        if self.numbers is not None:
             return BITS[0]
         return max(
             bits for bits in BITS if bits * self.kept(places, WIDEST, views) <= FULL_BITS or bits == BITS[0]
@@ -253,7 +242,6 @@ class Whitening(nn.Module):
         places: Tensor,
         views: Iterable[tuple[Tensor, Tensor]] | None = None,
         groups: Sequence[int] | None = None,
-        shares: Sequence[float] | None = None,
         samples: int | None = None,
     ) -> None:
         """Find the projection for one route.
@@ -261,10 +249,10 @@ class Whitening(nn.Module):
         Args:
             places: (N,D), the descriptors of the route; they may be in a file.
             views: batches of descriptors (B,D) and the places (B,) that they show, if any.
-            groups, shares: see `Joined`, if the constructor's groups are None.
+            groups: see `Joined`, if the constructor's groups are None.
             samples: number of independent views, for the shrinkage; None is all of them.
         """
-        groups, shares = (groups, shares) if self.groups is None else (self.groups, None)
+        groups = groups if self.groups is None else self.groups
         sizes = [places.shape[1]] if groups is None else [*groups]
         if sum(sizes) != places.shape[1]:
             seen = f"groups of {' + '.join(map(str, sizes))} dimensions, descriptors {tuple(places.shape)}"
@@ -272,11 +260,8 @@ class Whitening(nn.Module):
         bits = self.bits_of(len(places), views is not None)
         members = [self] if groups is None else [self._member() for _ in sizes]
         found = []
-        shares = [1.0] * len(members) if groups is None or shares is None else shares
-        for member, own, share in zip(members, places.split(sizes, 1), shares, strict=True):
+        for member, own in zip(members, places.split(sizes, 1), strict=True):
             kept = self.kept(len(places), own.shape[1], views is not None)
-            if groups is not None:
-                kept = math.ceil(share * (self.group_numbers or kept))
             found.append(member._components(own, kept, kept if views is None else self.components))
         pairs = None if views is None else _projected_views(places, views, found)
         with torch.autocast(self.scale.device.type, enabled=False):
@@ -289,21 +274,18 @@ class Whitening(nn.Module):
                     member.take(mean + basis @ centre, basis @ projection, None, bits)
             if groups is not None:
                 some = places[:: max(1, len(places) // SAMPLED)].to(self.scale.device).split(sizes, 1)
-                weights = [math.sqrt(share) for share in shares]
-                each = zip(weights, members, some, strict=True)
-                joined = torch.cat([weight * member(own) for weight, member, own in each], 1)
+                joined = torch.cat([member(own) for member, own in zip(members, some, strict=True)], 1)
                 kept = self.kept(len(places), joined.shape[1], views is not None)
                 # about zero, not the mean, to keep the inner products of all pairs, as cosines need
                 mean, basis, squares, _ = self._components(joined, kept, kept, centre=False)
                 if views is not None:
                     basis = basis / (squares / squares.mean()) ** (LEVELLING / 2)
-                parts = zip(weights, basis.split([member.dimension for member in members]), strict=True)
-                self.take(mean, torch.cat([weight * part for weight, part in parts]), None, bits)
+                self.take(mean, basis, None, bits)
         self.members = nn.ModuleList([] if groups is None else members)
 
     def _member(self) -> Whitening:
         """The whitening of a group, not learned yet."""
-        return Whitening(bits=self.bits, power=self.power, seed=self.seed).to(self.scale.device)
+        return Whitening(bits=self.bits, seed=self.seed).to(self.scale.device)
 
     def _components(self, places: Tensor, kept: int, count: int, centre: bool = True) -> _Components:
         """`principal_components` up to the rank, and how many dimensions to keep, `kept` at most."""

@@ -95,7 +95,7 @@ class LiveLocalizer:
     @torch.no_grad()
     def __call__(self, frame: Tensor | np.ndarray, left_out: int = 0) -> LiveMatch:
         start, model = time.perf_counter(), self.model
-        descriptor = self._describe(as_batch(frame, model.map.positions.device))
+        descriptor = self._describe(as_batch(frame, model.map.device))
         self._localizer.skip(min(left_out, MAX_SKIPPED))
         match = self._localizer(descriptor)
         place, score, table = int(match.index), float(match.score), model.map.table

@@ -96,14 +96,11 @@ def read_map(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         with safe_open(path, framework="pt") as archive:
             metadata = archive.metadata() or {}
             if NAME not in metadata:
-                seen = f"{path} is not a map of dejavu_torch, or an old one"
-                raise InputError(f"{seen}; expected {EXPECTED}; if it is old, learn the route anew")
+                raise InputError(f"{path} is not a map of dejavu_torch; expected {EXPECTED}")
             sealed = json.loads(metadata[NAME], parse_constant=_finite, parse_float=_finite)
-            version = sealed["version"]
-            if version != FORMAT:
-                newer = isinstance(version, int) and version > FORMAT
-                cure = "a newer dejavu_torch is needed" if newer else "learn the route anew"
-                raise InputError(f"{path} has map format {version!r:.40}; expected {FORMAT}; {cure}")
+            if (version := sealed["version"]) != FORMAT:
+                seen = f"{path} has map format {version!r:.40}, of another dejavu_torch"
+                raise InputError(f"{seen}; expected {FORMAT}")
             tensors = {name: archive.get_tensor(name) for name in archive.keys()}  # noqa: SIM118
         header, sums = sealed[HEADER], dict(sealed["checksums"] or {})
         found = checksums(tensors, header)

@@ -111,10 +111,15 @@ class PlaceMap(nn.Module, ABC):
         return self.table.place_of(frames)
 
     @property
+    def device(self) -> torch.device:
+        """Where the buffers are."""
+        return self.positions.device
+
+    @property
     def visit_counts(self) -> Tensor:
         """(N,) int64, number of visits that each place averages."""
         if not len(self.visits):
-            return torch.ones(self.places, dtype=torch.int64, device=self.visits.device)
+            return torch.ones(self.places, dtype=torch.int64, device=self.device)
         runs, counts = self.visits.long().unbind(1)
         return counts.repeat_interleave(runs)
 
@@ -207,7 +212,3 @@ class Mapper(nn.Module, ABC):
     @abstractmethod
     def empty(self) -> PlaceMap:
         """A map without places, which can load any map of this mapper."""
-
-    def with_overhead(self, overhead: int) -> Mapper:
-        """A mapper whose budget, if it has one, includes this many other bytes that grow with the places."""
-        return self

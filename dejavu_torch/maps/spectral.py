@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-import logging
 import math
 
 import torch
@@ -17,10 +15,7 @@ from dejavu_torch.maps.spectrum import Transform
 from dejavu_torch.text import settings_of
 from dejavu_torch.types import InputError
 
-log = logging.getLogger("dejavu_torch")
-
 ROWS = 2**14  # descriptors checked at a time
-HALF = 0.5  # share of the variance; a map that holds less reports the bytes that would hold `HELD`
 HELD = 0.85  # default share of the variance: such maps are nearly as accurate as their descriptors
 LINE_BYTES = 5.0  # per place: lines take as many by default, if they then hold more
 
@@ -29,8 +24,8 @@ class SpectralMapper(Mapper):
     """Codes descriptors along the route: the spectrum of each dimension over a chunk, all with one step.
 
     Args:
-        route_bytes_per_place: bytes that grow with the route; the step is the smallest that fits. Positions
-            of frames are included, unless they need over half: then they come on top, with a warning.
+        route_bytes_per_place: bytes that grow with the route, but for positions of frames; the step is the
+            smallest that fits.
         step: the step itself, in units of the descriptor.
         chunk: places of a chunk. Shorter chunks cost more bytes; a shorter route is one chunk.
         transform, metric: of the maps, see `SpectralMap`.
@@ -81,7 +76,6 @@ class SpectralMapper(Mapper):
                 raise InputError(f"{name} is {value}; expected a number above 0{share}")
         self.route_bytes_per_place, self.step, self.hold = route_bytes_per_place, step, hold
         self.chunk, self.transform, self.metric, self.resolution = chunk, transform, metric, resolution
-        self.overhead = 0  # see `with_overhead`
         self.empty()  # checks the settings
 
     @classmethod
@@ -90,18 +84,11 @@ class SpectralMapper(Mapper):
         size = (route.summary().route_bytes - route.positions.nbytes) / route.places
         return cls(size, None, route.chunk, route.transform, route.metric)
 
-    @property
-    def share(self) -> float | None:
-        """The share of the variance that maps hold at least; None if bytes or a step decide."""
-        given = self.route_bytes_per_place is not None or self.step is not None
-        return None if given else self.hold or HELD
-
     @torch.no_grad()
     def forward(self, features: Tensor) -> SpectralMap:
         route, lines = self._fitted(features, self.chunk)
         for (start, stop), levels in zip(lines.chunks, lines.levels(route.step), strict=True):
             route.extend([Chunk(stop - start, route.step, encode(levels))], [levels])
-        route.energy, route.error = lines.energy, lines.error(route.step)
         return route
 
     @torch.no_grad()
@@ -112,11 +99,6 @@ class SpectralMapper(Mapper):
 
     def empty(self, means: Tensor | None = None, step: float = 0.0) -> SpectralMap:
         return SpectralMap(means, self.metric, self.transform, self.chunk, self.resolution, step)
-
-    def with_overhead(self, overhead: int) -> SpectralMapper:
-        other = copy.copy(self)
-        other.overhead = overhead
-        return other
 
     extra_repr = settings_of
 
@@ -129,26 +111,15 @@ class SpectralMapper(Mapper):
         if not lines.scale > 1e-6 * float(lines.mean.float().square().mean().sqrt()):
             raise InputError(f"the {places} descriptors are all the same; expected a route that changes")
         fixed = round(share * lines.mean_bytes) + CHUNK_BYTES * len(lines.chunks)
-        budget = self.route_bytes_per_place
-        if budget is not None:
-            if self.overhead <= max(0, budget * places - fixed) / 2:
-                fixed += self.overhead
-            else:
-                seen = f"positions of frames take {self.overhead / places:.3g} bytes per place"
-                left = f"what route_bytes_per_place={budget:g} leaves for them and the lines"
-                log.warning(f"{seen}, over half of {left}: they come on top of it")
         step = float(torch.tensor(self._fitting_step(lines, fixed), dtype=torch.float32))  # as in the file
-        route = self.empty(lines.mean[None], step)
-        even = lines.even()  # lines that `resolution` removes do not count as missing
-        if self.share is None and even.held(step) < HALF:
-            route.needed = (fixed + lines.coded_bytes(even.step_that_holds(HELD))) / places
-        return route, lines
+        return self.empty(lines.mean[None], step), lines
 
     def _fitting_step(self, lines: RouteLines, fixed: int) -> float:
         """The smallest step whose coded lines fit into the budget, or the step that `step` or `hold` says."""
         if self.step is not None:
             return self.step
         if self.route_bytes_per_place is None:
+            # lines that `resolution` removes do not count as missing
             step = lines.even().step_that_holds(self.hold or HELD)
             room = 0 if self.hold else LINE_BYTES * len(lines.lines)
             return lines.step_of(room) if lines.coded_bytes(step) < room else step
@@ -157,7 +128,7 @@ class SpectralMapper(Mapper):
         most = math.floor(least) + 4 * dimension  # all numbers as floats
         if not least < budget <= most:
             example = math.ceil(least + min(5, 2 * dimension))
-            expected = f"more than {least:.3g} for mean, chunks and positions, such as {example}"
+            expected = f"more than {least:.3g} for mean and chunks, such as {example}"
             expected += f", and at most {most}, with all numbers as floats"
             raise InputError(f"route_bytes_per_place is {budget:g}; expected {expected}")
         return lines.step_of(budget * places - fixed)
@@ -180,7 +151,7 @@ def code_chunk(
     check_descriptors(descriptors, len(mean))
     lines = RouteLines(descriptors, [len(descriptors)], transform, resolution, mean)
     (levels,) = lines.levels(step)
-    return Chunk(len(descriptors), step, encode(levels), lines.energy, lines.error(step))
+    return Chunk(len(descriptors), step, encode(levels))
 
 
 def check_descriptors(features: Tensor, dimension: int | None = None) -> None:

@@ -44,16 +44,11 @@ CHUNK_BYTES = 8 + 4 + 8 + 8  # a chunk's length, step, stream length and checksu
 
 
 class Chunk(NamedTuple):
-    """Consecutive places as a file stores them.
-
-    energy, error: the sums of squares of all lines and of the quantisation errors; 0 if not known.
-    """
+    """Consecutive places as a file stores them."""
 
     places: int
     step: float
     stream: Stream
-    energy: float = 0.0
-    error: float = 0.0
 
 
 class SpectralState(NamedTuple):
@@ -94,8 +89,7 @@ class SpectralMap(PlaceMap):
         norms: (N,) float32, of the coded descriptors; tiny ones are 0 (`MIN_NORM`).
 
     Attributes:
-        chunks: the places [start, stop) of each. energy, error: see `Chunk`, summed over added chunks.
-        needed: bytes per place to hold .85 of the variance, if the map was learned and holds less than half.
+        chunks: the places [start, stop) of each.
 
     Args:
         means: as above; None makes a map that can load any state.
@@ -123,7 +117,6 @@ class SpectralMap(PlaceMap):
     feature: Tensor
     level: Tensor
     norms: Tensor
-    needed: float | None = None
 
     def __init__(
         self,
@@ -161,7 +154,7 @@ class SpectralMap(PlaceMap):
         self.level, self.norms = self.lengths.to(torch.int8), self.lengths.float()
         self.chunks: list[tuple[int, int]] = []
         self._bounds = [0]  # of each chunk's coefficients
-        self.places, self.energy, self.error = 0, 0.0, 0.0
+        self.places = 0
 
     def extend(self, chunks: Iterable[Chunk], levels: Iterable[Tensor] | None = None) -> None:
         """Add the places of coded chunks; the scores of the others do not change.
@@ -175,7 +168,7 @@ class SpectralMap(PlaceMap):
         chunks = [*chunks]
         if not chunks:
             return
-        places, device = [one.places for one in chunks], self.means.device
+        places, device = [one.places for one in chunks], self.device
         if levels is None:
             with ThreadPoolExecutor(torch.get_num_threads()) as pool:
                 parts = [*pool.map(lambda c: _nonzero(decode(c.stream, c.places, self.dimension)), chunks)]
@@ -201,7 +194,6 @@ class SpectralMap(PlaceMap):
             self.chunks.append((self.places, self.places + chunk.places))
             self._bounds.append(self._bounds[-1] + len(level))
             self.places += chunk.places
-            self.energy, self.error = self.energy + chunk.energy, self.error + chunk.error
         append("norms", *map(self._norms_of, range(len(self.chunks) - len(chunks), len(self.chunks))))
         if not self.norms.isfinite().all():
             raise InputError("the map does not fit together: its descriptors are not finite")
@@ -214,13 +206,8 @@ class SpectralMap(PlaceMap):
 
     def _routes_of(self, chunks: range) -> Tensor:
         """The route of each chunk."""
-        starts = torch.tensor([self.chunks[g][0] for g in chunks], device=self.means.device)
+        starts = torch.tensor([self.chunks[g][0] for g in chunks], device=self.device)
         return self.table.route_of(starts) if self.routes else torch.zeros_like(starts)
-
-    @property
-    def held(self) -> float | None:
-        """The share of the variance that the lines hold, over added chunks; None if there are none."""
-        return 1 - self.error / self.energy if self.energy else None
 
     def coded(self) -> list[Chunk]:
         """The chunks as a file stores them, for `extend`."""
@@ -291,7 +278,7 @@ class SpectralMap(PlaceMap):
     def _features(self, chunk: int) -> Iterator[Tensor]:
         """The coded descriptors of a chunk, some of their features at a time: (F,W) each."""
         start, stop = self.chunks[chunk]
-        units = torch.eye(self.dimension, dtype=torch.float32, device=self.means.device)
+        units = torch.eye(self.dimension, dtype=torch.float32, device=self.device)
         for some in units.split(max(1, LONG // (stop - start))):
             yield self.products(some, range(chunk, chunk + 1))
 
@@ -314,13 +301,8 @@ class SpectralMap(PlaceMap):
         """The places in a chunk nearest to M = `count` even positions, (M,) int64."""
         start, stop = self.chunks[chunk]
         half = 0.5 if self.transform == "dct" else 0.0  # DCT places are in the middle of a step
-        at = (torch.arange(count, device=self.norms.device) + half) * ((stop - start) / count) - half
+        at = (torch.arange(count, device=self.device) + half) * ((stop - start) / count) - half
         return at.round().long().clamp(max=stop - start - 1)
-
-    def inverse_norms(self, start: int = 0, stop: int | None = None) -> Tensor:
-        """1 / norm of the places [start, stop), 0 for a norm of 0."""
-        norms = self.norms[start:stop]
-        return torch.where(norms > 0, 1 / norms, 0)
 
     def products(self, queries: Tensor, chunks: range) -> Tensor:
         """Inner products with all descriptors of G chunks of equal length W: (Q,K) -> (Q,W G).
@@ -382,13 +364,7 @@ class SpectralMap(PlaceMap):
         for run in self._runs(rows):
             start, stop = self.chunks[run.start][0], self.chunks[run.stop - 1][1]
             products = self.products(queries, run)
-            if self.metric == "cosine":
-                inverse = self.inverse_norms(start, stop).to(queries)
-                scores = torch.addcmul(queries.new_ones(()), products, inverse, value=-1)
-            else:
-                square = self.norms[start:stop].to(queries).square()
-                scores = (square - 2 * products + length.square()).clamp(min=0)
-            yield start, scores
+            yield start, scores_of(products, self.norms[start:stop], length, self.metric)
 
     @property
     def block_places(self) -> int:
@@ -403,7 +379,7 @@ class SpectralMap(PlaceMap):
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         super().set_extra_state(state)
-        self.routes = checked(state.get("routes", ()), tuple[Route, ...], "the map's routes")
+        self.routes = checked(state["routes"], tuple[Route, ...], "the map's routes")
 
     def check(self) -> None:
         for name, (dtype, ndim) in FILE.items():
@@ -474,6 +450,17 @@ class SpectralMap(PlaceMap):
             f"places={self.places}, dimension={self.dimension}, lines={len(self.level)}, "
             f"chunks={len(self.chunks)}, metric={self.metric!r}, transform={self.transform!r}"
         )
+
+
+def scores_of(products: Tensor, norms: Tensor, length: Tensor, metric: SpectralMetric) -> Tensor:
+    """Scores of places from their inner products with queries, for "cosine" with queries of length 1 or 0.
+
+    Shape: products (Q,N); norms of the places, (N,) or (Q,N); length of the queries (Q,1), for "l2" -> (Q,N).
+    """
+    if metric == "cosine":
+        inverse = torch.where(norms > 0, 1 / norms, 0).to(products)
+        return torch.addcmul(products.new_ones(()), products, inverse, value=-1)
+    return (norms.to(products).square() - 2 * products + length.square()).clamp(min=0)
 
 
 def sparse_products(queries: Tensor, counts: Tensor, feature: Tensor, level: Tensor) -> Tensor:

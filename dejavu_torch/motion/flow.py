@@ -1,4 +1,4 @@
-"""The shift between two patches of ground by OpenCV's sparse or dense optical flow (section IV-B)."""
+"""The shift between two patches of ground by OpenCV's optical flow (section IV-B)."""
 
 from __future__ import annotations
 
@@ -19,35 +19,33 @@ Tracker = Callable[[Array, Array, float], tuple[Array, Array, Array]]
 TOLERANCE = 0.7  # pixels within which displacements agree
 STARTS = (0, -1, 1, -2, 2, -3, 3)  # initial shifts, in eighths of the patch
 SUFFICIENT_CONFIDENCE = 0.8  # stops the search over initial shifts
-MIN_CORRELATION = 0.25  # between the 9 x 9 pixels around a point before and after it moved
 CONTRAST = 40.0  # grey levels per standard deviation of the patch
 
 
-def flow_shift(first: Tensor, second: Tensor, method: str) -> tuple[Tensor, Tensor]:
+def flow_shift(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
     """The shift of the ground between two patches, as in `phase_shifts`: shift (B,), confidence (B,).
 
     The shift is the median displacement of points that return to their start when tracked forward and back.
-    "lk" tracks up to 200 corners (pyramidal Lucas-Kanade), "dis" every pixel around which the brightness
-    varies from row to row (dense inverse search). The confidence is the share of points that agree with the
-    median, 0 for a patch that is flat or not finite.
+    It tracks up to 200 corners (pyramidal Lucas-Kanade). The confidence is the share of points that agree
+    with the median, 0 for a patch that is flat or not finite.
 
-    Limits: |shift| up to about 0.4 h ("dis" 0.25 h, accurate to 0.1 pixels only). Lines along the way appear
-        static: on a motorway both are worse than `phase_shifts`.
+    Limits: |shift| up to about 0.4 h. Lines along the way appear static: on a motorway it is worse than
+        `phase_shifts`.
     """
-    track = _tracker(method)
+    track = _tracker()
     found = [_shift(track, *pair) for pair in zip(_to_uint8(first), _to_uint8(second), strict=True)]
     shift, confidence = first.new_tensor(found).view(-1, 2).T
     return shift, confidence
 
 
-def _tracker(method: str) -> Tracker:
-    """The function `track(first, second, start)` of a method, which follows points between two images."""
+def _tracker() -> Tracker:
+    """The function `track(first, second, start)`, which follows points between two images."""
     try:
         import cv2
     except ImportError as error:
         seen = f"optical flow needs OpenCV, which cannot be imported ({error})"
         raise InputError(f"{seen}; expected pip install 'dejavu_torch[flow]'") from error
-    return partial(TRACKERS[method], cv2)
+    return partial(_track_corners, cv2)
 
 
 def _to_uint8(patches: Tensor) -> Array:
@@ -89,27 +87,3 @@ def _track_corners(cv2: Any, first: Array, second: Array, start: float) -> tuple
     back, kept, _ = track(second, first, moved, moved - guess)
     returned = (found & kept)[:, 0].astype(bool) & (np.abs(back - points) < TOLERANCE).all((1, 2))
     return points[:, 0], (moved - points)[:, 0], returned
-
-
-def _track_pixels(cv2: Any, first: Array, second: Array, start: float) -> tuple[Array, Array, Array]:
-    search = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    mean = partial(cv2.boxFilter, ddepth=-1, ksize=(9, 9))
-    y, x = np.indices(first.shape, np.float32)
-    points = np.stack([x, y], 2)
-    guess = np.zeros_like(points)
-    guess[..., 1] = start
-    moved = search.calc(first, second, guess)
-    look_up = partial(cv2.remap, map1=points + moved, map2=None, interpolation=cv2.INTER_LINEAR)
-    back = look_up(search.calc(second, first, -guess), borderValue=(np.inf, np.inf))
-    returned = (np.abs(moved + back) < TOLERANCE).all(2)
-    # dense flow is smooth between any two images: the ground it matches must also correlate
-    one, other = first.astype(np.float32), look_up(second).astype(np.float32)
-    variances = (mean(one**2) - mean(one) ** 2) * (mean(other**2) - mean(other) ** 2)
-    covariance = mean(one * other) - mean(one) * mean(other)
-    similar = covariance / np.sqrt(np.maximum(variances, 1)) > MIN_CORRELATION
-    slope = mean(cv2.Sobel(first, cv2.CV_32F, 0, 1) ** 2)
-    textured = slope >= 0.25 * slope.mean()
-    return points[textured], moved[textured], (returned & similar)[textured]
-
-
-TRACKERS: dict[str, Callable[..., tuple[Array, Array, Array]]] = {"lk": _track_corners, "dis": _track_pixels}

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from dejavu_torch.data.traverse import runs
-from dejavu_torch.motion.flow import TRACKERS, flow_shift
+from dejavu_torch.motion.flow import flow_shift
 from dejavu_torch.motion.ground_plane import TRAPEZIUM, Corners, check_corners, ground_patch
 from dejavu_torch.motion.phase_correlation import MIN_CONFIDENCE, phase_shifts, viterbi_path
 from dejavu_torch.text import progress_of, settings_of
@@ -44,8 +44,8 @@ class GroundOdometry(nn.Module):
             patches of 96 x 96; in patches of 32 x 32, unrelated ground can reach 0.8.
         still: dead band in pixels of ground: a shorter step of either sign is set to 0. Low contrast needs
             more, slow footage at a high frame rate less.
-        flow: how patches are compared: "phase" (`phase_shifts`), or OpenCV's optical flow, "lk" on corners
-            or "dis" on all pixels (`flow_shift`, with its limits; `pip install 'dejavu_torch[flow]'`).
+        flow: how patches are compared: "phase" (`phase_shifts`), or "lk", OpenCV's optical flow of corners
+            (`flow_shift`, with its limits; `pip install 'dejavu_torch[flow]'`).
 
     Shape: (N,C,H,W) -> shift (N-1,) in pixels of ground, forward > 0; confidence (N-1,) in [0, 1].
 
@@ -79,8 +79,8 @@ class GroundOdometry(nn.Module):
             raise InputError(f"least is {least}; expected a confidence from 0 to 1")
         if not 0 <= still < math.inf:
             raise InputError(f"still is {still}; expected pixels of ground, at least 0")
-        if flow not in ("phase", *TRACKERS):
-            raise InputError(f"flow is {flow!r}; expected phase, {', '.join(TRACKERS)}")
+        if flow not in ("phase", "lk"):
+            raise InputError(f"flow is {flow!r}; expected phase or lk")
         self.corners = tuple((float(x), float(y)) for x, y in corners)
         self.size = (int(size[0]), int(size[1]))
         self.step = None if step is None else float(step)
@@ -95,7 +95,7 @@ class GroundOdometry(nn.Module):
             return []
         if self.flow == "phase":
             return [phase_shifts(patches[:-1], patches[1:])]
-        shift, confidence = flow_shift(patches[:-1], patches[1:], self.flow)
+        shift, confidence = flow_shift(patches[:-1], patches[1:])
         return [(shift[:, None], confidence[:, None])]
 
     def _path(self, parts: list[tuple[Tensor, Tensor]], name: str) -> tuple[Tensor, Tensor]:

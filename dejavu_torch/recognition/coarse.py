@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dejavu_torch.maps.place_map import PlaceMap
-from dejavu_torch.maps.spectral_map import SpectralMap
+from dejavu_torch.maps.spectral_map import SpectralMap, scores_of
 from dejavu_torch.maps.spectrum import half_cycles
 from dejavu_torch.recognition.search import NmsSpec, Scan, Search, TopK, check_search, empty_topk
 from dejavu_torch.recognition.select import best_candidates
@@ -238,9 +238,8 @@ class CoarseSearch(Scan):
                 own, row = query.unique_consecutive(return_inverse=True)
                 here = self.route.products(units[own], range(g, g + 1))
                 products[query, column] = here[row, place[query, column] - self.route.chunks[g][0]]
-        norms = self.route.norms[place]
-        inverse = torch.where(norms > 0, 1 / norms, 0).masked_fill(place < 0, 1)
-        return torch.addcmul(products.new_ones(()), products, inverse, value=-1)
+        norms = self.route.norms[place].masked_fill(place < 0, 1)
+        return scores_of(products, norms, norms, "cosine")
 
     def _incomplete(self, score: Tensor, place: Tensor, wanted: list[NmsSpec]) -> Tensor:
         """Which queries lack some of the wanted candidates, (Q,)."""

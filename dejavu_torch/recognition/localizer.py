@@ -92,7 +92,7 @@ class Localizer:
         searches = not self.models and matching.on_scores is None and (few or type(self.searcher) is not Scan)
         size = max(PER_BEST * n, places // PLACES_PER_NUMBER) if searches else places
         parts = descriptors.split(max(1, min(ROWS, SCORES_AT_ONCE // size)))
-        moved = (part.to(route.positions.device) for part in with_progress(parts, label))
+        moved = (part.to(route.device) for part in with_progress(parts, label))
         if searches:
             return Match.joined(self._search(part, wanted) for part in moved)
         return Match.joined(self.match(route.scores(part)) for part in moved)

@@ -25,7 +25,6 @@ KEYS: dict[str, type] = {  # that every reader needs; the others are Lightning's
     **{"pytorch-lightning_version": str, "epoch": int, "global_step": int, "state_dict": dict},
     **{"stages": list, "stage": int, "began": int, "trained": list, "routes": list, "held": list},
 }
-OPTIONAL: dict[str, Any] = {"routes": [], "held": []}  # missing in older checkpoints
 MAX_PARTS = 10**6  # of nested containers
 
 
@@ -62,7 +61,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     size = check_regular(path, EXPECTED.removeprefix("expected "))
     try:
         _check_archive(path, size)
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+        checkpoint: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
         _check_content(checkpoint, size)
     except InputError as error:
         raise InputError(f"{path} {error}; {EXPECTED}") from error
@@ -70,7 +69,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
         cause = "it holds more than tensors and plain data"
         cause = cause if isinstance(error, UnpicklingError) else cause_of(error)
         raise InputError(f"{path} cannot be read: {cause}; {EXPECTED}") from error
-    return {**checkpoint, **{key: checkpoint.get(key, value) for key, value in OPTIONAL.items()}}
+    return checkpoint
 
 
 def _check_archive(path: Path, size: int) -> None:
@@ -92,7 +91,7 @@ def _check_content(checkpoint: Any, size: int) -> None:
     if not isinstance(checkpoint, dict):
         raise InputError(f"is of type {type(checkpoint).__name__}")
     for key, kind in KEYS.items():
-        value = checkpoint.get(key, OPTIONAL.get(key))
+        value = checkpoint.get(key)
         whole = isinstance(value, kind) and not isinstance(value, bool)
         if not whole or (isinstance(value, int) and not 0 <= value < LARGEST):
             raise InputError(f"has {key} {str(value)[:40]}, not of type {kind.__name__} and in range")

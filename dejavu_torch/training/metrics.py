@@ -9,7 +9,7 @@ from torch import Tensor
 from torchmetrics import Metric
 from torchmetrics.utilities.data import dim_zero_cat
 
-from dejavu_torch.data.ground_truth import GroundTruth, Truth, counted, is_right
+from dejavu_torch.data.ground_truth import GroundTruth, Truth, scored_and_right
 from dejavu_torch.evaluation.curves import Scores, check_truth, evaluate
 from dejavu_torch.types import InputError, Match
 
@@ -63,8 +63,8 @@ class PlaceRecognition(Metric):
             raise InputError("a score is NaN; expected numbers or +inf")
         index, score = match.index.cpu(), match.score.detach().cpu()
         truth = GroundTruth(*(part.cpu() for part in truth))
-        good, answerable = is_right(index, truth.positives, self.tolerance), (truth.positives >= 0).any(1)
-        kept = counted(index, truth, self.tolerance)
+        kept, good = scored_and_right(index, truth, self.tolerance)
+        answerable = (truth.positives >= 0).any(1)
         # the same queries on a map of two places: the reported place is 0, and the right one is 0 or 1
         rows = torch.stack(
             [score, (index >= 0).double() - 1, torch.where(answerable, (~good).double(), -1)], 1

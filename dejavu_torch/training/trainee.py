@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.features.extract import features_of, in_mode
 from dejavu_torch.features.joined import groups_of
-from dejavu_torch.features.whitening import INDEPENDENT
+from dejavu_torch.features.whitening import INDEPENDENT, MOST_VIEWS
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.template_map import TemplateMap, log_posterior
@@ -177,10 +177,10 @@ class Trainee(pl.LightningModule):
                 self.check_budget(*features.shape)
             if whitening is not None:
                 torch.manual_seed(whitening.seed)
-                views = self.views_of(whitening.copies(*features.shape), whitening.most_views)
+                views = self.views_of(whitening.copies(*features.shape), MOST_VIEWS)
                 pairs = ((view, places[:, 0]) for view, places in views)
                 shown = None if whitening.views == 0 else pairs
-                whitening.learn(features, shown, *groups_of(self.features), INDEPENDENT * len(features))
+                whitening.learn(features, shown, groups_of(self.features), INDEPENDENT * len(features))
             alone = self.data.reference if len(self.data.routes) == 1 else None
             model.learn_features(model.descriptor.whitened(features), alone)
 

@@ -16,7 +16,7 @@ from dejavu_torch.evaluation.reproduce import paper_model
 
 FRAMES = 256
 PICTURES = (
-    *("pairs", "coverage", "scores", "pr", "auc", "storage", "sequences", "spectrum", "components"),
+    *("pairs", "coverage", "scores", "pr", "auc", "storage", "sequences", "spectrum"),
     "reliability",
 )
 OF_TEMPLATES = {"chunks", "spectrogram", "templates", "features", "activations"}

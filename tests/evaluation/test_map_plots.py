@@ -1,8 +1,6 @@
-"""Pictures of a spectral map, read back from the figures, and a query's scores as a sum of periods."""
+"""Pictures of a spectral map, read back from the figures."""
 
 from __future__ import annotations
-
-from fractions import Fraction
 
 import pytest
 import torch
@@ -14,7 +12,7 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import as_ground_truth, offset_truth
 from dejavu_torch.evaluation.contenders import COLOURS
 from dejavu_torch.evaluation.localization import Localization
-from dejavu_torch.evaluation.map_plots import components, draw_components, draw_spectrum
+from dejavu_torch.evaluation.map_plots import draw_spectrum
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.spectrum import period_of
@@ -61,56 +59,4 @@ def test_the_lines_that_are_marked_are_those_of_the_map(chunk: int) -> None:
 
 def test_a_map_without_lines_has_no_such_pictures() -> None:
     run, held = localized()[0], SpectralMapper(None, 1e6)(route(0))
-    assert draw_spectrum(run, held) == draw_components(run, held) == {}
-
-
-def test_the_components_end_with_the_map_s_own_scores() -> None:
-    run, held = localized()
-    picture = draw_components(run, held)["components"]
-    figure, axes = picture.plot
-    assert axes[-1].lines[0].get_ydata().tolist() == pytest.approx(
-        held.scores(route(1)[120:121])[0].tolist(), abs=1e-5
-    )
-    assert axes[-1].lines[0].get_color() == COLOURS["map"]
-    assert {"true place", "difference of query 120 (lower is better)"} <= set(texts(figure))
-    titles = [axis.get_title(loc="left") for axis in axes]
-    assert titles[0].startswith("strongest period, 8 frames: ")
-    assert titles[1].startswith("4 strongest periods: ")
-    better = picture.numbers["places_that_fit_better"]
-    assert [int(title.split(": ")[1].split()[0]) for title in titles] == better
-    assert better[-1] == 0 < better[0]
-    assert len({axis.get_ylim() for axis in axes}) == 1
-    unscored = draw_components(*localized(scored=False))["components"]
-    assert unscored.numbers == {}
-    assert "fit better" not in " ".join(texts(unscored.plot[0]))
-
-
-def waves() -> Tensor:
-    """Two numbers that repeat after 24 places and after 15, the first twice as large."""
-    angle = 2 * torch.pi * torch.arange(PLACES)[:, None] / torch.tensor([24.0, 15.0])
-    return torch.cat([angle.sin(), angle.cos()], 1) * torch.tensor([2.0, 1.0, 2.0, 1.0])
-
-
-@pytest.mark.parametrize(
-    ("transform", "metric", "chunk"), [("dft", "l2", 10_000), ("dct", "cosine", 70), ("dct", "l2", 70)]
-)
-def test_the_sum_of_all_periods_is_the_map_s_score(transform: str, metric: str, chunk: object) -> None:
-    torch.manual_seed(0)
-    route = SpectralMapper(None, 0.5, chunk, transform, metric)(waves() + 0.3 * torch.randn(240, 4) + 1)  # type: ignore[arg-type]
-    query = torch.randn(4)
-    expected = route.scores(query[None])[0]
-    for number, (start, stop) in enumerate(route.chunks):
-        *some, (every, scores) = components(route, query, number)
-        assert torch.allclose(scores, expected[start:stop], atol=1e-4)
-        assert [len(periods) for periods, _ in some] == [n for n in (1, 4, 16) if n < len(every)]
-        assert all(periods == every[: len(periods)] for periods, _ in some)
-
-
-def test_the_strongest_period_alone_is_a_wave() -> None:
-    route = SpectralMapper(None, 0.01, metric="l2")(waves())
-    (strongest, first), (both, every) = components(route, waves()[100])
-    assert (strongest, both) == ((Fraction(24),), (Fraction(24), Fraction(15)))
-    # |query|^2 + |place|^2 - 2 query . place
-    wave = 10 - 8 * (2 * torch.pi * (torch.arange(PLACES) - 100) / 24).cos()
-    assert torch.allclose(first, wave, atol=0.05)
-    assert int(every.argmin()) % 120 == 100  # both waves begin anew after 120 places
+    assert draw_spectrum(run, held) == {}

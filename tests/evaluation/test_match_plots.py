@@ -8,7 +8,7 @@ import torch
 from drawn import matched, run_of, texts
 from torch import Tensor
 
-from dejavu_torch import PlaceFilter, SequenceMatcher
+from dejavu_torch import PlaceFilter
 from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth
 from dejavu_torch.evaluation.match_plots import (
     draw_coverage,
@@ -103,7 +103,7 @@ def test_scores_are_scaled_and_the_best_of_each_block_is_shown(monkeypatch: pyte
     run.scores = of
     picture = draw_scores(run, cells=20)["scores"]
     for column, block in enumerate(scaled(scores)[::2].split(3, 1)):
-        assert torch.allclose(image(picture.plot[1].flat[0])[:, column], block.amin(1))
+        assert torch.allclose(image(picture.plot[1])[:, column], block.amin(1))
     assert (sum(asked), max(asked)) == (15, 4)
     told = "Shown: 15 of 30 queries; the best of every 3 neighbouring places."
     assert picture.caption.endswith(told)
@@ -121,7 +121,7 @@ def test_convention_11_places_and_queries_are_drawn_at_their_frames() -> None:
     assert labels <= set(texts(figure))
     run = run_of(torch.rand(4, 10), borders=borders, query_frames=queries, match=match, truth=truth)
     for cells, shape in ((20, (10, 4)), (4, (4, 4))):
-        figure, ((axis,),) = draw_scores(run, cells)["scores"].plot
+        figure, axis = draw_scores(run, cells)["scores"].plot
         assert axis.images[0].get_array().shape[:2] == shape
         assert (axis.get_xlim(), axis.get_ylim()) == ((-0.5, 12.5), (-0.5, 39.5))
         reported, first, second, _ = axis.lines
@@ -132,36 +132,6 @@ def test_convention_11_places_and_queries_are_drawn_at_their_frames() -> None:
         assert {"query (frame)", "place (frame)", "reported place", "right place"} <= set(texts(figure))
     run.truth = None
     assert "right place" not in texts(draw_scores(run)["scores"].plot[0])
-
-
-def test_the_cells_that_a_sequence_adds_up_are_drawn_on_the_scores_around_them() -> None:
-    scores, place = torch.rand(81, 50), 30
-    for k in range(5):  # the query is 2 places further on with each
-        scores[40 - k, place - 2 * k] = -1.0
-    borders, queries = torch.arange(0, 102, 2), torch.arange(0, 243, 3)  # convention 11
-    parts = {"match": matched(*[place] * 81), "sequence": SequenceMatcher(5, speeds=(1, 2))}
-    run = run_of(scores, borders=borders, query_frames=queries, **parts)
-    figure, (above, below) = draw_scores(run)["scores"].plot
-    (line,) = [line for line in below.lines if line.get_label() == "added up"]
-    added = [(40, 30), (39, 28), (38, 26), (37, 24), (36, 22)]
-    assert list(zip(*line.get_data(), strict=True)) == [(3 * query, 2 * place) for query, place in added]
-    assert torch.allclose(image(below), scaled(scores)[31:46, 17:36])
-    assert (below.get_xlim(), below.get_ylim()) == ((92.5, 137.5), (33.5, 71.5))
-    (frame,) = above.patches
-    assert (frame.get_xy(), frame.get_width(), frame.get_height()) == ((93, 34), 45, 38)
-    assert {"added up", "reported place", "query (frame)"} <= set(texts(figure))
-
-
-def test_what_a_sequence_adds_up_may_reach_off_the_map_and_before_the_first_query() -> None:
-    scores = torch.rand(4, 12)
-    scores[:, 9:] = torch.inf  # nothing covers the last places
-    matcher = SequenceMatcher(6, speeds=(1, -1))
-    run = run_of(scores, match=matched(1, 1, 1, 1), sequence=matcher)
-    below = draw_scores(run)["scores"].plot[1][1]
-    assert image(below).shape == (4, 12)
-    assert image(below)[:, 9:].isnan().all()
-    query, place = (torch.as_tensor(part).long() for part in below.lines[-1].get_data())
-    assert torch.isclose(scores[query, place].mean(), matcher(scores[:3])[-1, 1])
 
 
 def test_a_posterior_is_pooled_as_it_comes_and_shows_some_right_places(

@@ -11,7 +11,7 @@ from footage import QUERY, REFERENCE, STEP, camera, footage
 from helpers import Fixed, template_model
 from torch import Tensor, nn
 
-from dejavu_torch import HOG, DejaVu, Match, PlaceFilter, Preprocess, SequenceMatcher, SpectrogramAnalysis
+from dejavu_torch import HOG, DejaVu, Match, PlaceFilter, Preprocess, SpectrogramAnalysis
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth, offset_truth
 from dejavu_torch.data.positions import place_of
@@ -83,7 +83,7 @@ def test_every_picture_of_frames_that_repeat(run: Localization) -> None:
     pictures = drawn(run, stride=other, leave_out=other)
     assert tuple(pictures) == ALL
     assert {"this map", "the stride"} < set(texts(pictures["auc"].plot[0]))
-    best = torch.tensor(pictures["scores"].plot[1].flat[0].images[0].get_array()).argmin(0)
+    best = torch.tensor(pictures["scores"].plot[1].images[0].get_array()).argmin(0)
     assert torch.equal(best, run.match.index)
     assert [name for name, picture in pictures.items() if picture.numbers] == ["activations"]
     assert "Elsewhere" in pictures["activations"].caption
@@ -142,16 +142,11 @@ def sequenced(run: Localization, model: SequenceModel) -> Localization:
     return run._replace(matching=Matching(model), match=match)
 
 
-def test_a_sequence_shows_what_it_adds_up_and_a_filter_its_posterior(run: Localization) -> None:
+def test_a_filter_shows_its_posterior(run: Localization) -> None:
     pictures = draw_pictures(sequenced(run, PlaceFilter()), {})
     assert list(pictures)[2:4] == ["scores", "posterior"]
-    assert "cells" not in pictures["scores"].caption
+    assert "The scores are those of single queries" in pictures["scores"].caption
     assert "Circles" in pictures["posterior"].caption
-    run = sequenced(run, SequenceMatcher(5))
-    run.match.index[58:63] = -1  # the example is the nearest to the middle that is reported
-    assert "frame 57 and its reported place, the 5 cells" in draw_pictures(run, {})["scores"].caption
-    run.match.index.fill_(-1)
-    assert "cells" not in draw_pictures(run, {})["scores"].caption
 
 
 def test_the_paper_s_own_pictures(run: Localization) -> None:
@@ -222,7 +217,7 @@ def test_convention_11_every_axis_along_a_resampled_route_counts_frames(
     asked = [frame for line in axes["coverage"].lines for frame in line.get_xdata().tolist()]
     assert sorted(asked) == run.query.frame.tolist()
     assert axes["coverage"].get_ylim()[1] == axes["chunks"].get_xlim()[1] == frames
-    scores = axes["scores"].flat[0]
+    scores = axes["scores"]
     assert scores.get_ylim() == (-0.5, frames - 0.5)
     filtered = draw_pictures(sequenced(run, PlaceFilter()), {})["posterior"].plot[1][0]
     assert filtered.get_ylim() == (-0.5, frames - 0.5)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +11,6 @@ import pytest
 import torch
 from command_line import fails, run
 from helpers import refused
-from reference import joined_rows
 from torch import Tensor, nn
 
 from dejavu_torch import (
@@ -77,9 +75,8 @@ def test_features_lie_side_by_side_and_tell_their_groups() -> None:
     parts = [member(frames) for member in features.members]
     assert torch.equal(made, torch.cat(parts, 1))
     assert features.groups == tuple(part.shape[1] for part in parts) == (432, 24, 12)
-    assert groups_of(nn.Sequential(Preprocess(), features)) == (features.groups, None)
-    assert groups_of(Joined([HOG(), Means()], [1, 0.5])) == (None, [1, 0.5])
-    assert groups_of(HOG()) == (None, None)
+    assert groups_of(nn.Sequential(Preprocess(), features)) == features.groups
+    assert groups_of(HOG()) is None
 
 
 def test_gradients_reach_the_members_weights_and_the_frames() -> None:
@@ -113,9 +110,6 @@ def test_grey_pixels_are_those_of_grey_frames() -> None:
         (lambda: Joined([HOG(), nn.Identity()])(torch.rand(2, 3, 16, 16)), ("Identity made (2, 3, 16, 16)",)),
         (lambda: both()(torch.rand(2, 7)), ("Joined got (2, 7)", "float frames")),
         (lambda: PatchPixels(channel="mauve"), ("'mauve'", "'grey'")),
-        (lambda: Joined([HOG(), Means()], [1.0]), ("shares of 2 members", "[1.0]", "for each")),
-        (lambda: Joined([HOG(), Means()], [1, 0]), ("[1, 0]", "(0, 1]")),
-        (lambda: Joined([HOG(), Means()], [1, 1.5]), ("[1, 1.5]", "(0, 1]")),
     ],
 )
 def test_what_is_refused(call: Callable[[], Any], facts: tuple[str, ...]) -> None:
@@ -155,57 +149,6 @@ def test_the_default_features_are_joined_where_something_whitens_them() -> None:
         assert recipe_of(model.features) == recipe_of(joined)
     for model in (DejaVu(whitening="none"), DejaVu(mapper=templates)):
         assert recipe_of(model.features) == recipe_of(HOG())
-
-
-def members() -> tuple[list[Tensor], Tensor]:
-    """Features of 200 places, two members of 30 and 20 numbers, and of another visit: of both."""
-    random = torch.Generator().manual_seed(0)
-    own = [torch.randn(200, size, generator=random) for size in (30, 20)]
-    return own, torch.cat(own, 1) + 0.3 * torch.randn(200, 50, generator=random)
-
-
-@pytest.mark.parametrize("share", [0.3, 1.0])
-@pytest.mark.parametrize("views", [True, False])
-def test_a_share_is_that_of_a_members_numbers_and_of_its_squared_length(share: float, views: bool) -> None:
-    """With as many numbers as the members have and no views, cosines are the weighted mean of theirs."""
-    own, other = members()
-    shown = [(other, torch.arange(200))] if views else None
-    whitening = Whitening(numbers=21 if views else None, group_numbers=15, bits=16)
-    whitening.numbers = math.ceil(15) + math.ceil(share * 15) + 2 * (not views)  # and one constant each
-    whitening.learn(torch.cat(own, 1), shown, [30, 20], [1, share])
-    constant = 0 if views else 1
-    each = whitening.parts[1:]
-    assert [len(member.scale) for member in each] == [15, math.ceil(share * 15)]
-    assert [len(member.length) for member in each] == 2 * [constant]
-    alone = [one(part) for one, part in zip(each, own, strict=True)]
-    found = whitening(torch.cat(own, 1))
-    expected = (alone[0] @ alone[0].T + share * alone[1] @ alone[1].T) / (1 + share)
-    if views:
-        rows = [one.tolist() for one in alone]
-        expected = joined_rows(rows, rows, whitening.dimension, 0.25, (1, share))
-    torch.testing.assert_close(found @ found.T, expected, atol=2e-3, rtol=0)
-
-
-def test_shares_are_those_of_the_features_and_not_of_other_groups() -> None:
-    own, other = members()
-    rows, shown = torch.cat(own, 1), [(other, torch.arange(200))]
-    for groups, shares, sizes in (
-        (None, [0.5, 0.1], [8, 2]),
-        (None, None, [15, 15]),
-        ([10, 40], [0.5, 0.1], [10, 15]),  # those of the constructor; the first has rank 10
-    ):
-        whitening = Whitening(group_numbers=15, groups=groups)
-        whitening.learn(rows, shown, [30, 20], shares)
-        assert [len(member.scale) for member in whitening.parts[1:]] == sizes
-    alone = Whitening(numbers=12)
-    alone.learn(rows, shown, None, [0.5])
-    assert len(alone.scale) == 12  # nothing is joined
-
-
-def test_a_model_hands_the_shares_of_its_features_to_the_whitening(flights: list[Tensor]) -> None:
-    model = DejaVu(Joined([*both().members], [1, 0.5]), Whitening(views=2)).learn(flights[0])
-    assert model.whitening is not None
-    assert [len(member.scale) for member in model.whitening.parts] == [60, 60, 30]
 
 
 def test_ready_features_have_no_groups_but_those_that_are_asked_for() -> None:

@@ -40,8 +40,8 @@ MODULES: dict[str, nn.Module] = {
     "clahe": Preprocess("G", "clahe", clip_limit=3, grid=[2, 3]),
 }
 OTHERS = {
-    "grouped whitening": Whitening(groups=[30, 20], group_numbers=12),
-    "whitening": Whitening(20, views=3, strengths={"noise": 0.2}, power=0.5),
+    "grouped whitening": Whitening(groups=[30, 20]),
+    "whitening": Whitening(20, views=3, strengths={"noise": 0.2}),
     "spectrogram": SpectrogramAnalysis(256, hop=100, peaks="bins", false_alarm=None),
     "imposed": ImposedPeriods([4, 9], 3, True),
     "odometry": GroundOdometry(size=(64, 48), step=3.0, still=0.2),
