@@ -233,7 +233,7 @@ class DejaVu(nn.Module):
                 learned = learning.learn_descriptors(mapper, rows)
             if counts is not None:
                 learned.count_visits(1 + counts)
-        return self._keep_map(learned, traverse)
+        return self.replace_map(learned, _state_of(self, learned, traverse))
 
     def learn_features(self, features: Tensor, traverse: Traverse | None = None) -> DejaVu:
         """As `learn`, from ready descriptors.
@@ -243,7 +243,8 @@ class DejaVu(nn.Module):
             traverse: their source, if known: it tells the map which frames to expect, and the frame of each
                 resampled place.
         """
-        return self._keep_map(learning.learn_descriptors(self.mapper, features), traverse)
+        learned = learning.learn_descriptors(self.mapper, features)
+        return self.replace_map(learned, _state_of(self, learned, traverse))
 
     def resample(
         self,
@@ -284,43 +285,17 @@ class DejaVu(nn.Module):
             self.descriptor.warned.add((traverse.name, line))
         return at_size(traverse, size)
 
-    def _keep_map(self, route: PlaceMap, traverse: Traverse | None) -> DejaVu:
-        """Keep the map learned from a traverse; returns self in eval mode."""
-        shape = () if traverse is None else traverse.frame_shape
-        if len(shape) == 3 and route.dimension > MANY_FEATURES:
-            line = "each frame gives %d features; smaller frames make a smaller and faster map"
-            log.warning(line, route.dimension)
-        if len(shape) == 1 and (self.preprocess.channel or self.preprocess.contrast):
-            log.warning("these are ready features: channel and contrast have no effect")
-        device, positions = self.map.device, learning.positions_of(traverse)
-        route = route.to(device)  # many descriptors are in a file, on the CPU
-        if len(positions):
-            route.positions = positions.to(device)
-            route.check()
-        step = traverse.step if isinstance(traverse, ResampledTraverse) else None
-        names = [] if traverse is None else [*source_of(traverse).names]
-        self.state = model_file.ModelState(shape or None, step, None, names)
-        self._hand_on(route)
-        return self.replace_map(route)
+    def replace_map(self, place_map: PlaceMap, state: model_file.ModelState | None = None) -> DejaVu:
+        """Set another map, without calibration; returns self in eval mode.
 
-    @torch.no_grad()
-    def _hand_on(self, route: PlaceMap) -> None:
-        """Let the parameters of a new map be those of the present one, for an optimiser, with the new values;
-        the present map keeps a copy of its own."""
-        for name, new in dict(route.named_parameters(recurse=False)).items():
-            own = getattr(self.map, name, None)
-            if not isinstance(own, nn.Parameter) or not own.numel():
-                continue
-            if (own.shape, own.dtype, own.device) == (new.shape, new.dtype, new.device):
-                setattr(self.map, name, nn.Parameter(own.clone()))
-                own.grad = None
-                setattr(route, name, own.copy_(new))
-            else:
-                log.warning("the %s of the map are new parameters: an optimiser has to be made anew", name)
-
-    def replace_map(self, route: PlaceMap) -> DejaVu:
-        """Set another map of the same frames, without calibration; returns self in eval mode."""
-        self.map, self.searcher, self.calibration = route, None, None
+        Args:
+            state: what is known of its route; None: as of the present map.
+        """
+        if state is not None:
+            place_map = place_map.to(self.map.device)  # many descriptors are in a file, on the CPU
+            place_map.take_parameters(self.map)
+            self.state = state
+        self.map, self.searcher, self.calibration = place_map, None, None
         return self.eval()
 
     def calibrate(
@@ -426,15 +401,12 @@ class DejaVu(nn.Module):
         if matching.sequence is not None:
             matching.sequence.check(None, self.map.places)
         single = matching.sequence is None and matching.on_scores is None
-        chosen = self._searcher() if single and matching.search in ("auto", "coarse") else None
-        return Localizer(self.map, matching, chosen)
-
-    def _searcher(self) -> Searcher:
-        """`searcher`, made anew if the map is another one."""
+        if not single or matching.search not in ("auto", "coarse"):
+            return Localizer(self.map, matching)
         known = self.searcher
         if known is None or (isinstance(known, Scan) and not known.fits(self.map)):
             self.searcher = known = self.make_searcher(self.map)
-        return known
+        return Localizer(self.map, matching, known)
 
     def matches(
         self,
@@ -553,6 +525,23 @@ class DejaVu(nn.Module):
         values = checked_fields(state, model_file.STATE, "the model's state")
         self.state = model_file.state_from_json(values)
         self.searcher = None  # of the map before
+
+
+def _state_of(model: DejaVu, place_map: PlaceMap, traverse: Traverse | None) -> model_file.ModelState:
+    """What is known of the route of a map learned from a traverse, whose positions the map gets."""
+    if traverse is None:
+        return model_file.ModelState()
+    shape, positions = traverse.frame_shape, learning.positions_of(traverse)
+    if len(shape) == 3 and place_map.dimension > MANY_FEATURES:
+        line = "each frame gives %d features; smaller frames make a smaller and faster map"
+        log.warning(line, place_map.dimension)
+    if len(shape) == 1 and (model.preprocess.channel or model.preprocess.contrast):
+        log.warning("these are ready features: channel and contrast have no effect")
+    if len(positions):
+        place_map.positions = positions.to(place_map.device)
+        place_map.check()
+    step = traverse.step if isinstance(traverse, ResampledTraverse) else None
+    return model_file.ModelState(shape, step, frame_names=[*source_of(traverse).names])
 
 
 def require_map(model: DejaVu, purpose: str = "") -> None:

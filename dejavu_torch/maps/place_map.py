@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from typing import Any, ClassVar, Self
@@ -14,6 +15,8 @@ from dejavu_torch.data.positions import count_places
 from dejavu_torch.maps.frame_table import FrameTable, Route
 from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.types import InputError
+
+log = logging.getLogger("dejavu_torch")
 
 ScoreBlocks = Iterator[tuple[int, Tensor]]  # the first place of each block, and its scores (Q,n)
 EXTRA = "_extra_state"  # torch's key for the result of `get_extra_state`
@@ -127,6 +130,21 @@ class PlaceMap(nn.Module, ABC):
         """Set the number of visits that each place averages, (N,) int64."""
         values, runs = counts.unique_consecutive(return_counts=True)
         self.visits = torch.stack([runs, values], 1).int()[: 0 if (values == 1).all() else None]
+
+    @torch.no_grad()
+    def take_parameters(self, before: PlaceMap) -> None:
+        """Let the parameters be those of the map before, for an optimiser, with the new values; that map
+        keeps a copy of its own."""
+        for name, new in dict(self.named_parameters(recurse=False)).items():
+            own = getattr(before, name, None)
+            if not isinstance(own, nn.Parameter) or not own.numel():
+                continue
+            if (own.shape, own.dtype, own.device) == (new.shape, new.dtype, new.device):
+                setattr(before, name, nn.Parameter(own.clone()))
+                own.grad = None
+                setattr(self, name, own.copy_(new))
+            else:
+                log.warning("the %s of the map are new parameters: an optimiser has to be made anew", name)
 
     def check(self) -> None:
         """`require` that the buffers are consistent; a subclass checks its own first."""
