@@ -20,7 +20,7 @@ def layer(period: Fraction | int, phases: int, start: int = 0, stop: int = 40) -
 
 def rates(best: list[int], index: list[int], truth: GroundTruth, tolerance: int, places: int) -> list[Rate]:
     """Of a layer of period 10 in the chunk [0, 40), to which these phases are nearest, and of the fusion."""
-    route: Any = SimpleNamespace(plan=(layer(10, 10),), places=places, templates=torch.zeros(0))
+    route: Any = SimpleNamespace(plan=(layer(10, 10),), places=places, device="cpu")
     route.distances = lambda queries, _: [(queries - torch.arange(10)).abs()]
     return activation_rates(route, [0], torch.tensor(best)[:, None], torch.tensor(index), truth, tolerance)
 
