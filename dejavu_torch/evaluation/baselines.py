@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -83,8 +84,8 @@ def nearest_frames(
     if 1 in sequences:
         sequences[1] = sequences[1].renumbered(stored_frame)
     if matching.sequence is None or matcher.own == 1:  # single queries
-        found = found._replace(index=stored_frame(found.index))
-    return found._replace(probability=None, sequences=sequences)
+        found = replace(found, index=stored_frame(found.index))
+    return replace(found, probability=None, sequences=sequences)
 
 
 def stride_bytes(frames: int, dimension: int, itemsize: int, k: int) -> int:
@@ -153,8 +154,8 @@ def baselines_of(
 
     found |= _null_controls(run, seed, one, progress)
     if leave_out is not None:
-        index, score, *_ = leave_out_match(model, reference, leave_out)
-        itself = Match(index, score, score.isfinite())
+        itself = leave_out_match(model, reference, leave_out)
+        itself = replace(itself, accepted=itself.score.isfinite())
         found["leave_out"] = Baseline(f"reference on itself, +-{leave_out} left out", itself)
     pair, batch = (run.reference, run.query), model.batch_size
     if not _is_plain_hog(model):

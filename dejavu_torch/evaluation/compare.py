@@ -7,6 +7,7 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from typing import Any, Literal, NamedTuple
 
@@ -206,7 +207,7 @@ def compare(
     pictures |= draw_reliability(run.scored, known, tolerance)
     carried = all(source_of(one).place is not None for one in (reference, query))
     described = describe_ground_truth(truth, interpolate, carried)
-    shown, ranked = match._replace(index=route.frame_of(match.index)), route.table.scored(candidates.index)
+    shown, ranked = replace(match, index=route.frame_of(match.index)), route.table.scored(candidates.index)
     facts = {
         **_map_facts(model.summary(), run.reference_features),
         **_run_facts(run, seconds),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -105,11 +106,11 @@ def evaluate_file(
     if place_map is not None:
         known = ground_truth_in_places(known, place_map.place_of)
         candidates = place_map.place_of(candidates)
-    here = match._replace(index=candidates[:, 0].masked_fill(elsewhere[:, 0], -1))
+    here = replace(match, index=candidates[:, 0].masked_fill(elsewhere[:, 0], -1))
     if route is not None:  # number places on other routes beyond every place of this one and its truth
         highest = max(int(table.max()) for table in (candidates, known.positives) if table.numel())
         candidates = candidates.masked_fill(elsewhere, max(places or 0, 1 + highest) + tolerance)
-    match = match._replace(index=candidates[:, 0])
+    match = replace(match, index=candidates[:, 0])
     described = describe_ground_truth(truth, interpolate, carried)
     facts = evaluation_facts(match, candidates, known, tolerance, positions, described) | own
     accepted = facts["accepted"]

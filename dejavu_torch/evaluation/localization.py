@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -45,7 +46,7 @@ class Localization(NamedTuple):
     @property
     def scored(self) -> Match:
         """The matches with the places that are scored."""
-        return self.match._replace(index=self.model.map.table.scored(self.match.index))
+        return replace(self.match, index=self.model.map.table.scored(self.match.index))
 
     @property
     def borders(self) -> Tensor:

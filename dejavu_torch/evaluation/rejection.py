@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -31,7 +32,7 @@ def rejection_facts(
         facts["off_map"][name] = {"frames": len(found), "accepted": accepted}
     if truth is not None:
         probability, right = judged(match, truth, tolerance)
-        scores = evaluate(match._replace(score=1 - match.probability), truth, tolerance)
+        scores = evaluate(replace(match, score=1 - match.probability), truth, tolerance)
         facts |= {
             "auc": scores.auc,
             "recall_at_100_precision": scores.recall_at_100_precision,

@@ -110,7 +110,7 @@ class LiveLocalizer:
             probability=math.nan if match.probability is None else float(match.probability),
             accepted=bool(match.accepted),
             milliseconds=1e3 * (time.perf_counter() - start),
-            route=routes[int(table.route_of(match.index))].name if routes and place >= 0 else "",
+            route=routes[int(match.route)].name if match.route is not None and place >= 0 else "",
         )
 
     @property

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from itertools import accumulate
 from types import MappingProxyType
@@ -137,7 +138,7 @@ class Localizer:
         match = self._answer(self._candidates(final), confidence)
         self.states = {T: state for T, (_, state) in steps.items()}
         beside = {T: best_match(steps[T][0]).map(Tensor.cpu) for T in self.matching.beside}
-        return match._replace(sequences=beside)
+        return replace(match, sequences=beside)
 
     def _candidates(self, scores: Tensor) -> Match:
         if self.matching.on_scores is not None:
@@ -147,13 +148,15 @@ class Localizer:
     def _answer(self, match: Match, confidence: Tensor | None = None) -> Match:
         """Candidates (B,k) with their acceptance, and the probability that the first is right."""
         matching, match = self.matching, match.map(Tensor.cpu)
-        match = match._replace(accepted=accept(match.score, matching.rule.threshold))
+        match = replace(match, accepted=accept(match.score, matching.rule.threshold))
+        if self.route is not None and self.route.routes:
+            match = replace(match, route=self.route.table.route_of(match.index))
         if matching.platt is not None and confidence is not None:
             others = match.index.shape[1] - 1
             probability = F.pad(matching.platt.probability(confidence)[:, None], (0, others), value=math.nan)
             if matching.rule.precision is not None:
-                match = match._replace(accepted=probability >= matching.rule.precision)
-            match = match._replace(probability=probability)
+                match = replace(match, accepted=probability >= matching.rule.precision)
+            match = replace(match, probability=probability)
         return match if matching.k is not None else match.map(lambda column: column[:, 0])
 
     def _by_scores(self, descriptors: Tensor) -> Match:
@@ -164,7 +167,7 @@ class Localizer:
         for descriptor in descriptors.split(1):
             scores, start = self.local(descriptor, whole)
             match = self._candidates(scores)
-            matches.append(match._replace(index=match.index + start))
+            matches.append(replace(match, index=match.index + start))
         return self._answer(Match.joined(matches))
 
     def _by_search(self, wanted: Wanted, descriptors: Tensor) -> Match:

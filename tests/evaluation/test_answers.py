@@ -22,7 +22,7 @@ from dejavu_torch.types import Match
 
 def answers(index: Tensor, probability: Tensor | None = None, score: Tensor | None = None) -> Match:
     score = torch.zeros(len(index)) if score is None else score
-    return Match(index, score, torch.ones(len(index), dtype=torch.bool))._replace(probability=probability)
+    return Match(index, score, torch.ones(len(index), dtype=torch.bool), probability)
 
 
 def test_probable_answers_are_counted_and_told() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -88,7 +89,7 @@ MATCH = Match(torch.tensor([0, 1, -1]), torch.tensor([0.1, 0.2, INF]), torch.ten
 @pytest.mark.parametrize(
     ("match", "truth", "facts"),
     [
-        (MATCH._replace(score=MATCH.score * float("nan")), torch.zeros(3, 2).long(), ["a score is NaN"]),
+        (replace(MATCH, score=MATCH.score * float("nan")), torch.zeros(3, 2).long(), ["a score is NaN"]),
         (MATCH, torch.zeros(2, 2).long(), ["the truth is (2, 2)", "(3, R)"]),
     ],
     ids=["NaN", "truth"],
