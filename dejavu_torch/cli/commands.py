@@ -26,7 +26,7 @@ from dejavu_torch.data.frame_range import chained
 from dejavu_torch.data.names import names_of
 from dejavu_torch.data.output import check_output_file, check_output_folder, whole_folder
 from dejavu_torch.data.source import check_not_read, open_source
-from dejavu_torch.evaluation.answers import next_steps, probable_counts, told_line, told_probable
+from dejavu_torch.evaluation.answers import describe_line, describe_probable, next_steps, probable_counts
 from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.views import Views
 from dejavu_torch.learning import SAMPLE as SHORT
@@ -71,7 +71,7 @@ def run_demo(
     from dejavu_torch.evaluation.reproduce import paper_model
 
     _check_report_folder(out, COMPARED, options.several(second))
-    given = options.Learning(seed, second)
+    given = options.LearningOptions(seed, second)
     given.seed_whitening(model)
     learned, localized = f"sim:aerial?seed={seed}", f"sim:aerial?seed={seed}&traverse=1"
     reference, query = open_source(learned), open_source(localized)
@@ -92,8 +92,8 @@ def run_learn(
     sources: Sequence[str] = (),
     *,
     map: Path | None = None,
-    growing: options.Growth,
-    learning: options.Learning,
+    growing: options.GrowthOptions,
+    learning: options.LearningOptions,
     cluster: str | None = None,
     model: DejaVu,
     command: str,
@@ -221,7 +221,7 @@ def run_localize(
     if model.step is not None:
         query = model.resample(query, model.step, True, model.frame_shape)
         _print_steps(query)
-    rule = model.matching(matcher).rule
+    chosen = model.matching(matcher).rule
     matches = model.matches(query, True, matcher, None, top, SUPPRESSION)
     if top is not None:
         matches = (part.map(Tensor.flatten) for part in matches)
@@ -241,12 +241,12 @@ def run_localize(
         total, accepted = _write_matches(out, counted(), query, model, top, pairs)
     if not model.map.summary().covered:
         print("the map has no layers, so no place can be reported")
-    elif not rule.given:
-        print(rule)
+    elif not chosen.given:
+        print(chosen)
     _say(f"{total} queries, {accepted} accepted; written to {out}")
     if counts:
-        steps = next_steps(matcher is not None, rule.given)
-        _say(told_probable(counts, total) + (f"; next: {'; '.join(steps)}" if steps else ""))
+        steps = next_steps(matcher is not None, chosen.given)
+        _say(describe_probable(counts, total) + (f"; next: {'; '.join(steps)}" if steps else ""))
     table: tuple[str | Path, ...] = () if model.step is None else ("--map", map)
     table += ("--route", "ROUTE") if model.map.routes else ()
     print_next("evaluate", out, "--truth", "TRUTH", *table, "--out", "scores")
@@ -310,8 +310,8 @@ def run_compare(
     query: str,
     *,
     out: Path,
-    judging: options.Judging,
-    learning: options.Learning,
+    judging: options.EvaluationOptions,
+    learning: options.LearningOptions,
     map: Path | None = None,
     sequences: options.Sequences,
     searching: options.Searching,
@@ -687,13 +687,13 @@ def _publish(
     from dejavu_torch.evaluation.report import report_folder, write_report
 
     run, kept = result.run, out / "map.safetensors"
-    rule = run.model.acceptance(run.sequence)
+    acceptance = run.model.acceptance(run.sequence)
     _print_contradiction(result.report)
     print_map(run.model)
     if run.truth is None:
         print("no ground truth (see --truth): matches and pictures, but no scores")
-    if not rule.given:
-        print(rule)
+    if not acceptance.given:
+        print(acceptance)
     match = run.match
     if top is not None:
         match = result.candidates.map(lambda column: column[:, :top].flatten())
@@ -726,7 +726,7 @@ def _write_matches(
 def _print_contradiction(report: Report) -> None:
     """Say first if the answers contradict the ground truth."""
     if report.ours.scores is not None and "line" in report.facts:
-        _say(told_line(report.facts, True))
+        _say(describe_line(report.facts, True))
 
 
 def _print_scores(report: Report, out: Path) -> None:
@@ -741,7 +741,7 @@ def _print_scores(report: Report, out: Path) -> None:
     if report.ours.scores is not None:
         _say(page.verdict(report))
     else:
-        if line := told_line(report.facts, False):
+        if line := describe_line(report.facts, False):
             _say(line)
         if steps := page.steps_after(report.facts):
             _say(f"next: {steps}")

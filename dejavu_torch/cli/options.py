@@ -200,7 +200,7 @@ class Acceptance:
 
 
 @dataclass
-class Learning:
+class LearningOptions:
     """What a map is learned with in addition to its route.
 
     Args:
@@ -284,7 +284,7 @@ class Learning:
 
 
 @dataclass
-class Growth:
+class GrowthOptions:
     """How a map grows.
 
     Args:
@@ -322,7 +322,7 @@ class Growth:
 
 
 @dataclass
-class Judging:
+class EvaluationOptions:
     """How answers are evaluated, and what else a report has.
 
     Args:

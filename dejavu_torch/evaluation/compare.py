@@ -22,7 +22,7 @@ from dejavu_torch.data.ground_truth import (
     offset_of,
 )
 from dejavu_torch.data.source import Source, as_traverse
-from dejavu_torch.evaluation.answers import own_facts
+from dejavu_torch.evaluation.answers import answer_facts
 from dejavu_torch.evaluation.baselines import baselines_of
 from dejavu_torch.evaluation.contenders import Contender, contend, models_beside
 from dejavu_torch.evaluation.evaluate import RANKS, evaluation_facts
@@ -166,7 +166,7 @@ def compare(
     facts = {
         **_map_facts(model.summary(), run.reference_features),
         **_run_facts(run, seconds),
-        **_answer_facts(run, candidates, truth, interpolate, off_map),
+        **_match_facts(run, candidates, truth, interpolate, off_map),
         **{name: dict(picture.numbers) for name, picture in pictures.items() if picture.numbers},
     }
     if coded is not None and len(coded.chunks) == 1:
@@ -227,14 +227,14 @@ def _localized(
 ) -> tuple[Tensor, Match]:
     """Descriptors (Q,K) of the queries, and the best places of each as far as recall@N or `top` needs."""
     sequence, places = matching.sequence, model.map.places
-    rule = model.matching(sequence)
+    ranking = model.matching(sequence)
     model.check_queries(query.frame_shape, model.features_per_frame, query.name)
     queries = model.extract_all(query, progress)
     if sequence is not None:
         sequence.check(len(queries), places)
     ranks = max(top, min(max(RANKS), places))
-    rule = rule._replace(beside=matching.beside, k=ranks, radius=tolerance)
-    return queries, model.localize_descriptors(queries, rule, progress=progress)
+    ranking = ranking._replace(beside=matching.beside, k=ranks, radius=tolerance)
+    return queries, model.localize_descriptors(queries, ranking, progress=progress)
 
 
 def _other_contenders(
@@ -313,14 +313,14 @@ def _map_facts(summary: MapSummary, features: Tensor) -> dict[str, Any]:
 def _run_facts(run: Localization, seconds: Seconds) -> dict[str, Any]:
     """The entries of report.json about the run; no seconds to learn if the map is given."""
     model, reference, query = run.model, run.reference, run.query
-    rule = model.acceptance(run.sequence)
+    acceptance = model.acceptance(run.sequence)
     facts = {
         "seconds_learn": seconds["learn"],
         "seconds_localize": seconds["localize"],
         "l1_backend": l1_backend(),
         "spectrogram_backend": BACKEND,
-        "threshold": rule.threshold,
-        "least_probability": rule.precision,
+        "threshold": acceptance.threshold,
+        "least_probability": acceptance.precision,
         "sequence": run.sequence.length if isinstance(run.sequence, SequenceMatcher) else 1,
         "speeds": list(run.sequence.speeds) if isinstance(run.sequence, SequenceMatcher) else None,
         "filter": isinstance(run.sequence, PlaceFilter),
@@ -337,7 +337,7 @@ def _run_facts(run: Localization, seconds: Seconds) -> dict[str, Any]:
     return facts
 
 
-def _answer_facts(
+def _match_facts(
     run: Localization, candidates: Match, truth: Truth | None, interpolate: bool, off: Mapping[str, Tensor]
 ) -> dict[str, Any]:
     """The entries of report.json about the answers; `off`: see `rejection_facts`."""
@@ -346,7 +346,7 @@ def _answer_facts(
     words, offset = describe_ground_truth(truth, interpolate, carried), offset_of(truth, carried)
     ranked, shown = route.table.scored(candidates.index), run.match.renumbered(route.frame_of)
     facts = evaluation_facts(run.scored, ranked, run.truth, tolerance, route.positions, words, off)
-    return facts | own_facts(shown, run.query_frames, tolerance, run.truth is not None, offset)
+    return facts | answer_facts(shown, run.query_frames, tolerance, run.truth is not None, offset)
 
 
 def plain_number(period: object) -> int | float:

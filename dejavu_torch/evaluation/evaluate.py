@@ -21,7 +21,7 @@ from dejavu_torch.data.ground_truth import (
 )
 from dejavu_torch.data.positions import unit_of
 from dejavu_torch.evaluation import curves
-from dejavu_torch.evaluation.answers import own_facts
+from dejavu_torch.evaluation.answers import answer_facts
 from dejavu_torch.evaluation.contenders import contend
 from dejavu_torch.evaluation.match_plots import draw_coverage
 from dejavu_torch.evaluation.matches import ELSEWHERE, read_matches
@@ -102,7 +102,7 @@ def evaluate_file(
     if known is None:
         raise InputError("there is no ground truth; expected one, or traverses that carry positions")
     carried = all(one is not None and one.place is not None for one in (reference, query))
-    own = own_facts(match, queries, tolerance, True, offset_of(truth, carried))
+    own = answer_facts(match, queries, tolerance, True, offset_of(truth, carried))
     if place_map is not None:
         known = ground_truth_in_places(known, place_map.place_of)
         candidates = place_map.place_of(candidates)
