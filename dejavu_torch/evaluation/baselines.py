@@ -75,17 +75,17 @@ def nearest_frames(
     if k > 1:
         scores = (part[:, nearest] for part in scores)
     matcher, nearest = Localizer(None, matching), nearest.cpu()
-    found = Match.joined(map(matcher.match, scores))
+    match = Match.joined(map(matcher.match, scores))
 
     def stored_frame(frame: Tensor) -> Tensor:
         return torch.where(frame >= 0, k * nearest[frame], -1)
 
-    sequences = dict(found.sequences)
+    sequences = dict(match.sequences)
     if 1 in sequences:
         sequences[1] = sequences[1].renumbered(stored_frame)
     if matching.sequence is None or matcher.own == 1:  # single queries
-        found = replace(found, index=stored_frame(found.index))
-    return replace(found, probability=None, sequences=sequences)
+        match = replace(match, index=stored_frame(match.index))
+    return replace(match, probability=None, sequences=sequences)
 
 
 def stride_bytes(frames: int, dimension: int, itemsize: int, k: int) -> int:

@@ -7,10 +7,10 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
 
 from dejavu_torch.data.ground_truth import GroundTruth, counted, is_right
 from dejavu_torch.data.source import open_source
+from dejavu_torch.evaluation.activation import share
 from dejavu_torch.evaluation.compare import Comparison, compare
 from dejavu_torch.evaluation.contenders import Contender, contend
 from dejavu_torch.evaluation.controls import leave_out_match, template_map_of, with_mapper
@@ -198,12 +198,9 @@ def boundary_effect(
     right = is_right(match.index, truth.positives, tolerance)
     distance = (truth.positives[:, :, None] - torch.tensor(list(cuts))).abs().amin(2)
     close = ((distance <= near) & (truth.positives >= 0)).any(1)
-
-    def recall(which: Tensor) -> float | None:
-        return float(right[which].double().mean()) if which.any() else None
-
     inside, outside = answered & close, answered & ~close
-    return BoundaryEffect(near, int(inside.sum()), int(outside.sum()), recall(inside), recall(outside))
+    recalls = share(right, inside), share(right, outside)
+    return BoundaryEffect(near, int(inside.sum()), int(outside.sum()), *recalls)
 
 
 def known_boundaries(result: Comparison, cuts: Sequence[int]) -> dict[str, tuple[Contender, BoundaryEffect]]:
