@@ -216,7 +216,7 @@ def filter_contenders(route: Tensor, noise: Tensor) -> list[Contender]:
 
     def drive(every: int) -> Tensor:
         rows: list[Tensor] = []
-        localizer = Localizer(spectral, Matching(PlaceFilter(search_every=every), on_scores=rows.append))
+        localizer = Localizer(spectral, Matching(PlaceFilter(search_every=every), callback=rows.append))
         for part in queries:
             localizer(part)
         return torch.cat([(-row).exp() for row in rows])

@@ -487,7 +487,7 @@ class DejaVu(nn.Module):
             sequence.check(None, self.map.places)
         if self.search_file is not None:
             check_searches(self.search_file, matching, self.find is not None)
-        searches = getattr(sequence, "search_every", 1) > 1 if sequence else matching.on_scores is None
+        searches = getattr(sequence, "search_every", 1) > 1 if sequence else matching.callback is None
         if searches and self.find is None and matching.search != "scan":
             coarse = self._coarse_search(matching.search == "exact")
         if coarse is None:
@@ -567,7 +567,8 @@ class DejaVu(nn.Module):
             only = "calibrated for single queries and for a filter with search_every 1 only"
             seen = f"the precision is {self.precision}, but the map is "
             raise InputError(f"{seen}{only if self.calibration else 'not calibrated'}; expected a threshold")
-        return Matching(sequence, rule=self.acceptance(sequence), platt=platt, search=search or self.search)
+        accepts = self.acceptance(sequence)
+        return Matching(sequence, acceptance=accepts, platt=platt, search=search or self.search)
 
     def acceptance(self, sequence: SequenceModel | None = None) -> Acceptance:
         """Which answers are accepted, for single queries or for a sequence (convention 4).

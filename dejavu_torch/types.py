@@ -247,7 +247,9 @@ class SequenceModel(nn.Module, ABC):
         """The state before the first query; `fixed`: in its final shape, as an exported graph needs it."""
 
     @abstractmethod
-    def step(self, scores: Tensor, state: Tensor, firsts: Sequence[int] = (0,)) -> tuple[Tensor, Tensor]:
+    def step(
+        self, scores: Tensor, state: Tensor, route_starts: Sequence[int] = (0,)
+    ) -> tuple[Tensor, Tensor]:
         """Scores (B,N) of the next B queries, the state, and the first place of each route -> scores (B,N),
         the next state."""
 

@@ -221,7 +221,7 @@ def run_localize(
     if model.step is not None:
         query = model.resample(query, model.step, True, model.frame_shape)
         _print_steps(query)
-    chosen = model.matching(matcher).rule
+    chosen = model.matching(matcher).acceptance
     matches = model.matches(query, True, matcher, None, top, SUPPRESSION)
     if top is not None:
         matches = (part.map(Tensor.flatten) for part in matches)

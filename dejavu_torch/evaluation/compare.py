@@ -233,7 +233,7 @@ def _localized(
     if sequence is not None:
         sequence.check(len(queries), places)
     ranks = max(top, min(max(RANKS), places))
-    ranking = ranking._replace(beside=matching.beside, k=ranks, radius=tolerance)
+    ranking = ranking._replace(also=matching.also, k=ranks, radius=tolerance)
     return queries, model.localize_descriptors(queries, ranking, progress=progress)
 
 

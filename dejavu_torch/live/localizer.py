@@ -88,7 +88,7 @@ class LiveLocalizer:
         self.scores: Tensor | None = None
         matching = self.model.matching(self.sequence)
         keep = self._keep if self.keep_scores else None
-        self._localizer = self.model.localizer(matching._replace(on_scores=keep))
+        self._localizer = self.model.localizer(matching._replace(callback=keep))
 
     def _keep(self, scores: Tensor) -> None:
         self.scores = scores[0]

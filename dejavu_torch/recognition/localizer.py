@@ -34,12 +34,12 @@ class Matching(NamedTuple):
     """How queries are matched."""
 
     sequence: SequenceModel | None = None  # None matches each query by itself
-    beside: Mapping[Together, SequenceModel] = MappingProxyType({})  # further ways, see `Match.sequences`
+    also: Mapping[Together, SequenceModel] = MappingProxyType({})  # further ways, see `Match.sequences`
     k: int | None = None  # candidates per query; None gives matches (Q,)
     radius: int = 0  # suppression radius in places
-    rule: Acceptance = Acceptance()
+    acceptance: Acceptance = Acceptance()
     platt: Platt | None = None  # gives probabilities
-    on_scores: Callable[[Tensor], None] | None = None  # receives the final scores (B,N)
+    callback: Callable[[Tensor], None] | None = None  # receives the final scores (B,N)
     search: Search = "auto"  # of single queries
 
 
@@ -77,11 +77,11 @@ class Localizer:
         self.route, self.matching, self.find, self.track = route, matching, find, Track()
         sequence, routes = matching.sequence, () if route is None else route.routes
         self.own: Together = sequence.length if isinstance(sequence, SequenceMatcher) else "filter"
-        self.models = {**matching.beside, **({} if sequence is None else {self.own: sequence})}
+        self.models = {**matching.also, **({} if sequence is None else {self.own: sequence})}
         self.states: dict[Together, Tensor] = {}  # of the models; empty before the first query
-        self.firsts = (0, *accumulate(one.places for one in routes[:-1]))  # the first place of each route
+        self.route_starts = (0, *accumulate(one.places for one in routes[:-1]))
         self.local: LocalSearch | None = None
-        if route is not None and isinstance(sequence, PlaceFilter) and not matching.beside:
+        if route is not None and isinstance(sequence, PlaceFilter) and not matching.also:
             every = sequence.search_every
             self.local = LocalSearch(sequence, route, approximate or route.scores) if every > 1 else None
 
@@ -99,7 +99,7 @@ class Localizer:
         few = n <= max(1, MAX_SHARE * min(places, route.block_places))
         few = few or self.find is not None or places > SCORES_AT_ONCE
         way, size = self._by_scores, places
-        if not self.models and matching.on_scores is None and few:
+        if not self.models and matching.callback is None and few:
             way, size = partial(self._by_search, wanted), max(PER_BEST * n, places // PLACES_PER_NUMBER)
         parts = descriptors.split(max(1, min(ROWS, SCORES_AT_ONCE // size)))
         return Match.joined(way(part.to(route.positions.device)) for part in with_progress(parts, label))
@@ -130,32 +130,32 @@ class Localizer:
 
     def _in_sequence(self, scores: Tensor) -> Match:
         states = self.states or {T: one.start(scores.shape[1]).to(scores) for T, one in self.models.items()}
-        steps = {T: one.step(scores, states[T], self.firsts) for T, one in self.models.items()}
+        steps = {T: one.step(scores, states[T], self.route_starts) for T, one in self.models.items()}
         single = self.matching.sequence is None
         final, confidence = scores if single else steps[self.own][0], None
         if self.matching.platt is not None:
             confidence = confidence_of(scores) if single else self.track(final, scores)
         match = self._answer(self._candidates(final), confidence)
         self.states = {T: state for T, (_, state) in steps.items()}
-        beside = {T: best_match(steps[T][0]).map(Tensor.cpu) for T in self.matching.beside}
-        return replace(match, sequences=beside)
+        sequences = {T: best_match(steps[T][0]).map(Tensor.cpu) for T in self.matching.also}
+        return replace(match, sequences=sequences)
 
     def _candidates(self, scores: Tensor) -> Match:
-        if self.matching.on_scores is not None:
-            self.matching.on_scores(scores)
+        if self.matching.callback is not None:
+            self.matching.callback(scores)
         return best_candidates(scores, self.matching.k or 1, self.matching.radius)
 
     def _answer(self, match: Match, confidence: Tensor | None = None) -> Match:
         """Candidates (B,k) with their acceptance, and the probability that the first is right."""
         matching, match = self.matching, match.map(Tensor.cpu)
-        match = replace(match, accepted=accept(match.score, matching.rule.threshold))
+        match = replace(match, accepted=accept(match.score, matching.acceptance.threshold))
         if self.route is not None and self.route.routes:
             match = replace(match, route=self.route.table.route_of(match.index))
         if matching.platt is not None and confidence is not None:
             others = match.index.shape[1] - 1
             probability = F.pad(matching.platt.probability(confidence)[:, None], (0, others), value=math.nan)
-            if matching.rule.precision is not None:
-                match = replace(match, accepted=probability >= matching.rule.precision)
+            if matching.acceptance.precision is not None:
+                match = replace(match, accepted=probability >= matching.acceptance.precision)
             match = replace(match, probability=probability)
         return match if matching.k is not None else match.map(lambda column: column[:, 0])
 
@@ -163,7 +163,7 @@ class Localizer:
         assert self.route is not None
         if self.local is None:
             return self.match(self.route.scores(descriptors))
-        whole, matches = self.matching.k is not None or self.matching.on_scores is not None, []
+        whole, matches = self.matching.k is not None or self.matching.callback is not None, []
         for descriptor in descriptors.split(1):
             scores, start = self.local(descriptor, whole)
             match = self._candidates(scores)

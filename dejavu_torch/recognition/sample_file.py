@@ -31,7 +31,7 @@ def check_searches(path: Any, matching: Matching, elsewhere: bool) -> None:
     others = "a filter with search_every above 1, or single queries (--sequence 1)"
     for refused, seen, expected in (
         (not single and every <= 1, all_places, others),
-        (single and matching.on_scores, "scores of all places are kept", "none kept (no --page)"),
+        (single and matching.callback, "scores of all places are kept", "none kept (no --page)"),
         (elsewhere, "places are found elsewhere, such as by a cluster", "only one of the two"),
         (matching.search == "scan", "search scan scores all places", "search auto, coarse or exact"),
     ):

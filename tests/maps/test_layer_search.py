@@ -102,7 +102,7 @@ def test_localize_takes_it_and_gives_what_the_scan_gives() -> None:
     assert torch.equal(found.score, scores.amin(1))
     # everything that needs other scores makes them
     seen: list[tuple[int, ...]] = []
-    model.localize_descriptors(queries, Matching(on_scores=lambda scores: seen.append(tuple(scores.shape))))
+    model.localize_descriptors(queries, Matching(callback=lambda scores: seen.append(tuple(scores.shape))))
     assert seen == [(3, 60_000)]
     assert torch.equal(model.candidates(queries, k=2).index[:, 0], found.index)
     assert model.localize(queries, sequence=SequenceMatcher(1)).index.tolist() == found.index.tolist()
