@@ -216,7 +216,7 @@ def filter_contenders(route: Tensor, noise: Tensor) -> list[Contender]:
 
     def drive() -> Tensor:
         rows: list[Tensor] = []
-        localizer = Localizer(spectral, Matching(PlaceFilter(), on_scores=rows.append))
+        localizer = Localizer(spectral, Matching(PlaceFilter(), callback=rows.append))
         for part in queries:
             localizer(part)
         return torch.cat([(-row).exp() for row in rows])

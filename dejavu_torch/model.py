@@ -400,7 +400,7 @@ class DejaVu(nn.Module):
         check_search(matching.search)
         if matching.sequence is not None:
             matching.sequence.check(None, self.map.places)
-        single = matching.sequence is None and matching.on_scores is None
+        single = matching.sequence is None and matching.callback is None
         if not single or matching.search not in ("auto", "coarse"):
             return Localizer(self.map, matching)
         known = self.searcher
@@ -471,7 +471,8 @@ class DejaVu(nn.Module):
             only = "calibrated for single queries and for a filter only"
             seen = f"the precision is {self.precision}, but the map is "
             raise InputError(f"{seen}{only if self.calibration else 'not calibrated'}; expected a threshold")
-        return Matching(sequence, rule=self.acceptance(sequence), platt=platt, search=search or "auto")
+        accepts = self.acceptance(sequence)
+        return Matching(sequence, acceptance=accepts, platt=platt, search=search or "auto")
 
     def acceptance(self, sequence: SequenceModel | None = None) -> Acceptance:
         """Which answers are accepted, for single queries or for a sequence (convention 4).

@@ -7,11 +7,10 @@ import math
 import operator
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
 from itertools import pairwise
-from types import MappingProxyType
 from typing import Any, Literal, NamedTuple, Self, cast
 
 import torch
@@ -195,55 +194,65 @@ class FrequencyLayer:
 Plan = tuple[FrequencyLayer, ...]
 
 
-class _Columns(NamedTuple):
-    index: Tensor  # type: ignore[assignment]  # the field shadows tuple.index
-    score: Tensor
-    accepted: Tensor
+@dataclass(frozen=True, eq=False, repr=False)
+class Match:
+    """Where each query was found (eq. 5) and whether the answer is accepted (eq. 6).
 
-
-class Match(_Columns):
-    """Where each query was found (eq. 5) and whether the answer is accepted (eq. 6): index, score, accepted.
+    It unpacks to `index, score, accepted`. Its length, and what `match[i]` and slices select, are queries.
 
     Attributes:
         index: (Q,) int64, the place found, -1 if no place has a finite score; (Q,k) candidates, best first.
         score: float, lower is better, +inf without a place. accepted: bool, see `DejaVu.acceptance`.
         probability: float64, of being right, NaN for all but the first candidate; None without calibration.
-        sequences: by T, matches (Q,) of sequences or a filter. The tuple lacks this and `probability`.
+        route: int64, the index in `map.routes` of the place's route, -1 without a place; None if the map is
+            not merged.
+        sequences: by T, matches (Q,) of the same scores in sequences or a filter, for reports; mostly empty.
     """
 
+    index: Tensor
+    score: Tensor
+    accepted: Tensor
     probability: Tensor | None = None
-    sequences: Mapping[Together, Match] = MappingProxyType({})
+    route: Tensor | None = None
+    sequences: Mapping[Together, Match] = field(default_factory=dict)
 
-    def _asdict(self) -> dict[str, Any]:
-        """The columns by name, with the probability if there is one."""
-        return super()._asdict() | ({} if self.probability is None else {"probability": self.probability})
+    @property
+    def columns(self) -> dict[str, Tensor]:
+        """Those of the five columns that are known, by name."""
+        return {name: column for name, column in vars(self).items() if isinstance(column, Tensor)}
 
-    def _replace(self, **changes: Any) -> Match:
-        probability = changes.pop("probability", self.probability)
-        sequences = changes.pop("sequences", self.sequences)
-        match = super()._replace(**changes)
-        match.probability, match.sequences = probability, sequences
-        return match
+    def __iter__(self) -> Iterator[Tensor]:
+        return iter((self.index, self.score, self.accepted))
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def __getitem__(self, queries: Any) -> Match:
+        sequences = {T: match[queries] for T, match in self.sequences.items()}
+        return replace(self.map(lambda column: column[queries]), sequences=sequences)
+
+    def __repr__(self) -> str:
+        return f"Match({', '.join(f'{name}={column}' for name, column in self.columns.items())})"
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Match:
         """The same change in every column, but not in `sequences`."""
-        probability = None if self.probability is None else change(self.probability)
-        return Match(*map(change, self))._replace(probability=probability, sequences=self.sequences)
+        columns = {name: change(column) for name, column in self.columns.items()}
+        return Match(**columns, sequences=self.sequences)
 
     def renumbered(self, place: Callable[[Tensor], Tensor]) -> Match:
         """The match with `place` applied to its places, in `sequences` too; it must keep -1."""
         sequences = {T: match.renumbered(place) for T, match in self.sequences.items()}
-        return self._replace(index=place(self.index), sequences=sequences)
+        return replace(self, index=place(self.index), sequences=sequences)
 
     @staticmethod
     def joined(parts: Iterable[Match]) -> Match:
         """Concatenate matches of consecutive queries."""
         parts = list(parts)
-        known = [part.probability for part in parts if part.probability is not None]
-        probability = torch.cat(known) if len(known) == len(parts) else None
+        columns = [part.columns for part in parts]
+        names = [name for name in columns[0] if all(name in part for part in columns)]
+        whole = {name: torch.cat([part[name] for part in columns]) for name in names}
         sequences = {T: Match.joined(part.sequences[T] for part in parts) for T in parts[0].sequences}
-        joined = Match(*map(torch.cat, zip(*parts, strict=True)))
-        return joined._replace(probability=probability, sequences=sequences)
+        return Match(**whole, sequences=sequences)
 
 
 class Training(NamedTuple):
@@ -266,7 +275,9 @@ class SequenceModel(nn.Module, ABC):
         """The state before the first query; `fixed`: in its final shape, as an exported graph needs it."""
 
     @abstractmethod
-    def step(self, scores: Tensor, state: Tensor, firsts: Sequence[int] = (0,)) -> tuple[Tensor, Tensor]:
+    def step(
+        self, scores: Tensor, state: Tensor, route_starts: Sequence[int] = (0,)
+    ) -> tuple[Tensor, Tensor]:
         """Scores (B,N) of the next B queries, the state, and the first place of each route -> scores (B,N),
         the next state."""
 

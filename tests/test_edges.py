@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import math
+import pickle
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -352,11 +354,17 @@ def test_a_comparison_takes_places_as_truth() -> None:
     assert found.report.facts["truth"] == "the places that the caller gave"
 
 
-def test_a_match_by_name_has_its_probability() -> None:
-    match = Match(torch.tensor([1]), torch.tensor([0.5]), torch.tensor([True]))
-    assert match._asdict().keys() == {"index", "score", "accepted"}
-    told = match._replace(probability=torch.tensor([0.9]))
-    assert told._asdict()["probability"].item() == pytest.approx(0.9)
+def test_the_length_and_parts_of_a_match_are_queries() -> None:
+    each = Match(torch.tensor([3, 1, -1]), torch.tensor([0.5, 0.25, 9.0]), torch.tensor([True, True, False]))
+    sure = dataclasses.replace(each, probability=each.score / 2, sequences={5: each})
+    match = pickle.loads(pickle.dumps(sure))
+    assert match.columns.keys() == {"index", "score", "accepted", "probability"}
+    assert len(match) == 3
+    for some in (slice(1, 3), torch.tensor([False, True, True])):
+        index, score, accepted = match[some]
+        assert [index.tolist(), score.tolist(), accepted.tolist()] == [[1, -1], [0.25, 9.0], [True, False]]
+        assert match[some].sequences[5].index.tolist() == [1, -1]
+    assert repr(match[1]) == "Match(index=1, score=0.25, accepted=True, probability=0.125)"
 
 
 # torch.func through a whole model

@@ -26,10 +26,9 @@ from dejavu_torch.cli.device import device_of
 from dejavu_torch.data.output import check_output_file, check_output_folder, whole_folder
 from dejavu_torch.data.source import check_not_read, open_source
 from dejavu_torch.data.traverse import chained
-from dejavu_torch.evaluation.answers import next_steps, probable_counts, told_line, told_probable
+from dejavu_torch.evaluation.answers import describe_line, describe_probable, next_steps, probable_counts
 from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.views import SAMPLE as SHORT
-from dejavu_torch.features.views import Views
 from dejavu_torch.learning import Checkpoint, MapTasks
 from dejavu_torch.maps.place_map import Mapper
 from dejavu_torch.maps.spectral import SpectralMapper
@@ -71,12 +70,12 @@ def run_demo(
     from dejavu_torch.evaluation.reproduce import paper_model
 
     _check_report_folder(out, COMPARED, options.several(second))
-    given = options.Learning(seed, second)
+    given = options.LearningOptions(seed, second)
     given.seed_whitening(model)
     learned, localized = f"sim:aerial?seed={seed}", f"sim:aerial?seed={seed}&traverse=1"
     reference, query = open_source(learned), open_source(localized)
     print(f"learning {reference.name}, then finding {query.name} on it")
-    reference, views = given.with_second(model, reference, query)
+    reference, views, _ = given.with_views(model, reference, query)
     paper = paper_model()
     same = recipe_of(model.mapper) == recipe_of(paper.mapper)
     others = {} if same else {"paper": ("the paper to the letter", paper)}
@@ -92,8 +91,8 @@ def run_learn(
     sources: Sequence[str] = (),
     *,
     map: Path | None = None,
-    growing: options.Growth,
-    learning: options.Learning,
+    growing: options.GrowthOptions,
+    learning: options.LearningOptions,
     cluster: str | None = None,
     model: DejaVu,
     command: str,
@@ -120,15 +119,13 @@ def run_learn(
     learning.seed_whitening(model)
     growing.check(sources, learning.calibration)
     traverse: Traverse | None = None
-    views: Views | None = None
     if sources:
         chain = chained([open_source(one) for one in sources])
         traverse = model.resample(chain, model.step, True, model.frame_shape)
         _print_steps(traverse)
-        traverse, views = learning.with_second(model, traverse)
     visits = None if growing.average is None else growing.visits(model, traverse)
     learning.check_calibrated(model, visits.traverse if traverse is None else traverse)  # type: ignore[union-attr]
-    traverse, known = learning.with_calibration(model, traverse)
+    traverse, views, known = learning.with_views(model, traverse)
     places: Tensor | None = None  # that the traverse shows; None: all, from the first on
     done, start, checkpoint = "", model.map.places, Checkpoint(map)
     map_tasks: MapTasks = builtins.map
@@ -220,7 +217,7 @@ def run_localize(
     if model.step is not None:
         query = model.resample(query, model.step, True, model.frame_shape)
         _print_steps(query)
-    rule = model.matching(matcher).rule
+    chosen = model.matching(matcher).acceptance
     matches = model.matches(query, True, matcher, None, top, SUPPRESSION)
     if top is not None:
         matches = (part.map(Tensor.flatten) for part in matches)
@@ -240,12 +237,12 @@ def run_localize(
         total, accepted = _write_matches(out, counted(), query, model, top, pairs)
     if not model.map.summary().covered:
         print("the map has no layers, so no place can be reported")
-    elif not rule.given:
-        print(rule)
+    elif not chosen.given:
+        print(chosen)
     _say(f"{total} queries, {accepted} accepted; written to {out}")
     if counts:
-        steps = next_steps(matcher is not None, rule.given)
-        _say(told_probable(counts, total) + (f"; next: {'; '.join(steps)}" if steps else ""))
+        steps = next_steps(matcher is not None, chosen.given)
+        _say(describe_probable(counts, total) + (f"; next: {'; '.join(steps)}" if steps else ""))
     table: tuple[str | Path, ...] = () if model.step is None else ("--map", map)
     table += ("--route", "ROUTE") if model.map.routes else ()
     print_next("evaluate", out, "--truth", "TRUTH", *table, "--out", "scores")
@@ -309,8 +306,8 @@ def run_compare(
     query: str,
     *,
     out: Path,
-    judging: options.Judging,
-    learning: options.Learning,
+    judging: options.EvaluationOptions,
+    learning: options.LearningOptions,
     map: Path | None = None,
     sequences: options.Sequences,
     searching: options.Searching,
@@ -348,8 +345,7 @@ def run_compare(
     distractors = judging.off_map([first, queries, *others])
     learning.check_calibrated(model, first, map, judging.distractors)
     learning.seed_whitening(model)
-    first, views = learning.with_second(model, first, queries)
-    first, known = learning.with_calibration(model, first, queries)
+    first, views, known = learning.with_views(model, first, queries)
     result = compare(
         first,
         queries,
@@ -683,13 +679,13 @@ def _publish(
     from dejavu_torch.evaluation.report import report_folder, write_report
 
     run, kept = result.run, out / "map.safetensors"
-    rule = run.model.acceptance(run.sequence)
+    acceptance = run.model.acceptance(run.sequence)
     _print_contradiction(result.report)
     print_map(run.model)
     if run.truth is None:
         print("no ground truth (see --truth): matches and pictures, but no scores")
-    if not rule.given:
-        print(rule)
+    if not acceptance.given:
+        print(acceptance)
     match = run.match
     if top is not None:
         match = result.candidates.map(lambda column: column[:, :top].flatten())
@@ -722,7 +718,7 @@ def _write_matches(
 def _print_contradiction(report: Report) -> None:
     """Say first if the answers contradict the ground truth."""
     if report.ours.scores is not None and "line" in report.facts:
-        _say(told_line(report.facts, True))
+        _say(describe_line(report.facts, True))
 
 
 def _print_scores(report: Report, out: Path) -> None:
@@ -737,7 +733,7 @@ def _print_scores(report: Report, out: Path) -> None:
     if report.ours.scores is not None:
         _say(page.verdict(report))
     else:
-        if line := told_line(report.facts, False):
+        if line := describe_line(report.facts, False):
             _say(line)
         if steps := page.steps_after(report.facts):
             _say(f"next: {steps}")

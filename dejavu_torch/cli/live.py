@@ -89,8 +89,9 @@ def follow(
             if count:
                 p50, p99 = percentiles(recent)
                 times = f"milliseconds per frame: p50 {p50:.1f}, p99 {p99:.1f}"
-                rule = model.acceptance(sequence)
-                _log(f"{count} frames, {reader.dropped} dropped; {times}{'' if rule.given else f'; {rule}'}")
+                acceptance = model.acceptance(sequence)
+                default = "" if acceptance.given else f"; {acceptance}"
+                _log(f"{count} frames, {reader.dropped} dropped; {times}{default}")
 
 
 def frames_from(

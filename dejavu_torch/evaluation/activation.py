@@ -57,9 +57,9 @@ def activation_rates(
         layer, best = route.plan[j], best_phases(route, queries, j)
         near, far = (in_phase(layer, best, which, tolerance) for which in (here, right))
         chance = (2 * _phases_within(layer, tolerance) + 1) / layer.phases
-        rates.append(Rate(_share(near, inside), _share(far, outside), min(1.0, chance)))
+        rates.append(Rate(share(near, inside), share(far, outside), min(1.0, chance)))
     judged, found = scored_and_right(index, truth, tolerance)
-    shares = _share(found, inside & judged), _share(found, outside & judged)
+    shares = share(found, inside & judged), share(found, outside & judged)
     return [*rates, Rate(*shares, min(1.0, (2 * tolerance + 1) / route.places))]
 
 
@@ -102,5 +102,6 @@ def _phases_within(layer: FrequencyLayer, tolerance: int) -> int:
     return int(tolerance * layer.phases / layer.period)
 
 
-def _share(right: Tensor, among: Tensor) -> float | None:
+def share(right: Tensor, among: Tensor) -> float | None:
+    """Share of right answers (Q,) among some of the queries, (Q,) bool; None without any."""
     return float(right[among].double().mean()) if among.any() else None

@@ -39,11 +39,11 @@ def probable_counts(match: Match) -> dict[str, int]:
     return {f"{level:g}": int((match.probability >= level).sum()) for level in LEVELS}
 
 
-def told_probable(counts: Mapping[str, int], answers: int) -> str:
+def describe_probable(counts: Mapping[str, int], answers: int) -> str:
     """The counts of `probable_counts` in words.
 
     Example:
-        >>> told_probable({"0.9": 106, "0.5": 209}, 392)
+        >>> describe_probable({"0.9": 106, "0.5": 209}, 392)
         '106 of 392 answers are probably right (at least .9), 209 at .5'
     """
     (high, many), (low, more) = counts.items()
@@ -98,7 +98,7 @@ def line_of(places: Tensor, queries: Tensor, within: int, min_answers: float = M
     return Line(offset, near, n) if significant else None
 
 
-def own_facts(
+def answer_facts(
     match: Match, queries: Tensor, tolerance: int, scored: bool, offset: int | None = None
 ) -> dict[str, Any]:
     """The entries of report.json about the answers by themselves."""
@@ -113,8 +113,8 @@ def own_facts(
     return facts
 
 
-def told_line(facts: Mapping[str, Any], scored: bool) -> str:
-    """The line of `own_facts` in words; "" without one."""
+def describe_line(facts: Mapping[str, Any], scored: bool) -> str:
+    """The line of `answer_facts` in words; "" without one."""
     if "line" not in facts:
         return ""
     line = Line(**facts["line"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -74,17 +75,17 @@ def nearest_frames(
     if k > 1:
         scores = (part[:, nearest] for part in scores)
     matcher, nearest = Localizer(None, matching), nearest.cpu()
-    found = Match.joined(map(matcher.match, scores))
+    match = Match.joined(map(matcher.match, scores))
 
     def stored_frame(frame: Tensor) -> Tensor:
         return torch.where(frame >= 0, k * nearest[frame], -1)
 
-    sequences = dict(found.sequences)
+    sequences = dict(match.sequences)
     if 1 in sequences:
         sequences[1] = sequences[1].renumbered(stored_frame)
     if matching.sequence is None or matcher.own == 1:  # single queries
-        found = found._replace(index=stored_frame(found.index))
-    return found._replace(probability=None, sequences=sequences)
+        match = replace(match, index=stored_frame(match.index))
+    return replace(match, probability=None, sequences=sequences)
 
 
 def stride_bytes(frames: int, dimension: int, itemsize: int, k: int) -> int:
@@ -153,8 +154,8 @@ def baselines_of(
 
     found |= _null_controls(run, seed, one, progress)
     if leave_out is not None:
-        index, score, *_ = leave_out_match(model, reference, leave_out)
-        itself = Match(index, score, score.isfinite())
+        itself = leave_out_match(model, reference, leave_out)
+        itself = replace(itself, accepted=itself.score.isfinite())
         found["leave_out"] = Baseline(f"reference on itself, +-{leave_out} left out", itself)
     pair, batch = (run.reference, run.query), model.batch_size
     if not _is_plain_hog(model):

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 import time
-from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -15,7 +15,6 @@ from torch import Tensor
 from dejavu_torch.data.arrays import UNNAMED
 from dejavu_torch.data.ground_truth import (
     Truth,
-    as_ground_truth,
     check_ground_truth,
     describe_ground_truth,
     ground_truth_in_places,
@@ -23,8 +22,8 @@ from dejavu_torch.data.ground_truth import (
 )
 from dejavu_torch.data.source import Source, as_traverse
 from dejavu_torch.data.traverse import fitted
-from dejavu_torch.evaluation.answers import own_facts
-from dejavu_torch.evaluation.baselines import Baseline, baselines_of
+from dejavu_torch.evaluation.answers import answer_facts
+from dejavu_torch.evaluation.baselines import baselines_of
 from dejavu_torch.evaluation.contenders import Contender, contend, models_beside
 from dejavu_torch.evaluation.evaluate import RANKS, evaluation_facts
 from dejavu_torch.evaluation.localization import Localization
@@ -41,8 +40,8 @@ from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.maps.template_map import TemplateMapper
-from dejavu_torch.model import DejaVu, check_queries
-from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, source_of
+from dejavu_torch.model import DejaVu, check_queries, features_per_frame
+from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, resampled, source_of
 from dejavu_torch.periods.spectrogram import BACKEND
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.localizer import Matching
@@ -56,6 +55,7 @@ SAMPLED = 256  # reference frames that a given map is checked with
 NEAR = 10  # places within which it should find them, at least
 MAX_FILTERED = 2**25  # scores up to which ordered queries are also filtered by default
 
+Seconds = dict[str, float]  # that each stage took
 OtherModels = Mapping[str, tuple[str, DejaVu]]  # their names and models, by their keys in report.json
 
 
@@ -109,7 +109,7 @@ def compare(
         leave_out: also query the reference with itself, see `leave_out_match`; a diagnostic.
         seed: for shuffling the null control.
         interpolate: see `find_ground_truth`.
-        second: see `DejaVu.describe_reference`; another traverse than the query.
+        second: see `DejaVu.learn`; another traverse than the query.
         others: further models that learn the same reference, by their keys in report.json, with their names
             in tables. They need a ground truth, and none of them resamples.
         sequence: matches consecutive queries together, on the map and on all baselines.
@@ -127,43 +127,16 @@ def compare(
         InputError: bad input to any of the stages, or a map of another number of places.
     """
     model = DejaVu() if model is None else model
-    has_map, itself = model.map.places > 0, reference is query
-    reference, query = as_traverse(reference), as_traverse(query)
-    _check_leave_out(model, leave_out)
-    if tolerance < 0:
-        raise InputError(f"tolerance is {tolerance}; expected at least 0")
-    if truth is not None:
-        check_ground_truth(truth, interpolate)
-    check_candidates(top, tolerance)
-    reference = model.at_map_size(reference, model.frame_shape if has_map else None)
-    query = model.at_map_size(query, reference.frame_shape)
-    for one in distractors:
-        if is_ready(reference) and not is_ready(one):
-            raise InputError(f"{one.name} has frames; expected ready features, as of {reference.name}")
-    off = [one if is_ready(one) else fitted(one, reference.frame_shape) for one in distractors]
-    feature_shape = model.descriptor.check_sizes(reference, query, *off)
-
-    seconds: dict[str, float] = defaultdict(float)
-    with timed(seconds, "describe" if has_map else "learn"):
-        reference = model.resample(reference, model.step if has_map else None, progress)
-    with timed(seconds, "localize"):
-        step = getattr(reference, "step", None)
-        query = model.resample(query, step, progress)
-    off = [model.resample(one, step, progress, reference.frame_shape) for one in off]
+    has_map, seconds = model.map.places > 0, dict.fromkeys(("describe", "learn", "localize"), 0.0)
+    _check_settings(model, truth, interpolate, tolerance, top, leave_out)
+    reference, query, off = _prepared(model, reference, query, distractors, seconds, progress)
     check_candidates(top, tolerance, len(reference))
     if sequence is not None:
         sequence.check(None, len(reference))
-    if itself or (reference.name == query.name != UNNAMED):
-        log.warning(
-            "%s is matched with itself, each frame with its own copy; expected a second traverse", query.name
-        )
-    # early, so that a bad truth is refused before the long work
-    known = ground_truth_of(truth, reference, query, interpolate=interpolate)
+    known = ground_truth_of(truth, reference, query, interpolate)
 
     with timed(seconds, "describe" if has_map else "learn"):
         if has_map:
-            check_places(model, len(reference), reference.name)
-            check_queries(model, reference.frame_shape, feature_shape, reference.name)
             places = model.descriptor.all_of(reference, progress)
             _check_given_map(model, places, reference.name, tolerance)
         else:
@@ -172,78 +145,115 @@ def compare(
             model.learn_features(places, reference)
         if isinstance(calibration, Views) or (calibration is None and not has_map):
             calibrate_if_possible(model, reference, calibration, progress=progress)
-
     with timed(seconds, "localize"):
-        rule = model.matching(sequence)
-        check_queries(model, query.frame_shape, feature_shape, query.name)
-        queries = model.descriptor.all_of(query, progress)
-        if sequence is not None:
-            sequence.check(len(queries), model.map.places)
         if ordered is None:
-            ordered = source_of(query).ordered and len(queries) * model.map.places <= MAX_FILTERED
+            ordered = source_of(query).ordered and len(query) * model.map.places <= MAX_FILTERED
         ordered = ordered and known is not None  # without truth it has no scores
-        models = models_beside(sequence, ordered, len(queries), model.map.places, tolerance)
-        matching = Matching(sequence, models)
-        ranks = max(top, min(max(RANKS), model.map.places))
-        rule = rule._replace(beside=models, k=ranks, radius=tolerance)
-        candidates = model.localize_descriptors(queries, rule, progress=progress)
+        also = models_beside(sequence, ordered, len(query), model.map.places, tolerance)
+        matching = Matching(sequence, also)
+        queries, candidates = _localized(model, query, matching, top, tolerance, progress)
     off_map = _match_distractors(model, off, sequence, progress)
 
     model.cpu()
-    if known is not None:
-        known = ground_truth_in_places(known, model.map.place_of)
-    match = candidates.map(lambda column: column[:, 0])
-    run = Localization(
-        model, reference, query, places.cpu(), queries.cpu(), match, known, tolerance, matching
-    )
-    ours = _contend(run, "this map", match, model)
+    known = known and ground_truth_in_places(known, model.map.place_of)
+    places, queries, match = places.cpu(), queries.cpu(), candidates.map(lambda column: column[:, 0])
+    run = Localization(model, reference, query, places, queries, match, known, tolerance, matching)
+    ours = run.contend("this map", run.scored, model)
     contenders = _other_contenders(run, others or {}, leave_out, seed, progress)
-    route, scored = model.map, ours.scores is not None and isinstance(model.map, SpectralMap)
-    storage = coded_at_sizes(run, seed=seed, progress=progress) if storage_curve and scored else None
+    coded = model.map if ours.scores is not None and isinstance(model.map, SpectralMap) else None
+    storage = coded_at_sizes(run, seed=seed, progress=progress) if storage_curve and coded else None
     pictures = draw_pictures(run, {"map": ours, **contenders}, storage)
     pictures |= draw_reliability(run.scored, known, tolerance)
-    carried = all(source_of(one).places is not None for one in (reference, query))
-    described = describe_ground_truth(truth, interpolate, carried)
-    shown, ranked = match._replace(index=route.frame_of(match.index)), route.table.scored(candidates.index)
     facts = {
         **_map_facts(model.summary(), run.reference_features),
         **_run_facts(run, seconds),
-        **evaluation_facts(run.scored, ranked, known, tolerance, route.positions, described, off_map),
-        **own_facts(shown, run.query_frames, tolerance, known is not None, offset_of(truth, carried)),
+        **_match_facts(run, candidates, truth, interpolate, off_map),
         **{name: dict(picture.numbers) for name, picture in pictures.items() if picture.numbers},
     }
-    if scored and isinstance(route, SpectralMap) and len(route.chunks) == 1:
-        facts["noise_over_map"] = noise_over_map(route, run.reference_features, seed)
+    if coded is not None and len(coded.chunks) == 1:
+        facts["noise_over_map"] = noise_over_map(coded, run.reference_features, seed)
     return Comparison(Report(ours, contenders, facts), pictures, run, candidates)
+
+
+def _check_settings(
+    model: DejaVu, truth: Truth | None, interpolate: bool, tolerance: int, top: int, leave_out: int | None
+) -> None:
+    """Refuse settings that exclude each other, before anything is read."""
+    if leave_out is not None:
+        seen = f"leave_out is {leave_out}"
+        if leave_out < 0:
+            raise InputError(f"{seen}; expected at least 0")
+        if not isinstance(model.mapper, TemplateMapper):
+            expected = "expected a TemplateMapper, as with --config local_maxima"
+            raise InputError(f"{seen}, which needs a template map; {expected}")
+        if model.map.places and model.trained is not None:
+            raise InputError(f"{seen} and the templates are trained; expected means of frames")
+    if tolerance < 0:
+        raise InputError(f"tolerance is {tolerance}; expected at least 0")
+    if truth is not None:
+        check_ground_truth(truth, interpolate)
+    check_candidates(top, tolerance)
+
+
+def _prepared(
+    model: DejaVu, reference: Source, query: Source, off: Sequence[Traverse], seconds: Seconds, progress: bool
+) -> tuple[Traverse, Traverse, list[Traverse]]:
+    """The reference, the query and routes off the map, at the map's size and at even steps."""
+    itself, has_map = reference is query, model.map.places > 0
+    reference, query = as_traverse(reference), as_traverse(query)
+    if itself or (reference.name == query.name != UNNAMED):
+        line = "%s is matched with itself, each frame with its own copy; expected a second traverse"
+        log.warning(line, query.name)
+    reference = model.at_map_size(reference, model.frame_shape if has_map else None)
+    query = model.at_map_size(query, reference.frame_shape)
+    for other in off:
+        if is_ready(reference) and not is_ready(other):
+            raise InputError(f"{other.name} has frames; expected ready features, as of {reference.name}")
+    off = [other if is_ready(other) else fitted(other, reference.frame_shape) for other in off]
+    features = model.descriptor.check_sizes(reference, query, *off)
+    even = partial(resampled, odometry=model.velocity, batch_size=model.batch_size, progress=progress)
+    with timed(seconds, "describe" if has_map else "learn"):
+        reference = even(reference, step=model.step if has_map else None)
+    step = getattr(reference, "step", None)
+    with timed(seconds, "localize"):
+        query = even(query, step=step)
+    if has_map:
+        check_places(model, len(reference), reference.name)
+        check_queries(model, reference.frame_shape, features, reference.name)
+    return reference, query, [even(other, step=step) for other in off]
+
+
+def _localized(
+    model: DejaVu, query: Traverse, matching: Matching, top: int, tolerance: int, progress: bool
+) -> tuple[Tensor, Match]:
+    """Descriptors (Q,K) of the queries, and the best places of each as far as recall@N or `top` needs."""
+    sequence, places = matching.sequence, model.map.places
+    ranking = model.matching(sequence)
+    check_queries(model, query.frame_shape, features_per_frame(model), query.name)
+    queries = model.descriptor.all_of(query, progress)
+    if sequence is not None:
+        sequence.check(len(queries), places)
+    ranks = max(top, min(max(RANKS), places))
+    ranking = ranking._replace(also=matching.also, k=ranks, radius=tolerance)
+    return queries, model.localize_descriptors(queries, ranking, progress=progress)
 
 
 def _other_contenders(
     run: Localization, others: OtherModels, leave_out: int | None, seed: int, progress: bool
 ) -> dict[str, Contender]:
     """The baselines, null controls and further models, scored."""
-    known, contenders = run.truth is not None, {}
-    if known or leave_out is not None:
-        baselines = baselines_of(run, seed, leave_out, progress)
-        contenders = {key: _score_baseline(run, key, baseline) for key, baseline in baselines.items()}
-    for key, (name, other) in others.items() if known else ():
+    table, contenders = run.model.map.table, {}
+    itself = table.scored(torch.arange(table.places))[:, None]  # of the places as queries
+    if run.truth is not None or leave_out is not None:
+        for key, (name, match, bytes, k, fixed) in baselines_of(run, seed, leave_out, progress).items():
+            truth, match = itself if key == "leave_out" else run.truth, match.renumbered(table.scored)
+            contenders[key] = contend(name, match, truth, run.tolerance, bytes, k, fixed)
+    for key, (name, other) in others.items() if run.truth is not None else ():
         other.learn(run.reference, progress)
         queries = other.descriptor.all_of(run.query, progress)
-        found = other.localize_descriptors(queries, run.matching, progress=progress)
-        contenders[key] = _contend(run, name, found, other)
+        match = other.localize_descriptors(queries, run.matching, progress=progress)
+        contenders[key] = run.contend(name, match.renumbered(table.scored), other)
     return contenders
-
-
-def _check_leave_out(model: DejaVu, leave_out: int | None) -> None:
-    """Refuse early what `leave_out_match` refuses later."""
-    if leave_out is None:
-        return
-    if leave_out < 0:
-        raise InputError(f"leave_out is {leave_out}; expected at least 0")
-    if not isinstance(model.mapper, TemplateMapper):
-        seen = f"leave_out is {leave_out}, which needs a template map"
-        raise InputError(f"{seen}; expected a TemplateMapper, as with --config local_maxima")
-    if model.map.places and model.trained is not None:
-        raise InputError(f"leave_out is {leave_out} and the templates are trained; expected means of frames")
 
 
 def check_places(model: DejaVu, places: int, name: str) -> None:
@@ -254,14 +264,13 @@ def check_places(model: DejaVu, places: int, name: str) -> None:
 
 
 def _check_given_map(model: DejaVu, places: Tensor, name: str, tolerance: int) -> None:
-    """Check that the map was made of these descriptors (N,K): refuse another number, warn of a bad fit."""
-    check_places(model, len(places), name)
+    """Warn if the map finds few of the descriptors (N,K) that it was made of."""
     sample = torch.arange(0, len(places), max(1, len(places) // SAMPLED))
     distance = (model.localize_descriptors(places[sample]).index - sample).abs()
-    found = int((distance <= max(tolerance, NEAR)).sum())
-    if found < 0.5 * len(sample) and model.map.summary().covered:
+    near = int((distance <= max(tolerance, NEAR)).sum())
+    if near < 0.5 * len(sample) and model.map.summary().covered:
         expected = "expected the reference that the map was made of"
-        log.warning("the map finds %d of %d frames of %s; %s", found, len(sample), name, expected)
+        log.warning("the map finds %d of %d frames of %s; %s", near, len(sample), name, expected)
 
 
 def _match_distractors(
@@ -271,32 +280,16 @@ def _match_distractors(
     if distractors and not model.matching(sequence).platt:
         log.warning("the map is not calibrated, so no frame of other routes has a probability")
         return {}
-    found = {}
-    for one in distractors:
-        probability = model.localize_descriptors(model.descriptor.all_of(one, progress), sequence).probability
-        assert probability is not None
-        found[one.name] = probability
-    return found
-
-
-def _contend(run: Localization, name: str, found: Match, model: DejaVu) -> Contender:
-    """The matches of a model as a contender."""
-    found, summary = found.renumbered(run.model.map.table.scored), model.summary()
-    return contend(name, found, run.truth, run.tolerance, bytes=summary.map_bytes, fixed=summary.fixed_bytes)
-
-
-def _score_baseline(run: Localization, key: str, baseline: Baseline) -> Contender:
-    """A baseline as a contender, scored in the same way as the map."""
-    name, found, bytes, k, fixed = baseline
-    route, truth = run.model.map, run.truth
-    if key == "leave_out":  # its queries are the places themselves
-        own = route.frame_of(torch.arange(route.places))[:, None]
-        truth = ground_truth_in_places(as_ground_truth(own), route.place_of)
-    return contend(name, found.renumbered(route.table.scored), truth, run.tolerance, bytes, k, fixed)
+    probabilities = {}
+    for other in distractors:
+        match = model.localize_descriptors(model.descriptor.all_of(other, progress), sequence)
+        assert match.probability is not None
+        probabilities[other.name] = match.probability
+    return probabilities
 
 
 @contextmanager
-def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
+def timed(seconds: Seconds, name: str) -> Iterator[None]:
     """Add the seconds that a block takes to `seconds[name]`."""
     began = time.perf_counter()
     yield
@@ -305,10 +298,7 @@ def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
 
 def _map_facts(summary: MapSummary, features: Tensor) -> dict[str, Any]:
     """The entries of report.json about the map, whose places have these features (N,D)."""
-    chunks: list[dict[str, Any]] = [
-        chunk._asdict() | {"periods": [plain_number(period) for period in chunk.periods]}
-        for chunk in summary.chunks
-    ]
+    chunks = [chunk._asdict() | {"periods": [*map(plain_number, chunk.periods)]} for chunk in summary.chunks]
     names = ("kind", "map_bytes", "fixed_bytes", "route_bytes", "bytes_per_place", "lines")
     return {
         **{name: getattr(summary, name) for name in (*names, "templates", "template_numbers")},
@@ -321,17 +311,17 @@ def _map_facts(summary: MapSummary, features: Tensor) -> dict[str, Any]:
     }
 
 
-def _run_facts(run: Localization, seconds: Mapping[str, float]) -> dict[str, Any]:
+def _run_facts(run: Localization, seconds: Seconds) -> dict[str, Any]:
     """The entries of report.json about the run; no seconds to learn if the map is given."""
     model, reference, query = run.model, run.reference, run.query
-    rule = model.acceptance(run.sequence)
+    acceptance = model.acceptance(run.sequence)
     facts = {
         "seconds_learn": seconds["learn"],
         "seconds_localize": seconds["localize"],
         "l1_backend": l1_backend(),
         "spectrogram_backend": BACKEND,
-        "threshold": rule.threshold,
-        "least_probability": rule.precision,
+        "threshold": acceptance.threshold,
+        "least_probability": acceptance.precision,
         "sequence": run.sequence.length if isinstance(run.sequence, SequenceMatcher) else 1,
         "speeds": list(run.sequence.speeds) if isinstance(run.sequence, SequenceMatcher) else None,
         "filter": isinstance(run.sequence, PlaceFilter),
@@ -346,6 +336,18 @@ def _run_facts(run: Localization, seconds: Mapping[str, float]) -> dict[str, Any
             "query_frames": len(query.positions) if isinstance(query, ResampledTraverse) else None,
         }
     return facts
+
+
+def _match_facts(
+    run: Localization, candidates: Match, truth: Truth | None, interpolate: bool, off: Mapping[str, Tensor]
+) -> dict[str, Any]:
+    """The entries of report.json about the answers; `off`: see `rejection_facts`."""
+    route, tolerance = run.model.map, run.tolerance
+    carried = all(source_of(traverse).places is not None for traverse in (run.reference, run.query))
+    words, offset = describe_ground_truth(truth, interpolate, carried), offset_of(truth, carried)
+    ranked, shown = route.table.scored(candidates.index), run.match.renumbered(route.frame_of)
+    facts = evaluation_facts(run.scored, ranked, run.truth, tolerance, route.positions, words, off)
+    return facts | answer_facts(shown, run.query_frames, tolerance, run.truth is not None, offset)
 
 
 def plain_number(period: object) -> int | float:

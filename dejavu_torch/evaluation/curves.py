@@ -301,4 +301,4 @@ def _judged(match: Match, truth: Truth, tolerance: int) -> tuple[Match, Tensor, 
     if not kept.any():
         seen = f"of {len(kept)} queries {int(known.judged.sum())} are in the truth and none can be judged"
         raise InputError(f"{seen}; expected one in the truth that does not report an ignored place")
-    return match.map(lambda column: column[kept]), right[kept], (known.positives >= 0).any(1)[kept]
+    return match[kept], right[kept], (known.positives >= 0).any(1)[kept]

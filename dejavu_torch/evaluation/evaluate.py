@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -20,7 +21,7 @@ from dejavu_torch.data.ground_truth import (
 )
 from dejavu_torch.data.positions import unit_of
 from dejavu_torch.evaluation import curves
-from dejavu_torch.evaluation.answers import own_facts
+from dejavu_torch.evaluation.answers import answer_facts
 from dejavu_torch.evaluation.contenders import contend
 from dejavu_torch.evaluation.match_plots import draw_coverage
 from dejavu_torch.evaluation.matches import ELSEWHERE, read_matches
@@ -84,7 +85,7 @@ def evaluate_file(
     place_map = None if map is None else read_place_map(map)
     if isinstance(place_map, SpectralMap) and place_map.routes:
         if route is None:
-            names = ", ".join(one.name for one in place_map.routes)
+            names = ", ".join(part.name for part in place_map.routes)
             raise InputError(f"{map} has the routes {names}; expected --route with the one of the truth")
         place_map = place_map.part(route)
     positions = torch.zeros(0, dtype=torch.float32) if place_map is None else place_map.positions
@@ -100,18 +101,18 @@ def evaluate_file(
     known = find_ground_truth(truth, reference, query, frames, queries, interpolate, resampled)
     if known is None:
         raise InputError("there is no ground truth; expected one, or traverses that carry positions")
-    carried = all(one is not None and one.places is not None for one in (reference, query))
-    own = own_facts(match, queries, tolerance, True, offset_of(truth, carried))
+    carried = all(traverse is not None and traverse.places is not None for traverse in (reference, query))
+    alone = answer_facts(match, queries, tolerance, True, offset_of(truth, carried))
     if place_map is not None:
         known = ground_truth_in_places(known, place_map.place_of)
         candidates = place_map.place_of(candidates)
-    here = match._replace(index=candidates[:, 0].masked_fill(elsewhere[:, 0], -1))
+    here = replace(match, index=candidates[:, 0].masked_fill(elsewhere[:, 0], -1))
     if route is not None:  # number places on other routes beyond every place of this one and its truth
         highest = max(int(table.max()) for table in (candidates, known.positives) if table.numel())
         candidates = candidates.masked_fill(elsewhere, max(places or 0, 1 + highest) + tolerance)
-    match = match._replace(index=candidates[:, 0])
+    match = replace(match, index=candidates[:, 0])
     described = describe_ground_truth(truth, interpolate, carried)
-    facts = evaluation_facts(match, candidates, known, tolerance, positions, described) | own
+    facts = evaluation_facts(match, candidates, known, tolerance, positions, described) | alone
     accepted = facts["accepted"]
     facts["accepted_precision"] = facts["accepted_right"] / accepted if accepted else None
     facts |= {"matches": str(matches), "places": places}
@@ -155,8 +156,8 @@ def evaluation_facts(
         "torch": torch.__version__,
     }
     for first in RANKS:
-        found = None if truth is None else curves.recall_at(candidates, truth, tolerance, first)
-        facts[f"recall_at_{first}"] = found
+        recall = None if truth is None else curves.recall_at(candidates, truth, tolerance, first)
+        facts[f"recall_at_{first}"] = recall
     if truth is not None:
         facts |= curves.count_queries(match, truth, tolerance) | {"truth": described}
         curve = curves.curve_of(match, truth, tolerance)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from dejavu_torch.data.ground_truth import GroundTruth
 from dejavu_torch.data.positions import unit_of
+from dejavu_torch.evaluation.contenders import Contender, contend
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.recognition.localizer import SINGLE, Matching
@@ -45,7 +46,7 @@ class Localization(NamedTuple):
     @property
     def scored(self) -> Match:
         """The matches with the places that are scored."""
-        return self.match._replace(index=self.model.map.table.scored(self.match.index))
+        return self.match.renumbered(self.model.map.table.scored)
 
     @property
     def borders(self) -> Tensor:
@@ -68,6 +69,11 @@ class Localization(NamedTuple):
     def has_frames(self) -> bool:
         """Whether both traverses hold frames rather than ready features."""
         return len(self.reference.frame_shape) == len(self.query.frame_shape) == 3
+
+    def contend(self, name: str, match: Match, model: DejaVu) -> Contender:
+        """Matches with the places that are scored, on the map of this or another model, as a contender."""
+        size = model.summary()
+        return contend(name, match, self.truth, self.tolerance, size.map_bytes, fixed=size.fixed_bytes)
 
     @torch.no_grad()
     def scores(self, numbers: Tensor) -> Tensor:

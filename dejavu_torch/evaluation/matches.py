@@ -6,9 +6,9 @@ import csv
 import itertools
 import logging
 import math
-from bisect import bisect_right
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple, TextIO
 
@@ -64,8 +64,8 @@ def write_matches(
         query_names, place_names: of the frames; () leaves the column empty. Unprintable characters, such as
             line breaks, are escaped.
         ranks: matches per query; None is one, without a column for the rank.
-        routes: of a merged map: their names get a column, and the place is a frame of that route. `frame_of`
-            and `place_names` count through all routes.
+        routes: of a merged map, for `Match.route`: their names get a column, and the place is a frame of that
+            route. `frame_of` and `place_names` count through all routes.
         pairs: another file, with a line `query_name place_name` for each reported place: the image pairs
             that hloc and COLMAP read.
 
@@ -95,9 +95,9 @@ def write_matches(
             places = match.index if frame_of is None else frame_of(match.index)
             rank = torch.arange(each).repeat(len(queries)) + 1
             right = match.score if match.probability is None else match.probability
-            numbers = (queries.repeat_interleave(each), places, match.score, match.accepted, right, rank)
-            for query, place, score, good, p, at in zip(*(one.tolist() for one in numbers), strict=True):
-                on = bisect_right(starts, place) - 1 if routes and place >= 0 else -1
+            route = torch.full_like(places, -1) if match.route is None else match.route
+            cells = queries.repeat_interleave(each), places, match.score, match.accepted, right, rank, route
+            for query, place, score, good, p, at, on in zip(*(one.tolist() for one in cells), strict=True):
                 row = {
                     "query": query,
                     "place": place - starts[on] if on >= 0 else place,
@@ -186,7 +186,7 @@ def read_matches(path: Path, route: str | None = None) -> Matches:
     queries, _, index, scores, accepted, probability = zip(*answers, strict=True)
     match = Match(torch.tensor(index), torch.tensor(scores, dtype=torch.float64), torch.tensor(accepted))
     if "probability" in cells:
-        match = match._replace(probability=torch.tensor(probability, dtype=torch.float64))
+        match = replace(match, probability=torch.tensor(probability, dtype=torch.float64))
     return Matches(torch.tensor(queries), match, torch.tensor(ranked))
 
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from dejavu_torch.data.ground_truth import GroundTruth, scored_and_right
+from dejavu_torch.evaluation.activation import share
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.plots import DARK, GREY, RIGHT, Pictures, canvas, picture
 from dejavu_torch.memory import in_float32
@@ -26,23 +28,22 @@ def rejection_facts(
     if match.probability is None:
         return {}
     facts: dict[str, Any] = {"off_map": {}}
-    for name, found in off_map.items():
-        accepted = {f"{asked:g}": float((found >= asked).double().mean()) for asked in ASKED}
-        facts["off_map"][name] = {"frames": len(found), "accepted": accepted}
+    for name, probability in off_map.items():
+        accepted = {f"{asked:g}": float((probability >= asked).double().mean()) for asked in ASKED}
+        facts["off_map"][name] = {"frames": len(probability), "accepted": accepted}
     if truth is not None:
         probability, right = judged(match, truth, tolerance)
-        scores = evaluate(match._replace(score=1 - match.probability), truth, tolerance)
+        scores = evaluate(replace(match, score=1 - match.probability), truth, tolerance)
+        each = [(asked, probability >= asked) for asked in ASKED]
         facts |= {
             "auc": scores.auc,
             "recall_at_100_precision": scores.recall_at_100_precision,
-            "precision": [],
+            "precision": [
+                {"asked": asked, "precision": share(right, kept), "kept": share(kept, right) or 0.0}
+                for asked, kept in each
+            ],
+            "expected_calibration_error": calibration_error(probability, right, BINS),
         }
-        facts["expected_calibration_error"] = calibration_error(probability, right, BINS)
-        for asked in ASKED:
-            kept = probability >= asked
-            reached = float(right[kept].double().mean()) if kept.any() else None
-            share = int((kept & right).sum()) / max(1, int(right.sum()))
-            facts["precision"].append({"asked": asked, "precision": reached, "kept": share})
     return {"rejection": facts}
 
 

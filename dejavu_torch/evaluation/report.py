@@ -15,7 +15,7 @@ from textwrap import wrap
 from typing import Any, NamedTuple
 
 from dejavu_torch.data.output import whole_folder
-from dejavu_torch.evaluation.answers import next_steps, told_line, told_probable
+from dejavu_torch.evaluation.answers import describe_line, describe_probable, next_steps
 from dejavu_torch.evaluation.contenders import Contender, colour_of, distinct, sequences_as_json
 from dejavu_torch.evaluation.plots import Picture, Pictures
 from dejavu_torch.evaluation.prose import sentences, templates
@@ -69,7 +69,7 @@ class Report(NamedTuple):
         scores = ", ".join(f"{name} {value}" for name, value in zip(*rows[:2], strict=True) if name)
         others = f"; compared with {', '.join(self.contenders)}" if self.contenders else ""
         first = summary(self).partition(". ")[0].rstrip(".")
-        line = told_line(self.facts, bool(scores))
+        line = describe_line(self.facts, bool(scores))
         return "\n".join(filter(None, [first, f"{scores}{others}", line, "all of report.json: as_json()"]))
 
 
@@ -165,8 +165,8 @@ def _sentences(report: Report, part: str) -> str:
         ours=report.ours,
         scores=scores,
         baseline=report.contenders.get("uncompressed"),
-        line=told_line(facts, scores is not None),
-        probable=told_probable(counts, facts["queries"]) if counts else "",
+        line=describe_line(facts, scores is not None),
+        probable=describe_probable(counts, facts["queries"]) if counts else "",
         likely=counts[f"{PROBABLE:g}"] / max(1, facts["queries"]) if counts else None,
         steps=steps_after(facts),
         late=any(is_late(one) for one in report.shown().values()),

@@ -7,10 +7,10 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
 
 from dejavu_torch.data.ground_truth import GroundTruth, scored_and_right
 from dejavu_torch.data.source import open_source
+from dejavu_torch.evaluation.activation import share
 from dejavu_torch.evaluation.compare import Comparison, compare
 from dejavu_torch.evaluation.contenders import Contender, contend
 from dejavu_torch.evaluation.controls import leave_out_match, template_map_of, with_mapper
@@ -93,7 +93,7 @@ def reproduce(
     facts: dict[str, Any] = {
         **result.report.facts,
         "published": PUBLISHED[dataset]._asdict(),
-        "chunk_lengths": [row._asdict() for row in chunk_lengths(result, tolerance, lengths)],
+        "chunk_lengths": [row._asdict() for row in chunk_lengths(result, lengths)],
     }
     first, second = result.run.reference, result.run.query
     if isinstance(first, ResampledTraverse) and isinstance(second, ResampledTraverse):
@@ -102,7 +102,7 @@ def reproduce(
     frames_of_cuts = torch.tensor(structure_cuts(reference), dtype=torch.int64)
     cuts: list[int] = result.run.model.map.place_of(frames_of_cuts).unique().tolist()
     if cuts:
-        boundaries = known_boundaries(result, cuts, tolerance)
+        boundaries = known_boundaries(result, cuts)
         contenders |= {key: contender for key, (contender, _) in boundaries.items()}
         effects = {key: effect._asdict() for key, (_, effect) in boundaries.items()}
         facts["boundaries"] = {"cuts": len(cuts), **effects}
@@ -110,19 +110,20 @@ def reproduce(
     return result._replace(report=report, pictures={**pictures, **result.pictures})
 
 
-def chunk_lengths(result: Comparison, tolerance: int = 5, lengths: Sequence[int] = LENGTHS) -> list[Length]:
+def chunk_lengths(result: Comparison, lengths: Sequence[int] = LENGTHS) -> list[Length]:
     """Recall and storage of maps with chunks of other lengths (section VI)."""
     mapper, places = _mapper(result.run.model), len(result.run.reference_features)
-    if result.run.truth is None or mapper is None:
+    truth, tolerance = result.run.truth, result.run.tolerance
+    if truth is None or mapper is None:
         return []
     rows = []
     for window in (length for length in lengths if length <= places):
         periods = SpectrogramAnalysis(window, **_settings(mapper))
         model = _learned(result, TemplateMapper(periods, mapper.metric, mapper.reduction))
         size = model.summary().map_bytes
-        scores = evaluate(_localized(model, result), result.run.truth, tolerance)
+        scores = evaluate(_localized(model, result), truth, tolerance)
         template_map_of(model, "a comparable score").reduction = "mean"
-        comparable = evaluate(_localized(model, result), result.run.truth, tolerance).recall_at_1
+        comparable = evaluate(_localized(model, result), truth, tolerance).recall_at_1
         rows.append(Length(window, scores.recall_at_1, scores.auc, comparable, size, size / places))
     return rows
 
@@ -197,17 +198,12 @@ def boundary_effect(
     answered = scored & (truth.positives >= 0).any(1)
     distance = (truth.positives[:, :, None] - torch.tensor(list(cuts))).abs().amin(2)
     close = ((distance <= near) & (truth.positives >= 0)).any(1)
-
-    def recall(which: Tensor) -> float | None:
-        return float(right[which].double().mean()) if which.any() else None
-
     inside, outside = answered & close, answered & ~close
-    return BoundaryEffect(near, int(inside.sum()), int(outside.sum()), recall(inside), recall(outside))
+    recalls = share(right, inside), share(right, outside)
+    return BoundaryEffect(near, int(inside.sum()), int(outside.sum()), *recalls)
 
 
-def known_boundaries(
-    result: Comparison, cuts: Sequence[int], tolerance: int
-) -> dict[str, tuple[Contender, BoundaryEffect]]:
+def known_boundaries(result: Comparison, cuts: Sequence[int]) -> dict[str, tuple[Contender, BoundaryEffect]]:
     """The cost of chunks that do not end where structures start and stop (section V, underground).
 
     Raises:
@@ -221,14 +217,13 @@ def known_boundaries(
         "comparable": (same, mapper.periods),
         "known_boundaries": (given, GivenChunks(cuts, **_settings(mapper))),
     }
-    found = {}
+    effects = {}
     for key, (name, periods) in ways.items():
         model = _learned(result, TemplateMapper(periods, mapper.metric, "mean"))
-        match, summary = _localized(model, result), model.summary()
-        size, fixed = summary.map_bytes, summary.fixed_bytes
-        contender = contend(f"{name}, comparable scores", match, truth, tolerance, size, fixed=fixed)
-        found[key] = contender, boundary_effect(match, truth, cuts, tolerance)
-    return found
+        match = _localized(model, result)
+        contender = result.run.contend(f"{name}, comparable scores", match, model)
+        effects[key] = contender, boundary_effect(match, truth, cuts, result.run.tolerance)
+    return effects
 
 
 def _mapper(model: DejaVu) -> TemplateMapper | None:

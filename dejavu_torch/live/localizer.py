@@ -87,7 +87,7 @@ class LiveLocalizer:
         self.scores: Tensor | None = None
         matching = self.model.matching(self.sequence)
         keep = self._keep if self.keep_scores else None
-        self._localizer = self.model.localizer(matching._replace(on_scores=keep))
+        self._localizer = self.model.localizer(matching._replace(callback=keep))
 
     def _keep(self, scores: Tensor) -> None:
         self.scores = scores[0]
@@ -109,7 +109,7 @@ class LiveLocalizer:
             probability=math.nan if match.probability is None else float(match.probability),
             accepted=bool(match.accepted),
             milliseconds=1e3 * (time.perf_counter() - start),
-            route=routes[int(table.route_of(match.index))].name if routes and place >= 0 else "",
+            route=routes[int(match.route)].name if match.route is not None and place >= 0 else "",
         )
 
     @property

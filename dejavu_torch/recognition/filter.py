@@ -126,7 +126,9 @@ class PlaceFilter(SequenceModel):
             before = self.start(scores.shape[-1])
         return self._posteriors(scores, before)[1:]
 
-    def step(self, scores: Tensor, state: Tensor, firsts: Sequence[int] = (0,)) -> tuple[Tensor, Tensor]:
+    def step(
+        self, scores: Tensor, state: Tensor, route_starts: Sequence[int] = (0,)
+    ) -> tuple[Tensor, Tensor]:
         posteriors = self._posteriors(scores, state)
         return self.near_scores(posteriors[1:, :-1], scores), posteriors[-1]
 

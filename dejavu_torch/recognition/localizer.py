@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from itertools import accumulate
 from types import MappingProxyType
 from typing import NamedTuple
@@ -32,12 +33,12 @@ class Matching(NamedTuple):
     """How queries are matched."""
 
     sequence: SequenceModel | None = None  # None matches each query by itself
-    beside: Mapping[Together, SequenceModel] = MappingProxyType({})  # further ways, see `Match.sequences`
+    also: Mapping[Together, SequenceModel] = MappingProxyType({})  # further ways, see `Match.sequences`
     k: int | None = None  # candidates per query; None gives matches (Q,)
     radius: int = 0  # suppression radius in places
-    rule: Acceptance = Acceptance()
+    acceptance: Acceptance = Acceptance()
     platt: Platt | None = None  # gives probabilities
-    on_scores: Callable[[Tensor], None] | None = None  # receives the final scores (B,N)
+    callback: Callable[[Tensor], None] | None = None  # receives the final scores (B,N)
     search: Search = "auto"  # of single queries, see `DejaVu.localize`
 
 
@@ -73,9 +74,9 @@ class Localizer:
         self.searcher = Scan(route) if searcher is None and route is not None else searcher
         sequence, routes = matching.sequence, () if route is None else route.routes
         self.own: Together = sequence.length if isinstance(sequence, SequenceMatcher) else "filter"
-        self.models = {**matching.beside, **({} if sequence is None else {self.own: sequence})}
+        self.models = {**matching.also, **({} if sequence is None else {self.own: sequence})}
         self.states: dict[Together, Tensor] = {}  # of the models; empty before the first query
-        self.firsts = (0, *accumulate(one.places for one in routes[:-1]))  # the first place of each route
+        self.route_starts = (0, *accumulate(one.places for one in routes[:-1]))
 
     @torch.no_grad()
     def __call__(self, descriptors: Tensor, label: str | None = None) -> Match:
@@ -89,7 +90,7 @@ class Localizer:
             wanted.append((min(2, places), TOLERANCE))
         n = num_needed(wanted, places)
         few = n <= max(1, MAX_SHARE * min(places, route.block_places)) or places > SCORES_AT_ONCE
-        searches = not self.models and matching.on_scores is None and (few or type(self.searcher) is not Scan)
+        searches = not self.models and matching.callback is None and (few or type(self.searcher) is not Scan)
         size = max(PER_BEST * n, places // PLACES_PER_NUMBER) if searches else places
         parts = descriptors.split(max(1, min(ROWS, SCORES_AT_ONCE // size)))
         moved = (part.to(route.device) for part in with_progress(parts, label))
@@ -120,31 +121,33 @@ class Localizer:
 
     def _in_sequence(self, scores: Tensor) -> Match:
         states = self.states or {T: one.start(scores.shape[1]).to(scores) for T, one in self.models.items()}
-        steps = {T: one.step(scores, states[T], self.firsts) for T, one in self.models.items()}
+        steps = {T: one.step(scores, states[T], self.route_starts) for T, one in self.models.items()}
         single = self.matching.sequence is None
         final, confidence = scores if single else steps[self.own][0], None
         if self.matching.platt is not None:
             confidence = confidence_of(scores) if single else self.track(final, scores)
         match = self._answer(self._candidates(final), confidence)
         self.states = {T: state for T, (_, state) in steps.items()}
-        beside = {T: best_match(steps[T][0]).map(Tensor.cpu) for T in self.matching.beside}
-        return match._replace(sequences=beside)
+        sequences = {T: best_match(steps[T][0]).map(Tensor.cpu) for T in self.matching.also}
+        return replace(match, sequences=sequences)
 
     def _candidates(self, scores: Tensor) -> Match:
-        if self.matching.on_scores is not None:
-            self.matching.on_scores(scores)
+        if self.matching.callback is not None:
+            self.matching.callback(scores)
         return best_candidates(scores, self.matching.k or 1, self.matching.radius)
 
     def _answer(self, match: Match, confidence: Tensor | None = None) -> Match:
         """Candidates (B,k) with their acceptance, and the probability that the first is right."""
         matching, match = self.matching, match.map(Tensor.cpu)
-        match = match._replace(accepted=accept(match.score, matching.rule.threshold))
+        match = replace(match, accepted=accept(match.score, matching.acceptance.threshold))
+        if self.route is not None and self.route.routes:
+            match = replace(match, route=self.route.table.route_of(match.index))
         if matching.platt is not None and confidence is not None:
             others = match.index.shape[1] - 1
             probability = F.pad(matching.platt.probability(confidence)[:, None], (0, others), value=math.nan)
-            if matching.rule.precision is not None:
-                match = match._replace(accepted=probability >= matching.rule.precision)
-            match = match._replace(probability=probability)
+            if matching.acceptance.precision is not None:
+                match = replace(match, accepted=probability >= matching.acceptance.precision)
+            match = replace(match, probability=probability)
         return match if matching.k is not None else match.map(lambda column: column[:, 0])
 
     def _search(self, descriptors: Tensor, wanted: list[NmsSpec]) -> Match:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -52,7 +53,7 @@ def best_match(scores: Tensor, threshold: float | None = None) -> Match:
     lead = scores.shape[:-1] if isinstance(scores, Tensor) and scores.ndim > 2 else ()
     found = best_candidates(scores.flatten(0, -2) if lead else scores, 1, 0)
     match = found.map(lambda column: column[:, 0].view(lead or -1))
-    return match._replace(accepted=accept(match.score, threshold))
+    return replace(match, accepted=accept(match.score, threshold))
 
 
 def best_candidates(scores: Tensor, k: int, radius: int, places: Tensor | None = None) -> Match:

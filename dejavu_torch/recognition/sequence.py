@@ -71,7 +71,9 @@ class SequenceMatcher(SequenceModel):
             return each(self, scores, state)
         return self.step(scores, self.start(scores.shape[-1]).to(scores) if state is None else state)[0]
 
-    def step(self, scores: Tensor, state: Tensor, firsts: Sequence[int] = (0,)) -> tuple[Tensor, Tensor]:
+    def step(
+        self, scores: Tensor, state: Tensor, route_starts: Sequence[int] = (0,)
+    ) -> tuple[Tensor, Tensor]:
         fits = state.shape[1:] == scores.shape[1:] and len(state) < self.length
         if scores.ndim != 2 or not fits or not scores.is_floating_point():
             raise InputError(
@@ -83,7 +85,7 @@ class SequenceMatcher(SequenceModel):
         rows = torch.cat([state.to(scores), scores])
         before = (~state[:, :1].isnan()).sum()
         used = (torch.arange(1, len(scores) + 1, device=rows.device) + before).clamp(max=self.length)
-        routes = [self._best(part, used) for part in rows.tensor_split([*firsts[1:]], 1)]
+        routes = [self._best(part, used) for part in rows.tensor_split([*route_starts[1:]], 1)]
         best = routes[0] if len(routes) == 1 else torch.cat(routes, 1)
         return best, rows[max(0, len(rows) - self.length + 1) :]
 

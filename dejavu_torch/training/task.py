@@ -7,6 +7,7 @@ import logging
 import math
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -407,7 +408,7 @@ class PlaceRecognitionTask(Trainee):
                 match = best_match(self(frames))
             index = self.data.apart(self.map.table.scored(match.index))
             truth = batch.truth._replace(positives=self.data.apart(batch.truth.positives))
-            self.metric.update(match._replace(index=index), truth)
+            self.metric.update(replace(match, index=index), truth)
 
     def on_validation_epoch_end(self) -> None:
         """Log the scores of `evaluate`; those on the augmented reference get a suffix."""

@@ -73,3 +73,47 @@ def test_a_distance_that_is_not_finite_means_what_it_means_in_a_scan() -> None:
         assert torch.equal(place, expected.index)
         assert torch.equal(score.nan_to_num(-1, -2), expected.score.nan_to_num(-1, -2))
         assert place[1] == -1
+<<<<<<< HEAD:tests/benchmarks/test_layer_search.py
+=======
+
+
+def test_localize_takes_it_and_gives_what_the_scan_gives() -> None:
+    features = (torch.arange(60_000)[:, None] % torch.tensor([210, 286])).float()
+    model = template_model(periods=Fixed(*LONG)).learn(features)
+    queries = features[torch.tensor([17, 30_029, 4000])] + torch.tensor([[0.1], [0.2], [0.3]])
+    with patch.object(TemplateMap, "scores", side_effect=AssertionError("all scores")):
+        found = model.localize(queries)
+    assert found.index.tolist() == [17, 30_029, 4000]
+    scores = model.map.scores(queries)
+    assert torch.equal(found.score, scores.amin(1))
+    # everything that needs other scores makes them
+    seen: list[tuple[int, ...]] = []
+    model.localize_descriptors(queries, Matching(callback=lambda scores: seen.append(tuple(scores.shape))))
+    assert seen == [(3, 60_000)]
+    assert torch.equal(model.candidates(queries, k=2).index[:, 0], found.index)
+    assert model.localize(queries, sequence=SequenceMatcher(1)).index.tolist() == found.index.tolist()
+
+
+def test_a_map_it_is_not_worth_for_has_no_such_way() -> None:
+    one, other = LONG
+
+    def lowest_of(*plan: FrequencyLayer, **settings: float) -> object:
+        blocks = [torch.rand(layer.phases, len(layer.features)) for layer in plan]
+        return TemplateMap(plan, blocks, 60_000, 2, **settings).lowest(torch.rand(2, 2))  # type: ignore[arg-type]
+
+    assert lowest_of(one, other) is not None
+    assert lowest_of(one, other, temperature=1.0) is None
+    assert lowest_of() is None
+    assert lowest_of(one, replace(other, start=1)) is None
+    assert lowest_of(replace(one, stop=1024), replace(other, stop=1024)) is None
+    assert lowest_of(one, other, FrequencyLayer(Fraction(289), 289, 0, 60_000, (0, 1))) is None
+
+
+def test_a_map_of_ten_million_places_holds_its_templates_alone() -> None:
+    plan = tuple(FrequencyLayer(Fraction(p), p, 0, 10**7, (j,)) for j, p in enumerate((3163, 3164)))
+    route = TemplateMap(plan, [torch.rand(layer.phases, 1) for layer in plan], 10**7, 2)
+    assert route.lowest(torch.rand(1, 2)) is not None
+    assert route.summary().covered == 10**7
+    held = [*route.buffers(), *_circles(3164, 3163, route.layers.device)]
+    assert sum(tensor.nbytes for tensor in held) < 300_000
+>>>>>>> w-h3:tests/maps/test_layer_search.py

@@ -9,27 +9,27 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from dejavu_torch.evaluation.answers import (
+    answer_facts,
     confident,
+    describe_line,
+    describe_probable,
     line_of,
     next_steps,
-    own_facts,
     probable_counts,
-    told_line,
-    told_probable,
 )
 from dejavu_torch.types import Match
 
 
 def answers(index: Tensor, probability: Tensor | None = None, score: Tensor | None = None) -> Match:
     score = torch.zeros(len(index)) if score is None else score
-    return Match(index, score, torch.ones(len(index), dtype=torch.bool))._replace(probability=probability)
+    return Match(index, score, torch.ones(len(index), dtype=torch.bool), probability)
 
 
 def test_probable_answers_are_counted_and_told() -> None:
     match = answers(torch.arange(5), torch.tensor([0.95, 0.9, 0.5, 0.49, 0.0]))
     counts = probable_counts(match)
     assert counts == {"0.9": 2, "0.5": 3}
-    assert told_probable(counts, 5) == "2 of 5 answers are probably right (at least .9), 3 at .5"
+    assert describe_probable(counts, 5) == "2 of 5 answers are probably right (at least .9), 3 at .5"
     assert probable_counts(answers(torch.arange(5))) == {}
 
 
@@ -101,10 +101,10 @@ def test_what_is_asked_of_a_line(scored: bool, offset: int | None, asks: bool) -
     queries = torch.arange(60)
     sure = torch.where(queries < 40, 0.8, 0.1)
     match = answers(torch.where(queries < 40, queries + 20, -1), sure)
-    facts = own_facts(match, queries, 5, scored, offset)
+    facts = answer_facts(match, queries, 5, scored, offset)
     assert facts["probably_right"] == {"0.9": 0, "0.5": 40}
     assert facts.get("line") == ({"offset": 20, "answers": 40, "confident": 40} if asks else None)
-    told = told_line(facts | {"truth": "place = query + 0"}, scored)
+    told = describe_line(facts | {"truth": "place = query + 0"}, scored)
     assert ("40 of 40" in told) == ("is it --truth 20?" in told) == asks
     assert ("contradict the truth (place = query + 0)" in told) == (asks and scored)
 
@@ -114,4 +114,5 @@ def test_what_is_asked_of_a_line(scored: bool, offset: int | None, asks: bool) -
 )
 def test_an_offset_may_be_negative_or_none(offset: int, line: str) -> None:
     queries = torch.arange(60)
-    assert f"place = {line}" in told_line(own_facts(answers(queries + offset), queries, 5, False), False)
+    facts = answer_facts(answers(queries + offset), queries, 5, False)
+    assert f"place = {line}" in describe_line(facts, False)

@@ -46,8 +46,8 @@ def test_the_nearest_stored_frame(metric: str) -> None:
 def test_frames_that_are_not_stored_are_driven_past_in_a_sequence(k: int) -> None:
     """Their distances are those of the nearest stored frame; a sequence tells where between them it is."""
     reference, query, matcher = torch.rand(30, 3), torch.rand(25, 3), SequenceMatcher(6)
-    beside: dict[Together, SequenceModel] = {1: SequenceMatcher(1), 6: SequenceMatcher(6)}
-    found = nearest_frames(reference, query, k, matching=Matching(matcher, beside))
+    also: dict[Together, SequenceModel] = {1: SequenceMatcher(1), 6: SequenceMatcher(6)}
+    found = nearest_frames(reference, query, k, matching=Matching(matcher, also))
     nearest = [min(range(0, 30, k), key=lambda stored: (abs(stored - frame), -stored)) for frame in range(30)]
     score, index = matcher(torch.cdist(query, reference[nearest], p=1)).min(1)
     for match in (found, found.sequences[6]):

@@ -273,7 +273,7 @@ def test_a_filter_stands_beside_single_queries_in_order_and_changes_nothing_else
 
     single, ordered = report(False), report(True, storage=True)
     assert "sequences" not in report(None)  # an array does not tell
-    assert not compare(*pair, None, model, ordered=True).run.matching.beside  # nothing would show it
+    assert not compare(*pair, None, model, ordered=True).run.matching.also  # nothing would show it
     filtered = compare(*pair, "0", model, tolerance=1, sequence=PlaceFilter(within=1)).report.as_json()
     for key in (None, *(key for key, entry in single.items() if isinstance(entry, dict) and "auc" in entry)):
         one, other, by_filter = (all_ if key is None else all_[key] for all_ in (single, ordered, filtered))
@@ -291,7 +291,7 @@ def test_many_queries_in_order_are_filtered_if_that_is_asked_for(monkeypatch: py
     found = []
     for most in (900, 899):
         monkeypatch.setattr("dejavu_torch.evaluation.compare.MAX_FILTERED", most)
-        found.append([bool(compare(*pair, ordered=ordered).run.matching.beside) for ordered in (None, True)])
+        found.append([bool(compare(*pair, ordered=ordered).run.matching.also) for ordered in (None, True)])
     assert found == [[True, True], [False, True]]
 
 

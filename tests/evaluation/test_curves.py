@@ -233,7 +233,7 @@ def test_queries_that_are_not_counted_are_as_if_never_asked(
             with refused(f"of {len(rows)} queries", "none can be judged", "expected"):
                 judging(match, truth, tolerance)
         return
-    rest, right = Match(*(column[kept] for column in match)), truth.positives[kept]
+    rest, right = match[kept], truth.positives[kept]
     assert evaluate(match, truth, tolerance) == evaluate(rest, right, tolerance)
     for recall in ("all", "reported"):
         left, expected = curve_of(match, truth, tolerance, recall), curve_of(rest, right, tolerance, recall)

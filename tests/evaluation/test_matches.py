@@ -58,13 +58,10 @@ def test_what_is_written_in_parts_is_read(
     silent = index % 5 == 0
     index, score = torch.where(silent, -1, index), torch.where(silent, torch.inf, score.float())
     match = Match(index, score, accepted & ~silent)
-    parts = zip(*(column.split(size * (ranks or 1)) for column in match), strict=True)
-    path, frames = (
-        scratch / "m.csv",
-        torch.arange(count) // (1 if ranks is None else 2),
-    )  # a frame, two queries
-    first = Match(*(column[:: ranks or 1] for column in match))
-    written = write_matches(path, (Match(*part) for part in parts), frames, ranks=ranks)
+    path, step = scratch / "m.csv", size * (ranks or 1)
+    frames = torch.arange(count) // (1 if ranks is None else 2)  # a frame, two queries
+    first, parts = match[:: ranks or 1], (match[i : i + step] for i in range(0, len(match), step))
+    written = write_matches(path, parts, frames, ranks=ranks)
     assert written == (count, int(first.accepted.sum()))
     queries, read, candidates = read_matches(path)
     assert queries.tolist() == frames.tolist()
@@ -172,8 +169,8 @@ def test_convention_11_the_file_counts_frames_of_the_sources(tmp_path: Path) -> 
     def frame_of(places: torch.Tensor) -> torch.Tensor:
         return torch.where(places >= 0, frames[places.clamp(min=0)], -1)
 
-    parts = [Match(*(column[:2] for column in MATCH)), Match(*(column[2:] for column in MATCH))]
-    write_matches(path, parts, torch.tensor([4, 4, 7]), frame_of, "q{}.png".format, "0:00:{:02}.000".format)
+    names = "q{}.png".format, "0:00:{:02}.000".format
+    write_matches(path, [MATCH[:2], MATCH[2:]], torch.tensor([4, 4, 7]), frame_of, *names)
     assert lines(path)[1:] == [
         "4,19,0.5,1,q4.png,0:00:19.000",
         "4,-1,inf,0,q4.png,",
@@ -249,7 +246,8 @@ def test_names_that_no_pair_can_hold_are_refused(names: list[str]) -> None:
 
 def test_places_of_several_routes_are_told_by_route_and_frame(tmp_path: Path) -> None:
     routes = (Route("out", 4, 8), Route("b,ack", 3, 5))
-    match = Match(torch.tensor([0, 3, 4, -1, 6]), torch.tensor([0.1, 0.2, 0.3, INF, 0.5]), torch.ones(5) > 0)
+    score, route = torch.tensor([0.1, 0.2, 0.3, INF, 0.5]), torch.tensor([0, 0, 1, -1, 1])
+    match = Match(torch.tensor([0, 3, 4, -1, 6]), score, torch.ones(5) > 0, route=route)
     path = tmp_path / "m.csv"
     frame_of = torch.tensor([0, 2, 4, 7, 8, 10, 12, -1])  # of all routes, one behind the other
     write_matches(path, [match], None, lambda p: frame_of[p], None, lambda f: f"{f}.png", None, routes)

@@ -21,7 +21,8 @@ MATCH = Match(
     torch.tensor([0, 1, 9, 3, 4]),
     torch.tensor([0.3, 0.2, 0.1, 0.4, 0.5]),  # the wrong one has the best score
     torch.ones(5, dtype=torch.bool),
-)._replace(probability=torch.tensor([0.99, 0.995, 0.3, 0.9, 0.2], dtype=torch.float64))
+    torch.tensor([0.99, 0.995, 0.3, 0.9, 0.2], dtype=torch.float64),
+)
 
 
 def test_the_figures_of_a_rejection() -> None:
@@ -46,7 +47,7 @@ def test_the_figures_of_a_rejection() -> None:
 
 
 def test_without_probabilities_or_truth_there_is_less_to_tell() -> None:
-    plain = MATCH._replace(probability=None)
+    plain = Match(*MATCH)
     assert rejection_facts(plain, TRUTH, 0, {}) == draw_reliability(plain, TRUTH, 0) == {}
     assert rejection_facts(MATCH, None, 0, {}) == {"rejection": {"off_map": {}}}
     assert draw_reliability(MATCH, None, 0) == {}

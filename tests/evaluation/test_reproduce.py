@@ -252,7 +252,7 @@ def test_a_map_with_known_boundaries_is_learned_and_scored_as_any_other() -> Non
     result = compare(reference, query, "0", model=model, tolerance=0)
     chunks = [(chunk["start"], chunk["stop"]) for chunk in result.report.facts["chunks"]]
     assert chunks == [(0, 128), (128, 256)]
-    maps = known_boundaries(result, [90], tolerance=0)
+    maps = known_boundaries(result, [90])
     again = DejaVu(mapper=TemplateMapper(GivenChunks([90], **settings))).learn(reference)
     assert {(chunk.start, chunk.stop) for chunk in again.summary().chunks} == {(0, 90), (90, 256)}
     truth = torch.arange(256)

@@ -420,7 +420,7 @@ MUTANTS = [
     Mutant(
         "A sequence does not run from one route of a merged map into the next.",
         "dejavu_torch/recognition/sequence.py",
-        "rows.tensor_split([*firsts[1:]], 1)",
+        "rows.tensor_split([*route_starts[1:]], 1)",
         "rows.tensor_split([], 1)",
         ("tests/recognition/test_sequence.py::test_trajectories_stay_on_their_route",),
     ),

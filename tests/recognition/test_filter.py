@@ -205,7 +205,7 @@ class Watched(PlaceMap):
 def followed(model: SequenceModel | None, scores: Tensor, route: PlaceMap, size: int = 33) -> Tensor:
     """The scores that places are found by."""
     rows: list[Tensor] = []
-    localizer = Localizer(route, Matching(model, on_scores=rows.append))
+    localizer = Localizer(route, Matching(model, callback=rows.append))
     for part in scores.split(size):
         localizer(part)
     return torch.cat(rows)

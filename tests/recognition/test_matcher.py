@@ -74,7 +74,7 @@ def test_scores_pass_by_once_and_are_not_held(
 
 
 def test_single_queries_alone_where_there_is_no_sequence() -> None:
-    found = matched(Matching(rule=Acceptance(0.01)), size=7)
+    found = matched(Matching(acceptance=Acceptance(0.01)), size=7)
     assert same(found, best_match(SCORES, 0.01))
     assert found.sequences == {}
     several = matched(Matching(k=3, radius=4))
@@ -87,19 +87,19 @@ def test_of_several_candidates_the_first_has_the_probability_and_is_accepted_by_
     probability = platt.probability(confidence_of(SCORES))
     middle = float(probability.median())
     score = best_candidates(SCORES, 2, 4).score
-    for rule in (Acceptance(precision=middle), Acceptance(0.02), Acceptance()):
-        match = matched(Matching(k=2, radius=4, rule=rule, platt=platt), size=7)
+    for acceptance in (Acceptance(precision=middle), Acceptance(0.02), Acceptance()):
+        match = matched(Matching(k=2, radius=4, acceptance=acceptance, platt=platt), size=7)
         assert match.probability is not None
         assert torch.equal(match.probability[:, 0], probability)
         assert match.probability[:, 1].isnan().all()
-        if rule.precision is not None:
+        if acceptance.precision is not None:
             assert torch.equal(match.accepted[:, 0], probability >= middle)
             assert not match.accepted[:, 1].any()
         else:  # of scores, which all candidates have
-            assert torch.equal(match.accepted, score < (rule.threshold or math.inf))
-        first = matched(Matching(rule=rule, platt=platt))
+            assert torch.equal(match.accepted, score < (acceptance.threshold or math.inf))
+        first = matched(Matching(acceptance=acceptance, platt=platt))
         assert same(first, match.map(lambda column: column[:, 0]))
-    alone = matched(Matching(rule=Acceptance(precision=0.5)))
+    alone = matched(Matching(acceptance=Acceptance(precision=0.5)))
     assert alone.probability is None
 
 
@@ -107,7 +107,7 @@ def test_places_are_renumbered_everywhere() -> None:
     match = Match(torch.tensor([3, -1]), torch.tensor([0.0, math.inf]), torch.tensor([True, False]))
     several = Match(torch.tensor([[1, 2], [3, -1]]), torch.zeros(2, 2), torch.ones(2, 2) > 0)
     probability = torch.rand(2, 2)
-    found = several._replace(probability=probability, sequences={5: match})
+    found = Match(*several, probability, sequences={5: match})
     moved = found.renumbered(lambda place: torch.where(place >= 0, 10 * place, -1))
     assert moved.index.tolist() == [[10, 20], [30, -1]]
     assert moved.sequences[5].index.tolist() == [30, -1]
@@ -145,18 +145,18 @@ def test_ways_to_match_that_there_is_room_for(
 def test_sequences_and_a_filter_beside_single_queries_change_nothing_of_them() -> None:
     route = SpectralMapper(12.0)(torch.randn(60, 8).cumsum(0))
     queries = route.decode(0)[10:40] + 0.3 * torch.randn(30, 8)
-    beside: dict[Together, SequenceModel] = {5: SequenceMatcher(5), "filter": PlaceFilter()}
+    also: dict[Together, SequenceModel] = {5: SequenceMatcher(5), "filter": PlaceFilter()}
     platt = Platt(3.0, -1.0)
     batches = queries.split(7)  # the same for both: another size of a product rounds otherwise
     alone = Match.joined(map(Localizer(route, Matching(platt=platt)), batches))
     # the state goes on from batch to batch
-    parts = Match.joined(map(Localizer(route, Matching(platt=platt, beside=beside)), batches))
+    parts = Match.joined(map(Localizer(route, Matching(platt=platt, also=also)), batches))
     assert all(torch.equal(one, other) for one, other in zip(parts, alone, strict=True))
     assert parts.probability is not None
     assert alone.probability is not None
     assert torch.equal(parts.probability, alone.probability)
     scores = torch.cat([route.scores(part) for part in batches])
-    for key, model in beside.items():
+    for key, model in also.items():
         expected = best_match(model(scores))
         assert torch.equal(parts.sequences[key].index, expected.index)
         torch.testing.assert_close(parts.sequences[key].score, expected.score)
