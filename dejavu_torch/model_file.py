@@ -76,10 +76,10 @@ CLASSES: tuple[type[nn.Module], ...] = (
     GroundOdometry,
 )
 REGISTRY = {cls.__name__: cls for cls in CLASSES}
-# arguments that older files name and no class takes, with the only value that they may have
+# arguments that older files name and no class takes; the one that changes a descriptor, with its only value
 GONE: Mapping[str, Mapping[str, Any]] = {
-    "Joined": {"shares": None},
-    "Whitening": {"most_views": 20_000, "power": 1.0, "group_numbers": None},
+    "Joined": {"shares": ...},
+    "Whitening": {"most_views": ..., "power": 1.0, "group_numbers": ...},
 }
 
 
@@ -188,7 +188,7 @@ def without_gone(recipe: Recipe) -> Recipe:
     name, gone = recipe.class_path, GONE.get(recipe.class_path, {})
     arguments = {key: value for key, value in recipe.init_args.items() if key not in gone}
     for key in gone.keys() & recipe.init_args.keys():
-        if (seen := recipe.init_args[key]) != gone[key]:
+        if gone[key] not in (..., seen := recipe.init_args[key]):
             raise InputError(f"the map's {name} has {key} {seen!r:.40}; expected {gone[key]}")
     for key, parts in _parts(recipe).items():
         built = [without_gone(part)._asdict() for part in parts]
