@@ -230,7 +230,7 @@ class TemplateMap(PlaceMap):
             scores = self.combine(distances)
         else:
             dtype = torch.promote_types(queries.dtype, torch.float32)
-            scores = queries.new_full((len(queries), self.places), math.inf, dtype=dtype)
+            scores = queries.new_full((queries.shape[0], self.places), math.inf, dtype=dtype)
         return scores if self.temperature is None else log_posterior(scores, self.temperature)
 
     @property
