@@ -28,7 +28,6 @@ from dejavu_torch.data.output import check_output_file, check_output_folder, who
 from dejavu_torch.data.source import check_not_read, open_source
 from dejavu_torch.evaluation.answers import describe_line, describe_probable, next_steps, probable_counts
 from dejavu_torch.features.joined import Joined
-from dejavu_torch.features.views import Views
 from dejavu_torch.learning import SAMPLE as SHORT
 from dejavu_torch.learning import Checkpoint, ChunkCoder, Code
 from dejavu_torch.maps.place_map import Mapper
@@ -76,7 +75,7 @@ def run_demo(
     learned, localized = f"sim:aerial?seed={seed}", f"sim:aerial?seed={seed}&traverse=1"
     reference, query = open_source(learned), open_source(localized)
     print(f"learning {reference.name}, then finding {query.name} on it")
-    reference, views = given.with_second(model, reference, query)
+    reference, views, _ = given.with_views(model, reference, query)
     paper = paper_model()
     same = recipe_of(model.mapper) == recipe_of(paper.mapper)
     others = {} if same else {"paper": ("the paper to the letter", paper)}
@@ -120,15 +119,13 @@ def run_learn(
     learning.seed_whitening(model)
     growing.check(sources, learning.calibration)
     traverse: Traverse | None = None
-    views: Views | None = None
     if sources:
         chain = chained([open_source(one) for one in sources])
         traverse = model.resample(chain, model.step, True, model.frame_shape)
         _print_steps(traverse)
-        traverse, views = learning.with_second(model, traverse)
     visits = None if growing.average is None else growing.visits(model, traverse)
     learning.check_calibrated(model, visits.traverse if traverse is None else traverse)  # type: ignore[union-attr]
-    traverse, known = learning.with_calibration(model, traverse)
+    traverse, views, known = learning.with_views(model, traverse)
     places: Tensor | None = None  # that the traverse shows; None: all, from the first on
     done, start, checkpoint = "", model.map.places, Checkpoint(map)
     code: Code = ChunkCoder.chunks
@@ -349,8 +346,7 @@ def run_compare(
     distractors = judging.off_map([first, queries, *others])
     learning.check_calibrated(model, first, map, judging.distractors)
     learning.seed_whitening(model)
-    first, views = learning.with_second(model, first, queries)
-    first, known = learning.with_calibration(model, first, queries)
+    first, views, known = learning.with_views(model, first, queries)
     result = compare(
         first,
         queries,

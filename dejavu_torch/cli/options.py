@@ -233,38 +233,34 @@ class LearningOptions:
         if model.whitening is not None and not model.whitening.fixed and not model.map.places:
             model.whitening.seed = model.whitening.seed or self.seed
 
-    def with_second(
-        self, model: DejaVu, reference: Traverse, query: Traverse | None = None
-    ) -> tuple[Traverse, Views | None]:
-        """The reference, and the second traverses that the whitening learns from."""
+    def with_views(
+        self, model: DejaVu, reference: Reference, query: Traverse | None = None
+    ) -> tuple[Reference, Views | None, Views | None]:
+        """The reference, if there is one, what its whitening learns from, and what calibrates its map, or the
+        model's; all are opened and compared before one of them is measured."""
+        named = None if self.calibration in UNREAD else self.calibration
         if self.second is None:
             check_no_truth("second", self.second_truth)
-            return reference, None
-        traverses: list[Traverse] = []
-        for source in several(self.second):
-            others = query, *parts_of(source_of(reference)), *traverses
-            traverses.append(open_another("second", source, others))
-        reference = model.resample(reference, progress=True, shape=model.frame_shape)
-        truths = [None if one is None else str(one) for one in several(self.second_truth)]
-        return reference, growth.second_traverse(model, reference, traverses, truths or None)
-
-    def with_calibration(
-        self, model: DejaVu, reference: Reference, query: Traverse | None = None
-    ) -> tuple[Reference, Views | None]:
-        """The reference, if there is one, and the traverse that calibrates its map, or the model's."""
-        source, truth = self.calibration, self.calibration_truth
-        if source in UNREAD:
-            check_no_truth("calibration", truth)
-            return reference, None
+        if named is None:
+            check_no_truth("calibration", self.calibration_truth)
         others: list[Traverse | None] = [query]
         others += [] if reference is None else parts_of(source_of(reference))
-        others += [open_source(one) for one in several(self.second)]
-        traverse = open_another("calibration", str(source), others)
-        if reference is not None:
+        seconds: list[Traverse] = []
+        for source in several(self.second):
+            seconds.append(open_another("second", source, [*others, *seconds]))
+        other = None if named is None else open_another("calibration", named, [*others, *seconds])
+        views = None
+        if reference is not None and (self.second is not None or other is not None):
             reference = model.resample(reference, model.step, True, model.frame_shape)
-            traverse = model.fit(traverse, reference.frame_shape)
-            model.describer.check_sizes(reference, traverse)
-        return reference, growth.associate(model, reference, traverse, truth)
+            if self.second is not None:
+                truths = [None if truth is None else str(truth) for truth in several(self.second_truth)]
+                views = growth.second_traverse(model, reference, seconds, truths or None)
+            if other is not None:
+                other = model.fit(other, reference.frame_shape)
+                model.describer.check_sizes(reference, other)
+        if other is None:
+            return reference, views, None
+        return reference, views, growth.associate(model, reference, other, self.calibration_truth)
 
     def check_calibrated(
         self, model: DejaVu, traverse: Traverse, map: Path | None = None, distractors: object = None

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -43,7 +41,7 @@ def image(axis: object) -> Tensor:
 
 def test_without_a_truth_coverage_shows_the_probabilities() -> None:
     sure = torch.tensor([0.9, 0.2, 0.0, 0.6], dtype=torch.float64)
-    match = replace(matched(4, 9, -1, 2), probability=sure)
+    match = Match(*matched(4, 9, -1, 2), sure)
     figure, axis = draw_coverage(match, None, 1, torch.arange(11), torch.arange(4), "frames")["coverage"].plot
     (points,) = axis.collections
     shown = dict(zip(points.get_array().tolist(), map(tuple, points.get_offsets().tolist()), strict=True))
@@ -72,7 +70,7 @@ def test_examples_are_the_surest_right_the_surest_wrong_and_one_at_the_border() 
     judged = GroundTruth(truth, known, truth[:, :0])
     answers = {3: "surest right answer", 1: "surest wrong answer", 4: "least sure answer"}
     assert example_queries(match, judged, 0) == answers
-    strict = replace(match, accepted=score < 0.25)
+    strict = Match(match.index, score, score < 0.25)
     assert example_queries(strict, judged, 0) == {
         3: "surest right answer, surest not accepted",
         1: answers[1],

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -133,7 +132,7 @@ def test_the_pairs_are_the_frames_that_were_matched(run: Localization) -> None:
     for asked, reported in zip(numbers[::3], numbers[1::3], strict=True):
         assert int(run.match.index[asked]) == reported
     assert "All answers are accepted" in pairs.caption
-    strict = run._replace(match=replace(run.match, accepted=run.match.accepted & False))
+    strict = run._replace(match=Match(run.match.index, run.match.score, run.match.accepted & False))
     assert "best match of those that are rejected" in draw_pictures(strict, {})["pairs"].caption
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 import torch
 from helpers import refused
@@ -49,7 +47,7 @@ def test_the_figures_of_a_rejection() -> None:
 
 
 def test_without_probabilities_or_truth_there_is_less_to_tell() -> None:
-    plain = replace(MATCH, probability=None)
+    plain = Match(*MATCH)
     assert rejection_facts(plain, TRUTH, 0, {}) == draw_reliability(plain, TRUTH, 0) == {}
     assert rejection_facts(MATCH, None, 0, {}) == {"rejection": {"off_map": {}}}
     assert draw_reliability(MATCH, None, 0) == {}

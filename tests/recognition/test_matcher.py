@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
 
 import pytest
 import torch
@@ -108,7 +107,7 @@ def test_places_are_renumbered_everywhere() -> None:
     match = Match(torch.tensor([3, -1]), torch.tensor([0.0, math.inf]), torch.tensor([True, False]))
     several = Match(torch.tensor([[1, 2], [3, -1]]), torch.zeros(2, 2), torch.ones(2, 2) > 0)
     probability = torch.rand(2, 2)
-    found = replace(several, probability=probability, sequences={5: match})
+    found = Match(*several, probability, sequences={5: match})
     moved = found.renumbered(lambda place: torch.where(place >= 0, 10 * place, -1))
     assert moved.index.tolist() == [[10, 20], [30, -1]]
     assert moved.sequences[5].index.tolist() == [30, -1]

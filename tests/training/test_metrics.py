@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -84,12 +83,13 @@ def test_processes_are_joined(here: list[Any], elsewhere: list[Any]) -> None:
 
 
 MATCH = Match(torch.tensor([0, 1, -1]), torch.tensor([0.1, 0.2, INF]), torch.tensor([True, True, False]))
+NAN = Match(MATCH.index, MATCH.score * float("nan"), MATCH.accepted)
 
 
 @pytest.mark.parametrize(
     ("match", "truth", "facts"),
     [
-        (replace(MATCH, score=MATCH.score * float("nan")), torch.zeros(3, 2).long(), ["a score is NaN"]),
+        (NAN, torch.zeros(3, 2).long(), ["a score is NaN"]),
         (MATCH, torch.zeros(2, 2).long(), ["the truth is (2, 2)", "(3, R)"]),
     ],
     ids=["NaN", "truth"],
