@@ -225,9 +225,9 @@ class LearningOptions:
             seconds.append(open_another("second", source, [*others, *seconds]))
         other = None if named is None else open_another("calibration", named, [*others, *seconds])
         views = None
-        if reference is not None and (seconds or other is not None):
+        if reference is not None and (self.second is not None or other is not None):
             reference = model.resample(reference, model.step, True, model.frame_shape)
-            if seconds:
+            if self.second is not None:
                 truths = [None if truth is None else str(truth) for truth in several(self.second_truth)]
                 views = growth.second_traverse(model, reference, seconds, truths or None)
             if other is not None:
