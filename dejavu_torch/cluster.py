@@ -128,18 +128,18 @@ class ClusterSearch:
     """
 
     def __init__(
-        self, cluster: Cluster, route: PlaceMap, method: Search = "auto", memory: int | None = None
+        self, cluster: Cluster, place_map: PlaceMap, method: Search = "auto", memory: int | None = None
     ) -> None:
-        if not isinstance(route, SpectralMap):
-            raise InputError(f"a map of kind {route.kind!r} cannot be divided; expected a spectral one")
+        if not isinstance(place_map, SpectralMap):
+            raise InputError(f"a map of kind {place_map.kind!r} cannot be divided; expected a spectral one")
         actor = cluster.ray.remote(num_cpus=1, max_restarts=RETRIES, max_task_retries=RETRIES)(_Searcher)
         self.cluster, self.actors = cluster, []
         self.parts: list[Any] = []  # kept for restarted actors
-        starts, workers = [start for start, _ in route.chunks], cluster.workers
-        bounds = [bisect_left(starts, worker * route.places / workers) for worker in range(workers)]
+        starts, workers = [start for start, _ in place_map.chunks], cluster.workers
+        bounds = [bisect_left(starts, worker * place_map.places / workers) for worker in range(workers)]
         for first, stop in pairwise([*bounds, len(starts)]):
             if first < stop:
-                self.parts.append(cluster.ray.put(route.between(first, stop).cpu()))
+                self.parts.append(cluster.ray.put(place_map.between(first, stop).cpu()))
                 how = method, None if memory is None else memory // workers
                 self.actors.append(actor.remote(self.parts[-1], starts[first], *how))
 

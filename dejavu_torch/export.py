@@ -57,12 +57,12 @@ class Decoded(nn.Module):
     descriptors: Tensor
     norms: Tensor
 
-    def __init__(self, route: SpectralMap) -> None:
+    def __init__(self, place_map: SpectralMap) -> None:
         super().__init__()
-        self.metric = route.metric
-        decoded = torch.cat([route.decode(g) for g in range(len(route.chunks))])
+        self.metric = place_map.metric
+        decoded = torch.cat([place_map.decode(g) for g in range(len(place_map.chunks))])
         self.register_buffer("descriptors", decoded.T.contiguous())
-        self.register_buffer("norms", route.norms)
+        self.register_buffer("norms", place_map.norms)
 
     def forward(self, queries: Tensor) -> Tensor:
         length: Tensor = torch.linalg.vector_norm(queries, dim=1, keepdim=True)
@@ -100,7 +100,7 @@ class Graph(nn.Module):
         if model.whitening is not None and model.whitening.learned:
             whitening = copy.deepcopy(model.whitening)
             for part in whitening.parts:
-                part.projection = part.whole  # not two values per byte
+                part.projection = part.unpacked_projection  # not two values per byte
             parts["whitening"] = whitening
         parts["map"] = Decoded(model.map) if isinstance(model.map, SpectralMap) else model.map
         self.parts = nn.ModuleDict(parts)  # the stages in order

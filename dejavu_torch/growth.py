@@ -16,10 +16,10 @@ from dejavu_torch.data.ground_truth import find_ground_truth
 from dejavu_torch.data.positions import positions_behind
 from dejavu_torch.data.source import Source, as_traverse
 from dejavu_torch.data.traverse import chained
-from dejavu_torch.features.views import Views
+from dejavu_torch.features.views import LabelledFrames
 from dejavu_torch.maps.file import checksums, digests
 from dejavu_torch.maps.frame_table import FrameTable
-from dejavu_torch.maps.spectral import SpectralMapper, code_chunk
+from dejavu_torch.maps.spectral import SpectralMapper, encode_chunk
 from dejavu_torch.maps.spectral_map import LARGEST, Chunk, SpectralMap
 from dejavu_torch.model import DejaVu, features_per_frame, require_map
 from dejavu_torch.model_file import ModelState, Recipe, difference, recipe_of, run_key, weights_of
@@ -38,7 +38,7 @@ def append(
     progress: bool = False,
     checkpoint: learning.Checkpoint | None = None,
     map_tasks: learning.MapTasks = map,
-    visits: Views | None = None,
+    visits: LabelledFrames | None = None,
 ) -> DejaVu:
     """Append the places of a traverse to a model's map, whose own places stay unchanged.
 
@@ -67,41 +67,41 @@ def append(
         >>> append(model, wave[400:]).localize(wave[[50, 450]]).index
         tensor([ 50, 450])
     """
-    route = one_route(model, "append to")
+    place_map = one_route(model, "append to")
     added = model.resample(as_traverse(traverse), model.step, progress, model.frame_shape)
     _check_compatible(model, added)
     places = len(added)
-    positions = learning.positions_of(added).to(route.device)
-    _check_count(route.places + places, model.step is not None)
+    positions = learning.positions_of(added).to(place_map.device)
+    _check_count(place_map.places + places, model.step is not None)
     counts = None
     if visits is not None:
         _check_compatible(model, visits.traverse)
         counts = learning.observation_counts(visits, places)
-    grown = copy.deepcopy(route)
-    grown.positions = route.positions[:0]  # set when all places are appended
+    grown = copy.deepcopy(place_map)
+    grown.positions = place_map.positions[:0]  # set when all places are appended
     if checkpoint is not None:
-        own = digests(base=checksums(route.packed(), route.get_extra_state()))
+        own = digests(base=checksums(place_map.packed(), place_map.get_extra_state()))
         checkpoint.open(run_key(model, added, visits=visits) | own, grown, model.descriptor)
     settings = visits, progress, checkpoint, map_tasks
-    learning.append_places(grown, model.descriptor, added, route.places, *settings)
+    learning.append_places(grown, model.descriptor, added, place_map.places, *settings)
     if counts is not None:
         before = grown.visit_counts
-        grown.count_visits(before + F.pad(counts.to(before), (route.places, 0)))
+        grown.count_visits(before + F.pad(counts.to(before), (place_map.places, 0)))
     if len(positions):
-        grown.positions = torch.cat([route.positions, positions_behind(positions, route.places)])
+        grown.positions = torch.cat([place_map.positions, positions_behind(positions, place_map.places)])
     grown.check()
     frames = len(positions) or places
     names = [model.frame_names, [*source_of(added).names]]
-    model.frame_names = _joined_names(names, [route.table.frames, frames])
+    model.frame_names = _joined_names(names, [place_map.table.frames, frames])
     return model.replace_map(grown)
 
 
 def learn_mean(
     model: DejaVu,
     traverse: Source,
-    visits: Views,
+    visits: LabelledFrames,
     progress: bool = False,
-    second: Views | None = None,
+    second: LabelledFrames | None = None,
     checkpoint: learning.Checkpoint | None = None,
     map_tasks: learning.MapTasks = map,
 ) -> DejaVu:
@@ -119,7 +119,7 @@ def learn_mean(
 
     Example:
         >>> wave = torch.sin(torch.arange(200.0)[:, None] * torch.tensor([0.1, 0.23, 0.37]))
-        >>> again = Views(as_traverse(wave[50:] + 0.1), torch.arange(50, 200))
+        >>> again = LabelledFrames(as_traverse(wave[50:] + 0.1), torch.arange(50, 200))
         >>> learn_mean(DejaVu(whitening="none"), wave, again).map.visits
         tensor([[ 50,   1],
                 [150,   2]], dtype=torch.int32)
@@ -131,7 +131,7 @@ def learn_mean(
 
 
 @torch.no_grad()
-def average(model: DejaVu, visits: Views, progress: bool = False) -> int:
+def average(model: DejaVu, visits: LabelledFrames, progress: bool = False) -> int:
     """Average another visit into a map: its chunks are decoded, averaged and coded again with the same step.
 
     A chunk that no frame shows stays unchanged. `learn_mean` of both traverses makes a better map, since it
@@ -147,29 +147,31 @@ def average(model: DejaVu, visits: Views, progress: bool = False) -> int:
     Raises:
         InputError: no spectral map of one route, or visits that do not fit.
     """
-    route = one_route(model, "average visits into")
+    place_map = one_route(model, "average visits into")
     _check_compatible(model, visits.traverse)
-    counts, seen = route.visit_counts.cpu(), learning.observation_counts(visits, route.places)
+    counts, seen = place_map.visit_counts.cpu(), learning.observation_counts(visits, place_map.places)
     descriptors, places = learning.descriptors_of(model.descriptor, visits, progress)
 
     def averaged(g: int, chunk: Chunk) -> Chunk:
-        start, stop = route.chunks[g]
+        start, stop = place_map.chunks[g]
         inside = ((places >= start) & (places < stop)).nonzero()[:, 0]
         if not len(inside):
             return chunk
-        rows = descriptors[inside].to(route.device)
-        means = learning.with_visits(route.decode(g), counts[start:stop], rows, places[inside] - start)
-        return code_chunk(means, route.means[0], chunk.step, route.transform, route.resolution)
+        rows = descriptors[inside].to(place_map.device)
+        means = learning.with_visits(place_map.decode(g), counts[start:stop], rows, places[inside] - start)
+        return encode_chunk(means, place_map.means[0], chunk.step, place_map.transform, place_map.resolution)
 
-    mean = route.of_chunks(averaged(g, chunk) for g, chunk in enumerate(route.coded()))
-    mean.positions = route.positions
-    mean.count_visits((counts + seen).to(route.visits.device))
+    mean = place_map.of_chunks(averaged(g, chunk) for g, chunk in enumerate(place_map.coded()))
+    mean.positions = place_map.positions
+    mean.count_visits((counts + seen).to(place_map.visits.device))
     mean.check()
     model.replace_map(mean)
     return int((seen > 0).sum())
 
 
-def associate(model: DejaVu, reference: Traverse | None, second: Traverse, truth: str | None = None) -> Views:
+def associate(
+    model: DejaVu, reference: Traverse | None, second: Traverse, truth: str | None = None
+) -> LabelledFrames:
     """The place of each frame of another traverse, on a reference or on a map; resampled like it.
 
     Args:
@@ -203,7 +205,7 @@ def associate(model: DejaVu, reference: Traverse | None, second: Traverse, truth
         raise InputError(f"{seen}; expected the same number, frame i at place i, or a truth for its places")
     if not (places >= 0).any():
         raise InputError(f"no frame of {second.name} shows a place of {name}; expected some")
-    return Views(second, places)
+    return LabelledFrames(second, places)
 
 
 def second_traverse(
@@ -211,7 +213,7 @@ def second_traverse(
     reference: Traverse,
     second: Traverse | Sequence[Traverse],
     truth: str | Sequence[str | None] | None = None,
-) -> Views:
+) -> LabelledFrames:
     """As `associate`, for one or more traverses that whitening learns from, with one truth or one for each.
 
     Raises:
@@ -225,13 +227,13 @@ def second_traverse(
         seen = f"{len(visits)} further traverses and {len(truths)} truths"
         raise InputError(f"{seen}; expected one for each, or one for all")
     views = [associate(model, reference, *pair) for pair in zip(visits, truths, strict=True)]
-    return Views(chained([one.traverse for one in views]), torch.cat([one.places for one in views]))
+    return LabelledFrames(chained([one.traverse for one in views]), torch.cat([one.places for one in views]))
 
 
 def calibrate_if_possible(
     model: DejaVu,
     reference: Traverse,
-    views: Views | None = None,
+    views: LabelledFrames | None = None,
     places: Tensor | None = None,
     progress: bool = False,
 ) -> None:
@@ -248,14 +250,16 @@ def calibrate_if_possible(
 def one_route(model: DejaVu, verb: str) -> SpectralMap:
     """The spectral map of a model; InputError if it has none, another kind, or one of several routes."""
     require_map(model, f" to {verb}")
-    route = model.map
-    if route.routes:
-        names = ", ".join(one.name for one in route.routes)
+    place_map = model.map
+    if place_map.routes:
+        names = ", ".join(one.name for one in place_map.routes)
         raise InputError(f"the map has the routes {names}; expected to {verb} the map of a route, then merge")
-    if not isinstance(route, SpectralMap):
-        seen = f"there is a map of kind {route.kind!r}; expected one of kind {SpectralMap.kind!r} to {verb}"
+    if not isinstance(place_map, SpectralMap):
+        seen = (
+            f"there is a map of kind {place_map.kind!r}; expected one of kind {SpectralMap.kind!r} to {verb}"
+        )
         raise InputError(f"{seen}, or learn the route anew")
-    return route
+    return place_map
 
 
 def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
@@ -286,13 +290,13 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
         raise InputError(f"{seen}; expected at least two maps, and a name for each")
     first, parts = models[0], dict[str, SpectralMap]()
     for name, model in zip(names, models, strict=True):
-        route = model.map
-        if not isinstance(route, SpectralMap) or not route.places:
-            seen = f"a map of kind {route.kind!r}" if route.places else "no map"
+        place_map = model.map
+        if not isinstance(place_map, SpectralMap) or not place_map.places:
+            seen = f"a map of kind {place_map.kind!r}" if place_map.places else "no map"
             raise InputError(f"{name} is {seen}; expected one of kind {SpectralMap.kind!r} to merge")
         if problem := _difference(first, model):
             raise InputError(f"{names[0]} and {name} cannot be merged: {problem}")
-        own = [(one.name, route.part(one.name)) for one in route.routes] or [(name, route)]
+        own = [(one.name, place_map.part(one.name)) for one in place_map.routes] or [(name, place_map)]
         for wanted, part in own:
             parts[_free_name(wanted, parts)] = part
     _check_count(sum(part.places for part in parts.values()), first.step is not None)

@@ -17,10 +17,10 @@ from dejavu_torch.features.descriptor import Descriptor
 from dejavu_torch.features.views import (
     LEAST,
     SAMPLE,
-    STRETCH,
+    SEGMENT,
     AugmentedFrames,
+    LabelledFrames,
     Sample,
-    Views,
     augmented_segments,
     evenly_spaced,
     views_of,
@@ -28,7 +28,7 @@ from dejavu_torch.features.views import (
 from dejavu_torch.features.whitening import STRENGTHS
 from dejavu_torch.maps.file import part_of, read_map, write_map
 from dejavu_torch.maps.place_map import Mapper, PlaceMap
-from dejavu_torch.maps.spectral import SpectralMapper, code_chunk
+from dejavu_torch.maps.spectral import SpectralMapper, encode_chunk
 from dejavu_torch.maps.spectral_map import Chunk, SpectralMap
 from dejavu_torch.maps.spectrum import Transform
 from dejavu_torch.memory import concatenate
@@ -61,16 +61,16 @@ class ChunkEncoder:
     step: float
     transform: Transform
     resolution: float
-    visits: Views | None = None  # frames of another traverse, to average with those of their places
+    visits: LabelledFrames | None = None  # frames of another traverse, to average with those of their places
 
     def __call__(self, frames: range) -> Chunk:
-        """A chunk from these frames; InputError as from `feature_batches` and `code_chunk`."""
+        """A chunk from these frames; InputError as from `feature_batches` and `encode_chunk`."""
         with torch.no_grad(), in_one_thread():
             rows = torch.cat(list(self.descriptor.batches(Part(self.traverse, frames))))
             if self.visits is not None:
                 shown = views_of(self.visits, torch.arange(frames.start, frames.stop))
                 rows = averaged(self.descriptor, rows, shown)
-            return code_chunk(rows, self.mean, self.step, self.transform, self.resolution)
+            return encode_chunk(rows, self.mean, self.step, self.transform, self.resolution)
 
 
 @contextmanager
@@ -100,11 +100,11 @@ class Checkpoint:
         self.written, self.kept = monotonic(), 0
         self.opened = False
 
-    def open(self, key: Mapping[str, str], route: SpectralMap, descriptor: Descriptor) -> bool:
+    def open(self, key: Mapping[str, str], place_map: SpectralMap, descriptor: Descriptor) -> bool:
         """Load the finished part of the run with this key; False if there is none.
 
         Args:
-            route, descriptor: to load into; `route` has the places that precede the traverse.
+            place_map, descriptor: to load into; the map has the places that precede the traverse.
 
         Raises:
             InputError: not a partial map, or one of another run.
@@ -122,7 +122,7 @@ class Checkpoint:
             self._refuse(f": its {', '.join(other)} {'differs' if len(other) == 1 else 'differ'}")
         if descriptor.whitening is not None:
             descriptor.whitening.load_state_dict(part_of(tensors, "whitening"))
-        route.load_packed(part_of(tensors, "map"), state)
+        place_map.load_packed(part_of(tensors, "map"), state)
         return True
 
     def check_unused(self) -> None:
@@ -135,14 +135,14 @@ class Checkpoint:
         """Whether the partial map was last written over `SAVE_INTERVAL` seconds ago."""
         return monotonic() - self.written > SAVE_INTERVAL
 
-    def save(self, route: SpectralMap, descriptor: Descriptor, places: int) -> None:
+    def save(self, place_map: SpectralMap, descriptor: Descriptor, places: int) -> None:
         """Write the partial map, with the first `places` places of a traverse. InputError if this fails; an
         earlier file then stays."""
-        tensors = {f"map.{name}": tensor for name, tensor in route.packed().items()}
+        tensors = {f"map.{name}": tensor for name, tensor in place_map.packed().items()}
         if descriptor.whitening is not None:
             learned = descriptor.whitening.state_dict()
             tensors |= {f"whitening.{name}": tensor for name, tensor in learned.items()}
-        write_map(self.path, tensors, {"run": dict(self.key), "map": route.get_extra_state()})
+        write_map(self.path, tensors, {"run": dict(self.key), "map": place_map.get_extra_state()})
         self.written, self.kept = monotonic(), places
 
     def remove(self) -> None:
@@ -165,8 +165,8 @@ def fit(
     mapper: SpectralMapper,
     descriptor: Descriptor,
     traverse: Traverse,
-    second: Views | None = None,
-    visits: Views | None = None,
+    second: LabelledFrames | None = None,
+    visits: LabelledFrames | None = None,
     progress: bool = False,
 ) -> SpectralMap:
     """A map without places, but with whitening, mean and step from the sample of a long traverse."""
@@ -180,11 +180,11 @@ def fit(
 
 
 def append_places(
-    route: SpectralMap,
+    place_map: SpectralMap,
     descriptor: Descriptor,
     traverse: Traverse,
     start: int = 0,
-    visits: Views | None = None,
+    visits: LabelledFrames | None = None,
     progress: bool = False,
     checkpoint: Checkpoint | None = None,
     map_tasks: MapTasks = map,
@@ -199,18 +199,18 @@ def append_places(
     Raises:
         InputError: frames that cannot be read, or a full disk; finished chunks are kept.
     """
-    frames, settings = len(traverse), (route.transform, route.resolution)
-    encode = ChunkEncoder(traverse, descriptor, route.means[-1], route.step, *settings, visits)
-    done = range(route.places - start)
-    tasks = [range(i, min(i + route.chunk, frames)) for i in range(len(done), frames, route.chunk)]
+    frames, settings = len(traverse), (place_map.transform, place_map.resolution)
+    encode = ChunkEncoder(traverse, descriptor, place_map.means[-1], place_map.step, *settings, visits)
+    done = range(place_map.places - start)
+    tasks = [range(i, min(i + place_map.chunk, frames)) for i in range(len(done), frames, place_map.chunk)]
     held: list[Chunk] = []
 
     def add() -> None:
         if held:
             chunks, held[:] = [*held], []  # an interruption must not add them twice
-            route.extend(chunks)
+            place_map.extend(chunks)
             if checkpoint is not None:
-                checkpoint.save(route, descriptor, route.places - start)
+                checkpoint.save(place_map, descriptor, place_map.places - start)
 
     try:
         with progress_of("learning" if progress else None, frames - len(done)) as update:
@@ -235,14 +235,17 @@ def append_places(
 @torch.no_grad()
 def learn_descriptors(mapper: Mapper, descriptors: Tensor) -> PlaceMap:
     """The map of descriptors (N,K); a map of other sizes is refused."""
-    route: PlaceMap = mapper(descriptors)
-    if (route.places, route.dimension) != tuple(descriptors.shape):
-        seen = f"{type(mapper).__name__} made a map of {route.places} places and {route.dimension} features"
+    place_map: PlaceMap = mapper(descriptors)
+    if (place_map.places, place_map.dimension) != tuple(descriptors.shape):
+        seen = f"{place_map.places} places and {place_map.dimension} features"
+        seen = f"{type(mapper).__name__} made a map of {seen}"
         raise InputError(f"{seen} from features {tuple(descriptors.shape)}; expected the same numbers")
-    return route
+    return place_map
 
 
-def descriptors_of(descriptor: Descriptor, views: Views, progress: bool = False) -> tuple[Tensor, Tensor]:
+def descriptors_of(
+    descriptor: Descriptor, views: LabelledFrames, progress: bool = False
+) -> tuple[Tensor, Tensor]:
     """Descriptors (n,K) of the frames with a known place, and these places (n,)."""
     rows = concatenate(descriptor.batches(views.traverse, "averaging" if progress else None))
     if len(rows) != len(views.places):
@@ -252,7 +255,7 @@ def descriptors_of(descriptor: Descriptor, views: Views, progress: bool = False)
     return rows[known], views.places[known.to(views.places.device)]
 
 
-def averaged(descriptor: Descriptor, rows: Tensor, visits: Views, progress: bool = False) -> Tensor:
+def averaged(descriptor: Descriptor, rows: Tensor, visits: LabelledFrames, progress: bool = False) -> Tensor:
     """Descriptors (N,K) of places, averaged with those of visits to them."""
     if not len(visits.places):
         return rows
@@ -268,7 +271,7 @@ def with_visits(means: Tensor, counts: Tensor, rows: Tensor, places: Tensor) -> 
     return torch.where(more > 0, sums / (before + more), means)
 
 
-def observation_counts(visits: Views, places: int) -> Tensor:
+def observation_counts(visits: LabelledFrames, places: int) -> Tensor:
     """The number of frames that show each of N places, (N,); a place beyond them is refused."""
     shown = visits.places[visits.places >= 0].cpu()
     if len(shown) and int(shown.max()) >= places:
@@ -283,9 +286,9 @@ def positions_of(traverse: Traverse | None) -> Tensor:
 
 def calibration_of(
     descriptor: Descriptor,
-    route: PlaceMap,
+    place_map: PlaceMap,
     reference: Traverse | None,
-    views: Views | None = None,
+    views: LabelledFrames | None = None,
     places: Tensor | None = None,
     progress: bool = False,
 ) -> Calibration:
@@ -294,16 +297,16 @@ def calibration_of(
         if reference is None:
             raise InputError("no reference and no views to calibrate by; expected one of them")
         strengths = STRENGTHS if descriptor.whitening is None else descriptor.whitening.strengths
-        places = torch.arange(route.places) if places is None else places
-        segments = augmented_segments(reference, len(places), strengths, route.places)
-        views = Views(cast(Traverse, segments), places[segments.places])
-    observation_counts(views, route.places)  # refuses places beyond the map's
+        places = torch.arange(place_map.places) if places is None else places
+        segments = augmented_segments(reference, len(places), strengths, place_map.places)
+        views = LabelledFrames(cast(Traverse, segments), places[segments.places])
+    observation_counts(views, place_map.places)  # refuses places beyond the map's
     another = not isinstance(views.traverse, AugmentedFrames)
     if isinstance(views.traverse, AugmentedFrames):
         length = views.traverse.block
     else:
-        length = max(STRETCH, min(MAX_SEGMENT, SEGMENT_SCORES // route.places))
-        views = _segments_of(views, length, max(LEAST, CALIBRATION_SCORES // route.places))
+        length = max(SEGMENT, min(MAX_SEGMENT, SEGMENT_SCORES // place_map.places))
+        views = _segments_of(views, length, max(LEAST, CALIBRATION_SCORES // place_map.places))
     name, label = views.traverse.name, "calibrating" if progress else None
     descriptors = concatenate(descriptor.batches(views.traverse, label))
     if len(descriptors) != len(views.places):
@@ -311,15 +314,15 @@ def calibration_of(
         raise InputError(f"{seen}; expected the same number")
     parts = zip(descriptors.split(length), views.places.split(length), strict=True)
     try:
-        return calibrated(route, parts, another)
+        return calibrated(place_map, parts, another)
     except InputError as error:
         raise InputError(f"calibrating by {name}: {error}") from error
 
 
-def _segments_of(views: Views, length: int, frames: int) -> Views:
+def _segments_of(views: LabelledFrames, length: int, frames: int) -> LabelledFrames:
     """Evenly spaced segments of views, with about `frames` frames in total."""
     count, wanted = len(views.places) // length, max(1, frames // length)
     if count <= wanted:
         return views
     frame = evenly_spaced(len(views.places), length, wanted)
-    return Views(Part(views.traverse, frame), views.places[frame.to(views.places.device)])
+    return LabelledFrames(Part(views.traverse, frame), views.places[frame.to(views.places.device)])

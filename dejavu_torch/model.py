@@ -21,7 +21,7 @@ from dejavu_torch.data.traverse import at_size, resize_like, size_like
 from dejavu_torch.features.descriptor import Descriptor, own_size
 from dejavu_torch.features.extract import features_of
 from dejavu_torch.features.preprocess import Preprocess
-from dejavu_torch.features.views import Views
+from dejavu_torch.features.views import LabelledFrames
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.maps.file import checked_fields
 from dejavu_torch.maps.place_map import Mapper, PlaceMap
@@ -179,10 +179,10 @@ class DejaVu(nn.Module):
         self,
         traverse: Source,
         progress: bool = False,
-        second: Views | None = None,
+        second: LabelledFrames | None = None,
         checkpoint: learning.Checkpoint | None = None,
         map_tasks: learning.MapTasks = map,
-        visits: Views | None = None,
+        visits: LabelledFrames | None = None,
     ) -> DejaVu:
         """Section III-A: features, what repeats in them, and the map.
 
@@ -217,13 +217,13 @@ class DejaVu(nn.Module):
             counts = learning.observation_counts(visits, len(traverse))
         with descriptor.unchanged_by_errors():
             if isinstance(mapper, SpectralMapper) and learning.is_long(traverse, mapper.chunk):
-                route = mapper.empty().to(descriptor.device)
+                place_map = mapper.empty().to(descriptor.device)
                 key = checkpoint and model_file.run_key(self, traverse, second, visits)
-                if not (checkpoint and key and checkpoint.open(key, route, descriptor)):
-                    route = learning.fit(mapper, descriptor, traverse, second, visits, progress)
+                if not (checkpoint and key and checkpoint.open(key, place_map, descriptor)):
+                    place_map = learning.fit(mapper, descriptor, traverse, second, visits, progress)
                 settings = visits, progress, checkpoint, map_tasks
-                learning.append_places(route, descriptor, traverse, 0, *settings)
-                learned: PlaceMap = route
+                learning.append_places(place_map, descriptor, traverse, 0, *settings)
+                learned: PlaceMap = place_map
             else:
                 if checkpoint is not None:
                     checkpoint.check_unused()
@@ -301,7 +301,7 @@ class DejaVu(nn.Module):
     def calibrate(
         self,
         reference: Source | None,
-        views: Views | None = None,
+        views: LabelledFrames | None = None,
         places: Tensor | None = None,
         progress: bool = False,
     ) -> DejaVu:

@@ -27,7 +27,7 @@ from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.preprocess import Preprocess
-from dejavu_torch.features.views import SAMPLE, AugmentedFrames, Views
+from dejavu_torch.features.views import SAMPLE, AugmentedFrames, LabelledFrames
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.maps.file import HEADER as FILE_HEADER
 from dejavu_torch.maps.file import (
@@ -279,8 +279,8 @@ def contents(model: Model) -> tuple[dict[str, Tensor], dict[str, Any]]:
     settings = {"threshold": model.threshold, "precision": model.precision}
     header = recipes_of(model) | settings | {"batch_size": model.descriptor.batch_size}
     header |= state_to_json(model.state) | {"map": model.map.get_extra_state()}
-    route = model.map.packed() if model.map.places else {}
-    tensors = {f"map.{name}": tensor for name, tensor in route.items()}
+    place_map = model.map.packed() if model.map.places else {}
+    tensors = {f"map.{name}": tensor for name, tensor in place_map.items()}
     return tensors | weights_of(model, "features") | weights_of(model, "whitening"), header
 
 
@@ -341,11 +341,11 @@ def read_model(make: Callable[..., R], path: Path, features: nn.Module | None) -
 def read_place_map(path: Path) -> PlaceMap:
     """The map of a file without its feature modules; InputError as in `DejaVu.load`."""
     with opened(path) as (tensors, header):
-        route: PlaceMap = _part(header, "mapper", None).empty()
+        place_map: PlaceMap = _part(header, "mapper", None).empty()
         if header["map"].get("places") == 0:
             raise InputError(NO_MAP)
-        _fill(route, tensors, header["map"])
-    return route
+        _fill(place_map, tensors, header["map"])
+    return place_map
 
 
 @contextmanager
@@ -371,14 +371,14 @@ def _part(header: Mapping[str, Any], name: str, features: nn.Module | None) -> A
     return None if header[name] is None else build(header[name], kind, features)
 
 
-def _fill(route: PlaceMap, tensors: Mapping[str, Tensor], state: dict[str, Any]) -> None:
+def _fill(place_map: PlaceMap, tensors: Mapping[str, Tensor], state: dict[str, Any]) -> None:
     """Fill an empty map from a file; it stays empty if the file has only a descriptor."""
-    checked(state, route.state, "its map")
+    checked(state, place_map.state, "its map")
     own = part_of(tensors, "map")
     if own or state.get("places"):
-        route.load_packed(own, state)
+        place_map.load_packed(own, state)
     else:
-        route.set_extra_state(state)
+        place_map.set_extra_state(state)
 
 
 def check_types(tensors: Mapping[str, Tensor], features: nn.Module) -> None:
@@ -415,7 +415,10 @@ def _check(model: Model) -> None:
 
 
 def run_key(
-    model: Model, traverse: Traverse, second: Views | None = None, visits: Views | None = None
+    model: Model,
+    traverse: Traverse,
+    second: LabelledFrames | None = None,
+    visits: LabelledFrames | None = None,
 ) -> dict[str, str]:
     """Digests of everything that affects the chunks of a traverse, see `learning.Checkpoint`."""
     descriptor, header = model.descriptor, recipes_of(model)

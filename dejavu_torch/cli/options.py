@@ -15,7 +15,7 @@ from dejavu_torch.cli.device import device_of
 from dejavu_torch.data.source import open_source
 from dejavu_torch.data.traverse import parts_of
 from dejavu_torch.features.descriptor import default_features
-from dejavu_torch.features.views import Views
+from dejavu_torch.features.views import LabelledFrames
 from dejavu_torch.model import DejaVu, check_precision
 from dejavu_torch.model_file import NO_MAP, recipe_of
 from dejavu_torch.motion.resampling import source_of
@@ -210,7 +210,7 @@ class LearningOptions:
 
     def with_views(
         self, model: DejaVu, reference: Reference, query: Traverse | None = None
-    ) -> tuple[Reference, Views | None, Views | None]:
+    ) -> tuple[Reference, LabelledFrames | None, LabelledFrames | None]:
         """The reference, if there is one, what its whitening learns from, and what calibrates its map, or the
         model's; all are opened and compared before one of them is measured."""
         named = None if self.calibration in UNREAD else self.calibration
@@ -287,7 +287,7 @@ class GrowthOptions:
         if calibration not in UNREAD:
             open_another("calibration", str(calibration), [traverse])
 
-    def visits(self, model: DejaVu, reference: Traverse | None) -> Views:
+    def visits(self, model: DejaVu, reference: Traverse | None) -> LabelledFrames:
         """The traverse to average, and which places of the reference or the map it shows."""
         return growth.associate(model, reference, open_source(str(self.average)), self.average_truth)
 

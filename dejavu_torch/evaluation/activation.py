@@ -31,7 +31,12 @@ class Rate(NamedTuple):
 
 
 def activation_rates(
-    route: TemplateMap, chosen: list[int], queries: Tensor, index: Tensor, truth: GroundTruth, tolerance: int
+    place_map: TemplateMap,
+    chosen: list[int],
+    queries: Tensor,
+    index: Tensor,
+    truth: GroundTruth,
+    tolerance: int,
 ) -> list[Rate]:
     """How often each of the chosen layers of one chunk answers in phase, followed by the rate of the map.
 
@@ -47,35 +52,35 @@ def activation_rates(
 
     Shape: queries (Q,D), index (Q,) the places reported for them.
     """
-    start, stop = route.plan[chosen[0]].start, route.plan[chosen[0]].stop
+    start, stop = place_map.plan[chosen[0]].start, place_map.plan[chosen[0]].stop
     right = torch.where(truth.judged[:, None], truth.positives, -1)
     here = torch.where((right >= start) & (right < stop), right, -1)
     inside = (here >= 0).any(1)
     outside = (right >= 0).any(1) & ~inside
     rates = []
     for j in chosen:
-        layer, best = route.plan[j], best_phases(route, queries, j)
+        layer, best = place_map.plan[j], best_phases(place_map, queries, j)
         near, far = (in_phase(layer, best, which, tolerance) for which in (here, right))
         chance = (2 * _phases_within(layer, tolerance) + 1) / layer.phases
         rates.append(Rate(share(near, inside), share(far, outside), min(1.0, chance)))
     judged, found = scored_and_right(index, truth, tolerance)
     shares = share(found, inside & judged), share(found, outside & judged)
-    return [*rates, Rate(*shares, min(1.0, (2 * tolerance + 1) / route.places))]
+    return [*rates, Rate(*shares, min(1.0, (2 * tolerance + 1) / place_map.places))]
 
 
-def best_phases(route: TemplateMap, queries: Tensor, j: int) -> Tensor:
+def best_phases(place_map: TemplateMap, queries: Tensor, j: int) -> Tensor:
     """The phase of one layer that is nearest to each query, among the phases of its chunk: (Q,D) -> (Q,)."""
-    layer = route.plan[j]
+    layer = place_map.plan[j]
     present: Tensor = layer.place_phases.unique()
     parts = queries.split(max(1, BLOCK_DISTANCES // max(layer.phases, queries.shape[1])))
-    nearest = [layer_distances(route, part, j)[:, present].argmin(1) for part in parts]
+    nearest = [layer_distances(place_map, part, j)[:, present].argmin(1) for part in parts]
     return present[torch.cat(nearest)]
 
 
-def layer_distances(route: TemplateMap, queries: Tensor, j: int) -> Tensor:
+def layer_distances(place_map: TemplateMap, queries: Tensor, j: int) -> Tensor:
     """Eq. 3 for one layer of the map, on the CPU: (Q,D) -> (Q,P)."""
     with torch.no_grad():
-        (distances,) = route.distances(queries.to(route.device), [j])
+        (distances,) = place_map.distances(queries.to(place_map.device), [j])
     return distances.cpu()
 
 

@@ -33,7 +33,7 @@ from dejavu_torch.evaluation.rejection import draw_reliability
 from dejavu_torch.evaluation.report import Report, as_html
 from dejavu_torch.evaluation.storage import coded_at_sizes, noise_over_map
 from dejavu_torch.features.descriptor import is_ready
-from dejavu_torch.features.views import Views
+from dejavu_torch.features.views import LabelledFrames
 from dejavu_torch.growth import calibrate_if_possible
 from dejavu_torch.maps.distance import l1_backend
 from dejavu_torch.maps.spectral import SpectralMapper
@@ -87,11 +87,11 @@ def compare(
     leave_out: int | None = None,
     seed: int = 0,
     interpolate: bool = False,
-    second: Views | None = None,
+    second: LabelledFrames | None = None,
     others: OtherModels | None = None,
     sequence: SequenceModel | None = None,
     top: int = 1,
-    calibration: Views | Literal["none"] | None = None,
+    calibration: LabelledFrames | Literal["none"] | None = None,
     distractors: Sequence[Traverse] = (),
     storage_curve: bool = False,
     ordered: bool | None = None,
@@ -143,7 +143,7 @@ def compare(
             spectral = isinstance(model.mapper, SpectralMapper)
             places = model.descriptor.learn(reference, second, progress, spectral)
             model.learn_features(places, reference)
-        if isinstance(calibration, Views) or (calibration is None and not has_map):
+        if isinstance(calibration, LabelledFrames) or (calibration is None and not has_map):
             calibrate_if_possible(model, reference, calibration, progress=progress)
     with timed(seconds, "localize"):
         if ordered is None:
@@ -342,11 +342,11 @@ def _match_facts(
     run: Localization, candidates: Match, truth: Truth | None, interpolate: bool, off: Mapping[str, Tensor]
 ) -> dict[str, Any]:
     """The entries of report.json about the answers; `off`: see `rejection_facts`."""
-    route, tolerance = run.model.map, run.tolerance
+    place_map, tolerance = run.model.map, run.tolerance
     carried = all(source_of(traverse).places is not None for traverse in (run.reference, run.query))
     words, offset = describe_ground_truth(truth, interpolate, carried), offset_of(truth, carried)
-    ranked, shown = route.table.scored(candidates.index), run.match.renumbered(route.frame_of)
-    facts = evaluation_facts(run.scored, ranked, run.truth, tolerance, route.positions, words, off)
+    ranked, shown = place_map.table.scored(candidates.index), run.match.renumbered(place_map.frame_of)
+    facts = evaluation_facts(run.scored, ranked, run.truth, tolerance, place_map.positions, words, off)
     return facts | answer_facts(shown, run.query_frames, tolerance, run.truth is not None, offset)
 
 

@@ -79,9 +79,9 @@ def shuffled(reference: Tensor, seed: int = 0) -> tuple[Tensor, Tensor]:
     return order, concatenate(reference[part] for part in order.to(reference.device).split(256))
 
 
-def _same_layers(route: TemplateMap, features: Tensor) -> TemplateMap:
+def _same_layers(place_map: TemplateMap, features: Tensor) -> TemplateMap:
     """A map with the same layers and settings, and the phase means of other features."""
-    null = copy.deepcopy(route)
+    null = copy.deepcopy(place_map)
     null.freeze()
     null.positions = null.positions[:0]
     templates = PhaseTemplates()(null.weighted(features), null.plan)
@@ -107,30 +107,32 @@ def leave_out_match(model: DejaVu, reference: Tensor, width: int = 0) -> Match:
         InputError: a width below 0, features of another shape than the map's, or a map whose templates are
             not their means (another kind, or trained).
     """
-    route = template_map_of(model, "leave_out")
-    if width < 0 or tuple(reference.shape) != (route.places, route.dimension):
+    place_map = template_map_of(model, "leave_out")
+    if width < 0 or tuple(reference.shape) != (place_map.places, place_map.dimension):
         raise InputError(
             f"leave-out got width {width} and features {tuple(reference.shape)}; "
-            f"expected width >= 0 and ({route.places}, {route.dimension})"
+            f"expected width >= 0 and ({place_map.places}, {place_map.dimension})"
         )
-    width = min(width, route.places)  # all frames
+    width = min(width, place_map.places)  # all frames
     if model.trained is not None:
         raise InputError("leave-out got trained templates, which are not means; expected an untrained map")
-    if not route.plan:
+    if not place_map.plan:
         return model.localize(reference)
-    matches, reference = [], route.weighted(reference)
-    layers = list(zip(route.plan, route.blocks(), route.layer_features(), strict=True))
+    matches, reference = [], place_map.weighted(reference)
+    layers = list(zip(place_map.plan, place_map.blocks(), place_map.layer_features(), strict=True))
     with torch.no_grad():
         for frames in torch.arange(len(reference), device=reference.device).split(256):
             first = max(0, int(frames[0]) - width)
             rows = reference[first : int(frames[-1]) + width + 1]  # of the queries and windows
             distances = [
-                _distances_without(rows.index_select(1, i), first, layer, block, frames, width, route.metric)
+                _distances_without(
+                    rows.index_select(1, i), first, layer, block, frames, width, place_map.metric
+                )
                 for layer, block, i in layers
             ]
-            scores = route.combine(distances)
-            if route.temperature is not None:
-                scores = log_posterior(scores, route.temperature)
+            scores = place_map.combine(distances)
+            if place_map.temperature is not None:
+                scores = log_posterior(scores, place_map.temperature)
             matches.append(best_match(scores, model.threshold).map(Tensor.cpu))
     return Match.joined(matches)
 

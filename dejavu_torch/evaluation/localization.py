@@ -78,8 +78,8 @@ class Localization(NamedTuple):
     @torch.no_grad()
     def scores(self, numbers: Tensor) -> Tensor:
         """Scores of single queries, on the CPU: their indices (B,) -> (B,N)."""
-        route = self.model.map
-        return route.scores(self.query_features[numbers].to(route.device)).float().cpu()
+        place_map = self.model.map
+        return place_map.scores(self.query_features[numbers].to(place_map.device)).float().cpu()
 
     def example_query(self, start: int, stop: int) -> tuple[int, list[int]]:
         """A query near the middle of a chunk, and its right places there; without truth the middle query."""

@@ -29,30 +29,30 @@ class Lines(NamedTuple):
     kept: Tensor
 
 
-def longest_chunk(route: SpectralMap) -> int:
+def longest_chunk(place_map: SpectralMap) -> int:
     """The number of the longest chunk; of equals the first."""
-    return max(range(len(route.chunks)), key=lambda j: route.chunks[j][1] - route.chunks[j][0])
+    return max(range(len(place_map.chunks)), key=lambda j: place_map.chunks[j][1] - place_map.chunks[j][0])
 
 
-def draw_spectrum(run: Localization, route: SpectralMap) -> plots.Pictures:
+def draw_spectrum(run: Localization, place_map: SpectralMap) -> plots.Pictures:
     """The spectra of the descriptor dimensions of which the longest chunk keeps the most energy."""
-    chunk = longest_chunk(route)
-    start, stop = route.chunks[chunk]
-    lines = route.lines(chunk)
+    chunk = longest_chunk(place_map)
+    start, stop = place_map.chunks[chunk]
+    lines = place_map.lines(chunk)
     if stop - start < 2 or not len(lines.value):
         return {}
-    energy = lines.value.new_zeros(route.dimension).index_add(0, lines.feature, lines.value.square())
+    energy = lines.value.new_zeros(place_map.dimension).index_add(0, lines.feature, lines.value.square())
     chosen = energy.argsort(descending=True, stable=True)[:STRONGEST].cpu()
     values = (
-        run.reference_features[start:stop].cpu()[:, chosen].float() - route.means[0].cpu()[chosen].float()
+        run.reference_features[start:stop].cpu()[:, chosen].float() - place_map.means[0].cpu()[chosen].float()
     )
-    amplitudes = spectrum(values.T, route.transform).abs()
-    kept = torch.zeros(route.dimension, stop - start, dtype=torch.bool)
+    amplitudes = spectrum(values.T, place_map.transform).abs()
+    kept = torch.zeros(place_map.dimension, stop - start, dtype=torch.bool)
     kept[lines.feature.cpu(), lines.line.cpu()] = True
-    periods = [float(period_of(j, stop - start, route.transform)) for j in range(1, stop - start)]
+    periods = [float(period_of(j, stop - start, place_map.transform)) for j in range(1, stop - start)]
     features = {int(j): Lines(own[1:], kept[j, 1:]) for j, own in zip(chosen, amplitudes, strict=True)}
-    plot = plot_spectrum(features, torch.tensor(periods), float(route.steps[chunk]), run.unit)
-    edges = run.borders[[start, stop]].tolist() if len(route.chunks) > 1 else None
+    plot = plot_spectrum(features, torch.tensor(periods), float(place_map.steps[chunk]), run.unit)
+    edges = run.borders[[start, stop]].tolist() if len(place_map.chunks) > 1 else None
     return plots.picture("spectrum", plot, chunk=edges)
 
 

@@ -30,18 +30,18 @@ def draw_pictures(
     storage: Mapping[str, Sequence[Stored]] | None = None,
 ) -> Pictures:
     """All pictures that can be drawn; some need ground truth, frames or layers."""
-    route, tolerance, storage = run.model.map, f"{run.tolerance} {run.unit}", storage or {}
+    place_map, tolerance, storage = run.model.map, f"{run.tolerance} {run.unit}", storage or {}
     pictures = draw_pairs(run)
     pictures |= draw_coverage(run.scored, run.truth, run.tolerance, run.borders, run.query_frames, run.unit)
     pictures |= draw_scores(run) | draw_posterior(run)
     pictures |= draw_curves(contenders, tolerance)
     pictures |= draw_storage(contenders, storage, tolerance)
-    pictures |= draw_sequences(contenders, storage.get("map", ()), route.places, tolerance)
+    pictures |= draw_sequences(contenders, storage.get("map", ()), place_map.places, tolerance)
     pictures |= draw_motion(run)
-    if isinstance(route, SpectralMap):
-        pictures |= draw_spectrum(run, route)
-    if isinstance(route, TemplateMap):
-        pictures |= draw_template_map(run, route)
+    if isinstance(place_map, SpectralMap):
+        pictures |= draw_spectrum(run, place_map)
+    if isinstance(place_map, TemplateMap):
+        pictures |= draw_template_map(run, place_map)
     return pictures
 
 

@@ -39,59 +39,61 @@ def coded_at_sizes(
         InputError: the map is not spectral, or there is no ground truth.
     """
     run = run._replace(matching=SINGLE) if run.sequence is None else run  # without a filter for each size
-    route = run.model.map
-    if not isinstance(route, SpectralMap) or run.truth is None:
+    place_map = run.model.map
+    if not isinstance(place_map, SpectralMap) or run.truth is None:
         truth = "no" if run.truth is None else "a"
-        seen = f"a storage curve got a map of kind {route.kind!r} and {truth} ground truth"
+        seen = f"a storage curve got a map of kind {place_map.kind!r} and {truth} ground truth"
         raise InputError(f"{seen}; expected a spectral map and a ground truth")
     features = run.reference_features
     order, mixed = shuffled(features, seed)
     kinds = {
-        "map": partial(_coded, run, route, features, resolution=route.resolution),
-        "null": partial(_coded, run, route, mixed, order=order),
-        "interpolated": partial(_keyframes, run, route),
+        "map": partial(_coded, run, place_map, features, resolution=place_map.resolution),
+        "null": partial(_coded, run, place_map, mixed, order=order),
+        "interpolated": partial(_keyframes, run, place_map),
     }
     found: dict[str, list[Stored]] = {key: [] for key in kinds}
     cases = [(key, budget) for key in kinds for budget in budgets]
     for key, budget in with_progress(cases, "storage" if progress else None):
         for answers, size in kinds[key](budget):
-            answers = answers.renumbered(route.table.scored)
+            answers = answers.renumbered(place_map.table.scored)
             scores = evaluate(answers, run.truth, run.tolerance)
             sequences = evaluate_each(answers.sequences, run.truth, run.tolerance)
-            found[key].append(Stored(size / route.places, scores.auc, scores.recall_at_1, sequences))
+            found[key].append(Stored(size / place_map.places, scores.auc, scores.recall_at_1, sequences))
     return found
 
 
-def noise_over_map(route: SpectralMap, features: Tensor, seed: int = 0) -> float:
+def noise_over_map(place_map: SpectralMap, features: Tensor, seed: int = 0) -> float:
     """Bytes of noise as smooth as the route, coded in the map's steps, divided by those of the map.
 
     The noise is Gaussian with the spectrum of each descriptor dimension, averaged over half octaves, so that
     nothing in it repeats. The difference is an upper bound of what the map saves by repetition: a trend, or a
     segment with less energy than others, saves bytes too. All other savings come from smoothness.
     """
-    lines = spectrum((features.float() - route.means[0].float()).T, route.transform)
+    lines = spectrum((features.float() - place_map.means[0].float()).T, place_map.transform)
     band = (2 * torch.arange(1, lines.shape[1] + 1, device=lines.device).float().log2()).long()
     sums = lines.new_zeros(len(lines), int(band[-1]) + 1).index_add(1, band, lines.square())
     energy = (sums / band.bincount().clamp(min=1))[:, band]
     normal = torch.randn(lines.shape, dtype=torch.float32, generator=torch.Generator().manual_seed(seed))
-    noise = from_spectrum(energy.sqrt() * normal.to(energy), route.transform).T + route.means[0].float()
-    settings = route.chunk, route.transform, route.metric, route.resolution
-    mapper = SpectralMapper(None, float(route.steps.mean()), *settings)
-    packed = [one.packed() for one in (mapper(noise), route)]
+    noise = (
+        from_spectrum(energy.sqrt() * normal.to(energy), place_map.transform).T + place_map.means[0].float()
+    )
+    settings = place_map.chunk, place_map.transform, place_map.metric, place_map.resolution
+    mapper = SpectralMapper(None, float(place_map.steps.mean()), *settings)
+    packed = [one.packed() for one in (mapper(noise), place_map)]
     taken = [one["streams"].nbytes + one["means"].nbytes for one in packed]
     return taken[0] / taken[1]
 
 
 def _coded(
     run: Localization,
-    route: SpectralMap,
+    place_map: SpectralMap,
     features: Tensor,
     budget: float,
     order: Tensor | None = None,
     resolution: float = 0.0,
 ) -> Iterator[tuple[Match, int]]:
     """The matches on a map of about this budget, and its bytes; empty if no map can meet it."""
-    mapper = SpectralMapper(budget, None, route.chunk, route.transform, route.metric, resolution)
+    mapper = SpectralMapper(budget, None, place_map.chunk, place_map.transform, place_map.metric, resolution)
     model = with_mapper(run.model, mapper)
     try:
         model.learn_features(features)
@@ -101,9 +103,9 @@ def _coded(
     yield found, sum(tensor.nbytes for tensor in model.map.packed().values())
 
 
-def _keyframes(run: Localization, route: SpectralMap, budget: float) -> Iterator[tuple[Match, int]]:
+def _keyframes(run: Localization, place_map: SpectralMap, budget: float) -> Iterator[tuple[Match, int]]:
     """The matches among interpolated keyframes of at most this budget, and their bytes."""
-    between, _, keys = interpolated(as_int8(run.reference_features), budget * route.places)
-    size = keys * route.dimension
-    if size <= budget * route.places:
-        yield nearest_frames(between, run.query_features, 1, route.metric, matching=run.matching), size
+    between, _, keys = interpolated(as_int8(run.reference_features), budget * place_map.places)
+    size = keys * place_map.dimension
+    if size <= budget * place_map.places:
+        yield nearest_frames(between, run.query_features, 1, place_map.metric, matching=run.matching), size

@@ -32,28 +32,28 @@ DOTS = 2000  # along a picture, at least; a longer line is drawn as a band from 
 ROWS, CYCLES, MARKED = 64, 100, 12  # templates, cycles and multiples of a period drawn, at most
 
 
-def draw_template_map(run: Localization, route: TemplateMap) -> plots.Pictures:
+def draw_template_map(run: Localization, place_map: TemplateMap) -> plots.Pictures:
     """All pictures of a template map; without layers only the first."""
-    plan, pictures = route.plan, draw_chunks(route.plan, run.borders, run.unit)
+    plan, pictures = place_map.plan, draw_chunks(place_map.plan, run.borders, run.unit)
     shown = shown_chunk(plan)
     if not shown:
         return pictures
-    layers, templates = [plan[j] for j in shown[:2]], feature_templates(route, shown[0])
+    layers, templates = [plan[j] for j in shown[:2]], feature_templates(place_map, shown[0])
     chosen = best_explained(run.reference_features, layers[0], templates)
     pictures |= draw_spectrogram(run, plan, layers[0].features[chosen])
     pictures |= draw_templates(run, layers[0], templates, chosen)
-    return pictures | draw_features(run, layers) | draw_activations(run, route, shown)
+    return pictures | draw_features(run, layers) | draw_activations(run, place_map, shown)
 
 
-def draw_paper(run: Localization, route: TemplateMap) -> plots.Pictures:
+def draw_paper(run: Localization, place_map: TemplateMap) -> plots.Pictures:
     """The autocorrelogram of a feature, and the layers of its chunk; empty for a map without layers."""
-    shown = shown_chunk(route.plan)
+    shown = shown_chunk(place_map.plan)
     if not shown:
         return {}
-    layer, templates = route.plan[shown[0]], feature_templates(route, shown[0])
+    layer, templates = place_map.plan[shown[0]], feature_templates(place_map, shown[0])
     feature = layer.features[best_explained(run.reference_features, layer, templates)]
     values = run.reference_features[layer.start : layer.stop, feature].cpu()
-    layers = [route.plan[j] for j in sorted(shown)]
+    layers = [place_map.plan[j] for j in sorted(shown)]
     periods = [float(one.period) for one in layers if feature in one.features]
     pictures = draw_autocorrelogram(values, periods, feature, run.unit)
     return pictures | draw_layers(layers, run.borders, run.unit)
@@ -74,12 +74,12 @@ def shown_chunk(plan: Plan) -> list[int]:
     return chunks[order[-1]] if order else []
 
 
-def feature_templates(route: TemplateMap, j: int) -> Tensor:
+def feature_templates(place_map: TemplateMap, j: int) -> Tensor:
     """Templates of one layer in the units of the features, (P,F), without trained weights."""
-    templates: Tensor = route.blocks()[j].detach().cpu()
-    if not len(route.weights):
+    templates: Tensor = place_map.blocks()[j].detach().cpu()
+    if not len(place_map.weights):
         return templates
-    return templates / route.weights.detach().cpu()[list(route.plan[j].features)].clamp(min=1e-6)
+    return templates / place_map.weights.detach().cpu()[list(place_map.plan[j].features)].clamp(min=1e-6)
 
 
 def best_explained(values: Tensor, layer: FrequencyLayer, templates: Tensor) -> int:
@@ -302,23 +302,23 @@ def edges_seen(
     return torch.stack([middle - along, middle + along], 1), count
 
 
-def draw_activations(run: Localization, route: TemplateMap, chunk: list[int]) -> plots.Pictures:
+def draw_activations(run: Localization, place_map: TemplateMap, chunk: list[int]) -> plots.Pictures:
     """Scores of one query over a chunk, by two of its layers and by all fused (figure 17 of the paper)."""
     if len(chunk) < 2:
         return {}
-    plan, chosen = route.plan, chunk[:2]
+    plan, chosen = place_map.plan, chunk[:2]
     layers = [plan[j] for j in chosen]
     start, stop = layers[0].start, layers[0].stop
     query, places = run.example_query(start, stop)
     one = run.query_features[query : query + 1]
-    scores = [layer_distances(route, one, j)[0, plan[j].place_phases] for j in chosen]
+    scores = [layer_distances(place_map, one, j)[0, plan[j].place_phases] for j in chosen]
     scores.append(run.scores(torch.tensor([query]))[0, start:stop])
     titles = [f"period {float(layer.period):.4g}, {len(layer.features)} features" for layer in layers]
     titles.append("all layers fused")
     numbers: dict[str, Any] = {}
     if run.truth is not None:
         found = run.query_features, run.scored.index
-        rates = activation_rates(route, chosen, *found, run.truth, run.tolerance)
+        rates = activation_rates(place_map, chosen, *found, run.truth, run.tolerance)
         titles = [f"{title}:\n{rate.describe()}" for title, rate in zip(titles, rates, strict=True)]
         *alone, fused = (rate._asdict() for rate in rates)
         numbers = {"start": start, "stop": stop, "layers": alone, "fused": fused}

@@ -20,7 +20,7 @@ from dejavu_torch.features.extract import (
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.joined import Joined, groups_of
 from dejavu_torch.features.preprocess import Preprocess
-from dejavu_torch.features.views import SAMPLE, AugmentedFrames, Sample, Views, augmented_route
+from dejavu_torch.features.views import SAMPLE, AugmentedFrames, LabelledFrames, Sample, augmented_route
 from dejavu_torch.features.whitening import INDEPENDENT, MOST_VIEWS, WIDEST, Whitening
 from dejavu_torch.memory import IN_MEMORY, concatenate
 from dejavu_torch.types import BATCH_NUMBERS, BATCH_SIZE, InputError, Traverse
@@ -113,7 +113,7 @@ class Descriptor(nn.Module):
     def learn(
         self,
         traverse: Traverse,
-        second: Views | None = None,
+        second: LabelledFrames | None = None,
         progress: bool = False,
         spectral: bool = True,
         label: str = "learning",
@@ -168,7 +168,7 @@ class Descriptor(nn.Module):
         whitening: Whitening,
         features: Tensor,
         traverse: Traverse,
-        second: Views | None,
+        second: LabelledFrames | None,
         label: str | None,
     ) -> None:
         if len(features) < 2:

@@ -15,7 +15,7 @@ from dejavu_torch.types import InputError, Traverse
 SAMPLE = 10_000  # frames that a longer route is fitted on
 MIN_SEGMENTS = 4  # of a sample
 BLOCK = 64  # frames augmented together
-STRETCH, EVERY = 20, 10  # frames of a segment; every 10th segment is used
+SEGMENT, EVERY = 20, 10  # frames of a segment; every 10th segment is used
 STRONGER = 1.5  # factor on the strengths for whitening, which has seen the frames themselves
 FEWEST, MOST = 600, 1200  # frames of all segments together
 MAX_COPIES = 2  # frames of all segments, relative to the frames of a short route
@@ -40,7 +40,7 @@ class Sample(NamedTuple):
         segment = min(chunk, SAMPLE // MIN_SEGMENTS)
         return cls(evenly_spaced(frames, segment, SAMPLE // segment), segment)
 
-    def views(self, second: Views) -> Views:
+    def views(self, second: LabelledFrames) -> LabelledFrames:
         """The views of the sample in a second traverse; InputError if there are none."""
         views = views_of(second, self.frame)
         if not len(views.places):
@@ -49,7 +49,7 @@ class Sample(NamedTuple):
         return views
 
 
-class Views(NamedTuple):
+class LabelledFrames(NamedTuple):
     """Frames, and (n,) int64 the place of the reference that each shows, -1 for a frame to skip."""
 
     traverse: Traverse
@@ -62,12 +62,12 @@ def evenly_spaced(frames: int, length: int, count: int) -> Tensor:
     return (starts[:, None] + torch.arange(length)).flatten()
 
 
-def views_of(views: Views, frames: Tensor) -> Views:
+def views_of(views: LabelledFrames, frames: Tensor) -> LabelledFrames:
     """The views of some frames (n,) of a route, increasing; their places are indices into these frames."""
     places = views.places.cpu()
     at = torch.searchsorted(frames, places).clamp(max=len(frames) - 1)
     shown = (frames[at] == places).nonzero().flatten()
-    return Views(Part(views.traverse, shown), at[shown])
+    return LabelledFrames(Part(views.traverse, shown), at[shown])
 
 
 class AugmentedFrames:
@@ -123,12 +123,12 @@ class AugmentedFrames:
 
 def augmented_route(
     traverse: Traverse, frames: int, copies: int, most: int, strengths: Mapping[str, Any], seed: int = 0
-) -> tuple[Views, str]:
+) -> tuple[LabelledFrames, str]:
     """At most `most` augmented copies of N `frames`, evenly drawn, and a phrase for the log about them."""
     shown = range(0, frames, max(1, -(-frames * copies // most)))
     views = AugmentedFrames(traverse, [shown], traverse.at_once(BLOCK), copies, strengths, seed)
     each = "each frame" if shown.step == 1 else f"{len(shown)} of the frames"
-    return Views(cast(Traverse, views), views.places), f"{copies} look{'s' * (copies > 1)} at {each}"
+    return LabelledFrames(cast(Traverse, views), views.places), f"{copies} look{'s' * (copies > 1)} at {each}"
 
 
 def augmented_segments(
@@ -148,7 +148,7 @@ def augmented_segments(
         places: of the map to search; None is N.
         starts: of segments of 20 frames, increasing, instead of every 10th segment.
     """
-    length = min(STRETCH, max(1, frames // EVERY)) if starts is None else STRETCH
+    length = min(SEGMENT, max(1, frames // EVERY)) if starts is None else SEGMENT
     starts = range(0, frames - length + 1, EVERY * length) if starts is None else starts
     most = min(MOST, max(LEAST, SCORES // (places or frames)))
     runs = [range(one, one + length) for one in starts[:: max(1, -(-len(starts) * length // most))]]

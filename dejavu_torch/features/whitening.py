@@ -160,7 +160,7 @@ class Whitening(nn.Module):
         self.members = nn.ModuleList()  # a whitening per group, whose outputs the projection joins
 
     @property
-    def whole(self) -> Tensor:
+    def unpacked_projection(self) -> Tensor:
         """(D,K): the projection in units of `scale`."""
         if self.projection.dtype != torch.uint8:
             return self.projection
@@ -172,9 +172,9 @@ class Whitening(nn.Module):
         """This whitening, and those of its groups."""
         return [self, *(member for member in self.members if isinstance(member, Whitening))]
 
-    def unpacked(self) -> list[Tensor]:
-        """`whole` of all `parts` as float32, column-major, for a fast `forward` of single descriptors."""
-        return [part.whole.T.float().contiguous().T for part in self.parts]
+    def unpacked_projections(self) -> list[Tensor]:
+        """`unpacked_projection` of all `parts` as float32, column-major, for a fast `forward` of single descriptors."""
+        return [part.unpacked_projection.T.float().contiguous().T for part in self.parts]
 
     @property
     def sizes(self) -> list[int]:
@@ -191,8 +191,8 @@ class Whitening(nn.Module):
         """Of the output, once there is a projection."""
         return len(self.scale) + len(self.length)
 
-    def forward(self, descriptors: Tensor, unpacked: Sequence[Tensor] | None = None) -> Tensor:
-        """Descriptors (B,D) -> (B,K); `unpacked`: a stored result of that method."""
+    def forward(self, descriptors: Tensor, projections: Sequence[Tensor] | None = None) -> Tensor:
+        """Descriptors (B,D) -> (B,K); `projections`: stored `unpacked_projections`."""
         if not self.learned:
             return descriptors
         shape, sizes = tuple(descriptors.shape), self.sizes
@@ -201,7 +201,7 @@ class Whitening(nn.Module):
         # bf16 is too coarse for the small differences that whitening amplifies
         with torch.autocast(descriptors.device.type, enabled=False):
             exact = descriptors.to(torch.promote_types(descriptors.dtype, torch.float32))
-            wholes = [part.whole for part in self.parts] if unpacked is None else unpacked
+            wholes = [part.unpacked_projection for part in self.parts] if projections is None else projections
             if len(self.members):
                 each = zip(self.parts[1:], exact.split(sizes, 1), wholes[1:], strict=True)
                 exact = torch.cat([member._project(own, whole) for member, own, whole in each], 1)

@@ -79,23 +79,23 @@ class SpectralMapper(Mapper):
         self.empty()  # checks the settings
 
     @classmethod
-    def of_equal_size(cls, route: SpectralMap) -> SpectralMapper:
+    def of_equal_size(cls, place_map: SpectralMap) -> SpectralMapper:
         """A mapper with a map's settings and bytes per place, but no `resolution`, for routes of any kind."""
-        size = (route.summary().route_bytes - route.positions.nbytes) / route.places
-        return cls(size, None, route.chunk, route.transform, route.metric)
+        size = (place_map.summary().route_bytes - place_map.positions.nbytes) / place_map.places
+        return cls(size, None, place_map.chunk, place_map.transform, place_map.metric)
 
     @torch.no_grad()
     def forward(self, features: Tensor) -> SpectralMap:
-        route, lines = self._fitted(features, self.chunk)
-        for (start, stop), levels in zip(lines.chunks, lines.levels(route.step), strict=True):
-            route.extend([Chunk(stop - start, route.step, encode(levels))], [levels])
-        return route
+        place_map, lines = self._fitted(features, self.chunk)
+        for (start, stop), levels in zip(lines.chunks, lines.levels(place_map.step), strict=True):
+            place_map.extend([Chunk(stop - start, place_map.step, encode(levels))], [levels])
+        return place_map
 
     @torch.no_grad()
-    def fit(self, sample: Tensor, stretch: int, share: float = 1.0) -> SpectralMap:
-        """A map without places: mean and step for the chunks of a route, from sampled stretches (n,K) of it.
+    def fit(self, sample: Tensor, segment: int, share: float = 1.0) -> SpectralMap:
+        """A map without places: mean and step for the chunks of a route, from sampled segments (n,K) of it.
         The sample pays for a `share` of the mean, its part of the route's places."""
-        return self._fitted(sample, stretch, share)[0]
+        return self._fitted(sample, segment, share)[0]
 
     def empty(self, means: Tensor | None = None, step: float = 0.0) -> SpectralMap:
         return SpectralMap(means, self.metric, self.transform, self.chunk, self.resolution, step)
@@ -135,7 +135,7 @@ class SpectralMapper(Mapper):
 
 
 @torch.no_grad()
-def code_chunk(
+def encode_chunk(
     descriptors: Tensor, mean: Tensor, step: float, transform: Transform = "dft", resolution: float = 0.0
 ) -> Chunk:
     """The coded lines of one chunk, for `SpectralMap.extend`; the same on any machine.

@@ -141,7 +141,7 @@ def _window(index: Tensor, radius: int, scores: Tensor) -> Tensor:
 
 @torch.no_grad()
 def calibrated(
-    route: PlaceMap, segments: Iterable[tuple[Tensor, Tensor]], another_visit: bool = False
+    place_map: PlaceMap, segments: Iterable[tuple[Tensor, Tensor]], another_visit: bool = False
 ) -> Calibration:
     """Fit on queries with known places, once as they are and once without the scores near these places. The
     latter stand for queries off the map, whose answers are all wrong.
@@ -153,7 +153,7 @@ def calibrated(
     """
     answers: tuple[list[tuple[Tensor, ...]], ...] = [], []  # of single queries, of a filter
     for descriptors, places in segments:
-        scores = torch.cat([route.scores(part) for part in descriptors.split(64)])
+        scores = torch.cat([place_map.scores(part) for part in descriptors.split(64)])
         places = places.to(scores.device)
         off_map = scores.scatter(1, _window(places, 2 * TOLERANCE, scores), math.inf)
         for single, on_map in ((scores, True), (off_map, False)):

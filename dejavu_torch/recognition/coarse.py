@@ -39,7 +39,7 @@ CLIP = 6  # standard deviations at which a component of a unit vector is clipped
 MEASURED_CHUNKS = 16  # evenly along the map, for the energy of the lines
 
 
-class Plan(NamedTuple):
+class SamplingPlan(NamedTuple):
     """How a map is sampled."""
 
     coarse: int  # places from one coarse sample to the next
@@ -55,7 +55,7 @@ class Plan(NamedTuple):
         )
 
 
-def plan(route: PlaceMap, limit: int | None = None) -> Plan | None:
+def plan(place_map: PlaceMap, limit: int | None = None) -> SamplingPlan | None:
     """The widest spacings at which samples hold enough energy. None if the map has to be scanned: another
     kind or metric, few places, a single chunk, or mainly high frequencies.
 
@@ -66,38 +66,38 @@ def plan(route: PlaceMap, limit: int | None = None) -> Plan | None:
     Raises:
         InputError: the limit is below the samples of a single chunk.
     """
-    if not isinstance(route, SpectralMap) or route.metric != "cosine" or not route.chunks:
+    if not isinstance(place_map, SpectralMap) or place_map.metric != "cosine" or not place_map.chunks:
         return None
-    longest = max(stop - start for start, stop in route.chunks)
-    limit = max(MEMORY, MEMORY_PER_PLACE * route.places) if limit is None else limit
+    longest = max(stop - start for start, stop in place_map.chunks)
+    limit = max(MEMORY, MEMORY_PER_PLACE * place_map.places) if limit is None else limit
 
     def size(places: int, *spacings: int) -> int:
-        return sum(-(-places // d) * (route.dimension + OVERHEAD) for d in spacings)
+        return sum(-(-places // d) * (place_map.dimension + OVERHEAD) for d in spacings)
 
-    if route.places < max(MIN_PLACES, 2 * longest):
+    if place_map.places < max(MIN_PLACES, 2 * longest):
         return None
     minimum = size(longest, SPACINGS[0], SPACINGS[1])
     if limit < minimum:
         raise InputError(f"search_memory is {limit} bytes; expected at least {minimum}, for a chunk")
-    held = energy_held(route)
+    held = explained_variance(place_map)
     widest_coarse = next((d for d in SPACINGS if held[d] >= COARSE), 0)
     widest_fine = next((d for d in SPACINGS if held[d] >= FINE), 2)
     for coarse in [d for d in SPACINGS[::-1] if d >= max(4, widest_coarse)] if widest_coarse else ():
         for fine in [d for d in SPACINGS[::-1] if min(widest_fine, coarse // 2) <= d <= coarse // 2]:
-            if size(route.places, coarse, fine) <= limit:
+            if size(place_map.places, coarse, fine) <= limit:
                 refined = REFINED * (1 if coarse == widest_coarse else 4)
-                return Plan(coarse, fine, refined, held[coarse], size(route.places, coarse, fine))
+                return SamplingPlan(coarse, fine, refined, held[coarse], size(place_map.places, coarse, fine))
     return None
 
 
-def energy_held(route: SpectralMap) -> dict[int, float]:
+def explained_variance(place_map: SpectralMap) -> dict[int, float]:
     """The share of the lines' energy that samples at each of `SPACINGS` hold, from some chunks of a map."""
     held, whole = dict.fromkeys(SPACINGS, 0.0), 1e-30
-    for chunk in range(0, len(route.chunks), max(1, len(route.chunks) // MEASURED_CHUNKS)):
-        length = route.chunks[chunk][1] - route.chunks[chunk][0]
-        line, _, value = route.lines(chunk)
+    for chunk in range(0, len(place_map.chunks), max(1, len(place_map.chunks) // MEASURED_CHUNKS)):
+        length = place_map.chunks[chunk][1] - place_map.chunks[chunk][0]
+        line, _, value = place_map.lines(chunk)
         energy = value.new_zeros(length + 1, dtype=torch.float64)
-        energy.index_add_(0, half_cycles(line, route.transform), value.double().square())
+        energy.index_add_(0, half_cycles(line, place_map.transform), value.double().square())
         below = energy.cumsum(0).tolist()
         whole += below[-1]
         for d in SPACINGS:
@@ -105,7 +105,7 @@ def energy_held(route: SpectralMap) -> dict[int, float]:
     return {d: energy / whole for d, energy in held.items()}
 
 
-def searcher(route: PlaceMap, method: Search = "auto", memory: int | None = None) -> Scan:
+def searcher(place_map: PlaceMap, method: Search = "auto", memory: int | None = None) -> Scan:
     """The searcher of a map.
 
     Args:
@@ -113,8 +113,10 @@ def searcher(route: PlaceMap, method: Search = "auto", memory: int | None = None
         memory: bytes of the samples, see `plan`.
     """
     check_search(method)
-    chosen = plan(route, memory) if method in ("auto", "coarse") else None
-    return CoarseSearch(route, chosen) if isinstance(route, SpectralMap) and chosen else Scan(route)
+    chosen = plan(place_map, memory) if method in ("auto", "coarse") else None
+    return (
+        CoarseSearch(place_map, chosen) if isinstance(place_map, SpectralMap) and chosen else Scan(place_map)
+    )
 
 
 class Samples:
@@ -126,17 +128,17 @@ class Samples:
             order.
     """
 
-    def __init__(self, route: SpectralMap, spacing: int) -> None:
+    def __init__(self, place_map: SpectralMap, spacing: int) -> None:
         places = []
-        for chunk, (start, stop) in enumerate(route.chunks):
-            at = route.sampled(chunk, -(-(stop - start) // spacing))
+        for chunk, (start, stop) in enumerate(place_map.chunks):
+            at = place_map.sampled(chunk, -(-(stop - start) // spacing))
             places.append(F.pad(at, (0, -len(at) % GROUP), value=stop - start - 1) + start)
         place = torch.cat(places)
-        self.place = F.pad(place, (0, -len(place) % (GROUP * GROUPS_PER_BLOCK)), value=route.places - 1)
+        self.place = F.pad(place, (0, -len(place) % (GROUP * GROUPS_PER_BLOCK)), value=place_map.places - 1)
         # padding is 0, which is never the best
-        self.rows, first = self.place.new_zeros(len(self.place), route.dimension, dtype=torch.int8), 0
-        for chunk, (start, stop) in enumerate(route.chunks):
-            row = route.samples(chunk, -(-(stop - start) // spacing))
+        self.rows, first = self.place.new_zeros(len(self.place), place_map.dimension, dtype=torch.int8), 0
+        for chunk, (start, stop) in enumerate(place_map.chunks):
+            row = place_map.samples(chunk, -(-(stop - start) // spacing))
             self.rows[first : first + len(row)] = to_int8(F.normalize(row))
             first += len(places[chunk])
         norms = [torch.linalg.vector_norm(block.float(), dim=1) for block in self.rows.split(BLOCK)]
@@ -174,13 +176,13 @@ class CoarseSearch(Scan):
     Convention: scores are those of a scan. A query of norm 0, or one that is similar to no place, is scanned.
     """
 
-    route: SpectralMap
+    place_map: SpectralMap
 
-    def __init__(self, route: SpectralMap, chosen: Plan) -> None:
-        super().__init__(route)
+    def __init__(self, place_map: SpectralMap, chosen: SamplingPlan) -> None:
+        super().__init__(place_map)
         self.plan = chosen
-        self.starts = torch.tensor([start for start, _ in route.chunks], device=route.norms.device)
-        self.fine, self.coarse = Samples(route, chosen.fine), Samples(route, chosen.coarse)
+        self.starts = torch.tensor([start for start, _ in place_map.chunks], device=place_map.norms.device)
+        self.fine, self.coarse = Samples(place_map, chosen.fine), Samples(place_map, chosen.coarse)
         self.middle = torch.searchsorted(self.fine.place, self.coarse.place, out_int32=True)
 
     @torch.no_grad()
@@ -205,7 +207,7 @@ class CoarseSearch(Scan):
     def _windows(self, units: Tensor, best: Tensor, wanted: list[NmsSpec]) -> Tensor:
         """Places near the best fine samples of each query, (Q,M), by place; -1 for none. A window is wide
         enough for all candidates on one peak."""
-        plan, places = self.plan, self.route.places
+        plan, places = self.plan, self.place_map.places
         count = max(k for k, _ in wanted)
         group, best = topk_groups(best, max(plan.refined, 2 * count))
         reach = -(-plan.coarse // (2 * plan.fine))
@@ -236,9 +238,9 @@ class CoarseSearch(Scan):
             if g >= 0:
                 query, column = (chunk == g).nonzero().T
                 own, row = query.unique_consecutive(return_inverse=True)
-                here = self.route.products(units[own], range(g, g + 1))
-                products[query, column] = here[row, place[query, column] - self.route.chunks[g][0]]
-        norms = self.route.norms[place].masked_fill(place < 0, 1)
+                here = self.place_map.products(units[own], range(g, g + 1))
+                products[query, column] = here[row, place[query, column] - self.place_map.chunks[g][0]]
+        norms = self.place_map.norms[place].masked_fill(place < 0, 1)
         return scores_of(products, norms, norms, "cosine")
 
     def _incomplete(self, score: Tensor, place: Tensor, wanted: list[NmsSpec]) -> Tensor:

@@ -66,13 +66,13 @@ class Localizer:
 
     def __init__(
         self,
-        route: PlaceMap | None = None,
+        place_map: PlaceMap | None = None,
         matching: Matching = SINGLE,
         searcher: Searcher | None = None,
     ) -> None:
-        self.route, self.matching, self.track = route, matching, Track()
-        self.searcher = Scan(route) if searcher is None and route is not None else searcher
-        sequence, routes = matching.sequence, () if route is None else route.routes
+        self.place_map, self.matching, self.track = place_map, matching, Track()
+        self.searcher = Scan(place_map) if searcher is None and place_map is not None else searcher
+        sequence, routes = matching.sequence, () if place_map is None else place_map.routes
         self.own: Together = sequence.length if isinstance(sequence, SequenceMatcher) else "filter"
         self.models = {**matching.also, **({} if sequence is None else {self.own: sequence})}
         self.states: dict[Together, Tensor] = {}  # of the models; empty before the first query
@@ -80,23 +80,23 @@ class Localizer:
 
     @torch.no_grad()
     def __call__(self, descriptors: Tensor, label: str | None = None) -> Match:
-        route, matching = self.route, self.matching
-        assert route is not None
-        places = route.places
+        place_map, matching = self.place_map, self.matching
+        assert place_map is not None
+        places = place_map.places
         if not len(descriptors):
             return self.match(descriptors.new_zeros(0, places))
         wanted = [(matching.k or 1, matching.radius)]
         if matching.platt is not None:
             wanted.append((min(2, places), TOLERANCE))
         n = num_needed(wanted, places)
-        few = n <= max(1, MAX_SHARE * min(places, route.block_places)) or places > SCORES_AT_ONCE
+        few = n <= max(1, MAX_SHARE * min(places, place_map.block_places)) or places > SCORES_AT_ONCE
         searches = not self.models and matching.callback is None and (few or type(self.searcher) is not Scan)
         size = max(PER_BEST * n, places // PLACES_PER_NUMBER) if searches else places
         parts = descriptors.split(max(1, min(ROWS, SCORES_AT_ONCE // size)))
-        moved = (part.to(route.device) for part in with_progress(parts, label))
+        moved = (part.to(place_map.device) for part in with_progress(parts, label))
         if searches:
             return Match.joined(self._search(part, wanted) for part in moved)
-        return Match.joined(self.match(route.scores(part)) for part in moved)
+        return Match.joined(self.match(place_map.scores(part)) for part in moved)
 
     @torch.no_grad()
     def match(self, scores: Tensor) -> Match:
@@ -140,8 +140,8 @@ class Localizer:
         """Candidates (B,k) with their acceptance, and the probability that the first is right."""
         matching, match = self.matching, match.map(Tensor.cpu)
         match = replace(match, accepted=accept(match.score, matching.acceptance.threshold))
-        if self.route is not None and self.route.routes:
-            match = replace(match, route=self.route.table.route_of(match.index))
+        if self.place_map is not None and self.place_map.routes:
+            match = replace(match, route=self.place_map.table.route_of(match.index))
         if matching.platt is not None and confidence is not None:
             others = match.index.shape[1] - 1
             probability = F.pad(matching.platt.probability(confidence)[:, None], (0, others), value=math.nan)

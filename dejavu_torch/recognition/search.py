@@ -35,20 +35,20 @@ def num_needed(wanted: list[NmsSpec], places: int) -> int:
 class Scan:
     """The `Searcher` that scores all places of a map: only the scores of a block are in memory."""
 
-    def __init__(self, route: PlaceMap) -> None:
-        self.route, self.norms = route, getattr(route, "norms", None)
+    def __init__(self, place_map: PlaceMap) -> None:
+        self.place_map, self.norms = place_map, getattr(place_map, "norms", None)
 
-    def fits(self, route: PlaceMap) -> bool:
+    def fits(self, place_map: PlaceMap) -> bool:
         """Whether it searches this map, and the map still has the tensors that it had."""
-        return route is self.route and getattr(route, "norms", None) is self.norms
+        return place_map is self.place_map and getattr(place_map, "norms", None) is self.norms
 
     @torch.no_grad()
     def __call__(self, queries: Tensor, wanted: list[NmsSpec]) -> TopK:
-        route, n = self.route, num_needed(wanted, self.route.places)
+        place_map, n = self.place_map, num_needed(wanted, self.place_map.places)
         queries = queries.to(torch.promote_types(queries.dtype, torch.float32))
         (score, place), first = empty_topk(queries, n), 0
-        for part in queries.split(max(1, SCORES_AT_ONCE // max(1, route.block_places))):
-            for start, scores in route.score_blocks(part):
+        for part in queries.split(max(1, SCORES_AT_ONCE // max(1, place_map.block_places))):
+            for start, scores in place_map.score_blocks(part):
                 better = (scores.amin(1) < score[first : first + len(part), -1]).nonzero()[:, 0]
                 if len(better):
                     scores = scores[better] if len(better) < len(scores) else scores

@@ -20,7 +20,7 @@ from dejavu_torch.data.positions import place_of
 from dejavu_torch.data.source import as_traverse, routes_of
 from dejavu_torch.data.traverse import runs as runs_of
 from dejavu_torch.features.augmentation import Augmentation
-from dejavu_torch.features.views import STRETCH
+from dejavu_torch.features.views import SEGMENT
 from dejavu_torch.memory import check_room, concatenate
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, resampled
@@ -248,8 +248,8 @@ class RouteData(LightningDataModule):
         enough = len(frames) >= MIN_FRAMES and self.sources["validation"] is None
         if not (one_map and self.held_out and enough):
             return []
-        count = max(MIN_SEGMENTS, round(self.held_out * len(frames) / STRETCH))
-        return [(2 * i + 1) * len(frames) // (2 * count) - STRETCH // 2 for i in range(count)]
+        count = max(MIN_SEGMENTS, round(self.held_out * len(frames) / SEGMENT))
+        return [(2 * i + 1) * len(frames) // (2 * count) - SEGMENT // 2 for i in range(count)]
 
     def _of_task(self, name: str, default: Any = None) -> Any:
         """An attribute of the task in training; the default without one."""
@@ -366,7 +366,7 @@ class RouteData(LightningDataModule):
         sets = [self.sets[name] for name in ("reference", "second") if name in self.sets]
         parts = [part for one in sets for part in one.parts]
         frames = StoredFrames(parts, _concatenated([one.truth.positives for one in sets]))
-        held = torch.tensor(self.held, dtype=torch.int64)[:, None] + torch.arange(STRETCH)
+        held = torch.tensor(self.held, dtype=torch.int64)[:, None] + torch.arange(SEGMENT)
         kept = ~torch.isin(frames.truth.positives, held).any(1)
         each = torch.arange(len(frames)).split([len(part) for part in parts])
         runs = [run for part in each for run in runs_of(part[kept[part]])]

@@ -21,7 +21,7 @@ from dejavu_torch.evaluation.baselines import hog_baselines
 from dejavu_torch.evaluation.contenders import contend
 from dejavu_torch.evaluation.curves import Scores
 from dejavu_torch.features.preprocess import Preprocess
-from dejavu_torch.features.views import Views, augmented_segments
+from dejavu_torch.features.views import LabelledFrames, augmented_segments
 from dejavu_torch.features.whitening import STRENGTHS
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.template_map import TemplateMapper
@@ -138,7 +138,7 @@ def calibrate(model: DejaVu, data: RouteData, starts: list[int]) -> None:
         frames, truth = unseen
         frames = _of_shape(frames, model.frame_shape) if validated else frames
         try:
-            model.calibrate(data.reference, Views(frames, truth.positives[:, 0]))
+            model.calibrate(data.reference, LabelledFrames(frames, truth.positives[:, 0]))
         except InputError as error:
             log.warning("the map is not calibrated: %s", error)
     elif data.held:
