@@ -100,7 +100,7 @@ class Graph(nn.Module):
         if model.whitening is not None and model.whitening.learned:
             whitening = copy.deepcopy(model.whitening)
             for part in whitening.parts:
-                part.projection = part.unpacked_projection  # not two values per byte
+                part.projection = part.unpacked  # not two values per byte
             parts["whitening"] = whitening
         parts["map"] = Decoded(model.map) if isinstance(model.map, SpectralMap) else model.map
         self.parts = nn.ModuleDict(parts)  # the stages in order

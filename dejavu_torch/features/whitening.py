@@ -160,7 +160,7 @@ class Whitening(nn.Module):
         self.members = nn.ModuleList()  # a whitening per group, whose outputs the projection joins
 
     @property
-    def unpacked_projection(self) -> Tensor:
+    def unpacked(self) -> Tensor:
         """(D,K): the projection in units of `scale`."""
         if self.projection.dtype != torch.uint8:
             return self.projection
@@ -172,9 +172,9 @@ class Whitening(nn.Module):
         """This whitening, and those of its groups."""
         return [self, *(member for member in self.members if isinstance(member, Whitening))]
 
-    def unpacked_projections(self) -> list[Tensor]:
-        """`unpacked_projection` of all `parts` as float32, column-major, for a fast `forward` of single descriptors."""
-        return [part.unpacked_projection.T.float().contiguous().T for part in self.parts]
+    def all_unpacked(self) -> list[Tensor]:
+        """`unpacked` of all `parts` as float32, column-major, for a fast `forward` of single descriptors."""
+        return [part.unpacked.T.float().contiguous().T for part in self.parts]
 
     @property
     def sizes(self) -> list[int]:
@@ -192,7 +192,7 @@ class Whitening(nn.Module):
         return len(self.scale) + len(self.length)
 
     def forward(self, descriptors: Tensor, projections: Sequence[Tensor] | None = None) -> Tensor:
-        """Descriptors (B,D) -> (B,K); `projections`: stored `unpacked_projections`."""
+        """Descriptors (B,D) -> (B,K); `projections`: stored `all_unpacked`."""
         if not self.learned:
             return descriptors
         shape, sizes = tuple(descriptors.shape), self.sizes
@@ -201,7 +201,7 @@ class Whitening(nn.Module):
         # bf16 is too coarse for the small differences that whitening amplifies
         with torch.autocast(descriptors.device.type, enabled=False):
             exact = descriptors.to(torch.promote_types(descriptors.dtype, torch.float32))
-            wholes = [part.unpacked_projection for part in self.parts] if projections is None else projections
+            wholes = [part.unpacked for part in self.parts] if projections is None else projections
             if len(self.members):
                 each = zip(self.parts[1:], exact.split(sizes, 1), wholes[1:], strict=True)
                 exact = torch.cat([member._project(own, whole) for member, own, whole in each], 1)

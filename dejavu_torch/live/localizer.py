@@ -79,9 +79,7 @@ class LiveLocalizer:
         self.model, self.sequence = model, PlaceFilter() if isinstance(sequence, str) else sequence
         self._shape: tuple[int, ...] | None = None  # of the latest valid frame
         whitening = model.whitening
-        self._projection = (
-            whitening.unpacked_projections() if whitening is not None and whitening.learned else None
-        )
+        self._projection = whitening.all_unpacked() if whitening is not None and whitening.learned else None
         self.reset()
 
     def reset(self) -> None:
