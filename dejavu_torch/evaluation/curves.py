@@ -299,4 +299,4 @@ def _judged(match: Match, truth: Truth, tolerance: int) -> tuple[Match, GroundTr
     if not kept.any():
         seen = f"of {len(kept)} queries {int(known.judged.sum())} are in the truth and none can be judged"
         raise InputError(f"{seen}; expected one in the truth that does not report an ignored place")
-    return match[kept], GroundTruth(*(column[kept] for column in known))
+    return match.map(lambda column: column[kept]), GroundTruth(*(column[kept] for column in known))
