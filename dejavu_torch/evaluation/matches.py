@@ -95,7 +95,7 @@ def write_matches(
             places = match.index if frame_of is None else frame_of(match.index)
             rank = torch.arange(each).repeat(len(queries)) + 1
             right = match.score if match.probability is None else match.probability
-            route = torch.full_like(places, -1) if match.route is None else match.route
+            route = match.route if routes and match.route is not None else torch.full_like(places, -1)
             cells = queries.repeat_interleave(each), places, match.score, match.accepted, right, rank, route
             for query, place, score, good, p, at, on in zip(*(one.tolist() for one in cells), strict=True):
                 row = {
