@@ -6,9 +6,9 @@ import pytest
 import torch
 from helpers import refused
 
-from dejavu_torch.data.traverse import Fitted
 from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.data.source import as_traverse
+from dejavu_torch.data.traverse import Fitted
 from dejavu_torch.evaluation.rejection import (
     draw_reliability,
     rejection_facts,
