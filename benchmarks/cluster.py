@@ -8,19 +8,20 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
+import torch
 
 from benchmarks.measure import Column, Contender, Row, bars, new_row, table, threads, with_ratios, write_bench
-from dejavu_torch.cluster import Cluster, code_on
+from dejavu_torch.cluster import Cluster
 from dejavu_torch.data.arrays import read_array
-from dejavu_torch.data.traverse import FrameRange
 from dejavu_torch.data.simulate.aerial import AerialRoad
-from dejavu_torch.learning import ChunkCoder
-from dejavu_torch.maps.spectral import SpectralMapper
+from dejavu_torch.data.traverse import Part, frame_range
+from dejavu_torch.learning import ChunkEncoder
+from dejavu_torch.maps.spectral import SpectralMapper, code_chunk
 from dejavu_torch.maps.spectral_map import Chunk, SpectralMap
 from dejavu_torch.model import DejaVu
-from dejavu_torch.types import Traverse
 
 CHUNK = 128  # places
 SAMPLE = 1000  # frames to learn whitening, mean and step from
@@ -51,33 +52,39 @@ def run_cluster(*, out: Path) -> list[str]:
         pictures = AerialRoad(frames=FRAMES).batches(64)
         np.save(path, np.concatenate([(255 * one.permute(0, 2, 3, 1)).byte().numpy() for one in pictures]))
         route = read_array(path)
-        model = DejaVu(mapper=SpectralMapper(4.0, chunk=CHUNK)).learn(FrameRange(route, stop=SAMPLE))
-        assert isinstance(model.map, SpectralMap)
-        coder = ChunkCoder.like(model.map, model.descriptor, route.count())
-        rows = timed(contenders_of(coder, route, cluster))
+        model = DejaVu(mapper=SpectralMapper(4.0, chunk=CHUNK)).learn(frame_range(route, stop=SAMPLE))
+        known = model.map
+        assert isinstance(known, SpectralMap)
+        settings = known.means[-1], known.step, known.transform, known.resolution
+        rows = timed(contenders_of(ChunkEncoder(route, model.descriptor, *settings), cluster))
     write_bench(out, rows, bars(rows))
     faster = [row | {"faster": rows[0]["seconds"] / row["seconds"]} for row in rows]
     note = "other chunks: share that differ from those of one process; processor seconds: of all processes"
     return [table(faster, COLUMNS, "{contender}"), note]
 
 
-def contenders_of(coder: ChunkCoder, route: Traverse, cluster: Cluster) -> list[Contender]:
+def contenders_of(encode: ChunkEncoder, cluster: Cluster) -> list[Contender]:
     """What encodes all chunks; threads: of all processes together."""
-    every = range(coder.total)
+    tasks = [range(i, i + CHUNK) for i in range(0, FRAMES, CHUNK)]
+
+    def every(_: range) -> Any:  # in one task
+        return [*map(encode, tasks)]
 
     def threaded() -> list[Chunk]:
-        with threads(cluster.workers):
-            return list(coder.chunks(route, every))
+        with threads(cluster.workers), torch.no_grad():
+            parts = (encode.descriptor.batches(Part(encode.traverse, task)) for task in tasks)
+            settings = encode.mean, encode.step, encode.transform, encode.resolution
+            return [code_chunk(torch.cat([*part]), *settings) for part in parts]
 
     def works(name: str, count: int, work: Callable[[], list[Chunk]]) -> Contender:
         return Contender(name, lambda: work, count)
 
     workers = cluster.workers
     return [
-        works("dejavu, one process", 1, lambda: [*coder.chunks(route, every)]),
+        works("dejavu, one process", 1, lambda: [*map(encode, tasks)]),
         works(f"dejavu, one process, {workers} threads", workers, threaded),
-        works("dejavu, 1 worker", 1, lambda: [*code_on(cluster, coder, route, every, together=coder.total)]),
-        works(f"dejavu, {workers} workers", workers, lambda: [*code_on(cluster, coder, route, every)]),
+        works("dejavu, 1 worker", 1, lambda: cast(Any, next(cluster.map(every, [range(FRAMES)])))),
+        works(f"dejavu, {workers} workers", workers, lambda: [*cluster.map(encode, tasks)]),
     ]
 
 

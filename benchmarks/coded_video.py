@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.traverse import IndexedTraverse
+from dejavu_torch.data.traverse import Part
 from dejavu_torch.resize import resize_frames
 from dejavu_torch.types import InputError, Traverse
 
@@ -22,7 +22,7 @@ BATCH = 64
 WITHOUT_END = 10**6  # frames between key frames: only the first is one
 
 
-class CodedVideo(IndexedTraverse):
+class CodedVideo(Traverse):
     """Every step-th frame of a traverse, reduced, encoded, decoded, and enlarged again.
 
     codec: "libx264" or "libx265"; ValueError if it is not installed. crf: its quality, from 0 (best) to 51.
@@ -46,7 +46,7 @@ class CodedVideo(IndexedTraverse):
         if codec == "libx265":
             encoder.options |= {"x265-params": "log-level=none:info=0"}
         packets, count = [], 0
-        for batch in traverse.select(range(0, traverse.length or WITHOUT_END, step), BATCH):
+        for batch in Part(traverse, range(0, len(traverse), step)).batches(BATCH):
             for pixels in _pixels(batch, small):
                 frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
                 frame.pts, count = count, count + 1
@@ -55,11 +55,13 @@ class CodedVideo(IndexedTraverse):
         self.bytes = sum(packet.size for packet in packets)
         decoded = [frame for packet in [*packets, None] for frame in decoder.decode(packet)]
         self.frames = ArrayTraverse(np.stack([frame.to_ndarray(format="rgb24") for frame in decoded]))
-        self.length = self.frames.length
-        if self.length != count:
-            raise InputError(f"{codec} returned {self.length} frames; expected {count}")
+        if len(self) != count:
+            raise InputError(f"{codec} returned {len(self)} frames; expected {count}")
 
-    def read(self, frames: range) -> Tensor:
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def read(self, frames: range | list[int]) -> Tensor:
         return resize_frames(self.frames.read(frames), self.size)
 
 

@@ -17,6 +17,7 @@ from benchmarks.leaves import leaves
 from benchmarks.measure import Row, bars, write_bench
 from dejavu_torch.data.output import whole_folder
 from dejavu_torch.data.source import open_source
+from dejavu_torch.data.traverse import Part
 from dejavu_torch.evaluation.report import text_table
 from dejavu_torch.features.distilled import SIZE, STRIDES, WEIGHTS, distilled_maps, loaded
 from dejavu_torch.features.truncate import run, up_to
@@ -89,8 +90,8 @@ def teacher() -> nn.Module:
 def frames_of(kind: str, seed: int) -> Tensor:
     """Some frames of a simulated route, (n, 3, 128, 128) uint8."""
     route = open_source(f"sim:{kind}?seed={seed}")
-    chosen = range(0, route.count(), max(1, route.count() // FRAMES))
-    seen = (batch.expand(-1, 3, -1, -1) for batch in route.select(chosen, BATCH))
+    chosen = Part(route, range(0, len(route), max(1, len(route) // FRAMES)))
+    seen = (batch.expand(-1, 3, -1, -1) for batch in chosen.batches(BATCH))
     parts = (resize_frames(batch, (SIDE, SIDE)) for batch in seen)
     return torch.cat([(255 * part).to(torch.uint8) for part in parts])
 

@@ -162,7 +162,7 @@ def parts_of(model: DejaVu, video: Video) -> dict[str, float]:
     began = time.perf_counter()
     decoded = sum(1 for _ in video.batches(1))
     seconds = {"decoding": (time.perf_counter() - began) / decoded}
-    (frame,) = video.between(0, 1)
+    frame = video[:1]
     features, unpacked = model.descriptor.describe(frame), whitening.unpacked()
     descriptor = whitening(features, unpacked)
     scores, state = model.map.scores(descriptor), filter.start(model.map.places)

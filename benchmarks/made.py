@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from itertools import groupby
 from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dejavu_torch.data.traverse import IndexedTraverse
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, Traverse
 
 REACH = 2048  # places on either side that influence a made descriptor, at most
 BLOCK = 4096  # places made together; each block has its own random numbers
@@ -72,7 +72,7 @@ def _filters(series: Tensor) -> Tensor:
     return filters * (series.std(0) / size.clamp(min=1e-12))
 
 
-class MadeRoute(IndexedTraverse):
+class MadeRoute(Traverse):
     """Descriptors with the covariance, and the spectrum along the route, of one that was measured.
 
     Convention: Gaussian, then scaled to length 1 like whitened descriptors. A place depends only on its
@@ -85,15 +85,17 @@ class MadeRoute(IndexedTraverse):
         self._noise = lru_cache(4)(self._drawn)
         self._made = lru_cache(2)(self._block)
 
-    def read(self, frames: range) -> Tensor:
-        at = torch.arange(frames.start, frames.stop, frames.step)
-        blocks = at // BLOCK
-        return torch.cat([self._made(int(b))[at[blocks == b] - int(b) * BLOCK] for b in blocks.unique()])
+    def __len__(self) -> int:
+        return self.length
+
+    def read(self, frames: range | list[int]) -> Tensor:
+        runs = groupby(frames, lambda i: i // BLOCK)
+        return torch.cat([self._made(b)[[i - b * BLOCK for i in run]] for b, run in runs])
 
     def seen_again(self, places: Tensor) -> Tensor:
         """The same places on a second traverse. (Q,) -> (Q,K)"""
         like = self.like
-        own = torch.cat([self.read(range(i, i + 1)) for i in places.tolist()])
+        own = self[places]
         generator = torch.Generator().manual_seed(PRIME * self.seed + PRIME - 1)
         noise = torch.randn(own.shape, generator=generator) @ like.spread
         sizes = like.sizes[torch.randint(len(like.sizes), (len(own), 1), generator=generator)]

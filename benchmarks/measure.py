@@ -28,7 +28,6 @@ from tqdm import tqdm
 
 import dejavu_torch
 from benchmarks.plots import plot_ratios
-from dejavu_torch.data.traverse import IndexedTraverse
 from dejavu_torch.data.ground_truth import GroundTruth
 from dejavu_torch.data.output import whole_folder
 from dejavu_torch.evaluation.plots import Plot
@@ -68,12 +67,12 @@ class Contender(NamedTuple):
 class Store(ABC):
     """A way to keep a route in a file and to find places on it, each in a process of its own."""
 
-    def prepare(self, route: IndexedTraverse) -> float | None:
+    def prepare(self, route: Traverse) -> float | None:
         """Choose settings by the route, outside of learning; returns the step of a map learned with one."""
         return None
 
     @abstractmethod
-    def learn(self, route: IndexedTraverse, path: Path) -> int:
+    def learn(self, route: Traverse, path: Path) -> int:
         """Write a route to a file; returns the bytes that grow with the route."""
 
     @abstractmethod
@@ -245,24 +244,17 @@ def end_with_parent() -> None:
 def truth_of(
     reference: Traverse,
     query: Traverse,
-    frames: int | None = None,
-    queries: int | None = None,
     given: str | None = None,
 ) -> GroundTruth:
     """The given ground truth, that of the sources, or frame i is place i.
 
-    Args:
-        frames, queries: lengths of traverses that do not know theirs.
-
     Raises:
         InputError: there is no ground truth.
     """
-    truth = ground_truth_of(given, reference, query, frames, queries, aligned=True)
+    truth = ground_truth_of(given, reference, query, aligned=True)
     if truth is None:
-        seen = f"{reference.name} has {frames or reference.length} frames"
-        raise InputError(
-            f"{seen} and {query.name} {queries or query.length}; expected as many, frame i being place i"
-        )
+        seen = f"{reference.name} has {len(reference)} frames and {query.name} {len(query)}"
+        raise InputError(f"{seen}; expected as many, frame i being place i")
     return truth
 
 

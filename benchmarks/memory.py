@@ -37,7 +37,6 @@ from benchmarks.measure import (
     write_bench,
 )
 from benchmarks.scale_contenders import Mapped
-from dejavu_torch.data.traverse import IndexedTraverse
 from dejavu_torch.data.output import temporary_folder
 from dejavu_torch.data.simulate.aerial import HEIGHT, VIEW, paint_route
 from dejavu_torch.features.hog import HOG
@@ -71,7 +70,7 @@ class Held(Store):
     def __init__(self, whitened: bool) -> None:
         self.model = DejaVu(HOG(), Whitening() if whitened else "none").eval()
 
-    def learn(self, route: IndexedTraverse, path: Path) -> int:
+    def learn(self, route: Traverse, path: Path) -> int:
         model, fixed = self.model, {}
         if model.whitening is None:
             held = model.descriptor.all_of(route)
@@ -88,7 +87,7 @@ class Held(Store):
         lengths = torch.linalg.vector_norm(held, dim=1).square()
 
         def find(frames: Tensor) -> tuple[Tensor, Tensor]:
-            score, place = (lengths - 2 * model.descriptor.whitened(model.descriptor.describe(frames)) @ held.T).min(1)
+            score, place = (lengths - 2 * model.descriptor(frames) @ held.T).min(1)
             return score, place
 
         return find
@@ -101,7 +100,7 @@ class Faiss(scale_contenders.Faiss):
         super().__init__("Flat")
         self.model = DejaVu(whitening="none").eval()
 
-    def parts(self, route: IndexedTraverse) -> Iterable[Tensor]:
+    def parts(self, route: Traverse) -> Iterable[Tensor]:
         return self.model.descriptor.batches(route)
 
     def describe(self, queries: Tensor) -> Tensor:
@@ -152,16 +151,19 @@ def paint_drives(folder: Path, places: int) -> None:
             ) from error
 
 
-class Drive(IndexedTraverse):
+class Drive(Traverse):
     """The frames of a drive: windows of an image (VIEW,W,3) that start at the columns `shown`, (N,)."""
 
     def __init__(self, image: NDArray[np.uint8], shown: Tensor) -> None:
-        self.name, self.length = "drive", len(shown)
+        self.name = "drive"
         self.windows = sliding_window_view(image, VIEW, 1).transpose(1, 0, 3, 2)
         self.shown = shown.numpy()
 
-    def read(self, frames: range) -> Tensor:
-        part = self.windows[self.shown[frames.start : frames.stop : frames.step]]
+    def __len__(self) -> int:
+        return len(self.shown)
+
+    def read(self, frames: range | list[int]) -> Tensor:
+        part = self.windows[self.shown[frames]]
         return torch.from_numpy(part).permute(0, 3, 1, 2).float() / 255
 
 

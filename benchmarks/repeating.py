@@ -8,12 +8,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dejavu_torch.data.traverse import IndexedTraverse
 from dejavu_torch.data.simulate.aerial import TILES, AerialRoad
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.maps.quantisation import quantise
 from dejavu_torch.maps.spectrum import spectrum
 from dejavu_torch.model import DejaVu
+from dejavu_torch.types import Traverse
 
 LOOKED_AT = 16  # dimensions of a descriptor by which a step is chosen
 HALVINGS = 12
@@ -38,19 +38,22 @@ def tiles_of(model: DejaVu) -> dict[str, Tensor]:
     return {"first": first, "second": second}
 
 
-class TiledRoute(IndexedTraverse):
+class TiledRoute(Traverse):
     """Descriptors of two tiles that repeat; first, second: see `tiles_of`."""
 
     def __init__(self, first: Tensor, second: Tensor, length: int) -> None:
         self.first, self.second, self.length = first, second, length
         self.name = f"{length} places of two tiles"
 
-    def read(self, frames: range) -> Tensor:
-        at = torch.arange(frames.start, frames.stop, frames.step)
+    def __len__(self) -> int:
+        return self.length
+
+    def read(self, frames: range | list[int]) -> Tensor:
+        at = torch.as_tensor(frames)
         return F.normalize(self.first[at % len(self.first)] + self.second[at % len(self.second)], dim=1)
 
 
-def step_that_holds(share: float, route: IndexedTraverse, chunk: int) -> float:
+def step_that_holds(share: float, route: Traverse, chunk: int) -> float:
     """The step of a spectral map that holds this share of a route's variance, by some of its dimensions."""
     columns = torch.linspace(0, route.frame_shape[0] - 1, LOOKED_AT).long()
     series = torch.cat([part[:, columns] for part in route.batches(ROWS)])

@@ -42,14 +42,14 @@ from benchmarks.scale_report import RECALL, exponents, pictured, scale_row, scal
 from benchmarks.template_search import PLACES as TEMPLATES
 from benchmarks.template_search import bench_templates
 from dejavu_torch.cli.device import device_of
-from dejavu_torch.data.traverse import FrameRange, IndexedTraverse
 from dejavu_torch.data.output import temporary_folder
 from dejavu_torch.data.simulate.aerial import LONGEST, AerialRoad
+from dejavu_torch.data.traverse import Part, frame_range
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.maps import codec, distance
 from dejavu_torch.model import DejaVu
-from dejavu_torch.types import InputError, Match
+from dejavu_torch.types import InputError, Match, Traverse
 
 PLACES = (10_000, 100_000, 1_000_000)
 FEWEST, MOST = 500, 10**8
@@ -93,7 +93,7 @@ class Task(NamedTuple):
         return folder / f"kept-{self.case}-{list(CONTENDERS).index(learned)}"
 
 
-class Kept(IndexedTraverse):
+class Kept(Traverse):
     """The first places of the descriptors in a file.
 
     The file is mapped again for each part: pages that stay mapped would count as memory of the process.
@@ -102,9 +102,12 @@ class Kept(IndexedTraverse):
     def __init__(self, path: Path, length: int) -> None:
         self.path, self.length, self.name = path, length, path.stem
 
-    def read(self, frames: range) -> Tensor:
+    def __len__(self) -> int:
+        return self.length
+
+    def read(self, frames: range | list[int]) -> Tensor:
         values = np.load(self.path, mmap_mode="r")
-        return torch.from_numpy(np.array(values[frames.start : frames.stop : frames.step]))
+        return torch.from_numpy(np.array(values[frames]))
 
 
 def learn(task: Task, folder: Path) -> dict[str, Any]:
@@ -223,7 +226,7 @@ class Folder:
     def __init__(self, path: Path, drawn: int) -> None:
         self.path, self.model = path, DejaVu(HOG())  # `tiles_of` splits it
         first, self.second = AerialRoad(frames=drawn), AerialRoad(frames=drawn, traverse=1)
-        self.model.descriptor.learn(FrameRange(first, 0, min(drawn, DESCRIBED)))
+        self.model.descriptor.learn(frame_range(first, 0, min(drawn, DESCRIBED)))
         self.keep("drawn", drawn, self.seen(first, range(drawn)))
         shown, places = spread(drawn), torch.from_numpy(np.load(path / "drawn.npy"))
         self.like: Likeness = likeness(places, self.described(self.second, shown), shown)
@@ -255,7 +258,7 @@ class Folder:
 
     @torch.no_grad()
     def seen(self, road: AerialRoad, frames: range) -> Iterator[Tensor]:
-        for part in road.select(frames, 64):
+        for part in Part(road, frames).batches(64):
             yield self.model.descriptor.whitened(self.model.descriptor.describe(part))
 
     def keep(self, name: str, places: int, parts: Iterator[Tensor]) -> None:

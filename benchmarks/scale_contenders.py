@@ -15,12 +15,12 @@ from torch import Tensor
 
 from benchmarks.measure import OURS, Find, Store
 from benchmarks.repeating import step_that_holds
-from dejavu_torch.data.traverse import IndexedTraverse
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.coarse import searcher
 from dejavu_torch.recognition.search import Search
+from dejavu_torch.types import Traverse
 
 ROWS = 8192  # descriptors read together
 CHUNK = 8192
@@ -48,13 +48,13 @@ class Mapped(Store):
     ) -> None:
         self.mapper, self.whitening, self.shuffled, self.search = mapper, whitening, shuffled, search
 
-    def prepare(self, route: IndexedTraverse) -> float | None:
+    def prepare(self, route: Traverse) -> float | None:
         return getattr(self.mapper, "step", None)
 
-    def learn(self, route: IndexedTraverse, path: Path) -> int:
+    def learn(self, route: Traverse, path: Path) -> int:
         model = DejaVu(whitening=self.whitening, mapper=self.mapper)
         if self.shuffled:
-            order = torch.randperm(route.length, generator=torch.Generator().manual_seed(0))
+            order = torch.randperm(len(route), generator=torch.Generator().manual_seed(0))
             rows = torch.cat(list(route.batches(ROWS)))
             model.learn(rows[order])
             np.save(path.with_suffix(".npy"), order.numpy())
@@ -82,7 +82,7 @@ class Held(Mapped):
 
     mapper: SpectralMapper
 
-    def prepare(self, route: IndexedTraverse) -> float | None:
+    def prepare(self, route: Traverse) -> float | None:
         self.mapper.step = step_that_holds(SHARE, route, self.mapper.chunk)
         return self.mapper.step
 
@@ -98,19 +98,19 @@ class Faiss(Store):
     def __init__(self, factory: str, probes: int | None = None) -> None:
         self.factory, self.probes = factory, probes
 
-    def parts(self, route: IndexedTraverse) -> Iterable[Tensor]:
+    def parts(self, route: Traverse) -> Iterable[Tensor]:
         """The descriptors of a route to store, in batches."""
         return route.batches(ROWS)
 
     def describe(self, queries: Tensor) -> Tensor:
         return queries
 
-    def learn(self, route: IndexedTraverse, path: Path) -> int:
+    def learn(self, route: Traverse, path: Path) -> int:
         import faiss
 
         faiss.omp_set_num_threads(torch.get_num_threads())
-        every = -(-route.length // TRAINED)
-        cells = max(1, min(4 * math.isqrt(route.length), -(-route.length // every) // 40))
+        every = -(-len(route) // TRAINED)
+        cells = max(1, min(4 * math.isqrt(len(route)), -(-len(route) // every) // 40))
         numbers = self.describe(route.read(range(1))).shape[1]
         index: Any = faiss.index_factory(numbers, self.factory.format(cells=cells))
         if isinstance(
@@ -120,13 +120,13 @@ class Faiss(Store):
             rotation: Any = faiss.downcast_VectorTransform(chain.at(0))
             rotation.max_train_points = ROTATED
         if not index.is_trained:
-            index.train(torch.cat(list(route.select(range(0, route.length, every), ROWS))).numpy())
+            index.train(route[::every].numpy())
         faiss.write_index(index, str(path))
         empty = path.stat().st_size
         for part in self.parts(route):
             index.add(part.numpy())
         faiss.write_index(index, str(path))
-        names = 8 * route.length if "IVF" in self.factory else 0
+        names = 8 * len(route) if "IVF" in self.factory else 0
         return path.stat().st_size - empty - names
 
     def load(self, path: Path, device: str = "cpu") -> Find:
@@ -150,14 +150,14 @@ class Faiss(Store):
 class Usearch(Store):
     """A graph of usearch over descriptors of length 1, in 8 bits per dimension."""
 
-    def learn(self, route: IndexedTraverse, path: Path) -> int:
+    def learn(self, route: Traverse, path: Path) -> int:
         from usearch.index import Index
 
         index: Any = Index(ndim=route.frame_shape[0], metric="cos", dtype="i8")
-        for first, part in zip(range(0, route.length, ROWS), route.batches(ROWS), strict=True):
+        for first, part in zip(range(0, len(route), ROWS), route.batches(ROWS), strict=True):
             index.add(np.arange(first, first + len(part)), part.numpy(), threads=torch.get_num_threads())
         index.save(str(path))
-        return path.stat().st_size - 8 * route.length  # names
+        return path.stat().st_size - 8 * len(route)  # names
 
     def load(self, path: Path, device: str = "cpu") -> Find:
         from usearch.index import Index
@@ -179,16 +179,16 @@ class Interpolated(Store):
     def __init__(self, room: float) -> None:
         self.room = room
 
-    def learn(self, route: IndexedTraverse, path: Path) -> int:
+    def learn(self, route: Traverse, path: Path) -> int:
         from dejavu_torch.evaluation.baselines import as_int8, keyframes
 
         each = route.frame_shape[0]
-        k = max(1, math.ceil((route.length - 1) / max(1, self.room * route.length // each - 1)))
-        chosen = keyframes(route.length, k)
-        rows = torch.cat([route.read(range(i, i + 1)) for i in chosen.tolist()])
+        k = max(1, math.ceil((len(route) - 1) / max(1, self.room * len(route) // each - 1)))
+        chosen = keyframes(len(route), k)
+        rows = route[chosen]
         scale = rows.abs().max() / 127
         small = (as_int8(rows) / scale).round().to(torch.int8)
-        save_file({"keys": small, "scale": scale.view(1), "k": torch.tensor([k, route.length])}, path)
+        save_file({"keys": small, "scale": scale.view(1), "k": torch.tensor([k, len(route)])}, path)
         return small.nbytes
 
     def load(self, path: Path, device: str = "cpu") -> Find:

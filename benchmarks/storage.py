@@ -221,7 +221,7 @@ def routes_of(
             address = f"sim:{kind}?" + (f"frames={size}&" if size else "")
             seen = ("seed=0&traverse=0", "seed=0&traverse=1", "seed=1&traverse=0")
             reference, query, other = (open_source(address + one) for one in seen)
-            found.append((f"sim:{kind}, {reference.length} places", reference, query, other))
+            found.append((f"sim:{kind}, {len(reference)} places", reference, query, other))
     return found
 
 
@@ -241,10 +241,9 @@ def check(model: DejaVu, reference: Traverse, query: Traverse, truth: str | None
             f"the whitening is of {sum(whitening.sizes)} features and {reference.name} gives {features} "
             "per frame; expected as many, so frames of the same size"
         )
-    if reference.length is not None and query.length is not None:
-        truth_of(reference, query, reference.length, query.length, truth)
-    if model.map.places and reference.length is not None:
-        check_places(model, reference.length, reference.name)
+    truth_of(reference, query, truth)
+    if model.map.places:
+        check_places(model, len(reference), reference.name)
 
 
 def described(
@@ -259,7 +258,7 @@ def described(
     """A route described by a model, which learns its whitening if it has none; None is the default model."""
     model = DejaVu() if model is None else model
     places, queries = both(model, reference, query)
-    right = truth_of(reference, query, len(places), len(queries), truth)
+    right = truth_of(reference, query, truth)
     return Route(name, model, reference, query, places, queries, right, other, tolerance)
 
 

@@ -64,7 +64,7 @@ FEW_VIEWS = {
     *("test_storage_bench", "test_train_command", "test_held_out", "test_devices", "test_free_memory"),
     *("test_spectral_model", "test_notebooks"),
 }
-DRAWN = ("test_simulate", "test_golden", "test_frame_range", "test_source")  # what simulated routes draw
+DRAWN = ("test_simulate", "test_golden", "test_traverse", "test_source")  # what simulated routes draw
 MOST_HELD = 40_000_000  # numbers of frames
 PIXELS = FEW_VIEWS - {"test_demo", "test_compare"} | {"test_real_routes"}
 UNDRAWN = ("test_compare", "test_real_routes", "test_several_places", "test_other_data")
@@ -121,7 +121,7 @@ def _short_work(request: pytest.FixtureRequest) -> Iterator[None]:
 held: dict[tuple[str, int], Tensor] = {}  # frames by route and number
 
 
-def read_once(route: SimulatedRoute, frames: range) -> Tensor:
+def read_once(route: SimulatedRoute, frames: range | list[int]) -> Tensor:
     """Frames of a simulated route: drawing them took most of the time of many a test."""
     if sum(map(Tensor.numel, held.values())) > MOST_HELD:
         held.clear()

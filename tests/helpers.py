@@ -38,17 +38,6 @@ def all_of(traverse: Traverse, batch: int = 64) -> Tensor:
     return torch.cat(list(traverse.batches(batch)))
 
 
-class Stream(Traverse):
-    """Frames that can only be read from the beginning, of unknown length, in batches of odd sizes."""
-
-    def __init__(self, values: Tensor) -> None:
-        self.values = values
-
-    def batches(self, size: int) -> Iterator[Tensor]:
-        if len(self.values):
-            yield from self.values.split(min(size, 7))
-
-
 class Fixed(PeriodFinder):
     """Layers that are known beforehand."""
 

@@ -342,7 +342,9 @@ def test_a_sequence_does_not_run_from_one_route_into_the_next() -> None:
         assert not torch.equal(whole, expected)  # as one route's places they would count
         assert torch.equal(merged.localize(queries, sequence=matcher).index, expected.argmin(1))
         seen: list[Tensor] = []
-        merged.localizer(merged.matching(matcher)._replace(callback=seen.append))(merged.descriptor.whitened(queries))
+        merged.localizer(merged.matching(matcher)._replace(callback=seen.append))(
+            merged.descriptor.whitened(queries)
+        )
         torch.testing.assert_close(torch.cat(seen), expected, atol=1e-5, rtol=0)
     assert merged.localize(queries, sequence=PlaceFilter()).index.shape == (30,)
 

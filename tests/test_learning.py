@@ -21,8 +21,8 @@ from torch import Tensor
 
 from dejavu_torch import growth, learning
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.traverse import Chain
 from dejavu_torch.data.source import open_source
+from dejavu_torch.data.traverse import Chain
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.views import Views
 from dejavu_torch.features.whitening import Whitening

@@ -315,8 +315,9 @@ def test_frames_keep_their_size_where_it_was_asked_for(tmp_path: Path) -> None:
     block = DejaVu(HOG()).at_map_size(ArrayTraverse(torch.rand(1, 1, 20, 500)))
     assert block.frame_shape == (1, 16, 400)
     assert DejaVu(HOG(resize=(100, 100))).at_map_size(open_source(images)).frame_shape == (1, 100, 200)
-    assert DejaVu(preprocess=Preprocess(size=None)).at_map_size(open_source(images)).frame_shape == (1, 200, 400)
-    assert DejaVu(preprocess=Preprocess(size=50)).at_map_size(open_source(images)).frame_shape == (1, 25, 50)
+    for size, shape in ((None, (1, 200, 400)), (50, (1, 25, 50))):
+        small = DejaVu(preprocess=Preprocess(size=size)).at_map_size(open_source(images))
+        assert small.frame_shape == shape
     for size in (0, 1.5):
         with refused("size=", "at least 1"):
             Preprocess(size=size)  # type: ignore[arg-type]

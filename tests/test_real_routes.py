@@ -169,7 +169,8 @@ def test_even_steps_leave_the_period_of_a_constant_speed(
 @pytest.mark.figures
 def test_laps_in_even_steps_are_blunter_or_sharper_by_the_ground_one_looks_at(data_dir: Path) -> None:
     laps = open_source(f"{data_dir}/rc_car_laps/frames")
-    features = DejaVu(features=HOG()).descriptor.all_of(open_source(f"{data_dir}/rc_car_laps/frames?width=80"))
+    small = open_source(f"{data_dir}/rc_car_laps/frames?width=80")
+    features = DejaVu(features=HOG()).descriptor.all_of(small)
     told = rows(section("Laps of a small car"))
     frames = {"original frames": torch.arange(len(features))}
     for name in ("even steps, near ground", "even steps, far ground"):

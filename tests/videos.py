@@ -30,11 +30,13 @@ def clip(
     pixels: str = "bgr0",
     ticks: list[int] | None = None,
     bframes: int | None = None,
+    group: int | None = None,
     turn: int | None = None,
     options: dict[str, str] | None = None,
     base: Fraction = Fraction(1, 25),
 ) -> Path:
-    """Write frames at 25 per second, or at the given multiples of the time base."""
+    """Write frames at 25 per second, or at the given multiples of the time base, `group` from one key frame
+    to the next."""
     with av.open(str(path), "w", options=options or {}) as container:
         stream = container.add_stream(codec, rate=25)
         stream.height, stream.width = frames.shape[1:3]
@@ -42,6 +44,8 @@ def clip(
         stream.codec_context.time_base = base
         if bframes is not None:
             stream.codec_context.max_b_frames = bframes
+        if group is not None:
+            stream.codec_context.gop_size = group
         if turn is not None:
             stream.set_display_rotation(turn)
         for i, pixel in enumerate(frames):

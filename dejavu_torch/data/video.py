@@ -118,7 +118,9 @@ class Video(Traverse):
             _FORKED.append(self._decoder)  # closing it would wait for threads that are not in this process
             self._decoder = None
         if self._decoder is None or not key <= self._next <= i:
-            self._decoder, self._owner, self._next = self._frames(key), os.getpid(), key
+            self._owner, self._next = os.getpid(), key
+            # of a copy: not in a circle, the file is closed as soon as this object is gone
+            self._decoder = self.changed(_decoder=None)._frames(key)
         decoder, self._decoder = self._decoder, None  # after an error or the last frame
         for frame in decoder:
             self._next += 1
@@ -149,7 +151,7 @@ class Video(Traverse):
                     raise self._broken(i, "frames are missing")
                 size = size or (frame.height, frame.width)
                 check_same_size(self.name, i, frame, size)
-                i += 1
+                i = self._next = i + 1
                 yield frame
         if i == first > 0:  # the container cannot seek exactly
             yield from islice(self._frames(0), first, None)

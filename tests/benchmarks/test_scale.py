@@ -85,7 +85,9 @@ def test_descriptors_of_tiles_are_those_of_the_frames() -> None:
     model = DejaVu(HOG(), Whitening(numbers=16))
     assert model.whitening is not None
     still = {"ground": "repeat", "noise": 0, "drift": 0, "yaw": 0}
-    features = torch.cat([model.descriptor.describe(part) for part in AerialRoad(frames=200, **still).batches(64)])  # type: ignore[arg-type]
+    features = torch.cat(
+        [model.descriptor.describe(part) for part in AerialRoad(frames=200, **still).batches(64)]
+    )  # type: ignore[arg-type]
     noise = torch.randn(features.shape, generator=torch.Generator().manual_seed(0))
     model.whitening.learn(features, [(features + 0.02 * noise, torch.arange(200))])
     road = AerialRoad(frames=math.lcm(*TILES), **still)  # type: ignore[arg-type]

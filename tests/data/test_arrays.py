@@ -44,7 +44,7 @@ def test_values(values: np.ndarray, expected: Tensor, kind: str, tmp_path: Path)
     found = all_of(traverse)
     assert found.dtype == expected.dtype
     assert torch.equal(found, expected)
-    assert traverse.length == 7
+    assert len(traverse) == 7
 
 
 @pytest.mark.parametrize(
@@ -61,7 +61,7 @@ def test_a_file_beside_features_names_their_images(tmp_path: Path, text: str, or
     traverse = read_array(tmp_path / "a.npy")
     names = [line.strip("\ufeff ") for line in text.splitlines() if line]
     for one in (traverse, pickle.loads(pickle.dumps(traverse))):
-        assert [one.frame_name(i) for i in range(7)] == names
+        assert one.names == names
     assert traverse.ordered is ordered
     assert torch.equal(all_of(traverse), torch.tensor(FEATURES))
 
@@ -81,7 +81,7 @@ def test_names_that_are_no_text_are_refused_and_frames_have_none(tmp_path: Path)
         (tmp_path / name).write_bytes(b"\xff\xfe\n" * 7)
     with refused("a.txt", "UTF-8"):
         read_array(tmp_path / "a.npy")
-    assert read_array(tmp_path / "b.npy").frame_name(0) == ""
+    assert read_array(tmp_path / "b.npy").names == ()
 
 
 def test_another_byte_order_is_read(tmp_path: Path) -> None:

@@ -57,7 +57,7 @@ def test_a_pipe_gives_the_frames_of_the_file(tmp_path: Path, stream: bytes) -> N
 
 def test_frames_are_brought_to_a_size_as_those_of_a_file(tmp_path: Path, stream: bytes) -> None:
     (tmp_path / "clip.ts").write_bytes(stream)
-    (expected,) = Video(tmp_path / "clip.ts", width=24, height=16).between(0, 1)
+    expected = Video(tmp_path / "clip.ts", width=24, height=16)[0]
     with piped(tmp_path, stream) as pipe:
         camera = Camera(pipe, (16, 24))
         first = next(iter(camera))
@@ -65,7 +65,7 @@ def test_frames_are_brought_to_a_size_as_those_of_a_file(tmp_path: Path, stream:
     assert stretched("pipe", (32, 48), (16, 16)) == (
         "pipe: frames of 32 x 48 pixels are stretched to the map's 16 x 16"
     )
-    assert torch.equal(torch.from_numpy(first.pixels.copy()).permute(2, 0, 1) / 255, expected[0])
+    assert torch.equal(torch.from_numpy(first.pixels.copy()).permute(2, 0, 1) / 255, expected)
 
 
 def test_a_stream_that_changes_size_keeps_what_came_before(tmp_path: Path, stream: bytes) -> None:

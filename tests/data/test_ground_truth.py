@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import math
 import zipfile
 from contextlib import chdir
 from itertools import pairwise
@@ -21,7 +20,6 @@ from torch import Tensor
 
 from dejavu_torch import memory
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.traverse import FrameRange
 from dejavu_torch.data.ground_truth import (
     GroundTruth,
     check_ground_truth,
@@ -37,6 +35,7 @@ from dejavu_torch.data.ground_truth import (
 )
 from dejavu_torch.data.positions import look_up
 from dejavu_torch.data.strip import SlidingWindow
+from dejavu_torch.data.traverse import frame_range
 from dejavu_torch.types import Traverse
 
 POSITIONS = st.lists(st.integers(-20, 20), min_size=1, max_size=12)
@@ -137,7 +136,7 @@ def test_a_soft_place_counts_neither_way_and_an_unknown_query_never() -> None:
 
 def route(length: int, place: list[float] | None = None) -> Traverse:
     traverse = ArrayTraverse(torch.rand(length, 2))
-    traverse.place = None if place is None else torch.tensor(place, dtype=torch.float64)
+    traverse.places = None if place is None else torch.tensor(place, dtype=torch.float64)
     return traverse
 
 
@@ -180,8 +179,8 @@ def written(folder: Path, text: str | bytes) -> str:
 def test_what_a_command_was_given_or_can_know(
     truth: str | None, reference: Traverse | None, query: Traverse | None, expected: list[int] | None
 ) -> None:
-    queries = query.length if query is not None else None
-    found = find_ground_truth(truth, reference, query, reference and reference.length, queries or 3)
+    queries = len(query) if query is not None else None
+    found = find_ground_truth(truth, reference, query, reference and len(reference), queries or 3)
     assert (found is None) == (expected is None)
     if found is not None:
         assert found.positives[:, 0].tolist() == expected
@@ -200,18 +199,12 @@ class Named(ArrayTraverse):
 
     def __init__(self, names: list[str], timed: bool = False) -> None:
         super().__init__(torch.rand(len(names), 2))
-        self.names, self.timed = names, timed
-
-    def frame_name(self, i: int) -> str:
-        return self.names[i]
-
-    def frame_time(self, i: int) -> float:
-        return float(i) if self.timed else math.nan
+        self.names, self.times = names, torch.arange(len(names)).double() if timed else None
 
 
 def strip(pixels: int, width: int = 8, **part: int) -> Traverse:
     window: Traverse = SlidingWindow(torch.rand(1, 8, pixels), width)
-    return FrameRange(window, **part) if part else window
+    return frame_range(window, **part) if part else window
 
 
 ABC, TIMES = list("abc"), ["0:00.0", "0:00.5", "0:01.0"]
@@ -221,7 +214,7 @@ ABC, TIMES = list("abc"), ["0:00.0", "0:00.5", "0:01.0"]
     ("reference", "query", "says"),
     [
         (Named(ABC), Named(ABC), True),
-        (FrameRange(Named([*"xabc"]), 1), Named(ABC), True),
+        (frame_range(Named([*"xabc"]), 1), Named(ABC), True),
         (route(3), route(3), False),
         (Named(ABC), Named(["b", "a", "c"]), False),
         (Named(["a", "b", ""]), Named(["a", "b", ""]), False),
@@ -239,8 +232,7 @@ ABC, TIMES = list("abc"), ["0:00.0", "0:00.5", "0:01.0"]
 def test_as_many_frames_are_the_same_places_where_they_say_so(
     reference: Traverse, query: Traverse, says: bool
 ) -> None:
-    frames, queries = reference.length, query.length
-    assert frames is not None
+    frames, queries = len(reference), len(query)
     assert queries == frames
     found = find_ground_truth(None, reference, query, frames, queries)
     named = known(None, reference, query, frames, queries, aligned=True)  # by a user
@@ -642,7 +634,7 @@ def test_positions_and_coordinates_are_of_frames() -> None:
     query = images(*((10 * i, 0) for i in range(1, 12)))
     found = known("utm:1", reference, query, 12, SHOWN, resampled=True)
     assert sets(found.positives) == [{4}, {10}]
-    part = known("utm:1", FrameRange(reference, start=2), query, 10, SHOWN)
+    part = known("utm:1", frame_range(reference, start=2), query, 10, SHOWN)
     assert sets(part.positives) == [{2}, {8}]
     carried = route(12, list(range(12))), route(10, list(range(1, 11)))
     found = known(None, *carried, 12, SHOWN, resampled=True)

@@ -16,8 +16,8 @@ from PIL import Image
 
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.folder import ImageFolder
-from dejavu_torch.data.traverse import FrameRange
-from dejavu_torch.data.names import MAX_NAME_LENGTH, clock_time, decode_names, encode_names, names_of
+from dejavu_torch.data.names import MAX_NAME_LENGTH, clock_time, decode_names, encode_names
+from dejavu_torch.data.traverse import frame_range
 
 
 def packed(names: list[str]) -> str:
@@ -66,9 +66,9 @@ def test_the_names_of_a_traverse(tmp_path: Path) -> None:
     for i in range(8, 12):
         Image.new("L", (2, 2)).save(tmp_path / f"{i}.png")
     folder = ImageFolder(tmp_path)
-    assert names_of(folder, 4) == ["8.png", "9.png", "10.png", "11.png"]
-    assert names_of(FrameRange(folder, start=1, step=2), 2) == ["9.png", "11.png"]
-    assert names_of(ArrayTraverse(torch.rand(5, 2)), 5) == []
+    assert folder.names == ["8.png", "9.png", "10.png", "11.png"]
+    assert frame_range(folder, start=1, step=2).names == ["9.png", "11.png"]
+    assert ArrayTraverse(torch.rand(5, 2)).names == ()
 
 
 def test_a_name_beyond_reason_is_refused() -> None:

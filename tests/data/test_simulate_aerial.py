@@ -39,8 +39,8 @@ def flights() -> tuple[Tensor, Tensor]:
 def test_a_road_describes_itself() -> None:
     road = AerialRoad(frames=50, size=32)
     assert road.name == "sim:aerial?seed=0&traverse=0&frames=50&size=32"
-    assert road.length == 50
-    assert torch.equal(road.place, torch.arange(50, dtype=torch.float64))
+    assert len(road) == 50
+    assert torch.equal(road.places, torch.arange(50, dtype=torch.float64))
 
 
 def test_frames_depend_on_the_arguments_alone() -> None:
@@ -50,7 +50,7 @@ def test_frames_depend_on_the_arguments_alone() -> None:
     assert whole.shape == (70, 3, 64, 64)
     for batch in (7, 64):
         assert torch.equal(all_of(AerialRoad(seed=5, traverse=1, frames=70), batch), whole)
-    assert torch.equal(torch.cat(list(road.between(60, 80))), whole[60:])
+    assert torch.equal(road[60:80], whole[60:])
     for other in (AerialRoad(seed=2, traverse=1, frames=70), AerialRoad(seed=5, traverse=2, frames=70)):
         assert not torch.allclose(all_of(other), whole, atol=0.1)
     assert torch.equal(torch.get_rng_state(), before[0])
@@ -144,7 +144,7 @@ def test_the_road_between_the_tiles_is_the_same_everywhere(repeating: AerialRoad
 def test_repeating_ground_has_more_frames_than_ground_that_does_not() -> None:
     road = AerialRoad(ground="repeat", frames=math.lcm(*TILES), traverse=1)
     assert road.name == f"sim:aerial?seed=0&traverse=1&frames={math.lcm(*TILES)}&ground=repeat"
-    assert road.read(range(road.length - 1, road.length)).shape == (1, 3, VIEW, VIEW)
+    assert road.read(range(len(road) - 1, len(road))).shape == (1, 3, VIEW, VIEW)
     with refused(f"frames={math.lcm(*TILES)}", "frames <= 131072", "ground=repeat"):
         AerialRoad(frames=math.lcm(*TILES))
     with refused("frames=", f"1 <= frames <= {math.lcm(*TILES)}"):

@@ -35,7 +35,7 @@ def test_frame_i_begins_at_column_i_times_step(width: int, step: int, batch: int
     strip = torch.rand(2, 5, 9)
     traverse = SlidingWindow(strip, width, step)
     starts = range(0, 9 - width + 1, step)
-    assert traverse.length == len(starts)
+    assert len(traverse) == len(starts)
     assert torch.equal(all_of(traverse, batch), torch.stack([strip[:, :, i : i + width] for i in starts]))
 
 
@@ -48,7 +48,7 @@ def test_a_file_is_cut_as_asked(image: Path) -> None:
         open_source(f"strip:{image}?grey=1&halve=1&rows=2:8&width=7"),
     ):
         torch.testing.assert_close(all_of(traverse), expected.float(), atol=1e-6, rtol=0)
-        assert traverse.length == 14
+        assert len(traverse) == 14
 
 
 def test_a_file_as_it_is(image: Path) -> None:

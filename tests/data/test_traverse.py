@@ -1,24 +1,31 @@
-"""Parts of traverses, several as one route, and what every traverse offers by itself."""
+"""A traverse is a sequence, whatever it reads; parts, several as one, other sizes, and users' own frames."""
 
 from __future__ import annotations
 
-import math
 import pickle
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from command_line import frames, write_images
-from helpers import Stream, all_of, refused
+from footage import REFERENCE, camera, footage
+from helpers import all_of, refused
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
+from torch import Tensor
+from torch.utils.data import DataLoader, TensorDataset
+from videos import clip, numbers, pictures
 
-from dejavu_torch import types
+from dejavu_torch import DejaVu, types
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.traverse import Chain, FrameRange, Selection, chained, runs
-from dejavu_torch.data.source import open_source
+from dejavu_torch.data.source import as_traverse, open_source
+from dejavu_torch.data.traverse import Chain, Fitted, Frames, Part, at_size, chained, frame_range, runs
+from dejavu_torch.motion.resampling import ResampledTraverse
+from dejavu_torch.resize import is_stretched, reduced_size, resize_frames
 from dejavu_torch.types import Traverse
 
 VALUES = torch.arange(40.0)[:, None]
@@ -27,101 +34,171 @@ PARTS = st.tuples(st.integers(0, 39), st.integers(0, 40), st.integers(1, 45)).fi
 )
 
 
+# the sequence protocol
+
+
+def descriptor_file(folder: Path) -> Traverse:
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(folder / "a.h5", "w") as file:
+        for i, row in enumerate(np.random.default_rng(0).random((12, 4), np.float32)):
+            file[f"{i:02}.jpg/global_descriptor"] = row
+    return open_source(folder / "a.h5")
+
+
+MADE = {
+    "h5": lambda images, folder: descriptor_file(folder),
+    "chain": lambda images, folder: Chain([images, frame_range(images, 3, 9, 2)]),
+    "part": lambda images, folder: Part(images, torch.tensor([4, 1, 1, 11, 0, 7])),
+    "part of a part": lambda images, folder: Part(frame_range(images, 2, step=2), range(1, 5)),
+    "fitted": lambda images, folder: Fitted(images, (1, 8, 8)),
+    "resampled": lambda images, folder: ResampledTraverse(ArrayTraverse(footage(REFERENCE)), camera()),
+    "list": lambda images, folder: as_traverse([*images]),
+}
+SOURCES = ("images", "frames.npy", "features.npy", "clip.mkv", "clip.mp4", "strip", "aerial", "outdoor")
+
+
+@pytest.mark.parametrize("kind", [*SOURCES, *MADE])
+def test_any_traverse_is_a_sequence(kind: str, sources: dict[str, str], tmp_path: Path) -> None:
+    made, images = MADE.get(kind), open_source(sources["images"])
+    traverse: Traverse = made(images, tmp_path) if made else open_source(sources[kind])
+    count, whole = len(traverse), all_of(traverse, 5)
+    numbers = np.arange(count)
+
+    def same(found: Tensor, expected: Tensor) -> None:  # simulated frames are drawn together
+        torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
+
+    assert (len(whole), whole.shape[1:]) == (count, traverse.frame_shape)
+    same(traverse[:], whole)
+    same(torch.stack([*traverse]), whole)
+    for i in (count - 1, 0, 3, -1, -count, torch.tensor(2), np.int64(1)):
+        same(traverse[i], whole[int(i)])
+    mask = torch.arange(count) % 3 == 1
+    several: list[Any] = [slice(1, 5, 3), slice(-3, None), slice(None, None, -1), range(1, 4), [3, 2, 2, -1]]
+    for index in (*several, torch.tensor([3, 0, 3]), mask):
+        same(traverse[index], whole[numbers[index.numpy() if index is mask else index].copy()])
+    for none in (slice(3, 3), slice(count, count + 5), [], torch.zeros(count, dtype=torch.bool)):
+        assert traverse[none].shape == (0, *traverse.frame_shape)
+    for beyond in (count, -count - 1, [0, count]):
+        missing = beyond[-1] if isinstance(beyond, list) else beyond
+        with pytest.raises(IndexError) as caught:
+            traverse[beyond]
+        assert str(caught.value) == f"there is no frame {missing} of {traverse.name}, which has {count}"
+    with pytest.raises(TypeError, match="float"):
+        traverse[1.0]  # type: ignore[index]
+    assert len(traverse.names) in (0, count)
+    assert all(known is None or len(known) == count for known in (traverse.times, traverse.places))
+    same(all_of(pickle.loads(pickle.dumps(traverse))), whole)
+
+
+@pytest.mark.parametrize("how", ["fork", "spawn"])
+def test_a_loader_with_workers_gives_the_same_frames(how: str, sources: dict[str, str]) -> None:
+    for kind in ("clip.mp4", "images"):
+        traverse = open_source(sources[kind])
+        whole = traverse[:]
+        loader = DataLoader(traverse, batch_size=5, num_workers=2, multiprocessing_context=how)
+        assert torch.equal(torch.cat([*loader]), whole)
+
+
+def test_a_traverse_of_ones_own_is_a_length_and_a_reader() -> None:
+    class Ramp(Traverse):
+        def __init__(self, count: int) -> None:
+            self.count = count
+
+        def __len__(self) -> int:
+            return self.count
+
+        def read(self, frames: range | list[int]) -> Tensor:
+            return torch.tensor([*frames]).float()[:, None]
+
+    assert torch.equal(Ramp(40)[3:9], VALUES[3:9])
+    assert torch.equal(all_of(Ramp(40), 7), VALUES)
+    assert (Ramp(3).names, Ramp(3).times, Ramp(3).places, Ramp(3).frame_shape) == ((), None, None, (1,))
+    with refused("traverse holds no frames", "at least one"):
+        DejaVu().learn(Ramp(0))
+    with refused("0 frames", "at least 1"):
+        next(Ramp(3).batches(0))
+
+
+# parts, and several as one
+
+
 @given(PARTS, st.integers(1, 50))
 def test_a_part_is_a_slice_however_the_frames_are_read(part: tuple[int, int, int], size: int) -> None:
     start, stop, step = part
     expected = VALUES[start : stop or None : step]
-    for traverse in (Stream(VALUES), ArrayTraverse(VALUES), FrameRange(Stream(VALUES))):
-        some = FrameRange(traverse, start, stop, step)
-        frames = range(start, stop or len(VALUES), step)
-        for batches in (list(some.batches(size)), list(traverse.select(frames, size))):
-            assert torch.equal(torch.cat(batches), expected)
-            assert {len(batch) for batch in batches[:-1]} <= {size}
-        assert some.length in (None, len(expected))
-        inner = torch.cat([VALUES[:0], *some.between(1, 4)])
-        assert torch.equal(inner, expected[1:4])
+    for traverse in (ArrayTraverse(VALUES), frame_range(ArrayTraverse(VALUES))):
+        some = frame_range(traverse, start, stop, step)
+        batches = list(some.batches(size))
+        assert torch.equal(torch.cat(batches), expected)
+        assert {len(batch) for batch in batches[:-1]} <= {size}
+        assert len(some) == len(expected)
+        assert torch.equal(some[1:4], expected[1:4])
 
 
 def test_parts_of_parts_name_both() -> None:
-    part = FrameRange(FrameRange(ArrayTraverse(VALUES, "walk"), start=10), stop=8, step=2)
+    part = frame_range(frame_range(ArrayTraverse(VALUES, "walk"), start=10), stop=8, step=2)
     assert part.name == "walk[10:][0:8:2]"
-    assert all_of(part).flatten().tolist() == [10, 12, 14, 16]
+    assert part[:].flatten().tolist() == [10, 12, 14, 16]
 
 
-@pytest.mark.parametrize(("start", "stop"), [(40, 0), (90, 0), (0, 41), (50, 60)])
-def test_a_stream_that_ends_too_soon_is_refused(start: int, stop: int) -> None:
-    with refused("traverse[", "frames; expected"):
-        all_of(FrameRange(Stream(VALUES), start, stop))
-
-
-def test_the_shape_of_a_frame() -> None:
-    assert ArrayTraverse(torch.rand(3, 2)).frame_shape == (2,)
-    assert ArrayTraverse(torch.rand(3, 1, 4, 5)).frame_shape == (1, 4, 5)
-    assert FrameRange(Stream(VALUES), start=3).frame_shape == (1,)
-    with refused("holds no frames"):
-        _ = Stream(VALUES[:0]).frame_shape
-
-
-def parts(cuts: list[int], streams: bool) -> list[Traverse]:
+def parts(cuts: list[int]) -> list[Traverse]:
     bounds = [0, *sorted(cuts), len(VALUES)]
-    pieces = [VALUES[a:b] for a, b in pairwise(bounds) if b > a]
-    return [Stream(piece) if streams else ArrayTraverse(piece) for piece in pieces]
+    return [ArrayTraverse(VALUES[a:b]) for a, b in pairwise(bounds) if b > a]
 
 
-@given(
-    st.lists(st.integers(0, 40), max_size=4),
-    st.booleans(),
-    st.integers(1, 50),
-    st.integers(0, 40),
-    st.integers(0, 45),
-)
-def test_a_chain_reads_as_one_traverse(
-    cuts: list[int], streams: bool, size: int, start: int, stop: int
-) -> None:
-    chain = Chain(parts(cuts, streams))
+@given(st.lists(st.integers(0, 40), max_size=4), st.integers(1, 50), st.integers(0, 40), st.integers(0, 45))
+def test_a_chain_reads_as_one_traverse(cuts: list[int], size: int, start: int, stop: int) -> None:
+    chain = Chain(parts(cuts))
     assert torch.equal(all_of(chain, size), VALUES)
-    assert chain.length == (None if streams else 40)
-    assert chain.count() == 40
-    between = [VALUES[:0], *chain.between(start, stop)]
-    assert torch.equal(torch.cat(between), VALUES[start:stop])
-    selected = [VALUES[:0], *chain.select(range(start, stop, 3), size)]
-    assert torch.equal(torch.cat(selected), VALUES[start:stop:3])
+    assert len(chain) == 40
+    assert torch.equal(chain[start:stop:3], VALUES[start:stop:3])
+    mixed = [(7 * i + start) % 40 for i in range(stop)]
+    assert torch.equal(chain[mixed], VALUES[mixed])
 
 
-@given(st.sets(st.integers(0, 39)), st.booleans(), st.integers(1, 50))
-def test_a_selection_has_the_frames_with_these_numbers(numbers: set[int], streams: bool, size: int) -> None:
+@given(st.sets(st.integers(0, 39)), st.integers(1, 50))
+def test_a_part_has_the_frames_with_these_numbers(numbers: set[int], size: int) -> None:
     frame = torch.tensor(sorted(numbers), dtype=torch.int64)
-    traverse = Stream(VALUES) if streams else ArrayTraverse(VALUES)
-    some = Selection(traverse, frame)
-    assert some.length == len(frame)
+    some = Part(ArrayTraverse(VALUES), frame)
+    assert len(some) == len(frame)
     assert torch.equal(torch.cat([VALUES[:0], *some.batches(size)]), VALUES[frame])
     assert [i for run in runs(frame) for i in run] == sorted(numbers)
 
 
-@pytest.mark.parametrize("streams", [False, True])
-def test_large_frames_are_read_few_at_a_time(streams: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    chain = Chain(parts([20], streams))
-    some = Selection(chain, torch.arange(5, 30))
-    assert ArrayTraverse(torch.rand(9, 1, 4, 5)).batch_size(64) == 64
-    for numbers, most in ((3, 3), (0, 1)):
-        monkeypatch.setattr(types, "BATCH_NUMBERS", numbers)
+def test_repeated_frames_are_read_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    traverse, read = ArrayTraverse(VALUES), list[int]()
+    some = Part(traverse, torch.tensor([3, 3, 3, 9, 2, 9]))
+    monkeypatch.setattr(traverse, "read", lambda wanted: read.extend(wanted) or VALUES[[*wanted]])
+    assert some[:].flatten().tolist() == [3, 3, 3, 9, 2, 9]
+    assert read == [2, 3, 9]
+
+
+def test_large_frames_are_read_few_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    chain, large = Chain(parts([20])), ArrayTraverse(torch.rand(9, 1, 4, 5))
+    some = Part(chain, torch.arange(5, 30))
+    assert large.at_once(64) == 64
+    for values, most in ((3, 3), (0, 1)):
+        monkeypatch.setattr(types, "BATCH_NUMBERS", values)
         for traverse in (chain, some):
-            assert max(map(len, traverse.between(0, 25))) == traverse.batch_size(64) == most
-    assert torch.equal(torch.cat(list(some.select(range(25), 2))), VALUES[5:30])
+            assert max(map(len, traverse.batches(64))) == traverse.at_once(64) == most
+    assert torch.equal(all_of(some, 2), VALUES[5:30])
     monkeypatch.setattr(types, "FRAME_NUMBERS", 19)
     with refused("frames of 1 x 4 x 5 numbers", "expected at most 19"):
-        ArrayTraverse(torch.rand(9, 1, 4, 5)).batch_size(64)
+        large.at_once(64)
 
 
-def test_frames_keep_their_names_behind_that_of_their_traverse(tmp_path: Path) -> None:
+def test_frames_keep_their_names_and_times_behind_the_name_of_their_traverse(tmp_path: Path) -> None:
     folders = [write_images(tmp_path / name, frames(count, size=16)) for name, count in (("a", 3), ("b", 2))]
-    chain = chained([open_source(folder) for folder in folders])
-    assert [chain.frame_name(i) for i in range(5)] == ["a/0.png", "a/1.png", "a/2.png", "b/0.png", "b/1.png"]
-    assert math.isnan(chain.frame_time(4))
-    assert chain.seeks
-    assert not Chain([Stream(VALUES), open_source(folders[0])][:1]).seeks
-    alone = open_source(folders[0])
+    alone, other = map(open_source, folders)
+    chain = chained([alone, other])
+    assert chain.names == ["a/0.png", "a/1.png", "a/2.png", "b/0.png", "b/1.png"]
+    assert (chain.times, Part(chain, torch.tensor([4, 0])).names) == (None, ["b/1.png", "a/0.png"])
+    other.times = torch.tensor([0.5, 0.75], dtype=torch.float64)
+    times = chained([alone, other]).times
+    assert times is not None
+    assert [*times.isnan().tolist(), *times[3:].tolist()] == [True, True, True, False, False, 0.5, 0.75]
     assert chained([alone]) is alone
+    assert Chain([ArrayTraverse(VALUES)] * 2).names == ()
 
 
 def test_frames_of_other_sizes_are_refused() -> None:
@@ -135,10 +212,10 @@ def test_frames_of_other_sizes_are_refused() -> None:
 @pytest.mark.parametrize("source", ["aerial", "outdoor", "underground"])
 def test_a_simulated_route_goes_elsewhere_without_its_drawings(source: str) -> None:
     route = open_source(f"sim:{source}?frames=8&seed=3")
-    first = next(route.batches(2))
+    first = route[:2]
     packed = pickle.dumps(route)
     assert len(packed) < 1000
-    assert torch.equal(next(pickle.loads(packed).batches(2)), first)
+    assert torch.equal(pickle.loads(packed)[:2], first)
 
 
 def test_an_array_goes_elsewhere_as_its_file(tmp_path: Path) -> None:
@@ -146,40 +223,157 @@ def test_an_array_goes_elsewhere_as_its_file(tmp_path: Path) -> None:
     route = open_source(tmp_path / "route.npy")
     packed = pickle.dumps(route)
     assert len(packed) < 1000
-    assert torch.equal(all_of(pickle.loads(packed)), all_of(route))
+    assert torch.equal(pickle.loads(packed)[:], route[:])
     # a part of what is mapped goes as its values
-    mapped = np.load(tmp_path / "route.npy", mmap_mode="r")
-    part, other = ArrayTraverse(mapped[100:140]), ArrayTraverse(mapped[200:240])
-    assert torch.equal(all_of(pickle.loads(pickle.dumps(part))), all_of(route)[100:140])
-    assert part.state(0, 40) != other.state(0, 40)
+    part = ArrayTraverse(np.load(tmp_path / "route.npy", mmap_mode="r")[100:140])
+    assert torch.equal(pickle.loads(pickle.dumps(part))[:], route[100:140])
 
 
-def test_identities_tell_sources_apart(tmp_path: Path) -> None:
-    folder = write_images(tmp_path / "a", frames(3, size=16))
-    np.save(tmp_path / "b.npy", np.zeros((4, 8), np.float32))
-    sources = [folder, f"{folder}?width=8", f"{folder}?start=1", tmp_path / "b.npy"]
-    sources += ["sim:aerial?frames=9", "sim:aerial?frames=9&seed=1"]
-    opened = [open_source(source) for source in sources]
-    identities = [one.identity() for one in (*opened, Chain([opened[0], opened[0]]))]
-    assert len({*identities}) == 7
-    assert identities[:6] == [open_source(source).identity() for source in sources]
+# other sizes
 
 
-def test_states_change_with_the_frames_that_they_are_of(tmp_path: Path) -> None:
-    folder = write_images(tmp_path / "a", frames(3, size=16))
-    np.save(tmp_path / "b.npy", np.zeros((4, 8), np.float32))
-    images, array = open_source(folder), open_source(tmp_path / "b.npy")
-    chain, part = Chain([images, images]), open_source(f"{folder}?start=1")
-    watched = [(images, 0, 3), (array, 0, 3), (chain, 0, 3), (chain, 3, 4)]
-    others = [(images, 1, 3), (part, 0, 2), (chain, 1, 3), (chain, 4, 6)]
-    before, kept = ([one.state(start, stop) for one, start, stop in list] for list in (watched, others))
-    np.save(tmp_path / "b.npy", np.zeros((5, 8), np.float32))
-    (folder / "0.png").write_bytes((folder / "1.png").read_bytes() + b"\0")
-    assert all(one.state(a, b) != old for (one, a, b), old in zip(watched, before, strict=True))
-    assert [one.state(a, b) for one, a, b in others] == kept
-    (folder / "0.png").unlink()
-    with refused("0.png"):
-        images.state(0, 1)
-    arrays = [ArrayTraverse(values) for values in (VALUES, VALUES + 1, VALUES.to(torch.bfloat16))]
-    assert len({one.state(0, 3) for one in arrays}) == 3
-    assert ArrayTraverse(VALUES.clone()).state(0, 40) == arrays[0].state(0, 40)
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same 6 smooth frames of 64 x 96 pixels as images, as a video and as an array."""
+    folder, frames = tmp_path_factory.mktemp("frames"), pictures(6, 64, 96)
+    frames[:, :, 48:] = 100 + np.arange(48, dtype=np.uint8)[:, None]
+    (folder / "images").mkdir()
+    for i, frame in enumerate(frames):
+        Image.fromarray(frame).save(folder / "images" / f"{i}.png")
+    clip(folder / "clip.mkv", frames)
+    np.save(folder / "frames.npy", frames)
+    return folder
+
+
+@pytest.mark.parametrize(
+    "source", ["images", "clip.mkv", "frames.npy", "images?start=1&stop=6&step=2", "clip.mkv?stop=4"]
+)
+def test_frames_are_resized_and_all_else_stays(source: str, folder: Path) -> None:
+    own = open_source(f"{folder}/{source}")
+    own.places = torch.arange(len(own)).double()
+    first = own[0]  # what is open or known by now is of the other size
+    small = at_size(own, (32, 48))
+    assert small.frame_shape == (3, 32, 48)
+    assert (len(small), small.sized, small.ordered) == (len(own), True, own.ordered)
+    assert [*small.names] == [*own.names]
+    assert small.places is not None
+    assert torch.equal(small.places, own.places)
+    assert (own.frame_shape, own.sized) == ((3, 64, 96), False)
+    frames = all_of(small, batch=4)
+    assert numbers(frames) == numbers(own[:])
+    torch.testing.assert_close(frames, resize_frames(own[:], (32, 48)), atol=0.15, rtol=0)  # at the edge
+    torch.testing.assert_close(small[1:3], frames[1:3])
+    assert torch.equal(own[0], first)
+
+
+def test_large_frames_are_resized_few_at_a_time(
+    monkeypatch: pytest.MonkeyPatch, largest_tensor: type
+) -> None:
+    large = ArrayTraverse(torch.rand(9, 1, 40, 50))
+    monkeypatch.setattr(types, "BATCH_NUMBERS", 2 * 40 * 50)
+    with largest_tensor() as seen:
+        found = Fitted(large, (3, 4, 5))[:]
+    assert (found.shape, seen.numel) == ((9, 3, 4, 5), 2 * 40 * 50)
+    monkeypatch.undo()
+    torch.testing.assert_close(found, Fitted(large, (3, 4, 5))[:])
+
+
+def test_a_large_jpeg_is_decoded_small(tmp_path: Path) -> None:
+    across = torch.linspace(0, 255, 800).byte().expand(3, 600, 800)
+    Image.fromarray(across.permute(1, 2, 0).numpy()).save(tmp_path / "photo.jpg", quality=95)
+    small, whole = (open_source(f"{tmp_path}{size}")[:] for size in ("?width=80", ""))
+    assert small.shape == (1, 3, 60, 80)
+    torch.testing.assert_close(small, resize_frames(whole, (60, 80)), atol=0.02, rtol=0)
+
+
+def test_a_portrait_among_landscapes_is_refused(tmp_path: Path) -> None:
+    for i, size in enumerate(((400, 300), (404, 300), (300, 400))):
+        Image.new("L", size, 90).save(tmp_path / f"{i}.png")
+    with refused("2.png", "300 x 400", "aspect ratio", "0.png"):
+        all_of(at_size(open_source(tmp_path), (120, 160)))
+    assert open_source(f"{tmp_path}?width=160&height=120")[:].shape == (3, 1, 120, 160)  # as asked for
+
+
+def test_sizes() -> None:
+    assert reduced_size((4000, 1), 160) == (160, 1)
+    assert reduced_size((96, 96), 160) == (96, 96)
+    assert reduced_size((3000, 4000), None) == (3000, 4000)
+    assert reduced_size((480, 640), 160, least=(224, 224)) == (224, 299)
+    assert not is_stretched((480, 640), (90, 120))
+    assert is_stretched((480, 640), (120, 120))
+
+
+# a user's own frames
+
+
+class Labelled:
+    """A dataset without end in sight, as many have: items by number, and a length."""
+
+    def __init__(self, items: list[Any]) -> None:
+        self.items = items
+
+    def __len__(self) -> int:
+        return len(self.items)
+
+    def __getitem__(self, i: int) -> Any:
+        return self.items[i], i % 3
+
+
+def pil(frames: Tensor) -> list[Image.Image]:
+    return [Image.fromarray(frame) for frame in (frames.permute(0, 2, 3, 1) * 255).round().byte().numpy()]
+
+
+TOLD = {"pair": "of each pair the first part is taken", "pil": "PIL images are converted to floats in [0, 1]"}
+
+
+@pytest.mark.parametrize(
+    ("make", "told"),
+    [
+        (list, []),
+        (lambda frames: [*frames.numpy()], []),
+        (lambda frames: Labelled([*frames]), ["pair"]),
+        (TensorDataset, ["pair"]),
+        (pil, ["pil"]),
+        (lambda frames: Labelled(pil(frames)), ["pair", "pil"]),
+        (lambda frames: [np.asarray(image) for image in pil(frames)], []),
+    ],
+    ids=["tensors", "arrays", "pairs", "tensor dataset", "images", "pairs of images", "bytes"],
+)
+def test_any_frames_learn_and_localize(make: Any, told: list[str], caplog: pytest.LogCaptureFixture) -> None:
+    values = (open_source("sim:aerial?frames=40")[:] * 255).round() / 255
+    source = make(values)
+    assert torch.equal(as_traverse(source)[:], values)
+    expected = [f"the dataset: {', '.join(TOLD[one] for one in told)}"] if told else []
+    assert caplog.messages == expected
+    assert DejaVu().learn(source).localize(source).index.tolist() == list(range(40))
+
+
+def test_images_of_other_modes_are_frames() -> None:
+    grey, palette = Image.new("L", (5, 4), 51), Image.new("P", (5, 4))
+    assert torch.equal(as_traverse([grey])[:], torch.full((1, 1, 4, 5), 0.2))
+    assert as_traverse([palette, Image.new("RGBA", (5, 4))])[:].shape == (2, 3, 4, 5)
+    assert as_traverse([np.zeros((4, 5), np.uint8)]).frame_shape == (1, 4, 5)
+    assert as_traverse([torch.rand(7, dtype=torch.float64)] * 2)[:].dtype == torch.float64  # features
+
+
+@pytest.mark.parametrize(
+    ("source", "words"),
+    [
+        ({"a": torch.rand(3, 4, 5)}, ["got a dict", "expected a Traverse, a tensor or array"]),
+        (None, ["got a NoneType", "expected a Traverse"]),
+        (iter([torch.rand(3, 4, 5)]), ["got a list_iterator", "expected a Traverse"]),
+        ([], ["the dataset is empty"]),
+        ([1, 2], ["item 0 of the dataset is int", "expected a frame (C,H,W), features (D,) or an image"]),
+        ([torch.zeros(4, 5, dtype=torch.int64)], ["item 0", "(4, 5) torch.int64"]),
+        ([torch.rand(3, 4, 5), torch.rand(3, 4, 6)], ["item 1", "(3, 4, 6)", "expected (3, 4, 5) as item 0"]),
+        ([torch.rand(3, 4, 5), torch.rand(3)], ["item 1", "(3,)", "expected (3, 4, 5) as item 0"]),
+    ],
+)
+def test_what_holds_no_frames_of_one_shape_is_refused(source: Any, words: list[str]) -> None:
+    with refused(*words):
+        as_traverse(source)[:]
+
+
+def test_a_named_dataset_is_told_by_its_name() -> None:
+    with refused("item 1 of my photos"):
+        Frames([torch.rand(1, 4, 5), "two"], "my photos")[:]

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import pickle
+from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
 import pytest
 import torch
 from helpers import all_of, refused
-from torch import Tensor
 from torch.nn.functional import avg_pool2d
+from torch.utils.data import DataLoader
 from videos import H264, clip, numbers, pictures
 
 from dejavu_torch.data import video as video_module
@@ -38,10 +41,6 @@ FRONT = {"movflags": "faststart"}  # the table of contents first, so that a cut 
 FRAGMENTS = {"movflags": "empty_moov", "frag_duration": "400000"}  # of 10 frames each
 
 
-def times_of(video: Video) -> Tensor:
-    return torch.tensor([video.frame_time(i) for i in range(video.count())], dtype=torch.float64)
-
-
 @pytest.mark.parametrize("name", ["a.mkv", "a.avi", "with space: 100%d?.MKV", "12:30.mkv"])
 def test_lossless_pixels(tmp_path: Path, name: str) -> None:
     frames = pictures(5)
@@ -54,19 +53,15 @@ def test_lossless_pixels(tmp_path: Path, name: str) -> None:
 def test_frames_their_times_and_names_are_in_order(
     tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    path = clip(tmp_path / name, pictures(30), **KINDS[name])
-    video, fresh = Video(path), Video(path)
-    if name.endswith((".mp4", ".mov")):
-        assert video.length == 30  # the file lists its frames
-    named = [fresh.frame_name(i) for i in range(30)]
+    video = Video(clip(tmp_path / name, pictures(30), **KINDS[name]))
+    assert len(video) == 30
     for i, batch in enumerate(video.batches(7)):
-        numbered = list(range(7 * i, min(7 * i + 7, 30)))
         assert batch.shape[1:] == (3, 32, 48)
-        assert numbers(batch) == numbered
-        assert [video.frame_name(i) for i in numbered] == named[numbered[0] : numbered[-1] + 1]
-    times = times_of(video)
+        assert numbers(batch) == list(range(7 * i, min(7 * i + 7, 30)))
+    times = video.times
+    assert times is not None
     torch.testing.assert_close(times - times[0], torch.arange(30).double() / 25, atol=1e-3, rtol=0)
-    assert named == [clock_time(seconds) for seconds in times.tolist()]
+    assert video.names == [clock_time(seconds) for seconds in times.tolist()]
     assert len(all_of(Video(clip(tmp_path / "one.mkv", pictures(1))))) == 1
     assert caplog.messages == []  # the rate is steady
 
@@ -78,33 +73,65 @@ def test_the_batch_size_changes_nothing(tmp_path: Path, name: str) -> None:
     for batch in (1, 2, 5, 100):
         assert {len(part) for part in list(video.batches(batch))[:-1]} <= {batch}
         assert torch.equal(all_of(video, batch), whole)
-        chosen = list(Video(video.path).select(range(1, 9, 2), batch))
-        assert max(len(part) for part in chosen) <= batch
-        assert numbers(torch.cat(chosen)) == [1, 3, 5, 7]
-    assert numbers(torch.cat(list(Video(video.path).between(9, 20)))) == [9, 10]
 
 
-def test_a_name_costs_no_second_reading(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("group", [8, None], ids=["short groups", "one group"])
+@pytest.mark.parametrize("name", KINDS)
+def test_any_frame_is_exact_in_any_order(tmp_path: Path, name: str, group: int | None) -> None:
+    path = clip(tmp_path / name, pictures(30), group=group, **KINDS[name])
+    whole, video = all_of(Video(path)), Video(path)
+    assert numbers(whole) == list(range(30))
+    mixed = [29, 3, 3, 17, 8, 7, 9, 0, 28, 16, 24, 25, 1]
+    for i in (*mixed, *range(29, -1, -1), -1, -30):
+        assert torch.equal(video[i], whole[i])
+    assert torch.equal(video[mixed], whole[mixed])
+    assert torch.equal(Video(path)[20:26], whole[20:26])
+    assert torch.equal(pickle.loads(pickle.dumps(video))[[12, 4]], whole[[12, 4]])
+
+
+@pytest.mark.parametrize(("name", "key"), [("h264.mp4", 14), ("ffv1.mkv", 16)])
+def test_only_the_groups_asked_for_are_decoded(
+    tmp_path: Path, name: str, key: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = clip(tmp_path / name, pictures(30), group=8, **KINDS[name])
+    video, decode, decoded = Video(path), video_module._decode, list[int]()
+
+    def noted(*opened: Any) -> Iterator[Any]:
+        for frame in decode(*opened):
+            decoded.append(round(25 * frame.time))
+            yield frame
+
+    monkeypatch.setattr(video_module, "_decode", noted)
+    assert numbers(video[[18, 20]]) == [18, 20]
+    assert video[21].shape == (3, 32, 48)
+    assert decoded == list(range(key, 22))  # from a key frame on, each once
+
+
+def test_a_forked_process_reads_its_own_frames(tmp_path: Path) -> None:
+    video = Video(clip(tmp_path / "a.mp4", pictures(30), group=8, **H264))
+    assert numbers(video[9:12]) == [9, 10, 11]  # its file stays open
+    loader = DataLoader(video, batch_size=7, num_workers=2, multiprocessing_context="fork")
+    for _ in range(2):
+        assert numbers(torch.cat([*loader])) == list(range(30))
+    assert numbers(video[12:15]) == [12, 13, 14]
+
+
+def test_opening_reads_all_names_and_times(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     video = Video(clip(tmp_path / "a.mkv", pictures(30)))
-    batches = video.batches(4)
-    next(batches)
     monkeypatch.setattr(video, "_open", lambda: pytest.fail("it is read again"))
-    assert video.frame_name(3) == "0:00:00.120"
-    assert sum(len(part) for part in batches) == 26
-    assert video.frame_name(29) == "0:00:01.160"
+    assert (len(video), video.names[3], video.names[29]) == (30, "0:00:00.120", "0:00:01.160")
 
 
 @pytest.mark.parametrize("kind", ["h264.mp4", "h264.mkv", "mjpeg.avi"])
-@pytest.mark.parametrize("first", ["frames", "times"])
 def test_a_frame_rate_that_varies_is_told_once(
-    tmp_path: Path, kind: str, first: str, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, kind: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     ticks = [0, 1, 2, 3, 4, 5, 6, 9, 10, 11, 13, 14]
-    video = Video(clip(tmp_path / kind, pictures(12), ticks=ticks, **KINDS[kind]))
+    path = clip(tmp_path / kind, pictures(12), ticks=ticks, **KINDS[kind])
     for _ in (1, 2):
-        if first == "frames":
-            assert numbers(all_of(video)) == list(range(12))
-        assert torch.equal(times_of(video), torch.tensor(ticks, dtype=torch.float64) / 25)
+        video = Video(path)
+        assert numbers(all_of(video)) == list(range(12))
+        assert torch.equal(video.times, torch.tensor(ticks, dtype=torch.float64) / 25)
     (message,) = caplog.messages
     seen = f"{video.path}: the frame rate varies, 40 to 120 ms per frame (median 40)"
     assert message.startswith(seen)
@@ -121,8 +148,8 @@ def test_rounded_timestamps_are_no_varying_rate(
     base = Fraction(1, ticks)
     stamps = [round(i / rate / base) for i in range(40)]
     video = Video(clip(tmp_path / "a.mkv", pictures(40), ticks=stamps, base=base))
-    all_of(video)
-    assert len(set(times_of(video).diff().mul(1e6).round().tolist())) == 2  # they are rounded
+    assert video.times is not None
+    assert len(set(video.times.diff().mul(1e6).round().tolist())) == 2  # they are rounded
     assert caplog.messages == []
 
 
@@ -138,11 +165,10 @@ def test_frames_that_an_edit_list_hides_are_left_out(tmp_path: Path, hidden: int
                 packet.stream = stream
                 target.mux(packet)
     video = Video(tmp_path / "cut.mp4")
-    before = times_of(video)
-    assert video.length == 30 - hidden
+    assert len(video) == 30 - hidden
     assert numbers(all_of(video)) == list(range(hidden, 30))
-    assert torch.equal(before, torch.arange(30 - hidden).double() / 25)
-    assert torch.equal(times_of(video), before)
+    assert torch.equal(video.times, torch.arange(30 - hidden).double() / 25)
+    assert numbers(video[[20 - hidden, 2]]) == [20, 2 + hidden]
 
 
 @pytest.mark.parametrize(
@@ -176,18 +202,20 @@ def test_frames_are_streamed(tmp_path: Path, largest_tensor: type) -> None:
 
 @pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="needs /proc")
 def test_the_file_is_closed(tmp_path: Path) -> None:
-    video = Video(clip(tmp_path / "a.mkv", pictures(5)))
+    path = clip(tmp_path / "a.mkv", pictures(5))
+    video = Video(path)
 
     def is_open() -> bool:
-        return str(video.path) in [str(link.resolve()) for link in Path("/proc/self/fd").iterdir()]
+        return str(path) in [str(link.resolve()) for link in Path("/proc/self/fd").iterdir()]
 
     assert not is_open()
-    batches = video.batches(2)
-    next(batches)
-    assert is_open()
-    batches.close()
+    assert len(video[:2]) == 2
+    assert is_open()  # for the next frames
+    assert len(video[2:]) == 3
     assert not is_open()
-    assert len(times_of(video)) == 5
+    assert len(video[:1]) == 1
+    assert is_open()
+    del video
     assert not is_open()
 
 
@@ -309,9 +337,11 @@ def test_what_follows_a_video_does_not_matter(tmp_path: Path) -> None:
 
 def test_a_drive(data_dir: Path) -> None:
     video = Video(data_dir / "highway" / "solidWhiteRight.mp4", width=160)
-    assert video.length == 221
-    assert torch.equal(times_of(video), torch.arange(221).double() / 25)
-    assert all_of(video).shape == (221, 3, 90, 160)
+    assert len(video) == 221
+    assert torch.equal(video.times, torch.arange(221).double() / 25)
+    whole = all_of(video)
+    assert whole.shape == (221, 3, 90, 160)
+    assert torch.equal(video[[200, 7, 120]], whole[[200, 7, 120]])
     assert next(Video(video.path).batches(1)).shape == (1, 3, 540, 960)
 
 

@@ -116,7 +116,7 @@ def test_truth_that_lies_in_the_traverses(tmp_path: Path) -> None:
     stored, seen = ArrayTraverse(torch.rand(60, 2)), ArrayTraverse(torch.rand(5, 2))
     with refused("no ground truth"):
         evaluate_file(path, None, reference=stored, query=seen)
-    stored.place, seen.place = torch.arange(60.0), torch.tensor([0.0, 4.2, 2.0, 3.0, 30.0])
+    stored.places, seen.places = torch.arange(60.0), torch.tensor([0.0, 4.2, 2.0, 3.0, 30.0])
     assert evaluate_file(path, None, 0, reference=stored, query=seen).report.facts["accepted_right"] == 3
 
 

@@ -6,9 +6,9 @@ import pytest
 import torch
 from helpers import refused
 
-from dejavu_torch.data.traverse import Fitted
 from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.data.source import as_traverse
+from dejavu_torch.data.traverse import Fitted
 from dejavu_torch.evaluation.rejection import (
     draw_reliability,
     rejection_facts,
@@ -72,6 +72,6 @@ def test_frames_of_another_route_are_brought_to_the_map_s(shape: tuple[int, ...]
     for channels in (1, 3):
         fitted = Fitted(as_traverse(torch.rand(5, channels, 10, 12)), shape)
         assert [batch.shape for batch in fitted.batches(3)] == [(3, *shape), (2, *shape)]
-        assert fitted.length == 5
+        assert len(fitted) == 5
     with refused("expected frames, not features"):
         Fitted(as_traverse(torch.rand(5, 4)), shape)

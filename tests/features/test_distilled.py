@@ -103,7 +103,7 @@ def test_of_unseen_frames_it_tells_what_its_teacher_does() -> None:
 
 def _held(kind: str) -> list[Tensor]:
     route = open_source(f"sim:{kind}?seed={distil.HELD}&frames=320")
-    return [resize_frames(part, (96, 96)) for part in route.select(range(0, 320, 10), 64)]
+    return [resize_frames(route[::10], (96, 96))]
 
 
 def test_the_bench_makes_weights_that_the_class_reads(

@@ -25,10 +25,11 @@ from dejavu_torch import (
 )
 from dejavu_torch.cli.commands import run_learn
 from dejavu_torch.cli.parser import parse
+from dejavu_torch.features.descriptor import default_features, own_size
 from dejavu_torch.features.distilled import Distilled
 from dejavu_torch.features.joined import Joined, groups_of
 from dejavu_torch.features.pixels import PatchPixels
-from dejavu_torch.model import default_features, own_size
+from dejavu_torch.model import features_per_frame
 from dejavu_torch.model_file import recipe_of
 
 ZOO = """
@@ -184,7 +185,7 @@ def test_one_module_is_not_two_members(flights: list[Tensor], tmp_path: Path) ->
     with refused("several members of the features are", "Means", "as a list"):
         DejaVu.load(tmp_path / "map", features=Means())
     again = DejaVu.load(tmp_path / "map", features=Joined([Means(), Means()]))
-    torch.testing.assert_close(again.describe(flights[1]), model.descriptor.describe(flights[1]))
+    torch.testing.assert_close(again.descriptor.describe(flights[1]), model.descriptor.describe(flights[1]))
 
 
 # the command line -------------------------------------------------------------------------------------

@@ -181,7 +181,7 @@ def test_frames_left_out_move_the_filter_on(route: Tensor) -> None:
 
 def test_names_and_interruption(spectral: DejaVu, drive: Tensor, monkeypatch: pytest.MonkeyPatch) -> None:
     localizer = LiveLocalizer(spectral)
-    monkeypatch.setattr(spectral, "frame_names", [f"{i}.png" for i in range(PLACES)])
+    monkeypatch.setattr(spectral.state, "frame_names", [f"{i}.png" for i in range(PLACES)])
     assert localizer(drive[0]).name == f"{localizer(drive[0]).frame}.png"
 
     def interrupted(queries: Tensor) -> Tensor:

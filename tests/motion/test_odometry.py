@@ -104,7 +104,7 @@ JOURNEY = travelled(
 def shown(frames: Tensor, place: Tensor | None = None) -> ArrayTraverse:
     """Frames with known places."""
     traverse = ArrayTraverse(frames, "the drive")
-    traverse.place = place
+    traverse.places = place
     return traverse
 
 
@@ -342,27 +342,27 @@ def test_places_are_evenly_spaced() -> None:
     even = ResampledTraverse(journey(), GroundOdometry(step=8.0))
     true = JOURNEY[even.frame]
     furthest = JOURNEY.max()
-    assert even.length == len(even.frame) == len(all_of(even))
+    assert len(even) == len(even.frame) == len(all_of(even))
     assert even.positions.dtype == torch.float32
     assert len(even.positions) == len(JOURNEY)
-    assert abs(even.length - (int(furthest / 8) + 1)) <= 1
-    assert (true - 8 * torch.arange(even.length)).abs().max() < 16 / 2 + 0.01 * furthest
+    assert abs(len(even) - (int(furthest / 8) + 1)) <= 1
+    assert (true - 8 * torch.arange(len(even))).abs().max() < 16 / 2 + 0.01 * furthest
     assert (even.frame.diff() >= 0).all()
-    assert torch.equal(even.place, true)
+    assert torch.equal(even.places, true)
     assert torch.equal(all_of(even), journey().values[even.frame])
 
 
 def test_the_median_step_of_moving_frames_is_the_default() -> None:
     position = travelled((5, 5, 11), (0, 0, 30))
     even = ResampledTraverse(shown(drive(position)), GroundOdometry())
-    assert abs(even.length - 12) <= 1
+    assert abs(len(even) - 12) <= 1
     assert even.step == pytest.approx(5, abs=0.05)
-    assert even.place is None
+    assert even.places is None
 
 
 def test_a_camera_that_looks_back() -> None:
     even = ResampledTraverse(shown(short().values.flip(0)), GroundOdometry(step=5.0))
-    assert abs(even.length - 12) <= 1
+    assert abs(len(even) - 12) <= 1
     assert even.frame[0] == 0
 
 
@@ -375,8 +375,8 @@ def test_any_batch_size_any_number_of_times(step: float) -> None:
         assert max(len(batch) for batch in batches) <= size
         assert torch.equal(torch.cat(batches), frames)
     for start, stop in ((0, 1), (3, 9), (len(frames) - 2, len(frames) + 9)):
-        assert torch.equal(torch.cat(list(even.between(start, stop))), frames[start:stop])
-    assert list(even.between(len(frames), len(frames) + 5)) == []
+        assert torch.equal(even[start:stop], frames[start:stop])
+    assert len(even[len(frames) : len(frames) + 5]) == 0
 
 
 def test_few_frames_are_in_memory(largest_tensor: type) -> None:
