@@ -19,7 +19,7 @@ from dejavu_torch.data.arrays import read_array
 from dejavu_torch.data.simulate.aerial import AerialRoad
 from dejavu_torch.data.traverse import Part, frame_range
 from dejavu_torch.learning import ChunkEncoder
-from dejavu_torch.maps.spectral import SpectralMapper, code_chunk
+from dejavu_torch.maps.spectral import SpectralMapper, encode_chunk
 from dejavu_torch.maps.spectral_map import Chunk, SpectralMap
 from dejavu_torch.model import DejaVu
 
@@ -74,7 +74,7 @@ def contenders_of(encode: ChunkEncoder, cluster: Cluster) -> list[Contender]:
         with threads(cluster.workers), torch.no_grad():
             parts = (encode.descriptor.batches(Part(encode.traverse, task)) for task in tasks)
             settings = encode.mean, encode.step, encode.transform, encode.resolution
-            return [code_chunk(torch.cat([*part]), *settings) for part in parts]
+            return [encode_chunk(torch.cat([*part]), *settings) for part in parts]
 
     def works(name: str, count: int, work: Callable[[], list[Chunk]]) -> Contender:
         return Contender(name, lambda: work, count)

@@ -163,7 +163,7 @@ def parts_of(model: DejaVu, video: Video) -> dict[str, float]:
     decoded = sum(1 for _ in video.batches(1))
     seconds = {"decoding": (time.perf_counter() - began) / decoded}
     frame = video[:1]
-    features, unpacked = model.descriptor.describe(frame), whitening.unpacked()
+    features, unpacked = model.descriptor.describe(frame), whitening.all_unpacked()
     descriptor = whitening(features, unpacked)
     scores, state = model.map.scores(descriptor), filter.start(model.map.places)
     works: dict[str, Callable[[], object]] = {

@@ -32,7 +32,7 @@ def tiles_of(model: DejaVu) -> dict[str, Tensor]:
     whitening, road = model.whitening, AerialRoad(frames=max(TILES), ground="repeat", noise=0, drift=0, yaw=0)
     features = torch.cat([model.descriptor.describe(part) for part in road.batches(64)])
     middle = features.shape[1] // 7 * 3  # rows of blocks: three see the first tile
-    (whole,), scale = whitening.unpacked(), whitening.scale
+    (whole,), scale = whitening.all_unpacked(), whitening.scale
     first = features[: TILES[0], :middle] @ whole[:middle] * scale - whitening.offset
     second = features[: TILES[1], middle:] @ whole[middle:] * scale
     return {"first": first, "second": second}

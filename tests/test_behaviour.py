@@ -19,7 +19,7 @@ from dejavu_torch import (
 )
 from dejavu_torch.data.source import as_traverse
 from dejavu_torch.evaluation.controls import null_control
-from dejavu_torch.features.views import Views
+from dejavu_torch.features.views import LabelledFrames
 from dejavu_torch.growth import average, merge
 
 
@@ -124,7 +124,7 @@ def test_a_third_visit_weighs_a_third() -> None:
     first, others = smooth(60), (smooth(60) + 0.9, smooth(60) - 0.3)
     model = of_features(SpectralMapper(step=0.01, metric="l2", chunk=60), first)
     for visit in others:
-        average(model, Views(as_traverse(visit), torch.arange(60)))
+        average(model, LabelledFrames(as_traverse(visit), torch.arange(60)))
     assert model(first + 0.2).diagonal().max() < 0.01
     assert model(first + 0.3).diagonal().min() > 0.01
     assert (model.map.visit_counts == 3).all()

@@ -25,7 +25,7 @@ from dejavu_torch import learning
 from dejavu_torch.cluster import Cluster, ClusterSearch, code_on
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.source import open_source
-from dejavu_torch.features.views import Views
+from dejavu_torch.features.views import LabelledFrames
 from dejavu_torch.growth import learn_mean, merge
 from dejavu_torch.learning import Checkpoint, ChunkCoder, Sample
 from dejavu_torch.maps.spectral import SpectralMapper
@@ -106,7 +106,7 @@ def test_workers_write_the_file_of_one_process(
     kind: Callable[[Tensor], Traverse], cluster: Cluster, tmp_path: Path
 ) -> None:
     """Whitened, and with a second traverse averaged in."""
-    visits, files = Views(kind(route() + 0.1), torch.arange(PLACES)), []
+    visits, files = LabelledFrames(kind(route() + 0.1), torch.arange(PLACES)), []
     for code in (ChunkCoder.chunks, partial(code_on, cluster)):
         model = DejaVu(mapper=SpectralMapper(6.0, chunk=CHUNK))
         files.append(file_of(learn_mean(model, kind(route()), visits, code=code), tmp_path))
@@ -219,7 +219,7 @@ def test_a_part_scores_as_in_the_whole_map(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_probabilities_are_those_of_the_whole_map_whatever_happens_to_a_worker(cluster: Cluster) -> None:
     torch.manual_seed(0)
-    views = Views(ArrayTraverse(route() + 0.3 * torch.randn(PLACES, 8)), torch.arange(PLACES))
+    views = LabelledFrames(ArrayTraverse(route() + 0.3 * torch.randn(PLACES, 8)), torch.arange(PLACES))
     model = DejaVu(None, "none", SpectralMapper(6.0, chunk=CHUNK), precision=0.9).learn(route())
     model.calibrate(None, views)
     queries = route()[::5] + 0.4 * torch.randn(PLACES // 5, 8)

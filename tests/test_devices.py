@@ -45,7 +45,7 @@ from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.distilled import Distilled
 from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.pixels import PatchPixels
-from dejavu_torch.features.views import Views
+from dejavu_torch.features.views import LabelledFrames
 from dejavu_torch.maps.place_map import Mapper
 from dejavu_torch.recognition import coarse
 from dejavu_torch.recognition.select import best_candidates, best_match
@@ -226,7 +226,7 @@ def test_a_whitening_learned_on_a_gpu_is_that_of_the_cpu(device: str, frames: Te
 def test_a_map_calibrated_on_a_gpu_is_as_sure_as_that_of_the_cpu(device: str, visits: Visits) -> None:
     models = [small(whitening="none", mapper=LEARNED["spectral"]).to(one) for one in ("cpu", device)]
     for model in models:
-        model.learn(visits[0]).calibrate(visits[0], Views(visits[1], torch.arange(40)))
+        model.learn(visits[0]).calibrate(visits[0], LabelledFrames(visits[1], torch.arange(40)))
     expected, found = (model.calibration for model in models)
     assert expected is not None
     assert found is not None
@@ -277,11 +277,11 @@ def test_a_comparison_runs_on_a_gpu(
 
 def test_a_map_grows_on_a_gpu(device: str, visits: Visits) -> None:
     route, again = visits
-    second = Views(again, torch.arange(40))
+    second = LabelledFrames(again, torch.arange(40))
     model = small().to(device).learn(route, second=second, visits=second)
     model.calibrate(route, second)
-    grown = growth.append(copy.deepcopy(model), again, visits=Views(route, torch.arange(40)))
-    assert growth.average(model, Views(again, torch.arange(40))) == 40
+    grown = growth.append(copy.deepcopy(model), again, visits=LabelledFrames(route, torch.arange(40)))
+    assert growth.average(model, LabelledFrames(again, torch.arange(40))) == 40
     merged = growth.merge([model, grown], ["a", "b"])
     assert merged.map.places == 120
     for sequence in (PlaceFilter(), SequenceMatcher(3), None):

@@ -28,12 +28,12 @@ from dejavu_torch import (
 )
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.positions import count_places, positions_behind, shown_frames
-from dejavu_torch.features.views import Views
+from dejavu_torch.features.views import LabelledFrames
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.growth import append, associate, average, learn_mean, merge
 from dejavu_torch.maps.file import read_map
 from dejavu_torch.maps.frame_table import FrameTable, Route
-from dejavu_torch.maps.spectral import code_chunk
+from dejavu_torch.maps.spectral import encode_chunk
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.recognition.calibration import Calibration, Platt
 from dejavu_torch.types import Traverse
@@ -65,7 +65,7 @@ def spectral(model: DejaVu) -> SpectralMap:
 
 
 def coding_of(route: SpectralMap) -> Any:
-    """What `code_chunk` takes beside descriptors."""
+    """What `encode_chunk` takes beside descriptors."""
     return route.means[0], route.step, route.transform, route.resolution
 
 
@@ -95,7 +95,7 @@ def test_the_file_is_that_of_all_places_learned_at_once(
     for i, part in enumerate(others):
         append(model, ArrayTraverse(part, "rest") if i else part)
     known = spectral(whole)
-    whole.map = known.of_chunks(code_chunk(part, *coding_of(known)) for part in route.split(chunk))
+    whole.map = known.of_chunks(encode_chunk(part, *coding_of(known)) for part in route.split(chunk))
     for name, one in (("appended", model), ("whole", whole)):
         one.save(tmp_path / name)
     assert (tmp_path / "appended").read_bytes() == (tmp_path / "whole").read_bytes()
@@ -198,9 +198,9 @@ def test_frames_that_are_appended_are_coded_as_those_of_a_long_route(
     one = spectral(part)
     part.map = one.of_chunks(one.coded()[:2])
     sizes = []
-    code = learning.code_chunk
+    code = learning.encode_chunk
     monkeypatch.setattr(
-        learning, "code_chunk", lambda rows, **rest: sizes.append(len(rows)) or code(rows, **rest)
+        learning, "encode_chunk", lambda rows, **rest: sizes.append(len(rows)) or code(rows, **rest)
     )
     append(part, open_source("sim:aerial?frames=130&start=80"))
     assert sizes == [40, 10]  # a chunk of descriptors at a time
@@ -453,7 +453,7 @@ def test_a_map_of_means_is_that_of_the_means_by_hand(tmp_path: Path) -> None:
     route, more = walk(120), noisy(walk(150), 1)
     places = [*range(-10, 0), *range(20, 120), *[60] * 40]
     model = DejaVu(whitening="none", mapper=SpectralMapper(6.0, chunk=50))
-    learn_mean(model, route, Views(ArrayTraverse(more, "more"), torch.tensor(places).clamp(min=-1)))
+    learn_mean(model, route, LabelledFrames(ArrayTraverse(more, "more"), torch.tensor(places).clamp(min=-1)))
     means = by_hand(route, [1] * 120, more, places)
     whole = SpectralMapper(6.0, chunk=50)(means)
     assert spectral(model).steps.tolist() == pytest.approx(whole.steps.tolist(), rel=1e-3)
@@ -487,11 +487,11 @@ def test_a_visit_is_averaged_into_a_map() -> None:
     one = spectral(model)
     before, coded = torch.cat([one.decode(g) for g in range(len(one.chunks))]), one.coded()
     shown = [*range(5, 45), *[-1] * 10, *range(5, 15)]
-    visits = Views(ArrayTraverse(more, "more"), torch.tensor(shown))
+    visits = LabelledFrames(ArrayTraverse(more, "more"), torch.tensor(shown))
     assert average(model, visits) == 40
     means = by_hand(before, [1] * 150, more, shown)
     # nothing was seen in the other chunks: they are not coded again
-    same = one.of_chunks([code_chunk(means[:50], *coding_of(one)), *coded[1:]])
+    same = one.of_chunks([encode_chunk(means[:50], *coding_of(one)), *coded[1:]])
     query = walk(4, seed=5)
     assert torch.allclose(model.map.scores(query), same.scores(query), atol=1e-5)
     assert model.map.visits.tolist() == [[5, 1], [10, 3], [30, 2], [105, 1]]
@@ -505,11 +505,11 @@ def test_counts_follow_where_a_map_grows(tmp_path: Path) -> None:
     route = walk(200)
     model = learned(route[:100], 50)
     rest = ArrayTraverse(noisy(route[100:], 2), "rest")
-    append(model, route[100:], visits=Views(rest, torch.arange(100)))
+    append(model, route[100:], visits=LabelledFrames(rest, torch.arange(100)))
     assert model.map.visits.tolist() == [[100, 1], [100, 2]]
     first = spectral(model)
     means = (route[100:] + noisy(route[100:], 2)) / 2
-    expected = first.of_chunks(code_chunk(part, *coding_of(first)) for part in means.split(50))
+    expected = first.of_chunks(encode_chunk(part, *coding_of(first)) for part in means.split(50))
     query = walk(3, seed=4)
     assert torch.allclose(model.map.scores(query)[:, 100:], expected.scores(query), atol=1e-5)
     append(model, route)
@@ -549,12 +549,12 @@ def test_visits_that_cannot_be_averaged() -> None:
         (torch.full((90, 6), math.nan), at, ("NaN",)),
         (torch.rand(90, 1, 9, 9), at, ("frames",)),
     ):
-        visits = Views(ArrayTraverse(rows, "more"), places)
+        visits = LabelledFrames(ArrayTraverse(rows, "more"), places)
         for use in (lambda: average(model, visits), lambda: learn_mean(model, walk(90), visits)):  # noqa: B023
             with refused(*words):
                 use()
             assert model.map is before
-    good = Views(ArrayTraverse(walk(90), "more"), at)
+    good = LabelledFrames(ArrayTraverse(walk(90), "more"), at)
     with refused("TemplateMapper", "SpectralMapper"):
         learn_mean(templates, walk(90), good)
     with refused("'templates'", "'spectral'"):

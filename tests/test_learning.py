@@ -24,10 +24,10 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.source import open_source
 from dejavu_torch.data.traverse import Chain
 from dejavu_torch.features.hog import HOG
-from dejavu_torch.features.views import Views
+from dejavu_torch.features.views import LabelledFrames
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.learning import Checkpoint, ChunkCoder, Sample
-from dejavu_torch.maps.spectral import SpectralMapper, code_chunk
+from dejavu_torch.maps.spectral import SpectralMapper, encode_chunk
 from dejavu_torch.maps.spectral_map import Chunk, SpectralMap
 from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import run_key
@@ -68,9 +68,9 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
     def counted(descriptors: Tensor, **rest: object) -> object:
         seen.append(len(descriptors))
-        return code_chunk(descriptors, **rest)  # type: ignore[arg-type]
+        return encode_chunk(descriptors, **rest)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(learning, "code_chunk", counted)
+    monkeypatch.setattr(learning, "encode_chunk", counted)
     return seen
 
 
@@ -81,7 +81,9 @@ def test_chunks_are_those_of_their_own_descriptors() -> None:
     coded = model.map.coded()
     for part, own in zip(route().split(CHUNK), coded, strict=True):
         descriptors = torch.cat([whitening(batch) for batch in part.split(model.batch_size)])
-        expected = code_chunk(descriptors, model.map.means[0], own.step, mapper.transform, mapper.resolution)
+        expected = encode_chunk(
+            descriptors, model.map.means[0], own.step, mapper.transform, mapper.resolution
+        )
         assert torch.equal(own.stream.bytes, expected.stream.bytes)
         assert own.places == len(part)
     assert found_share(model, route()) > 0.95
@@ -154,13 +156,13 @@ def test_the_sample_of_a_long_route_meets_its_budget() -> None:
 def test_a_second_traverse_tells_of_what_is_in_the_sample() -> None:
     torch.manual_seed(0)
     noisy = route() + 0.2 * torch.randn(PLACES, 12)
-    views = Views(ArrayTraverse(noisy), torch.arange(PLACES))
+    views = LabelledFrames(ArrayTraverse(noisy), torch.arange(PLACES))
     assert len(Sample.of(PLACES, CHUNK).views(views).places) == 400
-    shown = Sample.of(PLACES, CHUNK).views(Views(views.traverse, torch.arange(PLACES) - 30))
+    shown = Sample.of(PLACES, CHUNK).views(LabelledFrames(views.traverse, torch.arange(PLACES) - 30))
     assert torch.equal(Sample.of(PLACES, CHUNK).frame[shown.places] + 30, shown.traverse.frame)  # type: ignore[attr-defined]
     unseen = torch.tensor([one for one in range(PLACES) if one not in Sample.of(PLACES, CHUNK).frame][:40])
     with refused("none of the 400 frames", "segments of 50"):
-        learned(route(), second=Views(ArrayTraverse(noisy[unseen]), unseen))
+        learned(route(), second=LabelledFrames(ArrayTraverse(noisy[unseen]), unseen))
     model = DejaVu(whitening=Whitening(numbers=8), mapper=SpectralMapper(8.0, chunk=CHUNK))
     model.learn(route(), second=views)
     assert found_share(model, noisy) > 0.9
@@ -248,7 +250,7 @@ def test_the_partial_map_of_another_run_is_refused(tmp_path: Path) -> None:
     with refused(str(part), "source"):
         learn(route(PLACES + 1))
     with refused(str(part), "second differs"):
-        learn(route(), second=Views(ArrayTraverse(route() + 0.1), torch.arange(PLACES)))
+        learn(route(), second=LabelledFrames(ArrayTraverse(route() + 0.1), torch.arange(PLACES)))
     with refused(str(part), "another run", "file removed"):  # which keeps no chunks, but writes the map
         learn(route(400))
     Checkpoint(tmp_path / "map.safetensors").remove()  # that opened nothing
@@ -348,7 +350,7 @@ def test_descriptors_of_a_long_route_in_one_chunk_lie_in_a_file(monkeypatch: pyt
 
 def test_places_appended_to_a_map_are_kept_as_well(tmp_path: Path, made: list[int]) -> None:
     first, rest = route()[:500], route()[500:]
-    visits = Views(ArrayTraverse(rest + 0.1), torch.arange(len(rest)))
+    visits = LabelledFrames(ArrayTraverse(rest + 0.1), torch.arange(len(rest)))
 
     def grown(**work: object) -> DejaVu:
         model = learned(first)
@@ -367,10 +369,10 @@ def test_places_appended_to_a_map_are_kept_as_well(tmp_path: Path, made: list[in
         growth.append(again, rest, visits=visits, checkpoint=Checkpoint(tmp_path / "m"))
 
 
-def visits_of(places: Tensor, kind: type[Traverse] = ArrayTraverse) -> Views:
+def visits_of(places: Tensor, kind: type[Traverse] = ArrayTraverse) -> LabelledFrames:
     """Frames that show these places; -1 is none."""
     noise = 0.5 * torch.randn(len(places), 12, generator=torch.Generator().manual_seed(2))
-    return Views(kind(route()[places] + noise), places)  # type: ignore[call-arg]
+    return LabelledFrames(kind(route()[places] + noise), places)  # type: ignore[call-arg]
 
 
 def test_visits_are_averaged_in_chunk_by_chunk(tmp_path: Path, made: list[int]) -> None:
@@ -389,7 +391,7 @@ def test_visits_are_averaged_in_chunk_by_chunk(tmp_path: Path, made: list[int]) 
     assert torch.equal(whole.map.visit_counts, counts.long())
     for own, mean in zip(whole.map.coded(), (sums / counts[:, None]).split(CHUNK), strict=True):
         settings = whole.map.means[0], own.step, whole.map.transform, whole.map.resolution
-        assert torch.equal(own.stream.bytes, code_chunk(mean, *settings).stream.bytes)
+        assert torch.equal(own.stream.bytes, encode_chunk(mean, *settings).stream.bytes)
     bytes_ = file_of(whole, tmp_path)
     assert file_of(growth.learn_mean(model(), route(), visits_of(places, Stream)), tmp_path) == bytes_
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from dejavu_torch import HOG, DejaVu, ImposedPeriods, SequenceMatcher, TemplateMapper, open_source
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.traverse import FrameRange
-from dejavu_torch.features.views import Views, augmented_route
+from dejavu_torch.features.views import LabelledFrames, augmented_route
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.growth import second_traverse
 from dejavu_torch.maps.spectral import SpectralMapper
@@ -104,7 +104,7 @@ def test_save_and_load(model: DejaVu, second: Traverse, tmp_path: Path) -> None:
 
 
 def test_whitening_by_a_second_traverse(model: DejaVu, reference: Traverse, second: Traverse) -> None:
-    learned = spectral().learn(reference, second=Views(second, torch.arange(FRAMES)))
+    learned = spectral().learn(reference, second=LabelledFrames(second, torch.arange(FRAMES)))
     projections = [one.state_dict()["whitening.projection"] for one in (learned, model)]
     assert not torch.equal(*projections)
     assert near_share(learned, open_source(f"sim:aerial?frames={FRAMES}&traverse=2")) > 0.95
@@ -115,9 +115,9 @@ def test_frames_that_show_no_place_are_left_out(reference: Traverse, second: Tra
     shown = torch.arange(FRAMES).where(torch.arange(FRAMES) >= 100, -1)
     learned = [
         spectral(numbers=20).learn(reference, second=views)
-        for views in (Views(second, shown), Views(part, shown[100:]))
+        for views in (LabelledFrames(second, shown), LabelledFrames(part, shown[100:]))
     ]
-    first, other = (model.whitening.whole.int() for model in learned)  # type: ignore[union-attr]
+    first, other = (model.whitening.unpacked.int() for model in learned)  # type: ignore[union-attr]
     assert (first - other).abs().max() <= 1  # a step of rounding
 
 
@@ -141,7 +141,7 @@ def test_views_of_a_second_traverse(reference: Traverse, second: Traverse) -> No
     with refused("no whitening", "few"):
         second_traverse(DejaVu(whitening="none"), *plain, "0")
     with refused("no whitening", "few"):
-        DejaVu(whitening="none").learn(plain[0], second=Views(plain[1], torch.arange(9)))
+        DejaVu(whitening="none").learn(plain[0], second=LabelledFrames(plain[1], torch.arange(9)))
 
 
 def test_the_whitening_of_another_model(model: DejaVu, reference: Traverse, tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from dejavu_torch.evaluation.pictures import draw_pictures
 from dejavu_torch.evaluation.report import sequence_table, summary
 from dejavu_torch.features.descriptor import Descriptor
 from dejavu_torch.features.pixels import PatchPixels
-from dejavu_torch.features.views import Views
+from dejavu_torch.features.views import LabelledFrames
 from dejavu_torch.maps.distance import phase_distances
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.recognition.filter import PlaceFilter
@@ -346,7 +346,7 @@ def test_routes_off_the_map_are_prepared_as_queries_are(monkeypatch: pytest.Monk
     """Ready features are accepted for ready features, and frames are resampled at the map's step."""
     monkeypatch.setattr("dejavu_torch.evaluation.compare.draw_pictures", lambda *_: {})
     features = [ArrayTraverse(smooth(seed), str(seed)) for seed in (0, 0, 3)]
-    views = Views(ArrayTraverse(smooth(0) + 0.1), torch.arange(200))
+    views = LabelledFrames(ArrayTraverse(smooth(0) + 0.1), torch.arange(200))
     found = compare(*features[:2], "0", distractors=features[2:], calibration=views).report.facts
     assert found["rejection"]["off_map"]["3"]["frames"] == 200
     drives = [ArrayTraverse(ground(at), name) for at, name in ((REFERENCE, "a"), (QUERY, "b"), (QUERY, "c"))]

@@ -144,7 +144,7 @@ def test_beside_hog_it_is_worth_more_than_pixels_in_the_city(data_dir: Path) -> 
     reference, query = (open_source(city / f"{name}.npy") for name in ("reference", "query"))
     truth = ground_truth_of(str(city / "truth.csv"), reference, query)
     assert truth is not None
-    pixels = Joined([HOG(), PatchPixels((24, 48), channel="grey")], [1, 0.5])
+    pixels = Joined([HOG(), PatchPixels((24, 48), channel="grey")])
     areas = []
     for features in (pixels, None):  # with it is the default
         model = DejaVu(features, mapper=SpectralMapper(5.0)).learn(reference)

@@ -133,7 +133,7 @@ def test_numbers_of_four_bits_come_back_from_their_bytes() -> None:
         whole[0] = 7
         whitening = Whitening(bits=4)
         whitening.take(torch.zeros(30), projection, None)
-        assert torch.equal(whitening.whole, whole.to(torch.int8))
+        assert torch.equal(whitening.unpacked, whole.to(torch.int8))
         torch.testing.assert_close(whitening.scale, torch.linspace(0.5, 2, numbers))
         assert whitening.projection.nbytes == 30 * math.ceil(numbers / 2)
 
@@ -329,7 +329,7 @@ def test_a_state_of_groups_is_loaded(bits: int, views: bool) -> None:
     one, other = joined(views, bits=bits), learned()
     other.load_state_dict(one.state_dict())
     assert torch.equal(other(SIDE[1]), one(SIDE[1]))
-    torch.testing.assert_close(one(SIDE[1], one.unpacked()), one(SIDE[1]))
+    torch.testing.assert_close(one(SIDE[1], one.all_unpacked()), one(SIDE[1]))
     exact = copy.deepcopy(one).double()(SIDE[1].double())
     assert exact.dtype == torch.float64
     torch.testing.assert_close(exact.float(), one(SIDE[1]), rtol=0, atol=1e-4)

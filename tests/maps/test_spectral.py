@@ -17,7 +17,7 @@ from torch import Tensor
 from dejavu_torch import DejaVu, PhaseTemplates
 from dejavu_torch.maps import spectral_map
 from dejavu_torch.maps.quantisation import dead_zone, quantise
-from dejavu_torch.maps.spectral import SpectralMapper, code_chunk
+from dejavu_torch.maps.spectral import SpectralMapper, encode_chunk
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.spectrum import from_spectrum, spectrum
 from dejavu_torch.types import FrequencyLayer, InputError
@@ -52,7 +52,7 @@ def levels_of(learned: SpectralMap) -> Tensor:
 
 def grow(learned: SpectralMap, descriptors: Tensor) -> None:
     coding = learned.means[-1], learned.step, learned.transform, learned.resolution
-    learned.extend(code_chunk(part, *coding) for part in descriptors.split(learned.chunk))
+    learned.extend(encode_chunk(part, *coding) for part in descriptors.split(learned.chunk))
 
 
 def copied(learned: SpectralMap, empty: SpectralMap) -> SpectralMap:
@@ -343,7 +343,7 @@ def test_a_map_is_that_of_its_chunks_coded_one_by_one() -> None:
         metric, transform, chunk, resolution = settings
         learned = SpectralMapper(None, 0.002, chunk, transform, metric, resolution)(features)
         coding = learned.means[0], learned.step, transform, resolution
-        alone = [code_chunk(part, *coding) for part in features.split(64)]
+        alone = [encode_chunk(part, *coding) for part in features.split(64)]
         for made in (learned.of_chunks(alone), learned.of_chunks(learned.coded())):
             for name, tensor in learned.packed().items():
                 assert torch.equal(made.packed()[name], tensor)

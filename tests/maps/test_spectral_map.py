@@ -20,7 +20,7 @@ from torch import Tensor
 from dejavu_torch import DejaVu, memory
 from dejavu_torch.maps import quantisation, spectral, spectral_map
 from dejavu_torch.maps.codec import encode
-from dejavu_torch.maps.spectral import SpectralMapper, code_chunk
+from dejavu_torch.maps.spectral import SpectralMapper, encode_chunk
 from dejavu_torch.maps.spectral_map import Chunk, SpectralMap, sparse_products
 
 
@@ -77,7 +77,7 @@ def test_a_long_chunk_is_decoded_by_parts(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_more_places_than_the_index_type_holds_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    one = code_chunk(torch.randn(4, 3), torch.zeros(3).bfloat16(), 0.1)
+    one = encode_chunk(torch.randn(4, 3), torch.zeros(3).bfloat16(), 0.1)
     monkeypatch.setattr(spectral_map, "LARGEST", 11)
     with refused("12 places", "at most 11"):
         SpectralMap(torch.zeros(1, 3).bfloat16()).extend([one] * 3)

@@ -18,7 +18,7 @@ from torch import Tensor
 from dejavu_torch import DejaVu, PlaceFilter, SequenceMatcher, SpectralMapper, export, open_source
 from dejavu_torch.data.source import as_traverse
 from dejavu_torch.evaluation.rejection import calibration_error
-from dejavu_torch.features.views import Views, augmented_segments
+from dejavu_torch.features.views import LabelledFrames, augmented_segments
 from dejavu_torch.model import HIGHEST
 from dejavu_torch.recognition.calibration import (
     Calibration,
@@ -165,7 +165,7 @@ def test_long_routes_are_looked_at_in_fewer_frames() -> None:
 
 def test_of_many_views_evenly_spaced_stretches_are_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     route, seen = torch.randn(2000, 6), list[Tensor]()
-    views = Views(as_traverse(route + 0.2 * torch.randn_like(route)), torch.arange(2000))
+    views = LabelledFrames(as_traverse(route + 0.2 * torch.randn_like(route)), torch.arange(2000))
     model = DejaVu(whitening="none", mapper=SpectralMapper(12.0)).learn(route)
     monkeypatch.setattr("dejavu_torch.learning.MAX_SEGMENT", 20)
     monkeypatch.setattr("dejavu_torch.learning.CALIBRATION_SCORES", 400 * 2000)
@@ -281,13 +281,13 @@ def test_a_map_without_calibration_tells_no_probability() -> None:
     features = torch.rand(64, 8)
     model = DejaVu(whitening="none").learn(features)
     assert model.localize(features).probability is None
-    model.calibrate(None, Views(as_traverse(features + 0.01), torch.arange(64)))
+    model.calibrate(None, LabelledFrames(as_traverse(features + 0.01), torch.arange(64)))
     assert model.localize(features).probability is not None
 
 
-def views_of(frames: int, first: int = 0) -> Views:
+def views_of(frames: int, first: int = 0) -> LabelledFrames:
     """Random frames that no place looks like."""
-    return Views(as_traverse(torch.rand(frames, 8)), torch.arange(first, first + frames))
+    return LabelledFrames(as_traverse(torch.rand(frames, 8)), torch.arange(first, first + frames))
 
 
 @pytest.mark.parametrize(
@@ -296,7 +296,10 @@ def views_of(frames: int, first: int = 0) -> Views:
         (lambda model: model.calibrate(torch.rand(64, 8)), ["ready features"]),
         (lambda _: DejaVu().calibrate(torch.rand(64, 8)), ["no map"]),
         (lambda model: model.calibrate(None), ["no reference and no views"]),
-        (lambda model: model.calibrate(None, Views(views_of(60).traverse, torch.arange(64))), ["60 frames"]),
+        (
+            lambda model: model.calibrate(None, LabelledFrames(views_of(60).traverse, torch.arange(64))),
+            ["60 frames"],
+        ),
         (lambda model: model.calibrate(None, views_of(64, 1)), ["shows place 64", "one of 64"]),
         (lambda model: model.calibrate(None, views_of(1, 60)), ["calibrating by", "none of"]),
         (lambda _: DejaVu(precision=0.0), ["precision", "above 0 and below 1"]),

@@ -18,7 +18,7 @@ from dejavu_torch.growth import append
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.recognition import coarse
 from dejavu_torch.recognition.calibration import Calibration, Platt
-from dejavu_torch.recognition.coarse import CoarseSearch, Plan, plan, searcher
+from dejavu_torch.recognition.coarse import CoarseSearch, SamplingPlan, plan, searcher
 from dejavu_torch.recognition.search import NmsSpec, Scan, Search, TopK
 from dejavu_torch.recognition.select import best_candidates
 
@@ -88,7 +88,7 @@ def test_products_are_the_same_without_those_of_integers(monkeypatch: pytest.Mon
     for there in (True, False):
         if not (there and coarse.has_int8_products()):
             monkeypatch.setattr(coarse, "has_int8_products", lambda: False)
-        found.append(CoarseSearch(learned, Plan(8, 4, 8, 1.0, 0))(queries, [(1, 0)]))
+        found.append(CoarseSearch(learned, SamplingPlan(8, 4, 8, 1.0, 0))(queries, [(1, 0)]))
     assert all(map(torch.equal, *found))
 
 

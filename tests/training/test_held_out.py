@@ -17,7 +17,7 @@ from dejavu_torch import DejaVu, Preprocess, RouteData, SpectralMapper
 from dejavu_torch.cli.train import MapTrainer
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import as_ground_truth
-from dejavu_torch.features.views import STRETCH, Views
+from dejavu_torch.features.views import SEGMENT, LabelledFrames
 from dejavu_torch.training import export
 from dejavu_torch.training.export import UNTRAINED, LastCheckpoint, compare_with_untrained
 from dejavu_torch.types import Match
@@ -40,7 +40,7 @@ def places_of(data: RouteData) -> set[int]:
 
 
 def held(data: RouteData) -> set[int]:
-    return {start + i for start in data.held for i in range(STRETCH)}
+    return {start + i for start in data.held for i in range(SEGMENT)}
 
 
 @pytest.fixture
@@ -48,7 +48,7 @@ def calibrations(monkeypatch: pytest.MonkeyPatch) -> list[set[int]]:
     """The places of the views that maps are calibrated by."""
     seen: list[set[int]] = []
 
-    def taken(model: DejaVu, reference: object, views: Views) -> None:
+    def taken(model: DejaVu, reference: object, views: LabelledFrames) -> None:
         seen.append(set(views.places.tolist()))
 
     monkeypatch.setattr(DejaVu, "calibrate", taken)
@@ -68,13 +68,13 @@ def test_stretches_are_evenly_spaced(frames: int, share: float, expected: int) -
         starts = torch.tensor([*data.held, frames + data.held[0]])
         assert (starts.diff() - frames / expected).abs().max() <= 1
         assert min(data.held) >= 0
-        assert max(data.held) + STRETCH <= frames
+        assert max(data.held) + SEGMENT <= frames
 
 
 @pytest.mark.parametrize("clip", [1, 4])
 def test_training_never_sees_them_in_any_traverse(clip: int) -> None:
     data = long(clip=clip, second=ArrayTraverse(footage(0.1, FRAMES)), batch_size=8)
-    assert len(held(data)) == 2 * STRETCH
+    assert len(held(data)) == 2 * SEGMENT
     assert set().union(*(places_of(data) for _ in range(8))) == set(range(FRAMES)) - held(data)
 
 
