@@ -120,7 +120,7 @@ def views() -> nn.Module:
 
 
 def batches(images: Tensor, seed: int) -> Iterator[Tensor]:
-    """LabelledFrames of images drawn at random, (64, 3, 96, 96) in [0, 1], without end."""
+    """Views of images drawn at random, (64, 3, 96, 96) in [0, 1], without end."""
     torch.manual_seed(seed)
     augment = views()
     while True:
