@@ -97,8 +97,7 @@ class Cluster:
                 running.popleft()
                 yield from done
                 if failure:
-                    frames = task[len(done)]
-                    raise InputError(f"frames {frames.start} to {frames.stop - 1}{failure}")
+                    raise InputError(f"frames {task[len(done)].start} to {task[-1].stop - 1}{failure}")
         finally:
             for _, reference in running:
                 with suppress(Exception):

@@ -248,9 +248,6 @@ def descriptors_of(
 ) -> tuple[Tensor, Tensor]:
     """Descriptors (n,K) of the frames with a known place, and these places (n,)."""
     rows = concatenate(descriptor.batches(views.traverse, "averaging" if progress else None))
-    if len(rows) != len(views.places):
-        seen = f"{views.traverse.name} gives {len(rows)} descriptors for {len(views.places)} places"
-        raise InputError(f"{seen}; expected one for each")
     known = views.places.to(rows.device) >= 0
     return rows[known], views.places[known.to(views.places.device)]
 
@@ -272,10 +269,15 @@ def with_visits(means: Tensor, counts: Tensor, rows: Tensor, places: Tensor) -> 
 
 
 def observation_counts(visits: LabelledFrames, places: int) -> Tensor:
-    """The number of frames that show each of N places, (N,); a place beyond them is refused."""
+    """The number of frames that show each of N places, (N,); a place beyond them is refused, and frames whose
+    places are not given."""
+    name, frames = visits.traverse.name, len(visits.traverse)
+    if frames != len(visits.places):
+        seen = f"{name} has {frames} frames and {len(visits.places)} places"
+        raise InputError(f"{seen}; expected the same number")
     shown = visits.places[visits.places >= 0].cpu()
     if len(shown) and int(shown.max()) >= places:
-        raise InputError(f"{visits.traverse.name} shows place {int(shown.max())}; expected one of {places}")
+        raise InputError(f"{name} shows place {int(shown.max())}; expected one of {places}")
     return shown.bincount(minlength=places)
 
 
@@ -300,7 +302,7 @@ def calibration_of(
         places = torch.arange(place_map.places) if places is None else places
         segments = augmented_segments(reference, len(places), strengths, place_map.places)
         views = LabelledFrames(cast(Traverse, segments), places[segments.places])
-    observation_counts(views, place_map.places)  # refuses places beyond the map's
+    observation_counts(views, place_map.places)  # refuses what does not fit
     another = not isinstance(views.traverse, AugmentedFrames)
     if isinstance(views.traverse, AugmentedFrames):
         length = views.traverse.block
@@ -309,9 +311,6 @@ def calibration_of(
         views = _segments_of(views, length, max(LEAST, CALIBRATION_SCORES // place_map.places))
     name, label = views.traverse.name, "calibrating" if progress else None
     descriptors = concatenate(descriptor.batches(views.traverse, label))
-    if len(descriptors) != len(views.places):
-        seen = f"{name} has {len(descriptors)} frames and {len(views.places)} places"
-        raise InputError(f"{seen}; expected the same number")
     parts = zip(descriptors.split(length), views.places.split(length), strict=True)
     try:
         return calibrated(place_map, parts, another)

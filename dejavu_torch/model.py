@@ -217,6 +217,7 @@ class DejaVu(nn.Module):
             counts = learning.observation_counts(visits, len(traverse))
         with descriptor.unchanged_by_errors():
             if isinstance(mapper, SpectralMapper) and learning.is_long(traverse, mapper.chunk):
+                descriptor.reduce_if_wide(traverse)  # for a partial map with its whitening
                 place_map = mapper.empty().to(descriptor.device)
                 key = checkpoint and model_file.run_key(self, traverse, second, visits)
                 if not (checkpoint and key and checkpoint.open(key, place_map, descriptor)):

@@ -317,20 +317,20 @@ def read_model(make: Callable[..., R], path: Path, features: nn.Module | None) -
         weights = unpacked(tensors, "features.")
         if features is None:
             with torch.device("meta"):  # large layers in a bad header allocate nothing
-                probe = build(header["features"], nn.Module)
-                probe.load_state_dict(part_of(weights, "features"), assign=True)
+                probe = nn.ModuleDict({"features": build(header["features"], nn.Module)})
+                own = {name: one for name, one in weights.items() if name.startswith("features.")}
+                probe.load_state_dict(own, assign=True)
         with in_float32():
             parts = {name: _part(header, name, features) for name in PARTS}
         parts["whitening"] = parts["whitening"] or "none"
         model = make(**parts, **{name: header[name] for name in SETTINGS})
         _fill(model.map, tensors, header["map"])
         check_types(weights, model.descriptor.features)
-        for name in ("features", "whitening"):
-            part = parts_of(model)[name]
-            if part is not None:
-                part.load_state_dict(part_of(weights, name))
-            elif part_of(weights, name):
-                raise InputError(f"it does not fit: unexpected {name}")
+        stored = {name: part for name, part in parts_of(model).items() if name in ("features", "whitening")}
+        whole = nn.ModuleDict(
+            {name: part for name, part in stored.items() if part is not None}
+        )  # for messages
+        whole.load_state_dict({name: one for name, one in weights.items() if not name.startswith("map.")})
         model.descriptor.weight_bits = 8 if len(weights) < len(tensors) else 32
         check_rounded(model.descriptor)
         model.state = state_from_json(header, model.map.table.frames)

@@ -9,6 +9,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from dejavu_torch import learning
+from dejavu_torch.features import descriptor, views
 from dejavu_torch.maps.template_map import TemplateMap, TemplateMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.finder import PeriodFinder
@@ -32,6 +34,12 @@ def streamed(model: SequenceModel, batches: Iterable[Tensor]) -> Iterator[Tensor
         state = model.start(scores.shape[1]).to(scores) if state is None else state
         found, state = model.step(scores, state)
         yield found
+
+
+def long_from(monkeypatch: pytest.MonkeyPatch, frames: int) -> None:
+    """Routes of more frames are learned from a sample, chunk by chunk."""
+    for module in (views, descriptor, learning):
+        monkeypatch.setattr(module, "SAMPLE", frames)
 
 
 def all_of(traverse: Traverse, batch: int = 64) -> Tensor:

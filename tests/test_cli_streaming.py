@@ -6,7 +6,6 @@ import errno
 import signal
 import subprocess
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +15,9 @@ from command_line import fails, frames, run, write_images
 from processes import PACKAGE, Forked
 
 from dejavu_torch.cli import main
-from dejavu_torch.learning import ChunkCoder
+from dejavu_torch.learning import ChunkEncoder
 from dejavu_torch.maps.spectral_map import Chunk
 from dejavu_torch.model import DejaVu
-from dejavu_torch.types import Traverse
 
 # more than the sample, of which features are ready
 CHUNKED = ("--mapper.chunk", "250", "--mapper.route_bytes_per_place", "2")
@@ -59,15 +57,15 @@ def test_a_killed_run_goes_on_where_it_was(
     assert not out.exists()
     began: list[int] = []
 
-    code = ChunkCoder.chunks
+    encode = ChunkEncoder.__call__
 
-    def noted(coder: ChunkCoder, traverse: Traverse, wanted: range, text: str | None) -> Iterator[Chunk]:
-        began.append(wanted.start)
-        return code(coder, traverse, wanted, text)
+    def noted(encoder: ChunkEncoder, frames: range) -> Chunk:
+        began.append(frames.start)
+        return encode(encoder, frames)
 
-    monkeypatch.setattr(ChunkCoder, "chunks", noted)
+    monkeypatch.setattr(ChunkEncoder, "__call__", noted)
     run(*words)
-    assert 0 < began[0] < LONG / 250
+    assert 0 < began[0] < LONG
     assert out.read_bytes() == whole.read_bytes()
     assert sorted(file.name for file in tmp_path.iterdir()) == [out.name]
 

@@ -9,7 +9,6 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 from types import ModuleType
 
@@ -17,17 +16,16 @@ import numpy as np
 import pytest
 import torch
 from command_line import fails, frames, run, write_images
-from helpers import Fixed, Stream, refused, template_model
+from helpers import Fixed, long_from, refused, template_model
 from torch import Tensor, nn
 
 from dejavu_torch import cluster as clustering
-from dejavu_torch import learning
-from dejavu_torch.cluster import Cluster, ClusterSearch, code_on
+from dejavu_torch.cluster import Cluster, ClusterSearch
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.source import open_source
 from dejavu_torch.features.views import LabelledFrames
 from dejavu_torch.growth import learn_mean, merge
-from dejavu_torch.learning import Checkpoint, ChunkCoder, Sample
+from dejavu_torch.learning import Checkpoint, Sample
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import Chunk, SpectralMap
 from dejavu_torch.model import DejaVu
@@ -69,7 +67,7 @@ def cluster() -> Iterator[Cluster]:
 
 @pytest.fixture(autouse=True)
 def _small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(learning, "SAMPLE", 400)
+    long_from(monkeypatch, 400)
     monkeypatch.setattr(clustering, "TASK", 100)
 
 
@@ -101,15 +99,12 @@ def file_of(model: DejaVu, folder: Path) -> bytes:
     return (folder / "map.safetensors").read_bytes()
 
 
-@pytest.mark.parametrize("kind", [ArrayTraverse, Stream])
-def test_workers_write_the_file_of_one_process(
-    kind: Callable[[Tensor], Traverse], cluster: Cluster, tmp_path: Path
-) -> None:
+def test_workers_write_the_file_of_one_process(cluster: Cluster, tmp_path: Path) -> None:
     """Whitened, and with a second traverse averaged in."""
-    visits, files = LabelledFrames(kind(route() + 0.1), torch.arange(PLACES)), []
-    for code in (ChunkCoder.chunks, partial(code_on, cluster)):
+    visits, files = LabelledFrames(ArrayTraverse(route() + 0.1), torch.arange(PLACES)), []
+    for map_tasks in (map, cluster.map):
         model = DejaVu(mapper=SpectralMapper(6.0, chunk=CHUNK))
-        files.append(file_of(learn_mean(model, kind(route()), visits, code=code), tmp_path))
+        files.append(file_of(learn_mean(model, route(), visits, map_tasks=map_tasks), tmp_path))
     assert files[0] == files[1]
 
 
@@ -131,7 +126,7 @@ def test_a_worker_that_is_killed_is_made_up_for(cluster: Cluster, watched: nn.Mo
     thread = threading.Thread(target=kill)
     thread.start()
     model = learned(
-        open_source(images), watched, checkpoint=Checkpoint(tmp_path / "m"), code=partial(code_on, cluster)
+        open_source(images), watched, checkpoint=Checkpoint(tmp_path / "m"), map_tasks=cluster.map
     )
     thread.join()
     assert killed
@@ -155,12 +150,12 @@ def test_what_cannot_be_made_is_named_and_what_precedes_it_is_kept(
     (tmp_path / "deadly").touch()
     began: list[int] = []
 
-    def code(*work: object) -> Iterator[Chunk]:
-        began.append(work[2].start)  # type: ignore[attr-defined]
-        return code_on(cluster, *work)  # type: ignore[arg-type]
+    def noted(encode: Callable[[range], Chunk], tasks: list[range]) -> Iterator[Chunk]:
+        began.append(tasks[0].start)
+        return cluster.map(encode, tasks)
 
     def learn() -> DejaVu:
-        return learned(open_source(images), watched, checkpoint=Checkpoint(tmp_path / "m"), code=code)
+        return learned(open_source(images), watched, checkpoint=Checkpoint(tmp_path / "m"), map_tasks=noted)
 
     with refused("110.png", "read on", "frames 100 to 199", "100 of 620 places"):
         learn()
@@ -169,16 +164,15 @@ def test_what_cannot_be_made_is_named_and_what_precedes_it_is_kept(
         learn()
     (tmp_path / "deadly").unlink()
     assert file_of(learn(), tmp_path) == whole
-    assert began == [0, 2, 8]
+    assert began == [0, 100, 400]
 
 
 def test_chunks_made_together_before_a_bad_frame_are_kept(cluster: Cluster, tmp_path: Path) -> None:
     bad = route()
     bad[544] = torch.nan
     assert 544 not in Sample.of(PLACES, CHUNK).frame
-    # a stream is divided as 0 to 349, and 350 on
-    with refused("frames 500 to 619", "read on", "frame 544", "500 of 620"):
-        learned(Stream(bad), checkpoint=Checkpoint(tmp_path / "m"), code=partial(code_on, cluster))
+    with refused("frames 500 to 599", "read on", "frame 544", "500 of 620"):
+        learned(bad, checkpoint=Checkpoint(tmp_path / "m"), map_tasks=cluster.map)
 
 
 def found_by(model: DejaVu, queries: Tensor, search: ClusterSearch | None = None) -> list[Tensor]:

@@ -544,7 +544,7 @@ def test_visits_that_cannot_be_averaged() -> None:
     at = torch.arange(90)
     for rows, places, words in (
         (walk(90), at + 1, ("shows place 90", "one of 90")),
-        (walk(80), at, ("80 descriptors for 90 places",)),
+        (walk(80), at, ("80 frames and 90 places",)),
         (torch.rand(90, 7), at, ("7",)),
         (torch.full((90, 6), math.nan), at, ("NaN",)),
         (torch.rand(90, 1, 9, 9), at, ("frames",)),

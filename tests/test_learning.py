@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import errno
 import importlib
-import itertools
 import math
-import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -16,17 +14,18 @@ import pytest
 import safetensors.torch
 import torch
 from command_line import frames, write_images
-from helpers import Stream, refused
+from helpers import long_from, refused
 from torch import Tensor
 
 from dejavu_torch import growth, learning
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.source import open_source
-from dejavu_torch.data.traverse import Chain
+from dejavu_torch.data.traverse import Chain, Part
+from dejavu_torch.features import descriptor
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.views import LabelledFrames
 from dejavu_torch.features.whitening import Whitening
-from dejavu_torch.learning import Checkpoint, ChunkCoder, Sample
+from dejavu_torch.learning import Checkpoint, ChunkEncoder, Sample
 from dejavu_torch.maps.spectral import SpectralMapper, encode_chunk
 from dejavu_torch.maps.spectral_map import Chunk, SpectralMap
 from dejavu_torch.model import DejaVu
@@ -38,7 +37,7 @@ CHUNK, PLACES = 50, 1030
 
 @pytest.fixture(autouse=True)
 def _small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(learning, "SAMPLE", 400)
+    long_from(monkeypatch, 400)
     monkeypatch.setattr(learning, "SAVE_INTERVAL", -1)  # after each chunk
 
 
@@ -66,9 +65,9 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """The places of each chunk that is coded."""
     seen: list[int] = []
 
-    def counted(descriptors: Tensor, **rest: object) -> object:
+    def counted(descriptors: Tensor, *rest: object) -> object:
         seen.append(len(descriptors))
-        return encode_chunk(descriptors, **rest)  # type: ignore[arg-type]
+        return encode_chunk(descriptors, *rest)  # type: ignore[arg-type]
 
     monkeypatch.setattr(learning, "encode_chunk", counted)
     return seen
@@ -90,7 +89,7 @@ def test_chunks_are_those_of_their_own_descriptors() -> None:
 
 
 def test_a_short_route_is_learned_from_all_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(learning, "SAMPLE", PLACES)
+    long_from(monkeypatch, PLACES)
     model = DejaVu(mapper=SpectralMapper(3.0, chunk=CHUNK))
     whole = model.learn_features(model.descriptor.learn(ArrayTraverse(route())), ArrayTraverse(route()))
     assert resumed(tmp_path) == file_of(whole, tmp_path)
@@ -109,16 +108,16 @@ def two_threads() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
+def settings_of(known: SpectralMap) -> tuple[Any, ...]:
+    return known.means[-1], known.step, known.transform, known.resolution
+
+
 def test_no_call_changes_the_number_of_threads() -> None:
-    """Nor one that is left in the middle, or fails."""
+    """Nor one that fails."""
     model = learned(route())
-    coder = ChunkCoder.like(model.map, model.descriptor, PLACES)  # type: ignore[arg-type]
+    encode = ChunkEncoder(ArrayTraverse(route()), model.descriptor, *settings_of(model.map))
     with two_threads():
-        chunks = coder.chunks(ArrayTraverse(route()), range(coder.total))
-        next(chunks)
-        assert torch.get_num_threads() == 2
-    with two_threads(), refused("ended at frame 500"):
-        list(coder.chunks(ArrayTraverse(route()[:500]), range(coder.total)))
+        encode(range(CHUNK))
     bad = route()
     bad[::50] = math.nan
     for call in (learned, lambda one: growth.append(model, one)):
@@ -129,9 +128,10 @@ def test_no_call_changes_the_number_of_threads() -> None:
 def test_bytes_do_not_hang_on_how_a_route_is_read(tmp_path: Path) -> None:
     whole = file_of(learned(route()), tmp_path)
     parts = route().split([333, 1, 696])
-    assert file_of(learned(Stream(route())), tmp_path) == whole  # of unknown length, in odd batches
     assert file_of(learned(Chain([ArrayTraverse(part) for part in parts])), tmp_path) == whole
-    assert file_of(learned(Chain([Stream(part) for part in parts])), tmp_path) == whole
+    shuffled = torch.randperm(PLACES)
+    some = Part(ArrayTraverse(route()[shuffled]), shuffled.argsort())
+    assert file_of(learned(some), tmp_path) == whole
     with two_threads():
         assert file_of(learned(route()), tmp_path) == whole
 
@@ -173,21 +173,21 @@ def resumed(folder: Path) -> bytes:
     return file_of(learned(route(), checkpoint=Checkpoint(folder / "m")), folder)
 
 
-def stopped(after: int) -> learning.Code:
-    """As `ChunkCoder.chunks`, interrupted after so many chunks."""
+def stopped(after: int) -> learning.MapTasks:
+    """As `map`, interrupted after so many chunks."""
 
-    def code(*work: object) -> Iterator[Chunk]:
-        yield from itertools.islice(ChunkCoder.chunks(*work), after)  # type: ignore[arg-type]
+    def some(encode: Callable[[range], Chunk], tasks: list[range]) -> Iterator[Chunk]:
+        yield from map(encode, tasks[:after])
         raise KeyboardInterrupt
 
-    return code
+    return some
 
 
 def test_finished_chunks_are_not_made_again(tmp_path: Path, made: list[int]) -> None:
     whole = file_of(learned(route()), tmp_path)
     assert sum(made) == PLACES
     with pytest.raises(KeyboardInterrupt):
-        learned(route(), checkpoint=Checkpoint(tmp_path / "m"), code=stopped(8))
+        learned(route(), checkpoint=Checkpoint(tmp_path / "m"), map_tasks=stopped(8))
     for rest in (PLACES - 8 * CHUNK, 0):
         made.clear()
         assert resumed(tmp_path) == whole
@@ -314,27 +314,15 @@ def test_an_image_that_cannot_be_read_is_named_and_the_rest_kept(tmp_path: Path,
     with refused("434.png", "400 of 520", "m.part"):
         learn("m")
     (folder / "434.png").write_bytes(good)
-    times = (folder / "7.png").stat()
-    os.utime(folder / "7.png")  # of a finished chunk
-    with refused("m.part", "source were changed"):
-        learn("m")
-    os.utime(folder / "7.png", ns=(times.st_atime_ns, times.st_mtime_ns))
     made.clear()
     assert learn("m") == whole
     assert sum(made) == 120
 
 
-def test_a_route_that_ends_early_is_refused() -> None:
-    model = learned(route())
-    coder = ChunkCoder.like(model.map, model.descriptor, PLACES + 60)
-    with refused("1030", "1090"):
-        list(coder.chunks(ArrayTraverse(route()), range(coder.total)))
-
-
 def test_descriptors_of_a_long_route_in_one_chunk_lie_in_a_file(monkeypatch: pytest.MonkeyPatch) -> None:
     values = route(PLACES, 40)
-    monkeypatch.setattr(learning, "IN_MEMORY", PLACES * 160 - 1)
-    monkeypatch.setattr(learning, "DESCRIPTOR_MEMORY", PLACES * 100)
+    monkeypatch.setattr(descriptor, "IN_MEMORY", PLACES * 160 - 1)
+    monkeypatch.setattr(descriptor, "DESCRIPTOR_MEMORY", PLACES * 100)
     model = DejaVu(whitening=Whitening(numbers=32))
     found = model.descriptor.learn(ArrayTraverse(values))
     assert found.dtype == torch.float16
@@ -361,7 +349,7 @@ def test_places_appended_to_a_map_are_kept_as_well(tmp_path: Path, made: list[in
     assert made == [CHUNK] * 10 + [30]
     assert whole.map.visits.tolist() == [[500, 1], [PLACES - 500, 2]]
     with pytest.raises(KeyboardInterrupt):
-        grown(checkpoint=Checkpoint(tmp_path / "m"), code=stopped(4))
+        grown(checkpoint=Checkpoint(tmp_path / "m"), map_tasks=stopped(4))
     again = grown(checkpoint=Checkpoint(tmp_path / "m"))
     assert sum(made) == PLACES - 500 - 4 * CHUNK
     assert file_of(again, tmp_path) == file_of(whole, tmp_path)
@@ -369,10 +357,10 @@ def test_places_appended_to_a_map_are_kept_as_well(tmp_path: Path, made: list[in
         growth.append(again, rest, visits=visits, checkpoint=Checkpoint(tmp_path / "m"))
 
 
-def visits_of(places: Tensor, kind: type[Traverse] = ArrayTraverse) -> LabelledFrames:
+def visits_of(places: Tensor) -> LabelledFrames:
     """Frames that show these places; -1 is none."""
     noise = 0.5 * torch.randn(len(places), 12, generator=torch.Generator().manual_seed(2))
-    return LabelledFrames(kind(route()[places] + noise), places)  # type: ignore[call-arg]
+    return LabelledFrames(ArrayTraverse(route()[places] + noise), places)
 
 
 def test_visits_are_averaged_in_chunk_by_chunk(tmp_path: Path, made: list[int]) -> None:
@@ -393,17 +381,15 @@ def test_visits_are_averaged_in_chunk_by_chunk(tmp_path: Path, made: list[int]) 
         settings = whole.map.means[0], own.step, whole.map.transform, whole.map.resolution
         assert torch.equal(own.stream.bytes, encode_chunk(mean, *settings).stream.bytes)
     bytes_ = file_of(whole, tmp_path)
-    assert file_of(growth.learn_mean(model(), route(), visits_of(places, Stream)), tmp_path) == bytes_
-
     work = {"checkpoint": Checkpoint(tmp_path / "m")}
     with pytest.raises(KeyboardInterrupt):
-        growth.learn_mean(model(), route(), visits_of(places), **work, code=stopped(8))
+        growth.learn_mean(model(), route(), visits_of(places), **work, map_tasks=stopped(8))
     with refused("m.part", "visits differs"):
         growth.learn_mean(model(), route(), visits_of(places.clamp(min=0)), **work)
     made.clear()
     assert file_of(growth.learn_mean(model(), route(), visits_of(places), **work), tmp_path) == bytes_
     assert sum(made) == PLACES - 8 * CHUNK
-    with refused("353 descriptors", "400 places"):
+    with refused("953 frames", "1030 places"):
         growth.learn_mean(model(), route(), visits_of(places)._replace(places=torch.arange(PLACES)))
 
 

@@ -141,10 +141,7 @@ class Descriptor(nn.Module):
             check_alone(self, self.describe, frames, features, traverse.name)
 
         with self.unchanged_by_errors():
-            if self.reduces or self.whitening is None:
-                wide = spectral and is_ready(traverse) and traverse.frame_shape[0] > WIDEST
-                self.whitening = Whitening(views=0).to(self.device) if wide else None
-                self.reduces = wide
+            self.reduce_if_wide(traverse, spectral)
             whitening = self.whitening
             if whitening is not None and not whitening.fixed:
                 if not (spectral and self._exceeds_memory(traverse)):
@@ -157,6 +154,12 @@ class Descriptor(nn.Module):
                 self.learn(Part(traverse, sample.frame), own, progress, label="sampling")
             storage = (DESCRIPTOR_MEMORY, self.whitening is not None) if spectral else ()
             return concatenate(self.batches(traverse, label_if, check_first), *storage)
+
+    def reduce_if_wide(self, traverse: Traverse, spectral: bool = True) -> None:
+        """Without whitening of the user's: one for ready features that are too wide for a spectral map."""
+        if self.reduces or self.whitening is None:
+            self.reduces = spectral and is_ready(traverse) and traverse.frame_shape[0] > WIDEST
+            self.whitening = Whitening(views=0).to(self.device) if self.reduces else None
 
     def _exceeds_memory(self, traverse: Traverse) -> bool:
         """Whether the float32 features of a traverse longer than `SAMPLE` exceed the memory."""

@@ -157,6 +157,16 @@ def test_of_ranked_rows_the_first_is_the_match(tmp_path: Path) -> None:
 MATCH = Match(torch.tensor([2, -1, 0]), torch.tensor([0.5, INF, 0.25]), torch.tensor([True, False, True]))
 
 
+class Named:
+    """The names of as many frames as one likes."""
+
+    def __init__(self, form: str) -> None:
+        self.form = form
+
+    def __getitem__(self, frame: int) -> str:
+        return self.form.format(frame)
+
+
 def lines(path: Path) -> list[str]:
     text = path.read_bytes().decode()
     assert text.count("\n") == text.count("\r\n")
@@ -169,8 +179,8 @@ def test_convention_11_the_file_counts_frames_of_the_sources(tmp_path: Path) -> 
     def frame_of(places: torch.Tensor) -> torch.Tensor:
         return torch.where(places >= 0, frames[places.clamp(min=0)], -1)
 
-    names = "q{}.png".format, "0:00:{:02}.000".format
-    write_matches(path, [MATCH[:2], MATCH[2:]], torch.tensor([4, 4, 7]), frame_of, *names)
+    parts = [MATCH[:2], MATCH[2:]]
+    write_matches(path, parts, torch.tensor([4, 4, 7]), frame_of, Named("q{}.png"), Named("0:00:{:02}.000"))
     assert lines(path)[1:] == [
         "4,19,0.5,1,q4.png,0:00:19.000",
         "4,-1,inf,0,q4.png,",
@@ -183,7 +193,7 @@ def test_convention_11_the_file_counts_frames_of_the_sources(tmp_path: Path) -> 
 @given(st.lists(st.text(st.characters(blacklist_characters="\0"), max_size=9), min_size=3, max_size=3))
 def test_any_name_leaves_the_file_readable(scratch: Path, names: list[str]) -> None:
     path = scratch / "names.csv"
-    write_matches(path, [MATCH], query_name=names.__getitem__, place_name=names.__getitem__)
+    write_matches(path, [MATCH], query_names=names, place_names=names)
     queries, match, _ = read_matches(path)
     assert queries.tolist() == [0, 1, 2]
     for one, other in zip(match, MATCH, strict=True):
@@ -205,7 +215,7 @@ def test_pairs_are_the_names_of_the_rows_that_report_a_place(
 ) -> None:
     index, score, accepted = (torch.tensor(column) for column in zip(*rows * (ranks or 1), strict=True))
     index = torch.where(index % 5 == 0, -1, index)
-    path, pairs, names = scratch / "m.csv", scratch / "pairs.txt", ("q/{}.jpg".format, "r\n{}.jpg".format)
+    path, pairs, names = scratch / "m.csv", scratch / "pairs.txt", (Named("q/{}.jpg"), Named("r\n{}.jpg"))
     write_matches(path, [Match(index, score, accepted)], None, None, *names, ranks, (), pairs)
     with path.open(newline="") as file:
         kept = [row for row in csv.DictReader(file) if row["place"] != "-1"]
@@ -224,7 +234,7 @@ def test_neither_matches_nor_pairs_are_half_written(tmp_path: Path) -> None:
         raise InputError("a frame is damaged")
 
     path, pairs = written(tmp_path, PLAIN), tmp_path / "pairs.txt"
-    names = "q{}".format, "r{}".format
+    names = Named("q{}"), Named("r{}")
     with refused("damaged"):
         write_matches(path, breaks_off(), None, None, *names, pairs=pairs)
     assert [file.name for file in tmp_path.iterdir()] == [path.name]
@@ -250,7 +260,7 @@ def test_places_of_several_routes_are_told_by_route_and_frame(tmp_path: Path) ->
     match = Match(torch.tensor([0, 3, 4, -1, 6]), score, torch.ones(5) > 0, route=route)
     path = tmp_path / "m.csv"
     frame_of = torch.tensor([0, 2, 4, 7, 8, 10, 12, -1])  # of all routes, one behind the other
-    write_matches(path, [match], None, lambda p: frame_of[p], None, lambda f: f"{f}.png", None, routes)
+    write_matches(path, [match], None, lambda p: frame_of[p], (), Named("{}.png"), None, routes)
     rows = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
     assert [(row["place"], row["route"], row["place_name"]) for row in rows] == [
         ("0", "out", "0.png"),

@@ -270,6 +270,7 @@ CRAFTED_TEMPLATES: list[tuple[dict[str, Any], dict[str, Any], list[str]]] = [
         [f"a map of {2**50} places, {2**51} in all layers", "expected at most"],
     ),
     ({"features.weight": torch.zeros(3)}, {}, ["features.weight"]),
+    ({"surprise.weight": torch.zeros(3)}, {}, ["surprise.weight"]),
     ({"map.layers": [[2**60, 1, 8, 0, 64], [9, 1, 9, 0, 64]]}, {}, ["below 2^63"]),
     ({"map.templates": None}, {}, ["it holds", "expected", "templates"]),
 ]
