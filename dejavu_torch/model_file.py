@@ -326,11 +326,11 @@ def read_model(make: Callable[..., R], path: Path, features: nn.Module | None) -
         model = make(**parts, **{name: header[name] for name in SETTINGS})
         _fill(model.map, tensors, header["map"])
         check_types(weights, model.descriptor.features)
-        stored = {name: part for name, part in parts_of(model).items() if name in ("features", "whitening")}
-        whole = nn.ModuleDict(
-            {name: part for name, part in stored.items() if part is not None}
-        )  # for messages
-        whole.load_state_dict({name: one for name, one in weights.items() if not name.startswith("map.")})
+        parts = {
+            name: part for name, part in parts_of(model).items() if part and name in ("features", "whitening")
+        }
+        rest = {name: weight for name, weight in weights.items() if not name.startswith("map.")}
+        nn.ModuleDict(parts).load_state_dict(rest)  # refuses others, by their whole names
         model.descriptor.weight_bits = 8 if len(weights) < len(tensors) else 32
         check_rounded(model.descriptor)
         model.state = state_from_json(header, model.map.table.frames)

@@ -313,12 +313,12 @@ def test_a_map_of_arguments_that_are_gone_scores_alike(path: Path) -> None:
     features, frames = Joined([PatchPixels((8, 12)), PatchPixels((12, 8))]), pictures()
     model = DejaVu(features, mapper=SpectralMapper(step=0.1)).learn(frames)
     model.save(path)
-    gone = {WHITENING + "most_views": 20_000, WHITENING + "power": 1.0, WHITENING + "group_numbers": None}
-    craft(path, None, **gone, **{FEATURES + "shares": None})
+    gone = {WHITENING + "most_views": 500, WHITENING + "power": 1.0, WHITENING + "group_numbers": None}
+    craft(path, None, **gone, **{FEATURES + "shares": [1, 0.5]})  # only learning took these
     for module in (None, features):
         assert torch.equal(DejaVu.load(path, features=module)(frames), model(frames))
-    craft(path, None, **{FEATURES + "shares": [1, 0.5]})
-    with refused(str(path), "Joined has shares [1, 0.5]; expected None"):
+    craft(path, None, **{WHITENING + "power": 0.5})
+    with refused(str(path), "Whitening has power 0.5; expected 1.0"):
         DejaVu.load(path)
 
 
