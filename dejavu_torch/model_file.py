@@ -327,7 +327,9 @@ def read_model(make: Callable[..., R], path: Path, features: nn.Module | None) -
         _fill(model.map, tensors, header["map"])
         check_types(weights, model.descriptor.features)
         parts = {
-            name: part for name, part in parts_of(model).items() if part and name in ("features", "whitening")
+            name: part
+            for name, part in parts_of(model).items()
+            if part is not None and name in ("features", "whitening")
         }
         rest = {name: weight for name, weight in weights.items() if not name.startswith("map.")}
         nn.ModuleDict(parts).load_state_dict(rest)  # refuses others, by their whole names
