@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import importlib
 import math
+import multiprocessing
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -361,6 +362,12 @@ def visits_of(places: Tensor) -> LabelledFrames:
     """Frames that show these places; -1 is none."""
     noise = 0.5 * torch.randn(len(places), 12, generator=torch.Generator().manual_seed(2))
     return LabelledFrames(ArrayTraverse(route()[places] + noise), places)
+
+
+def test_processes_write_the_file_of_one(tmp_path: Path) -> None:
+    whole = file_of(model().learn(route()), tmp_path)
+    with multiprocessing.get_context("spawn").Pool(2) as pool:
+        assert file_of(model().learn(route(), map_tasks=pool.imap), tmp_path) == whole
 
 
 def test_visits_are_averaged_in_chunk_by_chunk(tmp_path: Path, made: list[int]) -> None:
