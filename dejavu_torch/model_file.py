@@ -309,7 +309,9 @@ def read_model(make: Callable[..., R], path: Path, features: nn.Module | None) -
         _fill(model.map, tensors, header["map"])
         check_types(weights, model.descriptor.features)
         stored = {name: part for name, part in parts_of(model).items() if name in ("features", "whitening")}
-        whole = nn.ModuleDict({name: part for name, part in stored.items() if part is not None})  # for messages
+        whole = nn.ModuleDict(
+            {name: part for name, part in stored.items() if part is not None}
+        )  # for messages
         whole.load_state_dict({name: one for name, one in weights.items() if not name.startswith("map.")})
         model.descriptor.weight_bits = 8 if len(weights) < len(tensors) else 32
         check_rounded(model.descriptor)

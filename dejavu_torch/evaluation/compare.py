@@ -109,7 +109,7 @@ def compare(
         leave_out: also query the reference with itself, see `leave_out_match`; a diagnostic.
         seed: for shuffling the null control.
         interpolate: see `find_ground_truth`.
-        second: see `DejaVu.describe_reference`; another traverse than the query.
+        second: see `DejaVu.learn`; another traverse than the query.
         others: further models that learn the same reference, by their keys in report.json, with their names
             in tables. They need a ground truth, and none of them resamples.
         sequence: matches consecutive queries together, on the map and on all baselines.
