@@ -13,6 +13,7 @@ import pytest
 import torch
 from command_line import fails, run
 from devices import DEVICE, pretend
+from helpers import long_from
 from torch import Tensor, nn
 
 from dejavu_torch import (

@@ -68,15 +68,12 @@ def test_a_second_traverse_is_found_at_five_bytes_a_place(
 def test_two_runs_give_the_same_map(model: DejaVu, reference: Traverse) -> None:
     torch.manual_seed(5)  # of the caller: not of the copies
     again, other = spectral().learn(reference), spectral(seed=1).learn(reference)
+    projection = "descriptor.whitening.projection"
     states = [one.state_dict() for one in (model, again, other)]
-    assert torch.equal(
-        states[0]["descriptor.whitening.projection"], states[1]["descriptor.whitening.projection"]
-    )
+    assert torch.equal(states[0][projection], states[1][projection])
     for name in ("map.streams", "map.steps", "map.means"):
         assert torch.equal(states[0][name], states[1][name])
-    assert not torch.equal(
-        states[0]["descriptor.whitening.projection"], states[2]["descriptor.whitening.projection"]
-    )
+    assert not torch.equal(states[0][projection], states[2][projection])
 
 
 def test_scores_of_frames_and_of_their_features_agree(model: DejaVu, second: Traverse) -> None:
