@@ -13,6 +13,7 @@ import pytest
 import torch
 from command_line import fails, run
 from devices import DEVICE, pretend
+from helpers import long_from
 from torch import Tensor, nn
 
 from dejavu_torch import (
@@ -34,7 +35,6 @@ from dejavu_torch import (
     compare,
     evaluate,
     growth,
-    learning,
     open_source,
 )
 from dejavu_torch.cli.device import device_of
@@ -291,7 +291,7 @@ def test_a_map_grows_on_a_gpu(device: str, visits: Visits) -> None:
 
 def test_a_long_route_is_learned_and_searched_on_a_gpu(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """From a sample, chunk by chunk, with principal components of wide features; then by its own samples."""
-    monkeypatch.setattr(learning, "SAMPLE", 200)
+    long_from(monkeypatch, 200)
     monkeypatch.setattr(coarse, "MIN_PLACES", 100)
     wave = torch.sin(0.05 * torch.arange(600.0)[:, None] * torch.rand(260) + torch.arange(260))
     model = DejaVu(mapper=SpectralMapper(8.0, chunk=200)).to(device).learn(wave)

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 from footage import REFERENCE, SIDE, camera, footage
-from helpers import refused, streamed, template_model
+from helpers import long_from, refused, streamed, template_model
 from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
@@ -55,8 +55,9 @@ def learned(route: Tensor | Traverse, chunk: int = 64, **settings: object) -> De
 class Named(ArrayTraverse):
     """Frames or features with names."""
 
-    def frame_name(self, i: int) -> str:
-        return f"{self.name}_{i:04}.png"
+    @property
+    def names(self) -> list[str]:  # type: ignore[override]
+        return [f"{self.name}_{i:04}.png" for i in range(len(self))]
 
 
 def spectral(model: DejaVu) -> SpectralMap:
@@ -119,7 +120,7 @@ def test_names_follow_and_parts_without_names_stay_without() -> None:
     route = walk(192)
     model = learned(route[:64])
     append(append(model, Named(route[64:128], "b")), route[128:])
-    names = [model.frame_name(i) for i in (63, 64, 127, 128)]
+    names = [model.frame_names[i] for i in (63, 64, 127, 128)]
     assert names == ["", "b_0000.png", "b_0063.png", ""]
     assert append(learned(route[:64]), route[64:128]).frame_names == []
 
@@ -189,7 +190,7 @@ def test_no_place_is_lost_behind_more_than_float32_can_count() -> None:
 def test_frames_that_are_appended_are_coded_as_those_of_a_long_route(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(learning, "SAMPLE", 60)
+    long_from(monkeypatch, 60)
     route = open_source("sim:aerial?frames=130")
     mapper = SpectralMapper(5.0, chunk=40)
     whole = DejaVu(whitening=Whitening(views=1), mapper=mapper, batch_size=16).learn(route)
@@ -200,7 +201,7 @@ def test_frames_that_are_appended_are_coded_as_those_of_a_long_route(
     sizes = []
     code = learning.encode_chunk
     monkeypatch.setattr(
-        learning, "encode_chunk", lambda rows, **rest: sizes.append(len(rows)) or code(rows, **rest)
+        learning, "encode_chunk", lambda rows, *rest: sizes.append(len(rows)) or code(rows, *rest)
     )
     append(part, open_source("sim:aerial?frames=130&start=80"))
     assert sizes == [40, 10]  # a chunk of descriptors at a time
@@ -301,7 +302,7 @@ def test_a_place_of_a_merged_map_has_a_route_and_a_frame() -> None:
     assert merged.map.table.route_of(places).tolist() == [[0, 0, 1], [1, 2, 2], [-1, 0, -1]]
     assert merged.map.table.own_frame_of(places).tolist() == [[0, 99, 0], [129, 0, 159], [-1, 5, -1]]
     assert torch.equal(merged.map.frame_of(places), places)
-    assert [merged.frame_name(i) for i in (99, 100, 389)] == ["a_0099.png", "b_0000.png", "c_0159.png"]
+    assert [merged.frame_names[i] for i in (99, 100, 389)] == ["a_0099.png", "b_0000.png", "c_0159.png"]
     for i in range(3):
         found = merged.localize(walk(100 + 30 * i, seed=i) + i).index
         assert (merged.map.table.route_of(found) == i).float().mean() > 0.95
@@ -363,7 +364,7 @@ def test_merging_merged_maps_and_names_that_are_there(caplog: pytest.LogCaptureF
     names = [one.name for one in both.map.routes]
     assert names == ["route", "route-2", "route-3", "route-4", "route-2-2"]
     assert (both.map.places, both.threshold, len(both.frame_names)) == (2 * 230 + 160, 0.25, 620)
-    assert both.frame_name(390) == "a_0000.png"
+    assert both.frame_names[390] == "a_0000.png"
     assert caplog.text == ""
 
 

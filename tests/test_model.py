@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -42,16 +41,18 @@ class Tiny(nn.Module):
         return self.drop(torch.tanh(self.norm(self.conv(frames)))).mean((2, 3))
 
 
-class Stream(Traverse):
+class Made(Traverse):
     """Features or frames made as they are asked for; counts its batches."""
 
-    def __init__(self, make: Any, length: int) -> None:
-        self.make, self.length, self.given = make, length, 0
+    def __init__(self, make: Any, count: int) -> None:
+        self.make, self.count, self.given = make, count, 0
 
-    def batches(self, size: int) -> Iterator[Tensor]:
-        for start in range(0, self.length, size):
-            self.given += 1
-            yield self.make(torch.arange(start, min(start + size, self.length)))
+    def __len__(self) -> int:
+        return self.count
+
+    def read(self, frames: range | list[int]) -> Tensor:
+        self.given += 1
+        return self.make(torch.as_tensor(frames))
 
 
 def layers(*periods: int, stop: int = 72, features: int = 4) -> Fixed:
@@ -99,7 +100,7 @@ def test_tensors_traverses_and_batch_sizes_agree(make: Any) -> None:
     torch.testing.assert_close(other.map.templates, whole.map.templates)
     query = values[::5] + 0.01
     expected = whole.localize(query)
-    for source in (query, ArrayTraverse(query), Stream(lambda at: query[at], len(query))):
+    for source in (query, ArrayTraverse(query), Made(lambda at: query[at], len(query))):
         found = other.localize(source)
         assert torch.equal(found.index, expected.index)
         torch.testing.assert_close(found.score, expected.score)
@@ -343,11 +344,11 @@ def test_what_is_known_of_a_map_is_part_of_its_state() -> None:
     model, again = wave_model().learn(waves()), wave_model()
     model.trained, model.frame_names = Training(7, None), [f"{i:04}.png" for i in range(72)]
     again.load_state_dict(model.state_dict())
-    assert (again.frame_shape, again.trained, again.frame_name(7)) == ((2,), Training(7, None), "0007.png")
+    assert (again.frame_shape, again.trained, again.frame_names[7]) == ((2,), Training(7, None), "0007.png")
     again.learn(waves())  # anew
-    assert (again.trained, again.frame_name(7)) == (None, "")
+    assert (again.trained, again.frame_names) == (None, [])
     model.load_state_dict(again.state_dict())
-    assert (model.trained, model.frame_name(7)) == (None, "")
+    assert (model.trained, model.frame_names) == (None, [])
 
 
 class Paired(nn.Module):
@@ -395,7 +396,7 @@ def on_waves(query: Tensor) -> Any:
             for values in (torch.zeros(72), torch.zeros(72, 2, dtype=torch.int64), torch.zeros(72, 3, 4))
         ),
         (lambda: wave_model().learn(torch.zeros(0, 2)), ("(0, 2)", "expected frames")),
-        (lambda: wave_model().learn(Stream(waves, 0)), ("no frames",)),
+        (lambda: wave_model().learn(Made(waves, 0)), ("no frames",)),
         (
             lambda: template_model(Wrong(), layers(8)).learn(pictures()),
             ("Wrong", "expected features (64, D)"),
@@ -418,13 +419,13 @@ def test_what_is_refused(use: Any, words: tuple[str, ...]) -> None:
 
 def test_queries_are_read_as_they_are_matched_in_constant_memory(largest_tensor: Any) -> None:
     model = wave_model(batch_size=4).learn(waves())
-    stream, numbers = Stream(lambda at: waves()[at % 72], 5 * READY), set()
-    for i, match in enumerate(model.matches(stream)):  # ready features come in larger batches than frames
+    made, numbers = Made(lambda at: waves()[at % 72], 5 * READY), set()
+    for i, match in enumerate(model.matches(made)):  # ready features come in larger batches than frames
         assert match.index.tolist() == [(READY * i + j) % 72 for j in range(READY)]
-        assert stream.given <= i + 5
+        assert made.given <= i + 5
     for batches in (3, 12):
         with largest_tensor() as seen:
-            found = [*model.matches(Stream(lambda at: waves()[at % 72], batches * READY))]
+            found = [*model.matches(Made(lambda at: waves()[at % 72], batches * READY))]
             assert len(found) == batches
         numbers.add(seen.numel)
     assert len(numbers) == 1

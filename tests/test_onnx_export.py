@@ -228,7 +228,7 @@ def test_the_documentation_runs_and_a_filter_goes_from_state_to_state(
 ) -> None:
     page = (Path(__file__).parents[1] / "docs" / "howto" / "export.md").read_text()
     monkeypatch.chdir(tmp_path)
-    frame = next(open_source("sim:aerial?frames=64&traverse=1").between(40, 41))[0]
+    frame = open_source("sim:aerial?frames=64&traverse=1")[40]
     Image.fromarray((frame * 255).byte().permute(1, 2, 0).numpy()).save("frame.png")
     space: dict[str, Any] = {}
     for language, block in re.findall(r"```(sh|python)\n(.*?)```", page, re.DOTALL):
@@ -239,6 +239,6 @@ def test_the_documentation_runs_and_a_filter_goes_from_state_to_state(
     found = re.findall(r"^(\d+) (?:True|False)$", capsys.readouterr().out, re.MULTILINE)
     assert [abs(int(place) - 40) <= 5 for place in found] == [True] * 4
     route, model = DejaVu.load("road.safetensors").eval(), PlaceFilter()
-    queries = next(open_source("sim:aerial?frames=64&traverse=1").between(30, 42))
+    queries = open_source("sim:aerial?frames=64&traverse=1")[30:42]
     facts = assert_streams(Path("drive.onnx"), route, model, [65], queries)
     assert facts["threshold"] == model.likely

@@ -28,7 +28,7 @@ def flights(data_dir: Path) -> tuple[Tensor, Tensor]:
     both = []
     for name in ("pass1.png", "pass2.png"):
         strip = open_source(f"strip:{data_dir}/aerial_road/{name}?grey=1&halve=1&rows=32:128&width=96")
-        assert strip.length == 2697
+        assert len(strip) == 2697
         both.append(torch.cat(list(islice(feature_batches(strip, HOG(), 64), FRAMES // 64))))
     return both[0], both[1]
 

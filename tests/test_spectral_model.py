@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dejavu_torch import HOG, DejaVu, ImposedPeriods, SequenceMatcher, TemplateMapper, open_source
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.traverse import FrameRange
+from dejavu_torch.data.traverse import frame_range
 from dejavu_torch.features.views import LabelledFrames, augmented_route
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.growth import second_traverse
@@ -67,11 +67,12 @@ def test_a_second_traverse_is_found_at_five_bytes_a_place(
 def test_two_runs_give_the_same_map(model: DejaVu, reference: Traverse) -> None:
     torch.manual_seed(5)  # of the caller: not of the copies
     again, other = spectral().learn(reference), spectral(seed=1).learn(reference)
+    projection = "descriptor.whitening.projection"
     states = [one.state_dict() for one in (model, again, other)]
-    assert torch.equal(states[0]["whitening.projection"], states[1]["whitening.projection"])
+    assert torch.equal(states[0][projection], states[1][projection])
     for name in ("map.streams", "map.steps", "map.means"):
         assert torch.equal(states[0][name], states[1][name])
-    assert not torch.equal(states[0]["whitening.projection"], states[2]["whitening.projection"])
+    assert not torch.equal(states[0][projection], states[2][projection])
 
 
 def test_scores_of_frames_and_of_their_features_agree(model: DejaVu, second: Traverse) -> None:
@@ -105,7 +106,7 @@ def test_save_and_load(model: DejaVu, second: Traverse, tmp_path: Path) -> None:
 
 def test_whitening_by_a_second_traverse(model: DejaVu, reference: Traverse, second: Traverse) -> None:
     learned = spectral().learn(reference, second=LabelledFrames(second, torch.arange(FRAMES)))
-    projections = [one.state_dict()["whitening.projection"] for one in (learned, model)]
+    projections = [one.state_dict()["descriptor.whitening.projection"] for one in (learned, model)]
     assert not torch.equal(*projections)
     assert near_share(learned, open_source(f"sim:aerial?frames={FRAMES}&traverse=2")) > 0.95
 
@@ -152,7 +153,7 @@ def test_the_whitening_of_another_model(model: DejaVu, reference: Traverse, tmp_
             other.descriptor.take(without.descriptor, whitening=True)
     other.descriptor.take(known.descriptor, whitening=True)
     other.learn(open_source(f"sim:aerial?frames={FRAMES}&traverse=1"))
-    states = [one.state_dict()["whitening.projection"] for one in (model, other)]
+    states = [one.state_dict()["descriptor.whitening.projection"] for one in (model, other)]
     assert torch.equal(*states)  # fixed
     assert near_share(other, reference) > 0.9
 
@@ -176,7 +177,7 @@ def test_two_features_beside_a_larger_drift_are_localized() -> None:
 
 def test_copies_are_those_of_the_seed_and_in_order(reference: Traverse) -> None:
     (copies, places), _ = augmented_route(reference, FRAMES, copies=3, most=60, strengths={}, seed=4)
-    assert copies.length == 60
+    assert len(copies) == 60
     assert places.tolist() == 3 * list(range(0, FRAMES, 10))  # one block
     frames = all_of(copies, 12)
     torch.manual_seed(1)
@@ -233,7 +234,7 @@ def test_the_variance_that_a_map_of_ready_features_holds() -> None:
 
 def test_frames_that_five_bytes_are_too_few_for(reference: Traverse) -> None:
     """The mean of 1764 numbers alone takes 58.8 bytes of each of 60 places."""
-    few = FrameRange(reference, 0, 60, 1)
+    few = frame_range(reference, 0, 60, 1)
     with refused("route_bytes_per_place is 5;", "expected more than 59.3"):
         DejaVu(whitening="none", mapper=SpectralMapper(5.0)).learn(few)
     assert DejaVu(whitening="none").learn(few).map.dimension == 1764

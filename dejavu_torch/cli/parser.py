@@ -476,7 +476,7 @@ def _model_of(name: str, arguments: dict[str, Any], words: Sequence[str]) -> Dej
         _check_own(words, {"preprocess", "weight_bits"}, f"the descriptor of {descriptor}")
     model = DejaVu(**settings)
     if descriptor:
-        model.take_descriptor(DejaVu.load(descriptor, named_features(model)))
+        model.descriptor.take(DejaVu.load(descriptor, named_features(model)).descriptor)
     return model
 
 

@@ -145,9 +145,7 @@ def take(traverse: Traverse, most: int = 4) -> None:
             raise Wrong("frames out of [0, 1]")
         if i == most:
             break
-    if traverse.length:
-        for i in range(min(3, traverse.length)):
-            traverse.frame_name(i)
+    assert len(traverse.names) in (0, len(traverse))
 
 
 def localize(model: DejaVu, queries: Traverse, random: Random) -> None:
@@ -160,7 +158,7 @@ def localize(model: DejaVu, queries: Traverse, random: Random) -> None:
     if bool(match.score.isnan().any()):
         raise Wrong("scores are NaN")
     for frame in model.map.frame_of(match.index).tolist():
-        model.frame_name(frame)
+        model.frame_names[frame : frame + 1]
 
 
 def same_model(first: DejaVu, second: DejaVu) -> bool:

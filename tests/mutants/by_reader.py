@@ -221,8 +221,8 @@ MUTANTS = [
     Mutant(
         "Augmented copies, and the places that they are said to show, are the same whatever the batch size.",
         "dejavu_torch/features/views.py",
-        "for frames in self._blocks():",
-        "for frames in chain.from_iterable(block.split(size) for block in self._blocks()):",
+        "size = self.traverse.at_once(size)\n",
+        "size = self.block = self.traverse.at_once(size)\n",
         (
             "tests/test_spectral_model.py::test_copies_are_those_of_the_seed_and_in_order",
             "tests/recognition/test_calibration.py::test_changed_frames_show_their_places_whatever_the_batch",
@@ -257,14 +257,6 @@ MUTANTS = [
         ("tests/test_learning.py::-k partial_map_of_another_run or appended_to_a_map_are_kept",),
     ),
     Mutant(
-        "No batch spans two chunks of a long route: each has `chunk` places, also where that is no "
-        "multiple of the batch size, and the bytes do not hang on where reading began.",
-        "dejavu_torch/learning.py",
-        "wanted = min(size, self.chunk - done % self.chunk, self.length - done)",
-        "wanted = min(size, self.length - done)",
-        ("tests/test_learning.py::-k bytes_do_not_hang_on_how or own_descriptors",),
-    ),
-    Mutant(
         "On a cluster the places of a merged map, of three routes too, are those of a scan by one process.",
         "dejavu_torch/cluster.py",
         "place + self.first, place)",
@@ -274,8 +266,8 @@ MUTANTS = [
     Mutant(
         "Chunks of a long route, and of appended places, are coded with the resolution of the map.",
         "dejavu_torch/learning.py",
-        'settings = {"transform": route.transform, "resolution": route.resolution}',
-        'settings = {"transform": route.transform, "resolution": 0.0}',
+        "self.step, self.transform, self.resolution)",
+        "self.step, self.transform, 0.0)",
         (
             "tests/test_growth.py::-k those_of_a_long_route or learned_at_once",
             "tests/maps/test_spectral.py::test_resolution_is_kept_and_extends_alike",

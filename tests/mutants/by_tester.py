@@ -259,16 +259,16 @@ MUTANTS = [
     ),
     Mutant(
         "A whitening learns each member of joined features by itself.",
-        "dejavu_torch/learning.py",
-        "groups = None if is_ready(traverse) else groups_of(self.pipeline)",
+        "dejavu_torch/features/descriptor.py",
+        "groups = None if is_ready(traverse) else groups_of(self.features)",
         "groups = None",
         ("tests/features/test_joined.py::test_a_whitening_takes_the_groups_of_the_features",),
     ),
     Mutant(
         "Ready features do not have the groups of features that are not run.",
-        "dejavu_torch/learning.py",
-        "groups = None if is_ready(traverse) else groups_of(self.pipeline)",
-        "groups = groups_of(self.pipeline)",
+        "dejavu_torch/features/descriptor.py",
+        "groups = None if is_ready(traverse) else groups_of(self.features)",
+        "groups = groups_of(self.features)",
         ("tests/features/test_joined.py::test_ready_features_have_no_groups_but_those_that_are_asked_for",),
     ),
     Mutant(
@@ -331,17 +331,24 @@ MUTANTS = [
     ),
     Mutant(
         "A long route is learned from a sample of all of its length.",
-        "dejavu_torch/learning.py",
+        "dejavu_torch/features/views.py",
         "starts = torch.arange(count) * (frames // length - 1) // max(1, count - 1) * length",
         "starts = torch.arange(count) * length",
         ("tests/test_learning.py::test_convention_the_sample_is_evenly_spaced_and_of_whole_chunks",),
     ),
     Mutant(
-        "A route that ends ahead of its last frame is refused, and no shorter map written.",
-        "dejavu_torch/learning.py",
-        'raise InputError(f"{name} ended at frame {done}; expected its {self.frames} frames")',
-        "break",
-        ("tests/test_learning.py::test_a_route_that_ends_early_is_refused",),
+        "A video decodes from the key frame before a frame, and any frame is exact.",
+        "dejavu_torch/data/video.py",
+        "if self._decoder is None or not key <= self._next <= i:",
+        "if self._decoder is None or not self._next <= i + 1:",
+        ("tests/data/test_video.py::test_any_frame_is_exact_in_any_order",),
+    ),
+    Mutant(
+        "Negative numbers of frames count from the end.",
+        "dejavu_torch/types.py",
+        "[i + count if -count <= i < 0 else i for i in numbers]",
+        "[abs(i) for i in numbers]",
+        ("tests/data/test_traverse.py::test_any_traverse_is_a_sequence",),
     ),
     Mutant(
         "The tolerance is inclusive.",
@@ -448,8 +455,8 @@ MUTANTS = [
     Mutant(
         "A run that goes on makes no chunk again that FILE.part holds.",
         "dejavu_torch/learning.py",
-        "missing = range(-(-(route.places - start) // route.chunk), coder.total)",
-        "missing = range(coder.total)",
+        "for i in range(len(done), frames, route.chunk)]",
+        "for i in range(0, frames, route.chunk)]",
         ("tests/test_learning.py::test_finished_chunks_are_not_made_again",),
     ),
     Mutant(
