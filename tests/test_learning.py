@@ -365,9 +365,9 @@ def visits_of(places: Tensor) -> LabelledFrames:
 
 
 def test_processes_write_the_file_of_one(tmp_path: Path) -> None:
-    whole = file_of(model().learn(route()), tmp_path)
+    whole = file_of(learned(route()), tmp_path)
     with multiprocessing.get_context("spawn").Pool(2) as pool:
-        assert file_of(model().learn(route(), map_tasks=pool.imap), tmp_path) == whole
+        assert file_of(learned(route(), map_tasks=pool.imap), tmp_path) == whole
 
 
 def test_visits_are_averaged_in_chunk_by_chunk(tmp_path: Path, made: list[int]) -> None:

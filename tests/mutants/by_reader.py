@@ -231,15 +231,15 @@ MUTANTS = [
     Mutant(
         "Appending places drops the calibration of the map, which was made for fewer places.",
         "dejavu_torch/model.py",
-        "self.map, self.searcher, self.calibration = route, None, None",
+        "self.map, self.searcher, self.calibration = place_map, None, None",
         "self.map = route",
         ("tests/test_growth.py::test_a_calibration_goes_and_comes_again_from_the_new_places",),
     ),
     Mutant(
         "A third visit that is averaged into a map weighs a third.",
         "dejavu_torch/growth.py",
-        "means = learning.with_visits(route.decode(g), counts[start:stop], rows",
-        "means = learning.with_visits(route.decode(g), torch.ones(stop - start), rows",
+        "means = learning.with_visits(place_map.decode(g), counts[start:stop], rows",
+        "means = learning.with_visits(place_map.decode(g), torch.ones(stop - start), rows",
         ("tests/test_behaviour.py::test_a_third_visit_weighs_a_third",),
     ),
     Mutant(

@@ -455,8 +455,8 @@ MUTANTS = [
     Mutant(
         "A run that goes on makes no chunk again that FILE.part holds.",
         "dejavu_torch/learning.py",
-        "for i in range(len(done), frames, route.chunk)]",
-        "for i in range(0, frames, route.chunk)]",
+        "for i in range(len(done), frames, place_map.chunk)]",
+        "for i in range(0, frames, place_map.chunk)]",
         ("tests/test_learning.py::test_finished_chunks_are_not_made_again",),
     ),
     Mutant(
