@@ -145,20 +145,25 @@ class Fitted(Part):
         self.shape, self.sized = shape, True
 
     def read(self, frames: range | list[int]) -> Tensor:
-        channels, height, width = self.shape
         parts, at_once = [], self.traverse.at_once(len(frames))  # these may be larger
         for start in range(0, len(frames), at_once):
-            part = resize_frames(super().read(frames[start : start + at_once]), (height, width))
-            if part.shape[1] == 3 and channels == 1:
-                from kornia.color import rgb_to_grayscale  # slow to import
-
-                part = rgb_to_grayscale(part)
-            parts.append(part.expand(-1, channels, -1, -1))
+            parts.append(as_shape(super().read(frames[start : start + at_once]), self.shape))
         return parts[0] if len(parts) == 1 else torch.cat(parts)
 
     @cached_property
     def frame_shape(self) -> tuple[int, ...]:
         return self.shape
+
+
+def as_shape(frames: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """Frames (B,C,H,W) as ones of this shape: resized, turned grey, or the grey channel repeated."""
+    channels, height, width = shape
+    frames = resize_frames(frames, (height, width))
+    if frames.shape[1] == 3 and channels == 1:
+        from kornia.color import rgb_to_grayscale  # slow to import
+
+        frames = rgb_to_grayscale(frames)
+    return frames.expand(-1, channels, -1, -1)
 
 
 def fitted(traverse: Traverse, shape: tuple[int, ...]) -> Traverse:

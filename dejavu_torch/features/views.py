@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.traverse import Part
+from dejavu_torch.data.traverse import Part, as_shape
 from dejavu_torch.features.augmentation import LARGEST, Augmentation
 from dejavu_torch.types import InputError, Traverse
 
@@ -118,7 +119,13 @@ class AugmentedFrames:
                     torch.set_rng_state(state)
                     copies: Tensor = self.augmentation.train()(frames)
                     state = torch.get_rng_state()
-                yield from copies.split(size)
+                yield from (as_shape(part, self.frame_shape) for part in copies.split(size))
+
+    def fitted(self, shape: tuple[int, ...]) -> AugmentedFrames:
+        """The same copies converted to another shape (C,H,W), see `as_shape`."""
+        other = copy.copy(self)
+        other.frame_shape = shape
+        return other
 
 
 def augmented_route(

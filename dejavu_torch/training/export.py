@@ -21,7 +21,7 @@ from dejavu_torch.evaluation.baselines import hog_baselines
 from dejavu_torch.evaluation.contenders import contend
 from dejavu_torch.evaluation.curves import Scores
 from dejavu_torch.features.preprocess import Preprocess
-from dejavu_torch.features.views import LabelledFrames, augmented_segments
+from dejavu_torch.features.views import AugmentedFrames, LabelledFrames, augmented_segments
 from dejavu_torch.features.whitening import STRENGTHS
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.template_map import TemplateMapper
@@ -209,6 +209,8 @@ def compare_with_untrained(
 
 
 def _of_shape(query: Traverse, shape: tuple[int, ...] | None) -> Traverse:
+    if isinstance(query, AugmentedFrames):
+        return cast(Traverse, query.fitted(shape or ()))
     return fitted(query, shape or ()) if len(query.frame_shape) == 3 else query
 
 

@@ -112,7 +112,7 @@ def test_fewer_bytes_of_a_video_give_back_less(codec: str) -> None:
     still = float((frames[torch.randperm(40)] - frames).square().mean())
     assert errors[0] < min(errors[1], still / 4)  # and in their order
     last = (all_of(third)[-1] - frames).square().mean((1, 2, 3))
-    assert (third.length, int(last.argmin())) == (14, 39)
+    assert (len(third), int(last.argmin())) == (14, 39)
 
 
 def test_grey_frames_of_odd_sizes_and_ready_features() -> None:

@@ -132,7 +132,7 @@ def test_layers_that_were_found_are_taken_over(tmp_path: Path, settings: dict[st
     assert again.route.plan == written.plan
     assert [layer.phases for layer in again.route.plan] == [5, 7, 9]
     trainer(tmp_path).validate(evaluated, data_of(), ckpt_path=first, verbose=False)
-    for name in ("dejavu.features.linear.weight", "dejavu.map.templates", "log_temperature"):
+    for name in ("dejavu.descriptor.features.linear.weight", "dejavu.map.templates", "log_temperature"):
         assert torch.equal(evaluated.state_dict()[name], state[name])
     assert [one.dejavu.mapper.periods.asked for one in (again, evaluated)] == [0, 0]  # type: ignore[union-attr]
 
@@ -156,7 +156,7 @@ def test_a_resumed_run_finds_layers_anew_when_it_is_time_to(tmp_path: Path) -> N
         ("templates 3", {"mapper": mapper(ImposedPeriods([3, 4, 7], bin=2))}, FRAMES, ["5 in 10", "7 in 14"]),
         ("templates 3", {"mapper": mapper(metric="l2")}, FRAMES, ["metric is 'l1'", "expected 'l2'"]),
         ("templates 3", {"feature_weights": True}, FRAMES, ["dejavu.map.weights", "not in both"]),
-        ("templates 3", {"freeze": ["linear"]}, FRAMES, ["dejavu.features.linear.bias, dejavu"]),
+        ("templates 3", {"freeze": ["linear"]}, FRAMES, ["dejavu.descriptor.features.linear.bias, dejavu"]),
         ("templates 3", {"backbone": coded()}, FRAMES, ["['CodeStage']", "['DescriptorStage', 'CodeStage']"]),
         ("templates 3", {}, 30, ["the map has 40 places", "the array has 30"]),
         ("spectral 4", {"mapper": mapper()}, FRAMES, ["['DescriptorStage']", "'CodeStage'"]),

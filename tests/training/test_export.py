@@ -38,7 +38,7 @@ def test_the_map_is_of_the_best_checkpoint_and_training_stops_early(tmp_path: Pa
     state = torch.load(best.best_model_path, weights_only=True)["state_dict"]
     model = DejaVu.load(tmp_path / "map.safetensors")
     assert torch.equal(model.map.templates, state["dejavu.map.templates"])
-    assert torch.equal(model.features.linear.weight, state["dejavu.features.linear.weight"])
+    assert torch.equal(model.features.linear.weight, state["dejavu.descriptor.features.linear.weight"])
     last = torch.load(tmp_path / "last.ckpt", weights_only=True)["state_dict"]
     assert not torch.equal(model.map.templates, last["dejavu.map.templates"])
     assert model.trained is not None
