@@ -26,7 +26,7 @@ from dejavu_torch.types import InputError
 
 
 def pairs(n: int = 200, k: int = 6, seed: int = 0) -> tuple[Tensor, Tensor]:
-    """LabelledFrames and their places: the first numbers change most, the last ones tell most of the place."""
+    """Views and their places: the first numbers change most, the last ones tell most of the place."""
     random = torch.Generator().manual_seed(seed)
     places = torch.randn(n, k, generator=random) * torch.linspace(0.5, 3, k)
     return places + torch.randn(n, k, generator=random) * torch.linspace(3, 0.5, k), places
