@@ -99,7 +99,8 @@ class AugmentedFrames:
         self.traverse, self.runs, self.block, self.copies, self.seed = traverse, runs, block, copies, seed
         blocks = (part for run in runs for part in torch.tensor(run).split(block))
         self.places = torch.cat([part.repeat(copies) for part in blocks])
-        self.name, self.frame_shape = f"augmented copies of {traverse.name}", traverse.frame_shape
+        self.name = f"augmented copies of {traverse.name}"
+        self.frame_shape: tuple[int, ...] = traverse.frame_shape
 
     def __len__(self) -> int:
         return len(self.places)
