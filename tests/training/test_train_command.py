@@ -180,7 +180,6 @@ def test_a_spectral_map_whatever_mapper_a_preset_has(
         options = [*chosen[:-1], size, "--trainer.default_root_dir", tmp_path / str(size)]
         options += ["--data.validation=two.npy", "--data.validation_truth=0"]  # which calibrates the map
         train("export", "--ckpt_path", tmp_path / "fit" / "checkpoints" / "last.ckpt", *options)
-        assert ("less than half of the descriptors" in capfd.readouterr().out) == (size == 1.2)
     maps = [DejaVu.load(tmp_path / name / "map.safetensors") for name in ("fit", "12", "1.2")]
     assert all(isinstance(model.map, SpectralMap) for model in maps)
     assert [model.calibration is not None for model in maps] == [False, True, True]
