@@ -8,8 +8,8 @@ MUTANTS = [
     Mutant(
         "A second model made of the settings of a first learns a whitening of its own.",
         "dejavu_torch/model.py",
-        "            whitening = copy.deepcopy(whitening)\n        return own",
-        "            pass\n        return own",
+        "            whitening = copy.deepcopy(whitening)\n        return settings",
+        "            pass\n        return settings",
         ("tests/test_edges.py::-k leaves_the_first_alone",),
     ),
     Mutant(
