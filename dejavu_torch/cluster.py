@@ -208,26 +208,26 @@ def _encode(sent: list[Any], tasks: list[range], folder: str) -> tuple[list[Chun
 @contextmanager
 def _by_value(ray: Any, values: Iterable[object]) -> Iterator[None]:
     """Sends classes from the user's own files as code, since workers do not have these files."""
-    own = {module.__name__: module for value in values for module in _modules_of(value)}
-    for module in own.values():
+    modules = {module.__name__: module for value in values for module in _modules_of(value)}
+    for module in modules.values():
         ray.cloudpickle.register_pickle_by_value(module)
     try:
         yield
     finally:
-        for module in own.values():
+        for module in modules.values():
             ray.cloudpickle.unregister_pickle_by_value(module)
 
 
 def _modules_of(value: object) -> Iterator[ModuleType]:
     """The modules from the user's own files that define the classes of a value and its parts."""
     if isinstance(value, tuple | list):
-        for one in value:
-            yield from _modules_of(one)
+        for item in value:
+            yield from _modules_of(item)
     for part in value.modules() if isinstance(value, nn.Module) else [value]:
-        found = part if isinstance(part, ModuleType) else sys.modules.get(type(part).__module__)
-        file = getattr(found, "__file__", None)
-        if found is None or file is None or found.__name__.split(".")[0] in ("__main__", "dejavu_torch"):
+        module = part if isinstance(part, ModuleType) else sys.modules.get(type(part).__module__)
+        file = getattr(module, "__file__", None)
+        if module is None or file is None or module.__name__.split(".")[0] in ("__main__", "dejavu_torch"):
             continue
         installed = {Path(place).resolve() for place in sysconfig.get_paths().values()}
         if not any(Path(file).resolve().is_relative_to(place) for place in installed):
-            yield found
+            yield module

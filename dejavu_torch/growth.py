@@ -80,8 +80,8 @@ def append(
     grown = copy.deepcopy(place_map)
     grown.positions = place_map.positions[:0]  # set when all places are appended
     if checkpoint is not None:
-        own = digests(base=checksums(place_map.packed(), place_map.get_extra_state()))
-        checkpoint.open(run_key(model, added, visits=visits) | own, grown, model.descriptor)
+        base = digests(base=checksums(place_map.packed(), place_map.get_extra_state()))
+        checkpoint.open(run_key(model, added, visits=visits) | base, grown, model.descriptor)
     settings = visits, progress, checkpoint, map_tasks
     learning.append_places(grown, model.descriptor, added, place_map.places, *settings)
     if counts is not None:
@@ -192,11 +192,11 @@ def associate(
     second = model.resample(second, step, shape=shape)
     frames = len(second)
     numbers = second.frame if isinstance(second, ResampledTraverse) else frames
-    found = find_ground_truth(
+    ground_truth = find_ground_truth(
         truth, source, source_of(second), table.frames, numbers, resampled=step is not None, aligned=True
     )
-    if found is not None:
-        places = table.place_of(found.positives[:, 0])
+    if ground_truth is not None:
+        places = table.place_of(ground_truth.positives[:, 0])
     elif reference is None and step is None and table.frames == frames:
         places = torch.arange(frames)
     else:
@@ -220,14 +220,14 @@ def second_traverse(
         InputError: no whitening that learns, another number of truths, other frame sizes, or as `associate`.
     """
     visits = [second] if isinstance(second, Traverse) else [*second]
-    model.descriptor.require_learning(" + ".join(one.name for one in visits))
+    model.descriptor.require_learning(" + ".join(traverse.name for traverse in visits))
     truths = [truth] if isinstance(truth, str | None) else [*truth]
     truths *= len(visits) if len(truths) == 1 else 1
     if len(truths) != len(visits):
         seen = f"{len(visits)} further traverses and {len(truths)} truths"
         raise InputError(f"{seen}; expected one for each, or one for all")
     views = [associate(model, reference, *pair) for pair in zip(visits, truths, strict=True)]
-    return LabelledFrames(chained([one.traverse for one in views]), torch.cat([one.places for one in views]))
+    return LabelledFrames(chained([v.traverse for v in views]), torch.cat([v.places for v in views]))
 
 
 def calibrate_if_possible(
@@ -252,7 +252,7 @@ def one_route(model: DejaVu, verb: str) -> SpectralMap:
     require_map(model, f" to {verb}")
     place_map = model.map
     if place_map.routes:
-        names = ", ".join(one.name for one in place_map.routes)
+        names = ", ".join(route.name for route in place_map.routes)
         raise InputError(f"the map has the routes {names}; expected to {verb} the map of a route, then merge")
     if not isinstance(place_map, SpectralMap):
         seen = (
@@ -296,8 +296,8 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
             raise InputError(f"{name} is {seen}; expected one of kind {SpectralMap.kind!r} to merge")
         if problem := _difference(first, model):
             raise InputError(f"{names[0]} and {name} cannot be merged: {problem}")
-        own = [(one.name, place_map.part(one.name)) for one in place_map.routes] or [(name, place_map)]
-        for wanted, part in own:
+        maps = [(route.name, place_map.part(route.name)) for route in place_map.routes] or [(name, place_map)]
+        for wanted, part in maps:
             parts[_free_name(wanted, parts)] = part
     _check_count(sum(part.places for part in parts.values()), first.step is not None)
     thresholds = {model.threshold for model in models}
@@ -321,9 +321,9 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
     return merged.replace_map(SpectralMap.merged([*parts.values()], [*parts]))
 
 
-def _free_name(name: str, known: dict[str, SpectralMap]) -> str:
+def _free_name(name: str, taken: dict[str, SpectralMap]) -> str:
     """The name itself, or with the first free number after it."""
-    return name if name not in known else next(f"{name}-{i}" for i in count(2) if f"{name}-{i}" not in known)
+    return name if name not in taken else next(f"{name}-{i}" for i in count(2) if f"{name}-{i}" not in taken)
 
 
 def _difference(first: DejaVu, other: DejaVu) -> str:
@@ -349,8 +349,8 @@ def _difference(first: DejaVu, other: DejaVu) -> str:
             return f"their {what} differ: {mine} and {yours}; expected the same{option}"
     shapes = first.frame_shape, other.frame_shape
     if None not in shapes and not _compatible(first, *shapes):  # type: ignore[arg-type]
-        known, seen = (" x ".join(map(str, shape or ())) for shape in shapes)
-        return f"they were learned from frames of {known} and {seen}; expected the same size"
+        sizes = " and ".join(" x ".join(map(str, shape or ())) for shape in shapes)
+        return f"they were learned from frames of {sizes}; expected the same size"
     return ""
 
 
@@ -374,22 +374,22 @@ def _check_compatible(model: DejaVu, added: Traverse) -> None:
         seen = f"{added.name} has ready features or a single frame, without measurable steps"
         raise InputError(f"{seen}; expected frames, as the map's places are even steps along the ground")
     shape = added.frame_shape
-    own = model.frame_shape or shape  # None for a map learned from descriptors
-    if not _compatible(model, own, shape):
-        seen, known = (
-            "ready features" if len(one) == 1 else f"frames of {' x '.join(map(str, one))}"
-            for one in (shape, own)
+    stored = model.frame_shape or shape  # None for a map learned from descriptors
+    if not _compatible(model, stored, shape):
+        seen, learned = (
+            "ready features" if len(size) == 1 else f"frames of {' x '.join(map(str, size))}"
+            for size in (shape, stored)
         )
-        raise InputError(f"{added.name} has {seen}, the map was learned from {known}; expected the same")
+        raise InputError(f"{added.name} has {seen}, the map was learned from {learned}; expected the same")
     count, expected = model.descriptor.count_features(added), features_per_frame(model)
     if count != expected:
         raise InputError(f"{added.name} gives {count} features per frame; expected {expected}, as in the map")
 
 
-def _compatible(model: DejaVu, own: tuple[int, ...], shape: tuple[int, ...]) -> bool:
+def _compatible(model: DejaVu, stored: tuple[int, ...], shape: tuple[int, ...]) -> bool:
     """Whether a model gives the same descriptors for frames of two shapes, (C,H,W) or (D,)."""
-    if len(own) != len(shape) or len(own) == 1:
-        return len(own) == len(shape)
+    if len(stored) != len(shape) or len(stored) == 1:
+        return len(stored) == len(shape)
     resized = getattr(model.features, "resize", None) is not None
     one_channel = model.preprocess.channel is not None
-    return (own[0] == shape[0] or one_channel) and (own[1:] == shape[1:] or resized)
+    return (stored[0] == shape[0] or one_channel) and (stored[1:] == shape[1:] or resized)

@@ -114,11 +114,11 @@ class Checkpoint:
             return False
         try:
             tensors, header = read_map(self.path)
-            known, state = header["run"], header["map"]
+            stored, state = header["run"], header["map"]
         except (InputError, KeyError) as error:
             raise InputError(f"{self.path} is not a partial map; expected no file there") from error
-        if known != key:
-            other = [name for name in {**key, **known} if key.get(name) != known.get(name)]
+        if stored != key:
+            other = [name for name in {**key, **stored} if key.get(name) != stored.get(name)]
             self._refuse(f": its {', '.join(other)} {'differs' if len(other) == 1 else 'differ'}")
         if descriptor.whitening is not None:
             descriptor.whitening.load_state_dict(part_of(tensors, "whitening"))
@@ -171,8 +171,8 @@ def fit(
 ) -> SpectralMap:
     """A map without places, but with whitening, mean and step from the sample of a long traverse."""
     sample = Sample.of(len(traverse), mapper.chunk)
-    own = second and sample.views(second)
-    rows = descriptor.learn(Part(traverse, sample.frame), own, progress, label="sampling")
+    views = second and sample.views(second)
+    rows = descriptor.learn(Part(traverse, sample.frame), views, progress, label="sampling")
     if visits is not None:
         rows = averaged(descriptor, rows, views_of(visits, sample.frame), progress)
     # the sample is charged its share of the fixed bytes

@@ -45,7 +45,7 @@ def without_autocast(function: Callable[P, R]) -> Callable[P, R]:
 
     @functools.wraps(function)
     def exact(*args: P.args, **kwargs: P.kwargs) -> R:
-        device = next((one.device.type for one in (*args, *kwargs.values()) if isinstance(one, Tensor)), "")
+        device = next((arg.device.type for arg in (*args, *kwargs.values()) if isinstance(arg, Tensor)), "")
         if not device or not torch.amp.is_autocast_available(device):
             return function(*args, **kwargs)
         with torch.autocast(device, enabled=False):
@@ -64,7 +64,7 @@ def is_plain(tensor: Tensor) -> bool:
 
 def is_readable(*tensors: Tensor) -> bool:
     """Whether all are plain and on the CPU, so that nothing waits for a device."""
-    return all(is_plain(one) and one.device.type == "cpu" for one in tensors)
+    return all(is_plain(tensor) and tensor.device.type == "cpu" for tensor in tensors)
 
 
 def free_memory() -> float:
@@ -99,10 +99,10 @@ def _free_in_system() -> float:
 def _free_in_cgroups() -> float:
     """The least that the control group of the process, and every group around it, have left."""
     try:
-        own = next(line[3:] for line in OWN_CGROUP.read_text().splitlines() if line.startswith("0::"))
+        path = next(line[3:] for line in OWN_CGROUP.read_text().splitlines() if line.startswith("0::"))
     except (OSError, StopIteration):
-        own = "/"
-    inside = CGROUPS / own.lstrip("/")
+        path = "/"
+    inside = CGROUPS / path.lstrip("/")
     return min(_free_in(group) for group in (inside, *inside.parents) if group.is_relative_to(CGROUPS))
 
 

@@ -169,11 +169,11 @@ class DejaVu(nn.Module):
         A whitening that is learned with each map is a copy, so that another model can learn; all other parts,
         such as the features, are this model's own.
         """
-        own = {name: getattr(self, name) for name in inspect.signature(DejaVu).parameters}
+        settings = {name: getattr(self, name) for name in inspect.signature(DejaVu).parameters}
         whitening = None if self.descriptor.reduces else self.whitening
         if whitening is not None and not whitening.fixed:
             whitening = copy.deepcopy(whitening)
-        return own | {"whitening": whitening or "none"}
+        return settings | {"whitening": whitening or "none"}
 
     def learn(
         self,
@@ -332,10 +332,10 @@ class DejaVu(nn.Module):
             True
         """
         require_map(self)
-        own = None
+        route = None
         if reference is not None and views is None:
-            own = self.at_map_size(as_traverse(reference), self.frame_shape or ())
-        self.calibration = learning.calibration_of(self.descriptor, self.map, own, views, places, progress)
+            route = self.at_map_size(as_traverse(reference), self.frame_shape or ())
+        self.calibration = learning.calibration_of(self.descriptor, self.map, route, views, places, progress)
         return self
 
     def forward(self, queries: Tensor) -> Tensor:
@@ -404,10 +404,10 @@ class DejaVu(nn.Module):
         single = matching.sequence is None and matching.callback is None
         if not single or matching.search not in ("auto", "coarse"):
             return Localizer(self.map, matching)
-        known = self.searcher
-        if known is None or (isinstance(known, Scan) and not known.fits(self.map)):
-            self.searcher = known = self.make_searcher(self.map)
-        return Localizer(self.map, matching, known)
+        searcher = self.searcher
+        if searcher is None or (isinstance(searcher, Scan) and not searcher.fits(self.map)):
+            self.searcher = searcher = self.make_searcher(self.map)
+        return Localizer(self.map, matching, searcher)
 
     def matches(
         self,
@@ -577,7 +577,7 @@ def check_queries(model: DejaVu, shape: tuple[int, ...], dimension: int, name: s
     if len(reference) == 1:
         seen = f"{name} has frames, but the map was learned from ready features"
         raise InputError(f"{seen}; expected features (Q, {expected})")
-    own, other = (" x ".join(map(str, one)) for one in (shape, reference))
+    own, other = (" x ".join(map(str, size)) for size in (shape, reference))
     if dimension != expected:
         seen = f"{name}: frames of {own} give {dimension} features"
         raise InputError(f"{seen}; the map expects {expected}, as frames of {other} give")

@@ -148,7 +148,7 @@ def recipe_of(module: nn.Module) -> Recipe:
     arguments = {name: getattr(module, name) for name in inspect.signature(cls).parameters}
     for name, value in arguments.items():
         if isinstance(value, nn.ModuleList):
-            arguments[name] = [recipe_of(one)._asdict() for one in value]
+            arguments[name] = [recipe_of(member)._asdict() for member in value]
         elif isinstance(value, nn.Module):
             arguments[name] = recipe_of(value)._asdict()
     return Recipe(cls.__name__, json.loads(json.dumps(arguments)))  # compares equal to one from a file
@@ -175,11 +175,11 @@ def with_parts(recipe: Recipe) -> list[Recipe]:
 
 def _parts(recipe: Recipe) -> dict[str, list[Recipe]]:
     """The arguments that are recipes, or lists of them, by name."""
-    named = {name: one if isinstance(one, list) else [one] for name, one in recipe.init_args.items()}
+    named = {name: value if isinstance(value, list) else [value] for name, value in recipe.init_args.items()}
     return {
-        name: checked(ones, list[Recipe], name)
-        for name, ones in named.items()
-        if any(isinstance(one, dict) and "class_path" in one for one in ones)
+        name: checked(values, list[Recipe], name)
+        for name, values in named.items()
+        if any(isinstance(value, dict) and "class_path" in value for value in values)
     }
 
 
@@ -201,7 +201,7 @@ def difference(stored: Recipe, given: Recipe) -> str:
     if stored.class_path != given.class_path:
         return f"{stored.class_path}; got {given.class_path}"
     names = [name for name, value in stored.init_args.items() if given.init_args.get(name) != value]
-    values = [", ".join(f"{name}={one.init_args.get(name)}" for name in names) for one in (stored, given)]
+    values = [", ".join(f"{name}={part.init_args.get(name)}" for name in names) for part in (stored, given)]
     return f"{stored.class_path} with {'; got '.join(values)}"
 
 
@@ -230,7 +230,7 @@ def build(recipe: Recipe, kind: type[M], given: nn.Module | None = None) -> M:
         # only learning needs the period finder: a foreign one is omitted
         foreign = key == "periods" and parts[0].class_path not in REGISTRY
         built = [None if foreign else build(part, nn.Module, given) for part in parts]
-        if given is not None and sum(one is given for one in built) > 1:
+        if given is not None and sum(member is given for member in built) > 1:
             seen = f"several members of the features are {recipe_of(given).class_path}"
             raise InputError(f"{seen}, and one was given; expected all members, as a list")
         arguments[key] = built if isinstance(arguments[key], list) else built[0]
@@ -263,15 +263,15 @@ def state_to_json(state: ModelState) -> dict[str, Any]:
         name: platt and platt._asdict() for name, platt in state.calibration._asdict().items()
     }
     trained = state.trained and state.trained._asdict()
-    known = {"frame_shape": state.frame_shape, "step": state.step, "trained": trained, "names": names}
-    return known | {"calibration": calibration}
+    values = {"frame_shape": state.frame_shape, "step": state.step, "trained": trained, "names": names}
+    return values | {"calibration": calibration}
 
 
 def state_from_json(values: Mapping[str, Any], frames: int | None = None) -> ModelState:
     """The state from the result of `state_to_json`, whose types are checked."""
     names = [] if values["names"] is None else decode_names(values["names"], frames)
-    known = values["frame_shape"], values["step"], values["trained"]
-    return ModelState(*known, names, values["calibration"])
+    shape, step, trained = values["frame_shape"], values["step"], values["trained"]
+    return ModelState(shape, step, trained, names, values["calibration"])
 
 
 def contents(model: Model) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -318,8 +318,8 @@ def read_model(make: Callable[..., R], path: Path, features: nn.Module | None) -
         if features is None:
             with torch.device("meta"):  # large layers in a bad header allocate nothing
                 probe = nn.ModuleDict({"features": build(header["features"], nn.Module)})
-                own = {name: one for name, one in weights.items() if name.startswith("features.")}
-                probe.load_state_dict(own, assign=True)
+                stored = {name: tensor for name, tensor in weights.items() if name.startswith("features.")}
+                probe.load_state_dict(stored, assign=True)
         with in_float32():
             parts = {name: _part(header, name, features) for name in PARTS}
         parts["whitening"] = parts["whitening"] or "none"
@@ -357,10 +357,10 @@ def opened(path: Path) -> Iterator[tuple[dict[str, Tensor], dict[str, Any]]]:
     try:
         header = checked_fields(values, HEADER, "its header")
         header |= {name: without_gone(header[name]) for name in PARTS if header[name] is not None}
-        known = [cls.kind for cls in REGISTRY.values() if issubclass(cls, Mapper)]
-        if header["map"].get("kind") not in known:
+        kinds = [cls.kind for cls in REGISTRY.values() if issubclass(cls, Mapper)]
+        if header["map"].get("kind") not in kinds:
             seen = f"a map of kind {header['map'].get('kind')!r:.40}"
-            raise InputError(f"{seen}; this version knows {', '.join(known)}")
+            raise InputError(f"{seen}; this version knows {', '.join(kinds)}")
         yield tensors, header
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
@@ -376,18 +376,18 @@ def _part(header: Mapping[str, Any], name: str, features: nn.Module | None) -> A
 def _fill(place_map: PlaceMap, tensors: Mapping[str, Tensor], state: dict[str, Any]) -> None:
     """Fill an empty map from a file; it stays empty if the file has only a descriptor."""
     checked(state, place_map.state, "its map")
-    own = part_of(tensors, "map")
-    if own or state.get("places"):
-        place_map.load_packed(own, state)
+    stored = part_of(tensors, "map")
+    if stored or state.get("places"):
+        place_map.load_packed(stored, state)
     else:
         place_map.set_extra_state(state)
 
 
 def check_types(tensors: Mapping[str, Tensor], features: nn.Module) -> None:
     """Refuse integers for float weights, such as 8-bit weights without their scales."""
-    for name, own in features.state_dict().items():
+    for name, weight in features.state_dict().items():
         stored = tensors.get(f"features.{name}")
-        is_float = isinstance(own, Tensor) and own.dtype.is_floating_point
+        is_float = isinstance(weight, Tensor) and weight.dtype.is_floating_point
         if is_float and stored is not None and not stored.dtype.is_floating_point:
             kind = str(stored.dtype).removeprefix("torch.")
             raise InputError(f"it does not fit: features.{name} is {kind}; expected a float type")
@@ -409,9 +409,9 @@ def _check(model: Model) -> None:
         raise InputError(f"it has step {step} and {len(positions)} frame positions")
     whitening = model.descriptor.whitening
     if whitening is not None and whitening.learned:
-        found, expected = whitening.dimension, model.map.dimension
-        if found != (expected or found):
-            raise InputError(f"its whitening makes {found} dimensions; expected the map's {expected}")
+        dimension, expected = whitening.dimension, model.map.dimension
+        if dimension != (expected or dimension):
+            raise InputError(f"its whitening makes {dimension} dimensions; expected the map's {expected}")
     if shape is not None and (len(shape) not in (1, 3) or min(shape) < 1 or math.prod(shape) > FRAME_NUMBERS):
         raise InputError(f"its frames are {shape}; expected (C,H,W) or (D,)")
 

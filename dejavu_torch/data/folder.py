@@ -77,19 +77,19 @@ class ImageFolder(Traverse):
 
     def _image(self, file: Path) -> Tensor:
         image = read_image(file, max(self.width, self.height))
-        own = (image.shape[1], image.shape[2])
-        size = fitted_size(file, *own, self.width, self.height)
+        original = (image.shape[1], image.shape[2])
+        size = fitted_size(file, *original, self.width, self.height)
         if size != image.shape[1:]:
             image = resize_frames(image[None], size)[0].clamp(0, 1)
         channels, height, width = image.shape
         shape = f"{height} x {width} pixels of {channels} channel{'s' * (channels > 1)}"
-        self._first = self._first or (file.name, shape, own)
+        self._first = self._first or (file.name, shape, original)
         name, expected, first = self._first
         if shape != expected:
             raise InputError(f"{file} is {shape}; expected {expected} like {name}")
-        if self.same_aspect and is_stretched(own, first):
+        if self.same_aspect and is_stretched(original, first):
             ratio = f"the aspect ratio of {name}, {first[0]} x {first[1]}"
-            raise InputError(f"{file} is {own[0]} x {own[1]} pixels; expected {ratio}")
+            raise InputError(f"{file} is {original[0]} x {original[1]} pixels; expected {ratio}")
         return image
 
 

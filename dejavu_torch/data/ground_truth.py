@@ -68,14 +68,14 @@ def as_ground_truth(truth: Truth, queries: int | None = None) -> GroundTruth:
     if not is_given(truth):
         if queries is None:
             raise InputError(f"the truth is {truth} for an unknown number of queries; expected the number")
-        found = find_ground_truth(truth, None, None, None, queries)
-        assert found is not None
-        return found
+        ground_truth = find_ground_truth(truth, None, None, None, queries)
+        assert ground_truth is not None
+        return ground_truth
     if not isinstance(truth, GroundTruth):
         truth = _every(_table_of(truth))
     shapes = [tuple(part.shape) for part in truth]
     rows = len(truth.judged) if queries is None else queries
-    fits = shapes[1] == (rows,) and all(len(one) == 2 and one[0] == rows for one in shapes[::2])
+    fits = shapes[1] == (rows,) and all(len(shape) == 2 and shape[0] == rows for shape in shapes[::2])
     if not fits:
         seen = f"the truth is {shapes[0]}, with judged {shapes[1]} and ignored {shapes[2]}"
         raise InputError(f"{seen}; expected ({rows}, R), ({rows},) and ({rows}, S), one row per query")
@@ -299,25 +299,25 @@ def find_ground_truth(
     if isinstance(parsed, GroundTruth):
         count = len(numbers) if every else None if query is None else len(query)
         rows = (_rows_of(part, numbers) for part in as_ground_truth(parsed, count))
-        found = GroundTruth(*rows)
+        ground_truth = GroundTruth(*rows)
     elif isinstance(parsed, int):
-        found = _every(offset_truth(numbers, frames, parsed))
+        ground_truth = _every(offset_truth(numbers, frames, parsed))
     elif isinstance(parsed, float):
         if reference is None or query is None:
             raise InputError(f"truth utm:{parsed:g} reads the names of images; expected reference and query")
         coordinates = _rows_of(utm_coordinates(query), numbers)
-        found = _every(near_truth(utm_coordinates(reference), coordinates, parsed))
+        ground_truth = _every(near_truth(utm_coordinates(reference), coordinates, parsed))
     elif parsed.suffix.lower() == ".npz":
-        found = _read_matrices(parsed, numbers, frames, every)
+        ground_truth = _read_matrices(parsed, numbers, frames, every)
     else:
         length = len(query) if query is not None and resampled else None
         if parsed.suffix.lower() == ".csv":
             places = _read_csv(parsed, frames, interpolate)
         else:
             places = _read_json(parsed, frames, len(numbers) if every else length, int(numbers.max()) + 1)
-        found = _from_table(parsed, places, numbers, length, interpolate, resampled)
-    if (found.positives >= 0).any():
-        return found
+        ground_truth = _from_table(parsed, places, numbers, length, interpolate, resampled)
+    if (ground_truth.positives >= 0).any():
+        return ground_truth
     if not isinstance(parsed, int):
         raise InputError(f"no query has a right answer: {describe_ground_truth(truth)}")
     last = "" if frames is None else f" to {frames - 1 - int(numbers.min())}"
@@ -402,8 +402,8 @@ def _from_table(
         wanted = f"{int(numbers.min())} to {int(numbers.max())}"
         raise InputError(f"{path} lists queries from {first} to {last}; expected some of {wanted}")
     rows = [[_rounded(place) for place in places.get(query, ())] for query in queries]
-    found = padded(torch.tensor(row, dtype=torch.int64) for row in rows)
-    return _every(found)._replace(judged=judged)
+    positives = padded(torch.tensor(row, dtype=torch.int64) for row in rows)
+    return _every(positives)._replace(judged=judged)
 
 
 def _to_queries(listed: Listed, frames: Tensor) -> Listed:
@@ -458,19 +458,19 @@ def _read_csv(path: Path, frames: int | None, interpolate: bool) -> Listed:
     return listed
 
 
-def _read_json(path: Path, frames: int | None, count: int | None, least: int) -> Listed:
-    """The places of `count` queries, None if unknown, at least `least`."""
+def _read_json(path: Path, frames: int | None, count: int | None, minimum: int) -> Listed:
+    """The places of `count` queries, None if unknown, at least `minimum`."""
     expected = "a list of whole numbers, its right places, for each query"
     with reading(path, "is not JSON", expected):
         rows = json.loads(read_text(path, expected))
-    if not isinstance(rows, list) or len(rows) < least or count not in (None, len(rows)):
+    if not isinstance(rows, list) or len(rows) < minimum or count not in (None, len(rows)):
         seen = f"a list of {len(rows)}" if isinstance(rows, list) else f"a {type(rows).__name__}"
-        queries = f"{least} queries or more" if count is None else f"{count} queries"
+        queries = f"{minimum} queries or more" if count is None else f"{count} queries"
         raise InputError(f"{path} contains {seen}; expected {expected}, {queries}")
     end, valid = (LARGEST, "0") if frames is None else (frames, f"0 to {frames - 1}")
     for query, row in enumerate(rows):
         listed = isinstance(row, list)
-        wrong = [one for one in (row if listed else [row]) if type(one) is not int or not 0 <= one < end]
+        wrong = [item for item in (row if listed else [row]) if type(item) is not int or not 0 <= item < end]
         if wrong or not listed:
             seen = f"{path}, query {query}: {json.dumps(wrong[0] if listed else row)[:40]}"
             raise InputError(f"{seen}; expected a list of reference frames from {valid}")
@@ -508,8 +508,8 @@ def _read_matrices(path: Path, numbers: Tensor, frames: int | None, every: bool)
     if not all(np.isfinite(matrix).all() for matrix in matrices):
         raise InputError(f"{path} contains values that are not finite; expected {expected}")
     hard, *soft = (torch.from_numpy(matrix[:, numbers.numpy()] != 0).T for matrix in matrices)
-    found = _every(padded(row.nonzero()[:, 0] for row in hard))
-    return found._replace(ignored=padded(row.nonzero()[:, 0] for row in soft[0] & ~hard)) if soft else found
+    truth = _every(padded(row.nonzero()[:, 0] for row in hard))
+    return truth._replace(ignored=padded(row.nonzero()[:, 0] for row in soft[0] & ~hard)) if soft else truth
 
 
 def _check_shape(seen: str, matrix: np.ndarray, numbers: Tensor, frames: int | None, every: bool) -> None:

@@ -40,7 +40,7 @@ class DescriptorFile(Traverse):
 
     def __init__(self, path: str | Path, order: str = "") -> None:
         self.path, self.name = Path(path), printable(path)
-        found: dict[str, tuple[int, ...]] = {}
+        shapes: dict[str, tuple[int, ...]] = {}
 
         def visit(name: str, item: Any) -> None:
             image, _, leaf = name.rpartition("/")
@@ -51,19 +51,19 @@ class DescriptorFile(Traverse):
             if len(shape) != 1 or kind.kind != "f" or elsewhere:
                 seen = f"{shape} {kind.name}{' of another file' if elsewhere else ''}"
                 raise InputError(f"{self.name}: {KEY} of {image} is {seen}; expected {EXPECTED}")
-            found[image] = shape
+            shapes[image] = shape
 
         with self._open() as file:
             file.visititems(visit)
             shared = KEY in file
-            self.names = sort_names(found, order, self.name)
-        if not found:
+            self.names = sort_names(shapes, order, self.name)
+        if not shapes:
             seen = f"has one {KEY} for all images" if shared else f"contains no {KEY}"
             raise InputError(f"{self.name} {seen}; expected {EXPECTED}")
-        (width,) = found[self.names[0]]
+        (width,) = shapes[self.names[0]]
         for image in self.names:
-            if found[image] != (width,) or not width:
-                seen = f"{KEY} of {image} has {found[image][0]} dimensions"
+            if shapes[image] != (width,) or not width:
+                seen = f"{KEY} of {image} has {shapes[image][0]} dimensions"
                 expected = f"{width} like {self.names[0]}" if width else "at least 1"
                 raise InputError(f"{self.name}: {seen}; expected {expected}")
         check_room(24.0 * width, f"a descriptor of {self.name}")

@@ -92,11 +92,11 @@ def routes_of(source: str | Path) -> list[str]:
     address, query = _split(str(source))
     inside: list[Path] = []
     with suppress(OSError, ValueError):  # not a folder, or not a valid path
-        inside = [one for one in Path(address).iterdir() if one.name[0] != "."] if address else []
-    if not inside or not all(one.is_dir() for one in inside):
+        inside = [path for path in Path(address).iterdir() if path.name[0] != "."] if address else []
+    if not inside or not all(path.is_dir() for path in inside):
         return [str(source)]
     options = f"?{query}" if query else ""
-    return [f"{one}{options}" for one in sorted(inside, key=lambda one: natural(one.name))]
+    return [f"{path}{options}" for path in sorted(inside, key=lambda path: natural(path.name))]
 
 
 def check_not_read(out: Path, *sources: str | Path | None) -> None:
@@ -107,7 +107,7 @@ def check_not_read(out: Path, *sources: str | Path | None) -> None:
         read = False
         with suppress(OSError, ValueError, RuntimeError):  # missing, not a valid path, or a link to itself
             names = [path.with_suffix(".txt")] if path.suffix.lower() == ".npy" else []
-            read = any(out.resolve() == one.resolve() for one in (path, *names)) or out.samefile(path)
+            read = any(out.resolve() == file.resolve() for file in (path, *names)) or out.samefile(path)
             read = read or (out.suffix.lower() in IMAGE_SUFFIXES and out.parent.samefile(path))
         if read:
             raise InputError(f"{out} is an input; expected another name for the output")
@@ -147,18 +147,18 @@ def _arguments(text: str, query: str, reader: Callable[..., Traverse]) -> dict[s
     """`a=1&b=2` as keyword arguments of the reader and of `frame_range`, each of the type of its default."""
     empty = inspect.Parameter.empty
     defaults = {name: option.default for name, option in inspect.signature(reader).parameters.items()} | PART
-    given: dict[str, Any] = {}
+    arguments: dict[str, Any] = {}
     for name, value in parse_qsl(query, keep_blank_values=True):
-        if name not in defaults or name in given:
-            what = "a second" if name in given else "unknown"
+        if name not in defaults or name in arguments:
+            what = "a second" if name in arguments else "unknown"
             raise InputError(f"{text}: {what} {name!r}; expected {', '.join(defaults)}")
         default = defaults[name]
         kind = int if default is empty or isinstance(default, bool) else type(default)
         try:
-            given[name] = kind(value)
+            arguments[name] = kind(value)
         except ValueError as error:
             raise InputError(f"{text}: {name} is {value!r}; expected {KINDS[kind]}") from error
     for name, default in defaults.items():
-        if default is empty and name not in given:
+        if default is empty and name not in arguments:
             raise InputError(f"{text}: {name} is missing; expected {name}=...")
-    return given
+    return arguments

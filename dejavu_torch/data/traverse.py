@@ -32,8 +32,8 @@ class Part(Traverse):
         self.traverse, self.frame, self.name = traverse, frame, traverse.name
         self.sized, self.ordered = traverse.sized, traverse.ordered
         self.times, self.places = (
-            None if known is None else known[torch.as_tensor(frame)]
-            for known in (traverse.times, traverse.places)
+            None if values is None else values[torch.as_tensor(frame)]
+            for values in (traverse.times, traverse.places)
         )
         if traverse.cut is not None and isinstance(frame, range):
             image, cuts = traverse.cut
@@ -95,23 +95,23 @@ class Chain(Traverse):
         first = self.traverses[0]
         for other in self.traverses:
             if other.frame_shape != first.frame_shape:
-                own, expected = (" x ".join(map(str, one.frame_shape)) for one in (other, first))
-                raise InputError(f"{other.name} has frames of {own}; expected {expected} like {first.name}")
-        self.name = " + ".join(one.name for one in self.traverses)
-        self.sized = any(one.sized for one in self.traverses)
-        self.ordered = all(one.ordered for one in self.traverses)
+                seen, expected = (" x ".join(map(str, traverse.frame_shape)) for traverse in (other, first))
+                raise InputError(f"{other.name} has frames of {seen}; expected {expected} like {first.name}")
+        self.name = " + ".join(traverse.name for traverse in self.traverses)
+        self.sized = any(traverse.sized for traverse in self.traverses)
+        self.ordered = all(traverse.ordered for traverse in self.traverses)
         self.starts = list(accumulate(map(len, self.traverses), initial=0))
-        if any(one.times is not None for one in self.traverses):
-            unknown = (torch.full((len(one),), torch.nan, dtype=torch.float64) for one in self.traverses)
-            times = zip(self.traverses, unknown, strict=True)
-            self.times = torch.cat([nan if one.times is None else one.times for one, nan in times])
+        if any(traverse.times is not None for traverse in self.traverses):
+            unknown = (torch.full((n,), torch.nan, dtype=torch.float64) for n in map(len, self.traverses))
+            times = zip((traverse.times for traverse in self.traverses), unknown, strict=True)
+            self.times = torch.cat([nan if known is None else known for known, nan in times])
 
     def __len__(self) -> int:
         return self.starts[-1]
 
     def read(self, frames: range | list[int]) -> Tensor:
         owners = groupby(frames, lambda i: bisect_right(self.starts, i, hi=len(self.traverses)) - 1)
-        parts = [self.traverses[k][[i - self.starts[k] for i in own]] for k, own in owners]
+        parts = [self.traverses[k][[i - self.starts[k] for i in group]] for k, group in owners]
         return parts[0] if len(parts) == 1 else torch.cat(parts)
 
     @cached_property
@@ -120,8 +120,8 @@ class Chain(Traverse):
 
     @cached_property
     def names(self) -> Sequence[str]:  # type: ignore[override]
-        each = ((Path(one.name).name, one.names or [""] * len(one)) for one in self.traverses)
-        names = [name and f"{folder}/{name}" for folder, own in each for name in own]
+        each = ((Path(member.name).name, member.names or [""] * len(member)) for member in self.traverses)
+        names = [name and f"{folder}/{name}" for folder, listed in each for name in listed]
         return names if any(names) else ()
 
 
@@ -174,7 +174,7 @@ def fitted(traverse: Traverse, shape: tuple[int, ...]) -> Traverse:
 def at_size(traverse: Traverse, size: tuple[int, int]) -> Traverse:
     """The frames of a traverse at another size (height, width); images and videos are decoded at it."""
     if isinstance(traverse, Chain):
-        each = [at_size(one, size) for one in traverse.traverses]
+        each = [at_size(member, size) for member in traverse.traverses]
         return traverse.changed(traverses=each, sized=True)
     if type(traverse) is Part:
         return traverse.changed(traverse=at_size(traverse.traverse, size), sized=True)

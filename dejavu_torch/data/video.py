@@ -159,13 +159,13 @@ class Video(Traverse):
     def _listed(self) -> Index:
         """The frames that the file lists, without decoding them."""
         with self._decoding() as (container, stream):
-            packets = [one for one in container.demux(stream) if one.size and not one.is_discard]
+            packets = [packet for packet in container.demux(stream) if packet.size and not packet.is_discard]
             if container.format.name == "avi" and len(packets) < len(stream.index_entries):
                 raise self._broken(len(packets), "frames are missing")
             if stream.codec_context.name == "vp8":
-                packets = [one for one in packets if bytes(one)[0] & VP8_SHOWN]
-            packets.sort(key=lambda one: (one.pts is None, one.pts))
-            return self._index([one.pts for one in packets], [one.is_keyframe for one in packets], stream)
+                packets = [packet for packet in packets if bytes(packet)[0] & VP8_SHOWN]
+            packets.sort(key=lambda packet: (packet.pts is None, packet.pts))
+            return self._index([p.pts for p in packets], [p.is_keyframe for p in packets], stream)
 
     def _decoded(self) -> Index:
         """All frames, by decoding them once."""

@@ -75,10 +75,10 @@ class Augmentation(nn.Module):
         perspective: float = 0.0,
     ) -> None:
         super().__init__()
-        given = locals()
+        arguments = locals()
         self.strengths: dict[str, tuple[float, ...]] = {}
         for name, most in LARGEST.items():
-            value = given[name]
+            value = arguments[name]
             numbers = tuple(value) if isinstance(value, (tuple, list)) else (value,)
             fit = len(numbers) == len(most) and all(isinstance(number, (int, float)) for number in numbers)
             if not fit or not all(0 <= number <= limit for number, limit in zip(numbers, most, strict=True)):
@@ -95,7 +95,7 @@ class Augmentation(nn.Module):
         """The augmentation with every strength times a factor, up to the largest allowed."""
         other = Augmentation()
         for name, most in LARGEST.items():
-            scaled = (factor * one for one in self.strengths[name])
+            scaled = (factor * strength for strength in self.strengths[name])
             other.strengths[name] = tuple(map(min, scaled, most))
         return other
 

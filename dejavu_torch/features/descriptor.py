@@ -150,8 +150,8 @@ class Descriptor(nn.Module):
                     parts = features.split(ROWS)
                     return concatenate(self.whitened(part.to(self.device)) for part in parts)
                 sample = Sample.of(len(traverse), SAMPLE)
-                own = second and sample.views(second)
-                self.learn(Part(traverse, sample.frame), own, progress, label="sampling")
+                views = second and sample.views(second)
+                self.learn(Part(traverse, sample.frame), views, progress, label="sampling")
             storage = (DESCRIPTOR_MEMORY, self.whitening is not None) if spectral else ()
             return concatenate(self.batches(traverse, label_if, check_first), *storage)
 
@@ -243,9 +243,9 @@ class Descriptor(nn.Module):
         for query, count in zip(queries, counts[1:], strict=True):
             if count != counts[0]:
                 seen = " and ".join(
-                    f"{traverse.name} gives {own} features per frame of "
+                    f"{traverse.name} gives {number} features per frame of "
                     f"{' x '.join(map(str, traverse.frame_shape))}"
-                    for traverse, own in ((reference, counts[0]), (query, count))
+                    for traverse, number in ((reference, counts[0]), (query, count))
                 )
                 raise InputError(f"{seen}; expected the same number, from frames of the same size")
         return counts[0]
@@ -265,7 +265,7 @@ def own_size(features: nn.Module, block: bool = False) -> tuple[int, int] | None
     """The size (height, width) to which features of this package resize frames, the largest of joined ones;
     None if they do not. With `block`, also the size of a block of HOG."""
     if isinstance(features, Joined):
-        sizes = [one for one in (own_size(member, block) for member in features.members) if one is not None]
+        sizes = [*filter(None, (own_size(member, block) for member in features.members))]
         return (max(height for height, _ in sizes), max(width for _, width in sizes)) if sizes else None
     known = type(features).__module__.startswith("dejavu_torch.")
     size: tuple[int, int] | None = getattr(features, "resize", None) if known else None

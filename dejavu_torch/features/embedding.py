@@ -211,8 +211,8 @@ class Embedding(nn.Module):
     def code(self, descriptors: Tensor) -> Tensor:
         """Features of descriptors: (B,K) -> (B,D)."""
         features: Tensor = self.linear(descriptors)
-        own = next(self.standardise.buffers(), None)
-        dtype = torch.promote_types(features.dtype, torch.float32) if own is None else own.dtype
+        buffer = next(self.standardise.buffers(), None)
+        dtype = torch.promote_types(features.dtype, torch.float32) if buffer is None else buffer.dtype
         standardised: Tensor = self.standardise(features.to(dtype))
         return standardised
 
@@ -223,13 +223,13 @@ class Embedding(nn.Module):
         return settings_of(self, "network")
 
 
-def _per_channel(name: str, given: float | list[float] | None, channels: int, default: float) -> Tensor:
+def _per_channel(name: str, value: float | list[float] | None, channels: int, default: float) -> Tensor:
     """(channels,1,1), from a number per channel or one for all."""
-    numbers = [*given] if isinstance(given, (list, tuple)) else [default if given is None else given]
+    numbers = [*value] if isinstance(value, (list, tuple)) else [default if value is None else value]
     # in the range of float32, as are inverses
     least, most = (-1e38, 1e38) if name == "mean" else (1e-37, 1e37)
     if len(numbers) not in (1, channels) or not all(least <= number <= most for number in numbers):
         expected = f"a number for each of {channels} channels, or one for all"
         expected += ", above 0" * (name == "std")
-        raise InputError(f"Embedding got {name}={f'{given}':.80}; expected {expected}")
+        raise InputError(f"Embedding got {name}={f'{value}':.80}; expected {expected}")
     return torch.tensor(numbers, dtype=torch.float32).expand(channels).clone().view(channels, 1, 1)

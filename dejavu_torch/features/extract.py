@@ -70,7 +70,7 @@ def as_weights(frames: Tensor, module: nn.Module) -> Tensor:
     """Frames in the type of a module's weights, else of its buffers, which torch expects."""
     if getattr(module, "casts", False):
         return frames
-    dtypes = (one.dtype for one in chain(module.parameters(), module.buffers()))
+    dtypes = (tensor.dtype for tensor in chain(module.parameters(), module.buffers()))
     return frames.to(next((dtype for dtype in dtypes if dtype.is_floating_point), frames.dtype))
 
 
@@ -82,11 +82,11 @@ def features_of(batch: Tensor, describe: Callable[[Tensor], Tensor], name: str =
     features = describe(batch)
     # no len(): it would fix the batch of an exported graph
     if not isinstance(features, Tensor) or features.ndim != 2 or features.shape[0] != batch.shape[0]:
-        made = tuple(features.shape) if isinstance(features, Tensor) else f"a {type(features).__name__}"
+        output = tuple(features.shape) if isinstance(features, Tensor) else f"a {type(features).__name__}"
         owner = describe[-1] if isinstance(describe, nn.Sequential) else describe
         owner = getattr(owner, "__self__", owner)  # of a method
         owner = getattr(owner, "features", owner)
-        seen = f"{type(owner).__name__} made {made} of {tuple(batch.shape)}"
+        seen = f"{type(owner).__name__} made {output} of {tuple(batch.shape)}"
         raise InputError(f"{seen}; expected features ({len(batch)}, D)")
     return features
 
@@ -110,7 +110,7 @@ def check_alone(
     with torch.no_grad():
         alone = features_of(frames[:1].to(features.device), describe, name).to(features)
     difference = float((alone[0] - features[0]).norm() / features[0].norm().clamp(min=1e-12))
-    dtypes = {one.dtype for one in module.parameters() if one.is_floating_point()}
+    dtypes = {weight.dtype for weight in module.parameters() if weight.is_floating_point()}
     if torch.is_autocast_enabled(device):
         dtypes.add(torch.get_autocast_dtype(device))
     # a GPU may use TF32 in one batch and not in another

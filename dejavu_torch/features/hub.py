@@ -41,6 +41,6 @@ def known(name: str) -> dict[str, Any]:
     """The settings of a short name such as `hub:megaloc`."""
     settings = NETWORKS.get(name.removeprefix(PREFIX))
     if settings is None:
-        names = ", ".join(f"{PREFIX}{one}" for one in NETWORKS)
+        names = ", ".join(f"{PREFIX}{network}" for network in NETWORKS)
         raise InputError(f"{name} is not the short name of a network; expected one of {names}")
     return settings

@@ -39,18 +39,18 @@ class Joined(nn.Module):
     def __init__(self, members: list[nn.Module]) -> None:
         super().__init__()
         modules = [*members] if isinstance(members, (Sequence, nn.ModuleList)) else [members]
-        if not modules or not all(isinstance(one, nn.Module) for one in modules):
-            seen = ", ".join(type(one).__name__ for one in modules) or "none"
+        if not modules or not all(isinstance(module, nn.Module) for module in modules):
+            seen = ", ".join(type(module).__name__ for module in modules) or "none"
             raise InputError(f"the members of the features are {seen}; expected modules, at least one")
         self.members = nn.ModuleList(modules)
         self.groups: tuple[int, ...] | None = None
 
     def forward(self, frames: Tensor) -> Tensor:
         check_frames(frames, "Joined got")
-        made = [features_of(as_weights(frames, member), member) for member in self.members]
+        features = [features_of(as_weights(frames, member), member) for member in self.members]
         if not torch.compiler.is_compiling():  # a graph has no side effects
-            self.groups = tuple(one.shape[1] for one in made)
-        return torch.cat(made, 1)
+            self.groups = tuple(part.shape[1] for part in features)
+        return torch.cat(features, 1)
 
 
 def groups_of(features: nn.Module) -> tuple[int, ...] | None:

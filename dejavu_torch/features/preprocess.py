@@ -113,7 +113,7 @@ def equalise(frames: Tensor, clip_limit: float = 2.0, grid: tuple[int, int] = (8
     if not len(frames):
         return frames
     detached = frames.detach()
-    low, high = (one.item() for one in detached.aminmax())
+    low, high = (bound.item() for bound in detached.aminmax())
     if not (low >= 0 and high <= 1):
         raise InputError(f"clahe got values from {low:g} to {high:g}; expected values in [0, 1]")
     equalised = in_parts(lambda part: equalize_clahe(part, clip_limit, grid), detached)

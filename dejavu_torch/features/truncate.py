@@ -49,11 +49,11 @@ def up_to(network: nn.Module, layer: str, frames: Tensor) -> nn.Module:
 
     The copy omits modules that have not started by then, unless that changes its output for `frames`.
     """
-    name, names = type(network).__name__, [one for one, _ in network.named_modules() if one]
+    name, names = type(network).__name__, [path for path, _ in network.named_modules() if path]
     if layer not in names:
-        some = [one for one in names if one.count(".") < 2]
-        known = ", ".join([*some[:SHOWN], ".."][: len(some)]) or "none, it has none"
-        raise InputError(f"{name} has no layer {layer!r:.80}; expected one such as {known}")
+        some = [path for path in names if path.count(".") < 2]
+        examples = ", ".join([*some[:SHOWN], ".."][: len(some)]) or "none, it has none"
+        raise InputError(f"{name} has no layer {layer!r:.80}; expected one such as {examples}")
     try:
         ended = copy.deepcopy(network)
     except RuntimeError as error:
@@ -80,7 +80,7 @@ def up_to(network: nn.Module, layer: str, frames: Tensor) -> nn.Module:
     return smaller if same else ended
 
 
-def _end(layer: nn.Module, given: Any, output: object) -> None:
+def _end(layer: nn.Module, inputs: Any, output: object) -> None:
     raise Reached(output)
 
 

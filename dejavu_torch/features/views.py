@@ -159,6 +159,6 @@ def augmented_segments(
     length = min(SEGMENT, max(1, frames // EVERY)) if starts is None else SEGMENT
     starts = range(0, frames - length + 1, EVERY * length) if starts is None else starts
     most = min(MOST, max(LEAST, SCORES // (places or frames)))
-    runs = [range(one, one + length) for one in starts[:: max(1, -(-len(starts) * length // most))]]
+    runs = [range(start, start + length) for start in starts[:: max(1, -(-len(starts) * length // most))]]
     copies = max(1, -(-min(FEWEST, MAX_COPIES * frames, most) // (len(runs) * length)))
     return AugmentedFrames(traverse, runs, length, copies, strengths, factor=STRONGER)

@@ -204,7 +204,7 @@ class Whitening(nn.Module):
             wholes = [part.unpacked for part in self.parts] if projections is None else projections
             if len(self.members):
                 each = zip(self.parts[1:], exact.split(sizes, 1), wholes[1:], strict=True)
-                exact = torch.cat([member._project(own, whole) for member, own, whole in each], 1)
+                exact = torch.cat([member._project(group, whole) for member, group, whole in each], 1)
             return self._project(exact, wholes[0])
 
     def _project(self, exact: Tensor, whole: Tensor) -> Tensor:
@@ -259,22 +259,22 @@ class Whitening(nn.Module):
             raise InputError(f"{seen}; expected (N, {sum(sizes)})")
         bits = self.bits_of(len(places), views is not None)
         members = [self] if groups is None else [self._member() for _ in sizes]
-        found = []
-        for member, own in zip(members, places.split(sizes, 1), strict=True):
-            kept = self.kept(len(places), own.shape[1], views is not None)
-            found.append(member._components(own, kept, kept if views is None else self.components))
-        pairs = None if views is None else _projected_views(places, views, found)
+        bases = []
+        for member, group in zip(members, places.split(sizes, 1), strict=True):
+            kept = self.kept(len(places), group.shape[1], views is not None)
+            bases.append(member._components(group, kept, kept if views is None else self.components))
+        pairs = None if views is None else _projected_views(places, views, bases)
         with torch.autocast(self.scale.device.type, enabled=False):
             if pairs is None:
-                for member, (mean, basis, variances, _) in zip(members, found, strict=True):
+                for member, (mean, basis, variances, _) in zip(members, bases, strict=True):
                     member.take(mean, basis, variances.mean().sqrt(), bits)
             else:
-                for member, (mean, basis, _, kept), (shown, own) in zip(members, found, pairs, strict=True):
-                    centre, projection = learned_whitening(shown, own, kept, self.shrinkage, samples)
+                for member, (mean, basis, _, kept), (shown, place) in zip(members, bases, pairs, strict=True):
+                    centre, projection = learned_whitening(shown, place, kept, self.shrinkage, samples)
                     member.take(mean + basis @ centre, basis @ projection, None, bits)
             if groups is not None:
                 some = places[:: max(1, len(places) // SAMPLED)].to(self.scale.device).split(sizes, 1)
-                joined = torch.cat([member(own) for member, own in zip(members, some, strict=True)], 1)
+                joined = torch.cat([member(group) for member, group in zip(members, some, strict=True)], 1)
                 kept = self.kept(len(places), joined.shape[1], views is not None)
                 # about zero, not the mean, to keep the inner products of all pairs, as cosines need
                 mean, basis, squares, _ = self._components(joined, kept, kept, centre=False)
@@ -290,8 +290,8 @@ class Whitening(nn.Module):
     def _components(self, places: Tensor, kept: int, count: int, centre: bool = True) -> _Components:
         """`principal_components` up to the rank, and how many dimensions to keep, `kept` at most."""
         # the descriptors of a long route are in a file, wherever the model is
-        found = (one.to(self.scale.device) for one in principal_components(places, count, self.seed, centre))
-        mean, basis, variances = found
+        parts = principal_components(places, count, self.seed, centre)
+        mean, basis, variances = (part.to(self.scale.device) for part in parts)
         rank = int((variances > ROUNDING * variances[0]).sum())
         if kept > rank and self.numbers is not None:
             raise InputError(f"numbers is {kept}, but the descriptors of this route have rank {rank}")
@@ -316,14 +316,14 @@ class Whitening(nn.Module):
 
     def _load_from_state_dict(self, state: dict[str, Any], prefix: str, *args: Any) -> None:
         inner = f"{prefix}members."
-        inside = {name.removeprefix(inner): one for name, one in state.items() if name.startswith(inner)}
+        inside = {name.removeprefix(inner): value for name, value in state.items() if name.startswith(inner)}
         groups = {name.partition(".")[0] for name in inside}
         self.members = nn.ModuleList(self._member() for _ in groups)  # torch loads them next
         buffers = {name: state.get(prefix + name, own) for name, own in self.named_buffers(recurse=False)}
-        dtype, seen = buffers["projection"].dtype, [tuple(one.shape) for one in buffers.values()]
+        dtype, seen = buffers["projection"].dtype, [tuple(buffer.shape) for buffer in buffers.values()]
         width = tuple((count + 1) // 2 if dtype == torch.uint8 else count for count in seen[1])
         fits = len(seen[0]) == 2 and seen[0][1:] == width and seen[2] == seen[1] and seen[3] in ((0,), (1,))
-        joined = sum(one.numel() for name, one in inside.items() if name.endswith((".scale", ".length")))
+        joined = sum(value.numel() for name, value in inside.items() if name.endswith((".scale", ".length")))
         fits = fits and (not groups or joined == seen[0][0])
         finite = all(bool(stored.isfinite().all()) for stored in buffers.values())
         if not fits or not finite or dtype not in (torch.uint8, torch.int8, torch.int16):
@@ -340,15 +340,15 @@ class Whitening(nn.Module):
 
 
 def _projected_views(
-    places: Tensor, views: Iterable[tuple[Tensor, Tensor]], found: Sequence[_Components]
+    places: Tensor, views: Iterable[tuple[Tensor, Tensor]], bases: Sequence[_Components]
 ) -> list[Tensor]:
     """Components (2,n,C) of views, which are read batch by batch, and of their places, for each group."""
-    sizes, pairs = [len(mean) for mean, *_ in found], [list[Tensor]() for _ in found]
+    sizes, pairs = [len(mean) for mean, *_ in bases], [list[Tensor]() for _ in bases]
     for view, place in views:
         if view.shape[1] != places.shape[1]:
             raise InputError(f"views have {view.shape[1]} features; expected {places.shape[1]}, the route's")
         both = (rows.split(sizes, 1) for rows in (view, places[place.to(places.device)]))
-        for held, (mean, basis, *_), *parts in zip(pairs, found, *both, strict=True):
+        for held, (mean, basis, *_), *parts in zip(pairs, bases, *both, strict=True):
             held.append(torch.stack([_projected(part, mean, basis) for part in parts]))
     if not pairs[0]:
         raise InputError("there are no views for whitening; expected at least one batch, or None")

@@ -23,14 +23,14 @@ def compiled(
     None, and a log line that `what` happens instead, if numba is missing, disabled or broken.
     """
     options |= {"nogil": True, "error_model": "numpy"}
-    told = Timer(SILENCE, log.warning, ("compiling a loop with numba, once; this may take 20 s",))
+    notice = Timer(SILENCE, log.warning, ("compiling a loop with numba, once; this may take 20 s",))
     try:
         import numba
         from numba.extending import register_jitable
 
-        for one in calls:
-            register_jitable(one)
-        told.start()
+        for call in calls:
+            register_jitable(call)
+        notice.start()
         try:
             kernel: Callable[..., Any] = numba.njit(signature, cache=True, **options)(function)
         except Exception:  # the cache may have no folder
@@ -42,4 +42,4 @@ def compiled(
         log.info("%s, not by numba: %s", what, one_line(error))
         return None
     finally:
-        told.cancel()
+        notice.cancel()

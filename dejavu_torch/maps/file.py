@@ -48,7 +48,7 @@ def digests(**values: Any) -> dict[str, str]:
 def map_size(tensors: Mapping[str, Tensor], header: dict[str, Any]) -> int:
     """Bytes of the file that `write_map` writes, from names, types and shapes alone."""
     sums = dict.fromkeys((HEADER, *(name.partition(".")[0] for name in tensors)), "0" * 2 * DIGEST)
-    empty = {name: torch.empty(0, dtype=one.dtype) for name, one in tensors.items()}
+    empty = {name: torch.empty(0, dtype=tensor.dtype) for name, tensor in tensors.items()}
     # of tensors without data, so that safetensors gives the order
     entries, end = json.loads(safetensors.torch.save(empty, _metadata(sums, header))[8:]), 0
     for name, entry in entries.items():
@@ -65,7 +65,7 @@ def write_map(path: Path, tensors: Mapping[str, Tensor], header: dict[str, Any])
     with whole_file(path) as temporary:
         try:
             layout = torch.contiguous_format  # with memory of its own, as safetensors needs
-            plain = {name: one.detach().cpu().clone(memory_format=layout) for name, one in tensors.items()}
+            plain = {name: t.detach().cpu().clone(memory_format=layout) for name, t in tensors.items()}
             safetensors.torch.save_file(plain, temporary, _metadata(checksums(plain, header), header))
         except (SafetensorError, ValueError) as error:
             raise InputError(f"{path} was not written: {error}") from error
@@ -103,12 +103,12 @@ def read_map(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
                 raise InputError(f"{seen}; expected {FORMAT}")
             tensors = {name: archive.get_tensor(name) for name in archive.keys()}  # noqa: SIM118
         header, sums = sealed[HEADER], dict(sealed["checksums"] or {})
-        found = checksums(tensors, header)
+        computed = checksums(tensors, header)
     except InputError:
         raise
     except (SafetensorError, OSError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise InputError(f"{path} is truncated or not a map file ({error}); expected a whole one") from error
-    damaged = sorted(part for part in {*found, *sums} if found.get(part) != sums.get(part))
+    damaged = sorted(part for part in {*computed, *sums} if computed.get(part) != sums.get(part))
     if damaged:
         raise InputError(f"{path} is damaged: its {' and '.join(damaged)}; expected it as it was written")
     return tensors, header
@@ -117,7 +117,7 @@ def read_map(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 def part_of(tensors: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
     """The tensors of one part of a file, without the part in their names."""
     prefix = f"{part}."
-    return {name.removeprefix(prefix): one for name, one in tensors.items() if name.startswith(prefix)}
+    return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
 
 
 def checked(value: Any, kind: Any, where: str) -> Any:
@@ -137,9 +137,9 @@ def checked(value: Any, kind: Any, where: str) -> Any:
     if hasattr(kind, "_fields"):
         return kind(**checked_fields(value, get_type_hints(kind), where))
     if origin in (Union, types.UnionType):
-        for one in inner:
+        for member in inner:
             with suppress(InputError):
-                return checked(value, one, where)
+                return checked(value, member, where)
     elif origin in (tuple, list, Sequence) and isinstance(value, list | tuple):
         kinds = inner if origin is tuple and ... not in inner else inner[:1] * len(value)
         if len(kinds) == len(value):
@@ -158,7 +158,7 @@ def _fits(value: Any, origin: Any, inner: tuple[Any, ...]) -> bool:
     if type(value) in (int, float) and not abs(value) < (LARGEST if type(value) is int else math.inf):
         return False
     if origin is Literal:
-        return any(type(value) is type(one) and value == one for one in inner)
+        return any(type(value) is type(literal) and value == literal for literal in inner)
     if origin in (int, float, str, bool, None, type(None)):
         return type(value) in ((int, float) if origin is float else (origin or type(None),))
     return origin is Any or (isinstance(value, dict) and origin not in (tuple, list, Sequence))

@@ -81,9 +81,9 @@ class PlaceMap(nn.Module, ABC):
         """As in nn.Module, but what `double()` and the like would change for files keeps its type."""
         before: dict[str, Tensor] = {name: getattr(self, name) for name in self.kept}
         super()._apply(*args, **kwargs)  # type: ignore[no-untyped-call]
-        for name, own in before.items():
-            if own.dtype != (now := getattr(self, name)).dtype:
-                setattr(self, name, own.to(now.device))
+        for name, old in before.items():
+            if old.dtype != (now := getattr(self, name)).dtype:
+                setattr(self, name, old.to(now.device))
         return self
 
     def check_queries(self, queries: Tensor) -> None:
@@ -136,13 +136,13 @@ class PlaceMap(nn.Module, ABC):
         """Let the parameters be those of the map before, for an optimiser, with the new values; that map
         keeps a copy of its own."""
         for name, new in dict(self.named_parameters(recurse=False)).items():
-            own = getattr(before, name, None)
-            if not isinstance(own, nn.Parameter) or not own.numel():
+            old = getattr(before, name, None)
+            if not isinstance(old, nn.Parameter) or not old.numel():
                 continue
-            if (own.shape, own.dtype, own.device) == (new.shape, new.dtype, new.device):
-                setattr(before, name, nn.Parameter(own.clone()))
-                own.grad = None
-                setattr(self, name, own.copy_(new))
+            if (old.shape, old.dtype, old.device) == (new.shape, new.dtype, new.device):
+                setattr(before, name, nn.Parameter(old.clone()))
+                old.grad = None
+                setattr(self, name, old.copy_(new))
             else:
                 log.warning("the %s of the map are new parameters: an optimiser has to be made anew", name)
 
@@ -184,10 +184,10 @@ class PlaceMap(nn.Module, ABC):
         try:
             if prefix + EXTRA in state_dict:  # before any tensor changes
                 self.set_extra_state(state_dict[prefix + EXTRA])
-            for name, own in [*self.named_buffers(recurse=False), *self.named_parameters(recurse=False)]:
-                trained = isinstance(own, nn.Parameter)  # keeps its shape unless it is empty
-                if prefix + name in state_dict and not (trained and own.numel()):
-                    new = torch.empty_like(state_dict[prefix + name], device=own.device)
+            for name, tensor in [*self.named_buffers(recurse=False), *self.named_parameters(recurse=False)]:
+                trained = isinstance(tensor, nn.Parameter)  # keeps its shape unless it is empty
+                if prefix + name in state_dict and not (trained and tensor.numel()):
+                    new = torch.empty_like(state_dict[prefix + name], device=tensor.device)
                     setattr(self, name, nn.Parameter(new) if trained else new)
             super()._load_from_state_dict(state_dict, prefix, *args)
             self.check()
@@ -204,11 +204,11 @@ class PlaceMap(nn.Module, ABC):
 
     def load_packed(self, tensors: dict[str, Tensor], extra: dict[str, Any]) -> None:
         """Load the results of `packed` and `get_extra_state`; other tensors are an InputError."""
-        own = self.state_dict().keys() - {EXTRA}
-        if not own - {"visits"} <= tensors.keys() <= own:
+        names = self.state_dict().keys() - {EXTRA}
+        if not names - {"visits"} <= tensors.keys() <= names:
             seen = f"it holds {', '.join(sorted(tensors)) or 'nothing'}"
-            raise InputError(f"{seen} of a map; expected {', '.join(sorted(own))}")
-        default = {"visits": self.visits[:0]} if "visits" in own else {}
+            raise InputError(f"{seen} of a map; expected {', '.join(sorted(names))}")
+        default = {"visits": self.visits[:0]} if "visits" in names else {}
         self.load_state_dict({**default, **tensors, EXTRA: extra})
 
 

@@ -168,26 +168,26 @@ class SpectralMap(PlaceMap):
         chunks = [*chunks]
         if not chunks:
             return
-        places, device = [one.places for one in chunks], self.device
+        places, device = [chunk.places for chunk in chunks], self.device
         if levels is None:
             with ThreadPoolExecutor(torch.get_num_threads()) as pool:
                 parts = [*pool.map(lambda c: _nonzero(decode(c.stream, c.places, self.dimension)), chunks)]
         else:
-            parts = [_nonzero(one) for one in levels]
+            parts = [_nonzero(level) for level in levels]
         sizes = self.places + sum(places), self._bounds[-1] + sum(len(level) for *_, level in parts)
         if max(sizes) > LARGEST:
             seen = f"the map has {sizes[0]} places and {sizes[1]} coefficients"
             raise InputError(f"{seen}; expected at most {LARGEST} of each: make several maps")
 
         def append(name: str, *more: Tensor) -> None:
-            setattr(self, name, torch.cat([getattr(self, name), *(one.to(device) for one in more)]))
+            setattr(self, name, torch.cat([getattr(self, name), *(tensor.to(device) for tensor in more)]))
 
         for name, column in zip(("counts", "feature", "level"), zip(*parts, strict=True), strict=True):
             append(name, *column)
         append("lengths", torch.tensor(places))
-        append("steps", self.steps.new_tensor([one.step for one in chunks]))
+        append("steps", self.steps.new_tensor([chunk.step for chunk in chunks]))
         append("stream_table", torch.tensor([[len(c.stream.bytes), c.stream.checksum] for c in chunks]))
-        append("streams", *(one.stream.bytes for one in chunks))
+        append("streams", *(chunk.stream.bytes for chunk in chunks))
         if len(self.visits):
             self.count_visits(torch.cat([self.visit_counts, self.lengths.new_ones(sum(places))]))
         for chunk, (*_, level) in zip(chunks, parts, strict=True):
@@ -217,47 +217,47 @@ class SpectralMap(PlaceMap):
 
     def of_chunks(self, chunks: Iterable[Chunk]) -> SpectralMap:
         """A map of other chunks with this map's mean, settings and device."""
-        made = SpectralMap(self.means, **self.settings())
-        made.extend(chunks)
-        return made
+        place_map = SpectralMap(self.means, **self.settings())
+        place_map.extend(chunks)
+        return place_map
 
     @classmethod
     def merged(cls, parts: Sequence[SpectralMap], names: Sequence[str]) -> SpectralMap:
         """The map of several routes, each with its own mean and steps; `growth.merge` checks the routes."""
-        made = cls(torch.cat([part.means for part in parts]), **parts[0].settings())
+        place_map = cls(torch.cat([part.means for part in parts]), **parts[0].settings())
         sizes = ((part.places, part.table.frames) for part in parts)
-        made.routes = tuple(Route(name, *size) for name, size in zip(names, sizes, strict=True))
-        made.extend(chunk for part in parts for chunk in part.coded())
-        made.positions = torch.cat([part.positions for part in parts])
-        made.count_visits(torch.cat([part.visit_counts for part in parts]))
-        made.check()
-        return made
+        place_map.routes = tuple(Route(name, *size) for name, size in zip(names, sizes, strict=True))
+        place_map.extend(chunk for part in parts for chunk in part.coded())
+        place_map.positions = torch.cat([part.positions for part in parts])
+        place_map.count_visits(torch.cat([part.visit_counts for part in parts]))
+        place_map.check()
+        return place_map
 
     def part(self, name: str) -> SpectralMap:
         """The map of one route alone; an InputError if there is no such route."""
-        names = [one.name for one in self.routes]
+        names = [route.name for route in self.routes]
         if name not in names:
             raise InputError(f"there is no route {name!r}; expected one of {', '.join(names)}")
         r = names.index(name)
-        start, frame = (sum(one[i] for one in self.routes[:r]) for i in (1, 2))  # type: ignore[misc]
+        start, frame = (sum(route[i] for route in self.routes[:r]) for i in (1, 2))  # type: ignore[misc]
         _, places, frames = self.routes[r]
         starts = [first for first, _ in self.chunks]
-        made = self.between(bisect.bisect_left(starts, start), bisect.bisect_left(starts, start + places))
-        made.routes = ()
-        made.positions = self.positions[frame : frame + frames]
-        made.count_visits(self.visit_counts[start : start + places])
-        return made
+        part = self.between(bisect.bisect_left(starts, start), bisect.bisect_left(starts, start + places))
+        part.routes = ()
+        part.positions = self.positions[frame : frame + frames]
+        part.count_visits(self.visit_counts[start : start + places])
+        return part
 
     def between(self, first: int, last: int) -> SpectralMap:
         """A map of the chunks [first, last), with the same scores."""
         routes = self._routes_of(range(first, last))
-        own, counts = routes.unique_consecutive(return_counts=True)
-        made = SpectralMap(self.means[own], **self.settings())
+        unique, counts = routes.unique_consecutive(return_counts=True)
+        part = SpectralMap(self.means[unique], **self.settings())
         if self.routes:
-            sizes = [int(part.sum()) for part in self.lengths[first:last].split(counts.tolist())]
-            made.routes = tuple(Route(self.routes[r].name, n, n) for r, n in zip(own, sizes, strict=True))
-        made.extend(self.coded()[first:last])
-        return made
+            sizes = [int(lengths.sum()) for lengths in self.lengths[first:last].split(counts.tolist())]
+            part.routes = tuple(Route(self.routes[r].name, n, n) for r, n in zip(unique, sizes, strict=True))
+        part.extend(self.coded()[first:last])
+        return part
 
     @property
     def step(self) -> float:
@@ -375,7 +375,7 @@ class SpectralMap(PlaceMap):
         return {name: getattr(self, name) for name in ("metric", "transform", "chunk", "resolution")}
 
     def get_extra_state(self) -> dict[str, Any]:
-        return {**super().get_extra_state(), "routes": [one._asdict() for one in self.routes]}
+        return {**super().get_extra_state(), "routes": [route._asdict() for route in self.routes]}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         super().set_extra_state(state)
@@ -429,7 +429,7 @@ class SpectralMap(PlaceMap):
         chunks = [ChunkSummary(start, stop, self._periods(g)) for g, (start, stop) in enumerate(self.chunks)]
         packed = self.packed() if self.places else {}
         names = {"streams": "lines", "means": "mean", "positions": "positions", "visits": "visits"}
-        route = {own: packed[name].nbytes for name, own in names.items() if name in packed}
+        route = {part: packed[name].nbytes for name, part in names.items() if name in packed}
         route = {name: size for name, size in route.items() if size}
         route["chunks"] = sum(tensor.nbytes for name, tensor in packed.items() if name not in names)
         covered = int((self.norms > 0).sum())

@@ -242,12 +242,12 @@ class TemplateMap(PlaceMap):
         weights if the map has none, None or (0,) for 1."""
         self.freeze()
         if weights and not len(self.weights):
-            own = self.templates.new_ones(self.dimension)
+            initial = self.templates.new_ones(self.dimension)
             if start is not None and len(start):
-                if start.shape != own.shape:
-                    raise InputError(f"the weights start as {tuple(start.shape)}; expected ({len(own)},)")
-                own = start.detach().clone()
-            self.templates, self.weights = self._times(own), own
+                if start.shape != initial.shape:
+                    raise InputError(f"the weights start as {tuple(start.shape)}; expected ({len(initial)},)")
+                initial = start.detach().clone()
+            self.templates, self.weights = self._times(initial), initial
         for name, wanted in (("templates", templates), ("weights", weights)):
             if wanted:
                 setattr(self, name, nn.Parameter(getattr(self, name).detach().clone()))
@@ -270,8 +270,8 @@ class TemplateMap(PlaceMap):
     def summary(self) -> MapSummary:
         span = attrgetter("start", "stop")
         chunks = tuple(
-            ChunkSummary(*where, *zip(*((one.period, len(one.features)) for one in own), strict=True))
-            for where, own in groupby(sorted(self.plan, key=span), span)
+            ChunkSummary(*where, *zip(*((layer.period, len(layer.features)) for layer in group), strict=True))
+            for where, group in groupby(sorted(self.plan, key=span), span)
         )
         covered = sum(stop - start for start, stop, layers in self.segments if layers)
         parts = {"templates": self.templates, "weights": self.weights, "positions": self.positions}

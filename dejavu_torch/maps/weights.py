@@ -86,26 +86,26 @@ def in_bits(module: nn.Module, bits: int) -> Iterator[None]:
 
 def packed(module: nn.Module) -> dict[str, Tensor]:
     """The tensors of a module's state, with integers and scales for each parameter that `fits`."""
-    found = {name: one for name, one in module.state_dict().items() if isinstance(one, Tensor)}
+    tensors = {name: value for name, value in module.state_dict().items() if isinstance(value, Tensor)}
     for name, weight in module.named_parameters(remove_duplicate=False):
         if fits(weight):
-            found[name], found[name + SCALE] = quantised(weight.detach())
-    return found
+            tensors[name], tensors[name + SCALE] = quantised(weight.detach())
+    return tensors
 
 
 def unpacked(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
     """The tensors of a file; those of `quantised`, below a prefix, become weights, others are refused."""
-    found = dict(tensors)
+    plain = dict(tensors)
     for name, whole in tensors.items():
         if not name.startswith(prefix) or name + SCALE not in tensors:
             continue
-        scale = found.pop(name + SCALE)
+        scale = plain.pop(name + SCALE)
         dtypes = whole.dtype == torch.int8 and scale.dtype == torch.bfloat16
         fitting = dtypes and scale.shape == whole.shape[:1]
         weight = whole * _broadcast(scale, whole) if fitting else None
         if weight is None or not fits(weight) or not all(map(torch.equal, quantised(weight), (whole, scale))):
-            shapes = " and ".join(f"{one.dtype} {tuple(one.shape)}" for one in (whole, scale))
+            shapes = " and ".join(f"{tensor.dtype} {tuple(tensor.shape)}" for tensor in (whole, scale))
             expected = "int8 (O,...) and bfloat16 (O,), finite, the largest of each channel"
             raise InputError(f"{name} and its scale are {shapes}; expected {expected} {LARGEST}, or all 0")
-        found[name] = weight
-    return found
+        plain[name] = weight
+    return plain

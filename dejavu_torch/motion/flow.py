@@ -33,8 +33,8 @@ def flow_shift(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
         `phase_shifts`.
     """
     track = _tracker()
-    found = [_shift(track, *pair) for pair in zip(_to_uint8(first), _to_uint8(second), strict=True)]
-    shift, confidence = first.new_tensor(found).view(-1, 2).T
+    shifts = [_shift(track, *pair) for pair in zip(_to_uint8(first), _to_uint8(second), strict=True)]
+    shift, confidence = first.new_tensor(shifts).view(-1, 2).T
     return shift, confidence
 
 
@@ -70,7 +70,7 @@ def _shift(track: Tracker, first: Array, second: Array) -> tuple[float, float]:
         inside = ((target >= 0) & (target <= (first.shape[1] - 1, first.shape[0] - 1))).all(1)
         agree = inside & returned & (np.abs(moved - median) < TOLERANCE).all(1)
         confidence = float(agree.sum() / max(inside.sum(), len(points) / 2, 8))  # few agree by chance
-        best = max(best, (float(median[1]), confidence), key=lambda found: found[1])
+        best = max(best, (float(median[1]), confidence), key=lambda pair: pair[1])
         if confidence >= SUFFICIENT_CONFIDENCE:
             break
     return best

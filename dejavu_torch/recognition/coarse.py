@@ -237,8 +237,8 @@ class CoarseSearch(Scan):
         for g in chunk.unique().tolist():
             if g >= 0:
                 query, column = (chunk == g).nonzero().T
-                own, row = query.unique_consecutive(return_inverse=True)
-                here = self.place_map.products(units[own], range(g, g + 1))
+                queries, row = query.unique_consecutive(return_inverse=True)
+                here = self.place_map.products(units[queries], range(g, g + 1))
                 products[query, column] = here[row, place[query, column] - self.place_map.chunks[g][0]]
         norms = self.place_map.norms[place].masked_fill(place < 0, 1)
         return scores_of(products, norms, norms, "cosine")
@@ -247,7 +247,7 @@ class CoarseSearch(Scan):
         """Which queries lack some of the wanted candidates, (Q,)."""
         if score.shape[1] < max(k for k, _ in wanted):
             return score.new_ones(len(score), dtype=torch.bool)
-        last = [best_candidates(score, *one, place).score[:, -1] for one in wanted]
+        last = [best_candidates(score, *spec, place).score[:, -1] for spec in wanted]
         return torch.stack(last).isinf().any(0)
 
 

@@ -76,7 +76,7 @@ class Localizer:
         self.own: Together = sequence.length if isinstance(sequence, SequenceMatcher) else "filter"
         self.models = {**matching.also, **({} if sequence is None else {self.own: sequence})}
         self.states: dict[Together, Tensor] = {}  # of the models; empty before the first query
-        self.route_starts = (0, *accumulate(one.places for one in routes[:-1]))
+        self.route_starts = (0, *accumulate(route.places for route in routes[:-1]))
 
     @torch.no_grad()
     def __call__(self, descriptors: Tensor, label: str | None = None) -> Match:
@@ -120,8 +120,8 @@ class Localizer:
         return self.states.get("filter")
 
     def _in_sequence(self, scores: Tensor) -> Match:
-        states = self.states or {T: one.start(scores.shape[1]).to(scores) for T, one in self.models.items()}
-        steps = {T: one.step(scores, states[T], self.route_starts) for T, one in self.models.items()}
+        states = self.states or {T: m.start(scores.shape[1]).to(scores) for T, m in self.models.items()}
+        steps = {T: m.step(scores, states[T], self.route_starts) for T, m in self.models.items()}
         single = self.matching.sequence is None
         final, confidence = scores if single else steps[self.own][0], None
         if self.matching.platt is not None:
@@ -154,5 +154,5 @@ class Localizer:
         """Candidates from the lowest scores alone; `wanted` has those of the answer first."""
         assert self.searcher is not None
         score, place = self.searcher(descriptors, wanted)
-        match, *second = (best_candidates(score, *one, places=place) for one in wanted)
+        match, *second = (best_candidates(score, *spec, places=place) for spec in wanted)
         return self._answer(match, *map(confidence, second))

@@ -53,8 +53,8 @@ class Scan:
                 if len(better):
                     scores = scores[better] if len(better) < len(scores) else scores
                     block, better = topk(scores, min(n, scores.shape[1]), start), better + first
-                    found, place[better] = merge_topk((score[better], place[better]), block)
-                    score[better] = found.to(score)  # templates may be double
+                    merged, place[better] = merge_topk((score[better], place[better]), block)
+                    score[better] = merged.to(score)  # templates may be double
             first += len(part)
         return score, place
 

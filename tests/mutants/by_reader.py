@@ -252,8 +252,8 @@ MUTANTS = [
     Mutant(
         "FILE.part of a run with other settings, or of another route, is refused, and not gone on with.",
         "dejavu_torch/learning.py",
-        "if known != key:",
-        "if known.keys() != key.keys():",
+        "if stored != key:",
+        "if stored.keys() != key.keys():",
         ("tests/test_learning.py::-k partial_map_of_another_run or appended_to_a_map_are_kept",),
     ),
     Mutant(

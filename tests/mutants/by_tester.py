@@ -8,8 +8,8 @@ MUTANTS = [
     Mutant(
         "A second model made of the settings of a first learns a whitening of its own.",
         "dejavu_torch/model.py",
-        "            whitening = copy.deepcopy(whitening)\n        return own",
-        "            pass\n        return own",
+        "            whitening = copy.deepcopy(whitening)\n        return settings",
+        "            pass\n        return settings",
         ("tests/test_edges.py::-k leaves_the_first_alone",),
     ),
     Mutant(
@@ -22,7 +22,7 @@ MUTANTS = [
     Mutant(
         "The positions of frames keep their type.",
         "dejavu_torch/maps/place_map.py",
-        "                setattr(self, name, own.to(now.device))",
+        "                setattr(self, name, old.to(now.device))",
         "                pass",
         ("tests/test_edges.py::-k positions_keep",),
     ),
@@ -130,8 +130,8 @@ MUTANTS = [
     Mutant(
         "A map file that is damaged in any bit is refused.",
         "dejavu_torch/maps/file.py",
-        "if found.get(part) != sums.get(part)",
-        "if (part in seen) != (part in sums)",
+        "if computed.get(part) != sums.get(part)",
+        "if (part in computed) != (part in sums)",
         ("tests/maps/test_file.py::-k any_flipped",),
     ),
     Mutant(
@@ -434,8 +434,8 @@ MUTANTS = [
     Mutant(
         "The borders of routes that a sequence keeps are those of the places, through all routes.",
         "dejavu_torch/recognition/localizer.py",
-        "accumulate(one.places for one in routes[:-1])",
-        "(one.places for one in routes[:-1])",
+        "accumulate(route.places for route in routes[:-1])",
+        "(route.places for route in routes[:-1])",
         ("tests/test_growth.py::test_a_sequence_does_not_run_from_one_route_into_the_next",),
     ),
     Mutant(
@@ -448,8 +448,8 @@ MUTANTS = [
     Mutant(
         "Some chunks of a map, as a worker holds them, score as in the whole: with the mean of their route.",
         "dejavu_torch/maps/spectral_map.py",
-        "made = SpectralMap(self.means[own], **self.settings())",
-        "made = SpectralMap(self.means[own * 0], **self.settings())",
+        "part = SpectralMap(self.means[unique], **self.settings())",
+        "part = SpectralMap(self.means[unique * 0], **self.settings())",
         ("tests/test_cluster.py::test_a_part_scores_as_in_the_whole_map",),
     ),
     Mutant(
