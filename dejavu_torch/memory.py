@@ -22,9 +22,6 @@ from dejavu_torch.types import InputError
 P = ParamSpec("P")
 R = TypeVar("R")
 
-CGROUPS = Path("/sys/fs/cgroup")  # the limits of containers, jobs and services
-OWN_CGROUP = Path("/proc/self/cgroup")  # which of them the process is in
-RECLAIMABLE = ("inactive_file", "active_file", "slab_reclaimable")
 IN_MEMORY = 2**29  # bytes of features that are kept in memory
 BLOCK_BYTES = 2**26  # a tensor this large returns to the system when it is freed, a batch may not
 
@@ -68,8 +65,13 @@ def is_readable(*tensors: Tensor) -> bool:
 
 
 def free_memory() -> float:
-    """Bytes that the process can still allocate within the system and its limits; inf if unknown."""
-    return min(_free_in_system(), _free_in_cgroups(), _free_in_process())
+    """Bytes that the system has available; inf if unknown. Limits of a container or a process do not count."""
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        return next(1024.0 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
+    except (OSError, ValueError, StopIteration):  # another system
+        known = hasattr(os, "sysconf")
+        return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")) if known else math.inf
 
 
 def check_room(needed: float, what: str) -> None:
@@ -85,45 +87,6 @@ def check_room(needed: float, what: str) -> None:
 
 def _size(number: float) -> str:
     return f"{number / 1e9:.3g} GB" if number >= 1e9 else f"{max(number, 0) / 1e6:.3g} MB"
-
-
-def _free_in_system() -> float:
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-        return next(1024.0 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
-    except (OSError, ValueError, StopIteration):  # another system
-        known = hasattr(os, "sysconf")
-        return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")) if known else math.inf
-
-
-def _free_in_cgroups() -> float:
-    """The least that the control group of the process, and every group around it, have left."""
-    try:
-        path = next(line[3:] for line in OWN_CGROUP.read_text().splitlines() if line.startswith("0::"))
-    except (OSError, StopIteration):
-        path = "/"
-    inside = CGROUPS / path.lstrip("/")
-    return min(_free_in(group) for group in (inside, *inside.parents) if group.is_relative_to(CGROUPS))
-
-
-def _free_in(group: Path) -> float:
-    try:
-        limit, used = (float((group / f"memory.{name}").read_text()) for name in ("max", "current"))
-        stat = dict(map(str.split, (group / "memory.stat").read_text().splitlines()))
-        return limit - used + sum(float(stat.get(name, 0)) for name in RECLAIMABLE)
-    except (OSError, ValueError):  # no such files, or a limit of "max"
-        return math.inf
-
-
-def _free_in_process() -> float:
-    try:
-        import resource
-
-        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-        used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    except (ImportError, OSError, ValueError):  # another system
-        return math.inf
-    return math.inf if limit == resource.RLIM_INFINITY else float(limit - used)
 
 
 @contextmanager

@@ -44,8 +44,9 @@ from typing import Any, NamedTuple
 import torch
 
 import dejavu_torch
-from dejavu_torch import cli
+from dejavu_torch import cli, memory
 from dejavu_torch.data.output import PREFIX
+from dejavu_torch.maps import codec
 from dejavu_torch.types import InputError
 
 from .mutations import CANARY
@@ -245,6 +246,8 @@ def _work(reader: Reader, seed: int, numbers: Sequence[int], root: Path, told: C
             (root / "making").rename(folder)
     base = _address_space()
     resource.setrlimit(resource.RLIMIT_AS, (base + MEMORY, resource.RLIM_INFINITY))
+    system = memory.free_memory
+    memory.free_memory = codec.free_memory = lambda: min(system(), base + MEMORY - _address_space())
     for number in numbers:
         told.send(number)
         result = _run_case(reader, seed, number, root)
