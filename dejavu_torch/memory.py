@@ -65,7 +65,7 @@ def is_readable(*tensors: Tensor) -> bool:
 
 
 def free_memory() -> float:
-    """Bytes that the system has available; inf if unknown. Limits of a container or a process do not count."""
+    """Bytes that the system has available, whatever limits a container sets; inf if unknown."""
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
         return next(1024.0 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
