@@ -172,7 +172,7 @@ def fit(
     """A map without places, but with whitening, mean and step from the sample of a long traverse."""
     sample = Sample.of(len(traverse), mapper.chunk)
     views = second and sample.views(second)
-    rows = descriptor.learn(Part(traverse, sample.frame), views, progress, label="sampling")
+    rows = descriptor.learn(Part(traverse, sample.frame), views, progress, verb="sampling")
     if visits is not None:
         rows = averaged(descriptor, rows, views_of(visits, sample.frame), progress)
     # the sample is charged its share of the fixed bytes
@@ -213,7 +213,7 @@ def append_places(
                 checkpoint.save(place_map, descriptor, place_map.places - start)
 
     try:
-        with progress_of("learning" if progress else None, frames - len(done)) as update:
+        with progress_of("learning", frames - len(done), progress) as update:
             for chunk in map_tasks(encode, tasks) if tasks else ():
                 held.append(chunk)
                 update(chunk.places)
@@ -247,7 +247,7 @@ def descriptors_of(
     descriptor: Descriptor, views: LabelledFrames, progress: bool = False
 ) -> tuple[Tensor, Tensor]:
     """Descriptors (n,K) of the frames with a known place, and these places (n,)."""
-    rows = concatenate(descriptor.batches(views.traverse, "averaging" if progress else None))
+    rows = concatenate(descriptor.batches(views.traverse, progress, "averaging"))
     known = views.places.to(rows.device) >= 0
     return rows[known], views.places[known.to(views.places.device)]
 
@@ -309,8 +309,8 @@ def calibration_of(
     else:
         length = max(SEGMENT, min(MAX_SEGMENT, SEGMENT_SCORES // place_map.places))
         views = _segments_of(views, length, max(LEAST, CALIBRATION_SCORES // place_map.places))
-    name, label = views.traverse.name, "calibrating" if progress else None
-    descriptors = concatenate(descriptor.batches(views.traverse, label))
+    name = views.traverse.name
+    descriptors = concatenate(descriptor.batches(views.traverse, progress, "calibrating"))
     parts = zip(descriptors.split(length), views.places.split(length), strict=True)
     try:
         return calibrated(place_map, parts, another)

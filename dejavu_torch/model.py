@@ -386,12 +386,13 @@ class DejaVu(nn.Module):
             order: (N,) the frame of each place of a shuffled map; the match then counts frames.
         """
         matching = matching if isinstance(matching, Matching) else self.matching(matching)
-        localizer, label = self.localizer(matching), "localizing" if progress else None
+        localizer = self.localizer(matching)
         if order is None:
-            return localizer(descriptors, label)
+            return localizer(descriptors, progress)
         matcher, place = Localizer(None, matching), order.argsort()
         parts = descriptors.split(max(1, SCORES_AT_ONCE // self.map.places))
-        scores = (self.map.scores(part.to(self.map.device)) for part in with_progress(parts, label))
+        parts = with_progress(parts, "localizing", progress)
+        scores = (self.map.scores(part.to(self.map.device)) for part in parts)
         with torch.no_grad():
             return Match.joined(matcher.match(part[:, place.to(part.device)]) for part in scores)
 
@@ -434,8 +435,7 @@ class DejaVu(nn.Module):
             check_queries(self, shape, features.shape[1], name)
             self.descriptor.warn_of_bright(frames, name)
 
-        label = "localizing" if progress else None
-        yield from map(localizer, self.descriptor.batches(queries, label, on_first))
+        yield from map(localizer, self.descriptor.batches(queries, progress, "localizing", on_first))
 
     def candidates(
         self,

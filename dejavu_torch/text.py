@@ -36,14 +36,14 @@ def settings_of(module: nn.Module, *hidden: str) -> str:
 
 @contextmanager
 def progress_of(
-    label: str | None, total: int | None, unit: str = "frame"
+    verb: str, total: int, progress: bool, unit: str = "frame"
 ) -> Iterator[Callable[[int], object]]:
     """A function to call with the number of frames newly done: it shows a bar on stderr, or lines if that is
-    no terminal; nothing if `label` is None."""
+    no terminal; nothing without `progress`."""
     from tqdm import tqdm
 
-    if label is not None and sys.stderr.isatty():
-        with tqdm(total=total, desc=label, unit=unit, leave=False) as bar:
+    if progress and sys.stderr.isatty():
+        with tqdm(total=total, desc=verb, unit=unit, leave=False) as bar:
             yield bar.update
         return
     began, done = time.monotonic(), 0
@@ -52,19 +52,18 @@ def progress_of(
     def update(more: int) -> None:
         nonlocal done, due
         done, now = done + more, time.monotonic()
-        if label is None or now < due or not done:
+        if not progress or now < due or not done:
             return
         due = now + LINE_EVERY
-        of = f" of {total}" if total else ""
-        left = f", {max(0, total - done) * (now - began) / done:.0f} s left" if total else ""
-        tqdm.write(f"dejavu: {label}: {done}{of} {unit}s{left}", file=sys.stderr)
+        left = max(0, total - done) * (now - began) / done
+        tqdm.write(f"dejavu: {verb}: {done} of {total} {unit}s, {left:.0f} s left", file=sys.stderr)
 
     yield update
 
 
-def with_progress(steps: Sequence[Step], label: str | None) -> Iterator[Step]:
+def with_progress(steps: Sequence[Step], verb: str, progress: bool) -> Iterator[Step]:
     """The steps of a long task; see `progress_of`."""
-    with progress_of(label, len(steps), "step") as update:
+    with progress_of(verb, len(steps), progress, "step") as update:
         for step in steps:
             yield step
             update(1)

@@ -70,7 +70,7 @@ def nearest_frames(
         max=len(stored) - 1
     )
     parts = query.split(max(1, BLOCK_DISTANCES // len(reference)))
-    batches = with_progress(parts, "baselines" if progress else None)
+    batches = with_progress(parts, "baselines", progress)
     scores = (phase_distances(batch.to(stored.device), stored, metric) for batch in batches)
     if k > 1:
         scores = (part[:, nearest] for part in scores)

@@ -53,7 +53,7 @@ def coded_at_sizes(
     }
     found: dict[str, list[Stored]] = {key: [] for key in kinds}
     cases = [(key, budget) for key in kinds for budget in budgets]
-    for key, budget in with_progress(cases, "storage" if progress else None):
+    for key, budget in with_progress(cases, "storage", progress):
         for answers, size in kinds[key](budget):
             answers = answers.renumbered(place_map.table.scored)
             scores = evaluate(answers, run.truth, run.tolerance)

@@ -88,27 +88,35 @@ class Descriptor(nn.Module):
         return self.whitened(features_of(frames, self.describe, "the input"))
 
     def features_in(
-        self, traverse: Traverse | AugmentedFrames, label: str | None = None, on_first: OnFirst | None = None
+        self,
+        traverse: Traverse | AugmentedFrames,
+        progress: bool = False,
+        verb: str = "describing",
+        on_first: OnFirst | None = None,
     ) -> Iterator[Tensor]:
         """Batches (B,D) of features, without gradients; see `feature_batches`."""
         height, width = own_size(self.features) or (1, 1)
         size = max(1, min(self.batch_size, BATCH_NUMBERS // (3 * height * width)))
-        return feature_batches(traverse, self, size, self.device, label, on_first, self.describe)
+        return feature_batches(traverse, self, size, self.device, progress, verb, on_first, self.describe)
 
     def batches(
-        self, traverse: Traverse | AugmentedFrames, label: str | None = None, on_first: OnFirst | None = None
+        self,
+        traverse: Traverse | AugmentedFrames,
+        progress: bool = False,
+        verb: str = "describing",
+        on_first: OnFirst | None = None,
     ) -> Iterator[Tensor]:
         """Batches (B,K) of the descriptors of a traverse, in order, without gradients.
 
         Args:
-            label: of a progress bar on stderr, or of lines if it is no terminal.
+            progress: show a bar on stderr, or lines if it is no terminal. verb: its name.
             on_first: called with the first batch of frames and its features.
         """
-        return map(self.whitened, self.features_in(traverse, label, on_first))
+        return map(self.whitened, self.features_in(traverse, progress, verb, on_first))
 
     def all_of(self, traverse: Traverse, progress: bool = False) -> Tensor:
         """Descriptors (N,K) of a whole traverse; many are kept in a temporary file, see `concatenate`."""
-        return concatenate(self.batches(traverse, f"describing {traverse.name}" if progress else None))
+        return concatenate(self.batches(traverse, progress, f"describing {traverse.name}"))
 
     def learn(
         self,
@@ -116,7 +124,7 @@ class Descriptor(nn.Module):
         second: LabelledFrames | None = None,
         progress: bool = False,
         spectral: bool = True,
-        label: str = "learning",
+        verb: str = "learning",
     ) -> Tensor:
         """Descriptors (N,K) of a reference, from which the whitening is learned first, unless it is fixed.
 
@@ -134,7 +142,6 @@ class Descriptor(nn.Module):
         """
         if second is not None:
             self.require_learning(second.traverse.name)
-        label_if = label if progress else None
 
         def check_first(frames: Tensor, features: Tensor) -> None:
             self.warn_of_bright(frames, traverse.name)
@@ -145,15 +152,15 @@ class Descriptor(nn.Module):
             whitening = self.whitening
             if whitening is not None and not whitening.fixed:
                 if not (spectral and self._exceeds_memory(traverse)):
-                    features = concatenate(self.features_in(traverse, label_if, check_first))
-                    self._learn_whitening(whitening, features, traverse, second, label_if)
+                    features = concatenate(self.features_in(traverse, progress, verb, check_first))
+                    self._learn_whitening(whitening, features, traverse, second, progress)
                     parts = features.split(ROWS)
                     return concatenate(self.whitened(part.to(self.device)) for part in parts)
                 sample = Sample.of(len(traverse), SAMPLE)
                 views = second and sample.views(second)
-                self.learn(Part(traverse, sample.frame), views, progress, label="sampling")
+                self.learn(Part(traverse, sample.frame), views, progress, verb="sampling")
             storage = (DESCRIPTOR_MEMORY, self.whitening is not None) if spectral else ()
-            return concatenate(self.batches(traverse, label_if, check_first), *storage)
+            return concatenate(self.batches(traverse, progress, verb, check_first), *storage)
 
     def reduce_if_wide(self, traverse: Traverse, spectral: bool = True) -> None:
         """Without whitening of the user's: one for ready features that are too wide for a spectral map."""
@@ -172,7 +179,7 @@ class Descriptor(nn.Module):
         features: Tensor,
         traverse: Traverse,
         second: LabelledFrames | None,
-        label: str | None,
+        progress: bool,
     ) -> None:
         if len(features) < 2:
             raise InputError(f"{traverse.name} has 1 frame; expected at least 2")
@@ -186,7 +193,7 @@ class Descriptor(nn.Module):
             whitening.learn(features, None, groups)
         else:
             samples = INDEPENDENT * len(features) if isinstance(second.traverse, AugmentedFrames) else None
-            batches = self.features_in(second.traverse, label and f"learning what changes: {source}")
+            batches = self.features_in(second.traverse, progress, f"learning what changes: {source}")
             shown = _with_places(batches, second.places.to(self.device))
             whitening.learn(features, shown, groups, samples)
         whitening.to(self.device)

@@ -29,7 +29,8 @@ def feature_batches(
     module: nn.Module,
     batch_size: int = 64,
     device: torch.device | str = "cpu",
-    label: str | None = None,
+    progress: bool = False,
+    verb: str = "describing",
     on_first: Callable[[Tensor, Tensor], None] | None = None,
     describe: Callable[[Tensor], Tensor] | None = None,
 ) -> Iterator[Tensor]:
@@ -39,7 +40,7 @@ def feature_batches(
         traverse: frames (B,C,H,W), or ready features (B,D), which pass unchanged.
         module: (B,C,H,W) -> (B,D). It runs in eval mode; the modes of its parts are restored.
         batch_size: frames in memory at a time, fewer if they are large; at least 256 ready features.
-        label: of a progress bar on stderr, or of lines if it is no terminal; copies count once.
+        progress: show a bar on stderr, or lines if it is no terminal; copies count once. verb: its name.
         on_first: called with the first batch and its features.
         describe: a method of the module; None is its forward.
 
@@ -48,7 +49,7 @@ def feature_batches(
     """
     done, copies = 0, traverse.copies if isinstance(traverse, AugmentedFrames) else 1
     size = max(batch_size, READY) if len(traverse.frame_shape) == 1 else batch_size
-    with progress_of(label, len(traverse) // copies) as update, in_mode(module, False):
+    with progress_of(verb, len(traverse) // copies, progress) as update, in_mode(module, False):
         for batch in traverse.batches(size):
             with torch.no_grad():
                 features = features_of(batch.to(device), describe or module, traverse.name).detach()

@@ -121,7 +121,7 @@ class GroundOdometry(nn.Module):
         """
         last: list[Tensor] = []  # the last patch of the previous batch
         parts: list[tuple[Tensor, Tensor]] = []
-        with progress_of("measuring the ground" if progress else None, len(traverse)) as update:
+        with progress_of("measuring the ground", len(traverse), progress) as update:
             for batch in traverse.batches(batch_size):
                 patches = torch.cat([*last, ground_patch(batch, self.corners, self.size)])
                 if not last:

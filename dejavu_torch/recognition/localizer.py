@@ -79,7 +79,7 @@ class Localizer:
         self.route_starts = (0, *accumulate(route.places for route in routes[:-1]))
 
     @torch.no_grad()
-    def __call__(self, descriptors: Tensor, label: str | None = None) -> Match:
+    def __call__(self, descriptors: Tensor, progress: bool = False) -> Match:
         place_map, matching = self.place_map, self.matching
         assert place_map is not None
         places = place_map.places
@@ -93,7 +93,7 @@ class Localizer:
         searches = not self.models and matching.callback is None and (few or type(self.searcher) is not Scan)
         size = max(PER_BEST * n, places // PLACES_PER_NUMBER) if searches else places
         parts = descriptors.split(max(1, min(ROWS, SCORES_AT_ONCE // size)))
-        moved = (part.to(place_map.device) for part in with_progress(parts, label))
+        moved = (part.to(place_map.device) for part in with_progress(parts, "localizing", progress))
         if searches:
             return Match.joined(self._search(part, wanted) for part in moved)
         return Match.joined(self.match(place_map.scores(part)) for part in moved)

@@ -142,7 +142,7 @@ def test_a_bar_counts_frames_however_often_they_are_looked_at(monkeypatch: pytes
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setattr("tqdm.std.time", iter(range(10**6)).__next__)  # each update is shown
-    batches = list(feature_batches(copies, nn.Flatten(), 64, label=f"learning: {looks}"))
+    batches = list(feature_batches(copies, nn.Flatten(), 64, progress=True, verb=f"learning: {looks}"))
     assert sum(map(len, batches)) == 210
     counts = [tuple(map(int, pair)) for pair in re.findall(r"(\d+)/(\d+)", terminal.getvalue())]
     assert {total for _, total in counts} == {70}
@@ -157,11 +157,11 @@ def test_without_a_terminal_there_is_a_line_now_and_then(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     frames = ArrayTraverse(torch.rand(100, 1, 4, 4))
-    list(feature_batches(frames, nn.Flatten(), 1, label="learning"))
+    list(feature_batches(frames, nn.Flatten(), 1, progress=True, verb="learning"))
     assert capsys.readouterr().err == ""  # over at once
     clock = iter(range(10**6))
     monkeypatch.setattr(text.time, "monotonic", lambda: float(next(clock)))  # a second a frame
-    list(feature_batches(frames, nn.Flatten(), 1, label="learning"))
+    list(feature_batches(frames, nn.Flatten(), 1, progress=True, verb="learning"))
     lines = capsys.readouterr().err.splitlines()
     assert [re.findall(r"\d+", line) for line in lines] == [["30", "100", "70"], ["90", "100", "10"]]
     assert all("learning" in line for line in lines)
