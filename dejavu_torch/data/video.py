@@ -159,13 +159,15 @@ class Video(Traverse):
     def _listed(self) -> Index:
         """The frames that the file lists, without decoding them."""
         with self._decoding() as (container, stream):
-            packets = [packet for packet in container.demux(stream) if packet.size and not packet.is_discard]
-            if container.format.name == "avi" and len(packets) < len(stream.index_entries):
-                raise self._broken(len(packets), "frames are missing")
+            packets = (packet for packet in container.demux(stream) if packet.size and not packet.is_discard)
             if stream.codec_context.name == "vp8":
-                packets = [packet for packet in packets if bytes(packet)[0] & VP8_SHOWN]
-            packets.sort(key=lambda packet: (packet.pts is None, packet.pts))
-            return self._index([p.pts for p in packets], [p.is_keyframe for p in packets], stream)
+                packets = (packet for packet in packets if bytes(packet)[0] & VP8_SHOWN)
+            # not the packets themselves, which hold the whole file
+            frames = sorted((packet.pts is None, packet.pts or 0, packet.is_keyframe) for packet in packets)
+            if container.format.name == "avi" and len(frames) < len(stream.index_entries):
+                raise self._broken(len(frames), "frames are missing")
+            stamps = [None if unknown else stamp for unknown, stamp, _ in frames]
+            return self._index(stamps, [key for *_, key in frames], stream)
 
     def _decoded(self) -> Index:
         """All frames, by decoding them once."""
@@ -180,16 +182,16 @@ class Video(Traverse):
                 keys.append(bool(frame.key_frame))
             if container.format.name == "avi" and len(stamps) < len(stream.index_entries):
                 raise self._broken(len(stamps), "frames are missing")
-            self._sought = self._sought and None not in stamps and stamps == sorted({*stamps})
-            if None not in stamps:  # .avi stores no times of presentation
-                stamps.sort()
             return self._index(stamps, keys, stream)
 
     def _index(self, stamps: list[Any], keys: list[bool], stream: VideoStream) -> Index:
         if not stamps:
             raise InputError(f"{self.name} has no frames; expected a video")
+        known = None not in stamps
+        self._sought = self._sought and known and stamps == sorted({*stamps})
         starts = [i for i, key in enumerate(keys) if key and i and self._sought]
-        return stamps, [0, *starts], stream.time_base
+        # .avi stores no times of presentation
+        return sorted(stamps) if known else stamps, [0, *starts], stream.time_base
 
     @contextmanager
     def _decoding(self) -> Iterator[tuple[InputContainer, VideoStream]]:
@@ -210,8 +212,8 @@ class Video(Traverse):
         shortest, middle, longest = map(float, (intervals.min(), intervals.median(), intervals.max()))
         if longest > UNEVEN_RATIO * middle + 1e-3:
             seen = f"{shortest:.0f} to {longest:.0f} ms per frame (median {middle:.0f})"
-            why = "periods in frames are meaningless unless the footage is resampled by distance"
-            _warn_once(f"{self.name}: the frame rate varies, {seen}: {why}")
+            hint = "periods in frames are meaningless unless the footage is resampled by distance"
+            _warn_once(f"{self.name}: the frame rate varies, {seen}: {hint}")
 
     @contextmanager
     def _open(self) -> Iterator[tuple[InputContainer, VideoStream]]:
