@@ -138,7 +138,7 @@ class Judge:
                 try:
                     model.learn_features(places, self.reference)
                 except InputError:
-                    if mapper.share is not None:
+                    if mapper.route_bytes_per_place is None:
                         raise
                     continue  # too few bytes for a short route
             size = model.map.summary().route_bytes / model.map.places

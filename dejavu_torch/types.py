@@ -63,7 +63,7 @@ class Traverse(Dataset[Tensor], ABC):
         >>> from dejavu_torch import open_source
         >>> traverse = open_source("sim:aerial?frames=40")
         >>> len(traverse), traverse[-1].shape, traverse[10:20:2].shape
-        (40, torch.Size([3, 96, 96]), torch.Size([5, 3, 96, 96]))
+        (40, torch.Size([3, 64, 64]), torch.Size([5, 3, 64, 64]))
     """
 
     name: str = "traverse"

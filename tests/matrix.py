@@ -112,7 +112,10 @@ MODULES: dict[str, tuple[Callable[[], nn.Module], Callable[[], Tensor]]] = {
     "Joined": (lambda: Joined([HOG(cell=4), PatchPixels((8, 8))]), lambda: frames()[:5]),
     "Preprocess, patch": (lambda: Preprocess("grey", "patch"), lambda: frames()[:5]),
     "Augmentation": (lambda: Calls(augmented, module=Augmentation()), lambda: frames()[:5]),
-    "Whitening": (lambda: model(True).whitening or nn.Identity(), lambda: model(True).describe(frames()[:5])),
+    "Whitening": (
+        lambda: model(True).whitening or nn.Identity(),
+        lambda: model(True).descriptor.describe(frames()[:5]),
+    ),
     "SpectrogramAnalysis": (
         lambda: Calls(lambda module, values: module(values)[0].power.T, module=SpectrogramAnalysis(16)),
         lambda: rows(5),
@@ -128,7 +131,7 @@ MODULES: dict[str, tuple[Callable[[], nn.Module], Callable[[], Tensor]]] = {
         lambda: Calls(partial(distances, templates=rows(6)[7:11])),
         lambda: rows(6)[:5],
     ),
-    "TemplateMap": (lambda: model(False).map, lambda: model(False).describe(frames()[:5])),
+    "TemplateMap": (lambda: model(False).map, lambda: model(False).descriptor.describe(frames()[:5])),
     "SpectralMap": (
         lambda: DejaVu(whitening="none", mapper=SpectralMapper(None, step=1e-3)).learn(rows(6)).map,
         lambda: rows(6)[:5],
