@@ -1,4 +1,4 @@
-"""The whole method as one module; reads like section III of the paper."""
+"""The whole method as one module: learn a map of a route, and find places on it (section III)."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ STATE = [field.name for field in fields(model_file.ModelState)]
 
 
 class DejaVu(nn.Module):
-    """Learn a compressed map of a route from what repeats along it, and find places on it (section III).
+    """Learn a compressed map of a route, by default a spectral map, and find places on it (section III).
 
     Args:
         features: any nn.Module (B,C,H,W) -> (B,D), given frames in the type of its weights; None is HOG with
@@ -64,7 +64,7 @@ class DejaVu(nn.Module):
             calibrated. See `acceptance` for the default.
         batch_size: frames in memory at a time.
         preprocess: size, colour and contrast of the frames; None is Preprocess with its defaults, which
-            reduces the longer side to 160 pixels and changes nothing else.
+            reduces the longer side to 160 pixels, but no side below what the features need.
         velocity: measures the motion of the ground, so that places and queries are even steps along it
             (section IV-B); None uses the frames as they are.
         weight_bits: bits of each weight of the features in the file; 8 rounds the weights in place, with a
@@ -79,7 +79,7 @@ class DejaVu(nn.Module):
         state: what else is known of the route, whose fields are attributes of the model too; see
             `ModelState`.
 
-    Convention: a match counts places; `map.frame_of` gives the reference frame of a place. `forward` is a
+    Convention: `Match.index` is a place; `map.frame_of` gives the reference frame of a place. `forward` is a
         fixed sequence of tensor operations without host synchronisation: it supports `torch.export` with a
         dynamic batch and `torch.compile(fullgraph=True)`.
 

@@ -38,23 +38,23 @@ class InputError(ValueError):
 
 
 class Traverse(Dataset[Tensor], ABC):
-    """Frames along a route, in order: a sequence that is read as needed, never all of it in memory.
+    """Frames along a route, indexed from 0: a sequence that is read as needed, never all of it in memory.
 
     `len(t)` is the number of frames. `t[i]` is one, (C,H,W) float32 in [0, 1], or (D,) of ready features;
     slices, ranges, lists and tensors of numbers, or a mask (N,), give several, (n,C,H,W). Negative numbers
     count from the end. `torch.utils.data.DataLoader(t)` works as it is, with worker processes too: files are
     opened in each process when they are first read.
 
-    A subclass has `__len__` and `read`, and what is known of its frames:
+    A subclass implements `__len__` and `read`, and may set:
 
     Attributes:
-        name: in messages: a path or a `sim:` address.
+        name: shown in messages: a path or a `sim:` address.
         names: of the frames, such as file names or times in a video, "" for none; empty if all have none.
         times: (N,) float64, when each was taken, in seconds; None if unknown.
         places: (N,) float64, the true position of each in reference frames; None if unknown.
-        ordered: whether they are known to be consecutive, as in a video.
+        ordered: whether they are known to be consecutive, as in a video; see the filter and sequences.
         sized: whether the user asked for their size, as with `width=` of a video.
-        cut: how they were cut from one long image, and which cuts they are; equal: the same places.
+        cut: of windows of one long image, its size, the window's, and their range; equal: the same places.
 
     Raises:
         IndexError: a number beyond the frames. InputError: no frames, or frames that cannot be read.
@@ -79,7 +79,7 @@ class Traverse(Dataset[Tensor], ABC):
 
     @abstractmethod
     def read(self, frames: range | list[int]) -> Tensor:
-        """Existing frames, at least one: (n,C,H,W) or (n,D)."""
+        """The frames with these numbers, from 0 to N - 1, at least one, in any order: (n,C,H,W) or (n,D)."""
 
     def __getitem__(self, index: int | slice | range | Sequence[int] | Tensor) -> Tensor:
         if isinstance(index, Tensor) and index.dtype == torch.bool and index.shape == (len(self),):

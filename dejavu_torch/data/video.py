@@ -54,14 +54,14 @@ class Video(Traverse):
 
     Args:
         path: a video file of any container and codec that FFmpeg reads.
-        width, height: pixels to resize to by areas; 0 for both keeps the size, for one the aspect ratio.
+        width, height: in pixels, resized by areas; 0 for both keeps the size, 0 for one the aspect ratio.
 
-    Shape: frames (B,3,H,W), always RGB, rotated upright as the file says.
+    Shape: frames (n,3,H,W), always RGB, rotated upright as the file says.
 
     Convention: a frame's name is its time, as 0:01:23.480. Opening reads the times of all frames, without
-        decoding them where the file lists them (.mp4, .mov, .mkv, .webm, .avi); a variable frame rate is
-        warned of. Any frame can be read: decoding starts at the key frame before it, or goes on from the
-        last one read. .avi files whose frames are not stored in order are decoded from their beginning.
+        decoding them where the file lists them (.mp4, .mov, .mkv, .webm, most .avi); a variable frame rate
+        logs a warning. Any frame can be read: decoding starts at the key frame before it, or goes on from
+        the last one read. Files without usable times, as an .avi with B-frames, are read from the beginning.
 
     Raises:
         InputError: width or height out of range; not a video, or a truncated one; while reading, a damaged

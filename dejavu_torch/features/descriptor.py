@@ -32,7 +32,7 @@ OnFirst = Callable[[Tensor, Tensor], None]  # receives the first batch of frames
 
 
 class Descriptor(nn.Module):
-    """What describes a frame: preprocess, features, whitening.
+    """Computes descriptors: preprocessing, features, whitening.
 
     Args:
         preprocess, features, whitening: see `DejaVu`; without whitening the features are the descriptors.
