@@ -202,7 +202,8 @@ def test_parts_of_a_map_on_workers_find_what_the_whole_does(cluster: Cluster) ->
 
 
 def test_a_part_scores_as_in_the_whole_map(monkeypatch: pytest.MonkeyPatch) -> None:
-    models = [DejaVu(None, "none", SpectralMapper(6.0, chunk=CHUNK)).learn(route()[i:]) for i in (0, 300)]
+    settings = None, "none", SpectralMapper(6.0, chunk=CHUNK)
+    models = [DejaVu(*settings).learn(route()[i:] + i) for i in (0, 300)]  # of other means
     whole, queries = merge(models, ["one", "two"]).map, route()[:3]
     assert isinstance(whole, SpectralMap)
     for first, last in ((0, 3), (2, 9), (11, 17), (13, len(whole.chunks))):

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import pytest
 import torch
 from helpers import Fixed, refused, streamed, template_model
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from torch import Tensor
 
@@ -53,6 +53,7 @@ def test_equals_a_literal_loop(rows: list[list[float]], length: int, speeds: lis
 
 
 @given(TABLE, st.integers(1, 12), SPEEDS, st.integers(1, 4))
+@example([[0.0, 3.0], [1.0, 0.0], [5.0, 0.0], [0.0, 1.0]], 3, [1.0], 2)  # a batch after whole sequences
 def test_batches_do_not_matter(rows: list[list[float]], length: int, speeds: list[float], size: int) -> None:
     matcher, scores = SequenceMatcher(length, speeds), torch.tensor(rows)
     assert torch.equal(torch.cat(list(streamed(matcher, scores.split(size)))), matcher(scores))
