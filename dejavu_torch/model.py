@@ -151,9 +151,10 @@ class DejaVu(nn.Module):
         self.searcher: Searcher | None = None  # of this map; None is made at the first search
 
     def __getattr__(self, name: str) -> Any:
-        if name in DESCRIBES:
-            return getattr(self._modules["descriptor"], name)
-        return getattr(self.__dict__["state"], name) if name in STATE else super().__getattr__(name)
+        known = vars(self)  # not all of it while a model is made
+        if name in DESCRIBES and "descriptor" in known.get("_modules", ()):
+            return getattr(self.descriptor, name)
+        return getattr(self.state, name) if name in STATE and "state" in known else super().__getattr__(name)
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name in DESCRIBES:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, Literal, NamedTuple, Self, cast
+from typing import Any, Literal, NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
@@ -82,13 +82,18 @@ class Traverse(Dataset[Tensor], ABC):
         """The frames with these numbers, from 0 to N - 1, at least one, in any order: (n,C,H,W) or (n,D)."""
 
     def __getitem__(self, index: int | slice | range | Sequence[int] | Tensor) -> Tensor:
-        if isinstance(index, Tensor) and index.dtype == torch.bool and index.shape == (len(self),):
-            index = index.nonzero()[:, 0]
         if isinstance(index, slice):
             index = range(*index.indices(len(self)))
-        if not hasattr(index, "__len__") or getattr(index, "ndim", 1) == 0:
-            return self.read(self._existing([index]))[0]
-        numbers = self._existing(index.tolist() if isinstance(index, Tensor) else cast(Iterable[Any], index))
+        if not isinstance(index, range):
+            given = torch.as_tensor(index)
+            if given.dtype == torch.bool:
+                if given.shape != (len(self),):
+                    raise IndexError(f"a mask {tuple(given.shape)} for the {len(self)} frames of {self.name}")
+                given = given.nonzero()[:, 0]
+            if given.ndim == 0:
+                return self.read(self._existing([given.item()]))[0]
+            index = given.tolist()
+        numbers = self._existing(index)
         return self.read(numbers) if len(numbers) else torch.zeros(0, *self.frame_shape)
 
     def __getitems__(self, indices: list[int]) -> list[Tensor]:

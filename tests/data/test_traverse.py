@@ -74,8 +74,8 @@ def test_any_traverse_is_a_sequence(kind: str, sources: dict[str, str], tmp_path
         same(traverse[i], whole[int(i)])
     mask = torch.arange(count) % 3 == 1
     several: list[Any] = [slice(1, 5, 3), slice(-3, None), slice(None, None, -1), range(1, 4), [3, 2, 2, -1]]
-    for index in (*several, torch.tensor([3, 0, 3]), mask):
-        same(traverse[index], whole[numbers[index.numpy() if index is mask else index].copy()])
+    for index in (*several, torch.tensor([3, 0, 3]), mask, mask.numpy()):
+        same(traverse[index], whole[numbers[np.asarray(index) if index is mask else index].copy()])
     for none in (slice(3, 3), slice(count, count + 5), [], torch.zeros(count, dtype=torch.bool)):
         assert traverse[none].shape == (0, *traverse.frame_shape)
     for beyond in (count, -count - 1, [0, count]):
@@ -83,6 +83,8 @@ def test_any_traverse_is_a_sequence(kind: str, sources: dict[str, str], tmp_path
         with pytest.raises(IndexError) as caught:
             traverse[beyond]
         assert str(caught.value) == f"there is no frame {missing} of {traverse.name}, which has {count}"
+    with pytest.raises(IndexError, match=r"a mask \(2,\) for the"):
+        traverse[[True, False]]
     with pytest.raises(TypeError, match="float"):
         traverse[1.0]  # type: ignore[index]
     assert len(traverse.names) in (0, count)
