@@ -18,7 +18,7 @@ from torch.nn.parameter import is_lazy
 from dejavu_torch import learning, model_file
 from dejavu_torch.data.source import Source, as_traverse
 from dejavu_torch.data.traverse import at_size, resize_like, size_like
-from dejavu_torch.features.descriptor import Descriptor, own_size
+from dejavu_torch.features.descriptor import DESCRIPTOR_MEMORY, Descriptor, own_size
 from dejavu_torch.features.extract import features_of
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import LabelledFrames
@@ -28,12 +28,15 @@ from dejavu_torch.maps.place_map import Mapper, PlaceMap
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.maps.weights import BITS, round_weights
+from dejavu_torch.memory import concatenate
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse, resampled, source_of
+from dejavu_torch.recognition.centring import PRIOR, centred
 from dejavu_torch.recognition.coarse import searcher
 from dejavu_torch.recognition.localizer import Localizer, Matching
 from dejavu_torch.recognition.search import SCORES_AT_ONCE, Scan, Search, Searcher, check_search
 from dejavu_torch.recognition.select import HIGHEST, PROBABLE, Acceptance, check_candidates
+from dejavu_torch.recognition.smoother import PlaceSmoother, Rows
 from dejavu_torch.resize import reduced_size
 from dejavu_torch.text import with_progress
 from dejavu_torch.types import InputError, Match, SequenceModel, Traverse
@@ -352,16 +355,20 @@ class DejaVu(nn.Module):
         self,
         queries: Source,
         progress: bool = False,
-        sequence: SequenceModel | None = None,
+        sequence: SequenceModel | Literal["auto"] | None = "auto",
         search: Search | None = None,
+        centre: bool | None = None,
     ) -> Match:
         """Section III-C: the best place of each query and whether it is accepted (eq. 5, eq. 6).
 
         Args:
             queries: as in `learn`. They are resampled like the map's frames, see `resample`.
             progress: see `learn`.
-            sequence: scores consecutive queries together, such as a `SequenceMatcher` or a `PlaceFilter`;
-                None matches each query by itself.
+            sequence: matches consecutive queries together: a `PlaceSmoother`, which is fitted to them, a
+                `PlaceFilter` or a `SequenceMatcher`. None matches each query by itself. "auto" is a smoother
+                if the queries are known to be in order, as those of a video are, else None.
+            centre: remove what the descriptors of all queries have and the map's have not, see `centred`;
+                None does it for a smoother and at least 50 queries.
             search: for single queries: "scan" and "exact" score all places; "auto", "coarse" and None take
                 `self.searcher`, by default one that scores the places near the best samples of a long
                 spectral map, if that is faster.
@@ -371,7 +378,7 @@ class DejaVu(nn.Module):
         Raises:
             InputError: no map, no frames, NaN, or features of another dimension than the map's.
         """
-        return Match.joined(self.matches(queries, progress, sequence, search))
+        return Match.joined(self.matches(queries, progress, sequence, search, centre=centre))
 
     def localize_descriptors(
         self,
@@ -387,7 +394,10 @@ class DejaVu(nn.Module):
             order: (N,) the frame of each place of a shuffled map; the match then counts frames.
         """
         matching = matching if isinstance(matching, Matching) else self.matching(matching)
-        localizer = self.localizer(matching)
+        localizer, smoother = self.localizer(matching), matching.sequence
+        if isinstance(smoother, PlaceSmoother):
+            rows = None if order is None else self._shuffled_rows(descriptors, order)
+            return localizer.drive(descriptors, smoother, rows, progress)
         if order is None:
             return localizer(descriptors, progress)
         matcher, place = Localizer(None, matching), order.argsort()
@@ -396,6 +406,15 @@ class DejaVu(nn.Module):
         scores = (self.map.scores(part.to(self.map.device)) for part in parts)
         with torch.no_grad():
             return Match.joined(matcher.match(part[:, place.to(part.device)]) for part in scores)
+
+    def _shuffled_rows(self, descriptors: Tensor, order: Tensor) -> Rows:
+        """Scores of queries by their numbers, on a map whose places are the frames `order`."""
+        place, device = order.argsort(), self.map.device
+
+        def rows(numbers: Tensor) -> Tensor:
+            return self.map.scores(descriptors[numbers].to(device))[:, place.to(device)]
+
+        return rows
 
     def localizer(self, matching: Matching) -> Localizer:
         """A matcher of descriptors, for consecutive batches of queries."""
@@ -415,17 +434,22 @@ class DejaVu(nn.Module):
         self,
         queries: Source,
         progress: bool = False,
-        sequence: SequenceModel | None = None,
+        sequence: SequenceModel | Literal["auto"] | None = "auto",
         search: Search | None = None,
         k: int | None = None,
         apart: int = 5,
+        centre: bool | None = None,
     ) -> Iterator[Match]:
-        """As `localize`, or with k as `candidates`, one batch of queries at a time, in constant memory."""
+        """As `localize`, or with k as `candidates`, one batch of queries at a time, in constant memory; with
+        a smoother or centred queries, after the descriptors of all queries."""
         require_map(self)
         if k is not None:
             check_candidates(k, apart, self.map.places)
-        localizer = self.localizer(self.matching(sequence, search)._replace(k=k, radius=apart))
         queries = self.at_map_size(as_traverse(queries), self.frame_shape or ())
+        if isinstance(sequence, str):
+            sequence = PlaceSmoother(within=apart) if queries.ordered else None
+        matching = self.matching(sequence, search)._replace(k=k, radius=apart)
+        localizer = self.localizer(matching)
         if sequence is not None:
             sequence.check(len(queries), self.map.places)
         if self.step is not None:
@@ -436,14 +460,21 @@ class DejaVu(nn.Module):
             check_queries(self, shape, features.shape[1], name)
             self.descriptor.warn_of_bright(frames, name)
 
-        yield from map(localizer, self.descriptor.batches(queries, progress, "localizing", on_first))
+        batches = self.descriptor.batches(queries, progress, "localizing", on_first)
+        if not (isinstance(sequence, PlaceSmoother) or centre):
+            yield from map(localizer, batches)
+            return
+        descriptors = concatenate(batches, DESCRIPTOR_MEMORY)
+        if centre or (centre is None and len(descriptors) >= PRIOR):
+            descriptors = centred(self.map, descriptors)
+        yield self.localize_descriptors(descriptors, matching, progress=progress)
 
     def candidates(
         self,
         queries: Source,
         k: int,
         apart: int = 5,
-        sequence: SequenceModel | None = None,
+        sequence: SequenceModel | Literal["auto"] | None = "auto",
         search: Search | None = None,
     ) -> Match:
         """The k best places of each query; the first is that of `localize`.
@@ -468,8 +499,9 @@ class DejaVu(nn.Module):
     def matching(self, sequence: SequenceModel | None = None, search: Search | None = None) -> Matching:
         """How queries are matched, with probabilities if the map is calibrated for it. Raises InputError if a
         precision lacks this calibration."""
-        platt = self.calibration and self.calibration.of(sequence)
-        if self.precision is not None and platt is None:
+        smooths = isinstance(sequence, PlaceSmoother)  # its probabilities are its own
+        platt = self.calibration and self.calibration.of(None if smooths else sequence)
+        if self.precision is not None and platt is None and not smooths:
             only = "calibrated for single queries and for a filter only"
             seen = f"the precision is {self.precision}, but the map is "
             raise InputError(f"{seen}{only if self.calibration else 'not calibrated'}; expected a threshold")
@@ -480,13 +512,14 @@ class DejaVu(nn.Module):
         """Which answers are accepted, for single queries or for a sequence (convention 4).
 
         In this order: by the threshold or precision of the user or of the map's file; with a probability of
-        at least .5, if the map is calibrated for this way of matching; with a filter's own probability above
-        .5; every finite score.
+        at least .5, by a smoother, or if the map is calibrated for this way of matching; with a filter's own
+        probability above .5; every finite score.
         """
         threshold = self.threshold if sequence is None else sequence.threshold_of(self.threshold)
         if threshold is not None or self.precision is not None:
             return Acceptance(threshold, None if threshold is not None else self.precision)
-        if self.calibration is not None and self.calibration.of(sequence) is not None:
+        known = self.calibration is not None and self.calibration.of(sequence) is not None
+        if known or isinstance(sequence, PlaceSmoother):
             return Acceptance(precision=PROBABLE, given=False)
         return Acceptance(None if sequence is None else sequence.likely, given=False)
 

@@ -24,7 +24,8 @@ BATCH_SIZE = 64  # frames read at a time by default
 FRAME_NUMBERS = 2**28  # values in one frame: 1 GB
 LONGEST_MESSAGE = 2000  # characters
 
-Together = int | Literal["filter"]  # T queries in a sequence, or all so far in a filter
+# T queries in a sequence, all so far in a filter, or all of the drive in a smoother
+Together = int | Literal["filter", "smoother"]
 
 
 class InputError(ValueError):
@@ -211,7 +212,10 @@ class Match:
         probability: float64, of being right, NaN for all but the first candidate; None without calibration.
         route: int64, the index in `map.routes` of the place's route, -1 without a place; None if the map is
             not merged.
-        sequences: by T, matches (Q,) of the same scores in sequences or a filter, for reports; mostly empty.
+        confidence: float, how much worse the best place outside the suppression radius is, in the unit of the
+            scores; NaN for all but the first candidate. None if it was not computed.
+        sequences: by T, matches (Q,) of the same queries in sequences, a filter or a smoother, for reports;
+            mostly empty.
     """
 
     index: Tensor
@@ -219,11 +223,12 @@ class Match:
     accepted: Tensor
     probability: Tensor | None = None
     route: Tensor | None = None
+    confidence: Tensor | None = None
     sequences: Mapping[Together, Match] = field(default_factory=dict)
 
     @property
     def columns(self) -> dict[str, Tensor]:
-        """Those of the five columns that are known, by name."""
+        """Those of the six columns that are known, by name."""
         return {name: column for name, column in vars(self).items() if isinstance(column, Tensor)}
 
     def __iter__(self) -> Iterator[Tensor]:

@@ -260,6 +260,13 @@ class SpectralMap(PlaceMap):
         return part
 
     @property
+    def mean(self) -> Tensor:
+        """The mean descriptor of all places, (K,) float32."""
+        sizes = [route.places for route in self.routes] or [1]
+        weight = torch.tensor(sizes, dtype=torch.float32, device=self.device)
+        return (weight / weight.sum()) @ self.means.float()
+
+    @property
     def step(self) -> float:
         """Of the last chunk, and of the next."""
         return float(self.steps[-1]) if len(self.steps) else self._step

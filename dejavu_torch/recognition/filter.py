@@ -11,10 +11,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from dejavu_torch.memory import is_plain, without_autocast
+from dejavu_torch.recognition.motion import MIN_PROBABILITY, Layout, Motion, Rates, checked_rates, logits
 from dejavu_torch.recognition.sequence import each
 from dejavu_torch.types import InputError, SequenceModel
-
-MIN_PROBABILITY = 1e-30  # a probability of 0, with a finite gradient
 
 
 class Moments(NamedTuple):
@@ -87,12 +86,7 @@ class PlaceFilter(SequenceModel):
         threshold: float | None = None,
     ) -> None:
         super().__init__()
-        moves = tuple(float(move) for move in moves)
-        if not all(0 <= rate <= 1 for rate in (jump, leave, enter)) or jump + leave > 1:
-            seen = f"jump {jump}, leave {leave}, enter {enter}"
-            raise InputError(f"{seen}; expected probabilities, jump + leave at most 1")
-        if not all(move >= 0 for move in moves) or not abs(sum(moves) - 1) < 1e-6:
-            raise InputError(f"the moves are {[*moves]}; expected probabilities that add up to 1")
+        moves = checked_rates(moves, jump, leave, enter)
         if not 0 < sharpness < math.inf or not math.isfinite(off_map):
             seen = f"sharpness {sharpness}, off_map {off_map}"
             raise InputError(f"{seen}; expected finite numbers, the sharpness above 0")
@@ -100,9 +94,9 @@ class PlaceFilter(SequenceModel):
             raise InputError(f"within is {within}; expected a whole number, at least 0")
         if threshold is not None and math.isnan(threshold):
             raise InputError("the threshold is NaN; expected a number, or None")
-        self.move_logits = nn.Parameter(_logits(*moves))
-        self.rate_logits = nn.Parameter(_logits(1 - jump - leave, jump, leave))
-        self.enter_logit = nn.Parameter(_logits(enter)[0] - _logits(1 - enter)[0])
+        self.move_logits = nn.Parameter(logits(*moves))
+        self.rate_logits = nn.Parameter(logits(1 - jump - leave, jump, leave))
+        self.enter_logit = nn.Parameter(logits(enter)[0] - logits(1 - enter)[0])
         self.log_sharpness = nn.Parameter(torch.tensor(float(sharpness), dtype=torch.float32).log())
         self.off_map = nn.Parameter(torch.tensor(float(off_map), dtype=torch.float32))
         self.within, self.threshold = within, threshold
@@ -114,7 +108,7 @@ class PlaceFilter(SequenceModel):
         if scores.ndim > 2:
             check_posterior(before, scores.shape[-1])
             return each(self, scores, before)
-        return self.near_scores(self.posterior(scores, before)[:, :-1], scores)
+        return near_scores(self.posterior(scores, before)[:, :-1], scores, self.within)
 
     def posterior(self, scores: Tensor, before: Tensor | None = None) -> Tensor:
         """Probability of each place, and of being off the map, after each query.
@@ -129,22 +123,22 @@ class PlaceFilter(SequenceModel):
     def step(
         self, scores: Tensor, state: Tensor, route_starts: Sequence[int] = (0,)
     ) -> tuple[Tensor, Tensor]:
-        posteriors = self._posteriors(scores, state)
-        return self.near_scores(posteriors[1:, :-1], scores), posteriors[-1]
+        posteriors = self._posteriors(scores, state, route_starts)
+        return near_scores(posteriors[1:, :-1], scores, self.within), posteriors[-1]
 
     @without_autocast
-    def _posteriors(self, scores: Tensor, state: Tensor) -> Tensor:
+    def _posteriors(self, scores: Tensor, state: Tensor, route_starts: Sequence[int] = (0,)) -> Tensor:
         """The state before the first and after each query, (Q+1,N+1)."""
         if scores.ndim != 2 or scores.shape[1] < 1 or not scores.is_floating_point():
             raise InputError(f"scores are {tuple(scores.shape)} {scores.dtype}; expected floats (Q,N)")
         places = scores.shape[1]
         if state.shape != (places + 1,):
             raise InputError(f"the posterior is {tuple(state.shape)}; expected ({places + 1},) for this map")
-        rows = [state.to(scores)]
+        rows, motion = [state.to(scores)], self.motion(scores, route_starts)
         for likelihood in self.likelihoods(scores, moments_of(scores)):
-            expected = self.moved(rows[-1])
+            expected = motion.moved(rows[-1])
             if len(rows) == 1:
-                expected = torch.where((state == 0).all(), self.anywhere(places).to(scores), expected)
+                expected = torch.where((state == 0).all(), motion.anywhere(), expected)
             rows.append(updated(expected, likelihood))
         return torch.stack(rows)
 
@@ -158,32 +152,11 @@ class PlaceFilter(SequenceModel):
         logits = torch.where(moments.varied, logits, 0)
         return (logits - logits.amax(1, keepdim=True)).exp()
 
-    def anywhere(self, places: int) -> Tensor:
-        """The belief before the first query: on or off the map in the equilibrium of leaving and entering."""
-        leave, enter = self.rate_logits.softmax(0)[2], self.enter_logit.sigmoid()
-        off = (leave / (leave + enter)).clamp(max=0.5)
-        return torch.cat([((1 - off) / places).expand(places), off[None]])
-
-    def moved(self, belief: Tensor) -> Tensor:
-        """The belief (N+1,) before the next query."""
-        moves, rates = (logits.to(belief).softmax(0) for logits in (self.move_logits, self.rate_logits))
-        (stay, jump, leave), enter = rates, self.enter_logit.sigmoid().to(belief)
-        on, off, furthest = belief[:-1], belief[-1], len(moves) - 1
-        moved = F.pad(on, (furthest, 0)).unfold(0, furthest + 1, 1) @ moves.flip(0)
-        anywhere = (jump * (1 - off) + enter * off) / len(on)
-        off = stay * (on.sum() - moved.sum()) + leave * (1 - off) + (1 - enter) * off
-        return torch.cat([stay * moved + anywhere, off[None]])
-
-    @without_autocast
-    def near_scores(self, posterior: Tensor, scores: Tensor) -> Tensor:
-        """-log of the probability of each place and its neighbours, (Q,N) -> (Q,N); +inf if the place's score
-        is."""
-        within = min(self.within, posterior.shape[1])
-        side = within + 1  # two box filters make a triangle
-        padded = F.pad(posterior[:, None], (within, within))
-        mass = side * F.avg_pool1d(F.avg_pool1d(padded, side, 1), side, 1)[:, 0]
-        mass = mass.clamp(torch.finfo(mass.dtype).tiny, 1.0)  # an exporter promotes no types
-        return (-mass.log()).masked_fill(~scores.isfinite(), math.inf)
+    def motion(self, like: Tensor, route_starts: Sequence[int] = (0,)) -> Motion:
+        """The transitions of a map, in the type of its scores (..., N)."""
+        moves, (_, jump, leave) = (one.to(like).softmax(0) for one in (self.move_logits, self.rate_logits))
+        rates = Rates(moves, jump, leave, self.enter_logit.to(like).sigmoid())
+        return Motion(Layout(like.shape[-1], route_starts=tuple(route_starts)), rates)
 
     def check(self, queries: int | None, places: int) -> None:
         furthest = len(self.move_logits) - 1
@@ -216,14 +189,21 @@ def check_posterior(before: Tensor | None, places: int) -> None:
         raise InputError(f"{seen}; expected ({places + 1},) probabilities that add up to 1")
 
 
+@without_autocast
+def near_scores(posterior: Tensor, scores: Tensor, within: int) -> Tensor:
+    """-log of the probability of each place and its neighbours, weighted by a triangle that ends `within`
+    places away, (Q,N) -> (Q,N); +inf if the place's score is."""
+    within = min(within, posterior.shape[1])
+    side = within + 1  # two box filters make a triangle
+    padded = F.pad(posterior[:, None], (within, within))
+    mass = side * F.avg_pool1d(F.avg_pool1d(padded, side, 1), side, 1)[:, 0]
+    mass = mass.clamp(torch.finfo(mass.dtype).tiny, 1.0)  # an exporter promotes no types
+    return (-mass.log()).masked_fill(~scores.isfinite(), math.inf)
+
+
 def updated(expected: Tensor, likelihood: Tensor) -> Tensor:
     """Bayes' rule for a belief (N+1,), which stays if the query rules it out."""
     joint = expected * likelihood
     total = joint.sum()
     possible = total > MIN_PROBABILITY
     return torch.where(possible, joint / torch.where(possible, total, 1), expected)
-
-
-def _logits(*probabilities: float) -> Tensor:
-    """Logarithms, finite for a probability of 0."""
-    return torch.tensor(probabilities, dtype=torch.float32).clamp(min=MIN_PROBABILITY).log()

@@ -10,15 +10,17 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from dejavu_torch.maps.place_map import PlaceMap
-from dejavu_torch.recognition.calibration import TOLERANCE, Platt, Track, confidence, confidence_of
+from dejavu_torch.recognition.calibration import TOLERANCE, Platt, Track
+from dejavu_torch.recognition.calibration import confidence as confidence_of_pair
+from dejavu_torch.recognition.drive import first_of, localize_drive
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.search import SCORES_AT_ONCE, NmsSpec, Scan, Search, Searcher, num_needed
 from dejavu_torch.recognition.select import Acceptance, accept, best_candidates, best_match
 from dejavu_torch.recognition.sequence import SequenceMatcher
+from dejavu_torch.recognition.smoother import PlaceSmoother, Rows
 from dejavu_torch.text import with_progress
 from dejavu_torch.types import Match, SequenceModel, Together
 
@@ -32,12 +34,13 @@ PER_BEST = 16  # held for each of a query's lowest scores, while two lists are m
 class Matching(NamedTuple):
     """How queries are matched."""
 
-    sequence: SequenceModel | None = None  # None matches each query by itself
+    sequence: SequenceModel | PlaceSmoother | None = None  # None matches each query by itself
     also: Mapping[Together, SequenceModel] = MappingProxyType({})  # further ways, see `Match.sequences`
+    smoother: PlaceSmoother | None = None  # another further way, where all queries are known
     k: int | None = None  # candidates per query; None gives matches (Q,)
     radius: int = 0  # suppression radius in places
     acceptance: Acceptance = Acceptance()
-    platt: Platt | None = None  # gives probabilities
+    platt: Platt | None = None  # gives probabilities; for a smoother, that of single queries
     callback: Callable[[Tensor], None] | None = None  # receives the final scores (B,N)
     search: Search = "auto"  # of single queries, see `DejaVu.localize`
 
@@ -74,7 +77,9 @@ class Localizer:
         self.searcher = Scan(place_map) if searcher is None and place_map is not None else searcher
         sequence, routes = matching.sequence, () if place_map is None else place_map.routes
         self.own: Together = sequence.length if isinstance(sequence, SequenceMatcher) else "filter"
-        self.models = {**matching.also, **({} if sequence is None else {self.own: sequence})}
+        self.models: dict[Together, SequenceModel] = {**matching.also}
+        if isinstance(sequence, SequenceModel):
+            self.models[self.own] = sequence
         self.states: dict[Together, Tensor] = {}  # of the models; empty before the first query
         self.route_starts = (0, *accumulate(route.places for route in routes[:-1]))
 
@@ -85,9 +90,7 @@ class Localizer:
         places = place_map.places
         if not len(descriptors):
             return self.match(descriptors.new_zeros(0, places))
-        wanted = [(matching.k or 1, matching.radius)]
-        if matching.platt is not None:
-            wanted.append((min(2, places), TOLERANCE))
+        wanted = [(matching.k or 1, matching.radius), (min(2, places), TOLERANCE)]
         n = num_needed(wanted, places)
         few = n <= max(1, MAX_SHARE * min(places, place_map.block_places)) or places > SCORES_AT_ONCE
         searches = not self.models and matching.callback is None and (few or type(self.searcher) is not Scan)
@@ -102,9 +105,25 @@ class Localizer:
     def match(self, scores: Tensor) -> Match:
         """Match the next queries by their scores: (B,N) -> (B,), or (B,k)."""
         if not self.models:
-            confidence = None if self.matching.platt is None else confidence_of(scores)
-            return self._answer(self._candidates(scores), confidence)
+            return self._answer(self._candidates(scores), pair_of(scores))
         return Match.joined(map(self._in_sequence, scores.split(max(1, CACHED // scores.shape[1]))))
+
+    def drive(
+        self, descriptors: Tensor, smoother: PlaceSmoother, rows: Rows | None = None, progress: bool = False
+    ) -> Match:
+        """Match all queries (Q,K) of a drive by a smoother, which is fitted to them; see `localize_drive`.
+
+        Args:
+            rows: scores of queries by their numbers, (B,) -> (B,N); None are those of the map.
+        """
+        matching, place_map = self.matching, self.place_map
+        if rows is None:
+            assert place_map is not None
+            device, scores = place_map.device, place_map.scores
+            rows = lambda numbers: scores(descriptors[numbers].to(device))  # noqa: E731
+        settings = matching.k or 1, matching.radius, self.route_starts, matching.platt, progress
+        match = localize_drive(rows, descriptors, smoother, *settings)
+        return self._accepted(match)
 
     @torch.no_grad()
     def skip(self, queries: int) -> None:
@@ -112,7 +131,9 @@ class Localizer:
         filter = self.matching.sequence
         if isinstance(filter, PlaceFilter) and self.states:
             for _ in range(queries):
-                self.states = self.states | {"filter": filter.moved(self.states["filter"])}
+                belief = self.states["filter"]
+                motion = filter.motion(belief[:-1], self.route_starts)
+                self.states = self.states | {"filter": motion.moved(belief)}
 
     @property
     def posterior(self) -> Tensor | None:
@@ -123,10 +144,11 @@ class Localizer:
         states = self.states or {T: m.start(scores.shape[1]).to(scores) for T, m in self.models.items()}
         steps = {T: m.step(scores, states[T], self.route_starts) for T, m in self.models.items()}
         single = self.matching.sequence is None
-        final, confidence = scores if single else steps[self.own][0], None
-        if self.matching.platt is not None:
-            confidence = confidence_of(scores) if single else self.track(final, scores)
-        match = self._answer(self._candidates(final), confidence)
+        final = scores if single else steps[self.own][0]
+        pair, confidence = pair_of(final), None
+        if self.matching.platt is not None and not single:
+            confidence = self.track(final, scores)
+        match = self._answer(self._candidates(final), pair, confidence)
         self.states = {T: state for T, (_, state) in steps.items()}
         sequences = {T: best_match(steps[T][0]).map(Tensor.cpu) for T in self.matching.also}
         return replace(match, sequences=sequences)
@@ -136,23 +158,41 @@ class Localizer:
             self.matching.callback(scores)
         return best_candidates(scores, self.matching.k or 1, self.matching.radius)
 
-    def _answer(self, match: Match, confidence: Tensor | None = None) -> Match:
-        """Candidates (B,k) with their acceptance, and the probability that the first is right."""
+    def _answer(self, match: Match, pair: Match, confidence: Tensor | None = None) -> Match:
+        """Candidates (B,k) with all that is known of them.
+
+        Args:
+            pair: the two best places of each query, see `pair_of`.
+            confidence: for the calibration; None is that of single queries.
+        """
+        platt, k = self.matching.platt, match.index.shape[1]
+        margin = (
+            pair.score[:, -1] - pair.score[:, 0] if pair.index.shape[1] > 1 else pair.score[:, 0] * math.nan
+        )
+        match = replace(match, confidence=first_of(margin, k))
+        if platt is not None:
+            probability = platt.probability(confidence_of_pair(pair) if confidence is None else confidence)
+            match = replace(match, probability=first_of(probability, k))
+        return self._accepted(match)
+
+    def _accepted(self, match: Match) -> Match:
+        """Candidates (B,k) with their acceptance and routes, on the CPU; (B,) for best places alone."""
         matching, match = self.matching, match.map(Tensor.cpu)
         match = replace(match, accepted=accept(match.score, matching.acceptance.threshold))
+        if match.probability is not None and matching.acceptance.precision is not None:
+            match = replace(match, accepted=match.probability >= matching.acceptance.precision)
         if self.place_map is not None and self.place_map.routes:
             match = replace(match, route=self.place_map.table.route_of(match.index))
-        if matching.platt is not None and confidence is not None:
-            others = match.index.shape[1] - 1
-            probability = F.pad(matching.platt.probability(confidence)[:, None], (0, others), value=math.nan)
-            if matching.acceptance.precision is not None:
-                match = replace(match, accepted=probability >= matching.acceptance.precision)
-            match = replace(match, probability=probability)
         return match if matching.k is not None else match.map(lambda column: column[:, 0])
 
     def _search(self, descriptors: Tensor, wanted: list[NmsSpec]) -> Match:
         """Candidates from the lowest scores alone; `wanted` has those of the answer first."""
         assert self.searcher is not None
         score, place = self.searcher(descriptors, wanted)
-        match, *second = (best_candidates(score, *spec, places=place) for spec in wanted)
-        return self._answer(match, *map(confidence, second))
+        match, pair = (best_candidates(score, *spec, places=place) for spec in wanted)
+        return self._answer(match, pair)
+
+
+def pair_of(scores: Tensor) -> Match:
+    """The two best places of each query that are more than `TOLERANCE` apart, (B,N) -> (B,2)."""
+    return best_candidates(scores, min(2, scores.shape[1]), TOLERANCE)

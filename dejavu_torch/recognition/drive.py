@@ -1,0 +1,105 @@
+"""The matches of a whole drive, from a smoother."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from dejavu_torch.recognition.calibration import Platt, confidence_of
+from dejavu_torch.recognition.filter import near_scores
+from dejavu_torch.recognition.select import best_candidates
+from dejavu_torch.recognition.smoother import PlaceSmoother, Rows, near_mass
+from dejavu_torch.text import progress_of
+from dejavu_torch.types import Match
+
+DOUBT = 0.1  # nats for each deviation by which an answer's own score is worse than is usual in the drive
+NORMAL = 1.4826  # standard deviations of a Gaussian over its median absolute deviation
+
+
+class Shown(NamedTuple):
+    """What an answer is made of: candidates (Q,k); the rest (Q,)."""
+
+    match: Match
+    margin: Tensor  # to the best place outside the suppression radius
+    probability: Tensor
+    own: Tensor  # the score of the answer by its query alone
+
+
+@torch.no_grad()
+def localize_drive(
+    rows: Rows,
+    descriptors: Tensor,
+    smoother: PlaceSmoother,
+    k: int = 1,
+    radius: int = 5,
+    route_starts: Sequence[int] = (0,),
+    platt: Platt | None = None,
+    progress: bool = False,
+) -> Match:
+    """Fit a smoother to a drive and match its queries.
+
+    If they are no drive of the map, the answers are those of single queries, and a probability is the lower
+    one of the single query and the smoother.
+
+    Args:
+        rows: scores of queries by their numbers, (B,) -> (B,N). descriptors: (Q,K) of all queries.
+        k: candidates. radius: suppression radius in places.
+        platt: the calibration of single queries, if there is one.
+
+    Returns:
+        Match of (Q,k) on the CPU, with probability and confidence; all accepted that have a finite score.
+    """
+    smoother.fit(rows, descriptors, route_starts)
+    drive = smoother.drive(rows, descriptors)
+    places = len(drive.means)
+    parts: list[Shown] = []
+    with progress_of("smoothing", len(descriptors), progress, "query") as update:
+        for block in smoother.blocks(drive, route_starts):
+            scores = drive.rows(torch.arange(block.first, block.first + block.log.shape[-1]))
+            mass = smoother.folded(block.posterior)[:, :-1]
+            ranked = near_scores(mass, scores, smoother.within) if smoother.is_drive else scores
+            pair = best_candidates(ranked, min(2, places), radius)
+            match = pair if k <= pair.index.shape[1] else best_candidates(ranked, k, radius)
+            match = match.map(lambda column: column[:, :k])
+            at = match.index[:, :1].clamp(min=0)
+            probability = near_mass(mass, smoother.within).gather(1, at)[:, 0].double()
+            if not smoother.is_drive and platt is not None:
+                probability = torch.minimum(probability.cpu(), platt.probability(confidence_of(scores)))
+            probability = probability.masked_fill(match.index[:, 0].to(probability.device) < 0, 0)
+            margin = pair.score[:, -1] - pair.score[:, 0]
+            columns = margin, probability, scores.gather(1, at)[:, 0]
+            parts.append(Shown(match.map(Tensor.cpu), *(column.cpu() for column in columns)))
+            update(len(scores))
+    if not parts:
+        empty = torch.zeros(0, k)
+        return Match(empty.long(), empty, empty.bool())
+    parts.reverse()
+    match = Match.joined(part.match for part in parts)
+    margin = torch.cat([part.margin for part in parts])
+    probability = torch.cat([part.probability for part in parts])
+    own = torch.cat([part.own for part in parts])
+    if smoother.is_drive:
+        match = replace(match, score=match.score + doubt(own)[:, None].to(match.score))
+    return replace(match, probability=first_of(probability, k), confidence=first_of(margin, k))
+
+
+def doubt(own: Tensor) -> Tensor:
+    """What is added to the scores of answers whose own scores (Q,) are worse than the drive's median: the
+    whole drive makes its answers sure of places that only look alike as well."""
+    known = own[own.isfinite()]
+    if not len(known):
+        return torch.zeros_like(own)
+    median = known.median()
+    deviation = NORMAL * (known - median).abs().median()
+    worse = (own - median) / deviation.clamp(min=1e-12)
+    return DOUBT * worse.nan_to_num(0, 0, 0).clamp(0, 1 / DOUBT**2)
+
+
+def first_of(column: Tensor, k: int) -> Tensor:
+    """What is known of the first candidate, (Q,) -> (Q,k), NaN for the others."""
+    return F.pad(column[:, None], (0, k - 1), value=torch.nan)

@@ -1,0 +1,158 @@
+"""What the scores of a drive say of each place, by their rank, and how its queries depend on each other."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+LOWEST, HIGHEST, PER_DEVIATION = -8, 40, 64  # standard deviations of a rank table, and entries for each
+MIN_SHARE = 1e-30  # of wrong scores, for a finite normal score
+SMALLEST = 0.05  # autocorrelation at which the sum over lags ends
+DETRENDED = 25  # queries to each side whose mean is a trend
+UNCHANGED = 0.05  # of a typical step: the queries of a stop differ less than that from its first
+STOP = 20  # queries of a stop; in a shorter one, as where frames repeat in the dark, the camera may move
+
+
+class Spacing(NamedTuple):
+    """How the queries of a drive depend on each other.
+
+    weight: (Q,) float, 1 over the length of the stop that a query belongs to, and 1 while moving.
+    still: (Q,) bool, in a stop of more than `STOP` queries, and not its first.
+    correlation: tau, how many queries in a row say as much as one that is independent, at least 1.
+    detrended: likewise, without slow changes, which say nothing of the noise of a query.
+    """
+
+    weight: Tensor
+    still: Tensor
+    correlation: float
+    detrended: float
+
+
+def spacing_of(queries: Tensor) -> Spacing:
+    """The spacing of consecutive queries by their descriptors (Q,K)."""
+    queries = queries.float()
+    same = unchanged(queries)
+    run = (~same).cumsum(0) - 1
+    length = run.bincount()[run]
+    moving = queries[~same]
+    trend = local_mean(moving, DETRENDED)
+    return Spacing(
+        1 / length, same & (length > STOP), correlation_time(moving), correlation_time(moving - trend)
+    )
+
+
+def unchanged(queries: Tensor) -> Tensor:
+    """Which queries hardly differ from the first of their stop, (Q,K) -> (Q,) bool."""
+    same = torch.zeros(len(queries), dtype=torch.bool, device=queries.device)
+    steps = (queries[1:] - queries[:-1]).norm(dim=1)
+    moving = steps[steps > 0]
+    least = UNCHANGED * float(moving.median()) if len(moving) else 0.0
+    first = 0
+    for t in ((steps <= least).nonzero()[:, 0] + 1).tolist():
+        if not same[t - 1]:
+            first = t - 1
+        same[t] = (queries[t] - queries[first]).norm() <= least
+    return same
+
+
+def local_mean(queries: Tensor, side: int) -> Tensor:
+    """The mean of the queries up to `side` before and after each, (Q,K) -> (Q,K)."""
+    sums = F.pad(queries.double().cumsum(0), (0, 0, 1, 0))
+    at = torch.arange(len(queries), device=queries.device)
+    first, last = (at - side).clamp(min=0), (at + side + 1).clamp(max=len(queries))
+    return ((sums[last] - sums[first]) / (last - first)[:, None]).to(queries)
+
+
+def correlation_time(queries: Tensor) -> float:
+    """1 + 2 x the autocorrelations of the centred descriptors (Q,K), up to the first below .05.
+
+    Example:
+        >>> correlation_time(torch.tensor([[1.0], [-1], [1], [-1]]))
+        1.0
+    """
+    count = len(queries)
+    centred = (queries - queries.mean(0)).double() if count > 1 else queries.double()
+    if count < 2 or not centred.square().sum() > 0:
+        return 1.0
+    power = torch.fft.rfft(centred, n=2 * count, dim=0).abs().square().sum(1)
+    lags = torch.fft.irfft(power, n=2 * count)[:count] / torch.arange(count, 0, -1, device=power.device)
+    lags = lags / lags[0]
+    small = (lags < SMALLEST).nonzero()
+    last = int(small[0]) if len(small) else max(1, count // 2)  # longer lags have few pairs
+    return 1 + 2 * float(lags[1:last].sum())
+
+
+class Standardised(NamedTuple):
+    """z: (Q,N), how far a score lies below the mean of its query, in standard deviations; the mean of each
+    place over the queries is removed first, so that no place is good for all of them. valid: (Q,N), which
+    places are scored. speaks: (Q,), False where all scores are equal, or not finite."""
+
+    z: Tensor
+    valid: Tensor
+    speaks: Tensor
+
+
+def place_means(scores: Tensor, weight: Tensor) -> Tensor:
+    """The mean score of each place over the queries that say something, (Q,N), (Q,) -> (N,)."""
+    valid = scores.isfinite() & speaking(scores)[:, None]
+    share = weight[:, None] * valid
+    total = torch.where(valid, scores, 0).mul(weight[:, None]).sum(0)
+    return total / share.sum(0).clamp(min=MIN_SHARE)
+
+
+def speaking(scores: Tensor) -> Tensor:
+    """Which queries have different scores, and no NaN, (Q,N) -> (Q,) bool."""
+    valid = scores.isfinite()
+    highest = scores.masked_fill(~valid, -math.inf).amax(1)
+    lowest = scores.masked_fill(~valid, math.inf).amin(1)
+    return (highest > lowest) & ~scores.isnan().any(1)
+
+
+def standardised(scores: Tensor, means: Tensor) -> Standardised:
+    """Scores (Q,N) without the means (N,) of the places."""
+    valid, speaks = scores.isfinite(), speaking(scores)
+    count = valid.sum(1, keepdim=True).clamp(min=1)
+    centred = torch.where(valid, scores - means, 0)
+    centred = torch.where(valid, centred.sum(1, keepdim=True) / count - centred, 0)
+    spread = (centred.square().sum(1, keepdim=True) / count).sqrt()
+    speaks = speaks & (spread[:, 0] > MIN_SHARE)
+    return Standardised(centred / torch.where(speaks[:, None], spread, 1), valid, speaks)
+
+
+class RankTable:
+    """Normal scores: a z that a share u of the wrong ones reaches becomes x = -Phi^-1(u).
+
+    A histogram of z, weighted by the probability of being wrong; `x` interpolates in between.
+    """
+
+    def __init__(self) -> None:
+        self.counts = torch.zeros((HIGHEST - LOWEST) * PER_DEVIATION + 1, dtype=torch.float64)
+
+    def add(self, z: Tensor, weight: Tensor) -> None:
+        """Count values z with their weights, of the same shape."""
+        bins = self._position(z).long().flatten()
+        counts = torch.bincount(bins, weight.flatten().double(), minlength=len(self.counts))
+        self.counts += counts.cpu()
+
+    @property
+    def values(self) -> Tensor:
+        """x at the edge of each bin."""
+        reached = self.counts.flip(0).cumsum(0).flip(0)
+        share = (reached + 0.5) / (reached[0] + 1)
+        values: Tensor = -torch.special.ndtri(share.clamp(MIN_SHARE, 1 - 1e-7)).float()
+        return values
+
+    @staticmethod
+    def _position(z: Tensor) -> Tensor:
+        return ((z - LOWEST) * PER_DEVIATION).clamp(0, (HIGHEST - LOWEST) * PER_DEVIATION - 1)
+
+    @classmethod
+    def look_up(cls, values: Tensor, z: Tensor) -> Tensor:
+        """x of z by the `values` of a table, differentiable in z."""
+        at = cls._position(z)
+        low = at.detach().long()
+        return torch.lerp(values.to(z)[low], values.to(z)[low + 1], at - low)

@@ -1,0 +1,213 @@
+"""How a camera moves from one query to the next: the transitions of the filter and of the smoother."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from dejavu_torch.types import InputError
+
+MIN_PROBABILITY = 1e-30  # a probability of 0, with a finite gradient
+
+Link = tuple[int, int, float]  # a step from one place to another, with its probability
+
+
+class Rates(NamedTuple):
+    """Probabilities of a step, as tensors: moves (V+1,) add up to 1; jump, leave and enter ()."""
+
+    moves: Tensor
+    jump: Tensor
+    leave: Tensor
+    enter: Tensor
+
+
+class Counts(NamedTuple):
+    """Expected numbers of steps: moves (V+1,); jump, leave, enter, and staying off the map, each ()."""
+
+    moves: Tensor
+    jump: Tensor
+    leave: Tensor
+    enter: Tensor
+    absent: Tensor
+
+
+class Layout(NamedTuple):
+    """The states of a route: its N places in D directions of travel, and being off the map.
+
+    A belief is (..., D N + 1): the places in order; with D = 2 the places once more, from the last to the
+    first, for the opposite direction; then the off-map state.
+
+    Attributes:
+        route_starts: the first place of each route; no move crosses from one route into the next.
+        links: further steps, in place of that to the next place; backwards in the opposite direction.
+        turn: probability of turning round in a step, if there are two directions.
+    """
+
+    places: int
+    directions: int = 1
+    route_starts: tuple[int, ...] = (0,)
+    links: tuple[Link, ...] = ()
+    turn: float = 0.0
+
+
+class Motion:
+    """A step of a hidden Markov model, and its transpose.
+
+    A camera at a place moves on by 0 to V places, with turning round before, jumps to any place, or leaves
+    the map; moving past the end of a route leaves it too. Off the map, it enters at any place.
+    """
+
+    def __init__(self, layout: Layout, rates: Rates) -> None:
+        self.layout, self.rates = layout, rates
+        self.stay = 1 - rates.jump - rates.leave
+        self.moves = rates.moves.unbind()
+        keep = rates.moves.new_ones(layout.directions, layout.places)
+        self.linked: list[tuple[int, int, int, float]] = []
+        last = layout.places - 1
+        for start in layout.route_starts[1:]:
+            keep[0, start] = 0
+            keep[1:, last + 1 - start] = 0
+        for first, second, share in layout.links:
+            ways = [(first, second), (last - second, last - first)][: layout.directions]
+            for row, (at, to) in enumerate(ways):
+                self.linked.append((row, at, to, share))
+                if at < last:
+                    keep[row, at + 1] *= 1 - share
+        plain = len(layout.route_starts) == 1 and not layout.links
+        self.keep = None if plain else keep  # the share of a place's mass that moves on to the next one
+        reach = torch.ones_like(keep)
+        self.reach = [reach]  # the share of a move by 0, 1, .. V places that stays on the route
+        for _ in self.moves[1:]:
+            self.reach.append(self._shifted_back(self.reach[-1]))
+        self.lost = 1 - sum(move * share for move, share in zip(self.moves, self.reach, strict=True))
+
+    def _shifted(self, on: Tensor) -> Tensor:
+        """Mass (..., D, N) one place further."""
+        moved = F.pad(on[..., :-1], (1, 0))
+        if self.keep is None:
+            return moved
+        moved = moved * self.keep
+        for row, at, to, share in self.linked:
+            moved[..., row, to] += share * on[..., row, at]
+        return moved
+
+    def _shifted_back(self, message: Tensor) -> Tensor:
+        """The transpose of `_shifted`."""
+        if self.keep is None:
+            return F.pad(message[..., 1:], (0, 1))
+        moved = F.pad((message * self.keep)[..., 1:], (0, 1))
+        for row, at, to, share in self.linked:
+            moved[..., row, at] += share * message[..., row, to]
+        return moved
+
+    def _turned(self, on: Tensor) -> Tensor:
+        """Mass (..., D, N), some of it in the other direction; its own transpose."""
+        if self.layout.directions == 1:
+            return on
+        return torch.lerp(on, on.flip(-1, -2), self.layout.turn)
+
+    def _split(self, state: Tensor) -> tuple[Tensor, Tensor]:
+        """The places (..., D, N), and being off the map (..., 1)."""
+        return state[..., :-1].unflatten(-1, (self.layout.directions, -1)), state[..., -1:]
+
+    def moved(self, belief: Tensor) -> Tensor:
+        """The belief before the next query."""
+        on, off = self._split(belief)
+        start = self._turned(on)
+        moved = self.moves[-1] * start
+        for move in self.moves[-2::-1]:
+            moved = torch.addcmul(self._shifted(moved), move, start)
+        total, moved = belief[..., :-1].sum(-1, keepdim=True), moved.flatten(-2)
+        _, jump, leave, enter = self.rates
+        anywhere = (jump * total + enter * off) / moved.shape[-1]
+        off = self.stay * (total - moved.sum(-1, keepdim=True)) + leave * total + (1 - enter) * off
+        return torch.cat([self.stay * moved + anywhere, off], -1)
+
+    def expected(self, message: Tensor) -> Tensor:
+        """What a message of the next query says of the state before: the transpose of `moved`."""
+        on, off = self._split(message)
+        moved = self.moves[-1] * on
+        for move in self.moves[-2::-1]:
+            moved = torch.addcmul(self._shifted_back(moved), move, on)
+        moved = self._turned(moved + self.lost * off[..., None]).flatten(-2)
+        _, jump, leave, enter = self.rates
+        mean = message[..., :-1].mean(-1, keepdim=True)
+        before = self.stay * moved + (jump * mean + leave * off)
+        return torch.cat([before, enter * mean + (1 - enter) * off], -1)
+
+    def best_moved(self, log: Tensor) -> Tensor:
+        """Log probabilities of the best way to each state in a step, from those before it (Viterbi)."""
+        on, off = self._split(log)
+        _, jump, leave, enter = self.rates
+        anywhere = jump / (log.shape[-1] - 1)
+        turn = self.layout.turn if self.layout.directions == 2 else 0.0
+        best = torch.full_like(on, -math.inf)
+        for move in self.moves[::-1]:
+            best = self._best_shifted(best)
+            best = torch.maximum(best, on + (self.stay * move * (1 - turn) + anywhere).log())
+            if turn:
+                turned = on.flip(-1, -2) + (self.stay * move * turn + anywhere).log()
+                best = torch.maximum(best, turned)
+        jumped = torch.maximum(on.amax() + anywhere.log(), off + (enter / (log.shape[-1] - 1)).log())
+        left = (on + (self.stay * self.lost + leave).log()).amax()
+        return torch.cat([best.flatten().maximum(jumped), torch.maximum(left, off + (1 - enter).log())])
+
+    def _best_shifted(self, on: Tensor) -> Tensor:
+        moved = F.pad(on[..., :-1], (1, 0), value=-math.inf)
+        if self.keep is None:
+            return moved
+        moved = moved + self.keep.log()
+        for row, at, to, share in self.linked:
+            linked = on[..., row, at] + math.log(max(share, MIN_PROBABILITY))
+            moved[..., row, to] = torch.maximum(moved[..., row, to], linked)
+        return moved
+
+    def anywhere(self) -> Tensor:
+        """The belief before the first query: on or off the map in the equilibrium of leaving and entering."""
+        states = self.layout.directions * self.layout.places
+        off = (self.rates.leave / (self.rates.leave + self.rates.enter)).clamp(max=0.5)
+        return torch.cat([((1 - off) / states).expand(states), off[None]])
+
+    def counts(self, before: Tensor, after: Tensor) -> Counts:
+        """Expected numbers of steps (the E-step of Baum and Welch).
+
+        Args:
+            before: (..., S) beliefs given all queries so far. after: (..., S) messages of the next query and
+                all after it, of any scale.
+        """
+        (on, off), (shifted, off_after) = self._split(before), self._split(after)
+        start, off, off_after = self._turned(on), off[..., 0], off_after[..., 0]
+        total, mean = before[..., :-1].sum(-1), after[..., :-1].mean(-1)
+        _, jump, leave, enter = self.rates
+        kinds = []
+        for move, reach in zip(self.moves, self.reach, strict=True):
+            arrived = (start * shifted).sum((-1, -2)) + off_after * (start * (1 - reach)).sum((-1, -2))
+            kinds.append(self.stay * move * arrived)
+            shifted = self._shifted_back(shifted)
+        kinds += [jump * total * mean, leave * total * off_after]
+        kinds += [enter * off * mean, (1 - enter) * off * off_after]
+        each = torch.stack(kinds, -1).flatten(0, -2)
+        total = each.sum(-1, keepdim=True)
+        counts = torch.where(total > 0, each / total.clamp(min=MIN_PROBABILITY), 0).sum(0)
+        return Counts(counts[:-4], *counts[-4:])
+
+
+def logits(*probabilities: float) -> Tensor:
+    """Logarithms, finite for a probability of 0."""
+    return torch.tensor(probabilities, dtype=torch.float32).clamp(min=MIN_PROBABILITY).log()
+
+
+def checked_rates(moves: Sequence[float], jump: float, leave: float, enter: float) -> tuple[float, ...]:
+    """The moves, if these are probabilities of a step; else an InputError."""
+    moves = tuple(float(move) for move in moves)
+    if not all(0 <= rate <= 1 for rate in (jump, leave, enter)) or jump + leave > 1:
+        seen = f"jump {jump}, leave {leave}, enter {enter}"
+        raise InputError(f"{seen}; expected probabilities, jump + leave at most 1")
+    if not all(move >= 0 for move in moves) or not abs(sum(moves) - 1) < 1e-6:
+        raise InputError(f"the moves are {[*moves]}; expected probabilities that add up to 1")
+    return moves

@@ -1,0 +1,517 @@
+"""The places of all queries of a drive, each given all of them, before and after."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple, Self
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from dejavu_torch.recognition.evidence import (
+    RankTable,
+    Spacing,
+    Standardised,
+    place_means,
+    spacing_of,
+    standardised,
+)
+from dejavu_torch.recognition.filter import near_scores
+from dejavu_torch.recognition.motion import (
+    MIN_PROBABILITY,
+    Counts,
+    Layout,
+    Link,
+    Motion,
+    Rates,
+    checked_rates,
+    logits,
+)
+from dejavu_torch.types import InputError, SequenceModel
+
+MOVES = (0.2, 0.5, 0.2, 0.05, 0.02, 0.015, 0.015)
+SLOW = (0.67, 0.25, 0.05, 0.01, 0.01, 0.005, 0.005)  # of which EM starts if that at one place a query fails
+FAST = (0.05, 0.1, 0.2, 0.3, 0.2, 0.1, 0.05)
+RATES = 0.001, 0.001, 0.01  # jump, leave, enter
+SEPARATION = 1.5
+RADIUS = 5  # places around a right one whose scores are not counted as wrong
+ROUNDS = 5  # of expectation-maximisation
+MOVE_SHARE = 0.1  # of the queries: the weight of the prior of the moves
+RATE_COUNTS, ENTER_COUNTS = 200.0, 50.0  # steps that the priors of jump and leave, and of enter, count as
+SHARPENED = 0.6  # tau' = SHARPENED tau
+MIN_SEPARATION = 0.3
+FITTED, STRETCH, STRETCHES = 1000, 100, 10  # queries that are fitted to at most, in a stretch, and stretches
+CORRELATED = 4  # correlation times in a stretch, at least
+DRIVE = 10.0  # nats by which a drive beats being off the map throughout
+OTHER_DRIVE, PER_QUERY = 30.0, 0.1  # likewise at another speed, in all and per query,
+CLEARLY = 5.0  # and times as many as at one place a query
+WHOLE = "a smoother has to know the whole drive; expected a PlaceFilter, or a SequenceMatcher"
+BLOCK = 2**22  # numbers of a block of queries and states
+
+Rows = Callable[[Tensor], Tensor]  # numbers of queries (B,) -> their scores (B,N)
+
+
+class Block(NamedTuple):
+    """Consecutive queries from `first` on, of a sweep: (..., B, S) each; see `Layout` for the states.
+
+    before: beliefs given the queries before each. likelihood: of each query, 1 off the map. after: messages
+    of the queries after each, of any scale. log: (..., B), likelihood of each query given those before.
+    """
+
+    first: int
+    before: Tensor
+    likelihood: Tensor
+    after: Tensor
+    log: Tensor
+
+    @property
+    def posterior(self) -> Tensor:
+        return normalised(self.before * self.likelihood * self.after)
+
+
+class Fit(NamedTuple):
+    """What expectation-maximisation found. log: nats by which the model beats being off the map."""
+
+    rates: Rates
+    separation: float
+    values: Tensor  # of the rank table
+    log: float
+    queries: int
+
+
+class PlaceSmoother(SequenceModel):
+    """The place of each query given the whole drive: the forward-backward algorithm, with evidence by rank.
+
+    The states of a hidden Markov model are the places, in both directions of travel, and being off the map.
+    A score that a share u of the wrong scores of the drive reaches has the normal score x = -Phi^-1(u), and
+    its place the log evidence (separation x - separation^2 / 2) / tempering, relative to being off the map:
+    the likelihood ratio of Gaussians that are `separation` apart, tempered since consecutive queries are
+    alike. `fit` learns all of it from the queries, without ground truth.
+
+    Args:
+        moves: probabilities of moving by 0, 1, .., V places from one query to the next.
+        jump, leave, enter: of being anywhere next, of leaving the map and of entering it.
+        turn: of turning round.
+        separation: mu, mean normal score of right places, in standard deviations.
+        tempering: tau', consecutive queries that say as much as one; at least 1.
+        within: places; as in `PlaceFilter`.
+        threshold: accept a match if its score is below; None leaves it to `DejaVu.acceptance`.
+        links: further steps (from, to, probability) in place of that to the next place.
+        loop: the last place leads to the first one.
+
+    Shape: scores (..., Q, N) -> (..., Q, N), -log of a probability in nats. Descriptors (Q,K), where given,
+        tell how the queries depend on each other; else the scores tell it.
+
+    Convention: exp(-score) is at most the probability that the right place is within `within` places. A query
+        whose scores are all equal, or NaN or infinite, says nothing. A place that nothing covers scores +inf.
+
+    Source: Rabiner (1989) for forward-backward and Baum-Welch; evidence and motion model are ours.
+
+    Raises:
+        InputError: settings or scores of another shape or out of range.
+
+    Example:
+        >>> scores = torch.rand(60, 60, generator=torch.Generator().manual_seed(0)) - torch.eye(60) / 2
+        >>> scores[20] = 0.0  # says nothing
+        >>> PlaceSmoother(within=0).fit(scores)(scores)[19:22].argmin(1)
+        tensor([19, 20, 21])
+    """
+
+    values: Tensor
+    means: Tensor
+
+    def __init__(
+        self,
+        moves: Sequence[float] = MOVES,
+        jump: float = 0.001,
+        leave: float = 0.001,
+        enter: float = 0.01,
+        turn: float = 0.002,
+        separation: float = 1.5,
+        tempering: float = 1.0,
+        within: int = 5,
+        threshold: float | None = None,
+        links: Sequence[Link] = (),
+        loop: bool = False,
+    ) -> None:
+        super().__init__()
+        moves = checked_rates(moves, jump, leave, enter)
+        if not 0 <= turn <= 1:
+            raise InputError(f"turn is {turn}; expected a probability")
+        if not 0 < separation < math.inf or not 1 <= tempering < math.inf:
+            seen = f"separation {separation}, tempering {tempering}"
+            raise InputError(f"{seen}; expected finite numbers, above 0 and at least 1")
+        if not isinstance(within, int) or within < 0:
+            raise InputError(f"within is {within}; expected a whole number, at least 0")
+        if threshold is not None and math.isnan(threshold):
+            raise InputError("the threshold is NaN; expected a number, or None")
+        self.move_logits = nn.Parameter(logits(*moves))
+        self.rate_logits = nn.Parameter(logits(1 - jump - leave, jump, leave))
+        self.enter_logit = nn.Parameter(logits(enter)[0] - logits(1 - enter)[0])
+        self.turn, self.separation, self.tempering = turn, separation, tempering
+        self.within, self.threshold = within, threshold
+        self.links, self.loop = tuple(links), loop
+        self.log_likelihood: float | None = None  # nats above being off the map throughout, as fitted
+        self.is_drive = True  # whether the queries that were fitted to are a drive of the map
+        self.prior = moves
+        self.register_buffer("values", torch.zeros(0), persistent=False)  # of the rank table
+        self.register_buffer("means", torch.zeros(0), persistent=False)  # scores of each place
+
+    def start(self, places: int, fixed: bool = False) -> Tensor:
+        raise InputError(WHOLE)
+
+    def step(self, *_: Any) -> tuple[Tensor, Tensor]:
+        raise InputError(WHOLE)
+
+    def check(self, queries: int | None, places: int) -> None:
+        """Nothing: few queries, and maps of few places, are answered by single queries."""
+
+    def threshold_of(self, threshold: float | None) -> float | None:
+        """The smoother's own threshold: its scores are probabilities, not distances."""
+        return self.threshold
+
+    def forward(
+        self, scores: Tensor, descriptors: Tensor | None = None, route_starts: Sequence[int] = (0,)
+    ) -> Tensor:
+        if scores.ndim > 2:
+            lead = scores.shape[:-2]
+            each = [self(one, None, route_starts) for one in scores.flatten(0, -3)]
+            return torch.stack(each).view(*lead, *each[0].shape) if each else scores.clone()
+        posterior = self.posterior(scores, descriptors, route_starts)
+        return near_scores(posterior[:, :-1], scores, self.within)
+
+    def posterior(
+        self, scores: Tensor, descriptors: Tensor | None = None, route_starts: Sequence[int] = (0,)
+    ) -> Tensor:
+        """Probability of each place, and of being off the map, for each query.
+
+        Shape: (Q,N), (Q,K) or None -> (Q,N+1), off the map last; rows add up to 1.
+        """
+        blocks = self.blocks(self.drive(scores, descriptors), route_starts)
+        parts = [self.folded(block.posterior) for block in blocks]
+        return torch.cat(parts[::-1]) if parts else scores.new_zeros(0, scores.shape[1] + 1)
+
+    def log_evidence(
+        self, scores: Tensor, descriptors: Tensor | None = None, route_starts: Sequence[int] = (0,)
+    ) -> Tensor:
+        """Log likelihood of the queries, relative to being off the map throughout, in nats: ().
+
+        Differentiable in `move_logits`, `rate_logits` and `enter_logit`.
+        """
+        blocks = self.blocks(self.drive(scores, descriptors), route_starts)
+        return torch.stack([block.log.sum() for block in blocks]).sum()
+
+    @torch.no_grad()
+    def path(
+        self, scores: Tensor, descriptors: Tensor | None = None, route_starts: Sequence[int] = (0,)
+    ) -> Tensor:
+        """The most probable sequence of places (Viterbi): (Q,N) -> (Q,) int64, -1 off the map."""
+        drive = self.drive(scores, descriptors)
+        motion, still = self.motion(scores.shape[1], route_starts, drive.means), drive.spacing.still
+        log = self.wide(drive.log_likelihood(torch.arange(len(scores))), 0.0)
+        best = [motion.anywhere().log() + log[0]] if len(scores) else []
+        for t in range(1, len(scores)):
+            best.append((best[-1] if still[t] else motion.best_moved(best[-1])) + log[t])
+        states: list[int] = []
+        for t in reversed(range(len(best))):
+            reached = best[t]
+            if states and still[t + 1]:
+                states.append(states[-1])
+                continue
+            if states:
+                target = F.one_hot(torch.tensor(states[-1]), reached.shape[-1]).to(reached)
+                reached = reached + motion.expected(target).log()
+            states.append(int(reached.argmax()))
+        state, n = torch.tensor(states[::-1], dtype=torch.int64), scores.shape[1]
+        place = torch.where(state < n, state, 2 * n - 1 - state)
+        return torch.where(state < 2 * n, place, -1)
+
+    def motion(self, places: int, route_starts: Sequence[int], like: Tensor) -> Motion:
+        """The transitions of a map, in the type of its scores."""
+        moves, (_, jump, leave) = (one.to(like).softmax(0) for one in (self.move_logits, self.rate_logits))
+        rates = Rates(moves, jump, leave, self.enter_logit.to(like).sigmoid())
+        return Motion(self.layout(places, route_starts), rates)
+
+    def layout(self, places: int, route_starts: Sequence[int] = (0,)) -> Layout:
+        links = self.links
+        if self.loop:
+            ends = (*route_starts[1:], places)
+            links += tuple((end - 1, start, 1.0) for start, end in zip(route_starts, ends, strict=True))
+        for first, second, share in links:
+            if not (0 <= first < places and 0 <= second < places and 0 <= share <= 1):
+                seen = f"the link {(first, second, share)} on {places} places"
+                raise InputError(f"{seen}; expected two of these places and a probability")
+        return Layout(places, 2, tuple(route_starts), links, self.turn)
+
+    @staticmethod
+    def wide(places: Tensor, off: float) -> Tensor:
+        """Numbers of the places (..., N) for all states (..., 2 N + 1)."""
+        return torch.cat([places, places.flip(-1), places.new_full((*places.shape[:-1], 1), off)], -1)
+
+    @staticmethod
+    def folded(states: Tensor) -> Tensor:
+        """Mass of all states (..., 2 N + 1) -> of the places in either direction, and off the map."""
+        n = (states.shape[-1] - 1) // 2
+        return torch.cat([states[..., :n] + states[..., n:-1].flip(-1), states[..., -1:]], -1)
+
+    def drive(self, scores: Tensor | Rows, descriptors: Tensor | None = None) -> Drive:
+        """The evidence of a drive's queries, by what was fitted; for a matrix, also if nothing was."""
+        if not isinstance(scores, Tensor):
+            assert descriptors is not None
+            spacing = spacing_of(descriptors)
+            return Drive(scores, self.means, self.values, spacing, self.separation, self.tempering)
+        given, known = check_scores(scores).detach(), scores
+        spacing = spacing_of(finite(given) if descriptors is None else descriptors)
+        means, values = self.means, self.values
+        if len(means) != scores.shape[1]:
+            means = place_means(given, spacing.weight.to(given))
+        if not len(values):
+            z, valid, speaks = standardised(given, means)
+            table = RankTable()
+            table.add(z, valid * speaks[:, None])
+            values = table.values
+        return Drive(rows_of(known), means, values, spacing, self.separation, self.tempering)
+
+    def blocks(
+        self, drive: Drive, route_starts: Sequence[int] = (0,), size: int | None = None
+    ) -> Iterator[Block]:
+        """Sweep forward, then backward: blocks of queries, the last first. In memory are one block of
+        queries, and the belief before each of the others.
+
+        Args:
+            size: queries of a block; None is about the root of their number, or more if they are small.
+        """
+        queries, places = len(drive.spacing.still), len(drive.means)
+        if size is None:
+            size = max(1, math.isqrt(queries), BLOCK // (2 * places + 1))
+        motion = self.motion(places, route_starts, drive.means)
+
+        def likelihood(first: int, last: int) -> Tensor:
+            return self.wide(drive.log_likelihood(torch.arange(first, last)), 0.0).exp()
+
+        yield from sweep(motion, likelihood, queries, drive.spacing.still.to(drive.means.device), size)
+
+    @torch.no_grad()
+    def fit(
+        self,
+        scores: Tensor | Rows,
+        descriptors: Tensor | None = None,
+        route_starts: Sequence[int] = (0,),
+    ) -> Self:
+        """Learn moves, rates, separation, tempering and ranks from the queries of a drive, without truth.
+
+        Expectation-maximisation from one place a query, and, if that explains nothing, from a slower and a
+        faster start, on at most `FITTED` queries in up to ten stretches.
+
+        Args:
+            scores: (Q,N), or a function of the numbers of queries (B,) that returns their scores (B,N).
+            descriptors: (Q,K) of the queries; needed with a function.
+
+        Returns:
+            self; `is_drive` tells whether the queries are a drive of the map at all.
+        """
+        if isinstance(scores, Tensor):
+            descriptors = finite(check_scores(scores)) if descriptors is None else descriptors
+            scores = rows_of(scores)
+        assert descriptors is not None
+        self.is_drive, self.log_likelihood = False, None
+        if len(descriptors) < 2:
+            self.means = scores(torch.arange(len(descriptors))).sum(0).mul(0)
+            self.values = RankTable().values
+            return self
+        spacing = spacing_of(descriptors)
+        self.tempering = tempering_of(spacing)
+        picked = stretches(len(descriptors), spacing.correlation)
+        sample = scores(picked.flatten())
+        weight, still = spacing.weight.to(sample), spacing.still.to(sample.device)
+        self.means = place_means(sample, weight[picked.flatten()])
+        parts = standardised(sample, self.means)
+        std = Standardised(*(part.unflatten(0, picked.shape) for part in parts))
+        given = std, weight[picked], still[picked], route_starts
+        best = self._fitted(*given, self.prior)
+        if best.log < max(OTHER_DRIVE, PER_QUERY * best.queries) and len(self.prior) == len(MOVES):
+            other = max((self._fitted(*given, start) for start in (SLOW, FAST)), key=lambda one: one.log)
+            least = max(OTHER_DRIVE, PER_QUERY * other.queries, CLEARLY * best.log)
+            best = other if other.log >= least else best
+        self.is_drive, self.log_likelihood = best.log >= DRIVE, best.log
+        self.separation, self.values = best.separation, best.values
+        jump, leave, enter = map(float, best.rates[1:])
+        self.move_logits.copy_(logits(*best.rates.moves.tolist()))
+        self.rate_logits.copy_(logits(1 - jump - leave, jump, leave))
+        self.enter_logit.copy_(logits(enter)[0] - logits(1 - enter)[0])
+        return self
+
+    def _fitted(
+        self,
+        std: Standardised,
+        weight: Tensor,
+        still: Tensor,
+        route_starts: Sequence[int],
+        start: Sequence[float],
+    ) -> Fit:
+        """Expectation-maximisation on stretches (n,L,N) from a start of the moves, which is their prior."""
+        (n, length, places), prior = std.z.shape, std.z.new_tensor(start)
+        layout, separation = self.layout(places, route_starts), SEPARATION
+        rates = Rates(prior, *(prior.new_tensor(rate) for rate in RATES))
+        right = torch.zeros_like(std.z)  # probability that a score is a right one
+        moving, shares = ~still[:, 1:], (weight * std.speaks)[..., None]
+        for round in range(ROUNDS + 1):
+            table = RankTable()
+            table.add(std.z, shares * std.valid * (1 - right))
+            x = RankTable.look_up(table.values, std.z)
+            log = log_likelihood(x, std, weight, separation, self.tempering)
+            motion, like = Motion(layout, rates), self.wide(log, 0.0).exp()
+            (block,) = sweep(motion, lambda *_: like, length, still, length)  # noqa: B023
+            if round == ROUNDS:
+                break
+            right = near_mass(self.folded(block.posterior)[..., :-1], RADIUS)
+            # without its own evidence, that of a query is not mistaken for that of its place
+            others = self.folded(normalised(block.before * block.after))[..., :-1] * shares
+            mean = (others * torch.where(std.valid, x, 0)).sum() / others.sum().clamp(min=MIN_PROBABILITY)
+            separation = max(MIN_SEPARATION, float(mean))
+            belief, after = normalised(block.before * block.likelihood), block.likelihood * block.after
+            counts = motion.counts(belief[:, :-1][moving], after[:, 1:][moving])
+            rates = updated_rates(counts, prior * (MOVE_SHARE * n * length))
+        return Fit(rates, separation, table.values, float(block.log.sum()), n * length)
+
+    def extra_repr(self) -> str:
+        moves = [round(move, 4) for move in self.move_logits.softmax(0).tolist()]
+        _, jump, leave = self.rate_logits.softmax(0).tolist()
+        numbers = {"jump": jump, "leave": leave, "enter": float(self.enter_logit.sigmoid())}
+        numbers |= {"separation": self.separation, "tempering": self.tempering}
+        told = ", ".join(f"{name}={value:.3g}" for name, value in numbers.items())
+        return f"moves={moves}, {told}, within={self.within}"
+
+
+class Drive(NamedTuple):
+    """What a smoother knows of the queries of a drive.
+
+    means: (N,), mean score of each place. values: of the rank table.
+    """
+
+    rows: Rows
+    means: Tensor
+    values: Tensor
+    spacing: Spacing
+    separation: float
+    tempering: float
+
+    def log_likelihood(self, numbers: Tensor) -> Tensor:
+        """Log likelihood of the places for some queries, 0 being off the map: (B,) -> (B,N)."""
+        std = standardised(self.rows(numbers), self.means)
+        x = RankTable.look_up(self.values, std.z)
+        weight = self.spacing.weight.cpu()[numbers].to(x)
+        return log_likelihood(x, std, weight, self.separation, self.tempering)
+
+
+def rows_of(scores: Tensor) -> Rows:
+    """The rows of a matrix by their numbers."""
+    return lambda numbers: scores[numbers.to(scores.device)]
+
+
+def finite(scores: Tensor) -> Tensor:
+    """Scores with 0 in place of NaN and infinity."""
+    return scores.nan_to_num(0, 0, 0)
+
+
+def log_likelihood(
+    x: Tensor, std: Standardised, weight: Tensor, separation: float, tempering: float
+) -> Tensor:
+    """Tempered log likelihood ratio of normal scores (..., Q, N), right ones beside wrong ones: both Gaussian
+    with variance 1, and `separation` apart."""
+    log = (separation * x - separation**2 / 2) * (weight / tempering)[..., None]
+    return torch.where(std.speaks[..., None], log.masked_fill(~std.valid, -math.inf), 0)
+
+
+def sweep(
+    motion: Motion, likelihood: Callable[[int, int], Tensor], queries: int, still: Tensor, size: int
+) -> Iterator[Block]:
+    """Forward and backward over the queries, in blocks of `size`, which come from the last to the first.
+
+    Args:
+        likelihood: of the queries [first, last), (..., B, S). still: (..., Q) bool, where nothing moves.
+    """
+    starts, belief = [*range(0, queries, size)], motion.anywhere()
+    beliefs, stops = {}, bool(still.any())
+
+    def forward(first: int, belief: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        like = likelihood(first, min(first + size, queries))
+        before, logs = [], []
+        for t, seen in enumerate(like.unbind(-2), first):
+            if t:
+                moved = motion.moved(belief)
+                belief = torch.where(still[..., t, None], belief, moved) if stops else moved
+            before.append(belief.expand_as(seen))
+            joint = belief * seen
+            total = joint.sum(-1, keepdim=True)
+            belief = joint / total
+            logs.append(total[..., 0].log())
+        return like, torch.stack(before, -2), torch.stack(logs, -1), belief
+
+    for first in starts[:-1]:
+        beliefs[first] = belief
+        *_, belief = forward(first, belief)
+    message: Tensor | None = None  # of the queries after a block, with their own likelihoods
+    for first in starts[::-1]:
+        like, before, log, _ = forward(first, beliefs.pop(first, belief))
+        after = []
+        for t in reversed(range(first, first + like.shape[-2])):
+            seen = like[..., t - first, :]
+            if message is None:
+                message = torch.ones_like(seen)
+            else:
+                moved = motion.expected(message)
+                message = torch.where(still[..., t + 1, None], message, moved) if stops else moved
+            after.append(message)
+            message = message * seen
+            message = message / message.amax(-1, keepdim=True)
+        yield Block(first, before, like, torch.stack(after[::-1], -2), log)
+        belief = motion.anywhere()
+
+
+def updated_rates(counts: Counts, prior: Tensor) -> Rates:
+    """The M-step: counts with those of the priors."""
+    moves, on = counts.moves + prior, counts.moves.sum() + counts.jump + counts.leave + RATE_COUNTS
+    jump, leave, enter = RATES
+    return Rates(
+        moves / moves.sum(),
+        (counts.jump + RATE_COUNTS * jump) / on,
+        (counts.leave + RATE_COUNTS * leave) / on,
+        (counts.enter + ENTER_COUNTS * enter) / (counts.enter + counts.absent + ENTER_COUNTS),
+    )
+
+
+def normalised(mass: Tensor) -> Tensor:
+    """Mass (..., S) that adds up to 1."""
+    return mass / mass.sum(-1, keepdim=True)
+
+
+def near_mass(mass: Tensor, radius: int) -> Tensor:
+    """The mass of each place and its neighbours up to a radius, (..., N) -> (..., N)."""
+    radius = min(radius, mass.shape[-1])
+    flat = F.pad(mass.reshape(-1, 1, mass.shape[-1]), (radius, radius))
+    return (F.avg_pool1d(flat, 2 * radius + 1, 1) * (2 * radius + 1)).view_as(mass).clamp(0, 1)
+
+
+def stretches(queries: int, correlation: float) -> Tensor:
+    """Numbers of queries in evenly spaced stretches, (n,L)."""
+    used = min(queries, FITTED)
+    length = max(STRETCH, math.ceil(CORRELATED * correlation))
+    n = max(1, min(STRETCHES, used // length))
+    length = used // n
+    first = torch.linspace(0, queries - length, n).round().long()
+    return first[:, None] + torch.arange(length)
+
+
+def tempering_of(spacing: Spacing) -> float:
+    """tau', for how many consecutive queries count as one."""
+    return max(1.0, SHARPENED * spacing.correlation)
+
+
+def check_scores(scores: Tensor) -> Tensor:
+    """Refuse what are no scores (Q,N)."""
+    if scores.ndim != 2 or scores.shape[1] < 1 or not scores.is_floating_point():
+        raise InputError(f"scores are {tuple(scores.shape)} {scores.dtype}; expected floats (Q,N)")
+    return scores
