@@ -7,7 +7,7 @@ import inspect
 import logging
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -394,10 +394,15 @@ class DejaVu(nn.Module):
             order: (N,) the frame of each place of a shuffled map; the match then counts frames.
         """
         matching = matching if isinstance(matching, Matching) else self.matching(matching)
+        rows = None if order is None else self._shuffled_rows(descriptors, order)
         localizer, smoother = self.localizer(matching), matching.sequence
         if isinstance(smoother, PlaceSmoother):
-            rows = None if order is None else self._shuffled_rows(descriptors, order)
             return localizer.drive(descriptors, smoother, rows, progress)
+        if matching.smoother is not None:
+            match = self.localize_descriptors(descriptors, matching._replace(smoother=None), order, progress)
+            drive = localizer.drive(descriptors, copy.deepcopy(matching.smoother), rows, progress)
+            drive = drive if matching.k is None else drive.map(lambda column: column[:, 0])
+            return replace(match, sequences={**match.sequences, "smoother": drive})
         if order is None:
             return localizer(descriptors, progress)
         matcher, place = Localizer(None, matching), order.argsort()

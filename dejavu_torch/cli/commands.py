@@ -36,10 +36,12 @@ from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import REGISTRY, recipe_of, with_parts
 from dejavu_torch.motion.ground_plane import check_corners
-from dejavu_torch.motion.resampling import ResampledTraverse
+from dejavu_torch.motion.resampling import ResampledTraverse, source_of
 from dejavu_torch.recognition.calibration import Calibration
 from dejavu_torch.recognition.coarse import plan
+from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.select import check_candidates
+from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.text import printable
 from dejavu_torch.types import InputError, Match, Traverse
 
@@ -48,6 +50,7 @@ if TYPE_CHECKING:
     from dejavu_torch.evaluation.report import Report
 
 COMPARED = ("map.safetensors", "matches.csv")  # files next to the report of a comparison
+NO_DRIVE = "the queries are no drive of this map, as far as they show: each is matched by itself"
 SUPPRESSION = 5  # suppression radius in places: two candidates of a query are further apart
 
 
@@ -172,6 +175,7 @@ def run_localize(
     pairs: Path | None = None,
     corners: list[list[float]] | None = None,
     sequences: options.Sequences,
+    ordering: options.Ordering,
     searching: options.Searching,
     cluster: str | None = None,
     loading: options.Loading,
@@ -181,7 +185,7 @@ def run_localize(
     Args:
         map: map file
         source: frames to find, as in `dejavu learn`
-        out: csv of query,place,score,accepted[,probability][,rank][,route],query_name,place_name
+        out: csv of query,place,score,accepted[,probability],confidence[,rank][,route],query_name,place_name
         top: write this many places per query, no two within 5 of each other, each in a row with its rank; a
             probability is that of the first
         pairs: also write lines `query_name place_name` for hloc and COLMAP, one per place
@@ -197,11 +201,12 @@ def run_localize(
     if pairs is not None and pairs.resolve() == out.resolve():
         raise InputError(f"--pairs {pairs} is --out as well; expected another name")
     matcher = sequences.matcher(SUPPRESSION, acceptance.threshold)
+    ordered = ordering.of(matcher)
     acceptance.check(matcher)
     if cluster is not None:
         _check_cluster(cluster, loading.device)
-        length = sequences.sequence != 1 and sequences.sequence
-        options.refuse_with(f"--cluster {cluster}", filter=sequences.filter, sequence=length)
+        options.refuse_with(f"--cluster {cluster}", match=matcher not in (None, "auto") and sequences.way)
+        matcher = None
     model = loading.model(map)
     searching.of(model)
     if corners is not None:
@@ -217,8 +222,13 @@ def run_localize(
     if model.step is not None:
         query = model.resample(query, model.step, True, model.frame_shape)
         _print_steps(query)
+    ordered = source_of(query).ordered if ordered is None else ordered
+    if isinstance(matcher, str):
+        matcher = PlaceSmoother(within=SUPPRESSION, threshold=acceptance.threshold) if ordered else None
     chosen = model.matching(matcher).acceptance
-    matches = model.matches(query, True, matcher, None, top, SUPPRESSION)
+    smooths = isinstance(matcher, PlaceSmoother)
+    centre = (smooths or matcher is None) and ordering.centring(ordered, len(query))
+    matches = model.matches(query, True, matcher, None, top, SUPPRESSION, centre)
     if top is not None:
         matches = (part.map(Tensor.flatten) for part in matches)
     counts: Counter[str] = Counter()
@@ -239,6 +249,8 @@ def run_localize(
         print("the map has no layers, so no place can be reported")
     elif not chosen.given:
         print(chosen)
+    if isinstance(matcher, PlaceSmoother) and not matcher.is_drive:
+        print(NO_DRIVE)
     _say(f"{total} queries, {accepted} accepted; written to {out}")
     if counts:
         steps = next_steps(matcher is not None, chosen.given)
@@ -293,6 +305,7 @@ def run_live(
     if not 0 < timeout <= threading.TIMEOUT_MAX:
         raise InputError(f"--timeout {timeout:g}; expected seconds, above 0")
     matcher = sequences.matcher(SUPPRESSION, acceptance.threshold)
+    assert not isinstance(matcher, str)  # the default is the filter
     acceptance.check(matcher)
     model = loading.model(map)
     searching.of(model)
@@ -310,6 +323,7 @@ def run_compare(
     learning: options.LearningOptions,
     map: Path | None = None,
     sequences: options.Sequences,
+    ordering: options.Ordering,
     searching: options.Searching,
     model: DejaVu,
     command: str,
@@ -327,7 +341,7 @@ def run_compare(
     where = device_of(learning.device, learns=map is None)
     acceptance = options.Acceptance(model.threshold, model.precision)
     matcher = sequences.matcher(max(0, judging.tolerance), acceptance.threshold)
-    ordered = judging.in_order(matcher is not None)
+    ordered = ordering.of(matcher)
     acceptance.check(matcher, judging.distractors)
     if map is not None:
         model = options.load_map(map, options.named_features(model))
@@ -335,10 +349,13 @@ def run_compare(
             names = ", ".join(route.name for route in model.map.routes)
             raise InputError(f"--map {map} has the routes {names}; expected a map of {reference} alone")
         acceptance.of(model)
-    if sequences.filter and acceptance.threshold is not None:
-        model.threshold = None  # it is for the filter's scores, so the map must not keep it
     searching.of(model.to(where))
     first, queries = open_source(reference), open_source(query)
+    if isinstance(matcher, str) and acceptance.threshold is not None:
+        in_order, within = queries.ordered if ordered is None else ordered, max(0, judging.tolerance)
+        matcher = PlaceSmoother(within=within, threshold=acceptance.threshold) if in_order else None
+    if isinstance(matcher, PlaceFilter | PlaceSmoother) and acceptance.threshold is not None:
+        model.threshold = None  # it is for a probability, so the map must not keep it
     seconds = options.several(learning.second)
     _check_report_folder(out, COMPARED, [reference, query, *seconds], [judging.truth, *learning.files])
     others = [open_source(one) for one in (*seconds, learning.calibration) if one not in options.UNREAD]
@@ -362,6 +379,7 @@ def run_compare(
         distractors=distractors,
         storage_curve=judging.storage_curve,
         ordered=ordered,
+        centre=None if ordering.centre is None else ordering.centre == "mean",
         progress=True,
     )
     _publish(result, out, f"{query} found on {reference}", command, map, judging.top)
@@ -479,6 +497,7 @@ def run_export(
     check_output_file(onnx)
     check_not_read(onnx, map)
     matcher = sequences.matcher(SUPPRESSION, threshold)
+    matcher = None if isinstance(matcher, str) else matcher
     model = options.load_map(map, features)
     options.Acceptance(threshold).of(model)
     if matcher is not None and model.precision is not None:
@@ -679,7 +698,7 @@ def _publish(
     from dejavu_torch.evaluation.report import report_folder, write_report
 
     run, kept = result.run, out / "map.safetensors"
-    acceptance = run.model.acceptance(run.sequence)
+    acceptance = run.model.acceptance(run.smoother or run.sequence)
     _print_contradiction(result.report)
     print_map(run.model)
     if run.truth is None:

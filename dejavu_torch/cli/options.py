@@ -6,12 +6,13 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from torch import nn
 
 from dejavu_torch import growth
 from dejavu_torch.cli.device import device_of
+from dejavu_torch.data.files import as_number
 from dejavu_torch.data.source import open_source
 from dejavu_torch.data.traverse import parts_of
 from dejavu_torch.features.descriptor import default_features
@@ -19,10 +20,12 @@ from dejavu_torch.features.views import LabelledFrames
 from dejavu_torch.model import DejaVu, check_precision
 from dejavu_torch.model_file import NO_MAP, recipe_of
 from dejavu_torch.motion.resampling import source_of
+from dejavu_torch.recognition.centring import PRIOR
 from dejavu_torch.recognition.coarse import searcher
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.search import Search, check_search
 from dejavu_torch.recognition.sequence import SequenceMatcher
+from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.types import InputError, SequenceModel, Traverse
 
 NO_CALIBRATION = "none"
@@ -30,57 +33,104 @@ UNREAD = (None, NO_CALIBRATION)  # values of --calibration that name no source
 Reference = TypeVar("Reference", Traverse, Traverse | None)
 
 
+WAYS = "drive, filter, single or sequence:T with a whole number T of at least 1"
+
+
 @dataclass
 class Sequences:
     """How consecutive queries support each other.
 
     Args:
-        sequence: match this many consecutive queries together, at constant speed
+        match: drive matches each query with all queries of the drive, before and after it; filter with those
+            before it; sequence:T with T - 1 before it, at constant speed; single by itself. If not given,
+            drive for frames in order, else single. Scores and --threshold of drive and filter are
+            -log(probability)
         speeds: speeds of a sequence in places per query, such as '[.8,1,1.25]'; 1 if not given
-        filter: match each query with all queries before it, by a probability for every place; scores and
-            --threshold are then -log(probability)
-        moves: the filter's probabilities of moving by 0, 1, 2, .. places; '[.2,.6,.2]' if not given
     """
 
-    sequence: int = 1
+    match: str | None = None
     speeds: list[float] | None = None
-    filter: bool = False
-    moves: list[float] | None = None
+    sequence: int | None = None  # also spelt --match sequence:T
+    filter: bool = False  # also spelt --match filter
 
-    def matcher(self, within: int, threshold: float | None) -> SequenceModel | None:
-        """The filter or the sequence matcher; None for single queries.
+    @property
+    def way(self) -> str | None:
+        """The way of matching, in the words of --match; None if none is given."""
+        length = self.sequence
+        if self.filter:
+            refuse_with("--filter", match=self.match, sequence=length != 1 and length)
+            return "filter"
+        if length is not None:
+            refuse_with(f"--sequence {length}", match=self.match)
+            return f"sequence:{length}"
+        return self.match
+
+    def matcher(self, within: int, threshold: float | None) -> SequenceModel | Literal["auto"] | None:
+        """The model that matches queries together; None for single queries, "auto" if no way is given.
 
         Args:
-            within, threshold: of the filter; None keeps the filter's own threshold.
+            within, threshold: of filter and smoother; None keeps the model's own threshold.
         """
-        given: dict[str, Any] = {} if self.moves is None else {"moves": self.moves}
-        if self.speeds is not None and self.sequence == 1:
-            expected = "expected --sequence T with them, in place of a filter"
-            raise InputError(f"--speeds {self.speeds} without --sequence; {expected}")
-        if self.filter:
-            refuse_with("--filter", sequence=self.sequence > 1 and self.sequence)
-            chosen = PlaceFilter(within=within, **given)
-            chosen.threshold = chosen.threshold if threshold is None else threshold
-            return chosen
-        if self.moves is not None:
-            raise InputError(f"--moves {self.moves} without --filter; expected both")
-        matcher = SequenceMatcher(self.sequence, (1.0,) if self.speeds is None else self.speeds)
-        return None if self.sequence == 1 else matcher
+        way, length = self.way, None
+        if way is not None and way.startswith("sequence:"):
+            length = as_number(way.removeprefix("sequence:"))
+            if length is None or length % 1:
+                raise InputError(f"--match {way}; expected {WAYS}")
+        elif way not in (None, "drive", "filter", "single"):
+            raise InputError(f"--match {way}; expected {WAYS}")
+        if self.speeds is not None and length in (None, 1):
+            raise InputError(
+                f"--speeds {self.speeds} without a sequence; expected --match sequence:T with them"
+            )
+        if length is not None:
+            matcher = SequenceMatcher(int(length), (1.0,) if self.speeds is None else self.speeds)
+            return None if length == 1 else matcher
+        if way in ("drive", "filter"):
+            return (PlaceSmoother if way == "drive" else PlaceFilter)(within=within, threshold=threshold)
+        return "auto" if way is None else None
 
 
 @dataclass
 class LiveSequences(Sequences):
-    """The filter unless a sequence is given.
+    """The filter unless another way is given.
 
     Args:
-        sequence: match this many frames together instead of filtering; 1 matches each frame by itself
+        match: filter matches each frame with those before it, and is the default; sequence:T with T - 1
+            before it, at constant speed; single by itself
     """
 
-    sequence: int | None = None  # type: ignore[assignment]
+    @property
+    def way(self) -> str | None:
+        return super().way or "filter"
 
-    def __post_init__(self) -> None:
-        self.filter = self.filter or self.sequence is None
-        self.sequence = 1 if self.sequence is None else self.sequence
+
+@dataclass
+class Ordering:
+    """Whether queries are in order, and what follows from it.
+
+    Args:
+        ordered: queries are in order, as in a video; needed for a .npy of frames
+        unordered: queries are in no order: match each by itself
+        centre: mean removes from the queries what all of them have and the map has not, none does not. If
+            not given, mean for at least 50 queries in order; a filter and sequences never do
+    """
+
+    ordered: bool = False
+    unordered: bool = False
+    centre: Literal["mean", "none"] | None = None
+
+    def of(self, matcher: SequenceModel | Literal["auto"] | None) -> bool | None:
+        """Whether queries, matched so, are in order; None leaves it to their source."""
+        together = isinstance(matcher, SequenceModel)
+        if self.unordered:
+            refuse_with("--unordered", ordered=self.ordered, match=together and "drive, filter or sequence:T")
+        if self.centre == "mean" and together and not isinstance(matcher, PlaceSmoother):
+            raise InputError("--centre mean with a filter or a sequence; expected --match drive or single")
+        return self.ordered if self.ordered or self.unordered else None
+
+    def centring(self, ordered: bool, queries: int) -> bool:
+        """Whether single queries and those of a smoother are centred."""
+        return self.centre == "mean" if self.centre else ordered and queries >= PRIOR
 
 
 @dataclass
@@ -157,7 +207,7 @@ class Acceptance:
     threshold: float | None = None
     precision: float | None = None
 
-    def check(self, sequence: SequenceModel | None, distractors: object = None) -> None:
+    def check(self, sequence: SequenceModel | str | None, distractors: object = None) -> None:
         """Refuse what excludes a precision or distractors, which both need probabilities."""
         if self.threshold is not None:
             refuse_with(f"--threshold {self.threshold:g}", precision=self.precision)
@@ -305,8 +355,6 @@ class EvaluationOptions:
         top: write this many places per query, no two within the tolerance
         distractors: other route, or several, '[A,B]', to report what is accepted there
         storage_curve: also evaluate maps of other sizes; this doubles the time
-        ordered: queries are in order, as in a video: also evaluate a filter
-        unordered: queries are in no order
     """
 
     truth: str | None = None
@@ -316,14 +364,6 @@ class EvaluationOptions:
     top: int | None = None
     distractors: list[str] | str | None = None
     storage_curve: bool = False
-    ordered: bool = False
-    unordered: bool = False
-
-    def in_order(self, together: bool) -> bool | None:
-        """Whether queries, matched together or not, are in order; None leaves it to their source."""
-        if self.unordered:
-            refuse_with("--unordered", ordered=self.ordered, sequence=together and "or --filter")
-        return self.ordered if self.ordered or self.unordered else None
 
     def off_map(self, traverses: Collection[Traverse]) -> list[Traverse]:
         """The distractors, none of which may be one of the traverses."""

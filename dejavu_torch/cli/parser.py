@@ -388,7 +388,7 @@ def described(thing: Callable[..., Any]) -> tuple[str | None, dict[str, str | No
 def add_option(parser: Parser, parameter: inspect.Parameter, helps: Mapping[str, str | None]) -> None:
     """Add an option or a positional argument, see `command_parser`."""
     keyword, default = parameter.kind is parameter.KEYWORD_ONLY, parameter.default
-    settings: dict[str, Any] = {"help": helps[parameter.name]}
+    settings: dict[str, Any] = {"help": helps.get(parameter.name, argparse.SUPPRESS)}  # hidden
     if parameter.annotation is bool:
         settings["action"] = "store_true"
     elif get_origin(parameter.annotation) is Sequence:

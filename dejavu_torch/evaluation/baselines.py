@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 from collections.abc import Mapping
 from dataclasses import replace
@@ -83,6 +84,9 @@ def nearest_frames(
     sequences = dict(match.sequences)
     if 1 in sequences:
         sequences[1] = sequences[1].renumbered(stored_frame)
+    if matching.smoother is not None:
+        rows = lambda numbers: phase_distances(query[numbers].to(stored.device), stored, metric)[:, nearest]  # noqa: E731
+        sequences["smoother"] = matcher.drive(query, copy.deepcopy(matching.smoother), rows, progress)
     if matching.sequence is None or matcher.own == 1:  # single queries
         match = replace(match, index=stored_frame(match.index))
     return replace(match, probability=None, sequences=sequences)
@@ -127,7 +131,7 @@ def baselines_of(
         metric = "cosine"
 
     def nearest(name: str, stored: Tensor, k: int, bytes: int, stride: int = 1) -> Baseline:
-        match = nearest_frames(stored, run.query_features, stride, metric, progress, matching)
+        match = run.match_by(lambda *how: nearest_frames(stored, how[0], stride, metric, progress, how[1]))
         return Baseline(name, match, bytes + fixed, k, fixed)
 
     size, own = partial(stride_bytes, frames, dimension), reference.element_size()
@@ -173,9 +177,10 @@ def _null_controls(run: Localization, seed: int, one: str, progress: bool) -> di
     found = {}
 
     def null(name: str, same_plan: bool = False) -> Baseline:
-        pair = run.reference_features, run.query_features
-        match = null_control(model, *pair, seed, same_plan, run.matching, progress)
-        return Baseline(f"null: {name}", match)
+        def find(query: Tensor, matching: Matching) -> Match:
+            return null_control(model, run.reference_features, query, seed, same_plan, matching, progress)
+
+        return Baseline(f"null: {name}", run.match_by(find))
 
     foreign = isinstance(model.mapper, TemplateMapper) and model.mapper.periods is None
     if foreign:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import logging
+import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from typing import Any, Literal, NamedTuple
 
@@ -25,8 +28,9 @@ from dejavu_torch.data.traverse import fitted
 from dejavu_torch.evaluation.answers import answer_facts
 from dejavu_torch.evaluation.baselines import baselines_of
 from dejavu_torch.evaluation.contenders import Contender, contend, models_beside
+from dejavu_torch.evaluation.curves import auc_error
 from dejavu_torch.evaluation.evaluate import RANKS, evaluation_facts
-from dejavu_torch.evaluation.localization import Localization
+from dejavu_torch.evaluation.localization import NOTHING, Localization
 from dejavu_torch.evaluation.pictures import draw_pictures
 from dejavu_torch.evaluation.plots import Pictures
 from dejavu_torch.evaluation.rejection import draw_reliability
@@ -43,10 +47,12 @@ from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import DejaVu, check_queries, features_per_frame
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, resampled, source_of
 from dejavu_torch.periods.spectrogram import BACKEND
+from dejavu_torch.recognition.centring import PRIOR, centred
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.localizer import Matching
 from dejavu_torch.recognition.select import check_candidates
 from dejavu_torch.recognition.sequence import SequenceMatcher
+from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.types import InputError, Match, SequenceModel, Traverse
 
 log = logging.getLogger("dejavu_torch")
@@ -62,7 +68,7 @@ OtherModels = Mapping[str, tuple[str, DejaVu]]  # their names and models, by the
 class Comparison(NamedTuple):
     """The report, pictures and run of a comparison, of which a notebook shows the scores and two pictures.
 
-    candidates: the best places of each query, no two within the tolerance.
+    candidates: the best places of each query for its answer, no two within the tolerance.
     """
 
     report: Report
@@ -89,7 +95,8 @@ def compare(
     interpolate: bool = False,
     second: LabelledFrames | None = None,
     others: OtherModels | None = None,
-    sequence: SequenceModel | None = None,
+    sequence: SequenceModel | Literal["auto"] | None = "auto",
+    centre: bool | None = None,
     top: int = 1,
     calibration: LabelledFrames | Literal["none"] | None = None,
     distractors: Sequence[Traverse] = (),
@@ -112,15 +119,18 @@ def compare(
         second: see `DejaVu.learn`; another traverse than the query.
         others: further models that learn the same reference, by their keys in report.json, with their names
             in tables. They need a ground truth, and none of them resamples.
-        sequence: matches consecutive queries together, on the map and on all baselines.
+        sequence: how the answers are found, see `DejaVu.localize`. With a filter or a `SequenceMatcher` the
+            scores at top level are those of its answers, else of single queries.
+        centre: whether the single queries and those of a smoother are centred, see `centred`; None does it
+            for at least 50 queries that are in order.
         top: candidates of each query.
         calibration: see `DejaVu.calibrate`; another traverse than the query. None calibrates a newly learned
             map with changed frames of the reference, "none" does not.
         distractors: routes that are not on the map, to see how many of their frames are accepted.
         storage_curve: also code a spectral map at several sizes, see `coded_at_sizes`:
             the report gets `storage` and its picture. Needs a ground truth.
-        ordered: whether the queries are consecutive. If so, the report also has the scores of a filter.
-            None: as their source says.
+        ordered: whether the queries are consecutive. If so, the report also has the scores of a filter and
+            of a smoother, on the map and on all baselines. None: as their source says.
         progress: show progress bars on a terminal.
 
     Raises:
@@ -131,7 +141,13 @@ def compare(
     _check_settings(model, truth, interpolate, tolerance, top, leave_out)
     reference, query, off = _prepared(model, reference, query, distractors, seconds, progress)
     check_candidates(top, tolerance, len(reference))
-    if sequence is not None:
+    given, ordered = ordered, source_of(query).ordered if ordered is None else ordered
+    if isinstance(sequence, str):
+        sequence = PlaceSmoother(within=tolerance) if ordered and len(query) > 1 else None
+    smoother = sequence if isinstance(sequence, PlaceSmoother) else None
+    if smoother is not None:
+        sequence = None
+    elif sequence is not None:
         sequence.check(None, len(reference))
     known = ground_truth_of(truth, reference, query, interpolate)
 
@@ -146,19 +162,28 @@ def compare(
         if isinstance(calibration, LabelledFrames) or (calibration is None and not has_map):
             calibrate_if_possible(model, reference, calibration, progress=progress)
     with timed(seconds, "localize"):
-        if ordered is None:
-            ordered = source_of(query).ordered and len(query) * model.map.places <= MAX_FILTERED
-        ordered = ordered and known is not None  # without truth it has no scores
-        also = models_beside(sequence, ordered, len(query), model.map.places, tolerance)
-        matching = Matching(sequence, also)
-        queries, candidates = _localized(model, query, matching, top, tolerance, progress)
-    off_map = _match_distractors(model, off, sequence, progress)
+        beside = ordered and known is not None  # without truth they have no scores
+        beside = beside and (given is not None or len(query) * model.map.places <= MAX_FILTERED)
+        also = models_beside(sequence, beside, len(query), model.map.places, tolerance)
+        alike = PlaceSmoother(within=tolerance) if beside and len(query) > 1 else None
+        matching = Matching(sequence, also, smoother=alike)
+        centring = ordered and len(query) >= PRIOR if centre is None else centre
+        run, found = _localized(model, reference, query, places, matching, centring, tolerance, top, progress)
+        whole = smoother or alike
+        if whole is not None:
+            settings = model.matching(whole)._replace(k=found.index.shape[1], radius=tolerance)
+            drive = model.localize_descriptors(run.query_features, settings, progress=progress)
+            best = drive.map(lambda column: column[:, 0])
+            sequences = {**run.judged.sequences, "smoother": best}
+            run = run._replace(judged=replace(run.judged, sequences=sequences))
+        if smoother is not None:
+            run = run._replace(match=best, smoother=smoother)
+    off_map = _match_distractors(model, off, smoother or sequence, centring, progress)
 
     model.cpu()
     known = known and ground_truth_in_places(known, model.map.place_of)
-    places, queries, match = places.cpu(), queries.cpu(), candidates.map(lambda column: column[:, 0])
-    run = Localization(model, reference, query, places, queries, match, known, tolerance, matching)
-    ours = run.contend("this map", run.scored, model)
+    run = run._replace(truth=known, reference_features=places.cpu(), query_features=run.query_features.cpu())
+    ours = run.contend("this map", run.judged.renumbered(model.map.table.scored), model)
     contenders = _other_contenders(run, others or {}, leave_out, seed, progress)
     coded = model.map if ours.scores is not None and isinstance(model.map, SpectralMap) else None
     storage = coded_at_sizes(run, seed=seed, progress=progress) if storage_curve and coded else None
@@ -167,11 +192,13 @@ def compare(
     facts = {
         **_map_facts(model.summary(), run.reference_features),
         **_run_facts(run, seconds),
-        **_match_facts(run, candidates, truth, interpolate, off_map),
+        **_match_facts(run, found, truth, interpolate, off_map),
+        "centred": centring,
         **{name: dict(picture.numbers) for name, picture in pictures.items() if picture.numbers},
     }
     if coded is not None and len(coded.chunks) == 1:
         facts["noise_over_map"] = noise_over_map(coded, run.reference_features, seed)
+    candidates = found if smoother is None else drive
     return Comparison(Report(ours, contenders, facts), pictures, run, candidates)
 
 
@@ -224,18 +251,33 @@ def _prepared(
 
 
 def _localized(
-    model: DejaVu, query: Traverse, matching: Matching, top: int, tolerance: int, progress: bool
-) -> tuple[Tensor, Match]:
-    """Descriptors (Q,K) of the queries, and the best places of each as far as recall@N or `top` needs."""
-    sequence, places = matching.sequence, model.map.places
-    ranking = model.matching(sequence)
+    model: DejaVu,
+    reference: Traverse,
+    query: Traverse,
+    places: Tensor,
+    matching: Matching,
+    centring: bool,
+    tolerance: int,
+    top: int,
+    progress: bool,
+) -> tuple[Localization, Match]:
+    """The run, and the best places of each query as far as recall@N or `top` needs."""
     check_queries(model, query.frame_shape, features_per_frame(model), query.name)
     queries = model.descriptor.all_of(query, progress)
-    if sequence is not None:
-        sequence.check(len(queries), places)
-    ranks = max(top, min(max(RANKS), places))
-    ranking = ranking._replace(also=matching.also, k=ranks, radius=tolerance)
-    return queries, model.localize_descriptors(queries, ranking, progress=progress)
+    if matching.sequence is not None:
+        matching.sequence.check(len(queries), model.map.places)
+    ranks = max(top, min(max(RANKS), model.map.places))
+    moved = centred(model.map, queries) if centring else queries
+    causal = queries if centring else None
+    run = Localization(model, reference, query, places, moved, NOTHING, None, tolerance, matching, causal)
+
+    def match(queries: Tensor, how: Matching) -> Match:
+        own = model.matching(how.sequence)._replace(also=how.also, k=ranks, radius=tolerance)
+        return model.localize_descriptors(queries, own, progress=progress)
+
+    found = run.match_by(match)
+    best = found.map(lambda column: column[:, 0])
+    return run._replace(match=best, judged=best), found
 
 
 def _other_contenders(
@@ -274,15 +316,23 @@ def _check_given_map(model: DejaVu, places: Tensor, name: str, tolerance: int) -
 
 
 def _match_distractors(
-    model: DejaVu, distractors: Sequence[Traverse], sequence: SequenceModel | None, progress: bool
+    model: DejaVu,
+    distractors: Sequence[Traverse],
+    sequence: SequenceModel | None,
+    centring: bool,
+    progress: bool,
 ) -> dict[str, Tensor]:
     """The probability of the match of each frame of other routes, (n,) by name."""
-    if distractors and not model.matching(sequence).platt:
+    whole = sequence if isinstance(sequence, PlaceSmoother) else None
+    if distractors and not (whole or model.matching(sequence).platt):
         log.warning("the map is not calibrated, so no frame of other routes has a probability")
         return {}
     probabilities = {}
     for other in distractors:
-        match = model.localize_descriptors(model.descriptor.all_of(other, progress), sequence)
+        queries = model.descriptor.all_of(other, progress)
+        if centring and (sequence is None or whole):
+            queries = centred(model.map, queries)
+        match = model.localize_descriptors(queries, copy.deepcopy(whole) if whole else sequence)
         assert match.probability is not None
         probabilities[other.name] = match.probability
     return probabilities
@@ -314,8 +364,9 @@ def _map_facts(summary: MapSummary, features: Tensor) -> dict[str, Any]:
 def _run_facts(run: Localization, seconds: Seconds) -> dict[str, Any]:
     """The entries of report.json about the run; no seconds to learn if the map is given."""
     model, reference, query = run.model, run.reference, run.query
-    acceptance = model.acceptance(run.sequence)
+    acceptance = model.acceptance(run.smoother or run.sequence)
     facts = {
+        "answers": run.answers,
         "seconds_learn": seconds["learn"],
         "seconds_localize": seconds["localize"],
         "l1_backend": l1_backend(),
@@ -329,6 +380,11 @@ def _run_facts(run: Localization, seconds: Seconds) -> dict[str, Any]:
         "reference": reference.name,
         "query": query.name,
     }
+    if run.smoother is not None:
+        facts["drive"] = drive = run.smoother.settled()
+        if run.truth is not None:
+            block = math.ceil(run.smoother.correlation)
+            drive["auc_error"] = auc_error(run.scored, run.truth, run.tolerance, block)
     if isinstance(reference, ResampledTraverse):
         facts["resampling"] = {
             "step": reference.step,

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -46,7 +48,8 @@ class Contender(NamedTuple):
     """One way to store the route, with its scores (None without ground truth) and bytes (None for a null).
 
     k: the stride, if every k-th frame is stored. fixed: the part of the bytes that does not grow with the
-    route. sequences: scores of sequences of T queries, by T, and of a filter; may be empty.
+    route. sequences: scores of sequences of T queries, by T, of a filter and of a smoother; may be empty.
+    auc_by_confidence: area if answers are sorted by their confidence instead of their score.
     """
 
     name: str
@@ -56,6 +59,7 @@ class Contender(NamedTuple):
     curve: PRCurve | None = None
     fixed: int = 0
     sequences: Mapping[Together, Scores] = MappingProxyType({})
+    auc_by_confidence: float | None = None
 
     @property
     def by_length(self) -> Mapping[Together, Scores]:
@@ -78,7 +82,7 @@ class Contender(NamedTuple):
         """The nested entry of report.json."""
         scores = self.scores._asdict() if self.scores else dict.fromkeys(Scores._fields)
         extra: dict[str, Any] = {"bytes": self.bytes, "route_bytes": self.route_bytes, "k": self.k}
-        extra["curve_starts_at_recall"] = self.starts
+        extra |= {"curve_starts_at_recall": self.starts, "auc_by_confidence": self.auc_by_confidence}
         if self.sequences:
             extra["sequences"] = sequences_as_json(self.sequences)
         return scores | {name: value for name, value in extra.items() if value is not None}
@@ -102,7 +106,11 @@ def contend(
     if truth is None or not counted(match.index, as_ground_truth(truth), tolerance).any():
         return Contender(name, None, bytes, k, fixed=fixed)
     scores, curve = evaluate(match, truth, tolerance), curve_of(match, truth, tolerance)
-    return Contender(name, scores, bytes, k, curve, fixed, evaluate_each(match.sequences, truth, tolerance))
+    sequences, by_confidence = evaluate_each(match.sequences, truth, tolerance), None
+    if match.confidence is not None:
+        sure = replace(match, score=(-match.confidence).masked_fill(match.index < 0, math.inf))
+        by_confidence = evaluate(sure, truth, tolerance).auc
+    return Contender(name, scores, bytes, k, curve, fixed, sequences, by_confidence)
 
 
 def evaluate_each(

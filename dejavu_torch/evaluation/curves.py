@@ -138,6 +138,26 @@ def curve_of(
     return pr_curve(match.score, right, answerable, recall)
 
 
+def auc_error(match: Match, truth: Truth, tolerance: int, block: int, draws: int = 100) -> float:
+    """Standard error of the area, by drawing blocks of consecutive queries with replacement (bootstrap).
+
+    Args:
+        block: queries that depend on each other, so that n of them say as much as n / block.
+
+    Returns:
+        A number of at least 0; 0 for fewer than two blocks.
+    """
+    match, right, answerable = _judged(match, truth, tolerance)
+    blocks = torch.arange(len(right)).split(block)
+    generator, areas = torch.Generator().manual_seed(0), []
+    for _ in range(draws if len(blocks) > 1 else 0):
+        drawn = torch.randint(len(blocks), (len(blocks),), generator=generator).tolist()
+        chosen = torch.cat([blocks[i] for i in drawn])
+        if answerable[chosen].any():
+            areas.append(area(pr_curve(match.score[chosen], right[chosen], answerable[chosen])))
+    return float(torch.tensor(areas).std()) if len(areas) > 1 else 0.0
+
+
 def evaluate(match: Match, truth: Truth, tolerance: int) -> Scores:
     """All scores of matches against a truth.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -12,15 +14,22 @@ from dejavu_torch.data.positions import unit_of
 from dejavu_torch.evaluation.contenders import Contender, contend
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.resampling import ResampledTraverse
+from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.localizer import SINGLE, Matching
+from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.types import Match, SequenceModel, Traverse
+
+NOTHING = Match(torch.zeros(0, dtype=torch.int64), torch.zeros(0), torch.zeros(0, dtype=torch.bool))
 
 
 class Localization(NamedTuple):
     """A map, its reference traverse, a query traverse, and the matches.
 
     reference_features (N,D) and query_features (Q,D) may lie in a file. truth: None if unknown.
-    tolerance: in places, inclusive. matching: for the map and all baselines.
+    tolerance: in places, inclusive. matching: for the map and all baselines. causal_features: the queries
+    for sequences and filters, if query_features are centred, which takes all of them. match: the answers.
+    judged: the matches that the scores at top level judge, with those of other models. smoother: of the
+    answers, if they are those of the whole drive.
 
     Convention 11: match and truth count places and queries, pictures show frames of the sources.
     """
@@ -34,6 +43,9 @@ class Localization(NamedTuple):
     truth: GroundTruth | None
     tolerance: int
     matching: Matching = SINGLE
+    causal_features: Tensor | None = None
+    judged: Match = NOTHING
+    smoother: PlaceSmoother | None = None
 
     def __repr__(self) -> str:
         return f"{self.query.name} on {self.reference.name}"
@@ -42,6 +54,24 @@ class Localization(NamedTuple):
     def sequence(self) -> SequenceModel | None:
         """The model that scores consecutive queries together, if any."""
         return self.matching.sequence
+
+    def match_by(self, match: Callable[[Tensor, Matching], Match]) -> Match:
+        """The matches of a function of queries and matching, with those of all models in `sequences`."""
+        matching, causal = self.matching, self.causal_features
+        if causal is None or not (matching.also or matching.sequence):
+            return match(self.query_features, matching)
+        single = matching.sequence is None
+        found = match(causal, matching._replace(smoother=None))
+        whole = match(self.query_features, matching._replace(sequence=None, also={}))
+        return replace(whole if single else found, sequences={**found.sequences, **whole.sequences})
+
+    @property
+    def answers(self) -> str:
+        """How the answers were found: drive, filter, sequence or single."""
+        if self.smoother is not None:
+            return "drive" if self.smoother.is_drive else "single"
+        together = isinstance(self.sequence, PlaceFilter)
+        return "filter" if together else "single" if self.sequence is None else "sequence"
 
     @property
     def scored(self) -> Match:

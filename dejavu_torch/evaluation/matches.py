@@ -1,4 +1,4 @@
-"""Matches as a csv of query,place,score,accepted[,probability][,rank][,route],query_name,place_name."""
+"""Matches as a csv: query,place,score,accepted[,probability][,confidence][,rank][,route], and two names."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def write_matches(
     starts = list(itertools.accumulate((route.frames for route in routes), initial=0))
     matches = iter(matches)
     start = next(matches, None)
-    known = start is not None and start.probability is not None
+    known = [name for name in ("probability", "confidence") if start is not None and name in start.columns]
     with ExitStack() as stack:
 
         def opened(path: Path) -> TextIO:
@@ -84,8 +84,8 @@ def write_matches(
             return stack.enter_context(temporary.open("w", newline="", encoding="utf-8"))
 
         file, paired = opened(path), None if pairs is None else opened(pairs)
-        optional = {"probability": known, "rank": ranks is not None, "route": bool(routes)}
-        columns = [*NUMBERS, *(name for name, given in optional.items() if given), *NAMES]
+        others = ["rank"] * (ranks is not None) + ["route"] * bool(routes)
+        columns = [*NUMBERS, *known, *others, *NAMES]
         writer = csv.DictWriter(file, columns, extrasaction="ignore")
         writer.writeheader()
         for match in () if start is None else itertools.chain([start], matches):
@@ -94,16 +94,28 @@ def write_matches(
             queries = torch.arange(first, total) if query_frames is None else query_frames[first:total]
             places = match.index if frame_of is None else frame_of(match.index)
             rank = torch.arange(each).repeat(len(queries)) + 1
-            right = match.score if match.probability is None else match.probability
+            right, sure = (match.columns.get(name, match.score) for name in ("probability", "confidence"))
             route = match.route if routes and match.route is not None else torch.full_like(places, -1)
-            cells = queries.repeat_interleave(each), places, match.score, match.accepted, right, rank, route
-            for query, place, score, good, p, at, on in zip(*(one.tolist() for one in cells), strict=True):
+            cells = (
+                queries.repeat_interleave(each),
+                places,
+                match.score,
+                match.accepted,
+                right,
+                sure,
+                rank,
+                route,
+            )
+            for query, place, score, good, p, margin, at, on in zip(
+                *(one.tolist() for one in cells), strict=True
+            ):
                 row = {
                     "query": query,
                     "place": place - starts[on] if on >= 0 else place,
                     "score": f"{score:.{digits}g}",
                     "accepted": int(good),
                     "probability": "" if math.isnan(p) else f"{p:.6g}",
+                    "confidence": "" if math.isnan(margin) else f"{margin:.6g}",
                     "rank": at,
                     "route": printable(routes[on].name) if on >= 0 else "",
                     "query_name": _name(query_names, query),

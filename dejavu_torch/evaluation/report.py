@@ -22,6 +22,7 @@ from dejavu_torch.evaluation.prose import sentences, templates
 from dejavu_torch.evaluation.rejection import rejection_table
 from dejavu_torch.recognition.select import PROBABLE
 from dejavu_torch.text import printable
+from dejavu_torch.types import Together
 
 PICTURES = (
     *("frames", "pairs", "coverage", "scores", "pr", "auc", "storage", "sequences"),
@@ -34,6 +35,7 @@ HEADING = 11  # letters in a line of a heading
 SIZES = (1.0, 5.0)  # route bytes per place at which the table also lists the map
 
 _MAIN = {"auc": "AUC", "recall_at_1": "recall@1", "recall_at_100_precision": "R@100P"}
+_WAYS: dict[Together, str] = {1: "AUC, one image", "filter": "as it drives", "smoother": "whole drive"}
 _MORE = {
     "precision_at_100_recall": "P@100R",
     "auc_reported": "AUC rep.",
@@ -77,11 +79,18 @@ def score_table(report: Report, every: bool = False) -> list[list[str]]:
     """The scores as rows of text, the header first, with bytes if the number of frames is known."""
     if not any(one.scores for one in report.shown().values()):
         return []
-    frames, columns = report.facts.get("frames"), _MAIN | (_MORE if every else {})
+    frames = report.facts.get("frames")
+    ways = _ways(report)  # of which "auc" is named by the first
+    columns = ways | {
+        field: name for field, name in (_MAIN | (_MORE if every else {})).items() if field not in ways
+    }
     sizes = [*(["bytes"] if every else []), "bytes per place", "route bytes per place"] if frames else []
     rows = [["", *columns.values(), *sizes]]
     for one in report.shown().values():
-        row = [one.name, *(f"{getattr(one.scores, field):.3f}" if one.scores else "" for field in columns)]
+        known = (one.scores._asdict() if one.scores else {}) | {
+            T: scores.auc for T, scores in one.by_length.items()
+        }
+        row = [one.name, *(f"{known[field]:.3f}" if field in known else "" for field in columns)]
         row[1] += "*" * is_late(one)
         if frames:
             size = ["", "", ""]
@@ -98,6 +107,16 @@ def score_table(report: Report, every: bool = False) -> list[list[str]]:
     return rows
 
 
+def _ways(report: Report) -> dict[Together | str, str]:
+    """The columns of the areas of single queries, a filter and a smoother; empty with only the first."""
+    found = {T for one in report.shown().values() for T in one.by_length}
+    ways: dict[Together | str, str] = {T: name for T, name in _WAYS.items() if T in found}
+    single = report.facts.get("sequence", 1) == 1 and not report.facts.get("filter")
+    if len(ways) < 2:
+        return {}
+    return {"auc": ways.pop(1), **ways} if single and 1 in ways else ways
+
+
 def _in_bytes(route: float) -> str:
     """The name of the map coded at another size."""
     return f"the map in {route:.2g} route byte{'s' * (round(route, 1) != 1)} per place"
@@ -109,13 +128,13 @@ def sequence_table(report: Report) -> list[list[str]]:
     for size in report.facts.get("storage", {}).get("map", ()):
         if "sequences" in size:
             found[_in_bytes(size["route_bytes_per_place"])] = size["sequences"]
-    keys = {key for one in found.values() for key in one}
-    lengths = [*sorted(keys - {"filter"}, key=int), *(keys & {"filter"})]
-    rows = [["AUC", *(key if key == "filter" else f"T = {key}" for key in lengths)]]
+    keys = {key for one in found.values() for key in one} - {"filter", "smoother"}  # in the table of scores
+    lengths = sorted(keys, key=int)
+    rows = [["AUC", *(f"T = {key}" for key in lengths)]]
     for name, one in found.items():
         areas = (one.get(key) for key in lengths)
         rows.append([name, *("" if scores is None else f"{scores['auc']:.3f}" for scores in areas)])
-    return rows if found else []
+    return rows if len(lengths) > 1 else []
 
 
 def is_late(contender: Contender) -> bool:

@@ -176,10 +176,11 @@ def draw_sequences(
                 drawn.insert(len(sizes), (name, nearest.sequences, style | mark))
                 sizes.append(size)
     figure, axis = canvas(3.6 + 1.1 * LINE * sum(len(wrap(name, LETTERS - 8)) for name, *_ in drawn))
-    lengths = sorted({T for _, found, _ in drawn for T in found if T != "filter"})
+    lengths = sorted({T for _, found, _ in drawn for T in found if isinstance(T, int)})
     at: dict[Together, float] = {T: T for T in lengths}
-    if any("filter" in found for _, found, _ in drawn):
-        at["filter"] = lengths[-1] + max(1, lengths[-1] / 4)
+    models: tuple[Together, ...] = "filter", "smoother"
+    for model in (one for one in models if any(one in found for _, found, _ in drawn)):
+        at[model] = max(at.values()) + max(1, lengths[-1] / 4)
     for name, found, style in reversed(drawn):  # the first on top
         areas = drawn_areas([scores.auc for scores in found.values()])
         style = {"marker": "o", "markersize": 4.5} | style

@@ -38,7 +38,10 @@ def coded_at_sizes(
     Raises:
         InputError: the map is not spectral, or there is no ground truth.
     """
-    run = run._replace(matching=SINGLE) if run.sequence is None else run  # without a filter for each size
+    # without a filter and a smoother for each size
+    matching = SINGLE if run.sequence is None else run.matching._replace(smoother=None)
+    queries = run.query_features if run.sequence is None else run.causal_features
+    run = run._replace(matching=matching, query_features=run.query_features if queries is None else queries)
     place_map = run.model.map
     if not isinstance(place_map, SpectralMap) or run.truth is None:
         truth = "no" if run.truth is None else "a"

@@ -13,7 +13,7 @@ from torch import Tensor
 from dejavu_torch.recognition.calibration import Platt, confidence_of
 from dejavu_torch.recognition.filter import near_scores
 from dejavu_torch.recognition.select import best_candidates
-from dejavu_torch.recognition.smoother import PlaceSmoother, Rows, near_mass
+from dejavu_torch.recognition.smoother import PlaceSmoother, Rows, near_mass, normalised
 from dejavu_torch.text import progress_of
 from dejavu_torch.types import Match
 
@@ -67,10 +67,12 @@ def localize_drive(
             match = pair if k <= pair.index.shape[1] else best_candidates(ranked, k, radius)
             match = match.map(lambda column: column[:, :k])
             at = match.index[:, :1].clamp(min=0)
-            probability = near_mass(mass, smoother.within).gather(1, at)[:, 0].double()
+            # in double precision, so that those near 1 differ
+            precise = normalised(smoother.folded(block.posterior.cpu().double()))[:, :-1]
+            probability = near_mass(precise, smoother.within).gather(1, at.cpu())[:, 0]
             if not smoother.is_drive and platt is not None:
-                probability = torch.minimum(probability.cpu(), platt.probability(confidence_of(scores)))
-            probability = probability.masked_fill(match.index[:, 0].to(probability.device) < 0, 0)
+                probability = torch.minimum(probability, platt.probability(confidence_of(scores)))
+            probability = probability.masked_fill(match.index[:, 0].cpu() < 0, 0)
             margin = pair.score[:, -1] - pair.score[:, 0]
             columns = margin, probability, scores.gather(1, at)[:, 0]
             parts.append(Shown(match.map(Tensor.cpu), *(column.cpu() for column in columns)))

@@ -154,6 +154,7 @@ class PlaceSmoother(SequenceModel):
         self.within, self.threshold = within, threshold
         self.links, self.loop = tuple(links), loop
         self.log_likelihood: float | None = None  # nats above being off the map throughout, as fitted
+        self.correlation = 1.0  # tau of these queries
         self.is_drive = True  # whether the queries that were fitted to are a drive of the map
         self.prior = moves
         self.register_buffer("values", torch.zeros(0), persistent=False)  # of the rank table
@@ -322,7 +323,7 @@ class PlaceSmoother(SequenceModel):
             self.values = RankTable().values
             return self
         spacing = spacing_of(descriptors)
-        self.tempering = tempering_of(spacing)
+        self.correlation, self.tempering = spacing.correlation, tempering_of(spacing)
         picked = stretches(len(descriptors), spacing.correlation)
         sample = scores(picked.flatten())
         weight, still = spacing.weight.to(sample), spacing.still.to(sample.device)
@@ -376,13 +377,27 @@ class PlaceSmoother(SequenceModel):
             rates = updated_rates(counts, prior * (MOVE_SHARE * n * length))
         return Fit(rates, separation, table.values, float(block.log.sum()), n * length)
 
-    def extra_repr(self) -> str:
-        moves = [round(move, 4) for move in self.move_logits.softmax(0).tolist()]
+    @torch.no_grad()
+    def settled(self) -> dict[str, Any]:
+        """What the smoother settled on, for a report."""
         _, jump, leave = self.rate_logits.softmax(0).tolist()
-        numbers = {"jump": jump, "leave": leave, "enter": float(self.enter_logit.sigmoid())}
-        numbers |= {"separation": self.separation, "tempering": self.tempering}
-        told = ", ".join(f"{name}={value:.3g}" for name, value in numbers.items())
-        return f"moves={moves}, {told}, within={self.within}"
+        return {
+            "is_drive": self.is_drive,
+            "log_likelihood": self.log_likelihood,
+            "moves": self.move_logits.softmax(0).tolist(),
+            "jump": jump,
+            "leave": leave,
+            "enter": float(self.enter_logit.sigmoid()),
+            "separation": self.separation,
+            "correlation": self.correlation,
+            "tempering": self.tempering,
+        }
+
+    def extra_repr(self) -> str:
+        known = self.settled()
+        moves = ", ".join(f"{move:.3g}" for move in known.pop("moves"))
+        told = ", ".join(f"{name}={value:.3g}" for name, value in known.items() if type(value) is float)
+        return f"moves=[{moves}], {told}, within={self.within}"
 
 
 class Drive(NamedTuple):
