@@ -18,7 +18,7 @@ from torch.nn.parameter import is_lazy
 from dejavu_torch import learning, model_file
 from dejavu_torch.data.source import Source, as_traverse
 from dejavu_torch.data.traverse import at_size, resize_like, size_like
-from dejavu_torch.features.descriptor import DESCRIPTOR_MEMORY, Descriptor, own_size
+from dejavu_torch.features.descriptor import Descriptor, own_size
 from dejavu_torch.features.extract import features_of
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import LabelledFrames
@@ -28,7 +28,6 @@ from dejavu_torch.maps.place_map import Mapper, PlaceMap
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.maps.weights import BITS, round_weights
-from dejavu_torch.memory import concatenate
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse, resampled, source_of
 from dejavu_torch.recognition.centring import PRIOR, centred
@@ -465,11 +464,10 @@ class DejaVu(nn.Module):
             check_queries(self, shape, features.shape[1], name)
             self.descriptor.warn_of_bright(frames, name)
 
-        batches = self.descriptor.batches(queries, progress, "localizing", on_first)
         if not (isinstance(sequence, PlaceSmoother) or centre):
-            yield from map(localizer, batches)
+            yield from map(localizer, self.descriptor.batches(queries, progress, "localizing", on_first))
             return
-        descriptors = concatenate(batches, DESCRIPTOR_MEMORY)
+        descriptors = self.descriptor.all_of(queries, progress, on_first)
         if centre or (centre is None and len(descriptors) >= PRIOR):
             descriptors = centred(self.map, descriptors)
         yield self.localize_descriptors(descriptors, matching, progress=progress)

@@ -252,8 +252,8 @@ def test_a_cluster_that_is_not_there_is_refused(tmp_path: Path, capsys: pytest.C
     chunked = (*command, "--mapper.chunk", "50")
     assert "--device" in fails(capsys, *chunked, "--cluster", "auto", "--device", "cuda")
     found = ("localize", "map.safetensors", "sim:aerial", "--out", tmp_path / "m.csv", "--cluster", "auto")
-    assert "--filter" in fails(capsys, *found, "--filter")
-    assert "--sequence 5" in fails(capsys, *found, "--sequence", "5")
+    assert "--match filter" in fails(capsys, *found, "--filter")
+    assert "--match sequence:5" in fails(capsys, *found, "--match", "sequence:5")
     assert "TemplateMapper" in fails(capsys, *command, "--config", "local_maxima", "--cluster", "auto")
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(sys.modules, "ray", None)

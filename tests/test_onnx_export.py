@@ -214,9 +214,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert "expected one of them" in fails(
         capsys, *words, tmp_path / "map.onnx", "--filter", "--sequence", "3"
     )
-    assert "fewer" in fails(
-        capsys, *words, tmp_path / "map.onnx", "--filter", "--moves", str([1 / 40] * 40).replace(" ", "")
-    )
+    assert "the whole drive" in fails(capsys, *words, tmp_path / "map.onnx", "--match", "drive")
     assert "none.safetensors" in fails(
         capsys, "export", tmp_path / "none.safetensors", "--onnx", tmp_path / "map.onnx"
     )

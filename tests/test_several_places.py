@@ -72,8 +72,8 @@ def test_localize_writes_a_row_for_each_candidate(
     run("localize", route, pair[1], "--out", tmp_path / "best.csv")
     run("localize", route, pair[1], "--out", tmp_path / "top.csv", "--top", "10")
     best, rows = rows_of(tmp_path / "best.csv"), rows_of(tmp_path / "top.csv")
-    columns = ["query", "place", "score", "accepted", "probability", "rank", "query_name", "place_name"]
-    assert list(rows[0]) == columns
+    columns = ["query", "place", "score", "accepted", "probability", "confidence", "rank"]
+    assert list(rows[0]) == [*columns, "query_name", "place_name"]
     assert {row["probability"] for row in rows if row["rank"] != "1"} == {""}
     assert [int(row["rank"]) for row in rows] == [*range(1, 11)] * 96
     assert [row | {"rank": "1"} for row in rows[::10]] == rows[::10]

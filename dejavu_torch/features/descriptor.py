@@ -114,9 +114,9 @@ class Descriptor(nn.Module):
         """
         return map(self.whitened, self.features_in(traverse, progress, verb, on_first))
 
-    def all_of(self, traverse: Traverse, progress: bool = False) -> Tensor:
+    def all_of(self, traverse: Traverse, progress: bool = False, on_first: OnFirst | None = None) -> Tensor:
         """Descriptors (N,K) of a whole traverse; many are kept in a temporary file, see `concatenate`."""
-        return concatenate(self.batches(traverse, progress, f"describing {traverse.name}"))
+        return concatenate(self.batches(traverse, progress, f"describing {traverse.name}", on_first))
 
     def learn(
         self,

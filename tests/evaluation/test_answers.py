@@ -35,7 +35,7 @@ def test_probable_answers_are_counted_and_told() -> None:
 
 def test_the_next_step_is_one_that_was_not_taken() -> None:
     first, second = next_steps(together=False, strict=False)
-    assert "--filter" in first
+    assert "--ordered" in first
     assert "--precision .9" in second
     assert next_steps(together=True, strict=False) == [second]
     assert next_steps(together=True, strict=True) == []

@@ -173,7 +173,7 @@ def test_the_page_begins_with_plain_words() -> None:
 STEPS: list[tuple[dict[str, Any], float | None, str, list[str]]] = [  # facts, recall@1, verdict, steps
     ({"kind": "spectral"}, 0.95, "Yes: 19 of 20 queries", ["localize"]),
     ({"with_answer": 10}, 0.6, "Partly: 6 of 10 queries that have a right place", []),
-    ({"kind": "templates"}, 0.2, "No: 4 of 20", ["--filter", "--second", "localize"]),
+    ({"kind": "templates"}, 0.2, "No: 4 of 20", ["--ordered", "--second", "localize"]),
     ({"kind": "spectral", "filter": True, "trained": {"steps": 1}}, 0.2, "No: ", ["localize"]),
     ({"with_answer": 0}, 0.0, "No query has a right place", []),
     (
@@ -192,12 +192,12 @@ STEPS: list[tuple[dict[str, Any], float | None, str, list[str]]] = [  # facts, r
         {"least_probability": 0.5, "accepted": 20, "accepted_right": 5, "filter": True},
         *(0.2, "Of 20 accepted answers 5", []),
     ),
-    ({"probably_right": {"0.9": 18, "0.5": 19}}, None, "Probably: ", ["--filter", "--precision", "--truth"]),
+    ({"probably_right": {"0.9": 18, "0.5": 19}}, None, "Probably: ", ["--ordered", "--precision", "--truth"]),
     (
         {"probably_right": {"0.9": 0, "0.5": 1}},
         None,
         "Probably not: ",
-        ["--filter", "--precision", "--truth"],
+        ["--ordered", "--precision", "--truth"],
     ),
     ({}, None, "neither a ground truth", ["--truth 12"]),
 ]
@@ -215,12 +215,15 @@ def test_whether_it_worked_and_what_to_do_next(
     assert [word for word, step in zip(after, found, strict=True) if word not in step] == []
 
 
-def test_the_next_step_is_a_filter_or_more_bytes_if_these_find_more() -> None:
-    ours = Contender("this map", SCORES, 4000, sequences={"filter": SCORES._replace(recall_at_1=0.875)})
+def test_the_next_step_is_the_whole_drive_or_more_bytes_if_these_find_more() -> None:
+    ours = Contender("this map", SCORES, 4000, sequences={"smoother": SCORES._replace(recall_at_1=0.8)})
     floats = Contender("all frames", SCORES._replace(recall_at_1=0.9), 64000, 1)
     one = report({"kind": "spectral"}, uncompressed=floats)._replace(ours=ours)
     found = " ".join(steps(one)).replace("\xa0", " ")
-    assert "87.5 % of these queries are found" in found
+    assert "add `--ordered`" in found
+    drive = one._replace(facts=one.facts | {"answers": "drive", "drive": {"is_drive": True}})
+    assert "--ordered" not in " ".join(steps(drive))
+    assert "Partly: 16 of 20" in verdict(drive)
     assert "--mapper.hold .95`: the" in found
     # what --map would refuse
     given = " ".join(steps(one._replace(facts=one.facts | {"seconds_learn": 0.0})))

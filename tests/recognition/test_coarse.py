@@ -181,12 +181,14 @@ def test_a_searcher_of_the_user_finds_the_places_until_the_map_is_another() -> N
 
     def own(queries: Tensor, wanted: list[NmsSpec]) -> TopK:
         asked.append(wanted)
-        return torch.zeros(len(queries), 1), torch.full((len(queries), 1), 7)
+        return torch.tensor([[0.0, 1.0]]).expand(len(queries), 2), torch.tensor([[7, 99]]).expand(
+            len(queries), 2
+        )
 
     model.searcher = own
     queries = queries_of(700, noise=0.0)[:5]
     assert model.localize(queries).index.tolist() == [7] * 5
-    assert asked == [[(1, 5)]]
+    assert asked == [[(1, 5), (2, 5)]]  # the second best is for the confidence
     for search in ("scan", "exact"):
         assert model.localize(queries, search=search).index.tolist() == [0, 13, 26, 39, 52]  # type: ignore[arg-type]
     model.load_state_dict(model.state_dict())
