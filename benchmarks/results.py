@@ -83,9 +83,10 @@ SECOND = "railway, second half"
 WAYS = {  # options of `dejavu compare`; {default} and {visits} are folders of maps
     "default": "--storage_curve",
     "HOG": "--features HOG --calibration none",
-    "filter": "--map {default}/{footage}/map.safetensors --filter",
-    "sequence": "--map {default}/{footage}/map.safetensors --sequence 21",
-    "visits": "--whitening {visits}/first.safetensors --sequence 21 --storage_curve",
+    "drive": "--map {default}/{footage}/map.safetensors --ordered",
+    "filter": "--map {default}/{footage}/map.safetensors --match filter",
+    "sequence": "--map {default}/{footage}/map.safetensors --match sequence:21",
+    "visits": "--whitening {visits}/first.safetensors --match sequence:21 --storage_curve",
 }
 VISITS = (
     "learn {data}/nordland/summer?stop=900 --second {data}/nordland/winter?stop=900 "
@@ -111,7 +112,7 @@ def runs(ways: Sequence[str]) -> Iterator[Run]:
                 continue
             words = ["compare", one.reference, one.query, *shlex.split(one.words), *shlex.split(WAYS[way])]
             words = [word.replace("{footage}", slug(name)) for word in words]
-            if way in ("default", "filter") and one.distractors:
+            if way in ("default", "drive", "filter") and one.distractors:
                 words += ["--distractors", one.distractors]
             yield Run(name, way, words)
 
@@ -125,6 +126,7 @@ def kept(report: dict[str, Any]) -> Row:
     """The figures of a report for the map, its curve, and everything it is compared with."""
     figures = ("auc", "recall_at_1", "recall_at_100_precision", "route_bytes", "bytes", "sequences")
     own = ("frames", "fixed_bytes", "route_bytes_per_place", "noise_over_map", "storage", "rejection")
+    own += ("answers", "drive", "accepted", "accepted_right", "with_answer")
     rivals = {
         name: of for name, of in report.items() if isinstance(of, dict) and "auc" in of and name not in own
     }
@@ -149,7 +151,8 @@ def run_results(
     Args:
         data: folder of the footage, as for the tests
         out: folder for bench.json and the reports, which later runs reuse
-        ways: names of ways to run; all if not given. "filter" and "sequence" use the maps of "default"
+        ways: names of ways to run; all if not given. "drive", "filter" and "sequence" use the maps of
+            "default"
         footage: names of footage; all if not given. Other rows of bench.json are kept
         jobs: commands that run in parallel, with one thread each
 

@@ -175,6 +175,26 @@ def filtered() -> str:
     return rejection("filter")
 
 
+def drives() -> str:
+    """The AUC of one image, of a filter and of the whole drive, for the map, its null, and HOG."""
+    ways = {"one image": None, "as it drives": "filter", "whole drive": "smoother"}
+    table = [["AUC of map, null, HOG", *ways, "error", "p >= .9, right of these"]]
+    for name, row in reports("drive").items():
+        each = [row, row["null"], row["hog"]]
+        cells = [
+            ", ".join(area(of["auc"] if key is None else of["sequences"][key]["auc"]) for of in each)
+            for key in ways.values()
+        ]
+        sure = {one["asked"]: one["precision"] for one in row["rejection"]["precision"]}
+        error = area(row["drive"].get("auc_error")) if row["answers"] == "drive" else "no drive"
+        table.append([name, *cells, error, area(sure[0.9])])
+    return markdown(table)
+
+
+def driven() -> str:
+    return rejection("drive")
+
+
 def storage(name: str) -> str:
     """The best AUC of each kind of code on a route, by bytes."""
     rows = read(f"storage {name}")["rows"]
@@ -219,7 +239,8 @@ def trainings() -> str:
 
 TABLES: dict[str, Callable[[], str]] = {
     **{"routes": routes, "sizes": sizes, "descriptors": descriptors, "sequences": sequences},
-    **{"rejection": rejection, "filtered": filtered, "trainings": trainings},
+    **{"rejection": rejection, "filtered": filtered, "drives": drives, "driven": driven},
+    "trainings": trainings,
     **{f"storage {name}": partial(storage, name) for name in ("aerial", "road1", "road2", "city", "railway")},
 }
 

@@ -23,6 +23,7 @@ Supportive Feature Frequencies" (IROS 2017). From the paper's sections to the co
     V      (ours) with baselines and nulls       compare             evaluation.compare
     VI     (ours) several consecutive queries    SequenceMatcher     recognition.sequence
     VI     (ours) probabilities along the way    PlaceFilter         recognition.filter
+    VI     (ours) given the whole drive          PlaceSmoother       recognition.smoother
     VI     (ours) frames from a camera           LiveLocalizer       live.localizer
     VI     (ours) features trained to repeat     PlaceRecognitionTask training.task
            frames to train on                    RouteData           training.datamodule
@@ -62,6 +63,7 @@ if TYPE_CHECKING:
     from dejavu_torch.recognition.filter import PlaceFilter as PlaceFilter
     from dejavu_torch.recognition.select import best_match as best_match
     from dejavu_torch.recognition.sequence import SequenceMatcher as SequenceMatcher
+    from dejavu_torch.recognition.smoother import PlaceSmoother as PlaceSmoother
     from dejavu_torch.training.datamodule import RouteData as RouteData
     from dejavu_torch.training.task import PlaceRecognitionTask as PlaceRecognitionTask
     from dejavu_torch.types import FrequencyLayer as FrequencyLayer
@@ -91,6 +93,7 @@ _NAMES = {
     "recognition.filter": "PlaceFilter",
     "recognition.select": "best_match",
     "recognition.sequence": "SequenceMatcher",
+    "recognition.smoother": "PlaceSmoother",
     "training.datamodule": "RouteData",
     "training.task": "PlaceRecognitionTask",
     "types": "FrequencyLayer InputError Match Traverse",

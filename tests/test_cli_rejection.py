@@ -76,10 +76,12 @@ def test_no_calibration_where_none_is_wanted_or_can_be(
     path = tmp_path / "map.safetensors"
     run("learn", ROUTE, "--map", path, "--calibration", "none")
     assert DejaVu.load(path).calibration is None
-    run("compare", ROUTE, AGAIN, "--calibration", "none", "--out", tmp_path / "out")
+    single = "--match", "single"
+    run("compare", ROUTE, AGAIN, "--calibration", "none", *single, "--out", tmp_path / "out")
     assert "rejection" not in report_of(tmp_path / "out")
-    error = fails(capsys, "localize", path, AGAIN, "--precision", ".9", "--out", tmp_path / "m.csv")
+    error = fails(capsys, "localize", path, AGAIN, *single, "--precision", ".9", "--out", tmp_path / "m.csv")
     assert "the map is not calibrated" in error
+    run("localize", path, AGAIN, "--precision", ".9", "--out", tmp_path / "m.csv")  # by the whole drive
     np.save(tmp_path / "features.npy", np.random.default_rng(0).random((64, 8), np.float32))
     error = fails(
         capsys, "learn", tmp_path / "features.npy", "--map", tmp_path / "n.safetensors", "--precision", ".9"
@@ -91,15 +93,22 @@ def test_no_calibration_where_none_is_wanted_or_can_be(
 @pytest.mark.parametrize(
     ("line", "told"),
     [
-        ("localize m a --out c --sequence 5 --precision .9", ("--sequence 5", "--precision 0.9")),
+        ("localize m a --out c --sequence 5 --precision .9", ("--match sequence:5", "--precision 0.9")),
         ("localize m a --out c --threshold 1 --precision .9", ("--threshold 1", "--precision 0.9")),
-        ("localize m a --out c --moves [1]", ("--moves [1.0]", "--filter")),
-        ("localize m a --out c --speeds [2]", ("--speeds [2.0]", "--sequence")),
-        ("compare a b --out c --filter --speeds [2]", ("--speeds [2.0]", "--sequence")),
-        ("live m a --speeds [2]", ("--speeds [2.0]", "--sequence")),
+        ("localize m a --out c --match sequence:1.5", ("--match sequence:1.5", "drive, filter, single")),
+        ("localize m a --out c --match smooth", ("--match smooth", "drive, filter, single")),
+        ("localize m a --out c --match drive --filter", ("--filter", "--match drive")),
+        ("localize m a --out c --match drive --unordered", ("--unordered", "--match")),
+        ("compare a b --out c --match filter --centre mean", ("--centre mean", "--match drive")),
+        ("localize m a --out c --speeds [2]", ("--speeds [2.0]", "--match sequence:T")),
+        ("compare a b --out c --filter --speeds [2]", ("--speeds [2.0]", "--match sequence:T")),
+        ("live m a --speeds [2]", ("--speeds [2.0]", "--match sequence:T")),
         ("localize m a --out c --precision 1", ("precision is 1", "below 1")),
         ("live m a --sequence 5 --filter", ("--sequence 5", "--filter")),
-        ("compare a b --out c --sequence 5 --distractors sim:outdoor", ("--sequence 5", "--distractors")),
+        (
+            "compare a b --out c --sequence 5 --distractors sim:outdoor",
+            ("--match sequence:5", "--distractors"),
+        ),
     ],
 )
 def test_options_that_exclude_each_other_are_told_before_anything_is_read(

@@ -351,7 +351,7 @@ def run_compare(
         acceptance.of(model)
     searching.of(model.to(where))
     first, queries = open_source(reference), open_source(query)
-    if isinstance(matcher, str) and acceptance.threshold is not None:
+    if isinstance(matcher, str):
         in_order, within = queries.ordered if ordered is None else ordered, max(0, judging.tolerance)
         matcher = PlaceSmoother(within=within, threshold=acceptance.threshold) if in_order else None
     if isinstance(matcher, PlaceFilter | PlaceSmoother) and acceptance.threshold is not None:
@@ -360,7 +360,8 @@ def run_compare(
     _check_report_folder(out, COMPARED, [reference, query, *seconds], [judging.truth, *learning.files])
     others = [open_source(one) for one in (*seconds, learning.calibration) if one not in options.UNREAD]
     distractors = judging.off_map([first, queries, *others])
-    learning.check_calibrated(model, first, map, judging.distractors)
+    if not isinstance(matcher, PlaceSmoother):  # which has probabilities of its own
+        learning.check_calibrated(model, first, map, judging.distractors)
     learning.seed_whitening(model)
     first, views, known = learning.with_views(model, first, queries)
     result = compare(

@@ -214,8 +214,8 @@ class Acceptance:
         check_precision(self.precision)
         for name, value in (("--precision", self.precision), ("--distractors", distractors)):
             if value and isinstance(sequence, SequenceMatcher):
-                seen = f"--sequence {sequence.length} and {name} {value}"
-                why = "only single queries and a filter have probabilities"
+                seen = f"--match sequence:{sequence.length} and {name} {value}"
+                why = "a sequence has no probabilities"
                 raise InputError(f"{seen}: {why}; expected one of the two options")
 
     def of(self, model: DejaVu) -> None:

@@ -416,14 +416,14 @@ learn strip:in/strip.png?width=16 --map out/m.safetensors --features PatchPixels
 localize in/spectral.safetensors in/query.npy --out out/matches.csv
 localize in/templates.safetensors in/query.npy --out out/m.csv --top 3 --threshold .4
 localize in/named.safetensors in/query.npy --out out/m.csv --sequence=3 --speeds [.8,1]
-localize in/learned.safetensors in/query.npy --out m.csv --filter --moves [.2,.6,.2]
+localize in/learned.safetensors in/query.npy --out m.csv --match filter
 localize in/plain.safetensors in/features.npy --out out/m.csv --as_is
 localize in/spectral.safetensors in/query.npy --out out/m.csv --precision .5 --device cpu
 learn in/frames.npy --map out/m.safetensors --calibration in/query.npy --calibration_truth 0 --precision .9
 live in/spectral.safetensors in/frames.npy --timeout .2 --precision .5
 live in/spectral.safetensors in/clip.mp4?stop=5 --realtime --page 0 --reference in/frames.npy --timeout .2
 live in/named.safetensors in/fifo.mp4 --timeout .2 --sequence 2 --threshold 3
-live in/resampled.safetensors in/frames.npy --as_is --moves [.2,.6,.2] --timeout .2
+live in/resampled.safetensors in/frames.npy --as_is --match filter --timeout .2
 export in/spectral.safetensors --onnx out/m.onnx --filter
 export in/learned.safetensors --onnx out/m.onnx --sequence 3 --speeds [1] --threshold .4
 info in/chunked.safetensors
@@ -463,7 +463,7 @@ in/empty in/a_file in out missing utm:25 in/last.ckpt in/fifo.csv in/fifo.npy in
 --onnx in/spectral.safetensors
 /dev/video99 /dev/null rtsp://127.0.0.1:1/x in/fifo.mp4
 --seed -1 --seed 1180591620717411303424 --batch_size 0
---top 999 --sequence 999 --sequence=3 --filter --speeds [nan] --moves [0,0] --out in/a_file --out out/no/m.csv
+--top 999 --sequence 999 --sequence=3 --filter --speeds [nan] --match drive --out in/a_file --out out/no/m.csv
 --map in/spectral.safetensors --map in/fifo.safetensors --truth in/fifo.npz --out in/empty
 --out in/query.npy --out in/spectral.safetensors --out in/truth.csv --out in
 """
