@@ -19,7 +19,7 @@ Supportive Feature Frequencies" (IROS 2017). From the paper's sections to the co
     IV-B   velocity from the ground              GroundOdometry      motion.odometry, motion.resampling
     IV-A   (ours) channel, local contrast        Preprocess          features.preprocess
            (ours) few, distinctive dimensions    Whitening           features.whitening
-    IV-C   precision, recall, area               pr_curve, evaluate  evaluation.curves
+    IV-C   precision, recall, area               evaluate            evaluation.curves
     V      (ours) with baselines and nulls       compare             evaluation.compare
     VI     (ours) several consecutive queries    SequenceMatcher     recognition.sequence
     VI     (ours) probabilities along the way    PlaceFilter         recognition.filter
@@ -42,7 +42,6 @@ if TYPE_CHECKING:
     from dejavu_torch.data.source import open_source as open_source
     from dejavu_torch.evaluation.compare import compare as compare
     from dejavu_torch.evaluation.curves import evaluate as evaluate
-    from dejavu_torch.evaluation.curves import pr_curve as pr_curve
     from dejavu_torch.features.embedding import Embedding as Embedding
     from dejavu_torch.features.hog import HOG as HOG
     from dejavu_torch.features.hog import hog as hog
@@ -75,7 +74,7 @@ if TYPE_CHECKING:
 _NAMES = {
     "data.source": "open_source",
     "evaluation.compare": "compare",
-    "evaluation.curves": "evaluate pr_curve",
+    "evaluation.curves": "evaluate",
     "features.embedding": "Embedding",
     "features.hog": "HOG hog",
     "features.preprocess": "Preprocess",

@@ -41,8 +41,8 @@ def test_localize_writes_one_row_a_query_as_python_finds_them(small_map: Path, t
     rows = list(csv.DictReader((tmp_path / "m.csv").open()))
     model = DejaVu.load(small_map)
     match = model.localize(open_source(QUERY))
-    columns = ["query", "place", "score", "accepted", "probability", "query_name", "place_name"]
-    assert list(rows[0]) == columns
+    columns = ["query", "place", "score", "accepted", "probability", "confidence"]
+    assert list(rows[0]) == [*columns, "query_name", "place_name"]
     assert [int(row["query"]) for row in rows] == list(range(96))
     assert match.probability is not None
     assert [float(row["probability"]) for row in rows] == pytest.approx(match.probability.tolist(), abs=1e-4)
@@ -61,18 +61,20 @@ def test_convention_4_threshold_option_then_map_then_probability_then_all(
     run("localize", small_map, QUERY, "--out", out)
     assert "default for this way of matching: accepted if the probability is" in capsys.readouterr().out
     assert accepted() == sum(float(row["probability"]) >= 0.5 for row in csv.DictReader(out.open()))
-    run("localize", small_map, "sim:aerial?frames=96&seed=9", "--out", out)  # another road
-    assert accepted() == sum(float(row["probability"]) >= 0.5 for row in csv.DictReader(out.open())) < 96
+    run("localize", small_map, "sim:outdoor?stop=96", "--out", out)  # another route
+    assert "no drive of this map" in capsys.readouterr().out
+    assert accepted() == sum(float(row["probability"]) >= 0.5 for row in csv.DictReader(out.open())) == 0
     run("localize", small_map, QUERY, "--sequence", 5, "--out", out)  # which has no probabilities
     assert "every query with a finite score" in capsys.readouterr().out
     assert accepted() == 96
-    run("localize", small_map, QUERY, "--threshold", ".inf", "--out", out)
+    single = "--match", "single"
+    run("localize", small_map, QUERY, *single, "--threshold", ".inf", "--out", out)
     assert "default for this way" not in capsys.readouterr().out
     assert accepted() == 96
     score = sorted(float(row["score"]) for row in csv.DictReader(out.open()))[40]
     run("learn", SMALL, "--map", route, "--threshold", str(score))
     capsys.readouterr()
-    run("localize", route, QUERY, "--out", out)
+    run("localize", route, QUERY, *single, "--out", out)
     assert "default for this way" not in capsys.readouterr().out
     assert 35 <= accepted() <= 41
     run("localize", route, QUERY, "--out", out, "--threshold", "0")

@@ -94,10 +94,11 @@ def test_merged_routes_are_listed_and_matches_name_them(
         size = model.map.part(name).summary().route_bytes  # type: ignore[operator]
         assert f"route {name}: places {first}-{last}, {size} bytes" in told
     query = "sim:aerial?frames=96&seed=1&traverse=1"
-    run("localize", merged, query, "--out", tmp_path / "m.csv")
+    run("localize", merged, query, "--match", "single", "--out", tmp_path / "m.csv")
     assert "--route ROUTE" in capsys.readouterr().out
     rows = rows_of(tmp_path / "m.csv")
-    assert [*rows[0]] == ["query", "place", "score", "accepted", "route", "query_name", "place_name"]
+    columns = ["query", "place", "score", "accepted", "confidence", "route", "query_name", "place_name"]
+    assert [*rows[0]] == columns
     right = [row["route"] == "other" and abs(int(row["query"]) - int(row["place"])) <= 5 for row in rows]
     assert sum(right) > 48
     other = "--truth=0", "--route", "other", "--out", tmp_path / "e"
@@ -107,9 +108,9 @@ def test_merged_routes_are_listed_and_matches_name_them(
         assert report["accepted_right"] == sum(right)
         assert report["elsewhere"] == sum(row["route"] == "first" for row in rows)
         assert (report["route"], report["accepted"]) == ("other", 96)
-    run("localize", merged, query, "--out", tmp_path / "top.csv", "--top", "5")
+    run("localize", merged, query, "--match", "single", "--out", tmp_path / "top.csv", "--top", "5")
     top = rows_of(tmp_path / "top.csv")
-    assert [*top[0]][4:6] == ["rank", "route"]
+    assert [*top[0]][5:7] == ["rank", "route"]
     assert [row["route"] for row in top[::5]] == [row["route"] for row in rows]
     run("evaluate", tmp_path / "top.csv", *other)
     assert report_of(tmp_path / "e")["recall_at_5"] >= report["recall_at_1"]

@@ -127,8 +127,14 @@ def test_options_that_exclude_each_other_are_told_before_anything_is_read(
         (("--second", AGAIN), "itself; expected another traverse"),
         (("--distractors", AGAIN), "itself; expected another traverse"),
         (("--calibration_truth", "0"), "--calibration SOURCE"),
-        (("--precision", ".9", "--calibration", "none"), "a precision, 0.9, and --calibration none"),
-        (("--distractors", THIRD, "--calibration", "none"), "expected --calibration SOURCE"),
+        (
+            ("--match", "single", "--precision", ".9", "--calibration", "none"),
+            "a precision, 0.9, and --calibration none",
+        ),
+        (
+            ("--match", "single", "--distractors", THIRD, "--calibration", "none"),
+            "expected --calibration SOURCE",
+        ),
     ],
 )
 def test_traverses_that_do_not_serve(

@@ -62,13 +62,14 @@ def test_searches_of_localize(
     run("learn", ROUTE, "--map", path, "--mapper.chunk", "32", "--features", "HOG")
     found = []
     for search in ("scan", "exact", "auto"):
-        run("localize", path, SECOND, "--search", search, "--out", out)
+        run("localize", path, SECOND, "--match", "single", "--search", search, "--out", out)
         found.append(places(out))
     assert found[0] == found[1]
     assert sum(a == b for a, b in zip(found[0], found[2], strict=True)) > 90
     assert "scan" in fails(capsys, "localize", path, SECOND, "--search", "ivf", "--out", out)
     for memory, words in (("0", "search_memory 0"), ("1e-4", "expected at least")):
-        assert words in fails(capsys, "localize", path, SECOND, "--search_memory", memory, "--out", out)
+        single = "--match", "single", "--search_memory", memory
+        assert words in fails(capsys, "localize", path, SECOND, *single, "--out", out)
     run("info", path)
     assert "single queries: samples every" in capsys.readouterr().out
 

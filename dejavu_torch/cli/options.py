@@ -41,10 +41,8 @@ class Sequences:
     """How consecutive queries support each other.
 
     Args:
-        match: drive matches each query with all queries of the drive, before and after it; filter with those
-            before it; sequence:T with T - 1 before it, at constant speed; single by itself. If not given,
-            drive for frames in order, else single. Scores and --threshold of drive and filter are
-            -log(probability)
+        match: drive (each query with all others; default if in order), filter (with those before), sequence:T
+            (T together at constant speed) or single; the scores of the first two are -log(probability)
         speeds: speeds of a sequence in places per query, such as '[.8,1,1.25]'; 1 if not given
     """
 
@@ -111,8 +109,7 @@ class Ordering:
     Args:
         ordered: queries are in order, as in a video; needed for a .npy of frames
         unordered: queries are in no order: match each by itself
-        centre: mean removes from the queries what all of them have and the map has not, none does not. If
-            not given, mean for at least 50 queries in order; a filter and sequences never do
+        centre: mean removes what all queries have and the map has not; default for 50 or more in order
     """
 
     ordered: bool = False

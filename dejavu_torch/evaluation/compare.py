@@ -168,11 +168,12 @@ def compare(
         alike = PlaceSmoother(within=tolerance) if beside and len(query) > 1 else None
         matching = Matching(sequence, also, smoother=alike)
         centring = ordered and len(query) >= PRIOR if centre is None else centre
-        run, found = _localized(model, reference, query, places, matching, centring, tolerance, top, progress)
+        settings = matching, centring, smoother is not None, tolerance, top, progress
+        run, found = _localized(model, reference, query, places, *settings)
         whole = smoother or alike
         if whole is not None:
-            settings = model.matching(whole)._replace(k=found.index.shape[1], radius=tolerance)
-            drive = model.localize_descriptors(run.query_features, settings, progress=progress)
+            own = model.matching(whole)._replace(k=found.index.shape[1], radius=tolerance)
+            drive = model.localize_descriptors(run.query_features, own, progress=progress)
             best = drive.map(lambda column: column[:, 0])
             sequences = {**run.judged.sequences, "smoother": best}
             run = run._replace(judged=replace(run.judged, sequences=sequences))
@@ -257,6 +258,7 @@ def _localized(
     places: Tensor,
     matching: Matching,
     centring: bool,
+    drive: bool,
     tolerance: int,
     top: int,
     progress: bool,
@@ -272,7 +274,9 @@ def _localized(
     run = Localization(model, reference, query, places, moved, NOTHING, None, tolerance, matching, causal)
 
     def match(queries: Tensor, how: Matching) -> Match:
-        own = model.matching(how.sequence)._replace(also=how.also, k=ranks, radius=tolerance)
+        # whose acceptance is not asked for beside a drive
+        own = Matching(how.sequence) if drive else model.matching(how.sequence)
+        own = own._replace(also=how.also, k=ranks, radius=tolerance)
         return model.localize_descriptors(queries, own, progress=progress)
 
     found = run.match_by(match)
