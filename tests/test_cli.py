@@ -61,7 +61,8 @@ def test_convention_4_threshold_option_then_map_then_probability_then_all(
     run("localize", small_map, QUERY, "--out", out)
     assert "default for this way of matching: accepted if the probability is" in capsys.readouterr().out
     assert accepted() == sum(float(row["probability"]) >= 0.5 for row in csv.DictReader(out.open()))
-    run("localize", small_map, "sim:outdoor?stop=96", "--out", out)  # another route
+    np.save(tmp_path / "other.npy", np.random.default_rng(0).integers(0, 256, (96, 64, 64, 3), np.uint8))
+    run("localize", small_map, tmp_path / "other.npy", "--ordered", "--out", out)
     assert "no drive of this map" in capsys.readouterr().out
     assert accepted() == sum(float(row["probability"]) >= 0.5 for row in csv.DictReader(out.open())) == 0
     run("localize", small_map, QUERY, "--sequence", 5, "--out", out)  # which has no probabilities
