@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -279,7 +279,6 @@ def run_live(
     reference: str | None = None,
     realtime: bool = False,
     timeout: float = 10.0,
-    centre: Literal["mean", "none"] = "none",
     loading: options.Loading,
 ) -> None:
     """Find frames as they arrive: a line of JSON for each on stdout, a summary on stderr at the end.
@@ -296,7 +295,6 @@ def run_live(
         reference: what the map was learned from, a source as in `dejavu learn`, for the pictures of the page
         realtime: play a video in real time, and drop frames that arrive too fast
         timeout: seconds without a frame after which a camera, address or pipe has stalled
-        centre: mean removes from each frame what all so far have and the map has not
     """
     from dejavu_torch.cli.live import follow
     from dejavu_torch.data.camera import without_password
@@ -313,8 +311,7 @@ def run_live(
     searching.of(model)
     acceptance.of(model)
     model.matching(matcher)
-    title, centred = f"{without_password(source)} on {map}", centre == "mean"
-    follow(model, matcher, source, title, page, reference, realtime, timeout, centred)
+    follow(model, matcher, source, f"{without_password(source)} on {map}", page, reference, realtime, timeout)
 
 
 def run_compare(

@@ -44,8 +44,7 @@ class LiveLocalizer:
         model: with a map; frames are moved to its device.
         sequence: "filter" is a `PlaceFilter`; None matches each frame by itself.
         keep_scores: keep the scores of all places; otherwise single frames are searched as in `localize`.
-        centre: remove the mean of the frames so far from each, see `running`; off, since it gains on some
-            routes and loses on others.
+        centre: remove the mean of the frames so far from each, see `running`.
 
     Shape: a frame (H,W), (H,W,3) or (C,H,W), tensor or array, uint8 or float in [0, 1] -> `LiveMatch`.
 
