@@ -25,6 +25,7 @@ from dejavu_torch.maps.spectral_map import SpectralMap, scores_of
 from dejavu_torch.model import DejaVu, require_map
 from dejavu_torch.recognition.calibration import MARGIN
 from dejavu_torch.recognition.calibration import TOLERANCE as TOLERANCE_OF_MARGIN
+from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.text import one_line
 from dejavu_torch.types import InputError, SequenceModel
@@ -151,6 +152,9 @@ def export_onnx(model: DejaVu, path: str | Path, sequence: SequenceModel | None 
         raise InputError("the map does not know its frames; expected a map learned from a source")
     if sequence is not None:
         sequence.check(None, model.map.places)
+    if isinstance(sequence, PlaceFilter) and sequence.lag:
+        seen = f"a filter with a lag of {sequence.lag}"
+        raise InputError(f"{seen}; expected one without: an ONNX file answers each frame at once")
     size = 4 * model.map.places * model.map.dimension if isinstance(model.map, SpectralMap) else 0
     if size > MAX_BYTES:
         seen = f"{model.map.places} places of {model.map.dimension} dimensions need {size / 1e9:.1f} GB"

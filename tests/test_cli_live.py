@@ -22,7 +22,7 @@ from footage import REFERENCE, camera, footage
 from processes import PACKAGE, Forked
 from videos import H264, clip, piped
 
-from dejavu_torch import DejaVu, LiveLocalizer, SpectralMapper, Whitening, open_source
+from dejavu_torch import DejaVu, LiveLocalizer, PlaceFilter, SpectralMapper, Whitening, open_source
 from dejavu_torch.cli.commands import run_live
 from dejavu_torch.cli.parser import parse
 from dejavu_torch.live.localizer import LiveMatch
@@ -80,6 +80,38 @@ def test_a_line_a_frame_as_localize_finds_them(
     assert sum(abs(line["place"] - line["frame"]) <= 5 for line in found) > 50
 
 
+@pytest.mark.parametrize("lag", [10, 100])
+def test_with_a_lag_each_frame_has_its_line_later(
+    lag: int, folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    titles = []
+
+    def interrupted(seconds: float) -> None:
+        if seconds > 60:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(
+        Page, "show", lambda page, snapshot: titles.append((page.title, snapshot.frame.number))
+    )
+    monkeypatch.setattr("dejavu_torch.cli.live.time.sleep", interrupted)
+    run("live", folder / "map.safetensors", folder / "second.mkv", "--lag", lag, "--page", 0)
+    out, err = capsys.readouterr()
+    found = lines_of(out)
+    assert [line["frame"] for line in found] == [*range(64)]
+    assert [line["time"] for line in found] == pytest.approx([i / 25 for i in range(64)])
+    model = DejaVu.load(folder / "map.safetensors")
+    localizer = LiveLocalizer(model, PlaceFilter(lag=lag))
+    frames = open_source(folder / "second.mkv", model.frame_shape[1:])  # type: ignore[index,arg-type]
+    expected = [match for frame in frames for match in localizer.due(frame)] + localizer.finish()
+    assert [line["place"] for line in found] == [one.place for one in expected]
+    assert [line["posterior"] for line in found] == pytest.approx(
+        [one.posterior for one in expected], abs=1e-3
+    )
+    assert titles[-1][1] == 63
+    assert f"answers come {lag} frames later" in titles[-1][0]
+    assert "64 frames, 0 dropped" in err
+
+
 def test_a_pipe_is_brought_to_the_size_of_the_map(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -117,15 +149,15 @@ def test_what_was_found_is_kept_where_a_stream_fails(
 def test_frames_are_dropped_in_real_time_only(
     folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    call = LiveLocalizer.__call__
+    due = LiveLocalizer.due
     left_out = []
 
-    def slow(self: LiveLocalizer, frame: Any, dropped: int = 0) -> LiveMatch:
+    def slow(self: LiveLocalizer, frame: Any, dropped: int = 0) -> list[LiveMatch]:
         left_out.append(dropped)
         time.sleep(0.1)
-        return call(self, frame, dropped)
+        return due(self, frame, dropped)
 
-    monkeypatch.setattr(LiveLocalizer, "__call__", slow)
+    monkeypatch.setattr(LiveLocalizer, "due", slow)
     run("live", folder / "map.safetensors", folder / "second.mkv", "--realtime")
     out, err = capsys.readouterr()
     found = lines_of(out)
@@ -239,6 +271,12 @@ def test_a_page_of_a_file_plays_in_real_time_and_stays_until_ctrl_c(folder: Path
         ("sim:aerial?frames=20 --page 0 --reference sim:aerial?frames=20", "20 frames"),
         ("sim:aerial?frames=20 --page 99999", "65535"),
         ("/dev/video99 --timeout 0", "--timeout 0; expected seconds, above 0"),
+        ("sim:aerial?frames=20 --lag -1", "the lag is -1; expected a whole number"),
+        (
+            "sim:aerial?frames=20 --lag 5 --match single",
+            "--lag 5 with --match single; expected --match filter",
+        ),
+        ("sim:aerial?frames=20 --lag 5 --sequence 3", "--lag 5 with --match sequence:3"),
     ],
 )
 def test_mistakes_are_one_line(

@@ -218,6 +218,8 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert "none.safetensors" in fails(
         capsys, "export", tmp_path / "none.safetensors", "--onnx", tmp_path / "map.onnx"
     )
+    with refused("a lag of 3", "expected one without"):
+        export_onnx(model, tmp_path / "map.onnx", PlaceFilter(lag=3))
     assert (tmp_path / "map.onnx").read_bytes() == before
 
 

@@ -40,14 +40,17 @@ def follow(
 ) -> None:
     """Localize the frames of a source until it ends or Ctrl-C; see `run_live`.
 
-    Convention: with a page, a file plays in real time, and the page stays until Ctrl-C.
+    Convention: with a page, a file plays in real time, and the page stays until Ctrl-C. With a lag, frames
+        that wait for their answers get them at the end of the source, but not after Ctrl-C.
 
     Raises:
         InputError: the source fails; the lines and the summary of earlier frames are printed first.
     """
     localizer = LiveLocalizer(model, sequence, keep_scores=port is not None)
+    title += f"; answers come {localizer.lag} frames later and know of these" if localizer.lag else ""
     frames, newest, name = frames_from(source, model, realtime, port is not None)
     recent: deque[float] = deque(maxlen=RECENT)  # milliseconds
+    waiting: deque[Frame] = deque()  # for their answers
     count = 0
     with ExitStack() as stack:
         page = None
@@ -64,27 +67,39 @@ def follow(
         reader = stack.enter_context(
             FrameReader(frames, newest, timeout if is_stream(source) else None, name)
         )
+
+        def tell(matches: list[LiveMatch]) -> None:
+            nonlocal count
+            for match in matches:
+                frame = waiting.popleft()
+                recent.append(match.milliseconds)
+                count += 1
+                print(line_of(frame, match))
+            if matches and page is not None and localizer.scores is not None:
+                posterior = localizer.posterior
+                drawn = localizer.scores if posterior is None else posterior
+                stats = (count, reader.dropped, *percentiles(recent))
+                page.show(Snapshot(frame, match, drawn, posterior is not None, *stats))
+
         try:
             with interrupts_raise(), suppress(KeyboardInterrupt):
                 latest = -1
-                for frame in reader:
-                    match = localizer(frame.pixels, frame.number - latest - 1)
-                    latest = frame.number
-                    recent.append(match.milliseconds)
-                    count += 1
-                    print(line_of(frame, match))
-                    if isinstance(output_problem(), BrokenPipeError):
-                        break
-                    if page is not None and localizer.scores is not None:
-                        posterior = localizer.posterior
-                        drawn = localizer.scores if posterior is None else posterior
-                        stats = (count, reader.dropped, *percentiles(recent))
-                        page.show(Snapshot(frame, match, drawn, posterior is not None, *stats))
-                else:
-                    if page is not None and not is_stream(source):
-                        _log(f"that was the last frame; the page stays at {page.url} until Ctrl-C")
-                        while True:
-                            time.sleep(3600)
+                try:
+                    for frame in reader:
+                        matches = localizer.due(frame.pixels, frame.number - latest - 1)
+                        latest = frame.number
+                        waiting.append(frame)
+                        tell(matches)
+                        if isinstance(output_problem(), BrokenPipeError):
+                            return
+                except InputError:
+                    tell(localizer.finish())
+                    raise
+                tell(localizer.finish())
+                if page is not None and not is_stream(source):
+                    _log(f"that was the last frame; the page stays at {page.url} until Ctrl-C")
+                    while True:
+                        time.sleep(3600)
         finally:
             if count:
                 p50, p99 = percentiles(recent)

@@ -95,11 +95,21 @@ class LiveSequences(Sequences):
     Args:
         match: filter matches each frame with those before it, and is the default; sequence:T with T - 1
             before it, at constant speed; single by itself
+        lag: frames by which the filter's answers come later, and which they know of
     """
+
+    lag: int = 0
 
     @property
     def way(self) -> str | None:
         return super().way or "filter"
+
+    def matcher(self, within: int, threshold: float | None) -> SequenceModel | Literal["auto"] | None:
+        if self.lag and self.way != "filter":
+            raise InputError(f"--lag {self.lag} with --match {self.way}; expected --match filter with it")
+        if self.way == "filter":
+            return PlaceFilter(within=within, threshold=threshold, lag=self.lag)
+        return super().matcher(within, threshold)
 
 
 @dataclass

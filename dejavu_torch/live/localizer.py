@@ -13,8 +13,9 @@ from torch import Tensor
 from dejavu_torch.data.traverse import resize_like
 from dejavu_torch.features.extract import features_of, in_mode
 from dejavu_torch.model import DejaVu, check_queries
+from dejavu_torch.recognition.centring import running
 from dejavu_torch.recognition.filter import PlaceFilter
-from dejavu_torch.types import InputError, SequenceModel
+from dejavu_torch.types import InputError, Match, SequenceModel
 
 EXPECTED = "uint8 (H,W), (H,W,3) or (3,H,W), or float in [0, 1], or float (D,) for a map of ready features"
 DTYPES = ("uint8", "float16", "bfloat16", "float32", "float64")
@@ -43,18 +44,22 @@ class LiveLocalizer:
         model: with a map; frames are moved to its device.
         sequence: "filter" is a `PlaceFilter`; None matches each frame by itself.
         keep_scores: keep the scores of all places; otherwise single frames are searched as in `localize`.
+        centre: remove the mean of the frames so far from each, see `running`.
 
     Shape: a frame (H,W), (H,W,3) or (C,H,W), tensor or array, uint8 or float in [0, 1] -> `LiveMatch`.
 
     Attributes:
-        scores: (N,) of the latest frame, on the model's device; None before the first, or if not kept.
+        scores: (N,) of the latest answer, on the model's device; None before the first, or if not kept.
 
     Convention: the answers equal those of `DejaVu.localize` up to rounding. A refused frame changes nothing.
         `left_out` in `localizer(frame, left_out)` is the number of frames skipped before this one: a
-        `PlaceFilter` moves once more for each.
+        `PlaceFilter` moves once more for each. With a `PlaceFilter` that has a lag, `due(frame, left_out)`
+        gives the answers that this frame completes, none or one, in the order of the frames, and `finish()`
+        those that are left at the end; without a lag `due` has the answer of the frame itself.
 
     Raises:
-        InputError: no map, or one of even steps along the ground; a frame of another type, shape or range.
+        InputError: no map, or one of even steps along the ground; a frame of another type, shape or range;
+            `localizer(frame)` with a lag.
 
     Example:
         >>> route = torch.rand(60, 1, 32, 32)
@@ -68,6 +73,7 @@ class LiveLocalizer:
         model: DejaVu,
         sequence: SequenceModel | Literal["filter"] | None = "filter",
         keep_scores: bool = True,
+        centre: bool = False,
     ) -> None:
         if model.step is not None and model.velocity is not None:
             seen = "the map's places are even steps along the ground, which only a whole traverse shows"
@@ -75,7 +81,7 @@ class LiveLocalizer:
         if not (sequence is None or sequence == "filter" or isinstance(sequence, SequenceModel)):
             seen = f"the sequence is {sequence!r}"
             raise InputError(f"{seen}; expected a SequenceModel such as PlaceFilter, 'filter' or None")
-        self.keep_scores = keep_scores
+        self.keep_scores, self.centre = keep_scores, centre
         self.model, self.sequence = model, PlaceFilter() if isinstance(sequence, str) else sequence
         self._shape: tuple[int, ...] | None = None  # of the latest valid frame
         whitening = model.whitening
@@ -85,19 +91,48 @@ class LiveLocalizer:
     def reset(self) -> None:
         """Forget all frames."""
         self.scores: Tensor | None = None
+        self._mean: Tensor | None = None  # of the frames so far, see `running`
         matching = self.model.matching(self.sequence)
         keep = self._keep if self.keep_scores else None
         self._localizer = self.model.localizer(matching._replace(callback=keep))
 
     def _keep(self, scores: Tensor) -> None:
-        self.scores = scores[0]
+        self.scores = scores[-1] if len(scores) else self.scores
+
+    def __call__(self, frame: Tensor | np.ndarray, left_out: int = 0) -> LiveMatch:
+        if self.lag:
+            raise InputError(f"an answer for each frame with a lag of {self.lag}; expected due(frame)")
+        return self.due(frame, left_out)[0]
 
     @torch.no_grad()
-    def __call__(self, frame: Tensor | np.ndarray, left_out: int = 0) -> LiveMatch:
-        start, model = time.perf_counter(), self.model
-        descriptor = self._describe(as_batch(frame, model.map.device))
+    def due(self, frame: Tensor | np.ndarray, left_out: int = 0) -> list[LiveMatch]:
+        """The answers that a frame completes: its own, or that of the frame `lag` before, if there is one."""
+        start, mean = time.perf_counter(), self._mean
+        descriptor = self._describe(as_batch(frame, self.model.map.device))
+        if self.centre:
+            descriptor, mean = running(self.model.map, descriptor, mean)
         self._localizer.skip(min(left_out, MAX_SKIPPED))
         match = self._localizer(descriptor)
+        self._mean = mean
+        return self._told(match, start)
+
+    @torch.no_grad()
+    def finish(self) -> list[LiveMatch]:
+        """The answers of the latest `lag` frames, at the end of all."""
+        start = time.perf_counter()
+        return self._told(self._localizer.finish(), start)
+
+    @property
+    def lag(self) -> int:
+        """Frames by which an answer comes later."""
+        return self.sequence.lag if isinstance(self.sequence, PlaceFilter) else 0
+
+    def _told(self, matches: Match, start: float) -> list[LiveMatch]:
+        milliseconds = 1e3 * (time.perf_counter() - start) / max(1, len(matches))
+        return [self._live(matches[i], milliseconds) for i in range(len(matches))]
+
+    def _live(self, match: Match, milliseconds: float) -> LiveMatch:
+        model = self.model
         place, score, table = int(match.index), float(match.score), model.map.table
         shown, routes = int(table.frame_of(match.index)), model.map.routes
         return LiveMatch(
@@ -108,13 +143,13 @@ class LiveLocalizer:
             posterior=math.exp(-score) if isinstance(self.sequence, PlaceFilter) else math.nan,
             probability=math.nan if match.probability is None else float(match.probability),
             accepted=bool(match.accepted),
-            milliseconds=1e3 * (time.perf_counter() - start),
+            milliseconds=milliseconds,
             route=routes[int(match.route)].name if match.route is not None and place >= 0 else "",
         )
 
     @property
     def posterior(self) -> Tensor | None:
-        """(N+1,) of a filter after the latest frame; None without a filter, or before the first frame."""
+        """(N+1,) of a filter for the latest answer; None without a filter, or before the first frame."""
         return self._localizer.posterior
 
     def _describe(self, batch: Tensor) -> Tensor:

@@ -23,6 +23,25 @@ def centred(place_map: PlaceMap, queries: Tensor) -> Tensor:
     """
     if not isinstance(place_map, SpectralMap) or not len(queries):
         return queries
-    mean = place_map.mean.to(queries)
-    moved = queries - (queries - mean).sum(0) / (len(queries) + PRIOR)
+    total, count = (queries - place_map.mean.to(queries)).sum(0), len(queries)
+    return _without(place_map, queries, total / (count + PRIOR))
+
+
+def running(
+    place_map: PlaceMap, queries: Tensor, before: Tensor | None = None
+) -> tuple[Tensor, Tensor | None]:
+    """As `centred`, for consecutive batches: each query by the mean of those up to it.
+
+    Shape: (B,K), the state (K+1,) or None before the first query -> (B,K), the next state: the sum of q - m,
+        and the number of queries.
+    """
+    if not isinstance(place_map, SpectralMap) or not len(queries):
+        return queries, before
+    sums = F.pad(queries - place_map.mean.to(queries), (0, 1), value=1.0).cumsum(0)
+    sums = sums if before is None else sums + before
+    return _without(place_map, queries, sums[:, :-1] / (sums[:, -1:] + PRIOR)), sums[-1]
+
+
+def _without(place_map: SpectralMap, queries: Tensor, mean: Tensor) -> Tensor:
+    moved = queries - mean
     return F.normalize(moved, dim=1) if place_map.metric == "cosine" else moved

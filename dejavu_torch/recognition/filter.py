@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from dejavu_torch.memory import is_plain, without_autocast
 from dejavu_torch.recognition.motion import MIN_PROBABILITY, Layout, Motion, Rates, checked_rates, logits
+from dejavu_torch.recognition.online import Learned
 from dejavu_torch.recognition.sequence import each
 from dejavu_torch.types import InputError, SequenceModel
 
@@ -51,13 +52,22 @@ class PlaceFilter(SequenceModel):
         within: places; the score of a place includes its neighbours up to this distance, with weights that
             decrease with it.
         threshold: accept a match if its score is below; None leaves it to `DejaVu.acceptance`.
+        lag: queries. An answer comes so many queries later and takes them into account: `step` gives the
+            answers that are due, in the order of the queries, and `finish` the rest.
+        learns: moves, sharpness and off_map are learned from the queries so far, see `Learned`; those given
+            are where they begin.
 
     Shape: scores (..., Q, N), the posterior (..., N+1) before them or None -> (..., Q, N), -log of a
-        probability in nats.
+        probability in nats. From B queries `step` has B answers; with a lag L, those of the queries up to the
+        L-th before the latest that it has not given yet.
 
     Convention: causal. exp(-score) is at most the probability that the right place is within `within` places.
         The state is the posterior, the off-map probability last, and all 0 before the first query. A place
-        that nothing covers scores +inf. `moves` to `off_map` are parameters.
+        that nothing covers scores +inf. `moves` to `off_map` are parameters. With a lag, or learning, the
+        state is a matrix of N+1 columns: the posterior of the latest answer; with a lag, the filter's own for
+        this query; what is learned; and the scores of each query that waits for its answer, with the number
+        of frames left out after it. With a lag of all queries but one, the answers are those of
+        forward-backward smoothing.
 
     Source: the topometric filter of Xu, Fischer, Sünderhauf and Milford (RA-L 2021) has an off-map state; the
         motion model and the likelihood are ours.
@@ -84,6 +94,8 @@ class PlaceFilter(SequenceModel):
         off_map: float = 1.25,
         within: int = 5,
         threshold: float | None = None,
+        lag: int = 0,
+        learns: bool = False,
     ) -> None:
         super().__init__()
         moves = checked_rates(moves, jump, leave, enter)
@@ -94,15 +106,17 @@ class PlaceFilter(SequenceModel):
             raise InputError(f"within is {within}; expected a whole number, at least 0")
         if threshold is not None and math.isnan(threshold):
             raise InputError("the threshold is NaN; expected a number, or None")
+        if not isinstance(lag, int) or lag < 0:
+            raise InputError(f"the lag is {lag}; expected a whole number of queries, at least 0")
         self.move_logits = nn.Parameter(logits(*moves))
         self.rate_logits = nn.Parameter(logits(1 - jump - leave, jump, leave))
         self.enter_logit = nn.Parameter(logits(enter)[0] - logits(1 - enter)[0])
         self.log_sharpness = nn.Parameter(torch.tensor(float(sharpness), dtype=torch.float32).log())
         self.off_map = nn.Parameter(torch.tensor(float(off_map), dtype=torch.float32))
-        self.within, self.threshold = within, threshold
+        self.within, self.threshold, self.lag, self.learns = within, threshold, lag, learns
 
     def start(self, places: int, fixed: bool = False) -> Tensor:
-        return self.off_map.new_zeros(places + 1)
+        return self.off_map.new_zeros(self._shape(places))
 
     def forward(self, scores: Tensor, before: Tensor | None = None) -> Tensor:
         if scores.ndim > 2:
@@ -111,54 +125,147 @@ class PlaceFilter(SequenceModel):
         return near_scores(self.posterior(scores, before)[:, :-1], scores, self.within)
 
     def posterior(self, scores: Tensor, before: Tensor | None = None) -> Tensor:
-        """Probability of each place, and of being off the map, after each query.
+        """Probability of each place, and of being off the map, after each query; with a lag, given the
+        queries after it too.
 
         Shape: (Q,N), (N+1,) or None -> (Q,N+1), off the map last; rows add up to 1.
         """
         check_posterior(before, scores.shape[-1])
-        if before is None:
-            before = self.start(scores.shape[-1])
-        return self._posteriors(scores, before)[1:]
+        state = self.start(scores.shape[-1])
+        if before is not None and state.ndim == 1:
+            state = before
+        elif before is not None:
+            heads = 1 + (self.lag > 0)
+            state = torch.cat([before.expand(heads, -1), state[heads:].to(before)])
+        return self._answers(scores, state, last=True)[0]
 
     def step(
-        self, scores: Tensor, state: Tensor, route_starts: Sequence[int] = (0,)
+        self, scores: Tensor, state: Tensor, route_starts: Sequence[int] = (0,), last: bool = False
     ) -> tuple[Tensor, Tensor]:
-        posteriors = self._posteriors(scores, state, route_starts)
-        return near_scores(posteriors[1:, :-1], scores, self.within), posteriors[-1]
+        posteriors, answered, state = self._answers(scores, state, route_starts, last)
+        return near_scores(posteriors[:, :-1], answered, self.within), state
+
+    def finish(self, state: Tensor, route_starts: Sequence[int] = (0,)) -> tuple[Tensor, Tensor]:
+        """The answers that wait for later queries, at the end of all: -> scores (B,N), the next state."""
+        return self.step(state.new_zeros(0, state.shape[-1] - 1), state, route_starts, last=True)
+
+    def skipped(self, state: Tensor, queries: int, route_starts: Sequence[int] = (0,)) -> Tensor:
+        """The state after queries that are left out: the camera moved once more for each."""
+        _, belief, learned, waiting = self._parts(state)
+        if len(waiting):
+            state = state.clone()
+            state[-1, -1] += queries
+            return state
+        motion = self.motion(belief[:-1], route_starts, learned)
+        for _ in range(queries if bool(belief.any()) else 0):
+            belief = motion.moved(belief)
+        at = int(self.lag > 0)
+        return belief if state.ndim == 1 else torch.cat([state[:at], belief[None], state[at + 1 :]])
+
+    def waiting(self, state: Tensor) -> Tensor:
+        """Scores (R,N) of the queries that wait for their answers."""
+        return self._parts(state)[-1][:, :-1]
+
+    def _shape(self, places: int) -> tuple[int, ...]:
+        """Of the state while no query waits."""
+        rows = 1 + (self.lag > 0) + (Learned.rows(places, len(self.move_logits)) if self.learns else 0)
+        return (rows, places + 1)[not self.lag and not self.learns :]
+
+    def _parts(self, state: Tensor) -> tuple[Tensor, Tensor, Learned | None, Tensor]:
+        """Posterior of the latest answer (N+1,), that of the filter, what is learned, and (R,N+1) queries
+        that wait."""
+        rows, heads = state.reshape(-1, state.shape[-1]), 1 + (self.lag > 0)
+        end, learned = heads, None
+        if self.learns:
+            end = self._shape(rows.shape[1] - 1)[0]
+            learned = Learned.unpacked(rows[heads:end], len(self.move_logits))
+        return rows[0], rows[heads - 1], learned, rows[end:]
 
     @without_autocast
-    def _posteriors(self, scores: Tensor, state: Tensor, route_starts: Sequence[int] = (0,)) -> Tensor:
-        """The state before the first and after each query, (Q+1,N+1)."""
+    def _answers(
+        self, scores: Tensor, state: Tensor, route_starts: Sequence[int] = (0,), last: bool = False
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Posteriors (A,N+1) of the queries whose answers are due, or of all, their scores (A,N), and the
+        next state."""
         if scores.ndim != 2 or scores.shape[1] < 1 or not scores.is_floating_point():
             raise InputError(f"scores are {tuple(scores.shape)} {scores.dtype}; expected floats (Q,N)")
-        places = scores.shape[1]
-        if state.shape != (places + 1,):
-            raise InputError(f"the posterior is {tuple(state.shape)}; expected ({places + 1},) for this map")
-        rows, motion = [state.to(scores)], self.motion(scores, route_starts)
-        for likelihood in self.likelihoods(scores, moments_of(scores)):
-            expected = motion.moved(rows[-1])
-            if len(rows) == 1:
-                expected = torch.where((state == 0).all(), motion.anywhere(), expected)
-            rows.append(updated(expected, likelihood))
-        return torch.stack(rows)
+        places, shape = scores.shape[1], self._shape(scores.shape[1])
+        if state.shape[-1:] != shape[-1:] or state.ndim != len(shape) or len(state) < shape[0]:
+            raise InputError(f"the posterior is {tuple(state.shape)}; expected {shape} for this map")
+        posterior, belief, learned, waiting = self._parts(state.to(scores))
+        left_out = [0] * (len(waiting) + len(scores))
+        if len(waiting):
+            scores, left = torch.cat([waiting[:, :-1], scores]), waiting[:, -1]
+            left_out[: len(left)] = map(int, left.tolist()) if is_plain(left) else left_out[: len(left)]
+        moments, motion = moments_of(scores), self.motion(scores, route_starts, learned)
+        likelihoods = self.likelihoods(scores, moments) if learned is None else scores  # else in turn
+        posteriors, due = [], len(scores) if last else max(0, len(scores) - self.lag)
+        for t in range(due):
+            ahead = slice(t, t + 1 + self.lag)
+            seen = likelihoods[ahead]
+            if learned is not None:
+                motion = self.motion(scores, route_starts, learned)
+                seen = self.likelihoods(scores[ahead], Moments(*(one[ahead] for one in moments)), learned)
+            expected = motion.moved(belief)
+            if t == 0:
+                expected = torch.where((belief == 0).all(), motion.anywhere(), expected)
+            before, belief = belief, updated(expected, seen[0])
+            posterior = belief
+            if self.lag:
+                posterior = updated(belief, self._message(motion, seen, left_out[ahead]))
+            posteriors.append(posterior)
+            if learned is not None:
+                z = (moments.mean[t] - scores[t]).where(moments.valid[t], 0) / moments.spread[t]
+                moves = motion.counts(before[None], seen[:1]).moves
+                learned = learned.after(z, moments.varied[t, 0], expected[:-1], moves)
+            for _ in range(left_out[t]):
+                belief = motion.moved(belief)
+        answers = torch.stack(posteriors) if posteriors else scores.new_zeros(0, places + 1)
+        if state.ndim == 1:
+            return answers, scores, belief
+        rest = F.pad(scores[due:], (0, 1))
+        if any(left_out[due:]):
+            rest[:, -1] = rest.new_tensor(left_out[due:])
+        parts = [posterior[None], *([belief[None]] if self.lag else [])]
+        parts += [rest] if learned is None else [learned.packed, rest]
+        return answers, scores[:due], torch.cat(parts)
 
-    def likelihoods(self, scores: Tensor, moments: Moments) -> Tensor:
+    def _message(self, motion: Motion, likelihoods: Tensor, left_out: Sequence[int]) -> Tensor:
+        """What the queries after the first one say of it, (R,N+1) -> (N+1,)."""
+        message = torch.ones_like(likelihoods[0])
+        for t in range(len(likelihoods) - 1, 0, -1):
+            message = message * likelihoods[t]
+            message = message / message.amax().clamp(min=MIN_PROBABILITY)
+            for _ in range(1 + left_out[t - 1]):
+                message = motion.expected(message)
+        return message
+
+    def likelihoods(self, scores: Tensor, moments: Moments, learned: Learned | None = None) -> Tensor:
         """Likelihoods of the places and of being off the map, (Q,N) -> (Q,N+1), scaled to a maximum of 1 in
         each row."""
         valid, sharpness = scores.isfinite(), self.log_sharpness.to(scores).exp()
         z = torch.where(valid, moments.mean - scores, 0) / moments.spread
-        off = self.off_map.to(z).expand(len(z), 1)
+        off = self.off_map.to(z)
+        if learned is not None:
+            sharpness, off = learned.likelihood(sharpness, off)
+        off = off.expand(len(z), 1)
         logits = torch.cat([(sharpness * z).masked_fill(~valid, -math.inf), sharpness * off], 1)
         logits = torch.where(moments.varied, logits, 0)
         return (logits - logits.amax(1, keepdim=True)).exp()
 
-    def motion(self, like: Tensor, route_starts: Sequence[int] = (0,)) -> Motion:
+    def motion(
+        self, like: Tensor, route_starts: Sequence[int] = (0,), learned: Learned | None = None
+    ) -> Motion:
         """The transitions of a map, in the type of its scores (..., N)."""
         moves, (_, jump, leave) = (one.to(like).softmax(0) for one in (self.move_logits, self.rate_logits))
+        moves = moves if learned is None else learned.moves_after(moves)
         rates = Rates(moves, jump, leave, self.enter_logit.to(like).sigmoid())
         return Motion(Layout(like.shape[-1], route_starts=tuple(route_starts)), rates)
 
     def check(self, queries: int | None, places: int) -> None:
+        if self.lag and queries is not None:
+            seen = f"a lag of {self.lag} where all queries are known"
+            raise InputError(f"{seen}; expected a PlaceSmoother, or a LiveLocalizer")
         furthest = len(self.move_logits) - 1
         if furthest >= places:
             raise InputError(f"moves of up to {furthest} places on a map of {places}; expected fewer")
@@ -175,6 +282,8 @@ class PlaceFilter(SequenceModel):
         return (
             f"moves={moves}, jump={jump:.3g}, leave={leave:.3g}, enter={enter:.3g}, "
             f"sharpness={sharpness:.3g}, off_map={float(self.off_map):.3g}, within={self.within}"
+            + (f", lag={self.lag}" if self.lag else "")
+            + (", learns=True" if self.learns else "")
         )
 
 

@@ -130,20 +130,32 @@ class Localizer:
         """Skip queries: a `PlaceFilter` moves once more for each."""
         filter = self.matching.sequence
         if isinstance(filter, PlaceFilter) and self.states:
-            for _ in range(queries):
-                belief = self.states["filter"]
-                motion = filter.motion(belief[:-1], self.route_starts)
-                self.states = self.states | {"filter": motion.moved(belief)}
+            state = filter.skipped(self.states["filter"], queries, self.route_starts)
+            self.states = self.states | {"filter": state}
+
+    @torch.no_grad()
+    def finish(self) -> Match:
+        """The answers that a `PlaceFilter` with a lag still owes, after the last query; else none."""
+        places = 1 if self.place_map is None else self.place_map.places
+        if not isinstance(self.matching.sequence, PlaceFilter) or not self.states:
+            return self.match(torch.zeros(0, places))
+        return self._in_sequence(self.states["filter"].new_zeros(0, places), last=True)
 
     @property
     def posterior(self) -> Tensor | None:
-        """(N+1,) of a filter after the latest query; None without a filter, or before the first query."""
-        return self.states.get("filter")
+        """(N+1,) of a filter for the latest answer; None without a filter, or before the first query."""
+        state = self.states.get("filter")
+        return state if state is None or state.ndim == 1 else state[0]
 
-    def _in_sequence(self, scores: Tensor) -> Match:
+    def _in_sequence(self, scores: Tensor, last: bool = False) -> Match:
         states = self.states or {T: m.start(scores.shape[1]).to(scores) for T, m in self.models.items()}
         steps = {T: m.step(scores, states[T], self.route_starts) for T, m in self.models.items()}
-        single = self.matching.sequence is None
+        filter, single = self.matching.sequence, self.matching.sequence is None
+        if isinstance(filter, PlaceFilter) and filter.lag:
+            if last:
+                steps[self.own] = filter.finish(states[self.own], self.route_starts)
+            answered = torch.cat([filter.waiting(states[self.own]), scores])
+            scores = answered[: len(steps[self.own][0])]
         final = scores if single else steps[self.own][0]
         pair, confidence = pair_of(final), None
         if self.matching.platt is not None and not single:

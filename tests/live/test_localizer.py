@@ -79,6 +79,41 @@ def test_one_by_one_is_as_all_together(
     assert (match.index - torch.arange(10, 40)).abs().float().median() <= 2
 
 
+def test_with_a_lag_answers_come_later_and_know_of_it(spectral: DejaVu, drive: Tensor) -> None:
+    sequence = PlaceFilter(lag=4)
+    localizer = LiveLocalizer(spectral, sequence)
+    due = []
+    for t, frame in enumerate(drive):
+        if t == 10:
+            with refused("0 to 1"):
+                localizer.due(frame + 9)
+        due.append(localizer.due(frame))
+        assert localizer.scores is None or int(localizer.scores.argmin()) == due[-1][0].place
+    assert [len(one) for one in due] == [0] * 4 + [1] * 26
+    found = [match for one in due for match in one] + localizer.finish()
+    scores = spectral(drive)
+    expected = sequence(scores).detach()
+    assert [one.place for one in found] == expected.argmin(1).tolist()
+    assert [one.score for one in found] == pytest.approx(expected.amin(1).tolist(), rel=1e-3, abs=1e-4)
+    assert localizer.finish() == []
+    with refused("lag of 4", "due"):
+        localizer(drive[0])
+
+
+def test_the_mean_of_the_frames_so_far_is_removed_if_asked_for(spectral: DejaVu, drive: Tensor) -> None:
+    assert spectral.whitening is not None
+    queries = spectral.whitening(spectral.descriptor.describe(drive)).detach()
+    mean = spectral.map.mean
+    localizer = LiveLocalizer(spectral, None, centre=True)
+    for t, frame in enumerate(drive):
+        query = queries[t] - (queries[: t + 1] - mean).sum(0) / (t + 1 + 50)
+        found, scores = localizer(frame), spectral.map.scores(query[None])
+        assert (found.place, found.score) == (
+            int(scores.argmin()),
+            pytest.approx(float(scores.amin()), abs=1e-4),
+        )
+
+
 def test_the_default_is_a_filter_and_tells_its_posterior(spectral: DejaVu, drive: Tensor) -> None:
     found = answers(LiveLocalizer(spectral), drive)
     assert [one.posterior for one in found] == pytest.approx([math.exp(-one.score) for one in found])

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import pytest
 import torch
-from helpers import refused, streamed
+from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
 from dejavu_torch import DejaVu, PlaceFilter, SequenceMatcher
 from dejavu_torch.maps.place_map import PlaceMap
+from dejavu_torch.recognition.calibration import Platt, Track
+from dejavu_torch.recognition.filter import moments_of, near_scores
 from dejavu_torch.recognition.localizer import Localizer, Matching
+from dejavu_torch.recognition.online import Learned
+from dejavu_torch.recognition.smoother import sweep
 from dejavu_torch.types import Match, SequenceModel
 
 
@@ -77,10 +81,113 @@ def test_equals_a_literal_loop(rows: list[list[float]], filter_: PlaceFilter) ->
     assert torch.allclose(found.sum(1), torch.ones(len(rows), dtype=torch.float64))
 
 
-@given(TABLE, FILTER, st.integers(1, 4))
-def test_batches_do_not_matter(rows: list[list[float]], filter_: PlaceFilter, size: int) -> None:
-    scores = torch.tensor(rows)
-    assert torch.allclose(torch.cat(list(streamed(filter_, scores.split(size)))), filter_(scores), rtol=1e-4)
+@given(TABLE, FILTER, st.integers(1, 4), st.integers(0, 3), st.booleans())
+def test_batches_do_not_matter(
+    rows: list[list[float]], filter_: PlaceFilter, size: int, lag: int, learns: bool
+) -> None:
+    scores, filter_.lag, filter_.learns = torch.tensor(rows), lag, learns
+    state, found = filter_.start(scores.shape[1]), []
+    for part in scores.split(size):
+        answers, state = filter_.step(part, state)
+        found += [*answers]
+    assert len(found) == max(0, len(scores) - lag)
+    last, state = filter_.finish(state)
+    assert torch.allclose(torch.stack([*found, *last]), filter_(scores), rtol=1e-4)
+    assert len(filter_.finish(state)[0]) == 0
+
+
+def forward_backward(filter_: PlaceFilter, scores: Tensor, empty: Sequence[int] = ()) -> Tensor:
+    """Posteriors given all queries, those of `empty` saying nothing."""
+    filled = scores.clone()
+    filled[[*empty]] = 0.0
+    likelihood = filter_.likelihoods(filled, moments_of(filled))
+    motion, still = filter_.motion(filled), torch.zeros(len(scores), dtype=torch.bool)
+    (block,) = sweep(motion, lambda *_: likelihood, len(scores), still, len(scores))
+    return block.posterior
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("lag", [39, 100])
+def test_with_a_lag_of_all_queries_it_is_a_smoother(lag: int) -> None:
+    scores = standing_out(30, [*range(2, 22)] * 2).double()
+    filter_ = PlaceFilter(lag=lag).double()
+    torch.testing.assert_close(filter_.posterior(scores), forward_backward(filter_, scores))
+    left_out = 7, 8, 30  # no answers, but moves
+    state, found = filter_.start(30).double(), []
+    for t, row in enumerate(scores.split(1)):
+        if t in left_out:
+            state = filter_.skipped(state, 1)
+        else:
+            answers, state = filter_.step(row, state)
+            found += [*answers]
+    expected = forward_backward(filter_, scores, left_out)[[t for t in range(40) if t not in left_out], :-1]
+    torch.testing.assert_close(
+        torch.stack([*found, *filter_.finish(state)[0]]), near_scores(expected, scores[3:], 5)
+    )
+
+
+def test_a_lagged_answer_has_the_probability_and_score_of_its_own_query() -> None:
+    scores, filter_ = standing_out(30, [*range(2, 22)]), PlaceFilter(lag=4)
+    localizer = Localizer(Watched(30), Matching(filter_, k=2, platt=Platt(1.0, 0.0)))
+    found = Match.joined([*map(localizer, scores.split(3)), localizer.finish()])
+    expected = filter_(scores).detach()
+    assert torch.equal(found.index[:, 0], expected.argmin(1))
+    probability = Platt(1.0, 0.0).probability(Track()(expected, scores))
+    torch.testing.assert_close(found.probability[:, 0], probability, rtol=1e-4, atol=1e-6)
+
+
+@torch.no_grad()
+def test_an_answer_knows_of_the_lag_and_no_more() -> None:
+    scores = standing_out(30, [*range(2, 22)]).double()
+    lagged = PlaceFilter(lag=4).double()
+    for t in (0, 7, 15, 19):
+        known = scores[: t + 5]
+        torch.testing.assert_close(lagged.posterior(scores)[t], forward_backward(lagged, known)[t])
+
+
+@torch.no_grad()
+def test_what_is_learned_are_the_moves_and_how_far_right_places_stand_out() -> None:
+    shown = [t // 3 for t in range(150)]
+    scores = standing_out(60, shown)
+    learning, fixed = PlaceFilter(learns=True), PlaceFilter()
+    assert torch.equal(learning.posterior(scores)[0], fixed.posterior(scores)[0])
+
+    def learned(scores: Tensor) -> tuple[list[float], float, float]:
+        state = learning.step(scores, learning.start(60))[1]
+        _, _, sums, _ = learning._parts(state)
+        assert sums is not None
+        return (
+            sums.moves_after(torch.tensor([0.2, 0.6, 0.2])).tolist(),
+            *map(float, sums.likelihood(torch.tensor(1.0), torch.tensor(1.25))),
+        )
+
+    moves, sharpness, _ = learned(scores)
+    assert moves[0] > 0.4
+    alike = torch.cat([row.expand(10, -1) for row in standing_out(60, [*range(30)]).split(1)])
+    assert learned(alike)[1] < 0.8 * sharpness  # ten queries in a row say what one does
+    flat = torch.zeros(100, 60)
+    assert learned(flat)[1:] == (1.0, 1.25)
+
+
+@pytest.mark.parametrize("alike", [1, 25])
+def test_sharpness_is_the_mean_at_right_places_by_the_correlation_time(alike: int) -> None:
+    """Queries of which so many in a row are the same, each surely at its best place."""
+    rows = torch.randn(5000 // alike, 400, generator=torch.Generator().manual_seed(0))
+    rows = ((rows - rows.mean(1, keepdim=True)) / rows.std(1, keepdim=True, correction=0)).repeat_interleave(
+        alike, 0
+    )
+    sums = Learned(torch.zeros(400), torch.zeros(400), torch.zeros(4), torch.zeros(3))
+    for row in rows:
+        place = (row == row.max()).float()
+        sums = sums.after(row, torch.tensor(True), place, torch.tensor([0.0, 1, 0]))
+    mu = (100 * 2.5 + float(rows.amax(1).sum())) / 5100  # with the prior of 100 queries
+    tau = (100 * 2.5 + 5000 * alike) / 5100
+    sharpness, off_map = sums.likelihood(torch.tensor(1.0), torch.tensor(1.25))
+    assert float(off_map) == pytest.approx(mu / 2, rel=1e-3)
+    assert float(sharpness) == pytest.approx(math.sqrt(mu / tau), rel=0.05)
+    assert sums.moves_after(torch.tensor([0.2, 0.6, 0.2])).tolist() == pytest.approx(
+        [10 / 5050, 5030 / 5050, 10 / 5050]
+    )
 
 
 def test_gradients_reach_the_scores_and_every_parameter() -> None:
@@ -182,6 +289,9 @@ def test_no_graph_grows_from_batch_to_batch() -> None:
         (lambda: PlaceFilter(within=2.5), ["within is 2.5", "whole"]),  # type: ignore[arg-type]
         (lambda: PlaceFilter(threshold=math.nan), ["threshold is NaN"]),
         (lambda: PlaceFilter().check(10, 2), ["up to 2 places on a map of 2"]),
+        (lambda: PlaceFilter(lag=-1), ["lag is -1", "at least 0"]),
+        (lambda: PlaceFilter(lag=2).check(10, 20), ["a lag of 2", "PlaceSmoother"]),
+        (lambda: PlaceFilter(lag=2).step(torch.rand(2, 4), torch.zeros(5)), ["(5,)", "(2, 5)"]),
     ],
 )
 def test_bad_input_is_refused(make: Callable[[], object], told: list[str]) -> None:
@@ -235,6 +345,7 @@ MODELS = {
     "speeds": SequenceMatcher(5, (1, 0.75, 2.5)),
     "backwards": SequenceMatcher(7, (-1, 0)),
     "filter": PlaceFilter(),
+    "learning filter": PlaceFilter(learns=True),
     "filter alone": PlaceFilter(within=0, moves=(0.5, 0.0, 0.25, 0.25), jump=0.05, off_map=2.0),
 }
 

@@ -1,0 +1,83 @@
+"""What a filter learns of a drive on the way: how far right places stand out, and how the camera moves."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Self
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+BLOCK = 25  # queries, whose mean varies by as much as they depend on each other
+PRIOR, MOVE_PRIOR = 100.0, 50.0  # queries that the given sharpness, and the given moves, count as
+LEAST = 0.3  # mean z of right places
+MIN_VARIANCE = 1e-6
+
+
+class Learned(NamedTuple):
+    """Sums over the queries so far; z is how far a score lies below the mean of its query, in deviations.
+
+    total: (N,) of z, in whole blocks. block: (N,) of z, in the latest one. numbers: (4,) of the queries, of
+    the mean squares of a block's mean z, of z where a place was expected, and of the mass expected.
+    moves: (V+1,) of the moves.
+    """
+
+    total: Tensor
+    block: Tensor
+    numbers: Tensor
+    moves: Tensor
+
+    @classmethod
+    def rows(cls, places: int, moves: int) -> int:
+        """Rows of N+1 numbers that `packed` needs."""
+        return -(-(2 * places + 4 + moves) // (places + 1))
+
+    @classmethod
+    def unpacked(cls, rows: Tensor, moves: int) -> Self:
+        places = rows.shape[1] - 1
+        sizes = [places, places, 4, moves]
+        return cls(*rows.flatten()[: sum(sizes)].split(sizes))
+
+    @property
+    def packed(self) -> Tensor:
+        """All of it in rows of N+1."""
+        numbers, width = torch.cat(self), len(self.total) + 1
+        return F.pad(numbers, (0, -len(numbers) % width)).view(-1, width)
+
+    def after(self, z: Tensor, speaks: Tensor, expected: Tensor, moves: Tensor) -> Learned:
+        """The sums after another query.
+
+        Args:
+            z: (N,), 0 where nothing covers a place. speaks: (), whether scores differ. expected: (N,),
+                probabilities given the queries before. moves: (V+1,), expected numbers.
+        """
+        speaks = speaks.to(z)
+        queries, squares, mean, mass = self.numbers.unbind()
+        queries, block = queries + speaks, self.block + speaks * z
+        full = (queries.remainder(BLOCK) == 0) * speaks
+        squares = squares + full * (block / BLOCK).square().mean()
+        mean, mass = mean + speaks * (expected * z).sum(), mass + speaks * expected.sum()
+        numbers = torch.stack([queries, squares, mean, mass])
+        return Learned(self.total + full * block, (1 - full) * block, numbers, self.moves + moves)
+
+    def likelihood(self, sharpness: Tensor, off_map: Tensor) -> tuple[Tensor, Tensor]:
+        """Sharpness and off-map z, from those given: the geometric mean of the given sharpness and mu / tau.
+
+        mu is the mean z of the expected places, which leaves out each query's own evidence; tau, how many
+        queries in a row say as much as one, the variance of the means of blocks in relation to that of z.
+        The off-map state is half as far out as a right place, where Gaussian likelihoods are equal.
+        """
+        queries, squares, total, mass = self.numbers.unbind()
+        given = (2 * off_map).clamp(min=LEAST)
+        mu = ((PRIOR * given + total) / (PRIOR + mass)).clamp(min=LEAST)
+        blocks = (queries / BLOCK).floor()
+        common = (self.total / (blocks * BLOCK).clamp(min=1)).square().mean()
+        between = (squares / blocks.clamp(min=1) - common) * blocks / (blocks - 1).clamp(min=1)
+        tau = (BLOCK * between / (1 - common).clamp(min=MIN_VARIANCE)).clamp(min=1)
+        weight = torch.where(blocks > 1, blocks * BLOCK, 0)
+        tau = (PRIOR * given / sharpness + weight * tau) / (PRIOR + weight)
+        return (sharpness * mu / tau).sqrt(), torch.where(mass > 0, mu / 2, off_map)
+
+    def moves_after(self, given: Tensor) -> Tensor:
+        """Probabilities of the moves, from those given."""
+        return (MOVE_PRIOR * given + self.moves) / (MOVE_PRIOR + self.moves.sum())
