@@ -16,6 +16,7 @@ import torch
 from hypothesis import strategies as st
 from torch import Tensor
 
+from dejavu_torch.recognition.motion import Layout, Rates
 from dejavu_torch.types import FrequencyLayer, Plan
 
 Row = Sequence[float]
@@ -191,3 +192,63 @@ def joined_rows(places: Sequence[Table], queries: Sequence[Table], kept: int, le
     ours, theirs = (rows @ directions / sizes for rows in (own, asked))
     lengths = theirs.norm(dim=1)[:, None] * ours.norm(dim=1)
     return (theirs @ ours.T / lengths).float()
+
+
+def transitions(layout: Layout, rates: Rates) -> list[list[float]]:
+    """Probability of each step from one state to another, by walking; see `Layout` for the states."""
+    n, moves = layout.places, rates.moves.tolist()
+    jump, leave, enter = (float(rate) for rate in rates[1:])
+    states = layout.directions * n
+    matrix = [[0.0] * (states + 1) for _ in range(states + 1)]
+
+    def number(direction: int, place: int) -> int:
+        return place if direction == 0 else 2 * n - 1 - place
+
+    def walks(direction: int, place: int) -> list[tuple[int, float]]:
+        """Where one step leads; what is missing leaves the route."""
+        ways = [(a, b, s) if direction == 0 else (b, a, s) for a, b, s in layout.links]
+        linked = [(b, s) for a, b, s in ways if a == place]
+        total = sum(s for _, s in linked)
+        found = [(b, s / max(1.0, total)) for b, s in linked]
+        following = place + 1 if direction == 0 else place - 1
+        border = max(place, following)
+        if 0 <= following < n and border not in layout.route_starts[1:]:
+            found.append((following, max(0.0, 1 - total)))
+        return found
+
+    for direction in range(layout.directions):
+        for place in range(n):
+            row = matrix[number(direction, place)]
+            turned = [(direction, 1 - layout.turn), (1 - direction, layout.turn)][: layout.directions]
+            turned = turned if layout.directions == 2 else [(direction, 1.0)]
+            for way, share in turned:
+                mass = {place: share}
+                for v, move in enumerate(moves):
+                    if v:
+                        after: dict[int, float] = {}
+                        for at, amount in mass.items():
+                            for to, part in walks(way, at):
+                                after[to] = after.get(to, 0.0) + amount * part
+                        mass = after
+                    stay = (1 - jump - leave) * move
+                    for at, amount in mass.items():
+                        row[number(way, at)] += stay * amount
+                    row[states] += stay * (share - sum(mass.values()))
+            for j in range(states):
+                row[j] += jump / states
+            row[states] += leave
+    for j in range(states):
+        matrix[states][j] = enter / states
+    matrix[states][states] = 1 - enter
+    return matrix
+
+
+def smoothed(matrix: Tensor, first: Tensor, likelihood: Tensor) -> tuple[Tensor, float]:
+    """Forward and backward (Rabiner, 1989): posteriors (Q,S) and the log likelihood, for S states."""
+    forward, backward = [first * likelihood[0]], [torch.ones_like(first)]
+    for row in likelihood[1:]:
+        forward.append((forward[-1] @ matrix) * row)
+    for row in likelihood.flip(0)[:-1]:
+        backward.append(matrix @ (row * backward[-1]))
+    joint = torch.stack(forward) * torch.stack(backward[::-1])
+    return joint / joint.sum(1, keepdim=True), float(joint[0].sum().log())

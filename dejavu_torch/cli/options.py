@@ -105,11 +105,12 @@ class LiveSequences(Sequences):
         return super().way or "filter"
 
     def matcher(self, within: int, threshold: float | None) -> SequenceModel | Literal["auto"] | None:
-        if self.lag and self.way != "filter":
-            raise InputError(f"--lag {self.lag} with --match {self.way}; expected --match filter with it")
-        if self.way == "filter":
+        matcher = super().matcher(within, threshold)
+        if isinstance(matcher, PlaceFilter):
             return PlaceFilter(within=within, threshold=threshold, lag=self.lag)
-        return super().matcher(within, threshold)
+        if self.lag:
+            raise InputError(f"--lag {self.lag} with --match {self.way}; expected --match filter with it")
+        return matcher
 
 
 @dataclass

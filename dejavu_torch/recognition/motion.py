@@ -72,12 +72,13 @@ class Motion:
         for start in layout.route_starts[1:]:
             keep[0, start] = 0
             keep[1:, last + 1 - start] = 0
-        for first, second, share in layout.links:
-            ways = [(first, second), (last - second, last - first)][: layout.directions]
-            for row, (at, to) in enumerate(ways):
-                self.linked.append((row, at, to, share))
-                if at < last:
-                    keep[row, at + 1] *= 1 - share
+        for row in range(layout.directions):  # backwards in the opposite direction
+            ways = [(a, b, s) if not row else (last - b, last - a, s) for a, b, s in layout.links]
+            for at, to, share in ways:
+                total = sum(other for start, _, other in ways if start == at)
+                self.linked.append((row, at, to, share / max(1.0, total)))
+                if at < last and keep[row, at + 1] > 0:
+                    keep[row, at + 1] = max(0.0, 1 - total)
         plain = len(layout.route_starts) == 1 and not layout.links
         self.keep = None if plain else keep  # the share of a place's mass that moves on to the next one
         reach = torch.ones_like(keep)
@@ -154,7 +155,7 @@ class Motion:
                 turned = on.flip(-1, -2) + (self.stay * move * turn + anywhere).log()
                 best = torch.maximum(best, turned)
         jumped = torch.maximum(on.amax() + anywhere.log(), off + (enter / (log.shape[-1] - 1)).log())
-        left = (on + (self.stay * self.lost + leave).log()).amax()
+        left = (on + (self.stay * self._turned(self.lost) + leave).log()).amax()
         return torch.cat([best.flatten().maximum(jumped), torch.maximum(left, off + (1 - enter).log())])
 
     def _best_shifted(self, on: Tensor) -> Tensor:
