@@ -85,7 +85,7 @@ class Motion:
         self.reach = [reach]  # the share of a move by 0, 1, .. V places that stays on the route
         for _ in self.moves[1:]:
             self.reach.append(self._shifted_back(self.reach[-1]))
-        self.lost = 1 - sum(move * share for move, share in zip(self.moves, self.reach, strict=True))
+        self.lost = rates.moves.new_ones(()) - sum(move * share for move, share in zip(self.moves, self.reach, strict=True))
 
     def _shifted(self, on: Tensor) -> Tensor:
         """Mass (..., D, N) one place further."""
