@@ -97,7 +97,10 @@ class Standardised(NamedTuple):
 
 
 def place_means(scores: Tensor, weight: Tensor) -> Tensor:
-    """The mean score of each place over the queries that say something, (Q,N), (Q,) -> (N,)."""
+    """The mean score of each place over the queries that say something, (Q,N), (Q,) -> (N,); 0 for a single
+    query, of which nothing would be left."""
+    if len(scores) == 1:
+        return torch.zeros_like(scores[0])
     valid = scores.isfinite() & speaking(scores)[:, None]
     share = weight[:, None] * valid
     total = torch.where(valid, scores, 0).mul(weight[:, None]).sum(0)
