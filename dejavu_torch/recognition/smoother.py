@@ -180,7 +180,7 @@ class PlaceSmoother(SequenceModel):
             each = [self(one, None, route_starts) for one in scores.flatten(0, -3)]
             return torch.stack(each).view(*lead, *each[0].shape) if each else scores.clone()
         posterior = self.posterior(scores, descriptors, route_starts)
-        return near_scores(posterior[:, :-1], scores, self.within)
+        return near_scores(posterior[:, :-1], scores, self.within).to(scores.dtype)
 
     def posterior(
         self, scores: Tensor, descriptors: Tensor | None = None, route_starts: Sequence[int] = (0,)
@@ -201,7 +201,7 @@ class PlaceSmoother(SequenceModel):
         Differentiable in `move_logits`, `rate_logits` and `enter_logit`.
         """
         blocks = self.blocks(self.drive(scores, descriptors), route_starts)
-        return torch.stack([block.log.sum() for block in blocks]).sum()
+        return torch.stack([scores.new_zeros(()), *(block.log.sum() for block in blocks)]).sum()
 
     @torch.no_grad()
     def path(
@@ -262,9 +262,10 @@ class PlaceSmoother(SequenceModel):
             assert descriptors is not None
             spacing = spacing_of(descriptors)
             return Drive(scores, self.means, self.values, spacing, self.separation, self.tempering)
-        given, known = check_scores(scores).detach(), scores
+        known = check_scores(scores)
+        given = known.detach()
         spacing = spacing_of(finite(given) if descriptors is None else descriptors)
-        means, values = self.means, self.values
+        means, values = self.means.to(given), self.values
         if len(means) != scores.shape[1]:
             means = place_means(given, spacing.weight.to(given))
         if not len(values):
@@ -313,13 +314,11 @@ class PlaceSmoother(SequenceModel):
             self; `is_drive` tells whether the queries are a drive of the map at all.
         """
         if isinstance(scores, Tensor):
-            descriptors = finite(check_scores(scores)) if descriptors is None else descriptors
-            scores = rows_of(scores)
+            known = check_scores(scores)
+            scores, descriptors = rows_of(known), finite(known) if descriptors is None else descriptors
         assert descriptors is not None
         self.is_drive, self.log_likelihood = False, None
-        if len(descriptors) < 2:
-            self.means = scores(torch.arange(len(descriptors))).sum(0).mul(0)
-            self.values = RankTable().values
+        if not len(descriptors):
             return self
         spacing = spacing_of(descriptors)
         self.tempering = tempering_of(spacing)
@@ -468,7 +467,6 @@ def sweep(
             message = message * seen
             message = message / message.amax(-1, keepdim=True)
         yield Block(first, before, like, torch.stack(after[::-1], -2), log)
-        belief = motion.anywhere()
 
 
 def updated_rates(counts: Counts, prior: Tensor) -> Rates:
@@ -511,7 +509,7 @@ def tempering_of(spacing: Spacing) -> float:
 
 
 def check_scores(scores: Tensor) -> Tensor:
-    """Refuse what are no scores (Q,N)."""
+    """Scores (Q,N), at least in single precision; refuses what are none."""
     if scores.ndim != 2 or scores.shape[1] < 1 or not scores.is_floating_point():
         raise InputError(f"scores are {tuple(scores.shape)} {scores.dtype}; expected floats (Q,N)")
-    return scores
+    return scores if scores.dtype == torch.float64 else scores.float()
