@@ -375,6 +375,7 @@ class PlaceSmoother(SequenceModel):
             rates = updated_rates(counts, prior * (MOVE_SHARE * n * length))
         return Fit(rates, separation, table.values, float(block.log.sum()), n * length)
 
+    @torch.no_grad()
     def extra_repr(self) -> str:
         moves = [round(move, 4) for move in self.move_logits.softmax(0).tolist()]
         _, jump, leave = self.rate_logits.softmax(0).tolist()
