@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from fractions import Fraction
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import NamedTuple
 
 import torch
@@ -252,3 +252,109 @@ def smoothed(matrix: Tensor, first: Tensor, likelihood: Tensor) -> tuple[Tensor,
         backward.append(matrix @ (row * backward[-1]))
     joint = torch.stack(forward) * torch.stack(backward[::-1])
     return joint / joint.sum(1, keepdim=True), float(joint[0].sum().log())
+
+
+class Steps(NamedTuple):
+    """How a camera moves: see `PlaceSmoother`. Two directions; state i is place i on the way there, state
+    2N - 1 - i on the way back, state 2N off the map. With one direction state N is off the map."""
+
+    places: int
+    moves: Row
+    jump: float = 0.0
+    leave: float = 0.0
+    enter: float = 0.0
+    turn: float = 0.0
+    directions: int = 2
+    starts: Sequence[int] = (0,)  # the first place of each route
+    links: Sequence[tuple[int, int, float]] = ()
+
+    def onward(self, place: int, way: int) -> dict[int | None, float]:
+        """Where a move by one place leads to, with probabilities; None is off the map."""
+        pairs = [(a, b, share) if way == 0 else (b, a, share) for a, b, share in self.links]
+        linked = [(to, share) for at, to, share in pairs if at == place]
+        taken = sum(share for _, share in linked)
+        following = place + 1 if way == 0 else place - 1
+        route = sum(start <= place for start in self.starts)
+        on_route = 0 <= following < self.places and sum(start <= following for start in self.starts) == route
+        led: dict[int | None, float] = {following if on_route else None: max(0.0, 1 - taken)}
+        for to, share in linked:
+            led[to] = led.get(to, 0.0) + share / max(1.0, taken)
+        return led
+
+    def state(self, place: int | None, way: int) -> int:
+        if place is None:
+            return self.places * self.directions
+        return place if way == 0 else 2 * self.places - 1 - place
+
+    def transitions(self) -> Table:
+        """Probabilities of each state, row by row the one before it."""
+        off = self.places * self.directions
+        matrix = [[0.0] * (off + 1) for _ in range(off + 1)]
+        stay = 1 - self.jump - self.leave
+        for way in range(self.directions):
+            for place in range(self.places):
+                row = matrix[self.state(place, way)]
+                for now in range(self.directions):
+                    turned = self.turn if now != way else 1 - self.turn * (self.directions - 1)
+                    at: dict[int | None, float] = {place: 1.0}
+                    for move in self.moves:
+                        for reached, share in at.items():
+                            row[self.state(reached, now)] += stay * turned * move * share
+                        moved: dict[int | None, float] = {}
+                        for reached, share in at.items():
+                            onward = {None: 1.0} if reached is None else self.onward(reached, now)
+                            for to, part in onward.items():
+                                moved[to] = moved.get(to, 0.0) + share * part
+                        at = moved
+                for state in range(off):
+                    row[state] += self.jump / off
+                row[off] += self.leave
+        matrix[off] = [self.enter / off] * off + [1 - self.enter]
+        return matrix
+
+    def start(self) -> Row:
+        off = self.places * self.directions
+        share = min(0.5, self.leave / (self.leave + self.enter))
+        return [(1 - share) / off] * off + [share]
+
+
+def forward_backward(steps: Steps, evidence: Table, still: Sequence[bool]) -> tuple[list[list[float]], float]:
+    """Probability of each state for each query, and the log likelihood of all queries, from the log evidence
+    of each place, (Q,N), relative to being off the map; a query that stands still has the state before it."""
+    matrix, states = steps.transitions(), range(steps.places * steps.directions + 1)
+    likelihood = []
+    for row in evidence:
+        ways = [*row, *reversed(row)] if steps.directions == 2 else row
+        likelihood.append([*(math.exp(one) for one in ways), 1.0])
+    before = [steps.start()]
+    for t in range(1, len(evidence)):
+        at = [before[-1][i] * likelihood[t - 1][i] for i in states]
+        moved = [sum(at[i] * matrix[i][j] for i in states) for j in states]
+        before.append(at if still[t] else moved)
+    after = [[1.0 for _ in states]]
+    for t in range(len(evidence) - 1, 0, -1):
+        seen = [after[0][j] * likelihood[t][j] for j in states]
+        before_it = [sum(matrix[i][j] * seen[j] for j in states) for i in states]
+        after.insert(0, seen if still[t] else before_it)
+    found, total = [], 1.0
+    for t in range(len(evidence)):
+        joint = [before[t][i] * likelihood[t][i] * after[t][i] for i in states]
+        total = sum(joint)
+        found.append([one / total for one in joint])
+    return found, math.log(total)
+
+
+def all_paths(steps: Steps, evidence: Table, still: Sequence[bool]) -> dict[tuple[int, ...], float]:
+    """Every sequence of states with its probability times likelihood, as in `forward_backward`."""
+    matrix, states, found = steps.transitions(), range(2 * steps.places + 1), {}
+    for path in product(states, repeat=len(evidence)):
+        value = steps.start()[path[0]]
+        for t, state in enumerate(path):
+            ways = [*evidence[t], *reversed(evidence[t]), 0.0]
+            if t and not still[t]:
+                value *= matrix[path[t - 1]][state]
+            elif t:
+                value *= path[t - 1] == state
+            value *= math.exp(ways[state])
+        found[path] = value
+    return found

@@ -7,15 +7,16 @@ from torch import Tensor
 
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.maps.spectral_map import SpectralMap
+from dejavu_torch.recognition.evidence import run_lengths, unchanged
 
 PRIOR = 50  # queries that the map's own mean counts as; fewer queries are not centred by default
 
 
 def centred(place_map: PlaceMap, queries: Tensor) -> Tensor:
-    """Queries without what all of them have and the map has not: q - sum(q - m) / (Q + 50).
+    """Queries without what all of them have and the map has not: q - sum w (q - m) / (sum w + 50).
 
-    m is the mean descriptor of the map. For a map by cosine the results have norm 1. Queries of maps that are
-    not spectral, and so have no mean, stay as they are.
+    m is the mean descriptor of the map, w 1 over the length of the stop that a query belongs to. For a map by
+    cosine the results have norm 1. Queries of maps that are not spectral, and have no mean, stay as they are.
 
     Shape: (Q,K) -> (Q,K).
 
@@ -23,8 +24,9 @@ def centred(place_map: PlaceMap, queries: Tensor) -> Tensor:
     """
     if not isinstance(place_map, SpectralMap) or not len(queries):
         return queries
-    total, count = (queries - place_map.mean.to(queries)).sum(0), len(queries)
-    return _without(place_map, queries, total / (count + PRIOR))
+    weight = 1 / run_lengths(unchanged(queries)).to(queries)
+    shift = weight @ (queries - place_map.mean.to(queries))
+    return _without(place_map, queries, shift / (weight.sum() + PRIOR))
 
 
 def running(

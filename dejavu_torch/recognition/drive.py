@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -44,7 +45,7 @@ def localize_drive(
     """Fit a smoother to a drive and match its queries.
 
     If they are no drive of the map, the answers are those of single queries, and a probability is the lower
-    one of the single query and the smoother.
+    one of the single query and the smoother; of one query alone it is its own.
 
     Args:
         rows: scores of queries by their numbers, (B,) -> (B,N). descriptors: (Q,K) of all queries.
@@ -71,15 +72,16 @@ def localize_drive(
             precise = normalised(smoother.folded(block.posterior.cpu().double()))[:, :-1]
             probability = near_mass(precise, smoother.within).gather(1, at.cpu())[:, 0]
             if not smoother.is_drive and platt is not None:
-                probability = torch.minimum(probability, platt.probability(confidence_of(scores)))
+                single = platt.probability(confidence_of(scores))
+                probability = single if len(descriptors) == 1 else torch.minimum(probability, single)
             probability = probability.masked_fill(match.index[:, 0].cpu() < 0, 0)
-            margin = pair.score[:, -1] - pair.score[:, 0]
+            margin = pair.score[:, -1] - pair.score[:, 0] if places > 1 else pair.score[:, 0] * math.nan
             columns = margin, probability, scores.gather(1, at)[:, 0]
             parts.append(Shown(match.map(Tensor.cpu), *(column.cpu() for column in columns)))
             update(len(scores))
     if not parts:
         empty = torch.zeros(0, k)
-        return Match(empty.long(), empty, empty.bool())
+        return Match(empty.long(), empty, empty.bool(), empty.double(), confidence=empty)
     parts.reverse()
     match = Match.joined(part.match for part in parts)
     margin = torch.cat([part.margin for part in parts])

@@ -36,8 +36,7 @@ def spacing_of(queries: Tensor) -> Spacing:
     """The spacing of consecutive queries by their descriptors (Q,K)."""
     queries = queries.float()
     same = unchanged(queries)
-    run = (~same).cumsum(0) - 1
-    length = run.bincount()[run]
+    length = run_lengths(same)
     moving = queries[~same]
     trend = local_mean(moving, DETRENDED)
     return Spacing(
@@ -49,7 +48,9 @@ def unchanged(queries: Tensor) -> Tensor:
     """Which queries hardly differ from the first of their stop, (Q,K) -> (Q,) bool."""
     same = torch.zeros(len(queries), dtype=torch.bool, device=queries.device)
     steps = (queries[1:] - queries[:-1]).norm(dim=1)
-    moving = steps[steps > 0]
+    moving = steps[steps > 0].sort().values
+    if len(moving):  # a stop may be most of the drive
+        moving = moving[moving > UNCHANGED * moving[len(moving) * 9 // 10]]
     least = UNCHANGED * float(moving.median()) if len(moving) else 0.0
     first = 0
     for t in ((steps <= least).nonzero()[:, 0] + 1).tolist():
@@ -57,6 +58,12 @@ def unchanged(queries: Tensor) -> Tensor:
             first = t - 1
         same[t] = (queries[t] - queries[first]).norm() <= least
     return same
+
+
+def run_lengths(same: Tensor) -> Tensor:
+    """Queries of the stop that each belongs to, 1 while moving: (Q,) bool -> (Q,)."""
+    run = (~same).cumsum(0) - 1
+    return run.bincount()[run]
 
 
 def local_mean(queries: Tensor, side: int) -> Tensor:
@@ -97,7 +104,10 @@ class Standardised(NamedTuple):
 
 
 def place_means(scores: Tensor, weight: Tensor) -> Tensor:
-    """The mean score of each place over the queries that say something, (Q,N), (Q,) -> (N,)."""
+    """The mean score of each place over the queries that say something, (Q,N), (Q,) -> (N,); 0 for a single
+    query, of which nothing would be left."""
+    if len(scores) == 1:
+        return torch.zeros_like(scores[0])
     valid = scores.isfinite() & speaking(scores)[:, None]
     share = weight[:, None] * valid
     total = torch.where(valid, scores, 0).mul(weight[:, None]).sum(0)

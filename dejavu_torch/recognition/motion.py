@@ -44,7 +44,8 @@ class Layout(NamedTuple):
 
     Attributes:
         route_starts: the first place of each route; no move crosses from one route into the next.
-        links: further steps, in place of that to the next place; backwards in the opposite direction.
+        links: further steps, in place of that to the next place; backwards in the opposite direction. Those
+            from one place that have more than 1 in all share it.
         turn: probability of turning round in a step, if there are two directions.
     """
 
@@ -66,26 +67,25 @@ class Motion:
         self.layout, self.rates = layout, rates
         self.stay = 1 - rates.jump - rates.leave
         self.moves = rates.moves.unbind()
-        keep = rates.moves.new_ones(layout.directions, layout.places)
-        self.linked: list[tuple[int, int, int, float]] = []
-        last = layout.places - 1
+        last, taken = layout.places - 1, rates.moves.new_zeros(layout.directions, layout.places)
+        ways: list[tuple[int, int, int, float]] = []
+        for first, second, share in layout.links:
+            both = [(first, second), (last - second, last - first)][: layout.directions]
+            ways += [(row, at, to, share) for row, (at, to) in enumerate(both)]
+        for row, at, _, share in ways:
+            taken[row, at] += share
+        self.linked = [(row, at, to, share / max(1.0, float(taken[row, at]))) for row, at, to, share in ways]
+        keep = 1 - F.pad(taken[:, :-1].clamp(max=1), (1, 0))
         for start in layout.route_starts[1:]:
             keep[0, start] = 0
             keep[1:, last + 1 - start] = 0
-        for row in range(layout.directions):  # backwards in the opposite direction
-            ways = [(a, b, s) if not row else (last - b, last - a, s) for a, b, s in layout.links]
-            for at, to, share in ways:
-                total = sum(other for start, _, other in ways if start == at)
-                self.linked.append((row, at, to, share / max(1.0, total)))
-                if at < last and keep[row, at + 1] > 0:
-                    keep[row, at + 1] = max(0.0, 1 - total)
         plain = len(layout.route_starts) == 1 and not layout.links
         self.keep = None if plain else keep  # the share of a place's mass that moves on to the next one
         reach = torch.ones_like(keep)
         self.reach = [reach]  # the share of a move by 0, 1, .. V places that stays on the route
         for _ in self.moves[1:]:
             self.reach.append(self._shifted_back(self.reach[-1]))
-        self.lost = rates.moves.new_ones(()) - sum(move * share for move, share in zip(self.moves, self.reach, strict=True))
+        self.lost = torch.einsum("v,vdn", rates.moves, 1 - torch.stack(self.reach))
 
     def _shifted(self, on: Tensor) -> Tensor:
         """Mass (..., D, N) one place further."""
@@ -124,9 +124,10 @@ class Motion:
         for move in self.moves[-2::-1]:
             moved = torch.addcmul(self._shifted(moved), move, start)
         total, moved = belief[..., :-1].sum(-1, keepdim=True), moved.flatten(-2)
+        lost = (start * self.lost).flatten(-2).sum(-1, keepdim=True)
         _, jump, leave, enter = self.rates
         anywhere = (jump * total + enter * off) / moved.shape[-1]
-        off = self.stay * (total - moved.sum(-1, keepdim=True)) + leave * total + (1 - enter) * off
+        off = self.stay * lost + leave * total + (1 - enter) * off
         return torch.cat([self.stay * moved + anywhere, off], -1)
 
     def expected(self, message: Tensor) -> Tensor:

@@ -46,6 +46,11 @@ FITTED, STRETCH, STRETCHES = 1000, 100, 10  # queries that are fitted to at most
 CORRELATED = 4  # correlation times in a stretch, at least
 DRIVE = 10.0  # nats by which a drive beats being off the map throughout
 OTHER_DRIVE, PER_QUERY = 30.0, 0.1  # likewise at another speed, in all and per query,
+REPEATED = 0.8  # of these nats: places elsewhere that explain as much show the same
+FOUND = 0.05  # mass of a place that is found
+    0.8,
+    0.05,
+)  # share of these nats that places elsewhere explain; mass of a place that is found
 CLEARLY = 5.0  # and times as many as at one place a query
 WHOLE = "a smoother has to know the whole drive; expected a PlaceFilter, or a SequenceMatcher"
 BLOCK = 2**22  # numbers of a block of queries and states
@@ -72,12 +77,16 @@ class Block(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """What expectation-maximisation found. log: nats by which the model beats being off the map."""
+    """What expectation-maximisation found.
+
+    log: nats by which the model beats being off the map. second: likewise, without the places found.
+    """
 
     rates: Rates
     separation: float
     values: Tensor  # of the rank table
     log: float
+    second: float
     queries: int
 
 
@@ -181,7 +190,7 @@ class PlaceSmoother(SequenceModel):
             each = [self(one, None, route_starts) for one in scores.flatten(0, -3)]
             return torch.stack(each).view(*lead, *each[0].shape) if each else scores.clone()
         posterior = self.posterior(scores, descriptors, route_starts)
-        return near_scores(posterior[:, :-1], scores, self.within)
+        return near_scores(posterior[:, :-1], scores, self.within).to(scores.dtype)
 
     def posterior(
         self, scores: Tensor, descriptors: Tensor | None = None, route_starts: Sequence[int] = (0,)
@@ -202,7 +211,7 @@ class PlaceSmoother(SequenceModel):
         Differentiable in `move_logits`, `rate_logits` and `enter_logit`.
         """
         blocks = self.blocks(self.drive(scores, descriptors), route_starts)
-        return torch.stack([block.log.sum() for block in blocks]).sum()
+        return torch.stack([scores.new_zeros(()), *(block.log.sum() for block in blocks)]).sum()
 
     @torch.no_grad()
     def path(
@@ -263,9 +272,10 @@ class PlaceSmoother(SequenceModel):
             assert descriptors is not None
             spacing = spacing_of(descriptors)
             return Drive(scores, self.means, self.values, spacing, self.separation, self.tempering)
-        given, known = check_scores(scores).detach(), scores
+        known = check_scores(scores)
+        given = known.detach()
         spacing = spacing_of(finite(given) if descriptors is None else descriptors)
-        means, values = self.means, self.values
+        means, values = self.means.to(given), self.values
         if len(means) != scores.shape[1]:
             means = place_means(given, spacing.weight.to(given))
         if not len(values):
@@ -314,13 +324,11 @@ class PlaceSmoother(SequenceModel):
             self; `is_drive` tells whether the queries are a drive of the map at all.
         """
         if isinstance(scores, Tensor):
-            descriptors = finite(check_scores(scores)) if descriptors is None else descriptors
-            scores = rows_of(scores)
+            known = check_scores(scores)
+            scores, descriptors = rows_of(known), finite(known) if descriptors is None else descriptors
         assert descriptors is not None
         self.is_drive, self.log_likelihood = False, None
-        if len(descriptors) < 2:
-            self.means = scores(torch.arange(len(descriptors))).sum(0).mul(0)
-            self.values = RankTable().values
+        if not len(descriptors):
             return self
         spacing = spacing_of(descriptors)
         self.correlation, self.tempering = spacing.correlation, tempering_of(spacing)
@@ -336,7 +344,9 @@ class PlaceSmoother(SequenceModel):
             other = max((self._fitted(*given, start) for start in (SLOW, FAST)), key=lambda one: one.log)
             least = max(OTHER_DRIVE, PER_QUERY * other.queries, CLEARLY * best.log)
             best = other if other.log >= least else best
-        self.is_drive, self.log_likelihood = best.log >= DRIVE, best.log
+        # elsewhere explains a drive no better than being off the map, unless it shows the same places
+        alike = DRIVE <= best.second < REPEATED * best.log
+        self.is_drive, self.log_likelihood = best.log >= DRIVE and not alike, best.log
         self.separation, self.values = best.separation, best.values
         jump, leave, enter = map(float, best.rates[1:])
         self.move_logits.copy_(logits(*best.rates.moves.tolist()))
@@ -375,7 +385,14 @@ class PlaceSmoother(SequenceModel):
             belief, after = normalised(block.before * block.likelihood), block.likelihood * block.after
             counts = motion.counts(belief[:, :-1][moving], after[:, 1:][moving])
             rates = updated_rates(counts, prior * (MOVE_SHARE * n * length))
-        return Fit(rates, separation, table.values, float(block.log.sum()), n * length)
+        found = self.folded(block.posterior)[..., :-1]
+        elsewhere = (near_mass(found, RADIUS) > FOUND).float()
+        elsewhere = near_mass(elsewhere, RADIUS) == 0
+        unlikely = log.clamp(max=-(separation**2) / 2 / self.tempering)
+        like = self.wide(torch.where(elsewhere, log, unlikely), 0.0).exp()
+        (second,) = sweep(motion, lambda *_: like, length, still, length)
+        logs = float(block.log.sum()), float(second.log.sum())
+        return Fit(rates, separation, table.values, *logs, n * length)
 
     @torch.no_grad()
     def settled(self) -> dict[str, Any]:
@@ -483,7 +500,6 @@ def sweep(
             message = message * seen
             message = message / message.amax(-1, keepdim=True)
         yield Block(first, before, like, torch.stack(after[::-1], -2), log)
-        belief = motion.anywhere()
 
 
 def updated_rates(counts: Counts, prior: Tensor) -> Rates:
@@ -526,7 +542,7 @@ def tempering_of(spacing: Spacing) -> float:
 
 
 def check_scores(scores: Tensor) -> Tensor:
-    """Refuse what are no scores (Q,N)."""
+    """Scores (Q,N), at least in single precision; refuses what are none."""
     if scores.ndim != 2 or scores.shape[1] < 1 or not scores.is_floating_point():
         raise InputError(f"scores are {tuple(scores.shape)} {scores.dtype}; expected floats (Q,N)")
-    return scores
+    return scores if scores.dtype == torch.float64 else scores.float()

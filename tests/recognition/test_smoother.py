@@ -1,390 +1,386 @@
-"""The whole drive as the query: motion, evidence by rank, forward-backward, and what is learned from it."""
+"""The places of a drive given all of it, held against literal sums over all sequences of places."""
 
 from __future__ import annotations
 
-import itertools
 import math
+from collections.abc import Callable, Sequence
+from itertools import product
 
 import pytest
-import reference
 import torch
+from devices import pretend
 from helpers import refused
+from hypothesis import given
+from hypothesis import strategies as st
+from reference import Steps, all_paths, forward_backward
 from torch import Tensor
 
-from dejavu_torch import PlaceFilter, PlaceSmoother
-from dejavu_torch.recognition import smoother as smoothing
-from dejavu_torch.recognition.centring import PRIOR, centred
-from dejavu_torch.recognition.drive import doubt, localize_drive
-from dejavu_torch.recognition.evidence import (
-    LOWEST,
-    PER_DEVIATION,
-    RankTable,
-    correlation_time,
-    place_means,
-    spacing_of,
-    standardised,
-)
-from dejavu_torch.recognition.motion import Layout, Motion, Rates
-from dejavu_torch.recognition.smoother import Block, near_mass, sweep
+from dejavu_torch.recognition.motion import Motion
+from dejavu_torch.recognition.smoother import PlaceSmoother, normalised, stretches, sweep, updated_rates
 
-LAYOUTS = [
-    Layout(5),
-    Layout(5, 2, turn=0.1),
-    Layout(7, 2, (0, 3), turn=0.1),
-    Layout(6, 2, (0,), ((5, 0, 1.0),), 0.1),
-    Layout(7, 2, (0, 4), ((2, 5, 0.3), (2, 0, 0.5), (6, 0, 0.9)), 0.2),
-]
+MOVES = (0.2, 0.5, 0.2, 0.1)
 
 
-def rates(dtype: torch.dtype = torch.float64) -> Rates:
-    moves = torch.tensor([0.2, 0.4, 0.25, 0.15], dtype=dtype)
-    return Rates(moves, *(moves.new_tensor(rate) for rate in (0.05, 0.03, 0.2)))
+def noise(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
 
 
-def explicit(layout: Layout) -> tuple[Motion, Tensor]:
-    return Motion(layout, rates()), torch.tensor(reference.transitions(layout, rates()), dtype=torch.float64)
+def shown(places: int, path: Sequence[int], seed: int = 0, clear: float = 2.5) -> Tensor:
+    """Scores of queries that show a place each, and its neighbours a little; -1 shows none."""
+    scores, at = noise(len(path), places, seed=seed), torch.tensor(path)[:, None]
+    near = (torch.arange(places) - at).abs()
+    return scores - clear * torch.where(at < 0, 0, 0.5 ** near.float())
 
 
-def made(places: Tensor, count: int = 90, noise: float = 0.4, seed: int = 0) -> Tensor:
-    """Scores (Q,N) of queries at these places, -1 off the map, of features that change along the map."""
-    generator = torch.Generator().manual_seed(seed)
-    features = torch.randn(count, 24, generator=generator)
-    queries = torch.where(places[:, None] >= 0, features[places.clamp(min=0)], 0)
-    queries = queries + (noise + (places < 0)[:, None]) * torch.randn(len(places), 24, generator=generator)
-    return 1 - torch.nn.functional.cosine_similarity(queries[:, None], features[None], dim=2)
-
-
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_a_step_is_that_of_the_explicit_matrix(layout: Layout) -> None:
-    motion, matrix = explicit(layout)
-    belief, message = torch.rand(3, len(matrix)).double(), torch.rand(3, len(matrix)).double()
-    torch.testing.assert_close(matrix.sum(1), torch.ones(len(matrix)).double())
-    torch.testing.assert_close(motion.moved(belief), belief @ matrix)
-    torch.testing.assert_close(motion.expected(message), message @ matrix.T)
-    best = (belief[0].log()[:, None] + matrix.log()).amax(0)
-    if not layout.links:  # several ways between two places are one here
-        torch.testing.assert_close(motion.best_moved(belief[0].log()), best)
-    counts = motion.counts(belief, message)
-    joint = belief[:, :, None] * matrix * message[:, None, :]
-    joint = joint / joint.sum((1, 2), keepdim=True)
-    torch.testing.assert_close(counts.enter + counts.absent, joint[:, -1].sum())
-    torch.testing.assert_close(counts.absent, joint[:, -1, -1].sum())
-    torch.testing.assert_close(counts.moves.sum() + counts.jump + counts.leave, joint[:, :-1].sum())
-
-
-def test_no_move_crosses_into_the_next_route_and_a_loop_closes() -> None:
-    still = Rates(torch.tensor([0.0, 1.0]), *(torch.zeros(3).unbind()))
-    on = torch.eye(11)[2]  # the third of five places
-    parted = Motion(Layout(5, 2, (0, 3)), still).moved(on)
-    assert parted.nonzero().tolist() == [[10]]  # off the map
-    closed = Motion(PlaceSmoother(loop=True).layout(5), still)
-    assert closed.moved(torch.eye(11)[4]).argmax() == 0
-    assert closed.moved(torch.eye(11)[9]).argmax() == 5  # backwards from place 0 to place 4
-
-
-@pytest.mark.parametrize("layout", LAYOUTS)
-@pytest.mark.parametrize("size", [1, 4, 20])
-def test_blocks_of_any_size_give_the_explicit_posterior(layout: Layout, size: int) -> None:
-    motion, matrix = explicit(layout)
-    likelihood = torch.rand(9, len(matrix)).double() * 3
-    likelihood[:, -1] = 1
-    still = torch.zeros(9, dtype=torch.bool)
-    blocks = [*sweep(motion, lambda first, last: likelihood[first:last], 9, still, size)]
-    assert [block.first for block in blocks] == [*range(0, 9, size)][::-1]
-    expected, log = reference.smoothed(matrix, motion.anywhere(), likelihood)
-    torch.testing.assert_close(torch.cat([block.posterior for block in blocks[::-1]]), expected)
-    assert float(sum(block.log.sum() for block in blocks)) == pytest.approx(log)
-
-
-def test_the_posterior_and_the_likelihood_are_those_of_the_explicit_chain() -> None:
-    scores = torch.rand(8, 6).double()
-    smoother = PlaceSmoother(tempering=2.0, separation=1.0, within=0, turn=0.05)
+def evidence(smoother: PlaceSmoother, scores: Tensor) -> tuple[Tensor, Tensor]:
+    """What the scores say of the places, and which queries are in a stop."""
     drive = smoother.drive(scores)
-    log = torch.nn.functional.pad(smoother.wide(drive.log_likelihood(torch.arange(8)), 0.0), (0, 0))
-    motion = smoother.motion(6, (0,), scores)
-    matrix = torch.tensor(reference.transitions(motion.layout, motion.rates), dtype=torch.float64)
-    expected, total = reference.smoothed(matrix, motion.anywhere(), log.exp())
-    places = expected[:, :6] + expected[:, 6:12].flip(1)
-    posterior = smoother.posterior(scores)
-    torch.testing.assert_close(posterior, torch.cat([places, expected[:, 12:]], 1))
-    assert float(smoother.log_evidence(scores)) == pytest.approx(total)
-    torch.testing.assert_close((-smoother(scores)).exp(), places)
+    return drive.log_likelihood(torch.arange(len(scores))), drive.spacing.still
 
 
-def test_the_path_is_the_best_of_all() -> None:
-    scores = torch.rand(4, 3, generator=torch.Generator().manual_seed(3)).double()
-    smoother = PlaceSmoother(separation=2.0, turn=0.05, jump=0.05, leave=0.1, enter=0.3)
-    motion = smoother.motion(3, (0,), scores)
-    matrix = torch.tensor(reference.transitions(motion.layout, motion.rates), dtype=torch.float64).log()
-    log = smoother.wide(smoother.drive(scores).log_likelihood(torch.arange(4)), 0.0)
-    first = motion.anywhere().log()
-
-    def worth(path: tuple[int, ...]) -> float:
-        steps = sum(float(matrix[i, j]) for i, j in itertools.pairwise(path))
-        return float(first[path[0]]) + steps + sum(float(log[t, i]) for t, i in enumerate(path))
-
-    best = max(itertools.product(range(7), repeat=4), key=worth)
-    assert smoother.path(scores).tolist() == [-1 if i == 6 else i if i < 3 else 5 - i for i in best]
-    assert smoother.path(scores[:0]).tolist() == []
+def steps_of(smoother: PlaceSmoother, places: int, starts: Sequence[int] = (0,)) -> Steps:
+    with torch.no_grad():
+        _, jump, leave = smoother.rate_logits.softmax(0).tolist()
+        moves, enter = smoother.move_logits.softmax(0).tolist(), float(smoother.enter_logit.sigmoid())
+    ends, links = (*starts[1:], places), smoother.links
+    if smoother.loop:
+        links += tuple((end - 1, start, 1.0) for start, end in zip(starts, ends, strict=True))
+    return Steps(places, moves, jump, leave, enter, smoother.turn, 2, starts, links)
 
 
-def test_rates_have_gradients_and_tempering_none() -> None:
-    scores = torch.rand(6, 5).double()
-    smoother = PlaceSmoother(moves=(0.3, 0.5, 0.2), turn=0.1).double()
-    names = ("move_logits", "rate_logits", "enter_logit")
-    given = [getattr(smoother, name).detach().clone().requires_grad_() for name in names]
+SMOOTHER = st.builds(
+    PlaceSmoother,
+    st.sampled_from([(1.0,), (0.1, 0.8, 0.1), (0.0, 1.0), MOVES]),
+    jump=st.sampled_from([0.0, 0.01, 0.3]),
+    leave=st.sampled_from([0.0, 0.02, 0.5]),
+    enter=st.sampled_from([0.0, 0.1, 1.0]),
+    turn=st.sampled_from([0.0, 0.002, 0.5]),
+    separation=st.sampled_from([0.3, 1.5, 4.0]),
+    tempering=st.sampled_from([1.0, 6.0]),
+    links=st.sampled_from([(), ((1, 0, 0.5),)]),
+    loop=st.booleans(),
+)
+SHAPE = st.tuples(st.integers(1, 9), st.integers(2, 6), st.integers(0, 99))
 
-    def log(*values: Tensor) -> Tensor:
-        called = torch.func.functional_call
-        return called(
-            _Log(smoother), dict(zip((f"of.{name}" for name in names), values, strict=True)), scores
-        )
 
-    assert torch.autograd.gradcheck(log, given)
-    assert {name for name, _ in smoother.named_parameters()} == set(names)
+@given(SMOOTHER, SHAPE, st.integers(1, 5), st.booleans())
+def test_equals_a_literal_loop_in_blocks_of_any_size(
+    smoother: PlaceSmoother, shape: tuple[int, int, int], size: int, two_routes: bool
+) -> None:
+    queries, places, seed = shape
+    scores, starts = noise(queries, places, seed=seed).double(), (0, 1) if two_routes else (0,)
+    smoother = smoother.double()
+    log, still = evidence(smoother, scores)
+    steps = steps_of(smoother, places, starts)
+    expected, total = forward_backward(steps, log.tolist(), still.tolist())
+    states = torch.tensor(expected, dtype=torch.float64)
+    found = smoother.posterior(scores, route_starts=starts)
+    blocks = list(smoother.blocks(smoother.drive(scores), starts, size))
+    assert smoother.log_evidence(scores, route_starts=starts).item() == pytest.approx(total, abs=1e-9)
+    assert torch.allclose(found, smoother.folded(states), atol=1e-9)
+    assert torch.allclose(found.sum(1), torch.ones(queries, dtype=torch.float64))
+    assert [block.first for block in blocks] == [*range(0, queries, size)][::-1]
+    assert torch.allclose(torch.cat([block.posterior for block in blocks[::-1]]), states, atol=1e-9)
+    assert sum(block.log.sum().item() for block in blocks) == pytest.approx(total, abs=1e-9)
 
 
-class _Log(torch.nn.Module):
-    def __init__(self, of: PlaceSmoother) -> None:
+def stopped() -> Tensor:
+    """24 queries, 22 of them of a stop."""
+    moving = noise(3, 2, seed=4)
+    return torch.cat([moving[:2], moving[1:2].expand(21, 2), moving[2:]]).double()
+
+
+def test_a_stop_moves_nowhere_and_counts_once() -> None:
+    smoother, scores = PlaceSmoother(MOVES, 0.1, 0.1, 0.1, 0.3).double(), stopped()
+    log, still = evidence(smoother, scores)
+    assert still.tolist() == [False] * 2 + [True] * 21 + [False]
+    assert torch.allclose(log[1:23].sum(0), 22 * log[1])
+    steps = steps_of(smoother, 2)
+    expected, total = forward_backward(steps, log.tolist(), still.tolist())
+    states = torch.tensor(expected, dtype=torch.float64)
+    assert torch.allclose(smoother.posterior(scores), smoother.folded(states))
+    assert smoother.log_evidence(scores).item() == pytest.approx(total)
+    assert torch.equal(smoother.path(scores)[1:23], smoother.path(scores)[1].expand(22))
+
+
+@given(SMOOTHER, st.integers(0, 99))
+def test_the_path_and_the_likelihood_are_those_of_all_sequences(smoother: PlaceSmoother, seed: int) -> None:
+    smoother.links, smoother.loop = (), False  # where two ways lead to a place, each is one of its own
+    smoother, scores = smoother.double(), 3 * noise(4, 3, seed=seed).double()
+    log, still = evidence(smoother, scores)
+    values = all_paths(steps_of(smoother, 3), log.tolist(), still.tolist())
+    ways = [(6,) if place < 0 else (place, 5 - place) for place in smoother.path(scores).tolist()]
+    assert max(map(values.__getitem__, product(*ways))) == pytest.approx(max(values.values()))
+    assert smoother.log_evidence(scores).item() == pytest.approx(math.log(sum(values.values())))
+
+
+def test_the_path_stands_still_and_leaves_the_map() -> None:
+    path = [*range(10, 40), *[40] * 40, *range(40, 60), *[-1] * 60, *range(20, 50)]
+    scores = shown(80, path, clear=5.0)
+    scores[31:70] = scores[30]
+    smoother = PlaceSmoother().fit(scores)
+    found = smoother.path(scores)
+    truth = torch.tensor(path)
+    assert smoother.is_drive
+    assert ((found - truth).abs() <= 1).double().mean() > 0.95
+    assert found[30:70].unique().numel() == 1
+    assert (found[95:145] == -1).all()
+
+
+class Likelihood(torch.nn.Module):
+    def __init__(self, smoother: PlaceSmoother) -> None:
         super().__init__()
-        self.of = of
+        self.smoother = smoother
 
     def forward(self, scores: Tensor) -> Tensor:
-        return self.of.log_evidence(scores)
+        return self.smoother.log_evidence(scores)
 
 
-def test_expectation_maximisation_and_gradient_ascent_find_the_same_moves() -> None:
-    scores = made(torch.arange(60) + 10, noise=0.8).double()
-    smoother = PlaceSmoother().fit(scores).double()
-    drive = smoother.drive(scores)
-    like = smoother.wide(drive.log_likelihood(torch.arange(60)), 0.0).exp()
-    layout, still = smoother.layout(90), torch.zeros(60, dtype=torch.bool)
-    prior = torch.tensor(smoothing.MOVES, dtype=torch.float64) * smoothing.MOVE_SHARE * 60
-    found = Rates(prior / prior.sum(), *(prior.new_tensor(rate) for rate in smoothing.RATES))
+def test_gradients_reach_moves_and_rates_but_not_what_is_tempered() -> None:
+    model, scores = Likelihood(PlaceSmoother(MOVES, 0.1, 0.1, 0.2)).double(), noise(6, 4).double()
+    names, values = zip(*model.named_parameters(), strict=True)
+    assert names == ("smoother.move_logits", "smoother.rate_logits", "smoother.enter_logit")
 
-    def swept(given: Rates) -> tuple[Motion, Block]:
-        motion = Motion(layout, given)
-        (block,) = sweep(motion, lambda *_: like, 60, still, 60)
-        return motion, block
+    def run(*values: Tensor) -> Tensor:
+        return torch.func.functional_call(model, dict(zip(names, values, strict=True)), (scores,))
 
-    for _ in range(200):
-        motion, block = swept(found)
-        belief = smoothing.normalised(block.before * block.likelihood)
-        counts = motion.counts(belief[:-1], (block.likelihood * block.after)[1:])
-        found = smoothing.updated_rates(counts, prior)
-    logits = [one.log().clone().requires_grad_() for one in (found.moves * 0 + 1 / 7,)]
-    others = torch.tensor([math.log(0.998), math.log(1e-3), math.log(1e-3)], dtype=torch.float64)
-    others = others.requires_grad_()
-    enter = torch.tensor(math.log(0.01 / 0.99), dtype=torch.float64, requires_grad=True)
-    optimiser = torch.optim.LBFGS([*logits, others, enter], max_iter=200, line_search_fn="strong_wolfe")
-    counted = smoothing.RATE_COUNTS, smoothing.ENTER_COUNTS
+    assert torch.autograd.gradcheck(run, values)
+    assert all(bool((one != 0).all()) for one in torch.autograd.grad(run(*values), values))
+    fitted = PlaceSmoother(MOVES, within=1).double().fit(noise(6, 4, seed=1).double())
+    assert torch.autograd.gradcheck(fitted, (scores.requires_grad_(),))
+
+
+@pytest.mark.parametrize("none", [{"jump": 0.0}, {"leave": 0.0}, {"enter": 0.0}, {"jump": 0.0, "leave": 0.0}])
+def test_what_cannot_happen_stays_finite_in_single_precision(none: dict[str, float]) -> None:
+    """Queries that contradict each other by more than single precision holds."""
+    scores = shown(60, [*range(20), *range(40, 60), *range(20, 40)], clear=20.0)
+    smoother = PlaceSmoother((0.0, 1.0), separation=6.0, turn=0.0, **none)
+    smoother.log_evidence(scores).backward()
+    assert smoother.posterior(scores).isfinite().all()
+    assert all(one.grad is not None and bool(one.grad.isfinite().all()) for one in smoother.parameters())
+
+
+def test_climbing_the_likelihood_finds_the_moves_that_counting_finds() -> None:
+    """With the same evidence, and the prior of five more steps of each kind of move."""
+    scores = shown(15, [*range(0, 15, 2), *range(14, 0, -3), *range(8)], clear=3.0).double()
+    smoother, prior = PlaceSmoother(MOVES, 0.02, 0.02, 0.05).double(), torch.full((4,), 5.0).double()
+    drive, first = smoother.drive(scores), smoother.motion(15, (0,), scores)
+    like = smoother.wide(drive.log_likelihood(torch.arange(len(scores))), 0.0).exp()
+    with torch.no_grad():
+        rates = first.rates
+        for _ in range(100):
+            motion = Motion(first.layout, rates)
+            (block,) = sweep(motion, lambda *_: like, len(like), drive.spacing.still, len(like))
+            belief, after = normalised(block.before * block.likelihood), block.likelihood * block.after
+            rates = updated_rates(motion.counts(belief[:-1], after[1:]), prior)
+        on_map = torch.stack([1 - rates.jump - rates.leave, rates.jump, rates.leave])
+        smoother.rate_logits.copy_(on_map.log())
+        smoother.enter_logit.copy_(rates.enter.logit())
+    climber = torch.optim.LBFGS([smoother.move_logits], max_iter=100, tolerance_grad=1e-9)
 
     def loss() -> Tensor:
-        optimiser.zero_grad()
-        moves, (stay, jump, leave) = logits[0].softmax(0), others.softmax(0)
-        one = Rates(moves, jump, leave, enter.sigmoid())
-        log = swept(one)[1].log.sum() + (prior * moves.log()).sum() + prior.sum() * stay.log()
-        log = log + counted[0] * (0.001 * jump.log() + 0.001 * leave.log())
-        log = log + (counted[0] * 0.998 - prior.sum()) * stay.log()
-        log = log + counted[1] * (0.01 * one.enter.log() + 0.99 * (1 - one.enter).log())
-        (-log).backward()
-        return -log
+        climber.zero_grad()
+        value = -smoother.log_evidence(scores) - prior @ smoother.move_logits.log_softmax(0)
+        value.backward()
+        return value
 
-    optimiser.step(loss)
-    torch.testing.assert_close(logits[0].softmax(0).detach(), found.moves, rtol=0, atol=2e-3)
-
-
-def test_queries_that_say_nothing_change_nothing() -> None:
-    scores = made(torch.arange(40))
-    smoother = PlaceSmoother().fit(scores)
-    for silent in (1.0, math.nan, math.inf):
-        odd = scores.clone()
-        odd[20] = silent
-        log = smoother.drive(odd).log_likelihood(torch.tensor([20]))
-        assert log.unique().tolist() == [0.0]
-        assert smoother.posterior(odd)[:, :-1].argmax(1)[[19, 21]].tolist() == [19, 21]
-        best = smoother(odd)[20].isfinite().any()
-        assert bool(best) == (silent == 1.0)
-    odd = scores.clone()
-    odd[:, 7] = math.inf
-    assert smoother(odd)[:, 7].isinf().all()
+    climber.step(loss)
+    assert torch.allclose(smoother.move_logits.softmax(0), rates.moves, atol=1e-4)
+    assert (rates.moves - torch.tensor(MOVES)).abs().max() > 0.05
 
 
 DRIVES = {
-    "forwards": torch.arange(80),
-    "backwards": torch.arange(80).flip(0),
-    "there and back": torch.cat([torch.arange(60), torch.arange(60).flip(0)]),
-    "a third of the speed": torch.arange(5, 65).repeat_interleave(3),
-    "three times the speed": torch.arange(0, 90, 3).repeat(2),
-    "off the map in between": torch.cat([torch.arange(30), torch.full((40,), -1), torch.arange(40, 80)]),
-    "a jump": torch.cat([torch.arange(30), torch.arange(60, 90)]),
+    "on": range(20, 180),
+    "reversed": range(180, 20, -1),
+    "there and back": [*range(20, 120), *range(119, 20, -1)],
+    "jumps": [*range(20, 60), *range(150, 190), *range(70, 110), *range(40)],
+    "a stop": [*range(20, 80), *[80] * 200, *range(80, 150)],
+    "slow": [20 + t // 3 for t in range(300)],
+    "thrice the speed": range(0, 200, 3),
+    "five times the speed": range(0, 400, 5),
+    "partly off the map": [*range(20, 100), *[-1] * 80, *range(100, 160)],
 }
 
 
-@pytest.mark.parametrize("name", DRIVES)
-def test_drives_of_every_kind_are_followed(name: str) -> None:
-    truth = DRIVES[name]
-    scores = made(truth, noise=1.0)
-    smoother = PlaceSmoother(within=1)
-    match = localize_drive(lambda numbers: scores[numbers], scores, smoother, radius=2)
-    on, near = truth >= 0, (match.index[:, 0] - truth).abs() <= 1
+@pytest.mark.parametrize("drive", DRIVES.values(), ids=DRIVES)
+def test_drives_of_any_kind_are_found_where_single_queries_are_not(drive: Sequence[int]) -> None:
+    truth, places = torch.tensor(drive), 400 if max(drive) > 199 else 200
+    scores = shown(places, drive, clear=2.0)
+    if drive is DRIVES["a stop"]:
+        scores[60:260] = scores[60] + 0.001 * noise(200, places, seed=9)
+    smoother = PlaceSmoother(within=2).fit(scores)
+    on, found = truth >= 0, smoother.posterior(scores)
+    right = ((smoother(scores).argmin(1) - truth).abs() <= 2)[on].double().mean()
+    alone = ((scores.argmin(1) - truth).abs() <= 2)[on].double().mean()
     assert smoother.is_drive
-    assert near[on].double().mean() >= (near & on).sum() / on.sum() > 0.93
-    assert near[on].sum() > ((scores.argmin(1) - truth).abs() <= 1)[on].sum()
-    assert match.probability is not None
-    assert (match.probability[~on, 0] < 0.5).double().mean() > 0.8 or on.all()
-
-
-def test_a_long_stop_counts_once_and_is_followed() -> None:
-    truth = torch.cat([torch.arange(30), torch.full((150,), 30), torch.arange(31, 70)])
-    scores = made(truth, noise=1.0)
-    scores[30:180] = scores[30]
-    spacing = spacing_of(scores)
-    assert spacing.weight[100] == pytest.approx(1 / 150)
-    assert spacing.still.nonzero()[:, 0].tolist() == [*range(31, 180)]
-    found = PlaceSmoother(within=1).fit(scores)(scores).argmin(1)
-    assert ((found - truth).abs() <= 1).double().mean() > 0.95
-    assert set(PlaceSmoother().fit(scores).path(scores)[30:180].tolist()) == {30}
+    assert alone < 0.5 < 0.99 < right
+    assert found[on, -1].mean() < 0.1
+    assert on.all() or found[~on, -1].mean() > 0.5
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_queries_of_another_route_are_no_drive_and_are_answered_one_by_one(seed: int) -> None:
-    scores = made(torch.full((200,), -1), seed=seed)
-    smoother = PlaceSmoother()
-    match = localize_drive(lambda numbers: scores[numbers], scores, smoother)
+def test_another_route_is_no_drive(seed: int) -> None:
+    scores = noise(200, 300, seed=seed)
+    smoother = PlaceSmoother().fit(scores)
     assert not smoother.is_drive
-    assert match.index[:, 0].tolist() == scores.argmin(1).tolist()
-    torch.testing.assert_close(match.score[:, 0], scores.amin(1))
-    assert match.probability is not None
-    assert float(match.probability.max()) < 0.5
+    assert smoother.posterior(scores)[:, :-1].max() < 0.5
+    assert (-smoother(scores)).exp().max() < 0.5
 
 
-def test_what_a_match_of_a_drive_says() -> None:
-    scores = made(torch.arange(60), noise=1.0)
-    smoother = PlaceSmoother(within=2)
-    match = localize_drive(lambda numbers: scores[numbers], scores, smoother, k=3, radius=4)
-    posterior, near = smoother.posterior(scores)[:, :-1], smoother(scores)
-    assert match.probability is not None
-    assert match.confidence is not None
-    assert match.index[:, 0].tolist() == near.argmin(1).tolist()
-    assert all((a - b).abs().min() > 4 for a, b in itertools.combinations(match.index.unbind(1), 2))
-    for t in (0, 30, 59):
-        at = int(match.index[t, 0])
-        mass = posterior[t, max(0, at - 2) : at + 3].sum()
-        assert float(match.probability[t, 0]) == pytest.approx(float(mass), abs=1e-5)
-        elsewhere = near[t].clone()
-        elsewhere[max(0, at - 4) : at + 5] = math.inf
-        margin = float(elsewhere.min() - near[t, at])
-        assert float(match.confidence[t, 0]) == pytest.approx(margin, rel=1e-4)
-    assert match.probability[:, 1:].isnan().all()
-    assert ((-match.score[:, 0]).exp() <= match.probability[:, 0] + 1e-6).all()
-    own = scores.gather(1, match.index[:, :1])[:, 0]
-    torch.testing.assert_close(match.score[:, 0], near.amin(1) + doubt(own), rtol=1e-4, atol=1e-5)
+def test_circuits_links_and_routes_lead_where_they_say() -> None:
+    laps = [t % 50 for t in range(30, 130)]
+    scores = shown(50, laps, clear=2.5)
+    once, round_ = PlaceSmoother(MOVES, jump=1e-6), PlaceSmoother(MOVES, jump=1e-6, loop=True)
+    assert round_.log_evidence(scores) > once.log_evidence(scores) + 5
+    assert round_.log_evidence(scores, route_starts=(0, 25)) < once.log_evidence(scores)
+    crossing = [*range(20), *range(35, 50)]
+    scores = shown(50, crossing, clear=2.5)
+    linked = PlaceSmoother(MOVES, jump=1e-6, links=[(19, 35, 0.5)])
+    assert linked.log_evidence(scores) > once.log_evidence(scores) + 5
+    assert linked.log_evidence(scores.flip(0)) > once.log_evidence(scores.flip(0)) + 5
+    assert once.log_evidence(scores, route_starts=(0, 10)) < once.log_evidence(scores)
 
 
-def test_doubt_is_a_tenth_of_the_deviations_by_which_an_own_score_is_worse() -> None:
-    own = torch.tensor([1.0, 2, 3, 4, 5, 13, math.inf])
-    median = 3.0
-    spread = 1.4826 * float((own[:6] - median).abs().median())
-    expected = [0.1 * max(0.0, float(one - median)) / spread for one in own[:6]]
-    torch.testing.assert_close(doubt(own)[:6], torch.tensor(expected))
-    assert doubt(own[:0]).tolist() == []
+def test_queries_that_say_nothing_are_as_without_them() -> None:
+    """What lies between is filled in by the queries before and after: the same for all kinds of silence."""
+    scores = shown(60, range(60))
+    smoother = PlaceSmoother().fit(scores)
+    mute = [torch.full((5, 60), one) for one in (0.25, math.inf, -math.inf, math.nan)]
+    mute.append(scores[20:25].clone())
+    mute[-1][:, 7] = math.nan
+    found = [smoother.posterior(torch.cat([scores[:20], one, scores[25:]]), scores) for one in mute]
+    drive = smoother.drive(scores)
+    log = drive.log_likelihood(torch.arange(60))
+    log[20:25] = 0
+    expected, _ = forward_backward(steps_of(smoother, 60), log.tolist(), [False] * 60)
+    for one in found:
+        assert torch.allclose(one, smoother.folded(torch.tensor(expected)), atol=1e-4)
+    assert found[0][20:25, :-1].argmax(1).tolist() == [*range(20, 25)]
 
 
-@pytest.mark.parametrize("shape", [(0, 5), (1, 5), (2, 1), (1, 1), (40, 1)])
-def test_few_queries_and_a_map_of_one_place_are_answered_by_themselves(shape: tuple[int, int]) -> None:
-    scores = torch.rand(shape, generator=torch.Generator().manual_seed(1))
-    smoother = PlaceSmoother()
-    match = localize_drive(lambda numbers: scores[numbers], scores, smoother)
-    assert not smoother.is_drive
-    assert match.index[:, 0].tolist() == scores.argmin(1).tolist()
+def test_only_what_is_scored_is_answered() -> None:
+    scores = shown(60, range(60))
+    scores[:, 30:40], scores[7], scores[9, 3] = math.inf, math.inf, math.nan
+    found = PlaceSmoother(within=1).fit(scores)(scores)
+    assert torch.equal(found.isinf(), ~scores.isfinite())
+    assert not found.isnan().any()
+    closed = torch.full((5, 30), math.inf)
+    assert PlaceSmoother().fit(closed)(closed).isinf().all()
 
 
-def test_leading_dimensions_and_other_types() -> None:
-    scores = torch.stack([made(torch.arange(30), 40, seed=seed) for seed in range(2)])
-    smoother = PlaceSmoother()
-    each = torch.stack([smoother(one) for one in scores])
-    torch.testing.assert_close(smoother(scores), each)
-    assert smoother(scores.double()).dtype == torch.float64
-    assert smoother(scores[:, :0]).shape == (2, 0, 40)
+def test_few_queries_and_places_are_answered() -> None:
+    scores = shown(20, [7, 8], clear=9.0)
+    for queries in (0, 1, 2):
+        for smoother in (PlaceSmoother(within=0), PlaceSmoother(within=0).fit(scores[:queries])):
+            assert smoother(scores[:queries]).shape == (queries, 20)
+            assert smoother.posterior(scores[:queries]).sum(1).tolist() == pytest.approx([1] * queries)
+            assert smoother.log_evidence(scores[:queries]).isfinite()
+            assert len(smoother.path(scores[:queries])) == queries
+            assert (queries < 2) or smoother(scores).isfinite().all()
+        assert not smoother.is_drive
+    assert PlaceSmoother(within=0)(scores[:1]).argmin() == 7
+    alone = PlaceSmoother().fit(noise(30, 1))
+    assert not alone.is_drive
+    assert alone(noise(30, 1)).shape == (30, 1)
 
 
-def test_the_rank_of_a_score_is_its_evidence() -> None:
-    z = torch.randn(20_000, generator=torch.Generator().manual_seed(0))
-    table = RankTable()
-    table.add(z, torch.ones_like(z))
-    at = torch.linspace(-2.5, 2.5, 11)
-    exact = [-float(torch.special.ndtri((z >= one).double().mean())) for one in at]
-    found = RankTable.look_up(table.values, at)
-    torch.testing.assert_close(found, torch.tensor(exact).float(), rtol=0, atol=2 / PER_DEVIATION)
-    assert (RankTable.look_up(table.values, torch.linspace(LOWEST, 60, 999)).diff() >= 0).all()
-    given = torch.tensor([0.3], dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda one: RankTable.look_up(table.values.double(), one), [given])
+def test_leading_dimensions_are_drives_of_their_own() -> None:
+    scores, smoother = noise(2, 3, 8, 9), PlaceSmoother(within=1)
+    found = smoother(scores)
+    assert torch.equal(found[1, 2], smoother(scores[1, 2]))
+    assert found.shape == (2, 3, 8, 9)
+    assert smoother(scores[:0]).shape == (0, 3, 8, 9)
 
 
-def test_a_constant_of_a_query_or_a_place_and_the_scale_say_nothing() -> None:
-    scores = torch.rand(9, 7).double()
-    weight = torch.ones(9)
-    plain = standardised(scores, place_means(scores, weight)).z
-    moved = 3 * (scores + torch.rand(9, 1) + torch.rand(1, 7))
-    torch.testing.assert_close(standardised(moved, place_means(moved, weight)).z, plain)
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float16, torch.bfloat16])
+def test_other_precisions_give_the_same_places(dtype: torch.dtype) -> None:
+    scores = shown(80, range(80), clear=3.0)
+    found = PlaceSmoother(within=0).fit(scores)(scores)
+    smoother = PlaceSmoother(within=0).to(dtype).fit(scores.to(dtype))
+    other = smoother(scores.to(dtype))
+    assert other.dtype == dtype
+    assert torch.equal(other.argmin(1), found.argmin(1))
+    assert smoother(scores).isfinite().all()
 
 
-def test_correlation_times() -> None:
-    generator = torch.Generator().manual_seed(0)
-    white = torch.randn(4000, 20, generator=generator)
-    assert correlation_time(white) == pytest.approx(1.0, abs=0.02)
-    rows = [white[0]]
-    for row in white[1:]:
-        rows.append(0.8 * rows[-1] + 0.6 * row)  # of lag l: .8^l
-    assert correlation_time(torch.stack(rows)) == pytest.approx(1.8 / 0.2, rel=0.15)
-    slow = torch.stack(rows) + 3 * torch.sin(torch.arange(4000) / 300)[:, None]
-    spacing = spacing_of(slow)
-    assert spacing.correlation > 2 * spacing.detrended
+def test_a_device_gives_what_the_cpu_gives() -> None:
+    scores = shown(30, [*range(24), *[24] * 22], clear=3.0).double()
+    scores[24:] = scores[24]
+    smoother = PlaceSmoother().double().fit(scores)
+    with pretend() as device:
+        there = PlaceSmoother().double().to(device).fit(scores.to(device))
+        for one in (there, smoother):  # fitted there or here
+            found, path = one(scores.to(device)), one.path(scores.to(device))
+            assert found.device == device
+            assert torch.allclose(found.cpu(), smoother(scores), rtol=1e-6)
+            assert torch.equal(path.cpu(), smoother.path(scores))
 
 
-def test_queries_are_centred_with_a_prior() -> None:
-    from dejavu_torch import SpectralMapper, TemplateMapper
+def test_scores_may_be_made_as_they_are_asked_for() -> None:
+    scores, descriptors = shown(50, range(50)), noise(50, 8)
+    asked: list[int] = []
 
-    places = torch.nn.functional.normalize(torch.randn(60, 8, generator=torch.Generator().manual_seed(0)))
-    learned = SpectralMapper()(places)
-    queries = torch.nn.functional.normalize(places[:40] + 0.5)
-    shift = (queries - learned.mean).sum(0) / (40 + PRIOR)
-    expected = torch.nn.functional.normalize(queries - shift)
-    torch.testing.assert_close(centred(learned, queries), expected)
-    assert centred(TemplateMapper()(places), queries) is queries
+    def rows(numbers: Tensor) -> Tensor:
+        asked.extend(numbers.tolist())
+        return scores[numbers]
 
-
-def test_settings_and_scores_out_of_range_are_told() -> None:
-    for settings, told in (
-        ({"moves": (0.5, 0.4)}, "add up to 1"),
-        ({"jump": 0.6, "leave": 0.6}, "at most 1"),
-        ({"turn": 2.0}, "turn is 2.0; expected a probability"),
-        ({"separation": 0.0}, "separation 0.0"),
-        ({"tempering": 0.5}, "at least 1"),
-        ({"within": -1}, "within is -1"),
-        ({"threshold": math.nan}, "the threshold is NaN"),
-    ):
-        with refused(told):
-            PlaceSmoother(**settings)  # type: ignore[arg-type]
-    with refused("expected floats (Q,N)"):
-        PlaceSmoother()(torch.ones(3, 4, dtype=torch.int64))
-    with refused("the link (0, 9, 0.5) on 4 places", "expected two of these places"):
-        PlaceSmoother(links=((0, 9, 0.5),))(torch.rand(3, 4))
-    with refused("the whole drive"):
-        PlaceSmoother().step(torch.rand(3, 4), torch.zeros(5))
+    made, given_ = PlaceSmoother().fit(rows, descriptors), PlaceSmoother().fit(scores, descriptors)
+    assert repr(made) == repr(given_)
+    assert asked == [*range(50)]
+    blocks = made.blocks(made.drive(rows, descriptors), size=7)
+    found = torch.cat([made.folded(block.posterior) for block in blocks][::-1])
+    assert torch.allclose(found, given_.posterior(scores, descriptors), atol=1e-6)
+    assert made.log_likelihood == given_.log_likelihood
+    again = repr(made.fit(rows, descriptors))
+    assert again == repr(given_)
 
 
-def test_a_filter_moves_as_the_smoother_does() -> None:
-    scores = torch.rand(5, 6)
-    one, two = PlaceFilter(moves=(0.2, 0.8)).motion(scores), PlaceSmoother(moves=(0.2, 0.8), turn=0.0)
-    belief = torch.rand(6)
-    ways = torch.cat([belief, torch.zeros(6), torch.ones(1)])
-    both = two.folded(two.motion(6, (0,), scores).moved(ways))
-    torch.testing.assert_close(both, one.moved(torch.cat([belief, torch.ones(1)])))
+@given(st.integers(1, 5000), st.floats(1, 2000))
+def test_stretches_are_spread_over_the_drive(queries: int, correlation: float) -> None:
+    picked = stretches(queries, correlation)
+    assert picked.numel() <= min(queries, 1000) < picked.numel() + 10
+    assert picked[0, 0] == 0
+    assert len(picked) == 1 or picked[-1, -1] == queries - 1
+    assert (picked.diff(dim=1) == 1).all()
+    assert (picked[1:, 0] > picked[:-1, -1]).all()
 
 
-def test_near_mass_is_the_plain_sum() -> None:
-    mass = torch.rand(4, 9)
-    expected = torch.stack([mass[:, max(0, i - 2) : i + 3].sum(1) for i in range(9)], 1).clamp(0, 1)
-    torch.testing.assert_close(near_mass(mass, 2), expected)
+def test_the_module_says_what_it_has_settled_on() -> None:
+    told = repr(
+        PlaceSmoother(
+            (0.25, 0.75), jump=0.01, leave=0.02, enter=0.1, separation=2, correlation=1, tempering=3
+        )
+    )
+    assert (
+        "moves=[0.25, 0.75], jump=0.01, leave=0.02, enter=0.1, separation=2, correlation=1, tempering=3"
+        in told
+    )
+
+
+@pytest.mark.parametrize(
+    ("make", "told"),
+    [
+        (lambda: PlaceSmoother(moves=(0.5, 0.6)), ["moves are [0.5, 0.6]", "add up to 1"]),
+        (lambda: PlaceSmoother(jump=0.7, leave=0.5), ["jump 0.7, leave 0.5", "at most 1"]),
+        (lambda: PlaceSmoother(turn=-0.1), ["turn is -0.1", "probability"]),
+        (lambda: PlaceSmoother(turn=math.nan), ["turn is nan"]),
+        (lambda: PlaceSmoother(separation=0), ["separation 0, tempering 1", "above 0"]),
+        (lambda: PlaceSmoother(tempering=0.5), ["tempering 0.5", "at least 1"]),
+        (lambda: PlaceSmoother(tempering=math.inf), ["tempering inf", "finite"]),
+        (lambda: PlaceSmoother(within=-1), ["within is -1", "at least 0"]),
+        (lambda: PlaceSmoother(within=2.5), ["within is 2.5", "whole"]),  # type: ignore[arg-type]
+        (lambda: PlaceSmoother(threshold=math.nan), ["threshold is NaN", "None"]),
+        (lambda: PlaceSmoother()(torch.rand(4)), ["(4,)", "(Q,N)"]),
+        (lambda: PlaceSmoother()(torch.rand(4, 0)), ["(4, 0)", "(Q,N)"]),
+        (lambda: PlaceSmoother().fit(torch.zeros(3, 4).int()), ["torch.int32", "floats"]),
+        (lambda: PlaceSmoother().path(torch.rand(2, 3, 4)), ["(2, 3, 4)", "(Q,N)"]),
+        (lambda: PlaceSmoother(links=[(0, 4, 0.5)])(torch.rand(3, 4)), ["(0, 4, 0.5) on 4 places"]),
+        (lambda: PlaceSmoother(links=[(-1, 2, 0.5)])(torch.rand(3, 4)), ["(-1, 2, 0.5)", "two of these"]),
+        (lambda: PlaceSmoother(links=[(0, 2, 1.5)])(torch.rand(3, 4)), ["(0, 2, 1.5)", "a probability"]),
+        (lambda: PlaceSmoother().start(4), ["whole drive", "PlaceFilter"]),
+        (lambda: PlaceSmoother().step(torch.rand(2, 4), torch.rand(5)), ["whole drive", "SequenceMatcher"]),
+    ],
+)
+def test_bad_input_is_refused(make: Callable[[], object], told: list[str]) -> None:
+    with refused(*told):
+        make()

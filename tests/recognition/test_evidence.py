@@ -1,0 +1,195 @@
+"""What scores say of places by their rank, and how alike consecutive queries are."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from dejavu_torch.recognition.evidence import (
+    RankTable,
+    correlation_time,
+    local_mean,
+    place_means,
+    spacing_of,
+    speaking,
+    standardised,
+    unchanged,
+)
+
+
+def noise(rows: int, columns: int, seed: int = 0) -> Tensor:
+    return torch.randn(rows, columns, generator=torch.Generator().manual_seed(seed))
+
+
+def remembering(rows: int, columns: int, share: float) -> Tensor:
+    """Queries that keep a share of the one before: their autocorrelation at lag k is share^k."""
+    queries = noise(rows, columns)
+    for t in range(1, rows):
+        queries[t] = share * queries[t - 1] + math.sqrt(1 - share**2) * queries[t]
+    return queries
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.8, -0.5])
+def test_queries_that_remember_say_as_much_as_fewer(share: float) -> None:
+    """1 + 2 sum share^k up to the first lag below .05; (1 + share) / (1 - share) if it goes on."""
+    lags = [share**k for k in range(1, 100) if min(share**j for j in range(1, k + 1)) >= 0.05]
+    assert correlation_time(remembering(4000, 50, share)) == pytest.approx(1 + 2 * sum(lags), rel=0.05)
+    if share > 0:
+        assert 1 + 2 * sum(lags) == pytest.approx((1 + share) / (1 - share), rel=0.12)
+
+
+@given(st.integers(0, 9), st.integers(1, 30))
+def test_the_correlation_time_is_a_sum_over_pairs(seed: int, rows: int) -> None:
+    queries = noise(rows, 3, seed).cumsum(0)
+    centred = (queries - queries.mean(0)).double()
+    lags = [float((centred[k:] * centred[: rows - k]).sum() / (rows - k)) for k in range(rows)]
+    total, k = 1.0, 1
+    while k < rows and lags[k] / lags[0] >= 0.05:
+        total, k = total + 2 * lags[k] / lags[0], k + 1
+    if k < rows:
+        assert correlation_time(queries) == pytest.approx(total)
+    assert correlation_time(queries.repeat(3, 1)[:1]) == 1
+    assert correlation_time(torch.ones(rows, 3)) == 1
+
+
+def test_slow_changes_are_no_noise() -> None:
+    slow = torch.sin(torch.arange(1000.0) / 200)[:, None] * torch.ones(20)
+    spacing = spacing_of(noise(1000, 20) + 3 * slow)
+    assert spacing.correlation > 50
+    assert spacing.detrended < 1.5
+    queries = noise(9, 2).double()
+    means = [queries[max(0, t - 2) : t + 3].mean(0) for t in range(9)]
+    assert torch.allclose(local_mean(queries, 2), torch.stack(means))
+
+
+def test_a_stop_counts_once() -> None:
+    """30 repeats of the fifth query with little noise, and one frame that is there twice."""
+    moving = noise(40, 8)
+    queries = torch.cat([moving[:5], moving[4:5] + 0.001 * noise(30, 8, 1), moving[5:], moving[-1:]])
+    stop = torch.zeros(71, dtype=torch.bool)
+    stop[5:35] = True
+    last = torch.arange(71) == 70
+    spacing = spacing_of(queries)
+    assert torch.equal(unchanged(queries), stop | last)
+    assert torch.equal(spacing.still, stop)
+    assert torch.allclose(spacing.weight[4:35], torch.tensor(1 / 31))
+    assert torch.allclose(spacing.weight[69:], torch.tensor(0.5))
+    assert (spacing.weight[:4] == 1).all()
+    assert (spacing.weight[35:69] == 1).all()
+    alone = spacing_of(moving)
+    assert spacing[2:] == alone[2:]
+    assert spacing_of(queries.half())[2:] == pytest.approx(alone[2:], rel=0.01)
+
+
+def test_a_slow_drift_is_no_stop() -> None:
+    """Each query is near the one before it, but not near the first of the stop."""
+    queries = torch.cat([noise(300, 2), torch.linspace(3, 6, 200)[:, None] * torch.ones(2)])
+    assert int(unchanged(queries)[300:].sum()) > 90
+    assert spacing_of(queries).weight.min() > 0.2
+    assert not spacing_of(queries).still.any()
+
+
+@pytest.mark.parametrize("queries", [torch.zeros(0, 3), torch.zeros(1, 3), torch.zeros(4, 3), noise(2, 3)])
+def test_few_queries_and_equal_ones_have_a_spacing(queries: Tensor) -> None:
+    spacing = spacing_of(queries)
+    same = len(queries) == 4
+    assert spacing.weight.tolist() == [0.25 if same else 1] * len(queries)
+    assert spacing[2:] == (1, 1)
+    assert not spacing.still.any()
+
+
+def z_of(scores: Tensor) -> Tensor:
+    return standardised(scores, place_means(scores, scores.new_ones(len(scores)))).z
+
+
+@given(st.integers(0, 99), st.sampled_from([0.01, 3.0, 1000.0]))
+def test_a_score_counts_beside_those_of_its_query_and_of_its_place(seed: int, scale: float) -> None:
+    scores = noise(6, 9, seed).double()
+    z = z_of(scores)
+    query, place = noise(6, 1, seed + 1).double(), noise(1, 9, seed + 2).double()
+    assert torch.allclose(z, z_of(scale * scores + query + place))
+    assert torch.allclose(z.mean(1), torch.zeros(6, dtype=torch.float64), atol=1e-12)
+    assert torch.allclose(z.square().mean(1), torch.ones(6, dtype=torch.float64))
+    double = scores - scores.mean(0)
+    double = double - double.mean(1, keepdim=True)
+    assert torch.allclose(z, -double / double.square().mean(1, keepdim=True).sqrt())
+
+
+def test_queries_that_say_nothing_change_nothing() -> None:
+    scores = noise(6, 9).double()
+    silent = torch.stack([torch.full((9,), 2.0), torch.full((9,), math.inf), torch.full((9,), math.nan)])
+    silent = torch.cat([silent, torch.where(torch.arange(9) == 4, math.nan, silent[:1])])
+    one = torch.cat([torch.full((8,), math.inf), torch.zeros(1)])[None].double()  # no place to compare with
+    mixed = torch.cat([scores[:3], silent, one, scores[3:]])
+    weight = torch.ones(11, dtype=torch.float64)
+    speaks = [True] * 3 + [False] * 5 + [True] * 3
+    assert speaking(mixed).tolist() == speaks
+    assert torch.allclose(place_means(mixed, weight), place_means(scores, weight[:6]))
+    found = standardised(mixed, place_means(mixed, weight))
+    assert found.speaks.tolist() == speaks
+    assert torch.allclose(found.z[speaks], z_of(scores))
+    assert found.z.isfinite().all()
+
+
+def test_places_that_nothing_covers_are_left_out() -> None:
+    scores = noise(6, 9)
+    holes = scores.clone()
+    holes[:, 4] = math.inf
+    found = standardised(holes, place_means(holes, torch.ones(6)))
+    kept = [0, 1, 2, 3, 5, 6, 7, 8]
+    assert torch.allclose(found.z[:, kept], z_of(scores[:, kept]), atol=1e-6)
+    assert not found.valid[:, 4].any()
+    assert found.valid[:, kept].all()
+
+
+def test_means_are_weighted_and_a_single_query_keeps_its_scores() -> None:
+    scores, weight = noise(5, 4), torch.tensor([1.0, 0.25, 0.5, 1, 1])
+    assert torch.allclose(place_means(scores, weight), (weight @ scores) / weight.sum())
+    assert (place_means(scores[:1], weight[:1]) == 0).all()
+
+
+def table_of(z: Tensor, weight: Tensor | None = None) -> RankTable:
+    table = RankTable()
+    for part in torch.arange(len(z)).split(7):
+        table.add(z[part], torch.ones_like(z[part]) if weight is None else weight[part])
+    return table
+
+
+def test_ranks_are_exact_at_the_edges_of_bins() -> None:
+    """x = -Phi^-1((n + 1/2) / (N + 1)) for the n of N values that reach a z."""
+    z, weight = noise(500, 4) * 2 + 1, torch.rand(500, 4)
+    edges = torch.arange(-100, 300) / 64
+    reached = ((z >= edges[:, None, None]) * weight.double()).sum((1, 2))
+    expected = -torch.special.ndtri((reached + 0.5) / (weight.double().sum() + 1))
+    found = RankTable.look_up(table_of(z, weight).values, edges)
+    assert torch.allclose(found.double(), expected, atol=1e-5)
+
+
+def test_normal_scores_of_gaussian_noise_are_itself() -> None:
+    z = noise(1000, 1000)
+    at = torch.linspace(-3, 3, 50)
+    assert torch.allclose(RankTable.look_up(table_of(z).values, at), at, atol=0.03)
+
+
+def test_normal_scores_rise_with_z_and_their_slope_is_the_gradient() -> None:
+    values = table_of(noise(300, 3)).values
+    assert (values.diff() >= 0).all()
+    z = torch.linspace(-12, 50, 1001, dtype=torch.float64)  # beyond the table as well
+    x = RankTable.look_up(values, z)
+    assert x.isfinite().all()
+    assert (x.diff() >= 0).all()
+    inside = (torch.arange(-190, 190) / 64 + 0.004).double().requires_grad_()
+    assert torch.autograd.gradcheck(lambda z: RankTable.look_up(values, z), (inside,))
+    (slope,) = torch.autograd.grad(RankTable.look_up(values, inside).sum(), inside)
+    assert slope.max() > 0.5
+
+
+def test_values_of_no_weight_are_not_counted() -> None:
+    z = noise(200, 3)
+    weight = (torch.arange(600).view(200, 3) % 2).float()
+    assert torch.equal(table_of(z, weight).values, table_of(z[weight > 0][:, None]).values)
