@@ -48,9 +48,6 @@ DRIVE = 10.0  # nats by which a drive beats being off the map throughout
 OTHER_DRIVE, PER_QUERY = 30.0, 0.1  # likewise at another speed, in all and per query,
 REPEATED = 0.8  # of these nats: places elsewhere that explain as much show the same
 FOUND = 0.05  # mass of a place that is found
-    0.8,
-    0.05,
-)  # share of these nats that places elsewhere explain; mass of a place that is found
 CLEARLY = 5.0  # and times as many as at one place a query
 WHOLE = "a smoother has to know the whole drive; expected a PlaceFilter, or a SequenceMatcher"
 BLOCK = 2**22  # numbers of a block of queries and states
