@@ -43,10 +43,12 @@ RATE_COUNTS, ENTER_COUNTS = 200.0, 50.0  # steps that the priors of jump and lea
 SHARPENED = 0.6  # tau' = SHARPENED tau
 MIN_SEPARATION = 0.3
 FITTED, STRETCH, STRETCHES = 1000, 100, 10  # queries that are fitted to at most, in a stretch, and stretches
+LEAST, SAMPLED = 20, 2**23  # queries that are fitted to at least, and their scores at most otherwise
 CORRELATED = 4  # correlation times in a stretch, at least
 DRIVE = 10.0  # nats by which a drive beats being off the map throughout
 OTHER_DRIVE, PER_QUERY = 30.0, 0.1  # likewise at another speed, in all and per query,
-REPEATED = 0.8  # of these nats: places elsewhere that explain as much show the same
+ALIKE = 5.0  # nats by which places elsewhere explain the queries of a route that only looks like the map's
+REPEATED = 0.8  # of the drive's nats: places elsewhere that explain as much show the same
 FOUND = 0.05  # mass of a place that is found
 CLEARLY = 5.0  # and times as many as at one place a query
 WHOLE = "a smoother has to know the whole drive; expected a PlaceFilter, or a SequenceMatcher"
@@ -329,7 +331,8 @@ class PlaceSmoother(SequenceModel):
             return self
         spacing = spacing_of(descriptors)
         self.correlation, self.tempering = spacing.correlation, tempering_of(spacing)
-        picked = stretches(len(descriptors), spacing.correlation)
+        places = scores(torch.zeros(1, dtype=torch.int64)).shape[1]
+        picked = stretches(len(descriptors), spacing.correlation, places)
         sample = scores(picked.flatten())
         weight, still = spacing.weight.to(sample), spacing.still.to(sample.device)
         self.means = place_means(sample, weight[picked.flatten()])
@@ -342,7 +345,7 @@ class PlaceSmoother(SequenceModel):
             least = max(OTHER_DRIVE, PER_QUERY * other.queries, CLEARLY * best.log)
             best = other if other.log >= least else best
         # elsewhere explains a drive no better than being off the map, unless it shows the same places
-        alike = DRIVE <= best.second < REPEATED * best.log
+        alike = ALIKE <= best.second < REPEATED * best.log
         self.is_drive, self.log_likelihood = best.log >= DRIVE and not alike, best.log
         self.separation, self.values = best.separation, best.values
         jump, leave, enter = map(float, best.rates[1:])
@@ -523,9 +526,9 @@ def near_mass(mass: Tensor, radius: int) -> Tensor:
     return (F.avg_pool1d(flat, 2 * radius + 1, 1) * (2 * radius + 1)).view_as(mass).clamp(0, 1)
 
 
-def stretches(queries: int, correlation: float) -> Tensor:
-    """Numbers of queries in evenly spaced stretches, (n,L)."""
-    used = min(queries, FITTED)
+def stretches(queries: int, correlation: float, places: int = 1) -> Tensor:
+    """Numbers of queries in evenly spaced stretches, (n,L); of few queries on a large map."""
+    used = min(queries, FITTED, max(LEAST, SAMPLED // places))
     length = max(STRETCH, math.ceil(CORRELATED * correlation))
     n = max(1, min(STRETCHES, used // length))
     length = used // n

@@ -346,15 +346,9 @@ def test_stretches_are_spread_over_the_drive(queries: int, correlation: float) -
 
 
 def test_the_module_says_what_it_has_settled_on() -> None:
-    told = repr(
-        PlaceSmoother(
-            (0.25, 0.75), jump=0.01, leave=0.02, enter=0.1, separation=2, correlation=1, tempering=3
-        )
-    )
-    assert (
-        "moves=[0.25, 0.75], jump=0.01, leave=0.02, enter=0.1, separation=2, correlation=1, tempering=3"
-        in told
-    )
+    told = repr(PlaceSmoother((0.25, 0.75), jump=0.01, leave=0.02, enter=0.1, separation=2, tempering=3))
+    assert "moves=[0.25, 0.75], jump=0.01, leave=0.02, enter=0.1, separation=2, " in told
+    assert "tempering=3" in told
 
 
 @pytest.mark.parametrize(
