@@ -158,7 +158,7 @@ class PlaceSmoother(SequenceModel):
         self.move_logits = nn.Parameter(logits(*moves))
         self.rate_logits = nn.Parameter(logits(1 - jump - leave, jump, leave))
         self.enter_logit = nn.Parameter(logits(enter)[0] - logits(1 - enter)[0])
-        self.turn, self.separation, self.tempering = turn, separation, tempering
+        self.turn, self.separation, self.tempering = turn, float(separation), float(tempering)
         self.within, self.threshold = within, threshold
         self.links, self.loop = tuple(links), loop
         self.log_likelihood: float | None = None  # nats above being off the map throughout, as fitted

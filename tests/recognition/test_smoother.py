@@ -326,7 +326,7 @@ def test_scores_may_be_made_as_they_are_asked_for() -> None:
 
     made, given_ = PlaceSmoother().fit(rows, descriptors), PlaceSmoother().fit(scores, descriptors)
     assert repr(made) == repr(given_)
-    assert asked == [*range(50)]
+    assert asked[1:] == [*range(50)]  # after a look at how many places there are
     blocks = made.blocks(made.drive(rows, descriptors), size=7)
     found = torch.cat([made.folded(block.posterior) for block in blocks][::-1])
     assert torch.allclose(found, given_.posterior(scores, descriptors), atol=1e-6)
@@ -348,7 +348,7 @@ def test_stretches_are_spread_over_the_drive(queries: int, correlation: float) -
 def test_the_module_says_what_it_has_settled_on() -> None:
     told = repr(PlaceSmoother((0.25, 0.75), jump=0.01, leave=0.02, enter=0.1, separation=2, tempering=3))
     assert "moves=[0.25, 0.75], jump=0.01, leave=0.02, enter=0.1, separation=2, " in told
-    assert "tempering=3" in told
+    assert "tempering=3, " in told
 
 
 @pytest.mark.parametrize(
