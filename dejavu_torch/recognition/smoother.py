@@ -47,7 +47,6 @@ LEAST, SAMPLED = 20, 2**23  # queries that are fitted to at least, and their sco
 CORRELATED = 4  # correlation times in a stretch, at least
 DRIVE = 10.0  # nats by which a drive beats being off the map throughout
 OTHER_DRIVE, PER_QUERY = 30.0, 0.1  # likewise at another speed, in all and per query,
-ALIKE = 5.0  # nats by which places elsewhere explain the queries of a route that only looks like the map's
 REPEATED = 0.8  # of the drive's nats: places elsewhere that explain as much show the same
 FOUND = 0.05  # mass of a place that is found
 CLEARLY = 5.0  # and times as many as at one place a query
@@ -345,7 +344,7 @@ class PlaceSmoother(SequenceModel):
             least = max(OTHER_DRIVE, PER_QUERY * other.queries, CLEARLY * best.log)
             best = other if other.log >= least else best
         # elsewhere explains a drive no better than being off the map, unless it shows the same places
-        alike = ALIKE <= best.second < REPEATED * best.log
+        alike = DRIVE <= best.second < REPEATED * best.log
         self.is_drive, self.log_likelihood = best.log >= DRIVE and not alike, best.log
         self.separation, self.values = best.separation, best.values
         jump, leave, enter = map(float, best.rates[1:])
