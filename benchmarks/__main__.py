@@ -8,6 +8,7 @@ from typing import Any
 from benchmarks import (
     cluster,
     distil,
+    drives,
     live,
     matcher,
     memory,
@@ -28,6 +29,7 @@ BENCHES: dict[str, Any] = {  # each returns the lines to print
     "results": results.run_results,
     "matcher": matcher.run_matcher,
     "storage": storage.run_storage,
+    "drives": drives.run_drives,
     "train": train.run_train,
     "trainings": trainings.run_trainings,
     "distil": distil.run_distil,
