@@ -41,6 +41,7 @@ FAMILIES = {  # colours and lines in `plot_frontiers`
     "RaBitQ": ("#7a4a1f", "-"),
     "EDEN": ("#7a4a1f", ":"),
     "video": ("#56b4e9", "-"),
+    "HOG": (COLOURS["hog"], "--"),
     "the paper": (COLOURS["paper"], "-"),
 }
 
@@ -201,3 +202,38 @@ def _plot_whitenings(axis: Any, whitenings: Sequence[tuple[str, int, float]]) ->
     axis.locator_params(axis="x", nbins=5)
     axis.set(ylim=(-0.6, len(ordered) - 0.4), yticks=[], xlabel="AUC of the map, by whitening")
     axis.grid(alpha=0.25)
+
+
+def plot_both_ways(
+    cases: Mapping[str, Mapping[str, Mapping[str, Sequence[tuple[float, float]]]]], ways: Mapping[str, str]
+) -> Plot:
+    """The AUC of families of stores over route bytes per place, a row of panels for each route.
+
+    Args:
+        cases: case -> way of answering -> family -> bytes per place and area, ascending.
+        ways: the columns, with their headings.
+    """
+    height = 1.7 * len(cases) + 0.9
+    figure, axes = canvas(height, len(cases), len(ways), squeeze=False, sharex=True, sharey=True)
+    drawn: dict[str, Any] = {}
+    for row, (case, found) in zip(axes, cases.items(), strict=True):
+        for axis, (way, heading) in zip(row, ways.items(), strict=True):
+            for name, points in reversed(list(found.get(way, {}).items())):  # ours, the first, on top
+                colour, line = FAMILIES[name]
+                width = 2.4 if name == "dejavu" else 1.2
+                sizes, areas = zip(*points, strict=True)
+                (drawn[name],) = axis.plot(
+                    sizes, drawn_areas(areas), line, marker="o", markersize=2.5, color=colour, linewidth=width
+                )
+            axis.set_xscale("log")
+            axis.set_xticks(ticks := [0.25, 1, 5, 50, 500], [f"{tick:g}" for tick in ticks])
+            axis.minorticks_off()
+            area_axis(axis)
+            axis.set_ylabel("")
+            axis.set_title(f"{label(case)}:\n{heading}", loc="left", fontsize=9)
+    for axis in axes[-1]:
+        axis.set_xlabel("route bytes per place", fontsize=9)
+    names = [name for name in FAMILIES if name in drawn]
+    handles = [drawn[name] for name in names]
+    figure.legend(handles, names, loc="outside lower left", frameon=False, fontsize=9, ncols=2)
+    return figure, axes

@@ -42,7 +42,8 @@ from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.text import printable
 from dejavu_torch.types import InputError, Match, Traverse
 
-BUDGETS = (0.5, 1.0, 1.6, 2.5, 3.2, 5.0, 10.0, 16.0)  # route bytes per place of ours and of the null
+# route bytes per place of ours and of the null
+BUDGETS = (0.25, 0.5, 1.0, 1.6, 2.0, 2.5, 3.2, 5.0, 10.0, 16.0)
 SHOWN = (1.0, 1.6, 3.2, 5.0, 10.0)  # of the table
 NEAR = 1.02  # a budget is met by at most this share of it
 SPACED = (1, 2, 3, 4, 5, 8, 10)  # k of every k-th frame, repeated
@@ -76,8 +77,8 @@ WHITENED = 5.0  # route bytes per place of the map with each of them
 AT, LEVEL = 1.6, 0.95
 TOLERANCE = 5
 KEYS = (
-    *("family", "seconds", "peak_bytes", "bytes", "fixed_bytes", "route_bytes", "route_bytes_per_place"),
-    *("recall_at_1", "auc", "sequences", "ratio_to_ours", "skipped"),
+    *("family", "answer", "seconds", "peak_bytes", "bytes", "fixed_bytes", "route_bytes"),
+    *("route_bytes_per_place", "recall_at_1", "auc", "sequences", "ratio_to_ours", "skipped"),
 )
 OURS, NULL, OTHERS, GIVEN = "dejavu", "null", "dejavu, other whitenings", "dejavu, given maps"
 PAPER = "the paper"
@@ -134,6 +135,7 @@ def run_storage(
     places: Sequence[int] = (),
     truth: str | None = None,
     tolerance: int = TOLERANCE,
+    drives: Path | None = None,
 ) -> list[str]:
     """Accuracy over bytes of ways to store the descriptors of a route.
 
@@ -146,7 +148,14 @@ def run_storage(
         places: numbers of frames of the built-in sim:aerial; 3072 and 10000 if not given
         truth: places of the queries, as in `dejavu compare`; by default frame i is place i
         tolerance: answers this many places off are still right
+        drives: instead, few bytes on the routes of this folder of footage, by one image and the whole drive
     """
+    if drives is not None:
+        if sources or map or codebooks or whitening or places or truth:
+            raise InputError("--drives has routes of its own; expected no other option but --out")
+        from benchmarks.storage_drives import run_storage_drives  # imports this module
+
+        return run_storage_drives(drives, out)
     if tolerance < 0:
         raise InputError(f"--tolerance {tolerance}; expected at least 0")
     if truth is not None and len(sources) != 2:
@@ -389,7 +398,7 @@ def by_map(route: Route, made: Callable[[], DejaVu]) -> Answer:
 
 def judged(route: Route, contender: Contender) -> Row:
     """Store a route, match all queries, and score them: single ones, and sequences of each T that fits."""
-    row = new_row(route.name, contender.name, KEYS, family=contender.family)
+    row = new_row(route.name, contender.name, KEYS, family=contender.family, answer="one")
     answers: list[Answer] = []
     began = time.perf_counter()
     try:
