@@ -230,7 +230,8 @@ def plot_both_ways(
             axis.minorticks_off()
             area_axis(axis)
             axis.set_ylabel("")
-            axis.set_title(f"{label(case)}:\n{heading}", loc="left", fontsize=9)
+            heading = f"{heading}\n" if axis in axes[0] else ""
+            axis.set_title(f"{heading}{label(case)}", loc="left", fontsize=9)
     for axis in axes[-1]:
         axis.set_xlabel("route bytes per place", fontsize=9)
     names = [name for name in FAMILIES if name in drawn]

@@ -17,7 +17,8 @@ from typing import Any
 
 from benchmarks.measure import Row
 from benchmarks.results import FOOTAGE, rounded
-from benchmarks.storage import SHOWN, best, families, missed
+from benchmarks.storage import SHOWN, best, by, families, missed
+from benchmarks.storage_drives import drive_table
 from dejavu_torch.evaluation.contenders import LENGTHS
 
 FOLDER = Path(__file__).parents[1] / "docs" / "results"
@@ -195,12 +196,58 @@ def driven() -> str:
     return rejection("drive")
 
 
-def storage(name: str) -> str:
-    """The best AUC of each kind of code on a route, by bytes."""
-    rows = read(f"storage {name}")["rows"]
-    rows = [
+def coded(name: str) -> list[Row]:
+    """The rows of stores, as they were before `stored`."""
+    rows = read(name)["rows"]
+    return [
         row | {"skipped": row.get("skipped"), "sequences": {"1": {"auc": row.get("auc")}}} for row in rows
     ]
+
+
+def storage_drives() -> str:
+    """The best AUC of each kind of store by bytes: by one image, a window, the whole drive."""
+    return markdown(drive_table(coded("storage drives")))
+
+
+def made_drives() -> str:
+    """Drives made of real ones: a row for each over all routes, then the AUC of each on each route."""
+    rows = by("contender", [row | {"skipped": row.get("skipped")} for row in read("made drives")["rows"]])
+    cases = list(dict.fromkeys(row["case"] for own in rows.values() for row in own))
+    head = ["drive", "routes", "taken for one", "one image", "whole drive", "largest loss"]
+    means = [[*head, "p > .5", "p > .9", "accepted right", "calibration error"]]
+    areas = [["AUC of one image, whole drive", *cases]]
+
+    def mean_of(own: Sequence[Row], key: str) -> str:
+        return area(mean(some) if (some := [row[key] for row in own if key in row]) else None)
+
+    for name, own in rows.items():
+        known = {row["case"]: row for row in own if "auc" in row}
+        loss, where = max(
+            ((row["auc_one"] - row["auc"], case) for case, row in known.items()), default=(0, "")
+        )
+        cells = [name, str(len(own)), str(sum(row["is_drive"] for row in own))]
+        cells += [
+            mean_of(own, "auc_one"),
+            mean_of(own, "auc"),
+            f"{loss:.3f}, {where}" if loss > 0.0005 else "",
+        ]
+        shares = ("above_half", "above_nine_tenths", "accepted_right", "calibration_error")
+        means.append([*cells, *(mean_of(own, key) for key in shares)])
+        if known:
+            pairs = (known.get(case) for case in cases)
+            areas.append([name, *("" if row is None else shown_pair(row) for row in pairs)])
+    return f"{markdown(means)}\n{markdown(areas)}"
+
+
+def shown_pair(row: Row) -> str:
+    """The areas of one image and of the whole drive; with a star, if that was answered by single images."""
+    pair = [area(row[key]).removeprefix("0") for key in ("auc_one", "auc")]
+    return " ".join(pair) + "*" * (not row["is_drive"])
+
+
+def storage(name: str) -> str:
+    """The best AUC of each kind of code on a route, by bytes."""
+    rows = coded(f"storage {name}")
     table = [["AUC, route bytes per place", *(f"{budget:g}" for budget in SHOWN)]]
     known = families(rows)
     for kind, codes in CODES.items():
@@ -240,7 +287,7 @@ def trainings() -> str:
 TABLES: dict[str, Callable[[], str]] = {
     **{"routes": routes, "sizes": sizes, "descriptors": descriptors, "sequences": sequences},
     **{"rejection": rejection, "filtered": filtered, "drives": drives, "driven": driven},
-    "trainings": trainings,
+    **{"trainings": trainings, "made drives": made_drives, "storage drives": storage_drives},
     **{f"storage {name}": partial(storage, name) for name in ("aerial", "road1", "road2", "city", "railway")},
 }
 

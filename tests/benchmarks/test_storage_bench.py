@@ -74,7 +74,8 @@ def test_all_families_are_there_and_what_is_skipped_says_why(rows: list[Row]) ->
     ran = {row["family"] for row in rows if row["skipped"] is None}
     stores = {"dejavu", "null", "frames", "interpolated", "PCA", "binary", "PQ, own codebooks"}
     assert ran == stores | {"dejavu, other whitenings", "RaBitQ", "EDEN", "OPQ, own codebooks"}
-    assert [row["contender"] for row in rows[:2]] == ["dejavu 0.5", "dejavu 1"]
+    assert [row["contender"] for row in rows[:3]] == ["dejavu 0.25", "dejavu 0.5", "dejavu 1"]
+    assert {row["answer"] for row in rows} == {"one"}
     assert len({row["contender"] for row in rows}) == len(rows)
     reasons = {row["skipped"] for row in rows if row["family"] in storage.CODES}
     assert reasons == {"no other route to train codebooks on; expected --codebooks SOURCE"}
@@ -319,6 +320,8 @@ REFUSALS = {
     "storage --codebooks A": ["--codebooks", "pairs"],
     "storage A nowhere": ["nowhere", "expected"],
     "storage A B A B": ["given twice"],
+    "storage A B --drives data": ["--drives", "no other option"],
+    "drives data --routes moon": ["'moon' is no route", "'city 1'"],
     "storage A B --map OF_SHORT": ["300 places", "200", "the reference"],
     "storage A B --map OF_NARROW": ["24", "9"],
     "storage A B --whitening OF_NARROW": ["a.npy gives 24", "9 features"],
