@@ -50,7 +50,7 @@ ROUTES: dict[str, tuple[Route, str | None]] = {
 }
 STOP, BESIDE, THRICE, RANDOM = 200, 150, 400, 500  # queries
 STRETCHES = ((5, 15), (5, 40), (20, 40))
-AS_IT_WAS, ELSEWHERE = "as it was", "another route"
+AS_IT_WAS, HALF, ELSEWHERE = "as it was", "half of it off the map", "another route"
 NO_OTHER = "no other route has such features"
 KEYS = (
     *("queries", "auc_uncentred", "auc_one", "auc", "is_drive", "above_half", "above_nine_tenths"),
@@ -162,7 +162,7 @@ def drives_of(count: int, other: Tensor | None, seed: int = 0) -> dict[str, Tens
         drives[f"stretches of {low} to {high}"] = stretches(low, high)
     off = None if other is None else -1 - torch.arange(len(other))
     drives["stretches of 5 to 40, others between"] = None if other is None else stretches(5, 40, len(other))
-    drives["half of it off the map"] = None if off is None else torch.cat([whole[:half], off[: count - half]])
+    drives[HALF] = None if off is None else torch.cat([whole[:half], off[: count - half]])
     drives[ELSEWHERE] = off
     return drives
 
