@@ -153,7 +153,7 @@ def test_a_whitening_that_is_given_describes_all(
 
     def first(route: Route) -> list[Contender]:
         whitened.append(route.places)
-        return list(stores_of(route))[:1]
+        return list(stores_of(route))[1:2]  # a quarter of a byte is too few for 300 places
 
     monkeypatch.setattr(storage, "stores_of", first)
     benchmark("storage", *pair, "--whitening", tmp_path / "map.safetensors", "--out", tmp_path / "out")
