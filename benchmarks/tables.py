@@ -213,8 +213,8 @@ def made_drives() -> str:
     """Drives made of real ones: a row for each over all routes, then the AUC of each on each route."""
     rows = by("contender", [row | {"skipped": row.get("skipped")} for row in read("made drives")["rows"]])
     cases = list(dict.fromkeys(row["case"] for own in rows.values() for row in own))
-    head = ["drive", "routes", "taken for one", "one image", "whole drive", "largest loss"]
-    means = [[*head, "p > .5", "p > .9", "accepted right", "calibration error"]]
+    head = ["drive", "routes", "taken for one", "one image", "not centred", "whole drive"]
+    means = [[*head, "largest loss", "p > .5", "p > .9", "accepted right", "calibration error"]]
     areas = [["AUC of one image, whole drive", *cases]]
 
     def mean_of(own: Sequence[Row], key: str) -> str:
@@ -226,11 +226,8 @@ def made_drives() -> str:
             ((row["auc_one"] - row["auc"], case) for case, row in known.items()), default=(0, "")
         )
         cells = [name, str(len(own)), str(sum(row["is_drive"] for row in own))]
-        cells += [
-            mean_of(own, "auc_one"),
-            mean_of(own, "auc"),
-            f"{loss:.3f}, {where}" if loss > 0.0005 else "",
-        ]
+        cells += [mean_of(own, key) for key in ("auc_one", "auc_uncentred", "auc")]
+        cells.append(f"{loss:.3f}, {where}" if loss > 0.0005 else "")
         shares = ("above_half", "above_nine_tenths", "accepted_right", "calibration_error")
         means.append([*cells, *(mean_of(own, key) for key in shares)])
         if known:

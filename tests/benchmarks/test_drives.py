@@ -132,12 +132,13 @@ def test_stores_are_asked_three_ways_from_the_same_scores(monkeypatch: pytest.Mo
 def test_the_table_of_made_drives(monkeypatch: pytest.MonkeyPatch) -> None:
     def row(case: str, one: float, auc: float, taken: bool) -> dict[str, object]:
         facts = {"is_drive": taken, "above_half": 0.5, "above_nine_tenths": 0.25, "calibration_error": 0.125}
-        return {"case": case, "contender": "reversed", "auc_one": one, "auc": auc, **facts}
+        facts |= {"auc_one": one, "auc_uncentred": one - 0.25}
+        return {"case": case, "contender": "reversed", "auc": auc, **facts}
 
     rows = [row("city", 0.5, 1.0, True), row("laps", 0.75, 0.5, False)]
     monkeypatch.setattr(tables, "read", lambda _: {"rows": rows})
     means, areas = tables.made_drives().split("\n\n")
     assert means.splitlines()[2].startswith(
-        "| reversed | 2 | 1 | 0.625 | 0.750 | 0.250, laps | 0.500 | 0.250 |  | 0.125 |"
+        "| reversed | 2 | 1 | 0.625 | 0.375 | 0.750 | 0.250, laps | 0.500 | 0.250 |  | 0.125 |"
     )
     assert areas.splitlines()[2] == "| reversed | .500 1.000 | .750 .500* |"
