@@ -1,0 +1,175 @@
+"""The matches of a whole drive."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from devices import pretend
+from test_smoother import noise, shown
+from torch import Tensor
+
+from dejavu_torch import DejaVu, Whitening, open_source
+from dejavu_torch.data.traverse import fitted
+from dejavu_torch.evaluation.curves import evaluate
+from dejavu_torch.motion.resampling import ground_truth_of
+from dejavu_torch.recognition import smoother as smoothing
+from dejavu_torch.recognition.calibration import Platt, confidence_of
+from dejavu_torch.recognition.drive import doubt, localize_drive
+from dejavu_torch.recognition.smoother import PlaceSmoother
+from dejavu_torch.types import Match
+
+PLATT = Platt(3.0, 0.5)
+
+
+def localized(scores: Tensor, smoother: PlaceSmoother, k: int = 1, platt: Platt | None = None) -> Match:
+    """Of scores of which some are asked for at a time."""
+    drive = noise(len(scores), 16, seed=8)
+    return localize_drive(lambda numbers: scores[numbers], drive, smoother, k, radius=4, platt=platt)
+
+
+def test_an_answer_has_the_most_mass_around_it() -> None:
+    scores, smoother = shown(80, [*range(5, 75), *range(74, 40, -1)]), PlaceSmoother(within=3)
+    match = localized(scores, smoother, platt=PLATT)
+    assert smoother.is_drive
+    posterior = smoother.posterior(scores, noise(len(scores), 16, seed=8))[:, :-1]
+    ranked = smoother(scores, noise(len(scores), 16, seed=8))
+    answer, own = ranked.argmin(1), scores.gather(1, ranked.argmin(1)[:, None])[:, 0]
+    assert torch.equal(match.index[:, 0], answer)
+    assert torch.allclose(match.score[:, 0], ranked.amin(1) + doubt(own), atol=1e-5)
+    assert match.accepted.all()
+    assert match.probability is not None
+    assert match.confidence is not None
+    for t, place in enumerate(answer.tolist()):
+        mass = posterior[t, max(0, place - 3) : place + 4].sum().item()
+        assert match.probability[t].item() == pytest.approx(mass, abs=1e-5)
+        beyond = [one for i, one in enumerate(ranked[t].tolist()) if abs(i - place) > 4]
+        assert match.confidence[t].item() == pytest.approx(min(beyond) - ranked[t, place].item(), abs=1e-3)
+    assert ((-match.score[:, 0]).exp() <= match.probability[:, 0] + 1e-6).all()
+
+
+def test_candidates_are_apart_and_the_first_is_the_answer() -> None:
+    scores = shown(80, range(5, 75))
+    best, four = localized(scores, PlaceSmoother()), localized(scores, PlaceSmoother(), k=4)
+    assert four.index.shape == (70, 4)
+    apart = (four.index[:, :, None] - four.index[:, None]).abs() + 99 * torch.eye(4)
+    assert apart.min() > 4
+    assert (four.score.diff(dim=1) >= 0).all()
+    for name, column in best.columns.items():
+        assert torch.equal(four.columns[name][:, :1], column)
+    assert four.probability is not None
+    assert four.confidence is not None
+    assert four.probability[:, 1:].isnan().all()
+    assert four.confidence[:, 1:].isnan().all()
+
+
+def test_what_is_no_drive_is_answered_by_single_queries() -> None:
+    scores, smoother = noise(150, 200), PlaceSmoother(within=5)
+    match, alone = localized(scores, smoother, platt=PLATT), localized(scores, PlaceSmoother(within=5))
+    assert not smoother.is_drive
+    assert torch.equal(match.index[:, 0], scores.argmin(1))
+    assert torch.equal(match.score[:, 0], scores.amin(1))
+    assert alone.probability is not None
+    assert match.probability is not None
+    single = PLATT.probability(confidence_of(scores))
+    assert torch.allclose(match.probability[:, 0], torch.minimum(alone.probability[:, 0], single))
+    assert single.max() > 0.9 > 0.5 > match.probability.max()
+    best = scores.gather(1, match.index)
+    far = (torch.arange(200) - match.index).abs() > 4
+    second = scores.masked_fill(~far, math.inf).amin(1)
+    assert match.confidence is not None
+    assert torch.allclose(match.confidence[:, 0], second - best[:, 0])
+
+
+@pytest.mark.parametrize("drives", [True, False])
+def test_blocks_give_what_the_whole_gives(drives: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    scores = shown(80, range(70), clear=2.5 if drives else 0.0)
+    whole = localized(scores, PlaceSmoother(), k=2, platt=PLATT)
+    monkeypatch.setattr(smoothing, "BLOCK", 1)
+    parts = localized(scores, PlaceSmoother(), k=2, platt=PLATT)
+    for name, column in whole.columns.items():
+        assert torch.allclose(parts.columns[name], column, atol=1e-5, equal_nan=True)
+
+
+def test_doubt_grows_with_the_distance_from_what_is_usual() -> None:
+    """.1 nats for each standard deviation above the median, by the median absolute deviation."""
+    own = torch.tensor([1.0, 2, 3, 4, 5, 9, -9, math.inf, math.nan, 1e9])
+    expected = [0, 0, 0, 0.1 / (2 * 1.4826), 0.2 / (2 * 1.4826), 0.6 / (2 * 1.4826), 0, 0, 0, 10]
+    known = own[own.isfinite()]
+    assert float((known - 3).abs().median()) == 2
+    assert doubt(own).tolist() == pytest.approx(expected)
+    assert doubt(torch.full((4,), math.inf)).tolist() == [0] * 4
+    assert doubt(torch.full((4,), 2.0)).tolist() == [0] * 4
+
+
+def test_places_and_queries_without_scores_are_not_answered() -> None:
+    scores = shown(80, range(70))
+    scores[:, 40:50], scores[20], scores[25] = math.inf, math.inf, math.nan
+    for one in (scores, torch.where(scores.isfinite(), noise(70, 80), scores)):  # a drive, and none
+        match = localized(one, PlaceSmoother(), platt=PLATT)
+        assert not ((match.index >= 40) & (match.index < 50)).any()
+        assert match.index[[20, 25], 0].tolist() == [-1, -1]
+        assert match.score[[20, 25], 0].tolist() == [math.inf, math.inf]
+        assert match.probability is not None
+        assert match.probability[[20, 25], 0].tolist() == [0, 0]
+        assert not match.accepted[[20, 25]].any()
+        assert match.accepted.sum() == 68
+
+
+def test_few_queries_and_places_have_answers() -> None:
+    scores = noise(30, 20)
+    none, one = (localized(scores[:n], PlaceSmoother(), k=2, platt=PLATT) for n in (0, 1))
+    assert {name: column.shape for name, column in none.columns.items()} == dict.fromkeys(one.columns, (0, 2))
+    assert one.index[0, 0] == scores[0].argmin()
+    assert one.probability is not None
+    assert one.probability[0, 0] == PLATT.probability(confidence_of(scores[:1]))[0]
+    alone = localized(scores[:, :1], PlaceSmoother(), platt=PLATT)
+    assert alone.index.unique().tolist() == [0]
+    assert alone.confidence is not None
+    assert alone.confidence.isnan().all()
+
+
+@pytest.mark.parametrize("clear", [3.0, 0.0])
+def test_a_device_finds_what_the_cpu_finds(clear: float) -> None:
+    scores, descriptors = shown(20, range(16), clear=clear).double(), noise(16, 4)
+
+    def found(scores: Tensor, descriptors: Tensor) -> Match:
+        rows = smoothing.rows_of(scores)
+        return localize_drive(rows, descriptors, PlaceSmoother(MOVES), 2, 4, platt=PLATT)
+
+    expected = found(scores, descriptors)
+    with pretend() as device:
+        there = found(scores.to(device), descriptors.to(device))
+    for name, column in expected.columns.items():
+        assert there.columns[name].device.type == "cpu"
+        assert torch.allclose(there.columns[name], column, rtol=1e-5, equal_nan=True)
+
+
+MOVES = (0.2, 0.6, 0.2)
+
+
+@pytest.mark.parametrize(
+    ("folder", "names", "tolerance", "area", "other"),
+    [
+        ("robotcar/t1", ("reference.npy", "query.npy"), 2, 0.99, "nordland/winter?stop=150"),
+        ("corridor", ("ref", "query"), 0, 0.98, "floors_rejection/query.npy?stop=150"),
+    ],
+)
+def test_a_drive_is_found_in_another_season_and_another_route_is_not(
+    data_dir: Path, folder: str, names: tuple[str, str], tolerance: int, area: float, other: str
+) -> None:
+    reference, queries = (open_source(data_dir / folder / name) for name in names)
+    truth = ground_truth_of(str(data_dir / folder / "truth.csv"), reference, queries)
+    assert truth is not None
+    model = DejaVu(whitening=Whitening(views=1)).learn(reference)
+    found = model.localize(queries, sequence=PlaceSmoother())
+    assert evaluate(found, truth, tolerance).auc > area
+    assert evaluate(model.localize(queries, sequence=None), truth, tolerance).auc < area
+    assert found.accepted.double().mean() > 0.9
+    elsewhere = fitted(open_source(f"{data_dir}/{other}"), model.frame_shape)
+    wrong = model.localize(elsewhere, sequence=PlaceSmoother())
+    assert not wrong.accepted.any()
+    assert wrong.probability is not None
+    assert wrong.probability.max() < 0.5
