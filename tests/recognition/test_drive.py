@@ -66,7 +66,7 @@ def test_candidates_are_apart_and_the_first_is_the_answer() -> None:
 
 
 def test_what_is_no_drive_is_answered_by_single_queries() -> None:
-    scores, smoother = noise(150, 200), PlaceSmoother(within=5)
+    scores, smoother = noise(80, 100), PlaceSmoother(within=5)
     match, alone = localized(scores, smoother, platt=PLATT), localized(scores, PlaceSmoother(within=5))
     assert not smoother.is_drive
     assert torch.equal(match.index[:, 0], scores.argmin(1))
@@ -77,7 +77,7 @@ def test_what_is_no_drive_is_answered_by_single_queries() -> None:
     assert torch.allclose(match.probability[:, 0], torch.minimum(alone.probability[:, 0], single))
     assert single.max() > 0.9 > 0.5 > match.probability.max()
     best = scores.gather(1, match.index)
-    far = (torch.arange(200) - match.index).abs() > 4
+    far = (torch.arange(100) - match.index).abs() > 4
     second = scores.masked_fill(~far, math.inf).amin(1)
     assert match.confidence is not None
     assert torch.allclose(match.confidence[:, 0], second - best[:, 0])
