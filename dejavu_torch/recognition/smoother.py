@@ -72,13 +72,14 @@ class Block(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """What expectation-maximisation found. log: nats by which the model beats being off the map."""
+    """What expectation-maximisation found. log: nats by which the model beats being off the map. queries:
+    fitted to, each stop as one."""
 
     rates: Rates
     separation: float
     values: Tensor  # of the rank table
     log: float
-    queries: int
+    queries: float
 
 
 class PlaceSmoother(SequenceModel):
@@ -351,7 +352,8 @@ class PlaceSmoother(SequenceModel):
         start: Sequence[float],
     ) -> Fit:
         """Expectation-maximisation on stretches (n,L,N) from a start of the moves, which is their prior."""
-        (n, length, places), prior = std.z.shape, std.z.new_tensor(start)
+        (_, length, places), prior = std.z.shape, std.z.new_tensor(start)
+        queries = float(weight.sum())
         layout, separation = self.layout(places, route_starts), SEPARATION
         rates = Rates(prior, *(prior.new_tensor(rate) for rate in RATES))
         right = torch.zeros_like(std.z)  # probability that a score is a right one
@@ -372,8 +374,8 @@ class PlaceSmoother(SequenceModel):
             separation = max(MIN_SEPARATION, float(mean))
             belief, after = normalised(block.before * block.likelihood), block.likelihood * block.after
             counts = motion.counts(belief[:, :-1][moving], after[:, 1:][moving])
-            rates = updated_rates(counts, prior * (MOVE_SHARE * n * length))
-        return Fit(rates, separation, table.values, float(block.log.sum()), n * length)
+            rates = updated_rates(counts, prior * (MOVE_SHARE * queries))
+        return Fit(rates, separation, table.values, float(block.log.sum()), queries)
 
     @torch.no_grad()
     def extra_repr(self) -> str:

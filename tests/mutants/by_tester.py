@@ -620,4 +620,11 @@ MUTANTS = [
         "queries.new_ones(len(queries))",
         ("tests/recognition/test_centring.py::-k stop",),
     ),
+    Mutant(
+        "A stop is one of the queries that another speed has to explain.",
+        "dejavu_torch/recognition/smoother.py",
+        "queries = float(weight.sum())",
+        "queries = float(weight.numel())",
+        ("tests/recognition/test_smoother.py::-k another_speed",),
+    ),
 ]
