@@ -321,9 +321,9 @@ def test_other_precisions_give_the_same_places(dtype: torch.dtype) -> None:
 def test_a_device_gives_what_the_cpu_gives() -> None:
     scores = shown(30, [*range(24), *[24] * 22], clear=3.0).double()
     scores[24:] = scores[24]
-    smoother = PlaceSmoother().double().fit(scores)
+    smoother = PlaceSmoother(MOVES).double().fit(scores)
     with pretend() as device:
-        there = PlaceSmoother().double().to(device).fit(scores.to(device))
+        there = PlaceSmoother(MOVES).double().to(device).fit(scores.to(device))
         for one in (there, smoother):  # fitted there or here
             found, path = one(scores.to(device)), one.path(scores.to(device))
             assert found.device == device
