@@ -150,6 +150,7 @@ def test_a_device_finds_what_the_cpu_finds(clear: float) -> None:
 MOVES = (0.2, 0.6, 0.2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("folder", "names", "tolerance", "area", "other"),
     [
