@@ -15,8 +15,9 @@ PRIOR = 50  # queries that the map's own mean counts as; fewer queries are not c
 def centred(place_map: PlaceMap, queries: Tensor) -> Tensor:
     """Queries without what all of them have and the map has not: q - sum w (q - m) / (sum w + 50).
 
-    m is the mean descriptor of the map, w 1 over the length of the stop that a query belongs to. For a map by
-    cosine the results have norm 1. Queries of maps that are not spectral, and have no mean, stay as they are.
+    m is the mean descriptor of the map; w is 1 over the length of the stop that a query belongs to. For a map
+    by cosine the results have norm 1. Queries of maps that are not spectral, and so have no mean, stay as
+    they are.
 
     Shape: (Q,K) -> (Q,K).
 

@@ -77,7 +77,8 @@ class Block(NamedTuple):
 class Fit(NamedTuple):
     """What expectation-maximisation found.
 
-    log: nats by which the model beats being off the map. second: likewise, without the places found.
+    log: nats by which the model beats being off the map. second: likewise, without the places found. queries:
+    fitted to, each stop as one.
     """
 
     rates: Rates
@@ -85,7 +86,7 @@ class Fit(NamedTuple):
     values: Tensor  # of the rank table
     log: float
     second: float
-    queries: int
+    queries: float
 
 
 class PlaceSmoother(SequenceModel):
@@ -362,7 +363,8 @@ class PlaceSmoother(SequenceModel):
         start: Sequence[float],
     ) -> Fit:
         """Expectation-maximisation on stretches (n,L,N) from a start of the moves, which is their prior."""
-        (n, length, places), prior = std.z.shape, std.z.new_tensor(start)
+        (_, length, places), prior = std.z.shape, std.z.new_tensor(start)
+        queries = float(weight.sum())
         layout, separation = self.layout(places, route_starts), SEPARATION
         rates = Rates(prior, *(prior.new_tensor(rate) for rate in RATES))
         right = torch.zeros_like(std.z)  # probability that a score is a right one
@@ -383,7 +385,7 @@ class PlaceSmoother(SequenceModel):
             separation = max(MIN_SEPARATION, float(mean))
             belief, after = normalised(block.before * block.likelihood), block.likelihood * block.after
             counts = motion.counts(belief[:, :-1][moving], after[:, 1:][moving])
-            rates = updated_rates(counts, prior * (MOVE_SHARE * n * length))
+            rates = updated_rates(counts, prior * (MOVE_SHARE * queries))
         found = self.folded(block.posterior)[..., :-1]
         elsewhere = (near_mass(found, RADIUS) > FOUND).float()
         elsewhere = near_mass(elsewhere, RADIUS) == 0
@@ -391,7 +393,7 @@ class PlaceSmoother(SequenceModel):
         like = self.wide(torch.where(elsewhere, log, unlikely), 0.0).exp()
         (second,) = sweep(motion, lambda *_: like, length, still, length)
         logs = float(block.log.sum()), float(second.log.sum())
-        return Fit(rates, separation, table.values, *logs, n * length)
+        return Fit(rates, separation, table.values, *logs, queries)
 
     @torch.no_grad()
     def settled(self) -> dict[str, Any]:

@@ -112,8 +112,8 @@ MUTANTS = [
     Mutant(
         "With a precision an answer is accepted from that probability on, inclusive.",
         "dejavu_torch/recognition/localizer.py",
-        "accepted=probability >= matching.acceptance.precision",
-        "accepted=probability > matching.acceptance.precision",
+        "match.probability >= matching.acceptance.precision",
+        "match.probability > matching.acceptance.precision",
         ("tests/test_behaviour.py::test_a_precision_is_inclusive",),
     ),
     Mutant(
@@ -134,9 +134,9 @@ MUTANTS = [
     Mutant(
         "In a PlaceFilter what drives off the end of the map is off the map afterwards: the prediction "
         "adds up to 1.",
-        "dejavu_torch/recognition/filter.py",
-        "off = stay * (on.sum() - moved.sum()) + leave * (1 - off) + (1 - enter) * off",
-        "off = leave * (1 - off) + (1 - enter) * off",
+        "dejavu_torch/recognition/motion.py",
+        "off = self.stay * lost + leave * total + (1 - enter) * off",
+        "off = leave * total + (1 - enter) * off",
         ("tests/recognition/test_filter.py::-k literal_loop or drives_off",),
     ),
     Mutant(

@@ -123,7 +123,7 @@ def test_a_score_counts_beside_those_of_its_query_and_of_its_place(seed: int, sc
 def test_queries_that_say_nothing_change_nothing() -> None:
     scores = noise(6, 9).double()
     silent = torch.stack([torch.full((9,), 2.0), torch.full((9,), math.inf), torch.full((9,), math.nan)])
-    silent = torch.cat([silent, torch.where(torch.arange(9) == 4, math.nan, silent[:1])])
+    silent = torch.cat([silent, torch.where(torch.arange(9) == 4, math.nan, scores[:1])])
     one = torch.cat([torch.full((8,), math.inf), torch.zeros(1)])[None].double()  # no place to compare with
     mixed = torch.cat([scores[:3], silent, one, scores[3:]])
     weight = torch.ones(11, dtype=torch.float64)
