@@ -32,10 +32,10 @@ from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse, resampled, source_of
 from dejavu_torch.recognition.centring import PRIOR, centred
 from dejavu_torch.recognition.coarse import searcher
-from dejavu_torch.recognition.localizer import Localizer, Matching
+from dejavu_torch.recognition.localizer import Localizer, Matching, Scoring
 from dejavu_torch.recognition.search import SCORES_AT_ONCE, Scan, Search, Searcher, check_search
 from dejavu_torch.recognition.select import HIGHEST, PROBABLE, Acceptance, check_candidates
-from dejavu_torch.recognition.smoother import PlaceSmoother, Rows
+from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.resize import reduced_size
 from dejavu_torch.text import with_progress
 from dejavu_torch.types import InputError, Match, SequenceModel, Traverse
@@ -393,32 +393,30 @@ class DejaVu(nn.Module):
             order: (N,) the frame of each place of a shuffled map; the match then counts frames.
         """
         matching = matching if isinstance(matching, Matching) else self.matching(matching)
-        rows = None if order is None else self._shuffled_rows(descriptors, order)
+        score = None if order is None else self._shuffled(order)
         localizer, smoother = self.localizer(matching), matching.sequence
         if isinstance(smoother, PlaceSmoother):
-            return localizer.drive(descriptors, smoother, rows, progress)
+            return localizer.drive(descriptors, smoother, score, progress)
         if matching.smoother is not None:
             match = self.localize_descriptors(descriptors, matching._replace(smoother=None), order, progress)
-            drive = localizer.drive(descriptors, copy.deepcopy(matching.smoother), rows, progress)
+            drive = localizer.drive(descriptors, copy.deepcopy(matching.smoother), score, progress)
             drive = drive if matching.k is None else drive.map(lambda column: column[:, 0])
             return replace(match, sequences={**match.sequences, "smoother": drive})
-        if order is None:
+        if score is None:
             return localizer(descriptors, progress)
-        matcher, place = Localizer(None, matching), order.argsort()
-        parts = descriptors.split(max(1, SCORES_AT_ONCE // self.map.places))
-        parts = with_progress(parts, "localizing", progress)
-        scores = (self.map.scores(part.to(self.map.device)) for part in parts)
+        matcher, parts = (
+            Localizer(None, matching),
+            descriptors.split(max(1, SCORES_AT_ONCE // self.map.places)),
+        )
         with torch.no_grad():
-            return Match.joined(matcher.match(part[:, place.to(part.device)]) for part in scores)
+            scores = map(score, with_progress(parts, "localizing", progress))
+            return Match.joined(map(matcher.match, scores))
 
-    def _shuffled_rows(self, descriptors: Tensor, order: Tensor) -> Rows:
-        """Scores of queries by their numbers, on a map whose places are the frames `order`."""
-        place, device = order.argsort(), self.map.device
-
-        def rows(numbers: Tensor) -> Tensor:
-            return self.map.scores(descriptors[numbers].to(device))[:, place.to(device)]
-
-        return rows
+    def _shuffled(self, order: Tensor) -> Scoring:
+        """The scores of a map whose places are the frames `order`, frame by frame."""
+        device = self.map.device
+        place = order.argsort().to(device)
+        return lambda queries: self.map.scores(queries.to(device))[:, place]
 
     def localizer(self, matching: Matching) -> Localizer:
         """A matcher of descriptors, for consecutive batches of queries."""
@@ -469,6 +467,7 @@ class DejaVu(nn.Module):
             return
         descriptors = self.descriptor.all_of(queries, progress, on_first)
         if centre or (centre is None and len(descriptors) >= PRIOR):
+            matching = matching._replace(plain=descriptors)
             descriptors = centred(self.map, descriptors)
         yield self.localize_descriptors(descriptors, matching, progress=progress)
 

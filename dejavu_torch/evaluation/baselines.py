@@ -72,21 +72,22 @@ def nearest_frames(
     )
     parts = query.split(max(1, BLOCK_DISTANCES // len(reference)))
     batches = with_progress(parts, "baselines", progress)
-    scores = (phase_distances(batch.to(stored.device), stored, metric) for batch in batches)
-    if k > 1:
-        scores = (part[:, nearest] for part in scores)
-    matcher, nearest = Localizer(None, matching), nearest.cpu()
-    match = Match.joined(map(matcher.match, scores))
+
+    def score(queries: Tensor) -> Tensor:
+        scores = phase_distances(queries.to(stored.device), stored, metric)
+        return scores if k == 1 else scores[:, nearest]
+
+    matcher = Localizer(None, matching)
+    match = Match.joined(map(matcher.match, map(score, batches)))
 
     def stored_frame(frame: Tensor) -> Tensor:
-        return torch.where(frame >= 0, k * nearest[frame], -1)
+        return torch.where(frame >= 0, k * nearest.cpu()[frame], -1)
 
     sequences = dict(match.sequences)
     if 1 in sequences:
         sequences[1] = sequences[1].renumbered(stored_frame)
     if matching.smoother is not None:
-        rows = lambda numbers: phase_distances(query[numbers].to(stored.device), stored, metric)[:, nearest]  # noqa: E731
-        sequences["smoother"] = matcher.drive(query, copy.deepcopy(matching.smoother), rows, progress)
+        sequences["smoother"] = matcher.drive(query, copy.deepcopy(matching.smoother), score, progress)
     if matching.sequence is None or matcher.own == 1:  # single queries
         match = replace(match, index=stored_frame(match.index))
     return replace(match, probability=None, sequences=sequences)

@@ -173,6 +173,7 @@ def compare(
         whole = smoother or alike
         if whole is not None:
             own = model.matching(whole)._replace(k=found.index.shape[1], radius=tolerance)
+            own = own._replace(plain=run.causal_features)
             drive = model.localize_descriptors(run.query_features, own, progress=progress)
             best = drive.map(lambda column: column[:, 0])
             sequences = {**run.judged.sequences, "smoother": best}
@@ -334,9 +335,10 @@ def _match_distractors(
     probabilities = {}
     for other in distractors:
         queries = model.descriptor.all_of(other, progress)
+        matching = model.matching(copy.deepcopy(whole) if whole else sequence)
         if centring and (sequence is None or whole):
-            queries = centred(model.map, queries)
-        match = model.localize_descriptors(queries, copy.deepcopy(whole) if whole else sequence)
+            matching, queries = matching._replace(plain=queries), centred(model.map, queries)
+        match = model.localize_descriptors(queries, matching)
         assert match.probability is not None
         probabilities[other.name] = match.probability
     return probabilities

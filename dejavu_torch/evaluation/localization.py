@@ -57,7 +57,8 @@ class Localization(NamedTuple):
 
     def match_by(self, match: Callable[[Tensor, Matching], Match]) -> Match:
         """The matches of a function of queries and matching, with those of all models in `sequences`."""
-        matching, causal = self.matching, self.causal_features
+        causal = self.causal_features
+        matching = self.matching._replace(plain=causal)
         if causal is None or not (matching.also or matching.sequence):
             return match(self.query_features, matching)
         single = matching.sequence is None

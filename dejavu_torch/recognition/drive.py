@@ -41,6 +41,7 @@ def localize_drive(
     route_starts: Sequence[int] = (0,),
     platt: Platt | None = None,
     progress: bool = False,
+    single: Rows | None = None,
 ) -> Match:
     """Fit a smoother to a drive and match its queries.
 
@@ -49,6 +50,7 @@ def localize_drive(
 
     Args:
         rows: scores of queries by their numbers, (B,) -> (B,N). descriptors: (Q,K) of all queries.
+        single: likewise, of queries that are no drive, which are not centred; None is as `rows`.
         k: candidates. radius: suppression radius in places.
         platt: the calibration of single queries, if there is one.
 
@@ -57,27 +59,27 @@ def localize_drive(
     """
     smoother.fit(rows, descriptors, route_starts)
     drive = smoother.drive(rows, descriptors)
+    answered = rows if smoother.is_drive or single is None else single
     places = len(drive.means)
     parts: list[Shown] = []
     with progress_of("smoothing", len(descriptors), progress, "query") as update:
         for block in smoother.blocks(drive, route_starts):
-            scores = drive.rows(torch.arange(block.first, block.first + block.log.shape[-1]))
-            mass = smoother.folded(block.posterior)[:, :-1]
+            scores = answered(torch.arange(block.first, block.first + block.log.shape[-1]))
+            # in double precision, so that answers that are nearly sure differ
+            mass = normalised(smoother.folded(block.posterior.cpu().double()))[:, :-1]
+            scores = scores.cpu()
             ranked = near_scores(mass, scores, smoother.within) if smoother.is_drive else scores
             pair = best_candidates(ranked, min(2, places), radius)
             match = pair if k <= pair.index.shape[1] else best_candidates(ranked, k, radius)
             match = match.map(lambda column: column[:, :k])
             at = match.index[:, :1].clamp(min=0)
-            # in double precision, so that those near 1 differ
-            precise = normalised(smoother.folded(block.posterior.cpu().double()))[:, :-1]
-            probability = near_mass(precise, smoother.within).gather(1, at.cpu())[:, 0]
+            probability = near_mass(mass, smoother.within).gather(1, at)[:, 0]
             if not smoother.is_drive and platt is not None:
-                single = platt.probability(confidence_of(scores))
-                probability = single if len(descriptors) == 1 else torch.minimum(probability, single)
-            probability = probability.masked_fill(match.index[:, 0].cpu() < 0, 0)
+                by_itself = platt.probability(confidence_of(scores))
+                probability = by_itself if len(descriptors) == 1 else torch.minimum(probability, by_itself)
+            probability = probability.masked_fill(match.index[:, 0] < 0, 0)
             margin = pair.score[:, -1] - pair.score[:, 0] if places > 1 else pair.score[:, 0] * math.nan
-            columns = margin, probability, scores.gather(1, at)[:, 0]
-            parts.append(Shown(match.map(Tensor.cpu), *(column.cpu() for column in columns)))
+            parts.append(Shown(match, margin, probability, scores.gather(1, at)[:, 0]))
             update(len(scores))
     if not parts:
         empty = torch.zeros(0, k)
@@ -88,8 +90,9 @@ def localize_drive(
     probability = torch.cat([part.probability for part in parts])
     own = torch.cat([part.own for part in parts])
     if smoother.is_drive:
-        match = replace(match, score=match.score + doubt(own)[:, None].to(match.score))
-    return replace(match, probability=first_of(probability, k), confidence=first_of(margin, k))
+        match = replace(match, score=match.score + doubt(own)[:, None])
+    match = replace(match, score=match.score.to(own.dtype))
+    return replace(match, probability=first_of(probability, k), confidence=first_of(margin.to(own.dtype), k))
 
 
 def doubt(own: Tensor) -> Tensor:

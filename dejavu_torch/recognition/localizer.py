@@ -37,6 +37,7 @@ class Matching(NamedTuple):
     sequence: SequenceModel | PlaceSmoother | None = None  # None matches each query by itself
     also: Mapping[Together, SequenceModel] = MappingProxyType({})  # further ways, see `Match.sequences`
     smoother: PlaceSmoother | None = None  # another further way, where all queries are known
+    plain: Tensor | None = None  # the queries as they are, if those of a smoother are centred
     k: int | None = None  # candidates per query; None gives matches (Q,)
     radius: int = 0  # suppression radius in places
     acceptance: Acceptance = Acceptance()
@@ -46,6 +47,7 @@ class Matching(NamedTuple):
 
 
 SINGLE = Matching()  # each query by itself
+Scoring = Callable[[Tensor], Tensor]  # queries (B,K) -> scores (B,N)
 
 
 class Localizer:
@@ -109,21 +111,29 @@ class Localizer:
         return Match.joined(map(self._in_sequence, scores.split(max(1, CACHED // scores.shape[1]))))
 
     def drive(
-        self, descriptors: Tensor, smoother: PlaceSmoother, rows: Rows | None = None, progress: bool = False
+        self,
+        descriptors: Tensor,
+        smoother: PlaceSmoother,
+        score: Scoring | None = None,
+        progress: bool = False,
     ) -> Match:
         """Match all queries (Q,K) of a drive by a smoother, which is fitted to them; see `localize_drive`.
 
         Args:
-            rows: scores of queries by their numbers, (B,) -> (B,N); None are those of the map.
+            score: scores of queries, (B,K) -> (B,N); None are those of the map.
         """
         matching, place_map = self.matching, self.place_map
-        if rows is None:
+        if score is None:
             assert place_map is not None
             device, scores = place_map.device, place_map.scores
-            rows = lambda numbers: scores(descriptors[numbers].to(device))  # noqa: E731
-        settings = matching.k or 1, matching.radius, self.route_starts, matching.platt, progress
-        match = localize_drive(rows, descriptors, smoother, *settings)
-        return self._accepted(match)
+            score = lambda queries: scores(queries.to(device))  # noqa: E731
+
+        def rows(queries: Tensor) -> Rows:
+            return lambda numbers: score(queries[numbers])
+
+        single = None if matching.plain is None else rows(matching.plain)
+        settings = matching.k or 1, matching.radius, self.route_starts, matching.platt, progress, single
+        return self._accepted(localize_drive(rows(descriptors), descriptors, smoother, *settings))
 
     @torch.no_grad()
     def skip(self, queries: int) -> None:
