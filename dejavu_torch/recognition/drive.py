@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -13,8 +13,9 @@ from torch import Tensor
 
 from dejavu_torch.recognition.calibration import Platt, confidence_of
 from dejavu_torch.recognition.filter import near_scores
+from dejavu_torch.recognition.large import TILE, LargeDrive, Tiles, is_large
 from dejavu_torch.recognition.select import best_candidates
-from dejavu_torch.recognition.smoother import PlaceSmoother, Rows, near_mass, normalised
+from dejavu_torch.recognition.smoother import Drive, PlaceSmoother, Rows, near_mass, normalised
 from dejavu_torch.text import progress_of
 from dejavu_torch.types import Match
 
@@ -42,6 +43,7 @@ def localize_drive(
     platt: Platt | None = None,
     progress: bool = False,
     single: Rows | None = None,
+    tiles: Tiles | None = None,
 ) -> Match:
     """Fit a smoother to a drive and match its queries.
 
@@ -53,30 +55,35 @@ def localize_drive(
         single: likewise, of queries that are no drive, which are not centred; None is as `rows`.
         k: candidates. radius: suppression radius in places.
         platt: the calibration of single queries, if there is one.
+        tiles: the scores of `rows` for large maps; None makes them of rows.
 
     Returns:
         Match of (Q,k) on the CPU, with probability and confidence; all accepted that have a finite score.
     """
-    smoother.fit(rows, descriptors, route_starts)
-    drive = smoother.drive(rows, descriptors)
-    answered = rows if smoother.is_drive or single is None else single
-    places = len(drive.means)
+    queries = len(descriptors)
+    places = rows(torch.arange(min(1, queries))).shape[1]
+    if is_large(queries, places):
+        tiles = tiles or Tiles(lambda numbers: iter([(0, rows(numbers))]), places)
+        settings = places, smoother, route_starts, max(2, k), radius, progress
+        seen = _of_windows(LargeDrive(tiles, descriptors, *settings), single or rows)
+    else:
+        smoother.fit(rows, descriptors, route_starts)
+        seen = _of_all_places(smoother, smoother.drive(rows, descriptors), route_starts, single or rows)
     parts: list[Shown] = []
-    with progress_of("smoothing", len(descriptors), progress, "query") as update:
-        for block in smoother.blocks(drive, route_starts):
-            scores = answered(torch.arange(block.first, block.first + block.log.shape[-1]))
-            # in double precision, so that answers that are nearly sure differ
-            mass = normalised(smoother.folded(block.posterior.cpu().double()))[:, :-1]
-            scores = scores.cpu()
+    with progress_of("smoothing", queries, progress, "query") as update:
+        for mass, scores, known in seen:
             ranked = near_scores(mass, scores, smoother.within) if smoother.is_drive else scores
-            pair = best_candidates(ranked, min(2, places), radius)
-            match = pair if k <= pair.index.shape[1] else best_candidates(ranked, k, radius)
+            columns = None if known is None else known.expand_as(ranked)
+            pair = best_candidates(ranked, min(2, ranked.shape[1]), radius, columns)
+            match = pair if k <= pair.index.shape[1] else best_candidates(ranked, k, radius, columns)
             match = match.map(lambda column: column[:, :k])
             at = match.index[:, :1].clamp(min=0)
+            if known is not None:
+                at = torch.searchsorted(known, at).clamp(max=len(known) - 1)
             probability = near_mass(mass, smoother.within).gather(1, at)[:, 0]
             if not smoother.is_drive and platt is not None:
                 by_itself = platt.probability(confidence_of(scores))
-                probability = by_itself if len(descriptors) == 1 else torch.minimum(probability, by_itself)
+                probability = by_itself if queries == 1 else torch.minimum(probability, by_itself)
             probability = probability.masked_fill(match.index[:, 0] < 0, 0)
             margin = pair.score[:, -1] - pair.score[:, 0] if places > 1 else pair.score[:, 0] * math.nan
             parts.append(Shown(match, margin, probability, scores.gather(1, at)[:, 0]))
@@ -93,6 +100,33 @@ def localize_drive(
         match = replace(match, score=match.score + doubt(own)[:, None])
     match = replace(match, score=match.score.to(own.dtype))
     return replace(match, probability=first_of(probability, k), confidence=first_of(margin.to(own.dtype), k))
+
+
+# mass of places (B,n) in double precision, so that answers that are nearly sure differ; scores (B,n); which
+# places (n,), or None for all; the last queries come first
+Seen = Iterator[tuple[Tensor, Tensor, Tensor | None]]
+
+
+def _mass(posterior: Tensor) -> Tensor:
+    return normalised(PlaceSmoother.folded(posterior.cpu().double()))[:, :-1]
+
+
+def _of_all_places(smoother: PlaceSmoother, drive: Drive, route_starts: Sequence[int], single: Rows) -> Seen:
+    rows = drive.rows if smoother.is_drive else single
+    for block in smoother.blocks(drive, route_starts):
+        numbers = torch.arange(block.first, block.first + block.log.shape[-1])
+        yield _mass(block.posterior), rows(numbers).cpu(), None
+
+
+def _of_windows(drive: LargeDrive, single: Rows) -> Seen:
+    for first, posterior, scores, places in drive:
+        mass = _mass(posterior)
+        if drive.smoother.is_drive:
+            yield mass, scores, places
+            continue
+        for part in reversed(torch.arange(len(mass)).split(max(1, TILE // drive.places))):
+            whole = mass.new_zeros(len(part), drive.places).index_copy(1, places, mass[part])
+            yield whole, single(first + part).cpu(), None
 
 
 def doubt(own: Tensor) -> Tensor:

@@ -137,10 +137,14 @@ class RankTable:
     """Normal scores: a z that a share u of the wrong ones reaches becomes x = -Phi^-1(u).
 
     A histogram of z, weighted by the probability of being wrong; `x` interpolates in between.
+
+    Args:
+        counts: of another table, to begin with.
     """
 
-    def __init__(self) -> None:
-        self.counts = torch.zeros((HIGHEST - LOWEST) * PER_DEVIATION + 1, dtype=torch.float64)
+    def __init__(self, counts: Tensor | None = None) -> None:
+        empty = torch.zeros((HIGHEST - LOWEST) * PER_DEVIATION + 1, dtype=torch.float64)
+        self.counts = empty if counts is None else counts.clone()
 
     def add(self, z: Tensor, weight: Tensor) -> None:
         """Count values z with their weights, of the same shape."""

@@ -17,6 +17,7 @@ from dejavu_torch.recognition.calibration import TOLERANCE, Platt, Track
 from dejavu_torch.recognition.calibration import confidence as confidence_of_pair
 from dejavu_torch.recognition.drive import first_of, localize_drive
 from dejavu_torch.recognition.filter import PlaceFilter
+from dejavu_torch.recognition.large import Tiles
 from dejavu_torch.recognition.search import SCORES_AT_ONCE, NmsSpec, Scan, Search, Searcher, num_needed
 from dejavu_torch.recognition.select import Acceptance, accept, best_candidates, best_match
 from dejavu_torch.recognition.sequence import SequenceMatcher
@@ -122,17 +123,27 @@ class Localizer:
         Args:
             score: scores of queries, (B,K) -> (B,N); None are those of the map.
         """
-        matching, place_map = self.matching, self.place_map
+        matching, place_map, tiles = self.matching, self.place_map, None
         if score is None:
             assert place_map is not None
-            device, scores = place_map.device, place_map.scores
+            device, scores, score_blocks = place_map.device, place_map.scores, place_map.score_blocks
             score = lambda queries: scores(queries.to(device))  # noqa: E731
+            blocks = lambda numbers: score_blocks(descriptors[numbers].to(device))  # noqa: E731
+            tiles = Tiles(blocks, place_map.block_places)
 
         def rows(queries: Tensor) -> Rows:
             return lambda numbers: score(queries[numbers])
 
         single = None if matching.plain is None else rows(matching.plain)
-        settings = matching.k or 1, matching.radius, self.route_starts, matching.platt, progress, single
+        settings = (
+            matching.k or 1,
+            matching.radius,
+            self.route_starts,
+            matching.platt,
+            progress,
+            single,
+            tiles,
+        )
         return self._accepted(localize_drive(rows(descriptors), descriptors, smoother, *settings))
 
     @torch.no_grad()

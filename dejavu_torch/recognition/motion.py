@@ -47,6 +47,7 @@ class Layout(NamedTuple):
         links: further steps, in place of that to the next place; backwards in the opposite direction. Those
             from one place that have more than 1 in all share it.
         turn: probability of turning round in a step, if there are two directions.
+        share: of the places of a map that these are; the others are off the map.
     """
 
     places: int
@@ -54,6 +55,16 @@ class Layout(NamedTuple):
     route_starts: tuple[int, ...] = (0,)
     links: tuple[Link, ...] = ()
     turn: float = 0.0
+    share: float = 1.0
+
+    def of(self, places: Tensor) -> Layout:
+        """The layout of some places (n,) in order; moves end at each gap."""
+        starts = torch.isin(places, torch.tensor(self.route_starts))
+        starts |= F.pad(places[1:] != places[:-1] + 1, (1, 0), value=True)
+        at = {place: i for i, place in enumerate(places.tolist())} if self.links else {}
+        links = tuple((at[one], at[two], share) for one, two, share in self.links if {one, two} <= at.keys())
+        routes, share = tuple(starts.nonzero()[:, 0].tolist()), len(places) / self.places
+        return Layout(len(places), self.directions, routes, links, self.turn, share)
 
 
 class Motion:
@@ -66,6 +77,7 @@ class Motion:
     def __init__(self, layout: Layout, rates: Rates) -> None:
         self.layout, self.rates = layout, rates
         self.stay = 1 - rates.jump - rates.leave
+        self.each = layout.share / max(1, layout.directions * layout.places)
         self.moves = rates.moves.unbind()
         last, taken = layout.places - 1, rates.moves.new_zeros(layout.directions, layout.places)
         ways: list[tuple[int, int, int, float]] = []
@@ -116,6 +128,10 @@ class Motion:
         """The places (..., D, N), and being off the map (..., 1)."""
         return state[..., :-1].unflatten(-1, (self.layout.directions, -1)), state[..., -1:]
 
+    def _mean(self, message: Tensor) -> Tensor:
+        """The mean over all places of the map, (..., S) -> (..., 1)."""
+        return torch.lerp(message[..., -1:], message[..., :-1].mean(-1, keepdim=True), self.layout.share)
+
     def moved(self, belief: Tensor) -> Tensor:
         """The belief before the next query."""
         on, off = self._split(belief)
@@ -126,9 +142,9 @@ class Motion:
         total, moved = belief[..., :-1].sum(-1, keepdim=True), moved.flatten(-2)
         lost = (start * self.lost).flatten(-2).sum(-1, keepdim=True)
         _, jump, leave, enter = self.rates
-        anywhere = (jump * total + enter * off) / moved.shape[-1]
-        off = self.stay * lost + leave * total + (1 - enter) * off
-        return torch.cat([self.stay * moved + anywhere, off], -1)
+        anywhere = jump * total + enter * off
+        off = self.stay * lost + leave * total + (1 - enter) * off + (1 - self.layout.share) * anywhere
+        return torch.cat([self.stay * moved + anywhere * self.each, off], -1)
 
     def expected(self, message: Tensor) -> Tensor:
         """What a message of the next query says of the state before: the transpose of `moved`."""
@@ -138,7 +154,7 @@ class Motion:
             moved = torch.addcmul(self._shifted_back(moved), move, on)
         moved = self._turned(moved + self.lost * off[..., None]).flatten(-2)
         _, jump, leave, enter = self.rates
-        mean = message[..., :-1].mean(-1, keepdim=True)
+        mean = self._mean(message)
         before = self.stay * moved + (jump * mean + leave * off)
         return torch.cat([before, enter * mean + (1 - enter) * off], -1)
 
@@ -146,7 +162,7 @@ class Motion:
         """Log probabilities of the best way to each state in a step, from those before it (Viterbi)."""
         on, off = self._split(log)
         _, jump, leave, enter = self.rates
-        anywhere = jump / (log.shape[-1] - 1)
+        anywhere = jump * self.each
         turn = self.layout.turn if self.layout.directions == 2 else 0.0
         best = torch.full_like(on, -math.inf)
         for move in self.moves[::-1]:
@@ -155,9 +171,11 @@ class Motion:
             if turn:
                 turned = on.flip(-1, -2) + (self.stay * move * turn + anywhere).log()
                 best = torch.maximum(best, turned)
-        jumped = torch.maximum(on.amax() + anywhere.log(), off + (enter / (log.shape[-1] - 1)).log())
-        left = (on + (self.stay * self._turned(self.lost) + leave).log()).amax()
-        return torch.cat([best.flatten().maximum(jumped), torch.maximum(left, off + (1 - enter).log())])
+        jumped = torch.maximum(on.amax() + anywhere.log(), off + (enter * self.each).log())
+        gone = 1 - self.layout.share
+        left = (on + (self.stay * self._turned(self.lost) + leave + gone * jump).log()).amax()
+        stayed = off + (1 - enter + gone * enter).log()
+        return torch.cat([best.flatten().maximum(jumped), torch.maximum(left, stayed)])
 
     def _best_shifted(self, on: Tensor) -> Tensor:
         moved = F.pad(on[..., :-1], (1, 0), value=-math.inf)
@@ -171,9 +189,9 @@ class Motion:
 
     def anywhere(self) -> Tensor:
         """The belief before the first query: on or off the map in the equilibrium of leaving and entering."""
-        states = self.layout.directions * self.layout.places
         off = (self.rates.leave / (self.rates.leave + self.rates.enter)).clamp(max=0.5)
-        return torch.cat([((1 - off) / states).expand(states), off[None]])
+        on = ((1 - off) * self.each).expand(self.layout.directions * self.layout.places)
+        return torch.cat([on, 1 - (1 - off[None]) * self.layout.share])
 
     def counts(self, before: Tensor, after: Tensor) -> Counts:
         """Expected numbers of steps (the E-step of Baum and Welch).
@@ -184,7 +202,7 @@ class Motion:
         """
         (on, off), (shifted, off_after) = self._split(before), self._split(after)
         start, off, off_after = self._turned(on), off[..., 0], off_after[..., 0]
-        total, mean = before[..., :-1].sum(-1), after[..., :-1].mean(-1)
+        total, mean = before[..., :-1].sum(-1), self._mean(after)[..., 0]
         _, jump, leave, enter = self.rates
         kinds = []
         for move, reach in zip(self.moves, self.reach, strict=True):

@@ -44,11 +44,12 @@ SHARPENED = 0.6  # tau' = SHARPENED tau
 MIN_SEPARATION = 0.3
 SURE = 2.5  # separation from which on slow changes, as of waiting trains, make no query say less
 FITTED, STRETCH, STRETCHES = 1000, 100, 10  # queries that are fitted to at most, in a stretch, and stretches
-LEAST, SAMPLED = 20, 2**23  # queries that are fitted to at least, and their scores at most otherwise
+LEAST, SAMPLED = 20, 2**21  # queries that are fitted to at least, and their scores at most otherwise
 CORRELATED = 4  # correlation times in a stretch, at least
 DRIVE = 10.0  # nats by which a drive beats being off the map throughout
 OTHER_DRIVE, PER_QUERY = 30.0, 0.1  # likewise at another speed, in all and per query,
-REPEATED = 0.8  # of the drive's nats: places elsewhere that explain as much show the same
+ALIKE = 0.15  # of the drive's nats: where places elsewhere explain as much, these places only look alike,
+REPEATED = 0.8  # and where they explain as much, they show the same
 FOUND = 0.05  # mass of a place that is found
 CLEARLY = 5.0  # and times as many as at one place a query
 WHOLE = "a smoother has to know the whole drive; expected a PlaceFilter, or a SequenceMatcher"
@@ -73,6 +74,16 @@ class Block(NamedTuple):
     @property
     def posterior(self) -> Tensor:
         return normalised(self.before * self.likelihood * self.after)
+
+
+class Sample(NamedTuple):
+    """Stretches of a drive that a smoother is fitted to: (..., L, N) at the places of a layout; weight and
+    still (..., L) as in `Spacing`."""
+
+    std: Standardised
+    weight: Tensor
+    still: Tensor
+    layout: Layout
 
 
 class Fit(NamedTuple):
@@ -240,9 +251,11 @@ class PlaceSmoother(SequenceModel):
 
     def motion(self, places: int, route_starts: Sequence[int], like: Tensor) -> Motion:
         """The transitions of a map, in the type of its scores."""
+        return Motion(self.layout(places, route_starts), self.rates(like))
+
+    def rates(self, like: Tensor) -> Rates:
         moves, (_, jump, leave) = (one.to(like).softmax(0) for one in (self.move_logits, self.rate_logits))
-        rates = Rates(moves, jump, leave, self.enter_logit.to(like).sigmoid())
-        return Motion(self.layout(places, route_starts), rates)
+        return Rates(moves, jump, leave, self.enter_logit.to(like).sigmoid())
 
     def layout(self, places: int, route_starts: Sequence[int] = (0,)) -> Layout:
         links = self.links
@@ -331,22 +344,30 @@ class PlaceSmoother(SequenceModel):
         if not len(descriptors):
             return self
         spacing = spacing_of(descriptors)
-        self.correlation, self.tempering = spacing.correlation, tempering_of(spacing)
         places = scores(torch.zeros(1, dtype=torch.int64)).shape[1]
         picked = stretches(len(descriptors), spacing.correlation, places)
-        sample = scores(picked.flatten())
-        weight, still = spacing.weight.to(sample), spacing.still.to(sample.device)
-        self.means = place_means(sample, weight[picked.flatten()])
-        parts = standardised(sample, self.means)
+        known = scores(picked.flatten())
+        weight, still = spacing.weight.to(known), spacing.still.to(known.device)
+        self.means = place_means(known, weight[picked.flatten()])
+        parts = standardised(known, self.means)
         std = Standardised(*(part.unflatten(0, picked.shape) for part in parts))
-        given = std, weight[picked], still[picked], route_starts
-        best = self._fitted(*given, self.prior)
+        ranks = RankTable()
+        ranks.add(std.z, (weight[picked] * std.speaks)[..., None] * std.valid)
+        layout = self.layout(places, route_starts)
+        return self.learn([Sample(std, weight[picked], still[picked], layout)], ranks, spacing)
+
+    @torch.no_grad()
+    def learn(self, samples: Sequence[Sample], ranks: RankTable, spacing: Spacing) -> Self:
+        """As `fit`, from stretches of the drive and the ranks of all their scores."""
+        self.correlation, self.tempering = spacing.correlation, tempering_of(spacing)
+        best = self._fitted(samples, ranks, self.prior)
         if best.log < max(OTHER_DRIVE, PER_QUERY * best.queries) and len(self.prior) == len(MOVES):
-            other = max((self._fitted(*given, start) for start in (SLOW, FAST)), key=lambda one: one.log)
+            others = (self._fitted(samples, ranks, start) for start in (SLOW, FAST))
+            other = max(others, key=lambda one: one.log)
             least = max(OTHER_DRIVE, PER_QUERY * other.queries, CLEARLY * best.log)
             best = other if other.log >= least else best
         # elsewhere explains a drive no better than being off the map, unless it shows the same places
-        alike = DRIVE <= best.second < REPEATED * best.log
+        alike = max(DRIVE, ALIKE * best.log) <= best.second < REPEATED * best.log
         self.is_drive, self.log_likelihood = best.log >= DRIVE and not alike, best.log
         if best.separation >= SURE:
             self.tempering = max(1.0, min(self.tempering, spacing.detrended))
@@ -357,46 +378,57 @@ class PlaceSmoother(SequenceModel):
         self.enter_logit.copy_(logits(enter)[0] - logits(1 - enter)[0])
         return self
 
-    def _fitted(
-        self,
-        std: Standardised,
-        weight: Tensor,
-        still: Tensor,
-        route_starts: Sequence[int],
-        start: Sequence[float],
-    ) -> Fit:
-        """Expectation-maximisation on stretches (n,L,N) from a start of the moves, which is their prior."""
-        (_, length, places), prior = std.z.shape, std.z.new_tensor(start)
-        queries = float(weight.sum())
-        layout, separation = self.layout(places, route_starts), SEPARATION
+    def _fitted(self, samples: Sequence[Sample], ranks: RankTable, start: Sequence[float]) -> Fit:
+        """Expectation-maximisation from a start of the moves, which is their prior."""
+        z = samples[0].std.z
+        prior, separation = z.new_tensor(start), SEPARATION
         rates = Rates(prior, *(prior.new_tensor(rate) for rate in RATES))
-        right = torch.zeros_like(std.z)  # probability that a score is a right one
-        moving, shares = ~still[:, 1:], (weight * std.speaks)[..., None]
+        queries = float(sum(sample.weight.sum() for sample in samples))
+        rights: list[Tensor] = []  # shares of the scores that are right ones
         for round in range(ROUNDS + 1):
-            table = RankTable()
-            table.add(std.z, shares * std.valid * (1 - right))
-            x = RankTable.look_up(table.values, std.z)
-            log = log_likelihood(x, std, weight, separation, self.tempering)
-            motion, like = Motion(layout, rates), self.wide(log, 0.0).exp()
-            (block,) = sweep(motion, lambda *_: like, length, still, length)  # noqa: B023
+            table = RankTable(ranks.counts)
+            for sample, right in zip(samples, rights, strict=False):
+                table.add(sample.std.z, -right)
+            seen = [self._explained(sample, table.values, separation, rates) for sample in samples]
             if round == ROUNDS:
                 break
-            right = near_mass(self.folded(block.posterior)[..., :-1], RADIUS)
-            # without its own evidence, that of a query is not mistaken for that of its place
-            others = self.folded(normalised(block.before * block.after))[..., :-1] * shares
-            mean = (others * torch.where(std.valid, x, 0)).sum() / others.sum().clamp(min=MIN_PROBABILITY)
-            separation = max(MIN_SEPARATION, float(mean))
-            belief, after = normalised(block.before * block.likelihood), block.likelihood * block.after
-            counts = motion.counts(belief[:, :-1][moving], after[:, 1:][moving])
-            rates = updated_rates(counts, prior * (MOVE_SHARE * queries))
-        found = self.folded(block.posterior)[..., :-1]
-        elsewhere = (near_mass(found, RADIUS) > FOUND).float()
-        elsewhere = near_mass(elsewhere, RADIUS) == 0
-        unlikely = log.clamp(max=-(separation**2) / 2 / self.tempering)
-        like = self.wide(torch.where(elsewhere, log, unlikely), 0.0).exp()
-        (second,) = sweep(motion, lambda *_: like, length, still, length)
-        logs = float(block.log.sum()), float(second.log.sum())
-        return Fit(rates, separation, table.values, *logs, queries)
+            rights, sums, counts = [], z.new_zeros(2), []
+            for sample, (x, _, motion, block) in zip(samples, seen, strict=True):
+                shares = (sample.weight * sample.std.speaks)[..., None]
+                near = near_mass(self.folded(block.posterior)[..., :-1], RADIUS)
+                rights.append(shares * sample.std.valid * near)
+                # without its own evidence, that of a query is not mistaken for that of its place
+                others = self.folded(normalised(block.before * block.after))[..., :-1] * shares
+                known = torch.where(sample.std.valid, x, 0)
+                sums += torch.stack([(others * known).sum(), others.sum()])
+                belief, after = normalised(block.before * block.likelihood), block.likelihood * block.after
+                moving = ~sample.still[..., 1:]
+                counts.append(motion.counts(belief[..., :-1, :][moving], after[..., 1:, :][moving]))
+            separation = max(MIN_SEPARATION, float(sums[0] / sums[1].clamp(min=MIN_PROBABILITY)))
+            total = Counts(*(torch.stack(kind).sum(0) for kind in zip(*counts, strict=True)))
+            rates = updated_rates(total, prior * (MOVE_SHARE * queries))
+        second = 0.0
+        for sample, (_, log, motion, block) in zip(samples, seen, strict=True):
+            found = self.folded(block.posterior)[..., :-1]
+            elsewhere = (near_mass(found, RADIUS) > FOUND).float()
+            elsewhere = near_mass(elsewhere, RADIUS) == 0
+            unlikely = log.clamp(max=-(separation**2) / 2 / self.tempering)
+            second += float(self._swept(torch.where(elsewhere, log, unlikely), sample, motion).log.sum())
+        first = float(sum(block.log.sum() for *_, block in seen))
+        return Fit(rates, separation, table.values, first, second, queries)
+
+    def _explained(
+        self, sample: Sample, values: Tensor, separation: float, rates: Rates
+    ) -> tuple[Tensor, Tensor, Motion, Block]:
+        """Normal scores of a sample, their log likelihood, and what follows from it."""
+        x, motion = RankTable.look_up(values, sample.std.z), Motion(sample.layout, rates)
+        log = log_likelihood(x, sample.std, sample.weight, separation, self.tempering)
+        return x, log, motion, self._swept(log, sample, motion)
+
+    def _swept(self, log: Tensor, sample: Sample, motion: Motion) -> Block:
+        like = self.wide(log, 0.0).exp()
+        (block,) = sweep(motion, lambda *_: like, log.shape[-2], sample.still, log.shape[-2])
+        return block
 
     @torch.no_grad()
     def settled(self) -> dict[str, Any]:

@@ -1,0 +1,269 @@
+"""The smoother on large maps, coarse to fine: single places only where a pass over groups leaves mass."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from dejavu_torch.maps.place_map import ScoreBlocks
+from dejavu_torch.recognition.evidence import (
+    MIN_SHARE,
+    RankTable,
+    Standardised,
+    spacing_of,
+)
+from dejavu_torch.recognition.motion import Motion
+from dejavu_torch.recognition.smoother import (
+    CORRELATED,
+    FITTED,
+    STRETCHES,
+    PlaceSmoother,
+    Sample,
+    log_likelihood,
+    sweep,
+)
+from dejavu_torch.text import progress_of
+
+LARGE, LARGE_MAP = 2**25, 2**13  # queries x places, and places, from which on a drive goes coarse to fine
+GROUP = 16  # consecutive places that are one in the coarse pass; more if more than `HELD` scores were held
+HELD = 2**27
+LIKELY = 1e-4  # coarse mass from which on the places of a group are looked at
+LOOKED = 2**13  # places of a window that are looked at by their mass, at most
+WINDOW, MARGIN = 400, 100  # queries that are smoothed at a time, and those on both sides that they depend on
+MEANS = 256  # queries whose mean score of a place is taken
+TILE = 2**22  # numbers at a time
+
+
+class Tiles(NamedTuple):
+    """blocks: numbers of queries (B,) -> blocks of their scores. width: about how many numbers a query has in
+    a block."""
+
+    blocks: Callable[[Tensor], ScoreBlocks]
+    width: int
+
+
+def is_large(queries: int, places: int) -> bool:
+    """Whether a drive goes coarse to fine."""
+    return places > LARGE_MAP or queries * places > LARGE
+
+
+class Window(NamedTuple):
+    """Queries [first, last) beside others [start, stop), and z at the places (n,) that they may be at."""
+
+    first: int
+    last: int
+    start: int
+    stop: int
+    places: Tensor
+    z: Tensor  # (stop - start, n), -inf where a place has no score
+
+
+class LargeDrive:
+    """A drive on a large map, whose scores are never held.
+
+    First, a smoother of groups of places, each by its best score. Then, window by window, one of the places
+    in groups with a mass above `LIKELY`, and in those beside them; all others are off the map.
+
+    Args:
+        tiles: the scores. descriptors: (Q,K) of all queries. candidates, radius: as in `best_candidates`.
+    """
+
+    def __init__(
+        self,
+        tiles: Tiles,
+        descriptors: Tensor,
+        places: int,
+        smoother: PlaceSmoother,
+        route_starts: Sequence[int] = (0,),
+        candidates: int = 2,
+        radius: int = 5,
+        progress: bool = False,
+    ) -> None:
+        self.blocks, self.places, self.smoother, self.progress = tiles.blocks, places, smoother, progress
+        self.descriptors, self.queries, self.route_starts = descriptors, len(descriptors), route_starts
+        self.parts = torch.arange(self.queries).split(max(16, TILE // tiles.width))
+        self.spacing = spacing_of(descriptors.cpu())
+        self.group = GROUP
+        while self.queries * places > self.group * HELD:
+            self.group *= 2
+        self.layout = smoother.layout(places, route_starts)
+        self.means = self._means()
+        self.mean, self.spread, self.speaks = torch.zeros(3, self.queries)
+        best = self._pooled()
+        self.windows = self._windows(best, candidates * (1 + math.ceil(radius / self.group)))
+        del best
+        self._fit(self._scored())
+
+    def _means(self) -> Tensor:
+        """The mean score of each place over some of the queries, (N,)."""
+        numbers = torch.linspace(0, self.queries - 1, min(self.queries, MEANS)).round().long()
+        total, share = torch.zeros(2, self.places)
+        for part in numbers.split(len(self.parts[0])):
+            weight = self.spacing.weight[part].float()
+            for start, scores in self.blocks(part):
+                some, scores = slice(start, start + scores.shape[1]), scores.cpu().float()
+                valid = scores.isfinite()
+                total[some] += weight @ scores.where(valid, 0)
+                share[some] += weight @ valid.float()
+        means: Tensor = total / share.clamp(min=MIN_SHARE)
+        return means
+
+    def _scores(self, verb: str) -> Iterator[tuple[Tensor, Iterator[tuple[int, Tensor]]]]:
+        """Numbers of queries, and blocks of their scores."""
+        with progress_of(verb, self.queries, self.progress, "query") as update:
+            for part in self.parts:
+                yield part, ((start, scores.cpu().float()) for start, scores in self.blocks(part))
+                update(len(part))
+
+    def _pooled(self) -> Tensor:
+        """The best score of each group, without the means of the places, (Q,C) float16, in any unit; and mean
+        and spread of all scores of each query."""
+        size, unit = self.group, 0.0
+        best = torch.full((self.queries, -(-self.places // size)), math.inf, dtype=torch.float16)
+        for part, blocks in self._scores("scoring"):
+            count, total, squares = torch.zeros(3, len(part), dtype=torch.float64)
+            low, high = torch.full((len(part),), math.inf), torch.full((len(part),), -math.inf)
+            for start, scores in blocks:
+                stop = start + scores.shape[1]
+                least, most = scores.aminmax(dim=1)
+                worse = scores - self.means[start:stop]
+                known = worse
+                if bool((most - least).isfinite().all()):
+                    count += stop - start
+                else:
+                    valid = scores.isfinite()
+                    least, most = (
+                        scores.where(valid, math.inf).amin(1),
+                        scores.where(valid, -math.inf).amax(1),
+                    )
+                    most[scores.isnan().any(1)] = math.nan  # such a query says nothing
+                    count += valid.sum(1)
+                    known, worse = worse.where(valid, 0), worse.where(valid, math.inf)
+                low, high = torch.minimum(low, least), torch.maximum(high, most)
+                total += known.sum(1)
+                squares += torch.linalg.vector_norm(known, dim=1).double().square()
+                unit = unit or float(known.std()) or 1.0
+                ends = start % size, -stop % size
+                worse = F.pad(worse, ends, value=math.inf) if any(ends) else worse
+                low_of = worse.unflatten(1, (-1, size)).amin(2).div_(unit).half()
+                some = slice(start // size, start // size + low_of.shape[1])
+                best[part[0] : part[-1] + 1, some] = torch.minimum(best[part[0] : part[-1] + 1, some], low_of)
+            mean = total / count.clamp(min=1)
+            spread = (squares / count.clamp(min=1) - mean.square()).clamp(min=0).sqrt()
+            speaks = (high > low) & (spread > MIN_SHARE)
+            self.mean[part], self.spread[part] = mean.float(), torch.where(speaks, spread, 1).float()
+            self.speaks[part] = speaks.float()
+            best[part[~speaks]] = 0
+        return best
+
+    def _windows(self, best: Tensor, candidates: int) -> list[Window]:
+        """The windows of a drive, with the places that a smoother of groups leaves."""
+        size, fine = self.group, self.smoother
+        speed = sum(move * share for move, share in enumerate(fine.prior)) / size
+        links = [(one // size, two // size, share / 2) for one, two, share in self.layout.links]
+        coarse = PlaceSmoother((1 - speed, speed), turn=fine.turn, links=links)
+        starts = sorted({start // size for start in self.route_starts})
+
+        def rows(numbers: Tensor) -> Tensor:
+            return best[numbers].float()
+
+        coarse.fit(rows, self.descriptors, starts)
+        count = max(1, round(self.queries / WINDOW))
+        ends = torch.linspace(0, self.queries, count + 1).round().int().tolist()
+        around = [(max(0, a - MARGIN), min(self.queries, b + MARGIN)) for a, b in pairwise(ends)]
+        top = torch.zeros(count, best.shape[1])
+        with progress_of("searching", self.queries, self.progress, "query") as update:
+            for block in coarse.blocks(coarse.drive(rows, self.descriptors), starts):
+                mass = coarse.folded(block.posterior)[:, :-1]
+                for looked, (start, stop) in zip(top, around, strict=True):
+                    some = slice(max(0, start - block.first), max(0, stop - block.first))
+                    if len(mass[some]):
+                        torch.maximum(looked, mass[some].amax(0), out=looked)
+                update(len(mass))
+        reach, windows = 1 + fine.within // size, []
+        for looked, first, last, (start, stop) in zip(top, ends, ends[1:], around, strict=False):
+            ranked = looked.sort(descending=True).values
+            least = max(LIKELY, float(ranked[min(LOOKED // size, len(ranked)) - 1]))
+            least = min(least, float(ranked[min(candidates, len(ranked)) - 1]))
+            near = F.max_pool1d((looked >= least).float()[None], 2 * reach + 1, 1, reach)[0] > 0
+            places = near.repeat_interleave(size)[: self.places].nonzero()[:, 0]
+            windows.append(Window(first, last, start, stop, places, torch.zeros(stop - start, len(places))))
+        return windows
+
+    def _scored(self) -> RankTable:
+        """Fill the windows; the ranks of a sample of the scores at other places, where it is fitted."""
+        ranks, fitted = RankTable(), self._fitted()
+        for part, blocks in self._scores("smoothing"):
+            begin, end = int(part[0]), int(part[-1]) + 1
+            for at, scores in blocks:
+                ends = torch.tensor([at, at + scores.shape[1]])
+                for i, window in enumerate(self.windows):
+                    first, last = max(begin, window.start), min(end, window.stop)
+                    if first >= last:
+                        continue
+                    some = slice(*torch.searchsorted(window.places, ends).tolist())
+                    known = window.places[some]
+                    found = self._z(scores, begin, at, slice(first, last), known)
+                    window.z[first - window.start : last - window.start, some] = found
+                    first, last = max(first, window.first), min(last, window.first + fitted.get(i, 0))
+                    if first < last:
+                        others = torch.arange(at, at + scores.shape[1], self.group)
+                        others = others[~torch.isin(others, known)]
+                        found = self._z(scores, begin, at, slice(first, last), others)
+                        weight = self.group * (self.spacing.weight * self.speaks)[first:last, None]
+                        ranks.add(found.where(found.isfinite(), 0), weight * found.isfinite())
+        return ranks
+
+    def _z(self, scores: Tensor, begin: int, at: int, some: slice, places: Tensor) -> Tensor:
+        """z of some queries at some places; scores are those from query `begin` and place `at` on."""
+        own = scores[some.start - begin : some.stop - begin, places - at]
+        better = self.means[places] - own + self.mean[some, None]
+        z: Tensor = better / self.spread[some, None]
+        return z
+
+    def _fitted(self) -> dict[int, int]:
+        """The windows that are fitted to, and how many of their queries."""
+        last = len(self.windows) - 1
+        chosen = torch.linspace(0, last, min(STRETCHES, last + 1)).round().int().tolist()
+        length = max(FITTED // len(chosen), math.ceil(CORRELATED * self.spacing.correlation))
+        return {i: min(length, self.windows[i].last - self.windows[i].first) for i in chosen}
+
+    def _fit(self, ranks: RankTable) -> None:
+        samples = []
+        for i, length in self._fitted().items():
+            window = self.windows[i]
+            some = slice(window.first, window.first + length)
+            std, layout = self._standardised(window, some), self.layout.of(window.places)
+            samples.append(Sample(std, self.spacing.weight[some], self.spacing.still[some], layout))
+            ranks.add(std.z, (self.spacing.weight[some] * std.speaks)[:, None] * std.valid)
+        self.smoother.means = self.means
+        self.smoother.learn(samples, ranks, self.spacing)
+
+    def _standardised(self, window: Window, some: slice) -> Standardised:
+        z = window.z[some.start - window.start : some.stop - window.start]
+        valid = z.isfinite()
+        return Standardised(z.where(valid, 0), valid, self.speaks[some] > 0)
+
+    def __iter__(self) -> Iterator[tuple[int, Tensor, Tensor, Tensor]]:
+        """The first query of each window, the last window first; the posterior (B, 2 n + 1) and scores (B,n)
+        of some places (n,)."""
+        smoother = self.smoother
+        rates = smoother.rates(self.means)
+        for window in self.windows[::-1]:
+            some = slice(window.start, window.stop)
+            std, weight = self._standardised(window, some), self.spacing.weight[some]
+            x = RankTable.look_up(smoother.values, std.z)
+            log = log_likelihood(x, std, weight, smoother.separation, smoother.tempering)
+            like, motion = smoother.wide(log, 0.0).exp(), Motion(self.layout.of(window.places), rates)
+            still = self.spacing.still[some]
+            (block,) = sweep(motion, lambda *_: like, len(log), still, len(log))  # noqa: B023
+            own = slice(window.first - window.start, window.last - window.start)
+            z = window.z[own] * self.spread[window.first : window.last, None]
+            scores = self.means[window.places] - z + self.mean[window.first : window.last, None]
+            yield window.first, block.posterior[own], scores, window.places
