@@ -46,6 +46,7 @@ def progress_of(
         with tqdm(total=total, desc=verb, unit=unit, leave=False) as bar:
             yield bar.update
         return
+    units = unit[:-1] + "ies" if unit.endswith("y") else unit + "s"
     began, done = time.monotonic(), 0
     due = began + FIRST_LINE
 
@@ -56,7 +57,7 @@ def progress_of(
             return
         due = now + LINE_EVERY
         left = max(0, total - done) * (now - began) / done
-        tqdm.write(f"dejavu: {verb}: {done} of {total} {unit}s, {left:.0f} s left", file=sys.stderr)
+        tqdm.write(f"dejavu: {verb}: {done} of {total} {units}, {left:.0f} s left", file=sys.stderr)
 
     yield update
 
