@@ -11,6 +11,8 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from benchmarks.large_drives import COLUMNS as LARGE
+from benchmarks.large_drives import TASKS, bench_large_drives
 from benchmarks.measure import Column, Row, new_row, table, truth_of, write_bench
 from benchmarks.trainings import Route, drive
 from dejavu_torch.data.ground_truth import GroundTruth
@@ -77,7 +79,9 @@ class Known(NamedTuple):
     other: Tensor | None = None
 
 
-def run_drives(data: Path, *, out: Path, routes: Sequence[str] = (), seed: int = 0) -> list[str]:
+def run_drives(
+    data: Path, *, out: Path, routes: Sequence[str] = (), seed: int = 0, large: bool = False
+) -> list[str]:
     """Drives cut from real ones, each answered by one image and by the whole drive.
 
     Args:
@@ -85,10 +89,15 @@ def run_drives(data: Path, *, out: Path, routes: Sequence[str] = (), seed: int =
         out: folder for bench.json
         routes: names of routes; all if not given
         seed: of the stretches in random order
+        large: instead, time and memory on large maps, of made descriptors
     """
+    if large:
+        rows = list(tqdm(bench_large_drives(), "large maps", len(TASKS), disable=None, leave=False))
+        write_bench(out, rows)
+        return [table(rows, LARGE, "{contender}"), "places found; seconds, and memory beyond map and queries"]
     if unknown := [name for name in routes if name not in ROUTES]:
         raise InputError(f"{unknown[0]!r} is no route; expected one of {', '.join(map(repr, ROUTES))}")
-    rows: list[Row] = []
+    rows = []
     for name in tqdm(routes or list(ROUTES), "drives", disable=None, leave=False):
         route, other = ROUTES[name]
         source = None if other is None else other.format(data=data)
@@ -184,7 +193,7 @@ def facts_of(known: Known, numbers: Tensor) -> dict[str, Any]:
     moved = centred(model.map, queries) if len(queries) >= PRIOR else queries
     smoother = PlaceSmoother(within=tolerance)
     single = model.matching()._replace(radius=tolerance)
-    together = model.matching(smoother)._replace(radius=tolerance)
+    together = model.matching(smoother)._replace(radius=tolerance, plain=queries)
     plain, one = (model.localize_descriptors(some, single) for some in (queries, moved))
     whole = model.localize_descriptors(moved, together)
     assert whole.probability is not None

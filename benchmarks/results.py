@@ -125,8 +125,10 @@ def slug(name: str) -> str:
 def kept(report: dict[str, Any]) -> Row:
     """The figures of a report for the map, its curve, and everything it is compared with."""
     figures = ("auc", "recall_at_1", "recall_at_100_precision", "route_bytes", "bytes", "sequences")
-    own = ("frames", "fixed_bytes", "route_bytes_per_place", "noise_over_map", "storage", "rejection")
-    own += ("answers", "drive", "accepted", "accepted_right", "with_answer")
+    own = (
+        *("frames", "fixed_bytes", "route_bytes_per_place", "noise_over_map", "storage", "rejection"),
+        *("answers", "drive", "accepted", "accepted_right", "with_answer"),
+    )
     rivals = {
         name: of for name, of in report.items() if isinstance(of, dict) and "auc" in of and name not in own
     }

@@ -22,6 +22,7 @@ from dejavu_torch.recognition.motion import Motion
 from dejavu_torch.recognition.smoother import (
     CORRELATED,
     FITTED,
+    LEAST,
     STRETCHES,
     PlaceSmoother,
     Sample,
@@ -34,7 +35,7 @@ LARGE, LARGE_MAP = 2**25, 2**13  # queries x places, and places, from which on a
 GROUP = 16  # consecutive places that are one in the coarse pass; more if more than `HELD` scores were held
 HELD = 2**27
 LIKELY = 1e-4  # coarse mass from which on the places of a group are looked at
-LOOKED = 2**13  # places of a window that are looked at by their mass, at most
+LOOKED = 2**12  # places of a window that are looked at by their mass, at most
 WINDOW, MARGIN = 400, 100  # queries that are smoothed at a time, and those on both sides that they depend on
 MEANS = 256  # queries whose mean score of a place is taken
 TILE = 2**22  # numbers at a time
@@ -50,7 +51,7 @@ class Tiles(NamedTuple):
 
 def is_large(queries: int, places: int) -> bool:
     """Whether a drive goes coarse to fine."""
-    return places > LARGE_MAP or queries * places > LARGE
+    return queries > LEAST and (places > LARGE_MAP or queries * places > LARGE)
 
 
 class Window(NamedTuple):
@@ -61,7 +62,7 @@ class Window(NamedTuple):
     start: int
     stop: int
     places: Tensor
-    z: Tensor  # (stop - start, n), -inf where a place has no score
+    z: Tensor  # (stop - start, n) float16, -inf where a place has no score
 
 
 class LargeDrive:
@@ -74,6 +75,7 @@ class LargeDrive:
         tiles: the scores. descriptors: (Q,K) of all queries. candidates, radius: as in `best_candidates`.
     """
 
+    @torch.no_grad()
     def __init__(
         self,
         tiles: Tiles,
@@ -132,18 +134,14 @@ class LargeDrive:
             for start, scores in blocks:
                 stop = start + scores.shape[1]
                 least, most = scores.aminmax(dim=1)
-                worse = scores - self.means[start:stop]
-                known = worse
-                if bool((most - least).isfinite().all()):
-                    count += stop - start
-                else:
+                known = worse = scores - self.means[start:stop]
+                count += scores.shape[1]
+                if not bool((most - least).isfinite().all()):  # seldom, and slower
                     valid = scores.isfinite()
-                    least, most = (
-                        scores.where(valid, math.inf).amin(1),
-                        scores.where(valid, -math.inf).amax(1),
-                    )
+                    least = scores.where(valid, math.inf).amin(1)
+                    most = scores.where(valid, -math.inf).amax(1)
                     most[scores.isnan().any(1)] = math.nan  # such a query says nothing
-                    count += valid.sum(1)
+                    count -= (~valid).sum(1)
                     known, worse = worse.where(valid, 0), worse.where(valid, math.inf)
                 low, high = torch.minimum(low, least), torch.maximum(high, most)
                 total += known.sum(1)
@@ -151,9 +149,9 @@ class LargeDrive:
                 unit = unit or float(known.std()) or 1.0
                 ends = start % size, -stop % size
                 worse = F.pad(worse, ends, value=math.inf) if any(ends) else worse
-                low_of = worse.unflatten(1, (-1, size)).amin(2).div_(unit).half()
-                some = slice(start // size, start // size + low_of.shape[1])
-                best[part[0] : part[-1] + 1, some] = torch.minimum(best[part[0] : part[-1] + 1, some], low_of)
+                groups = worse.unflatten(1, (-1, size)).amin(2).div_(unit).half()
+                some = best[part[0] : part[-1] + 1, start // size : start // size + groups.shape[1]]
+                torch.minimum(some, groups, out=some)  # a group may begin in the block before
             mean = total / count.clamp(min=1)
             spread = (squares / count.clamp(min=1) - mean.square()).clamp(min=0).sqrt()
             speaks = (high > low) & (spread > MIN_SHARE)
@@ -193,13 +191,14 @@ class LargeDrive:
             least = min(least, float(ranked[min(candidates, len(ranked)) - 1]))
             near = F.max_pool1d((looked >= least).float()[None], 2 * reach + 1, 1, reach)[0] > 0
             places = near.repeat_interleave(size)[: self.places].nonzero()[:, 0]
-            windows.append(Window(first, last, start, stop, places, torch.zeros(stop - start, len(places))))
+            z = torch.zeros(stop - start, len(places), dtype=torch.float16)
+            windows.append(Window(first, last, start, stop, places, z))
         return windows
 
     def _scored(self) -> RankTable:
         """Fill the windows; the ranks of a sample of the scores at other places, where it is fitted."""
         ranks, fitted = RankTable(), self._fitted()
-        for part, blocks in self._scores("smoothing"):
+        for part, blocks in self._scores("scoring"):
             begin, end = int(part[0]), int(part[-1]) + 1
             for at, scores in blocks:
                 ends = torch.tensor([at, at + scores.shape[1]])
@@ -246,10 +245,11 @@ class LargeDrive:
         self.smoother.learn(samples, ranks, self.spacing)
 
     def _standardised(self, window: Window, some: slice) -> Standardised:
-        z = window.z[some.start - window.start : some.stop - window.start]
+        z = window.z[some.start - window.start : some.stop - window.start].float()
         valid = z.isfinite()
         return Standardised(z.where(valid, 0), valid, self.speaks[some] > 0)
 
+    @torch.no_grad()
     def __iter__(self) -> Iterator[tuple[int, Tensor, Tensor, Tensor]]:
         """The first query of each window, the last window first; the posterior (B, 2 n + 1) and scores (B,n)
         of some places (n,)."""
@@ -264,6 +264,6 @@ class LargeDrive:
             still = self.spacing.still[some]
             (block,) = sweep(motion, lambda *_: like, len(log), still, len(log))  # noqa: B023
             own = slice(window.first - window.start, window.last - window.start)
-            z = window.z[own] * self.spread[window.first : window.last, None]
+            z = window.z[own].float() * self.spread[window.first : window.last, None]
             scores = self.means[window.places] - z + self.mean[window.first : window.last, None]
             yield window.first, block.posterior[own], scores, window.places

@@ -42,7 +42,8 @@ MOVE_SHARE = 0.1  # of the queries: the weight of the prior of the moves
 RATE_COUNTS, ENTER_COUNTS = 200.0, 50.0  # steps that the priors of jump and leave, and of enter, count as
 SHARPENED = 0.6  # tau' = SHARPENED tau
 MIN_SEPARATION = 0.3
-SURE = 2.5  # separation from which on slow changes, as of waiting trains, make no query say less
+SURE, SLOW_CHANGES = 2.5, 8.0  # separation, and tau over tau of detrended queries, from which on changes so
+# slow, as of trains that wait, make no query say less
 FITTED, STRETCH, STRETCHES = 1000, 100, 10  # queries that are fitted to at most, in a stretch, and stretches
 LEAST, SAMPLED = 20, 2**21  # queries that are fitted to at least, and their scores at most otherwise
 CORRELATED = 4  # correlation times in a stretch, at least
@@ -369,8 +370,8 @@ class PlaceSmoother(SequenceModel):
         # elsewhere explains a drive no better than being off the map, unless it shows the same places
         alike = max(DRIVE, ALIKE * best.log) <= best.second < REPEATED * best.log
         self.is_drive, self.log_likelihood = best.log >= DRIVE and not alike, best.log
-        if best.separation >= SURE:
-            self.tempering = max(1.0, min(self.tempering, spacing.detrended))
+        if best.separation >= SURE and spacing.correlation >= SLOW_CHANGES * spacing.detrended:
+            self.tempering = spacing.detrended
         self.separation, self.values = best.separation, best.values
         jump, leave, enter = map(float, best.rates[1:])
         self.move_logits.copy_(logits(*best.rates.moves.tolist()))
@@ -383,7 +384,7 @@ class PlaceSmoother(SequenceModel):
         z = samples[0].std.z
         prior, separation = z.new_tensor(start), SEPARATION
         rates = Rates(prior, *(prior.new_tensor(rate) for rate in RATES))
-        queries = float(sum(sample.weight.sum() for sample in samples))
+        queries = float(sum((~sample.still).sum() for sample in samples))
         rights: list[Tensor] = []  # shares of the scores that are right ones
         for round in range(ROUNDS + 1):
             table = RankTable(ranks.counts)

@@ -1,0 +1,180 @@
+"""A drive on a large map, coarse to fine, held against the smoother of all places."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import pytest
+import torch
+import torch.nn.functional as F
+from test_smoother import noise, shown
+from torch import Tensor
+
+from dejavu_torch.maps.place_map import ScoreBlocks
+from dejavu_torch.maps.spectral import SpectralMapper
+from dejavu_torch.recognition import drive as driving
+from dejavu_torch.recognition import large
+from dejavu_torch.recognition.drive import localize_drive
+from dejavu_torch.recognition.large import LargeDrive, Tiles, is_large
+from dejavu_torch.recognition.localizer import Localizer, Matching
+from dejavu_torch.recognition.motion import Layout, Motion, Rates
+from dejavu_torch.recognition.smoother import PlaceSmoother
+from dejavu_torch.types import Match
+
+
+def both(
+    scores: Tensor, monkeypatch: pytest.MonkeyPatch, starts: Sequence[int] = (0,), **settings: object
+) -> tuple[Match, Match, PlaceSmoother, PlaceSmoother]:
+    """Matches by the smoother of all places, and coarse to fine with scores of a few places at a time."""
+
+    def blocks(numbers: Tensor) -> ScoreBlocks:
+        for start in range(0, scores.shape[1], 70):
+            yield start, scores[numbers, start : start + 70]
+
+    found = []
+    queries = noise(len(scores), 16, seed=8)
+    for coarse in (False, True):
+        monkeypatch.setattr(driving, "is_large", lambda *_, answer=coarse: answer)
+        smoother = PlaceSmoother(within=3)
+        tiles, rows = Tiles(blocks, 2**18), scores.__getitem__
+        match = localize_drive(
+            rows, queries, smoother, radius=4, route_starts=starts, tiles=tiles, **settings
+        )  # type: ignore[arg-type]
+        found.append((match, smoother))
+    (one, first), (two, second) = found
+    return one, two, first, second
+
+
+PATHS = {
+    "on": [*range(20, 320)],
+    "back": [*range(320, 20, -1)],
+    "there and back": [*range(100, 250), *range(250, 100, -1)],
+    "off the map in between": [*range(40, 140), *[-1] * 60, *range(200, 340)],
+    "slow": [i // 3 for i in range(300, 900)],
+    "in stretches": [i for first in (300, 20, 180, 250, 90) for i in range(first, first + 60)],
+}
+
+
+@pytest.mark.parametrize("name", PATHS)
+def test_answers_are_those_of_all_places(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = torch.tensor(PATHS[name])
+    monkeypatch.setattr(large, "WINDOW", 120)
+    monkeypatch.setattr(large, "MARGIN", 40)
+    one, two, dense, coarse = both(shown(400, PATHS[name]), monkeypatch)
+    assert dense.is_drive
+    assert coarse.is_drive
+    on = path >= 0
+    right = [((match.index[:, 0] - path).abs() <= 3)[on].double().mean() for match in (one, two)]
+    assert right[1] > 0.95
+    assert abs(right[1] - right[0]) <= 0.01
+    assert one.probability is not None
+    assert two.probability is not None
+    assert float((one.probability - two.probability)[on].abs().median()) < 0.02
+    assert (two.probability[~on] < 0.5).double().mean() > 0.8 or on.all()
+    agreeing = one.index == two.index
+    assert torch.allclose(
+        one.score[agreeing & on[:, None]].exp(), two.score[agreeing & on[:, None]].exp(), atol=0.2
+    )
+
+
+def test_only_likely_places_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(large, "WINDOW", 100)
+    scores = shown(4000, range(1000, 1400))
+    drive = LargeDrive(
+        Tiles(lambda numbers: iter([(0, scores[numbers])]), 4000), noise(400, 8), 4000, PlaceSmoother()
+    )
+    assert len(drive.windows) == 4
+    for window in drive.windows:
+        assert window.stop - window.start <= 300
+        assert len(window.places) < 600
+        seen = torch.isin(torch.arange(1000 + window.first, 1000 + window.last), window.places)
+        assert seen.all()
+        assert torch.equal(window.places.unique(), window.places)
+
+
+def test_scores_of_windows_are_those_that_were_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    scores = shown(300, range(20, 280))
+    drive = LargeDrive(
+        Tiles(lambda numbers: iter([(0, scores[numbers])]), 300), noise(260, 8), 300, PlaceSmoother()
+    )
+    for first, posterior, own, places in drive:
+        assert torch.allclose(posterior.sum(1), torch.ones(len(posterior)), atol=1e-5)
+        assert torch.allclose(own, scores[first : first + len(own)][:, places], atol=0.01)
+
+
+def test_another_route_is_answered_by_single_queries(monkeypatch: pytest.MonkeyPatch) -> None:
+    scores = shown(400, [-1] * 200)
+    single = noise(200, 400, seed=3)
+    _, two, _, coarse = both(scores, monkeypatch, single=single.__getitem__)
+    assert not coarse.is_drive
+    assert torch.equal(two.index[:, 0], single.argmin(1))
+    assert torch.equal(two.score[:, 0], single.amin(1))
+    assert two.probability is not None
+    assert float(two.probability.max()) < 0.5
+
+
+def test_queries_and_places_without_scores(monkeypatch: pytest.MonkeyPatch) -> None:
+    scores = shown(400, range(50, 250))
+    scores[30] = math.nan
+    scores[60] = 1.0
+    scores[90] = math.inf
+    scores[:, 100:110] = math.inf
+    one, two, _, coarse = both(scores, monkeypatch)
+    assert coarse.is_drive
+    assert (one.index - two.index).abs().max() <= 1
+    assert two.index[[30, 90], 0].tolist() == [-1, -1]
+    assert two.index[60, 0] == 110 or abs(int(two.index[60, 0]) - 110) <= 4
+
+
+def test_candidates_are_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, four, *_ = both(shown(400, range(50, 250)), monkeypatch, k=4)
+    assert four.index.shape == (200, 4)
+    apart = (four.index[:, :, None] - four.index[:, None]).abs() + 99 * torch.eye(4)
+    assert apart[(four.index >= 0).all(1)].min() > 4
+
+
+def test_routes_and_circuits_end_where_they_say(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = Layout(10, 2, (0, 6), ((9, 6, 1.0), (2, 0, 0.5)))
+    some = whole.of(torch.tensor([0, 1, 2, 5, 6, 7, 9]))
+    assert some.route_starts == (0, 3, 4, 6)
+    assert some.links == ((6, 4, 1.0), (2, 0, 0.5))
+    assert some.share == 0.7
+    rates = Rates(torch.tensor([0.0, 1.0]), *torch.tensor([0.1, 0.0, 0.2]).unbind())
+    motion = Motion(some, rates)
+    belief = torch.eye(15)[4]
+    moved = motion.moved(belief)
+    assert float(moved.sum()) == pytest.approx(1)
+    assert float(moved[5]) == pytest.approx(0.9 + 0.1 * 0.7 / 14)
+    assert float(moved[14]) == pytest.approx(0.1 * 0.3)  # jumped to a place that is left out
+    assert float(motion.anywhere().sum()) == pytest.approx(1)
+    assert torch.allclose(motion.expected(torch.ones(15)), torch.ones(15))
+    message = noise(15).abs()
+    assert float(motion.moved(belief) @ message) == pytest.approx(
+        float(belief @ motion.expected(message)), rel=1e-5
+    )
+
+
+@pytest.mark.parametrize("room", [5.0, 0.5])
+def test_few_bytes_are_placed_as_by_all_places(room: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    places, queries = 3000, 400
+    smooth = F.avg_pool1d(noise(places + 15, 64, seed=1).T[None], 16, 1)[0].T
+    route = F.normalize(smooth)
+    learned = SpectralMapper(room)(route)
+    asked = F.normalize(route[500 : 500 + queries] + 0.7 / 8 * noise(queries, 64, seed=2))
+    truth, found = torch.arange(500, 500 + queries), []
+    for coarse in (False, True):
+        monkeypatch.setattr(driving, "is_large", lambda *_, answer=coarse: answer)
+        smoother = PlaceSmoother(within=5)
+        match = Localizer(learned, Matching(smoother, radius=5)).drive(asked, smoother)
+        assert smoother.is_drive
+        found.append(float(((match.index - truth).abs() <= 5).double().mean()))
+    assert found[1] > 0.95
+    assert found[1] >= found[0] - 0.01
+
+
+def test_large_maps_and_long_drives_are_large() -> None:
+    assert not is_large(1000, 4000)
+    assert not is_large(1, 10**6)
+    assert is_large(100, 10**5)
+    assert is_large(10**5, 4000)
