@@ -32,6 +32,7 @@ from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse, resampled, source_of
 from dejavu_torch.recognition.centring import PRIOR, centred
 from dejavu_torch.recognition.coarse import searcher
+from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.localizer import Localizer, Matching, Scoring
 from dejavu_torch.recognition.search import SCORES_AT_ONCE, Scan, Search, Searcher, check_search
 from dejavu_torch.recognition.select import HIGHEST, PROBABLE, Acceptance, check_candidates
@@ -403,11 +404,11 @@ class DejaVu(nn.Module):
             drive = drive if matching.k is None else drive.map(lambda column: column[:, 0])
             return replace(match, sequences={**match.sequences, "smoother": drive})
         if score is None:
-            return localizer(descriptors, progress)
-        matcher, parts = (
-            Localizer(None, matching),
-            descriptors.split(max(1, SCORES_AT_ONCE // self.map.places)),
-        )
+            match = localizer(descriptors, progress)
+            late = isinstance(smoother, PlaceFilter) and smoother.lag
+            return Match.joined([match, localizer.finish()]) if late else match
+        matcher = Localizer(None, matching)
+        parts = descriptors.split(max(1, SCORES_AT_ONCE // self.map.places))
         with torch.no_grad():
             scores = map(score, with_progress(parts, "localizing", progress))
             return Match.joined(map(matcher.match, scores))

@@ -35,7 +35,6 @@ MOVES = (0.2, 0.5, 0.2, 0.05, 0.02, 0.015, 0.015)
 SLOW = (0.67, 0.25, 0.05, 0.01, 0.01, 0.005, 0.005)  # of which EM starts if that at one place a query fails
 FAST = (0.05, 0.1, 0.2, 0.3, 0.2, 0.1, 0.05)
 RATES = 0.001, 0.001, 0.01  # jump, leave, enter
-SEPARATION = 1.5
 RADIUS = 5  # places around a right one whose scores are not counted as wrong
 ROUNDS = 5  # of expectation-maximisation
 MOVE_SHARE = 0.1  # of the queries: the weight of the prior of the moves
@@ -109,7 +108,8 @@ class PlaceSmoother(SequenceModel):
     A score that a share u of the wrong scores of the drive reaches has the normal score x = -Phi^-1(u), and
     its place the log evidence (separation x - separation^2 / 2) / tempering, relative to being off the map:
     the likelihood ratio of Gaussians that are `separation` apart, tempered since consecutive queries are
-    alike. `fit` learns all of it from the queries, without ground truth.
+    alike. `fit` learns all of it from the queries, without ground truth, with the moves and rates below as
+    priors.
 
     Args:
         moves: probabilities of moving by 0, 1, .., V places from one query to the next.
@@ -177,7 +177,7 @@ class PlaceSmoother(SequenceModel):
         self.log_likelihood: float | None = None  # nats above being off the map throughout, as fitted
         self.correlation = 1.0  # tau of these queries
         self.is_drive = True  # whether the queries that were fitted to are a drive of the map
-        self.prior = moves
+        self.prior, self.rate_prior, self.first_separation = moves, (jump, leave, enter), float(separation)
         self.register_buffer("values", torch.zeros(0), persistent=False)  # of the rank table
         self.register_buffer("means", torch.zeros(0), persistent=False)  # scores of each place
 
@@ -382,8 +382,8 @@ class PlaceSmoother(SequenceModel):
     def _fitted(self, samples: Sequence[Sample], ranks: RankTable, start: Sequence[float]) -> Fit:
         """Expectation-maximisation from a start of the moves, which is their prior."""
         z = samples[0].std.z
-        prior, separation = z.new_tensor(start), SEPARATION
-        rates = Rates(prior, *(prior.new_tensor(rate) for rate in RATES))
+        prior, separation = z.new_tensor(start), self.first_separation
+        rates = Rates(prior, *(prior.new_tensor(rate) for rate in self.rate_prior))
         queries = float(sum((~sample.still).sum() for sample in samples))
         rights: list[Tensor] = []  # shares of the scores that are right ones
         for round in range(ROUNDS + 1):
@@ -407,7 +407,7 @@ class PlaceSmoother(SequenceModel):
                 counts.append(motion.counts(belief[..., :-1, :][moving], after[..., 1:, :][moving]))
             separation = max(MIN_SEPARATION, float(sums[0] / sums[1].clamp(min=MIN_PROBABILITY)))
             total = Counts(*(torch.stack(kind).sum(0) for kind in zip(*counts, strict=True)))
-            rates = updated_rates(total, prior * (MOVE_SHARE * queries))
+            rates = updated_rates(total, prior * (MOVE_SHARE * queries), self.rate_prior)
         second = 0.0
         for sample, (_, log, motion, block) in zip(samples, seen, strict=True):
             found = self.folded(block.posterior)[..., :-1]
@@ -539,10 +539,10 @@ def sweep(
         yield Block(first, before, like, torch.stack(after[::-1], -2), log)
 
 
-def updated_rates(counts: Counts, prior: Tensor) -> Rates:
-    """The M-step: counts with those of the priors."""
+def updated_rates(counts: Counts, prior: Tensor, rates: Sequence[float] = RATES) -> Rates:
+    """The M-step: counts with those of the priors, of moves (V+1,), and of jump, leave and enter."""
     moves, on = counts.moves + prior, counts.moves.sum() + counts.jump + counts.leave + RATE_COUNTS
-    jump, leave, enter = RATES
+    jump, leave, enter = rates
     return Rates(
         moves / moves.sum(),
         (counts.jump + RATE_COUNTS * jump) / on,

@@ -276,8 +276,8 @@ MUTANTS = [
     Mutant(
         "A match on a map of shuffled frames (the null) tells the frame that is stored at the place.",
         "dejavu_torch/model.py",
-        "matcher, place = Localizer(None, matching), order.argsort()",
-        "matcher, place = Localizer(None, matching), order",
+        "place = order.argsort().to(device)",
+        "place = order.to(device)",
         (
             "tests/evaluation/test_controls.py::test_convention_8_a_match_of_the_null_names_the_frame_that_is_stored",
         ),

@@ -609,8 +609,8 @@ MUTANTS = [
     Mutant(
         "A probability of what is no drive is the lower of the single query's and the smoother's.",
         "dejavu_torch/recognition/drive.py",
-        "torch.minimum(probability.cpu(), single)",
-        "single",
+        "torch.minimum(probability, by_itself)",
+        "by_itself",
         ("tests/recognition/test_drive.py::-k no_drive",),
     ),
     Mutant(
@@ -623,8 +623,43 @@ MUTANTS = [
     Mutant(
         "A stop is one of the queries that another speed has to explain.",
         "dejavu_torch/recognition/smoother.py",
-        "queries = float(weight.sum())",
-        "queries = float(weight.numel())",
+        "(~sample.still).sum() for",
+        "sample.still.numel() for",
         ("tests/recognition/test_smoother.py::-k another_speed",),
+    ),
+    Mutant(
+        "Answers of a drive that are nearly sure differ.",
+        "dejavu_torch/recognition/drive.py",
+        "posterior.cpu().double()",
+        "posterior.cpu()",
+        ("tests/recognition/test_drive.py::-k nearly_sure",),
+    ),
+    Mutant(
+        "Queries that are no drive are answered as they are, not centred.",
+        "dejavu_torch/recognition/drive.py",
+        "smoother.drive(rows, descriptors), route_starts, single or rows",
+        "smoother.drive(rows, descriptors), route_starts, rows",
+        ("tests/recognition/test_drive.py::-k as_they_are",),
+    ),
+    Mutant(
+        "Changes far slower than the noise of the queries make none say less.",
+        "dejavu_torch/recognition/smoother.py",
+        "self.tempering = spacing.detrended",
+        "self.tempering = self.tempering",
+        ("tests/recognition/test_smoother.py::-k slow_changes",),
+    ),
+    Mutant(
+        "The places of a window are a share of the map, and jumps to others leave them.",
+        "dejavu_torch/recognition/motion.py",
+        "(1 - self.layout.share) * anywhere",
+        "0 * anywhere",
+        ("tests/recognition/test_large.py::-k routes_and_circuits",),
+    ),
+    Mutant(
+        "Groups beside likely ones are looked at too.",
+        "dejavu_torch/recognition/large.py",
+        "reach, windows = 1 + fine.within // size, []",
+        "reach, windows = 0, []",
+        ("tests/recognition/test_large.py::-k likely_places",),
     ),
 ]

@@ -118,6 +118,35 @@ def test_places_and_queries_without_scores_are_not_answered() -> None:
         assert match.accepted.sum() == 68
 
 
+def test_answers_that_are_nearly_sure_have_different_scores() -> None:
+    sure = PlaceSmoother((0.0, 1.0), jump=1e-9, leave=1e-9, within=3)
+    match = localized(shown(80, range(80), clear=9.0), sure)
+    assert match.index[:, 0].tolist() == [*range(80)]
+    assert float(match.score.min()) < 1e-12
+    assert len(match.score.unique()) > 60
+
+
+def test_what_is_no_drive_is_answered_by_queries_as_they_are() -> None:
+    centred, plain = noise(60, 80, seed=1), noise(60, 80, seed=2)
+    descriptors = noise(60, 16, seed=8)
+    rows, single = smoothing.rows_of(centred), smoothing.rows_of(plain)
+    match = localize_drive(rows, descriptors, PlaceSmoother(), single=single)
+    assert torch.equal(match.index[:, 0], plain.argmin(1))
+    drive = smoothing.rows_of(shown(80, range(60)))
+    match = localize_drive(drive, descriptors, PlaceSmoother(), single=single)
+    assert (match.index[:, 0] - torch.arange(60)).abs().max() <= 1
+
+
+def test_frames_that_are_no_drive_are_localized_as_if_in_no_order() -> None:
+    features = noise(80, 12, seed=3).cumsum(0)
+    model = DejaVu(None, "none").learn(features)
+    other, smoother = noise(60, 12, seed=4) + 5, PlaceSmoother()
+    match = model.localize(other, sequence=smoother)
+    assert not smoother.is_drive
+    assert torch.equal(match.index, model.localize(other, sequence=None, centre=False).index)
+    assert not torch.equal(match.index, model.localize(other, sequence=None, centre=True).index)
+
+
 def test_few_queries_and_places_have_answers() -> None:
     scores = noise(30, 20)
     none, one = (localized(scores[:n], PlaceSmoother(), k=2, platt=PLATT) for n in (0, 1))

@@ -361,6 +361,25 @@ def test_stretches_are_spread_over_the_drive(queries: int, correlation: float) -
     assert (picked[1:, 0] > picked[:-1, -1]).all()
 
 
+def test_changes_that_are_slow_make_no_query_say_less() -> None:
+    """Light that comes and goes in 200 queries, beside noise of a query."""
+    slow = torch.sin(torch.arange(800) / 200 * 2 * math.pi)[:, None] + noise(800, 4)
+    clear, unclear = (shown(900, range(800), clear=one) for one in (6.0, 1.2))
+    found = PlaceSmoother().fit(clear, slow)
+    assert found.correlation > 15
+    assert found.tempering == pytest.approx(1, abs=0.3)
+    assert PlaceSmoother().fit(unclear, slow).tempering > 9
+
+
+def test_rates_and_moves_are_the_priors_of_a_fit() -> None:
+    scores = shown(90, range(80))
+    plain = PlaceSmoother().fit(scores).settled()
+    given = PlaceSmoother((0.5, 0.5), jump=0.1, enter=0.3).fit(scores).settled()
+    assert given["jump"] > 20 * plain["jump"]
+    assert given["enter"] > 10 * plain["enter"]
+    assert len(given["moves"]) == 2
+
+
 def test_the_module_says_what_it_has_settled_on() -> None:
     told = repr(PlaceSmoother((0.25, 0.75), jump=0.01, leave=0.02, enter=0.1, separation=2, tempering=3))
     assert "moves=[0.25, 0.75], jump=0.01, leave=0.02, enter=0.1, separation=2, " in told
