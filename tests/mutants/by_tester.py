@@ -646,7 +646,7 @@ MUTANTS = [
         "dejavu_torch/recognition/smoother.py",
         "self.tempering = spacing.detrended",
         "self.tempering = self.tempering",
-        ("tests/recognition/test_smoother.py::-k slow_changes",),
+        ("tests/recognition/test_smoother.py::-k that_are_slow",),
     ),
     Mutant(
         "The places of a window are a share of the map, and jumps to others leave them.",
