@@ -89,8 +89,7 @@ class Sample(NamedTuple):
 class Fit(NamedTuple):
     """What expectation-maximisation found.
 
-    log: nats by which the model beats being off the map. second: likewise, without the places found. queries:
-    fitted to, each stop as one.
+    log: nats by which the model beats being off the map. second: likewise, without the places found.
     """
 
     rates: Rates
@@ -98,7 +97,6 @@ class Fit(NamedTuple):
     values: Tensor  # of the rank table
     log: float
     second: float
-    queries: float
 
 
 class PlaceSmoother(SequenceModel):
@@ -346,7 +344,8 @@ class PlaceSmoother(SequenceModel):
             return self
         spacing = spacing_of(descriptors)
         places = scores(torch.zeros(1, dtype=torch.int64)).shape[1]
-        picked = stretches(len(descriptors), spacing.correlation, places)
+        repeated = len(descriptors) / float(spacing.weight.sum())  # where frames repeat, stretches are longer
+        picked = stretches(len(descriptors), spacing.correlation, places, repeated)
         known = scores(picked.flatten())
         weight, still = spacing.weight.to(known), spacing.still.to(known.device)
         self.means = place_means(known, weight[picked.flatten()])
@@ -362,10 +361,12 @@ class PlaceSmoother(SequenceModel):
         """As `fit`, from stretches of the drive and the ranks of all their scores."""
         self.correlation, self.tempering = spacing.correlation, tempering_of(spacing)
         best = self._fitted(samples, ranks, self.prior)
-        if best.log < max(OTHER_DRIVE, PER_QUERY * best.queries) and len(self.prior) == len(MOVES):
+        moving = float(sum((~sample.still).sum() for sample in samples))
+        if best.log < max(OTHER_DRIVE, PER_QUERY * moving) and len(self.prior) == len(MOVES):
             others = (self._fitted(samples, ranks, start) for start in (SLOW, FAST))
             other = max(others, key=lambda one: one.log)
-            least = max(OTHER_DRIVE, PER_QUERY * other.queries, CLEARLY * best.log)
+            different = float(sum(sample.weight.sum() for sample in samples))
+            least = max(OTHER_DRIVE, PER_QUERY * different, CLEARLY * best.log)
             best = other if other.log >= least else best
         # elsewhere explains a drive no better than being off the map, unless it shows the same places
         alike = max(DRIVE, ALIKE * best.log) <= best.second < REPEATED * best.log
@@ -384,7 +385,7 @@ class PlaceSmoother(SequenceModel):
         z = samples[0].std.z
         prior, separation = z.new_tensor(start), self.first_separation
         rates = Rates(prior, *(prior.new_tensor(rate) for rate in self.rate_prior))
-        queries = float(sum((~sample.still).sum() for sample in samples))
+        moving = float(sum((~sample.still).sum() for sample in samples))
         rights: list[Tensor] = []  # shares of the scores that are right ones
         for round in range(ROUNDS + 1):
             table = RankTable(ranks.counts)
@@ -403,11 +404,11 @@ class PlaceSmoother(SequenceModel):
                 known = torch.where(sample.std.valid, x, 0)
                 sums += torch.stack([(others * known).sum(), others.sum()])
                 belief, after = normalised(block.before * block.likelihood), block.likelihood * block.after
-                moving = ~sample.still[..., 1:]
-                counts.append(motion.counts(belief[..., :-1, :][moving], after[..., 1:, :][moving]))
+                steps = ~sample.still[..., 1:]
+                counts.append(motion.counts(belief[..., :-1, :][steps], after[..., 1:, :][steps]))
             separation = max(MIN_SEPARATION, float(sums[0] / sums[1].clamp(min=MIN_PROBABILITY)))
             total = Counts(*(torch.stack(kind).sum(0) for kind in zip(*counts, strict=True)))
-            rates = updated_rates(total, prior * (MOVE_SHARE * queries), self.rate_prior)
+            rates = updated_rates(total, prior * (MOVE_SHARE * moving), self.rate_prior)
         second = 0.0
         for sample, (_, log, motion, block) in zip(samples, seen, strict=True):
             found = self.folded(block.posterior)[..., :-1]
@@ -416,7 +417,7 @@ class PlaceSmoother(SequenceModel):
             unlikely = log.clamp(max=-(separation**2) / 2 / self.tempering)
             second += float(self._swept(torch.where(elsewhere, log, unlikely), sample, motion).log.sum())
         first = float(sum(block.log.sum() for *_, block in seen))
-        return Fit(rates, separation, table.values, first, second, queries)
+        return Fit(rates, separation, table.values, first, second)
 
     def _explained(
         self, sample: Sample, values: Tensor, separation: float, rates: Rates
@@ -563,10 +564,10 @@ def near_mass(mass: Tensor, radius: int) -> Tensor:
     return (F.avg_pool1d(flat, 2 * radius + 1, 1) * (2 * radius + 1)).view_as(mass).clamp(0, 1)
 
 
-def stretches(queries: int, correlation: float, places: int = 1) -> Tensor:
+def stretches(queries: int, correlation: float, places: int = 1, repeated: float = 1.0) -> Tensor:
     """Numbers of queries in evenly spaced stretches, (n,L); of few queries on a large map."""
     used = min(queries, FITTED, max(LEAST, SAMPLED // places))
-    length = max(STRETCH, math.ceil(CORRELATED * correlation))
+    length = math.ceil(repeated * max(STRETCH, CORRELATED * correlation))
     n = max(1, min(STRETCHES, used // length))
     length = used // n
     first = torch.linspace(0, queries - length, n).round().long()

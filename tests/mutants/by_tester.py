@@ -623,8 +623,8 @@ MUTANTS = [
     Mutant(
         "A stop is one of the queries that another speed has to explain.",
         "dejavu_torch/recognition/smoother.py",
-        "(~sample.still).sum() for",
-        "sample.still.numel() for",
+        "different = float(sum(sample.weight.sum() for",
+        "different = float(sum(sample.weight.numel() for",
         ("tests/recognition/test_smoother.py::-k another_speed",),
     ),
     Mutant(
