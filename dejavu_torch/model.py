@@ -368,7 +368,7 @@ class DejaVu(nn.Module):
                 `PlaceFilter` or a `SequenceMatcher`. None matches each query by itself. "auto" is a smoother
                 if the queries are known to be in order, as those of a video are, else None.
             centre: remove what the descriptors of all queries have and the map's have not, see `centred`;
-                None does it for a smoother and at least 50 queries.
+                None does it for a smoother and at least 50 queries, not for single ones.
             search: for single queries: "scan" and "exact" score all places; "auto", "coarse" and None take
                 `self.searcher`, by default one that scores the places near the best samples of a long
                 spectral map, if that is faster.
@@ -390,7 +390,7 @@ class DejaVu(nn.Module):
         """As `localize`, for descriptors (Q,K), whitened if the model whitens.
 
         Args:
-            matching: a Matching, or the sequence of `localize`. progress: see `learn`.
+            matching: a Matching, or a sequence; None matches each query by itself. progress: see `learn`.
             order: (N,) the frame of each place of a shuffled map; the match then counts frames.
         """
         matching = matching if isinstance(matching, Matching) else self.matching(matching)
@@ -450,7 +450,7 @@ class DejaVu(nn.Module):
             check_candidates(k, apart, self.map.places)
         queries = self.at_map_size(as_traverse(queries), self.frame_shape or ())
         if isinstance(sequence, str):
-            sequence = PlaceSmoother(within=apart) if queries.ordered else None
+            sequence = PlaceSmoother() if queries.ordered else None
         matching = self.matching(sequence, search)._replace(k=k, radius=apart)
         localizer = self.localizer(matching)
         if sequence is not None:
@@ -516,7 +516,8 @@ class DejaVu(nn.Module):
 
         In this order: by the threshold or precision of the user or of the map's file; with a probability of
         at least .5, by a smoother, or if the map is calibrated for this way of matching; with a filter's own
-        probability above .5; every finite score.
+        probability above .5; every finite score. A threshold of the model or its file is a distance, which
+        holds for no filter and no smoother: these have thresholds of their own.
         """
         threshold = self.threshold if sequence is None else sequence.threshold_of(self.threshold)
         if threshold is not None or self.precision is not None:

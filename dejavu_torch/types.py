@@ -209,11 +209,12 @@ class Match:
     Attributes:
         index: (Q,) int64, the place found, -1 if no place has a finite score; (Q,k) candidates, best first.
         score: float, lower is better, +inf without a place. accepted: bool, see `DejaVu.acceptance`.
-        probability: float64, of being right, NaN for all but the first candidate; None without calibration.
+        probability: float64, of being right, NaN for all but the first candidate; None without calibration,
+            but for a whole drive.
         route: int64, the index in `map.routes` of the place's route, -1 without a place; None if the map is
             not merged.
-        confidence: float, how much worse the best place outside the suppression radius is, in the unit of the
-            scores; NaN for all but the first candidate. None if it was not computed.
+        confidence: float, how much worse the best place over 5 places away is, in the unit of the scores; NaN
+            for all but the first candidate. None if it was not computed.
         sequences: by T, matches (Q,) of the same queries in sequences, a filter or a smoother, for reports;
             mostly empty.
     """
@@ -275,7 +276,8 @@ class Training(NamedTuple):
 class SequenceModel(nn.Module, ABC):
     """Combines the scores of consecutive queries: the `sequence` argument of `DejaVu.localize`.
 
-    Convention: causal; each score is for the place of its own query. Memory does not grow with the queries.
+    Convention: causal, but for a `PlaceSmoother`; each score is for the place of its own query. Memory does
+        not grow with the queries.
     """
 
     likely: float | None = None  # a score below it is more likely right than wrong; None if scores do not say

@@ -42,7 +42,7 @@ class Sequences:
 
     Args:
         match: drive (each query with all others; default if in order), filter (with those before), sequence:T
-            (T together at constant speed) or single; the scores of the first two are -log(probability)
+            (T together at constant speed) or single; the first two score at least -log(probability)
         speeds: speeds of a sequence in places per query, such as '[.8,1,1.25]'; 1 if not given
     """
 
@@ -134,7 +134,8 @@ class Ordering:
             refuse_with("--unordered", ordered=self.ordered, match=together and "drive, filter or sequence:T")
         if self.centre == "mean" and together and not isinstance(matcher, PlaceSmoother):
             raise InputError("--centre mean with a filter or a sequence; expected --match drive or single")
-        return self.ordered if self.ordered or self.unordered else None
+        ordered = self.ordered or isinstance(matcher, PlaceSmoother)
+        return ordered if ordered or self.unordered else None
 
     def centring(self, ordered: bool, queries: int) -> bool:
         """Whether single queries and those of a smoother are centred."""
@@ -209,7 +210,7 @@ class Acceptance:
     Args:
         threshold: accept matches with a score below this; .inf accepts all
         precision: accept matches that are right with at least this probability, such as .99. If neither the
-            options nor the map say anything: .5 on a calibrated map, else all
+            options nor the map say anything: .5 for a whole drive or on a calibrated map, else all
     """
 
     threshold: float | None = None

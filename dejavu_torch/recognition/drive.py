@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dejavu_torch.recognition.calibration import Platt, confidence_of
+from dejavu_torch.recognition.calibration import TOLERANCE, Platt, confidence_of
 from dejavu_torch.recognition.filter import near_scores
 from dejavu_torch.recognition.large import TILE, LargeDrive, Tiles, is_large
 from dejavu_torch.recognition.select import best_candidates
@@ -27,7 +27,7 @@ class Shown(NamedTuple):
     """What an answer is made of: candidates (Q,k); the rest (Q,)."""
 
     match: Match
-    margin: Tensor  # to the best place outside the suppression radius
+    margin: Tensor  # to the best place elsewhere
     probability: Tensor
     own: Tensor  # the score of the answer by its query alone
 
@@ -72,11 +72,11 @@ def localize_drive(
     parts: list[Shown] = []
     with progress_of("smoothing", queries, progress, "query") as update:
         for mass, scores, known in seen:
+            scores = scores.masked_fill(scores.isnan(), math.inf)
             ranked = near_scores(mass, scores, smoother.within) if smoother.is_drive else scores
             columns = None if known is None else known.expand_as(ranked)
-            pair = best_candidates(ranked, min(2, ranked.shape[1]), radius, columns)
-            match = pair if k <= pair.index.shape[1] else best_candidates(ranked, k, radius, columns)
-            match = match.map(lambda column: column[:, :k])
+            pair = best_candidates(ranked, min(2, ranked.shape[1]), TOLERANCE, columns)
+            match = best_candidates(ranked, k, radius, columns)
             at = match.index[:, :1].clamp(min=0)
             if known is not None:
                 at = torch.searchsorted(known, at).clamp(max=len(known) - 1)

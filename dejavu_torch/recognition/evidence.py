@@ -34,7 +34,7 @@ class Spacing(NamedTuple):
 
 def spacing_of(queries: Tensor) -> Spacing:
     """The spacing of consecutive queries by their descriptors (Q,K)."""
-    queries = queries.float()
+    queries = queries.cpu().float()
     same = unchanged(queries)
     length = run_lengths(same)
     moving = queries[~same]
@@ -148,9 +148,8 @@ class RankTable:
 
     def add(self, z: Tensor, weight: Tensor) -> None:
         """Count values z with their weights, of the same shape."""
-        bins = self._position(z).long().flatten()
-        counts = torch.bincount(bins, weight.flatten().double(), minlength=len(self.counts))
-        self.counts += counts.cpu()
+        bins = self._position(z).long().flatten().cpu()  # some devices have no double precision
+        self.counts += torch.bincount(bins, weight.flatten().cpu().double(), minlength=len(self.counts))
 
     @property
     def values(self) -> Tensor:

@@ -23,6 +23,8 @@ from dejavu_torch.recognition.smoother import (
     CORRELATED,
     FITTED,
     LEAST,
+    SAMPLED,
+    STRETCH,
     STRETCHES,
     PlaceSmoother,
     Sample,
@@ -35,7 +37,7 @@ LARGE, LARGE_MAP = 2**25, 2**13  # queries x places, and places, from which on a
 GROUP = 16  # consecutive places that are one in the coarse pass; more if more than `HELD` scores were held
 HELD = 2**27
 LIKELY = 1e-4  # coarse mass from which on the places of a group are looked at
-LOOKED = 2**12  # places of a window that are looked at by their mass, at most
+LOOKED = 2**12  # places of a window that are looked at, at most, and those beside them
 WINDOW, MARGIN = 400, 100  # queries that are smoothed at a time, and those on both sides that they depend on
 MEANS = 256  # queries whose mean score of a place is taken
 TILE = 2**22  # numbers at a time
@@ -90,7 +92,7 @@ class LargeDrive:
         self.blocks, self.places, self.smoother, self.progress = tiles.blocks, places, smoother, progress
         self.descriptors, self.queries, self.route_starts = descriptors, len(descriptors), route_starts
         self.parts = torch.arange(self.queries).split(max(16, TILE // tiles.width))
-        self.spacing = spacing_of(descriptors.cpu())
+        self.spacing = spacing_of(descriptors)
         self.group = GROUP
         while self.queries * places > self.group * HELD:
             self.group *= 2
@@ -186,10 +188,10 @@ class LargeDrive:
                 update(len(mass))
         reach, windows = 1 + fine.within // size, []
         for looked, first, last, (start, stop) in zip(top, ends, ends[1:], around, strict=False):
-            ranked = looked.sort(descending=True).values
-            least = max(LIKELY, float(ranked[min(LOOKED // size, len(ranked)) - 1]))
-            least = min(least, float(ranked[min(candidates, len(ranked)) - 1]))
-            near = F.max_pool1d((looked >= least).float()[None], 2 * reach + 1, 1, reach)[0] > 0
+            most, groups = looked.topk(min(LOOKED // size, len(looked)))
+            groups = groups[(most >= LIKELY) | (torch.arange(len(most)) < candidates)]
+            chosen = torch.zeros(1, len(looked)).index_fill(1, groups, 1)
+            near = F.max_pool1d(chosen, 2 * reach + 1, 1, reach)[0] > 0
             places = near.repeat_interleave(size)[: self.places].nonzero()[:, 0]
             z = torch.zeros(stop - start, len(places), dtype=torch.float16)
             windows.append(Window(first, last, start, stop, places, z))
@@ -228,10 +230,12 @@ class LargeDrive:
 
     def _fitted(self) -> dict[int, int]:
         """The windows that are fitted to, and how many of their queries."""
-        last = len(self.windows) - 1
-        chosen = torch.linspace(0, last, min(STRETCHES, last + 1)).round().int().tolist()
-        length = max(FITTED // len(chosen), math.ceil(CORRELATED * self.spacing.correlation))
-        return {i: min(length, self.windows[i].last - self.windows[i].first) for i in chosen}
+        length, windows = max(STRETCH, math.ceil(CORRELATED * self.spacing.correlation)), self.windows
+        count = max(1, min(STRETCHES, FITTED // length, len(windows)))
+        chosen = torch.linspace(0, len(windows) - 1, count).round().int().tolist()
+        most = [max(LEAST, SAMPLED // (count * max(1, len(windows[i].places)))) for i in chosen]
+        lengths = [min(FITTED // count, windows[i].last - windows[i].first) for i in chosen]
+        return {i: min(pair) for i, *pair in zip(chosen, most, lengths, strict=True)}
 
     def _fit(self, ranks: RankTable) -> None:
         samples = []

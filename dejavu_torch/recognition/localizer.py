@@ -144,7 +144,11 @@ class Localizer:
             single,
             tiles,
         )
-        return self._accepted(localize_drive(rows(descriptors), descriptors, smoother, *settings))
+        match = localize_drive(rows(descriptors), descriptors, smoother, *settings)
+        acceptance = matching.acceptance
+        if acceptance.threshold is not None and not smoother.is_drive:  # whose scores are distances
+            acceptance = Acceptance(precision=math.exp(-acceptance.threshold))
+        return self._accepted(match, acceptance)
 
     @torch.no_grad()
     def skip(self, queries: int) -> None:
@@ -208,12 +212,13 @@ class Localizer:
             match = replace(match, probability=first_of(probability, k))
         return self._accepted(match)
 
-    def _accepted(self, match: Match) -> Match:
+    def _accepted(self, match: Match, acceptance: Acceptance | None = None) -> Match:
         """Candidates (B,k) with their acceptance and routes, on the CPU; (B,) for best places alone."""
         matching, match = self.matching, match.map(Tensor.cpu)
-        match = replace(match, accepted=accept(match.score, matching.acceptance.threshold))
-        if match.probability is not None and matching.acceptance.precision is not None:
-            match = replace(match, accepted=match.probability >= matching.acceptance.precision)
+        threshold, precision, _ = acceptance or matching.acceptance
+        match = replace(match, accepted=accept(match.score, threshold))
+        if match.probability is not None and precision is not None:
+            match = replace(match, accepted=match.probability >= precision)
         if self.place_map is not None and self.place_map.routes:
             match = replace(match, route=self.place_map.table.route_of(match.index))
         return match if matching.k is not None else match.map(lambda column: column[:, 0])

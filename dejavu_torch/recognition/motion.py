@@ -189,7 +189,8 @@ class Motion:
 
     def anywhere(self) -> Tensor:
         """The belief before the first query: on or off the map in the equilibrium of leaving and entering."""
-        off = (self.rates.leave / (self.rates.leave + self.rates.enter)).clamp(max=0.5)
+        both = (self.rates.leave + self.rates.enter).clamp(min=MIN_PROBABILITY)
+        off = (self.rates.leave / both).clamp(max=0.5)
         on = ((1 - off) * self.each).expand(self.layout.directions * self.layout.places)
         return torch.cat([on, 1 - (1 - off[None]) * self.layout.share])
 

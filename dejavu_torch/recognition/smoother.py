@@ -16,6 +16,7 @@ from dejavu_torch.recognition.evidence import (
     Standardised,
     place_means,
     spacing_of,
+    speaking,
     standardised,
 )
 from dejavu_torch.recognition.filter import near_scores
@@ -124,7 +125,8 @@ class PlaceSmoother(SequenceModel):
         tell how the queries depend on each other; else the scores tell it.
 
     Convention: exp(-score) is at most the probability that the right place is within `within` places. A query
-        whose scores are all equal, or NaN or infinite, says nothing. A place that nothing covers scores +inf.
+        whose scores are all equal, or NaN or infinite, says nothing. Where a score is NaN or infinite, so is
+        the result. A state holds moves and rates; `fit` learns the rest again.
 
     Source: Rabiner (1989) for forward-backward and Baum-Welch; evidence and motion model are ours.
 
@@ -166,6 +168,9 @@ class PlaceSmoother(SequenceModel):
             raise InputError(f"within is {within}; expected a whole number, at least 0")
         if threshold is not None and math.isnan(threshold):
             raise InputError("the threshold is NaN; expected a number, or None")
+        for link in links:
+            if len(link) != 3 or not all(isinstance(place, int) for place in link[:2]):
+                raise InputError(f"a link is {link}; expected a place, another one, and a probability")
         self.move_logits = nn.Parameter(logits(*moves))
         self.rate_logits = nn.Parameter(logits(1 - jump - leave, jump, leave))
         self.enter_logit = nn.Parameter(logits(enter)[0] - logits(1 - enter)[0])
@@ -281,12 +286,11 @@ class PlaceSmoother(SequenceModel):
     def drive(self, scores: Tensor | Rows, descriptors: Tensor | None = None) -> Drive:
         """The evidence of a drive's queries, by what was fitted; for a matrix, also if nothing was."""
         if not isinstance(scores, Tensor):
-            assert descriptors is not None
-            spacing = spacing_of(descriptors)
+            spacing = spacing_of(check_descriptors(descriptors))
             return Drive(scores, self.means, self.values, spacing, self.separation, self.tempering)
-        known = check_scores(scores)
+        known = check_scores(scores, descriptors)
         given = known.detach()
-        spacing = spacing_of(finite(given) if descriptors is None else descriptors)
+        spacing = spacing_of(spoken(given) if descriptors is None else check_descriptors(descriptors))
         means, values = self.means.to(given), self.values
         if len(means) != scores.shape[1]:
             means = place_means(given, spacing.weight.to(given))
@@ -336,9 +340,9 @@ class PlaceSmoother(SequenceModel):
             self; `is_drive` tells whether the queries are a drive of the map at all.
         """
         if isinstance(scores, Tensor):
-            known = check_scores(scores)
-            scores, descriptors = rows_of(known), finite(known) if descriptors is None else descriptors
-        assert descriptors is not None
+            known = check_scores(scores, descriptors)
+            scores, descriptors = rows_of(known), spoken(known) if descriptors is None else descriptors
+        descriptors = check_descriptors(descriptors)
         self.is_drive, self.log_likelihood = False, None
         if not len(descriptors):
             return self
@@ -362,7 +366,7 @@ class PlaceSmoother(SequenceModel):
         self.correlation, self.tempering = spacing.correlation, tempering_of(spacing)
         best = self._fitted(samples, ranks, self.prior)
         moving = float(sum((~sample.still).sum() for sample in samples))
-        if best.log < max(OTHER_DRIVE, PER_QUERY * moving) and len(self.prior) == len(MOVES):
+        if best.log < max(OTHER_DRIVE, PER_QUERY * moving) and self.prior == MOVES:
             others = (self._fitted(samples, ranks, start) for start in (SLOW, FAST))
             other = max(others, key=lambda one: one.log)
             different = float(sum(sample.weight.sum() for sample in samples))
@@ -481,9 +485,22 @@ def rows_of(scores: Tensor) -> Rows:
     return lambda numbers: scores[numbers.to(scores.device)]
 
 
-def finite(scores: Tensor) -> Tensor:
-    """Scores with 0 in place of NaN and infinity."""
-    return scores.nan_to_num(0, 0, 0)
+def spoken(scores: Tensor) -> Tensor:
+    """Scores as descriptors of the queries: queries that say nothing are as the one before them, and 0 is in
+    place of infinity."""
+    speaks = speaking(scores)
+    before = torch.where(speaks, torch.arange(len(scores), device=scores.device), 0).cummax(0).values
+    return torch.where(speaks[before, None], scores[before], 0).nan_to_num(0, 0, 0)
+
+
+def check_descriptors(descriptors: Tensor | None) -> Tensor:
+    """Descriptors (Q,K), or an InputError that tells why not."""
+    if descriptors is None:
+        raise InputError("a function of scores without descriptors; expected those of the queries")
+    if descriptors.ndim != 2 or not bool(descriptors.isfinite().all()):
+        seen = f"descriptors are {tuple(descriptors.shape)} {descriptors.dtype}"
+        raise InputError(f"{seen}; expected finite ones (Q,K)")
+    return descriptors
 
 
 def log_likelihood(
@@ -579,8 +596,10 @@ def tempering_of(spacing: Spacing) -> float:
     return max(1.0, SHARPENED * spacing.correlation)
 
 
-def check_scores(scores: Tensor) -> Tensor:
-    """Scores (Q,N), at least in single precision; refuses what are none."""
+def check_scores(scores: Tensor, descriptors: Tensor | None = None) -> Tensor:
+    """Scores (Q,N), at least in single precision; refuses what are none, or not those of the descriptors."""
     if scores.ndim != 2 or scores.shape[1] < 1 or not scores.is_floating_point():
         raise InputError(f"scores are {tuple(scores.shape)} {scores.dtype}; expected floats (Q,N)")
+    if descriptors is not None and len(descriptors) != len(scores):
+        raise InputError(f"{len(descriptors)} descriptors of {len(scores)} queries; expected as many")
     return scores if scores.dtype == torch.float64 else scores.float()

@@ -45,7 +45,7 @@ def test_an_answer_has_the_most_mass_around_it() -> None:
     for t, place in enumerate(answer.tolist()):
         mass = posterior[t, max(0, place - 3) : place + 4].sum().item()
         assert match.probability[t].item() == pytest.approx(mass, abs=1e-5)
-        beyond = [one for i, one in enumerate(ranked[t].tolist()) if abs(i - place) > 4]
+        beyond = [one for i, one in enumerate(ranked[t].tolist()) if abs(i - place) > 5]
         assert match.confidence[t].item() == pytest.approx(min(beyond) - ranked[t, place].item(), abs=1e-3)
     assert ((-match.score[:, 0]).exp() <= match.probability[:, 0] + 1e-6).all()
 
@@ -77,7 +77,7 @@ def test_what_is_no_drive_is_answered_by_single_queries() -> None:
     assert torch.allclose(match.probability[:, 0], torch.minimum(alone.probability[:, 0], single))
     assert single.max() > 0.9 > 0.5 > match.probability.max()
     best = scores.gather(1, match.index)
-    far = (torch.arange(100) - match.index).abs() > 4
+    far = (torch.arange(100) - match.index).abs() > 5
     second = scores.masked_fill(~far, math.inf).amin(1)
     assert match.confidence is not None
     assert torch.allclose(match.confidence[:, 0], second - best[:, 0])
@@ -135,6 +135,18 @@ def test_what_is_no_drive_is_answered_by_queries_as_they_are() -> None:
     drive = smoothing.rows_of(shown(80, range(60)))
     match = localize_drive(drive, descriptors, PlaceSmoother(), single=single)
     assert (match.index[:, 0] - torch.arange(60)).abs().max() <= 1
+
+
+def test_a_threshold_is_of_a_probability_for_what_is_no_drive_too() -> None:
+    route, other = noise(80, 12, seed=3).cumsum(0), noise(60, 12, seed=4)
+    model = DejaVu(None, "none").learn(route)
+    for threshold in (math.log(2), 1e-3):
+        smoother = PlaceSmoother(threshold=threshold)
+        match = model.localize(other, sequence=smoother)
+        assert not smoother.is_drive
+        assert match.probability is not None
+        assert torch.equal(match.accepted, match.probability >= math.exp(-threshold))
+        assert not match.accepted.any()
 
 
 def test_frames_that_are_no_drive_are_localized_as_if_in_no_order() -> None:

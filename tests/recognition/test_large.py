@@ -94,6 +94,32 @@ def test_only_likely_places_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> No
         assert torch.equal(window.places.unique(), window.places)
 
 
+@pytest.mark.parametrize("kind", ["equal", "none", "few"])
+def test_no_drive_looks_at_more_places_than_it_may(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(large, "LOOKED", 320)
+    monkeypatch.setattr(large, "WINDOW", 100)
+    scores = noise(300, 4000)
+    if kind == "equal":
+        scores[:] = 1.0
+    elif kind == "none":
+        scores[:] = math.nan
+    else:
+        scores[:, 40:] = math.inf
+    tiles = Tiles(lambda numbers: iter([(0, scores[numbers])]), 4000)
+    drive = LargeDrive(tiles, noise(300, 8), 4000, PlaceSmoother(), candidates=4, radius=10**4)
+    assert not drive.smoother.is_drive
+    assert all(0 < len(window.places) <= 3 * 320 for window in drive.windows)
+    assert [len(own) for _, own, *_ in drive] == [100, 100, 100]
+
+
+def test_a_drive_is_fitted_to_no_more_queries_than_it_may() -> None:
+    walk = F.avg_pool1d(noise(4039, 4, seed=1).T[None], 40, 1)[0].T  # few are independent
+    scores = noise(4000, 300)
+    drive = LargeDrive(Tiles(lambda numbers: iter([(0, scores[numbers])]), 300), walk, 300, PlaceSmoother())
+    assert drive.spacing.correlation > 5
+    assert 500 < sum(drive._fitted().values()) <= 1000
+
+
 def test_scores_of_windows_are_those_that_were_given(monkeypatch: pytest.MonkeyPatch) -> None:
     scores = shown(300, range(20, 280))
     drive = LargeDrive(

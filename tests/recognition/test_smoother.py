@@ -371,6 +371,22 @@ def test_changes_that_are_slow_make_no_query_say_less() -> None:
     assert PlaceSmoother().fit(unclear, slow).tempering > 9
 
 
+def test_queries_that_say_nothing_do_not_make_the_others_say_more() -> None:
+    walk = noise(200, 12, seed=1).cumsum(0)
+    scores = torch.cdist(walk[20:180], walk) + 50
+    clean = PlaceSmoother().fit(scores)
+    for silent in (math.nan, math.inf, 0.0):
+        odd = scores.clone()
+        odd[[0, 1, 50, 120]] = silent
+        assert PlaceSmoother().fit(odd).correlation == pytest.approx(clean.correlation, rel=0.4)
+
+
+def test_a_camera_that_never_leaves_the_map_has_a_place() -> None:
+    smoother = PlaceSmoother(jump=0.0, leave=0.0, enter=0.0)
+    scores = shown(30, range(30))
+    assert (smoother.fit(scores)(scores).argmin(1) - torch.arange(30)).abs().max() <= 1
+
+
 def test_rates_and_moves_are_the_priors_of_a_fit() -> None:
     scores = shown(90, range(80))
     plain = PlaceSmoother().fit(scores).settled()
@@ -403,6 +419,12 @@ def test_the_module_says_what_it_has_settled_on() -> None:
         (lambda: PlaceSmoother()(torch.rand(4, 0)), ["(4, 0)", "(Q,N)"]),
         (lambda: PlaceSmoother().fit(torch.zeros(3, 4).int()), ["torch.int32", "floats"]),
         (lambda: PlaceSmoother().path(torch.rand(2, 3, 4)), ["(2, 3, 4)", "(Q,N)"]),
+        (lambda: PlaceSmoother().fit(torch.rand(3, 4), torch.rand(2, 5)), ["2 descriptors of 3 queries"]),
+        (lambda: PlaceSmoother().posterior(torch.rand(3, 4), torch.rand(5, 2)), ["5 descriptors of 3"]),
+        (lambda: PlaceSmoother().fit(torch.rand(3, 4), torch.full((3, 2), math.nan)), ["(3, 2)", "finite"]),
+        (lambda: PlaceSmoother().fit(lambda some: torch.rand(len(some), 4)), ["without descriptors"]),
+        (lambda: PlaceSmoother(links=[(0, 1)]), ["a link is (0, 1)", "a probability"]),  # type: ignore[list-item]
+        (lambda: PlaceSmoother(links=[(0.5, 1, 1.0)]), ["(0.5, 1, 1.0)"]),  # type: ignore[list-item]
         (lambda: PlaceSmoother(links=[(0, 4, 0.5)])(torch.rand(3, 4)), ["(0, 4, 0.5) on 4 places"]),
         (lambda: PlaceSmoother(links=[(-1, 2, 0.5)])(torch.rand(3, 4)), ["(-1, 2, 0.5)", "two of these"]),
         (lambda: PlaceSmoother(links=[(0, 2, 1.5)])(torch.rand(3, 4)), ["(0, 2, 1.5)", "a probability"]),
