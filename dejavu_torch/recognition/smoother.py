@@ -42,14 +42,14 @@ MOVE_SHARE = 0.1  # of the queries: the weight of the prior of the moves
 RATE_COUNTS, ENTER_COUNTS = 200.0, 50.0  # steps that the priors of jump and leave, and of enter, count as
 SHARPENED = 0.6  # tau' = SHARPENED tau
 MIN_SEPARATION = 0.3
-SURE, SLOW_CHANGES = 2.5, 8.0  # separation, and tau over tau of detrended queries, from which on changes so
+SURE, SLOW_CHANGES = 2.5, 7.0  # separation, and tau over tau of detrended queries, from which on changes so
 # slow, as of trains that wait, make no query say less
 FITTED, STRETCH, STRETCHES = 1000, 100, 10  # queries that are fitted to at most, in a stretch, and stretches
 LEAST, SAMPLED = 20, 2**21  # queries that are fitted to at least, and their scores at most otherwise
 CORRELATED = 4  # correlation times in a stretch, at least
 DRIVE = 10.0  # nats by which a drive beats being off the map throughout
 OTHER_DRIVE, PER_QUERY = 30.0, 0.1  # likewise at another speed, in all and per query,
-ALIKE = 0.15  # of the drive's nats: where places elsewhere explain as much, these places only look alike,
+ALIKE = 0.2  # of the drive's nats: where places elsewhere explain as much, these places only look alike,
 REPEATED = 0.8  # and where they explain as much, they show the same
 FOUND = 0.05  # mass of a place that is found
 CLEARLY = 5.0  # and times as many as at one place a query
