@@ -21,16 +21,9 @@ from dejavu_torch.recognition.localizer import Localizer, Matching
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.types import Match
 
-NUMBERS, SMOOTH, PART = (
-    128,
-    8,
-    100_000,
-)  # of a descriptor; places that are alike; places that are made at a time
-NOISE, TOLERANCE, SINGLE = (
-    3.0,
-    5,
-    200,
-)  # length of the noise of a query; places; queries that are asked one by one
+NUMBERS, NOISE = 128, 3.0  # of a descriptor, and the length of the noise of a query's
+SMOOTH, PART = 8, 100_000  # places that are alike, and that are made at a time
+TOLERANCE, SINGLE = 5, 200  # places; queries that are asked by one image
 KEYS = ("queries", "places", "room", "recall_one", "recall", "recall_all", "seconds", "peak_bytes", "skipped")
 COLUMNS: dict[str, Column] = {
     **{"one image": ("recall_one", ".3f"), "whole drive": ("recall", ".3f")},

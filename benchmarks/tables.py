@@ -236,6 +236,16 @@ def made_drives() -> str:
     return f"{markdown(means)}\n{markdown(areas)}"
 
 
+def large_drives() -> str:
+    """Time and memory of drives on large maps, and what they find."""
+    table = [["queries, places, B per place", "one image", "whole drive", "at all places", "s", "MB"]]
+    for row in read("large drives")["rows"]:
+        shares = (area(row.get(key)) if key in row else "" for key in ("recall_one", "recall", "recall_all"))
+        size = f"{row['queries']:,}, {row['places']:,}, {row['room']:g}"
+        table.append([size, *shares, f"{row['seconds']:.0f}", f"{row['peak_bytes'] / 1e6:.0f}"])
+    return markdown(table)
+
+
 def shown_pair(row: Row) -> str:
     """The areas of one image and of the whole drive; with a star, if that was answered by single images."""
     pair = [area(row[key]).removeprefix("0") for key in ("auc_one", "auc")]
@@ -285,6 +295,7 @@ TABLES: dict[str, Callable[[], str]] = {
     **{"routes": routes, "sizes": sizes, "descriptors": descriptors, "sequences": sequences},
     **{"rejection": rejection, "filtered": filtered, "drives": drives, "driven": driven},
     **{"trainings": trainings, "made drives": made_drives, "storage drives": storage_drives},
+    "large drives": large_drives,
     **{f"storage {name}": partial(storage, name) for name in ("aerial", "road1", "road2", "city", "railway")},
 }
 

@@ -13,7 +13,7 @@ from command_line import benchmark
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from benchmarks import drives, storage_drives, tables
+from benchmarks import drives, large_drives, storage_drives, tables
 from benchmarks.drives import AS_IT_WAS, ELSEWHERE, HALF, NO_OTHER, Known, asked, bench_drives, drives_of
 from benchmarks.storage_drives import ANSWERS, Asked, bench_storage_drives, both_sides, drive_table
 from benchmarks.trainings import Route
@@ -51,6 +51,26 @@ def test_drives_are_cut_from_the_one_that_was() -> None:
     again = drives_of(300, None, seed=3)["stretches of 20 to 40"]
     assert again is not None
     assert torch.equal(again, cut)
+
+
+def test_large_maps_are_measured_beside_all_places(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    task = large_drives.Task(120, 600, 5.0)
+    monkeypatch.setattr(large_drives, "TASKS", (task,))
+    monkeypatch.setattr(drives, "TASKS", (task,))
+    benchmark("drives", tmp_path, "--large", "--out", tmp_path / "out")
+    (row,) = json.loads((tmp_path / "out" / "bench.json").read_text())["rows"]
+    assert row["skipped"] is None
+    assert row["recall"] == row["recall_all"] == 1
+    assert row["recall_one"] < 1
+    assert row["seconds"] > 0
+    assert "120 on 600, 5 B" in capsys.readouterr().out
+    place_map, queries, truth = large_drives.made(task)
+    assert place_map.places == 600
+    assert len(queries) == len(truth) == 120
+    monkeypatch.setattr(tables, "read", lambda _: {"rows": [row]})
+    assert "| 120, 600, 5 |" in tables.large_drives()
 
 
 def test_queries_of_another_route_have_no_place_but_are_judged() -> None:
