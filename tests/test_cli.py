@@ -83,14 +83,11 @@ def test_convention_4_threshold_option_then_map_then_probability_then_all(
 
 
 def test_a_drive_that_is_asked_for_is_in_order(small_map: Path, tmp_path: Path) -> None:
-    frames = open_source(QUERY)[:]
-    np.save(tmp_path / "q.npy", frames.movedim(1, -1).numpy())
-    found = []
+    frames, out, found = 255 * open_source(QUERY)[:].float(), tmp_path / "m.csv", []
+    np.save(tmp_path / "q.npy", frames.movedim(1, -1).byte().numpy())
     for words in ((), ("--ordered",)):
-        run(
-            "localize", small_map, tmp_path / "q.npy", "--match", "drive", *words, "--out", tmp_path / "m.csv"
-        )
-        found.append((tmp_path / "m.csv").read_text())
+        run("localize", small_map, tmp_path / "q.npy", "--match", "drive", *words, "--out", out)
+        found.append(out.read_text())
     assert found[0] == found[1]
 
 
