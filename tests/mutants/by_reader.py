@@ -112,8 +112,8 @@ MUTANTS = [
     Mutant(
         "With a precision an answer is accepted from that probability on, inclusive.",
         "dejavu_torch/recognition/localizer.py",
-        "match.probability >= matching.acceptance.precision",
-        "match.probability > matching.acceptance.precision",
+        "match.probability >= precision",
+        "match.probability > precision",
         ("tests/test_behaviour.py::test_a_precision_is_inclusive",),
     ),
     Mutant(

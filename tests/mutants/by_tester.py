@@ -174,8 +174,8 @@ MUTANTS = [
     Mutant(
         "Ahead of the first query a filter is off the map as likely as leaving and entering make it.",
         "dejavu_torch/recognition/motion.py",
-        "off = (self.rates.leave / (self.rates.leave + self.rates.enter)).clamp(max=0.5)",
-        "off = (self.rates.enter / (self.rates.leave + self.rates.enter)).clamp(max=0.5)",
+        "off = (self.rates.leave / both).clamp(max=0.5)",
+        "off = (self.rates.enter / both).clamp(max=0.5)",
         ("tests/recognition/test_filter.py::test_equals_a_literal_loop",),
     ),
     Mutant(
@@ -581,7 +581,7 @@ MUTANTS = [
     Mutant(
         "Right scores are not counted among the wrong ones, nor queries of a stop each for itself.",
         "dejavu_torch/recognition/evidence.py",
-        "torch.bincount(bins, weight.flatten().double(), minlength=len(self.counts))",
+        "torch.bincount(bins, weight.flatten().cpu().double(), minlength=len(self.counts))",
         "torch.bincount(bins, minlength=len(self.counts))",
         ("tests/recognition/test_evidence.py::-k ranks_are_exact or no_weight",),
     ),

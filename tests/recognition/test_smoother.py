@@ -221,11 +221,11 @@ def test_drives_of_any_kind_are_found_where_single_queries_are_not(drive: Sequen
 
 @pytest.mark.slow
 def test_a_stop_is_one_of_the_queries_that_another_speed_has_to_explain() -> None:
-    """80 queries that are alike, at four times the speed, and 600 of a stop."""
+    """80 queries that are alike, at four times the speed, and 800 of a stop."""
     scores, descriptors = shown(400, range(0, 320, 4), clear=3.5), noise(80, 16, seed=3)
     for t in range(1, 80):
         descriptors[t] = 0.8 * descriptors[t - 1] + 0.6 * descriptors[t]
-    at = torch.tensor([*range(40), *[40] * 600, *range(40, 80)])
+    at = torch.tensor([*range(40), *[40] * 800, *range(40, 80)])
     moving, stopped = (PlaceSmoother().fit(scores[one], descriptors[one]) for one in (at.unique(), at))
     assert moving.is_drive
     assert stopped.is_drive
