@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -118,6 +118,19 @@ class Motion:
             moved[..., row, at] += share * message[..., row, to]
         return moved
 
+    def _by_all_moves(self, on: Tensor, shifted: Callable[[Tensor], Tensor], back: bool) -> Tensor:
+        """The sum of mass (..., D, N) moved by 0 to V places, each times its probability."""
+        if self.keep is not None:
+            moved = self.moves[-1] * on
+            for move in self.moves[-2::-1]:
+                moved = torch.addcmul(shifted(moved), move, on)
+            return moved
+        moved, last, n = self.moves[0] * on, len(self.moves) - 1, on.shape[-1]
+        padded = F.pad(on, (0, last) if back else (last, 0))  # once, which is faster
+        for by, move in enumerate(self.moves[1:], 1):
+            moved = torch.addcmul(moved, move, padded.narrow(-1, by if back else last - by, n))
+        return moved
+
     def _turned(self, on: Tensor) -> Tensor:
         """Mass (..., D, N), some of it in the other direction; its own transpose."""
         if self.layout.directions == 1:
@@ -136,9 +149,7 @@ class Motion:
         """The belief before the next query."""
         on, off = self._split(belief)
         start = self._turned(on)
-        moved = self.moves[-1] * start
-        for move in self.moves[-2::-1]:
-            moved = torch.addcmul(self._shifted(moved), move, start)
+        moved = self._by_all_moves(start, self._shifted, back=False)
         total, moved = belief[..., :-1].sum(-1, keepdim=True), moved.flatten(-2)
         lost = (start * self.lost).flatten(-2).sum(-1, keepdim=True)
         _, jump, leave, enter = self.rates
@@ -149,9 +160,7 @@ class Motion:
     def expected(self, message: Tensor) -> Tensor:
         """What a message of the next query says of the state before: the transpose of `moved`."""
         on, off = self._split(message)
-        moved = self.moves[-1] * on
-        for move in self.moves[-2::-1]:
-            moved = torch.addcmul(self._shifted_back(moved), move, on)
+        moved = self._by_all_moves(on, self._shifted_back, back=True)
         moved = self._turned(moved + self.lost * off[..., None]).flatten(-2)
         _, jump, leave, enter = self.rates
         mean = self._mean(message)

@@ -525,7 +525,7 @@ def sweep(
 
     def forward(first: int, belief: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         like = likelihood(first, min(first + size, queries))
-        before, logs = [], []
+        before, totals = [], []
         for t, seen in enumerate(like.unbind(-2), first):
             if t:
                 moved = motion.moved(belief)
@@ -534,8 +534,8 @@ def sweep(
             joint = belief * seen
             total = joint.sum(-1, keepdim=True)
             belief = joint / total
-            logs.append(total[..., 0].log())
-        return like, torch.stack(before, -2), torch.stack(logs, -1), belief
+            totals.append(total)
+        return like, torch.stack(before, -2), torch.cat(totals, -1).log(), belief
 
     for first in starts[:-1]:
         beliefs[first] = belief
