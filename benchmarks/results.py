@@ -181,7 +181,8 @@ def run_results(
         words, report = [*placed(run.words, folders), "--out", str(folder)], folder / "report.json"
         if (said := done_once(words, folder, report)) is not None:
             return row | {"skipped": said}
-        return row | kept(json.loads(report.read_text(encoding="utf-8")))
+        said = report.read_text(encoding="utf-8").replace(str(data), "data")  # in the names of sources
+        return row | kept(json.loads(said))
 
     planned = [run for run in runs(ways or list(WAYS)) if not footage or run.footage in footage]
     if any(run.way == "visits" for run in planned):

@@ -26,6 +26,11 @@ def test_every_command_is_understood_and_every_way_is_used() -> None:
     assert {run.footage for run in planned if run.way == "default"} == set(FOOTAGE)
 
 
+def test_kept_figures_name_no_folder_of_a_machine() -> None:
+    for file in tables.FOLDER.glob("*.json"):
+        assert '"/' not in file.read_text(encoding="utf-8"), file.name
+
+
 def test_reports_are_kept_and_made_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
