@@ -226,7 +226,7 @@ def plot_both_ways(
                     sizes, drawn_areas(areas), line, marker="o", markersize=2.5, color=colour, linewidth=width
                 )
             axis.set_xscale("log")
-            axis.set_xticks(ticks := [0.25, 2, 16, 128, 1000], [f"{tick:g}" for tick in ticks])
+            axis.set_xticks(ticks := [0.25, 4, 64, 1024], [f"{tick:g}" for tick in ticks])
             axis.minorticks_off()
             area_axis(axis)
             axis.set_ylabel("")
