@@ -276,8 +276,8 @@ class Training(NamedTuple):
 class SequenceModel(nn.Module, ABC):
     """Combines the scores of consecutive queries: the `sequence` argument of `DejaVu.localize`.
 
-    Convention: causal, but for a `PlaceSmoother`; each score is for the place of its own query. Memory does
-        not grow with the queries.
+    Convention: each score is for the place of its own query. All but a `PlaceSmoother` are causal, and their
+        memory does not grow with the queries.
     """
 
     likely: float | None = None  # a score below it is more likely right than wrong; None if scores do not say

@@ -18,7 +18,6 @@ from dejavu_torch.recognition.evidence import (
     Standardised,
     spacing_of,
 )
-from dejavu_torch.recognition.motion import Motion
 from dejavu_torch.recognition.smoother import (
     CORRELATED,
     FITTED,
@@ -28,8 +27,6 @@ from dejavu_torch.recognition.smoother import (
     STRETCHES,
     PlaceSmoother,
     Sample,
-    log_likelihood,
-    sweep,
 )
 from dejavu_torch.text import progress_of
 
@@ -241,17 +238,18 @@ class LargeDrive:
         samples = []
         for i, length in self._fitted().items():
             window = self.windows[i]
-            some = slice(window.first, window.first + length)
-            std, layout = self._standardised(window, some), self.layout.of(window.places)
-            samples.append(Sample(std, self.spacing.weight[some], self.spacing.still[some], layout))
-            ranks.add(std.z, (self.spacing.weight[some] * std.speaks)[:, None] * std.valid)
+            sample = self._sample(window, slice(window.first, window.first + length))
+            std = sample.std
+            ranks.add(std.z, (sample.weight * std.speaks)[:, None] * std.valid)
+            samples.append(sample)
         self.smoother.means = self.means
         self.smoother.learn(samples, ranks, self.spacing)
 
-    def _standardised(self, window: Window, some: slice) -> Standardised:
+    def _sample(self, window: Window, some: slice) -> Sample:
         z = window.z[some.start - window.start : some.stop - window.start].float()
-        valid = z.isfinite()
-        return Standardised(z.where(valid, 0), valid, self.speaks[some] > 0)
+        valid, layout = z.isfinite(), self.layout.of(window.places)
+        std = Standardised(z.where(valid, 0), valid, self.speaks[some] > 0)
+        return Sample(std, self.spacing.weight[some], self.spacing.still[some], layout)
 
     @torch.no_grad()
     def __iter__(self) -> Iterator[tuple[int, Tensor, Tensor, Tensor]]:
@@ -260,13 +258,8 @@ class LargeDrive:
         smoother = self.smoother
         rates = smoother.rates(self.means)
         for window in self.windows[::-1]:
-            some = slice(window.start, window.stop)
-            std, weight = self._standardised(window, some), self.spacing.weight[some]
-            x = RankTable.look_up(smoother.values, std.z)
-            log = log_likelihood(x, std, weight, smoother.separation, smoother.tempering)
-            like, motion = smoother.wide(log, 0.0).exp(), Motion(self.layout.of(window.places), rates)
-            still = self.spacing.still[some]
-            (block,) = sweep(motion, lambda *_: like, len(log), still, len(log))  # noqa: B023
+            sample = self._sample(window, slice(window.start, window.stop))
+            *_, block = smoother.explained(sample, smoother.values, smoother.separation, rates)
             own = slice(window.first - window.start, window.last - window.start)
             z = window.z[own].float() * self.spread[window.first : window.last, None]
             scores = self.means[window.places] - z + self.mean[window.first : window.last, None]

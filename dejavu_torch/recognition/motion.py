@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -118,9 +118,10 @@ class Motion:
             moved[..., row, at] += share * message[..., row, to]
         return moved
 
-    def _by_all_moves(self, on: Tensor, shifted: Callable[[Tensor], Tensor], back: bool) -> Tensor:
+    def _by_all_moves(self, on: Tensor, back: bool) -> Tensor:
         """The sum of mass (..., D, N) moved by 0 to V places, each times its probability."""
         if self.keep is not None:
+            shifted = self._shifted_back if back else self._shifted
             moved = self.moves[-1] * on
             for move in self.moves[-2::-1]:
                 moved = torch.addcmul(shifted(moved), move, on)
@@ -149,7 +150,7 @@ class Motion:
         """The belief before the next query."""
         on, off = self._split(belief)
         start = self._turned(on)
-        moved = self._by_all_moves(start, self._shifted, back=False)
+        moved = self._by_all_moves(start, back=False)
         total, moved = belief[..., :-1].sum(-1, keepdim=True), moved.flatten(-2)
         lost = (start * self.lost).flatten(-2).sum(-1, keepdim=True)
         _, jump, leave, enter = self.rates
@@ -160,7 +161,7 @@ class Motion:
     def expected(self, message: Tensor) -> Tensor:
         """What a message of the next query says of the state before: the transpose of `moved`."""
         on, off = self._split(message)
-        moved = self._by_all_moves(on, self._shifted_back, back=True)
+        moved = self._by_all_moves(on, back=True)
         moved = self._turned(moved + self.lost * off[..., None]).flatten(-2)
         _, jump, leave, enter = self.rates
         mean = self._mean(message)

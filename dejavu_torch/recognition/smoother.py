@@ -364,10 +364,10 @@ class PlaceSmoother(SequenceModel):
     def learn(self, samples: Sequence[Sample], ranks: RankTable, spacing: Spacing) -> Self:
         """As `fit`, from stretches of the drive and the ranks of all their scores."""
         self.correlation, self.tempering = spacing.correlation, tempering_of(spacing)
-        best = self._fitted(samples, ranks, self.prior)
         moving = float(sum((~sample.still).sum() for sample in samples))
+        best = self._fitted(samples, ranks, self.prior, moving)
         if best.log < max(OTHER_DRIVE, PER_QUERY * moving) and self.prior == MOVES:
-            others = (self._fitted(samples, ranks, start) for start in (SLOW, FAST))
+            others = (self._fitted(samples, ranks, start, moving) for start in (SLOW, FAST))
             other = max(others, key=lambda one: one.log)
             different = float(sum(sample.weight.sum() for sample in samples))
             least = max(OTHER_DRIVE, PER_QUERY * different, CLEARLY * best.log)
@@ -384,18 +384,19 @@ class PlaceSmoother(SequenceModel):
         self.enter_logit.copy_(logits(enter)[0] - logits(1 - enter)[0])
         return self
 
-    def _fitted(self, samples: Sequence[Sample], ranks: RankTable, start: Sequence[float]) -> Fit:
-        """Expectation-maximisation from a start of the moves, which is their prior."""
+    def _fitted(
+        self, samples: Sequence[Sample], ranks: RankTable, start: Sequence[float], moving: float
+    ) -> Fit:
+        """Expectation-maximisation from a start of the moves, which is their prior; `moving` queries."""
         z = samples[0].std.z
         prior, separation = z.new_tensor(start), self.first_separation
         rates = Rates(prior, *(prior.new_tensor(rate) for rate in self.rate_prior))
-        moving = float(sum((~sample.still).sum() for sample in samples))
         rights: list[Tensor] = []  # shares of the scores that are right ones
         for round in range(ROUNDS + 1):
             table = RankTable(ranks.counts)
             for sample, right in zip(samples, rights, strict=False):
                 table.add(sample.std.z, -right)
-            seen = [self._explained(sample, table.values, separation, rates) for sample in samples]
+            seen = [self.explained(sample, table.values, separation, rates) for sample in samples]
             if round == ROUNDS:
                 break
             rights, sums, counts = [], z.new_zeros(2), []
@@ -423,7 +424,7 @@ class PlaceSmoother(SequenceModel):
         first = float(sum(block.log.sum() for *_, block in seen))
         return Fit(rates, separation, table.values, first, second)
 
-    def _explained(
+    def explained(
         self, sample: Sample, values: Tensor, separation: float, rates: Rates
     ) -> tuple[Tensor, Tensor, Motion, Block]:
         """Normal scores of a sample, their log likelihood, and what follows from it."""
