@@ -15,7 +15,7 @@ from dejavu_torch.recognition.calibration import TOLERANCE, Platt, confidence_of
 from dejavu_torch.recognition.filter import near_scores
 from dejavu_torch.recognition.large import TILE, LargeDrive, Tiles, is_large
 from dejavu_torch.recognition.select import best_candidates
-from dejavu_torch.recognition.smoother import Drive, PlaceSmoother, Rows, near_mass, normalised
+from dejavu_torch.recognition.smoother import Drive, PlaceSmoother, Rows, normalised
 from dejavu_torch.text import progress_of
 from dejavu_torch.types import Match
 
@@ -80,7 +80,7 @@ def localize_drive(
             at = match.index[:, :1].clamp(min=0)
             if known is not None:
                 at = torch.searchsorted(known, at).clamp(max=len(known) - 1)
-            probability = near_mass(mass, smoother.within).gather(1, at)[:, 0]
+            probability = mass_around(mass, at, smoother.within)
             if not smoother.is_drive and platt is not None:
                 by_itself = platt.probability(confidence_of(scores))
                 probability = by_itself if queries == 1 else torch.minimum(probability, by_itself)
@@ -127,6 +127,13 @@ def _of_windows(drive: LargeDrive, single: Rows) -> Seen:
         for part in reversed(torch.arange(len(mass)).split(max(1, TILE // drive.places))):
             whole = mass.new_zeros(len(part), drive.places).index_copy(1, places, mass[part])
             yield whole, single(first + part).cpu(), None
+
+
+def mass_around(mass: Tensor, at: Tensor, radius: int) -> Tensor:
+    """The mass of a place (Q,1) and its neighbours up to a radius, (Q,N) -> (Q,)."""
+    near = at + torch.arange(-radius, radius + 1)
+    inside = (near >= 0) & (near < mass.shape[1])
+    return (mass.gather(1, near.clamp(0, mass.shape[1] - 1)) * inside).sum(1).clamp(0, 1)
 
 
 def doubt(own: Tensor) -> Tensor:

@@ -304,10 +304,25 @@ def near_scores(posterior: Tensor, scores: Tensor, within: int) -> Tensor:
     places away, (Q,N) -> (Q,N); +inf if the place's score is."""
     within = min(within, posterior.shape[1])
     side = within + 1  # two box filters make a triangle
-    padded = F.pad(posterior[:, None], (within, within))
-    mass = side * F.avg_pool1d(F.avg_pool1d(padded, side, 1), side, 1)[:, 0]
+    mass = window_sums(window_sums(F.pad(posterior, (within, within)), side), side) / side
     mass = mass.clamp(torch.finfo(mass.dtype).tiny, 1.0)  # an exporter promotes no types
     return (-mass.log()).masked_fill(~scores.isfinite(), math.inf)
+
+
+def window_sums(values: Tensor, width: int) -> Tensor:
+    """Sums of `width` neighbours, (..., N + width - 1) -> (..., N).
+
+    Example:
+        >>> window_sums(torch.tensor([1.0, 2, 3, 4]), 3)
+        tensor([6., 9.])
+    """
+    count, size, at, total = values.shape[-1] - width + 1, 1, 0, torch.zeros(())
+    while True:  # sums of 1, 2, 4, .. neighbours, which is several times as fast as pooling
+        if width & size:
+            total, at = total + values.narrow(-1, at, count), at + size
+        if (size := 2 * size) > width:
+            return total
+        values = values[..., : -(size // 2)] + values[..., size // 2 :]
 
 
 def updated(expected: Tensor, likelihood: Tensor) -> Tensor:

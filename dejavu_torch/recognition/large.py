@@ -18,6 +18,7 @@ from dejavu_torch.recognition.evidence import (
     Standardised,
     spacing_of,
 )
+from dejavu_torch.recognition.motion import Motion
 from dejavu_torch.recognition.smoother import (
     CORRELATED,
     FITTED,
@@ -259,7 +260,8 @@ class LargeDrive:
         rates = smoother.rates(self.means)
         for window in self.windows[::-1]:
             sample = self._sample(window, slice(window.start, window.stop))
-            *_, block = smoother.explained(sample, smoother.values, smoother.separation, rates)
+            model = smoother.values, smoother.separation, Motion(sample.layout, rates)
+            (block,) = smoother.explained(sample, *model, len(sample.weight))
             own = slice(window.first - window.start, window.last - window.start)
             z = window.z[own].float() * self.spread[window.first : window.last, None]
             scores = self.means[window.places] - z + self.mean[window.first : window.last, None]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import torch
@@ -76,9 +76,9 @@ class Motion:
 
     def __init__(self, layout: Layout, rates: Rates) -> None:
         self.layout, self.rates = layout, rates
-        self.stay = 1 - rates.jump - rates.leave
+        _, jump, leave, enter = rates
         self.each = layout.share / max(1, layout.directions * layout.places)
-        self.moves = rates.moves.unbind()
+        self.moves = ((1 - jump - leave) * rates.moves).unbind()
         last, taken = layout.places - 1, rates.moves.new_zeros(layout.directions, layout.places)
         ways: list[tuple[int, int, int, float]] = []
         for first, second, share in layout.links:
@@ -93,11 +93,13 @@ class Motion:
             keep[1:, last + 1 - start] = 0
         plain = len(layout.route_starts) == 1 and not layout.links
         self.keep = None if plain else keep  # the share of a place's mass that moves on to the next one
-        reach = torch.ones_like(keep)
-        self.reach = [reach]  # the share of a move by 0, 1, .. V places that stays on the route
-        for _ in self.moves[1:]:
-            self.reach.append(self._shifted_back(self.reach[-1]))
-        self.lost = torch.einsum("v,vdn", rates.moves, 1 - torch.stack(self.reach))
+        # the share of a move by 0, 1, .. V places that stays on the route
+        self.reach = [*self._shifts(torch.ones_like(keep), back=True)]
+        self.lost = torch.einsum("v,vdn", torch.stack(self.moves), 1 - torch.stack(self.reach))
+        # the shares of a state's mass (S,) that go anywhere, and off the map
+        self.free = torch.cat([jump.expand(keep.numel()), enter[None]])
+        left = torch.cat([self._turned(self.lost).flatten() + leave, 1 - enter[None]])
+        self.gone = left + (1 - layout.share) * self.free
 
     def _shifted(self, on: Tensor) -> Tensor:
         """Mass (..., D, N) one place further."""
@@ -118,18 +120,26 @@ class Motion:
             moved[..., row, at] += share * message[..., row, to]
         return moved
 
-    def _by_all_moves(self, on: Tensor, back: bool) -> Tensor:
-        """The sum of mass (..., D, N) moved by 0 to V places, each times its probability."""
+    def _shifts(self, on: Tensor, back: bool) -> Iterator[Tensor]:
+        """Mass (..., D, N) moved by 0, 1, .. V places."""
+        last, n = len(self.moves) - 1, on.shape[-1]
         if self.keep is not None:
             shifted = self._shifted_back if back else self._shifted
-            moved = self.moves[-1] * on
-            for move in self.moves[-2::-1]:
-                moved = torch.addcmul(shifted(moved), move, on)
-            return moved
-        moved, last, n = self.moves[0] * on, len(self.moves) - 1, on.shape[-1]
-        padded = F.pad(on, (0, last) if back else (last, 0))  # once, which is faster
-        for by, move in enumerate(self.moves[1:], 1):
-            moved = torch.addcmul(moved, move, padded.narrow(-1, by if back else last - by, n))
+            yield on
+            for _ in range(last):
+                yield (on := shifted(on))
+            return
+        beyond = on.new_zeros(*on.shape[:-1], last)
+        shifts = torch.cat([on, beyond] if back else [beyond, on], -1).unfold(-1, n, 1).unbind(-2)
+        yield from shifts if back else shifts[::-1]
+
+    def _by_all_moves(self, on: Tensor, back: bool) -> Tensor:
+        """The sum of mass (..., D, N) moved by 0 to V places, each times its probability."""
+        first, *others = self.moves
+        shifts = self._shifts(on, back)
+        moved = first * next(shifts)
+        for move, shifted in zip(others, shifts, strict=True):
+            moved.addcmul_(move, shifted)
         return moved
 
     def _turned(self, on: Tensor) -> Tensor:
@@ -142,50 +152,36 @@ class Motion:
         """The places (..., D, N), and being off the map (..., 1)."""
         return state[..., :-1].unflatten(-1, (self.layout.directions, -1)), state[..., -1:]
 
-    def _mean(self, message: Tensor) -> Tensor:
-        """The mean over all places of the map, (..., S) -> (..., 1)."""
-        return torch.lerp(message[..., -1:], message[..., :-1].mean(-1, keepdim=True), self.layout.share)
-
     def moved(self, belief: Tensor) -> Tensor:
         """The belief before the next query."""
-        on, off = self._split(belief)
-        start = self._turned(on)
-        moved = self._by_all_moves(start, back=False)
-        total, moved = belief[..., :-1].sum(-1, keepdim=True), moved.flatten(-2)
-        lost = (start * self.lost).flatten(-2).sum(-1, keepdim=True)
-        _, jump, leave, enter = self.rates
-        anywhere = jump * total + enter * off
-        off = self.stay * lost + leave * total + (1 - enter) * off + (1 - self.layout.share) * anywhere
-        return torch.cat([self.stay * moved + anywhere * self.each, off], -1)
+        on, _ = self._split(belief)
+        moved = self._by_all_moves(self._turned(on), back=False).flatten(-2)
+        anywhere, off = (belief @ self.free)[..., None], (belief @ self.gone)[..., None]
+        return torch.cat([moved + anywhere * self.each, off], -1)
 
     def expected(self, message: Tensor) -> Tensor:
         """What a message of the next query says of the state before: the transpose of `moved`."""
         on, off = self._split(message)
-        moved = self._by_all_moves(on, back=True)
-        moved = self._turned(moved + self.lost * off[..., None]).flatten(-2)
-        _, jump, leave, enter = self.rates
-        mean = self._mean(message)
-        before = self.stay * moved + (jump * mean + leave * off)
-        return torch.cat([before, enter * mean + (1 - enter) * off], -1)
+        moved = self._turned(self._by_all_moves(on, back=True)).flatten(-2)
+        anywhere = self.each * message[..., :-1].sum(-1, keepdim=True)
+        return F.pad(moved, (0, 1)) + (anywhere * self.free + off * self.gone)
 
     def best_moved(self, log: Tensor) -> Tensor:
         """Log probabilities of the best way to each state in a step, from those before it (Viterbi)."""
         on, off = self._split(log)
-        _, jump, leave, enter = self.rates
+        _, jump, _, enter = self.rates
         anywhere = jump * self.each
         turn = self.layout.turn if self.layout.directions == 2 else 0.0
         best = torch.full_like(on, -math.inf)
         for move in self.moves[::-1]:
             best = self._best_shifted(best)
-            best = torch.maximum(best, on + (self.stay * move * (1 - turn) + anywhere).log())
+            best = torch.maximum(best, on + (move * (1 - turn) + anywhere).log())
             if turn:
-                turned = on.flip(-1, -2) + (self.stay * move * turn + anywhere).log()
+                turned = on.flip(-1, -2) + (move * turn + anywhere).log()
                 best = torch.maximum(best, turned)
         jumped = torch.maximum(on.amax() + anywhere.log(), off + (enter * self.each).log())
-        gone = 1 - self.layout.share
-        left = (on + (self.stay * self._turned(self.lost) + leave + gone * jump).log()).amax()
-        stayed = off + (1 - enter + gone * enter).log()
-        return torch.cat([best.flatten().maximum(jumped), torch.maximum(left, stayed)])
+        left = log + self.gone.log()
+        return torch.cat([best.flatten().maximum(jumped), left.amax()[None]])
 
     def _best_shifted(self, on: Tensor) -> Tensor:
         moved = F.pad(on[..., :-1], (1, 0), value=-math.inf)
@@ -211,15 +207,19 @@ class Motion:
             before: (..., S) beliefs given all queries so far. after: (..., S) messages of the next query and
                 all after it, of any scale.
         """
-        (on, off), (shifted, off_after) = self._split(before), self._split(after)
+        (on, off), (on_after, off_after) = self._split(before), self._split(after)
         start, off, off_after = self._turned(on), off[..., 0], off_after[..., 0]
-        total, mean = before[..., :-1].sum(-1), self._mean(after)[..., 0]
+        total, mean = (
+            before[..., :-1].sum(-1),
+            torch.lerp(off_after, after[..., :-1].mean(-1), self.layout.share),
+        )
         _, jump, leave, enter = self.rates
         kinds = []
-        for move, reach in zip(self.moves, self.reach, strict=True):
-            arrived = (start * shifted).sum((-1, -2)) + off_after * (start * (1 - reach)).sum((-1, -2))
-            kinds.append(self.stay * move * arrived)
-            shifted = self._shifted_back(shifted)
+        for move, reach, shifted in zip(
+            self.moves, self.reach, self._shifts(on_after, back=True), strict=True
+        ):
+            lost = start.flatten(-2) @ (1 - reach).flatten()
+            kinds.append(move * ((start * shifted).sum((-1, -2)) + off_after * lost))
         kinds += [jump * total * mean, leave * total * off_after]
         kinds += [enter * off * mean, (1 - enter) * off * off_after]
         each = torch.stack(kinds, -1).flatten(0, -2)

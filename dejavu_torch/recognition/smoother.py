@@ -19,7 +19,7 @@ from dejavu_torch.recognition.evidence import (
     speaking,
     standardised,
 )
-from dejavu_torch.recognition.filter import near_scores
+from dejavu_torch.recognition.filter import near_scores, window_sums
 from dejavu_torch.recognition.motion import (
     MIN_PROBABILITY,
     Counts,
@@ -54,9 +54,11 @@ REPEATED = 0.8  # and where they explain as much, they show the same
 FOUND = 0.05  # mass of a place that is found
 CLEARLY = 5.0  # and times as many as at one place a query
 WHOLE = "a smoother has to know the whole drive; expected a PlaceFilter, or a SequenceMatcher"
-BLOCK = 2**22  # numbers of a block of queries and states
+BLOCK = 2**20  # numbers of a block of queries and states, which stays in the cache
+HELD = 2**25  # of all of them, up to which they are kept for the way back
 
 Rows = Callable[[Tensor], Tensor]  # numbers of queries (B,) -> their scores (B,N)
+Likelihood = Callable[[int, int], Tensor]  # of the queries [first, last), (..., B, S)
 
 
 class Block(NamedTuple):
@@ -85,6 +87,12 @@ class Sample(NamedTuple):
     weight: Tensor
     still: Tensor
     layout: Layout
+
+    def part(self, first: int, last: int) -> Sample:
+        """The queries [first, last) of each stretch."""
+        z, valid, speaks = self.std
+        std = Standardised(z[..., first:last, :], valid[..., first:last, :], speaks[..., first:last])
+        return Sample(std, self.weight[..., first:last], self.still[..., first:last], self.layout)
 
 
 class Fit(NamedTuple):
@@ -385,57 +393,73 @@ class PlaceSmoother(SequenceModel):
         return self
 
     def _fitted(
-        self, samples: Sequence[Sample], ranks: RankTable, start: Sequence[float], moving: float
+        self, samples: Sequence[Sample], ranks: RankTable, start: Sequence[float], moved: float
     ) -> Fit:
-        """Expectation-maximisation from a start of the moves, which is their prior; `moving` queries."""
+        """Expectation-maximisation from a start of the moves, which is their prior; `moved` queries move."""
         z = samples[0].std.z
         prior, separation = z.new_tensor(start), self.first_separation
         rates = Rates(prior, *(prior.new_tensor(rate) for rate in self.rate_prior))
-        rights: list[Tensor] = []  # shares of the scores that are right ones
-        for round in range(ROUNDS + 1):
-            table = RankTable(ranks.counts)
-            for sample, right in zip(samples, rights, strict=False):
-                table.add(sample.std.z, -right)
-            seen = [self.explained(sample, table.values, separation, rates) for sample in samples]
-            if round == ROUNDS:
-                break
-            rights, sums, counts = [], z.new_zeros(2), []
-            for sample, (x, _, motion, block) in zip(samples, seen, strict=True):
-                shares = (sample.weight * sample.std.speaks)[..., None]
-                near = near_mass(self.folded(block.posterior)[..., :-1], RADIUS)
-                rights.append(shares * sample.std.valid * near)
-                # without its own evidence, that of a query is not mistaken for that of its place
-                others = self.folded(normalised(block.before * block.after))[..., :-1] * shares
-                known = torch.where(sample.std.valid, x, 0)
-                sums += torch.stack([(others * known).sum(), others.sum()])
-                belief, after = normalised(block.before * block.likelihood), block.likelihood * block.after
-                steps = ~sample.still[..., 1:]
-                counts.append(motion.counts(belief[..., :-1, :][steps], after[..., 1:, :][steps]))
+        table = ranks
+        for _ in range(ROUNDS):
+            values, table, sums, counts = table.values, RankTable(ranks.counts), z.new_zeros(2), []
+            for sample in samples:
+                motion, queries, later = Motion(sample.layout, rates), sample.weight.shape[-1], None
+                for block in self.explained(sample, values, separation, motion):
+                    first, last = block.first, block.first + block.log.shape[-1]
+                    std, weight, *_ = sample.part(first, last)
+                    shares = (weight * std.speaks)[..., None]
+                    near = near_mass(self.folded(block.posterior)[..., :-1], RADIUS)
+                    table.add(std.z, -shares * std.valid * near)  # right ones
+                    # without its own evidence, that of a query is not mistaken for that of its place
+                    others = self.folded(normalised(block.before * block.after))[..., :-1] * shares
+                    known = torch.where(std.valid, RankTable.look_up(values, std.z), 0)
+                    sums += torch.stack([(others * known).sum(), others.sum()])
+                    belief, after = block.before * block.likelihood, block.likelihood * block.after
+                    later = after[..., 1:, :] if later is None else torch.cat([after[..., 1:, :], later], -2)
+                    moving = ~sample.still[..., first + 1 : last + 1]
+                    counts.append(
+                        motion.counts(belief[..., : min(last, queries - 1) - first, :][moving], later[moving])
+                    )
+                    later = after[..., :1, :]
             separation = max(MIN_SEPARATION, float(sums[0] / sums[1].clamp(min=MIN_PROBABILITY)))
             total = Counts(*(torch.stack(kind).sum(0) for kind in zip(*counts, strict=True)))
-            rates = updated_rates(total, prior * (MOVE_SHARE * moving), self.rate_prior)
-        second = 0.0
-        for sample, (_, log, motion, block) in zip(samples, seen, strict=True):
-            found = self.folded(block.posterior)[..., :-1]
-            elsewhere = (near_mass(found, RADIUS) > FOUND).float()
-            elsewhere = near_mass(elsewhere, RADIUS) == 0
-            unlikely = log.clamp(max=-(separation**2) / 2 / self.tempering)
-            second += float(self._swept(torch.where(elsewhere, log, unlikely), sample, motion).log.sum())
-        first = float(sum(block.log.sum() for *_, block in seen))
-        return Fit(rates, separation, table.values, first, second)
+            rates = updated_rates(total, prior * (MOVE_SHARE * moved), self.rate_prior)
+        values, first, second = table.values, 0.0, 0.0
+        for sample in samples:
+            motion, masks = Motion(sample.layout, rates), []
+            for block in self.explained(sample, values, separation, motion):
+                first += float(block.log.sum())
+                found = near_mass(self.folded(block.posterior)[..., :-1], RADIUS) > FOUND
+                masks.append(near_mass(found.float(), RADIUS) == 0)
+            likelihood = self._likelihood(sample, values, separation, torch.cat(masks[::-1], -2))
+            numbers = range(0, sample.weight.shape[-1], masks[-1].shape[-2])
+            parts = forward(motion, likelihood, numbers, sample.still)
+            second += sum(float(part.log.sum()) for part in parts)
+        return Fit(rates, separation, values, first, second)
 
     def explained(
-        self, sample: Sample, values: Tensor, separation: float, rates: Rates
-    ) -> tuple[Tensor, Tensor, Motion, Block]:
-        """Normal scores of a sample, their log likelihood, and what follows from it."""
-        x, motion = RankTable.look_up(values, sample.std.z), Motion(sample.layout, rates)
-        log = log_likelihood(x, sample.std, sample.weight, separation, self.tempering)
-        return x, log, motion, self._swept(log, sample, motion)
+        self, sample: Sample, values: Tensor, separation: float, motion: Motion, size: int | None = None
+    ) -> Iterator[Block]:
+        """What follows from a sample, in blocks of `size` queries, the last first."""
+        *lead, queries = sample.weight.shape
+        if size is None:
+            size = max(1, BLOCK // (math.prod(lead) * (2 * sample.layout.places + 1)))
+        yield from sweep(motion, self._likelihood(sample, values, separation), queries, sample.still, size)
 
-    def _swept(self, log: Tensor, sample: Sample, motion: Motion) -> Block:
-        like = self.wide(log, 0.0).exp()
-        (block,) = sweep(motion, lambda *_: like, log.shape[-2], sample.still, log.shape[-2])
-        return block
+    def _likelihood(
+        self, sample: Sample, values: Tensor, separation: float, elsewhere: Tensor | None = None
+    ) -> Likelihood:
+        """The likelihoods of a sample; `elsewhere` (..., L, N): only those places may be likely."""
+
+        def likelihood(first: int, last: int) -> Tensor:
+            std, weight, *_ = sample.part(first, last)
+            log = log_likelihood(RankTable.look_up(values, std.z), std, weight, separation, self.tempering)
+            if elsewhere is not None:
+                unlikely = log.clamp(max=-(separation**2) / 2 / self.tempering)
+                log = torch.where(elsewhere[..., first:last, :], log, unlikely)
+            return self.wide(log, 0.0).exp()
+
+        return likelihood
 
     @torch.no_grad()
     def settled(self) -> dict[str, Any]:
@@ -513,19 +537,32 @@ def log_likelihood(
     return torch.where(std.speaks[..., None], log.masked_fill(~std.valid, -math.inf), 0)
 
 
-def sweep(
-    motion: Motion, likelihood: Callable[[int, int], Tensor], queries: int, still: Tensor, size: int
-) -> Iterator[Block]:
-    """Forward and backward over the queries, in blocks of `size`, which come from the last to the first.
+class Ahead(NamedTuple):
+    """As `Block`, of a pass forward alone; start: (..., S), the belief before any move to its first query."""
+
+    first: int
+    start: Tensor
+    before: Tensor
+    likelihood: Tensor
+    log: Tensor
+
+
+def forward(
+    motion: Motion,
+    likelihood: Likelihood,
+    numbers: range,
+    still: Tensor,
+    start: Tensor | None = None,
+) -> Iterator[Ahead]:
+    """Forward over the queries, in blocks.
 
     Args:
-        likelihood: of the queries [first, last), (..., B, S). still: (..., Q) bool, where nothing moves.
+        likelihood: of the queries [first, last), (..., B, S). numbers: the first queries of all blocks.
+        still: (..., Q) bool, where nothing moves. start: the belief to begin with.
     """
-    starts, belief = [*range(0, queries, size)], motion.anywhere()
-    beliefs, stops = {}, bool(still.any())
-
-    def forward(first: int, belief: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        like = likelihood(first, min(first + size, queries))
+    belief, stops = motion.anywhere() if start is None else start, bool(still.any())
+    for first in numbers:
+        start, like = belief, likelihood(first, min(first + numbers.step, numbers.stop))
         before, totals = [], []
         for t, seen in enumerate(like.unbind(-2), first):
             if t:
@@ -536,17 +573,23 @@ def sweep(
             total = joint.sum(-1, keepdim=True)
             belief = joint / total
             totals.append(total)
-        return like, torch.stack(before, -2), torch.cat(totals, -1).log(), belief
+        yield Ahead(first, start, torch.stack(before, -2), like, torch.cat(totals, -1).log())
 
-    for first in starts[:-1]:
-        beliefs[first] = belief
-        *_, belief = forward(first, belief)
+
+def sweep(motion: Motion, likelihood: Likelihood, queries: int, still: Tensor, size: int) -> Iterator[Block]:
+    """Forward and backward over the queries, in blocks of `size`, which come from the last to the first;
+    see `forward`."""
+    numbers, stops, parts = range(0, queries, size), bool(still.any()), []
+    for part in forward(motion, likelihood, numbers, still):
+        held = part.first == numbers[-1] or part.before[..., 0, :].numel() * queries <= HELD
+        parts.append((part.first, part.start, part if held else None))
     message: Tensor | None = None  # of the queries after a block, with their own likelihoods
-    for first in starts[::-1]:
-        like, before, log, _ = forward(first, beliefs.pop(first, belief))
+    while parts:
+        first, start, known = parts.pop()
+        part = known or next(forward(motion, likelihood, numbers[first // size :], still, start))
         after = []
-        for t in reversed(range(first, first + like.shape[-2])):
-            seen = like[..., t - first, :]
+        for t in reversed(range(part.first, part.first + part.before.shape[-2])):
+            seen = part.likelihood[..., t - part.first, :]
             if message is None:
                 message = torch.ones_like(seen)
             else:
@@ -555,7 +598,7 @@ def sweep(
             after.append(message)
             message = message * seen
             message = message / message.amax(-1, keepdim=True)
-        yield Block(first, before, like, torch.stack(after[::-1], -2), log)
+        yield Block(part.first, part.before, part.likelihood, torch.stack(after[::-1], -2), part.log)
 
 
 def updated_rates(counts: Counts, prior: Tensor, rates: Sequence[float] = RATES) -> Rates:
@@ -578,8 +621,7 @@ def normalised(mass: Tensor) -> Tensor:
 def near_mass(mass: Tensor, radius: int) -> Tensor:
     """The mass of each place and its neighbours up to a radius, (..., N) -> (..., N)."""
     radius = min(radius, mass.shape[-1])
-    flat = F.pad(mass.reshape(-1, 1, mass.shape[-1]), (radius, radius))
-    return (F.avg_pool1d(flat, 2 * radius + 1, 1) * (2 * radius + 1)).view_as(mass).clamp(0, 1)
+    return window_sums(F.pad(mass, (radius, radius)), 2 * radius + 1).clamp(0, 1)
 
 
 def stretches(queries: int, correlation: float, places: int = 1, repeated: float = 1.0) -> Tensor:
