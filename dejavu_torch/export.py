@@ -15,7 +15,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -25,6 +24,7 @@ from dejavu_torch.maps.spectral_map import SpectralMap, scores_of
 from dejavu_torch.model import DejaVu, require_map
 from dejavu_torch.recognition.calibration import MARGIN
 from dejavu_torch.recognition.calibration import TOLERANCE as TOLERANCE_OF_MARGIN
+from dejavu_torch.recognition.centring import running_mean
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.text import one_line
@@ -87,10 +87,11 @@ class Resized(nn.Module):
 class Graph(nn.Module):
     """The exported form of a model: frames (B,C,H,W), or features (B,D), -> scores (B,N).
 
-    With a sequence: one frame (1,C,H,W) and the state before it -> scores (1,N) and the next state.
+    With a sequence: one frame (1,C,H,W) and the state before it -> scores (1,N) and the next state. If it is
+    `centred`, there is a further state, of the mean.
     """
 
-    def __init__(self, model: DejaVu, sequence: SequenceModel | None = None) -> None:
+    def __init__(self, model: DejaVu, sequence: SequenceModel | None = None, centred: bool = False) -> None:
         super().__init__()
         parts: dict[str, nn.Module] = {}
         shape = model.frame_shape or ()
@@ -106,14 +107,24 @@ class Graph(nn.Module):
         parts["map"] = Decoded(model.map) if isinstance(model.map, SpectralMap) else model.map
         self.parts = nn.ModuleDict(parts)  # the stages in order
         self.sequence = sequence
+        self.centring = running_mean(model.map) if centred else None
 
-    def forward(self, frames: Tensor, state: Tensor | None = None) -> Tensor | tuple[Tensor, Tensor]:
-        for part in self.parts.values():
+    def forward(self, frames: Tensor, *states: Tensor) -> Tensor | tuple[Tensor, ...]:
+        after: list[Tensor] = []
+        for name, part in self.parts.items():
+            if name == "map" and self.centring is not None:
+                frames, mean = self.centring(frames, states[-1])
+                after.append(mean)
             frames = part(frames)
-        return frames if self.sequence is None or state is None else self.sequence.step(frames, state)
+        if self.sequence is not None:
+            frames, state = self.sequence.step(frames, states[0])
+            after.insert(0, state)
+        return (frames, *after) if after else frames
 
 
-def export_onnx(model: DejaVu, path: str | Path, sequence: SequenceModel | None = None) -> Exported:
+def export_onnx(
+    model: DejaVu, path: str | Path, sequence: SequenceModel | None = None, centre: bool = False
+) -> Exported:
     """Write preprocessing, features, whitening, map and scores as one ONNX file, opset 18.
 
     Args:
@@ -121,10 +132,12 @@ def export_onnx(model: DejaVu, path: str | Path, sequence: SequenceModel | None 
         path: of the file, which is written only if onnxruntime reproduces torch's scores.
         sequence: a `SequenceMatcher` or a `PlaceFilter`. The file then maps one frame and the state before it
             to scores and the next state, see `SequenceModel.step`.
+        centre: remove the mean of the frames so far from each, see `RunningMean`, which is a state as well.
 
     Shape: `frames` (B,C,H,W) float32 in [0, 1] -> `scores` (B,N), for any B, H and W: frames are resized to
         the size of the map's. For a map of ready features the input is `features` (B,D). With a sequence
-        `frames` (1,C,H,W), `state` -> `scores` (1,N), `next_state`.
+        `frames` (1,C,H,W), `state` -> `scores` (1,N), `next_state`. If centred, `mean` (K+1,) is the last
+        input, zeros before the first frame, and `next_mean` the last output.
 
     Convention: the metadata's entry "dejavu_torch" is JSON: names and shapes of inputs and outputs, the
         number of places, and if there is one, the threshold, the calibration for single frames, the step
@@ -160,15 +173,14 @@ def export_onnx(model: DejaVu, path: str | Path, sequence: SequenceModel | None 
         seen = f"{model.map.places} places of {model.map.dimension} dimensions need {size / 1e9:.1f} GB"
         raise InputError(f"{seen}; expected at most {MAX_BYTES / 1e9:.1f} GB in an ONNX file")
     device = model.map.device
-    graph = Graph(model, sequence)
+    graph = Graph(model, sequence, centre)
     shape, generator = (TRIED, *model.frame_shape), torch.Generator().manual_seed(0)
     noise = torch.rand(shape, generator=generator, dtype=torch.float32).to(device)
     noise[1:, ..., : noise.shape[-1] // 2], noise[2:] = 0, 0  # half a flat frame, a flat frame
-    facts = _facts(model, sequence)
+    facts = _facts(model, sequence, centre)
     with torch.no_grad(), in_mode(graph, False), _quiet():
-        inputs: tuple[Tensor, ...] = (noise[:2],)
-        if sequence is not None:
-            inputs = noise[:1], sequence.start(model.map.places, fixed=True).to(device)
+        states = [first.to(device) for first in _first_states(facts)]
+        inputs = noise[: 2 if sequence is None else 1], *states
         try:
             names = [*facts["inputs"]], [*facts["outputs"]]
             free = {0: "batch"} if sequence is None else {}
@@ -197,19 +209,22 @@ def session_of(file: str | bytes, threads: int = 0) -> Any:
 def run_session(session: Any, frames: Tensor) -> Tensor:
     """Scores of frames, or of features, from a session: (B,C,H,W) -> (B,N); one by one with a sequence."""
     facts = json.loads(session.get_modelmeta().custom_metadata_map[METADATA])
-    name, *states = facts["inputs"]
-    arrays = frames.cpu().numpy()
-    if not states:
-        return torch.from_numpy(session.run(None, {name: arrays})[0])
-    state = np.full(facts["inputs"]["state"], float(facts["first_state"]), np.float32)
-    rows = []
-    for frame in arrays:
-        scores, state = session.run(None, {name: frame[None], "state": state})
+    name, *names = facts["inputs"]
+    states, rows = [state.numpy() for state in _first_states(facts)], []
+    for part in frames.cpu().split(1 if "state" in names else max(1, len(frames))):
+        given = {name: part.numpy(), **dict(zip(names, states, strict=True))}
+        scores, *states = session.run(None, given)
         rows.append(torch.from_numpy(scores))
     return torch.cat(rows)
 
 
-def _facts(model: DejaVu, sequence: SequenceModel | None) -> dict[str, Any]:
+def _first_states(facts: dict[str, Any]) -> list[Tensor]:
+    """The states before the first frame, from the metadata."""
+    first = {"state": float(facts.get("first_state", 0)), "mean": 0.0}
+    return [torch.full(shape, first[name]) for name, shape in facts["inputs"].items() if name in first]
+
+
+def _facts(model: DejaVu, sequence: SequenceModel | None, centre: bool) -> dict[str, Any]:
     """The metadata; free dimensions have a name."""
     shape, places = list(model.frame_shape or ()), model.map.places
     name, sizes = ("frames", [*shape[:1], "height", "width"]) if len(shape) == 3 else ("features", shape)
@@ -229,6 +244,8 @@ def _facts(model: DejaVu, sequence: SequenceModel | None) -> dict[str, Any]:
         facts["sequence"] = str(sequence)
         threshold = sequence.threshold_of(model.threshold)
         threshold = sequence.likely if threshold is None else threshold  # without a calibration
+    if centre:
+        facts["inputs"]["mean"] = facts["outputs"]["next_mean"] = [model.map.dimension + 1]
     facts |= {} if threshold is None else {"threshold": threshold}
     return facts | ({} if model.step is None else {"step": model.step})
 
@@ -239,7 +256,8 @@ def _program(
     """The ONNX program of a module; `free` names the variable dimensions of the first input."""
     # exported here, since torch.onnx.export would fall back to ways that fix the batch size
     sizes = {axis: torch.export.Dim(name, min=1, max=MAX_SIZE) for axis, name in free.items()}
-    shapes = (sizes or None, *[None] * (len(inputs) - 1))
+    states = (None,) * (len(inputs) - 1)
+    shapes = (sizes or None, states) if states else (sizes or None,)
     program = torch.export.export(graph, inputs, dynamic_shapes=shapes)
     return torch.onnx.export(
         program,
@@ -302,15 +320,12 @@ def _serialised(program: Any, facts: dict[str, Any]) -> bytes:
 
 def _difference(written: bytes, graph: Graph, frames: Tensor, facts: dict[str, Any]) -> float:
     """The largest difference of onnxruntime's scores to torch's, relative above 1."""
-    if graph.sequence is None:
-        expected = graph(frames)
-    else:
-        state, rows = graph.sequence.start(facts["places"], fixed=True).to(frames.device), []
-        for frame in frames.split(1):
-            scores, state = graph(frame, state)
-            rows.append(scores)
-        expected = torch.cat(rows)
-    expected = expected.cpu()
+    states, rows = [state.to(frames.device) for state in _first_states(facts)], []
+    for part in frames.split(len(frames) if graph.sequence is None else 1):
+        found = graph(part, *states)
+        scores, *states = found if states else [found]
+        rows.append(scores)
+    expected = torch.cat(rows).cpu()
     scores = run_session(session_of(written), frames)
     difference = (scores - expected).abs() / expected.abs().clamp(min=1)
     return float(torch.where(scores == expected, 0, difference.nan_to_num(math.inf)).max())

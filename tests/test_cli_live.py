@@ -112,6 +112,21 @@ def test_with_a_lag_each_frame_has_its_line_later(
     assert "64 frames, 0 dropped" in err
 
 
+def test_a_filter_learns_and_queries_are_centred_on_the_way(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run("live", folder / "map.safetensors", folder / "second.mkv", "--learns", "--centre", "mean")
+    found, model = lines_of(capsys.readouterr().out), DejaVu.load(folder / "map.safetensors")
+    frames = open_source(folder / "second.mkv", model.frame_shape[1:])  # type: ignore[index,arg-type]
+    ways = [(learns, centre) for learns in (True, False) for centre in (True, False)]
+    scores = []
+    for learns, centre in ways:
+        localizer = LiveLocalizer(model, PlaceFilter(learns=learns), centre=centre)
+        scores.append([localizer(frame).score for frame in frames])
+    assert [line["score"] for line in found] == pytest.approx(scores[0], abs=1e-3)
+    assert all(one != pytest.approx(scores[0], abs=1e-3) for one in scores[1:])
+
+
 def test_a_pipe_is_brought_to_the_size_of_the_map(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -277,6 +292,7 @@ def test_a_page_of_a_file_plays_in_real_time_and_stays_until_ctrl_c(folder: Path
             "--lag 5 with --match single; expected --match filter",
         ),
         ("sim:aerial?frames=20 --lag 5 --sequence 3", "--lag 5 with --match sequence:3"),
+        ("sim:aerial?frames=20 --learns --match single", "--learns with --match single"),
     ],
 )
 def test_mistakes_are_one_line(

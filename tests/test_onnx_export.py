@@ -20,6 +20,7 @@ from dejavu_torch import (
     HOG,
     DejaVu,
     ImposedPeriods,
+    LiveLocalizer,
     PlaceFilter,
     Preprocess,
     SequenceMatcher,
@@ -132,6 +133,38 @@ def assert_streams(
     return facts
 
 
+@pytest.mark.parametrize("sequence", [None, PlaceFilter(within=2)], ids=["single", "filter"])
+def test_a_file_centres_as_a_live_run_does(sequence: PlaceFilter | None, tmp_path: Path) -> None:
+    model, queries = DejaVu(mapper=SpectralMapper(8.0)).learn(torch.rand(60, 4)), torch.rand(9, 4) + 1
+    facts = export_onnx(model, tmp_path / "map.onnx", sequence, centre=True).facts
+    assert [*facts["inputs"].items()][-1] == ("mean", [model.map.dimension + 1])
+    assert [*facts["outputs"]][-1] == "next_mean"
+    found, live = (
+        run_session(session_of(str(tmp_path / "map.onnx")), queries),
+        LiveLocalizer(model, sequence, centre=True),
+    )
+    for query, scores in zip(queries, found, strict=True):
+        live(query)
+        assert live.scores is not None
+        torch.testing.assert_close(scores, live.scores, rtol=0, atol=1e-4)
+    plain = export_onnx(model, tmp_path / "plain.onnx", sequence)
+    assert "mean" not in plain.facts["inputs"]
+    assert not torch.allclose(
+        found, run_session(session_of(str(tmp_path / "plain.onnx")), queries), atol=1e-2
+    )
+
+
+def test_only_maps_with_a_mean_centre(tmp_path: Path) -> None:
+    mapper = TemplateMapper(Fixed(FrequencyLayer(4, 4, 0, 20, (0, 1))))
+    model = DejaVu(mapper=mapper).learn(torch.rand(20, 3, 24, 24))
+    for centred in (
+        lambda: LiveLocalizer(model, None, centre=True),
+        lambda: export_onnx(model, tmp_path / "map.onnx", centre=True),
+    ):
+        with refused("TemplateMap has no mean", "expected a SpectralMap"):
+            centred()
+
+
 class Solves(nn.Module):
     """What ONNX has no operation for."""
 
@@ -214,6 +247,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert "expected one of them" in fails(
         capsys, *words, tmp_path / "map.onnx", "--filter", "--sequence", "3"
     )
+    assert "has no mean" in fails(capsys, *words, tmp_path / "map.onnx", "--centre", "mean")
     assert "the whole drive" in fails(capsys, *words, tmp_path / "map.onnx", "--match", "drive")
     assert "none.safetensors" in fails(
         capsys, "export", tmp_path / "none.safetensors", "--onnx", tmp_path / "map.onnx"

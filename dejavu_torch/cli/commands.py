@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -311,7 +311,8 @@ def run_live(
     searching.of(model)
     acceptance.of(model)
     model.matching(matcher)
-    follow(model, matcher, source, f"{without_password(source)} on {map}", page, reference, realtime, timeout)
+    title, centre = f"{without_password(source)} on {map}", sequences.centre == "mean"
+    follow(model, matcher, source, title, page, reference, realtime, timeout, centre)
 
 
 def run_compare(
@@ -478,6 +479,7 @@ def run_export(
     *,
     onnx: Path,
     sequences: options.Sequences,
+    centre: Literal["mean", "none"] = "none",
     threshold: float | None = None,
     features: nn.Module | None = None,
 ) -> None:
@@ -488,6 +490,7 @@ def run_export(
     Args:
         map: map file
         onnx: file to write (.onnx)
+        centre: mean removes the mean of the frames so far from each, as in live
         threshold: threshold to store in the file; the map's own if not given
         features: class of the map's features, if it is not part of dejavu_torch
     """
@@ -504,7 +507,7 @@ def run_export(
     if matcher is not None and model.precision is not None:
         seen = f"the map's precision, {model.precision}, only holds for single frames in an ONNX file"
         raise InputError(f"{seen}; expected --threshold with a sequence or a filter")
-    written = export_onnx(model, onnx, matcher)
+    written = export_onnx(model, onnx, matcher, centre == "mean")
     for kind in ("inputs", "outputs"):
         shapes = (f"{name} {tuple(shape)}" for name, shape in written.facts[kind].items())
         print(f"{kind}: {', '.join(shapes)}".replace("'", ""))

@@ -37,6 +37,7 @@ def follow(
     reference: str | None = None,
     realtime: bool = False,
     timeout: float = 10.0,
+    centre: bool = False,
 ) -> None:
     """Localize the frames of a source until it ends or Ctrl-C; see `run_live`.
 
@@ -46,7 +47,7 @@ def follow(
     Raises:
         InputError: the source fails; the lines and the summary of earlier frames are printed first.
     """
-    localizer = LiveLocalizer(model, sequence, keep_scores=port is not None)
+    localizer = LiveLocalizer(model, sequence, port is not None, centre)
     title += f"; answers come {localizer.lag} frames later and know of these" if localizer.lag else ""
     frames, newest, name = frames_from(source, model, realtime, port is not None)
     recent: deque[float] = deque(maxlen=RECENT)  # milliseconds

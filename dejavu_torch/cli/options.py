@@ -96,9 +96,13 @@ class LiveSequences(Sequences):
         match: filter matches each frame with those before it, and is the default; sequence:T with T - 1
             before it, at constant speed; single by itself
         lag: frames by which the filter's answers come later, and which they know of
+        learns: the filter learns moves and sharpness on the way
+        centre: mean removes the mean of the frames so far from each
     """
 
     lag: int = 0
+    learns: bool = False
+    centre: Literal["mean", "none"] = "none"
 
     @property
     def way(self) -> str | None:
@@ -107,9 +111,10 @@ class LiveSequences(Sequences):
     def matcher(self, within: int, threshold: float | None) -> SequenceModel | Literal["auto"] | None:
         matcher = super().matcher(within, threshold)
         if isinstance(matcher, PlaceFilter):
-            return PlaceFilter(within=within, threshold=threshold, lag=self.lag)
-        if self.lag:
-            raise InputError(f"--lag {self.lag} with --match {self.way}; expected --match filter with it")
+            return PlaceFilter(within=within, threshold=threshold, lag=self.lag, learns=self.learns)
+        if self.lag or self.learns:
+            seen = f"--lag {self.lag}" if self.lag else "--learns"
+            raise InputError(f"{seen} with --match {self.way}; expected --match filter with it")
         return matcher
 
 

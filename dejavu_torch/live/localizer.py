@@ -13,7 +13,7 @@ from torch import Tensor
 from dejavu_torch.data.traverse import resize_like
 from dejavu_torch.features.extract import features_of, in_mode
 from dejavu_torch.model import DejaVu, check_queries
-from dejavu_torch.recognition.centring import running
+from dejavu_torch.recognition.centring import running_mean
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.types import InputError, Match, SequenceModel
 
@@ -44,7 +44,7 @@ class LiveLocalizer:
         model: with a map; frames are moved to its device.
         sequence: "filter" is a `PlaceFilter`; None matches each frame by itself.
         keep_scores: keep the scores of all places; otherwise single frames are searched as in `localize`.
-        centre: remove the mean of the frames so far from each, see `running`.
+        centre: remove the mean of the frames so far from each, see `RunningMean`.
 
     Shape: a frame (H,W), (H,W,3) or (C,H,W), tensor or array, uint8 or float in [0, 1] -> `LiveMatch`.
 
@@ -81,7 +81,7 @@ class LiveLocalizer:
         if not (sequence is None or sequence == "filter" or isinstance(sequence, SequenceModel)):
             seen = f"the sequence is {sequence!r}"
             raise InputError(f"{seen}; expected a SequenceModel such as PlaceFilter, 'filter' or None")
-        self.keep_scores, self.centre = keep_scores, centre
+        self.keep_scores, self.centring = keep_scores, running_mean(model.map) if centre else None
         self.model, self.sequence = model, PlaceFilter() if isinstance(sequence, str) else sequence
         self._shape: tuple[int, ...] | None = None  # of the latest valid frame
         whitening = model.whitening
@@ -91,7 +91,8 @@ class LiveLocalizer:
     def reset(self) -> None:
         """Forget all frames."""
         self.scores: Tensor | None = None
-        self._mean: Tensor | None = None  # of the frames so far, see `running`
+        place_map = self.model.map
+        self._mean = torch.zeros(place_map.dimension + 1, device=place_map.device)  # of the frames so far
         matching = self.model.matching(self.sequence)
         keep = self._keep if self.keep_scores else None
         self._localizer = self.model.localizer(matching._replace(callback=keep))
@@ -109,8 +110,8 @@ class LiveLocalizer:
         """The answers that a frame completes: its own, or that of the frame `lag` before, if there is one."""
         start, mean = time.perf_counter(), self._mean
         descriptor = self._describe(as_batch(frame, self.model.map.device))
-        if self.centre:
-            descriptor, mean = running(self.model.map, descriptor, mean)
+        if self.centring is not None:
+            descriptor, mean = self.centring(descriptor, mean)
         self._localizer.skip(min(left_out, MAX_SKIPPED))
         match = self._localizer(descriptor)
         self._mean = mean

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.recognition.evidence import run_lengths, unchanged
+from dejavu_torch.types import InputError
 
 PRIOR = 50  # queries that the map's own mean counts as; fewer queries are not centred by default
 
@@ -27,24 +28,37 @@ def centred(place_map: PlaceMap, queries: Tensor) -> Tensor:
         return queries
     weight = 1 / run_lengths(unchanged(queries)).to(queries)
     shift = weight @ (queries - place_map.mean.to(queries))
-    return _without(place_map, queries, shift / (weight.sum() + PRIOR))
+    return _without(place_map.metric, queries, shift / (weight.sum() + PRIOR))
 
 
-def running(
-    place_map: PlaceMap, queries: Tensor, before: Tensor | None = None
-) -> tuple[Tensor, Tensor | None]:
+class RunningMean(nn.Module):
     """As `centred`, for consecutive batches: each query by the mean of those up to it.
 
-    Shape: (B,K), the state (K+1,) or None before the first query -> (B,K), the next state: the sum of q - m,
-        and the number of queries.
+    Shape: queries (B,K), the state (K+1,) before them -> (B,K), the next state: the sum of q - m, and the
+        number of queries. The first state is 0.
     """
-    if not isinstance(place_map, SpectralMap) or not len(queries):
-        return queries, before
-    sums = F.pad(queries - place_map.mean.to(queries), (0, 1), value=1.0).cumsum(0)
-    sums = sums if before is None else sums + before
-    return _without(place_map, queries, sums[:, :-1] / (sums[:, -1:] + PRIOR)), sums[-1]
+
+    mean: Tensor
+
+    def __init__(self, place_map: SpectralMap) -> None:
+        super().__init__()
+        self.metric = place_map.metric
+        self.register_buffer("mean", place_map.mean)
+
+    def forward(self, queries: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        mean = self.mean.to(queries)
+        sums = state + F.pad(queries - mean, (0, 1), value=1.0).cumsum(0)
+        return _without(self.metric, queries, sums[:, :-1] / (sums[:, -1:] + PRIOR)), sums[-1]
 
 
-def _without(place_map: SpectralMap, queries: Tensor, mean: Tensor) -> Tensor:
+def running_mean(place_map: PlaceMap) -> RunningMean:
+    """The running mean of a map's queries, or an InputError."""
+    if not isinstance(place_map, SpectralMap):
+        seen = f"a {type(place_map).__name__} has no mean"
+        raise InputError(f"{seen}; expected a SpectralMap to centre queries")
+    return RunningMean(place_map)
+
+
+def _without(metric: str, queries: Tensor, mean: Tensor) -> Tensor:
     moved = queries - mean
-    return F.normalize(moved, dim=1) if place_map.metric == "cosine" else moved
+    return F.normalize(moved, dim=1) if metric == "cosine" else moved

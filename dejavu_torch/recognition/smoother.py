@@ -424,18 +424,18 @@ class PlaceSmoother(SequenceModel):
             separation = max(MIN_SEPARATION, float(sums[0] / sums[1].clamp(min=MIN_PROBABILITY)))
             total = Counts(*(torch.stack(kind).sum(0) for kind in zip(*counts, strict=True)))
             rates = updated_rates(total, prior * (MOVE_SHARE * moved), self.rate_prior)
-        values, first, second = table.values, 0.0, 0.0
+        values, log, second = table.values, 0.0, 0.0
         for sample in samples:
             motion, masks = Motion(sample.layout, rates), []
             for block in self.explained(sample, values, separation, motion):
-                first += float(block.log.sum())
+                log += float(block.log.sum())
                 found = near_mass(self.folded(block.posterior)[..., :-1], RADIUS) > FOUND
                 masks.append(near_mass(found.float(), RADIUS) == 0)
             likelihood = self._likelihood(sample, values, separation, torch.cat(masks[::-1], -2))
             numbers = range(0, sample.weight.shape[-1], masks[-1].shape[-2])
             parts = forward(motion, likelihood, numbers, sample.still)
-            second += sum(float(part.log.sum()) for part in parts)
-        return Fit(rates, separation, values, first, second)
+            second += float(sum(part.log.sum() for part in parts))
+        return Fit(rates, separation, values, log, second)
 
     def explained(
         self, sample: Sample, values: Tensor, separation: float, motion: Motion, size: int | None = None
