@@ -546,15 +546,15 @@ MUTANTS = [
     Mutant(
         "Moves past the end of a route count as moves.",
         "dejavu_torch/recognition/motion.py",
-        " + off_after * (start * (1 - reach)).sum((-1, -2))",
+        " + off_after * lost",
         "",
         ("tests/recognition/test_motion.py::test_counts_are_those_of_each_pair_of_states",),
     ),
     Mutant(
         "The message of a query goes backwards through the turn as well.",
         "dejavu_torch/recognition/motion.py",
-        "moved = self._turned(moved + self.lost * off[..., None]).flatten(-2)",
-        "moved = (moved + self.lost * off[..., None]).flatten(-2)",
+        "moved = self._turned(self._by_all_moves(on, back=True)).flatten(-2)",
+        "moved = self._by_all_moves(on, back=True).flatten(-2)",
         ("tests/recognition/test_motion.py::test_a_step_is_that_of_the_matrix_and_keeps_the_mass",),
     ),
     Mutant(
@@ -651,8 +651,8 @@ MUTANTS = [
     Mutant(
         "The places of a window are a share of the map, and jumps to others leave them.",
         "dejavu_torch/recognition/motion.py",
-        "(1 - self.layout.share) * anywhere",
-        "0 * anywhere",
+        "left + (1 - layout.share) * self.free",
+        "left",
         ("tests/recognition/test_large.py::-k routes_and_circuits",),
     ),
     Mutant(
