@@ -16,6 +16,7 @@ from benchmarks import (
     scale,
     spread,
     storage,
+    teaching,
     train,
     trainings,
 )
@@ -30,6 +31,7 @@ BENCHES: dict[str, Any] = {  # each returns the lines to print
     "matcher": matcher.run_matcher,
     "storage": storage.run_storage,
     "drives": drives.run_drives,
+    "teaching": teaching.run_teaching,
     "train": train.run_train,
     "trainings": trainings.run_trainings,
     "distil": distil.run_distil,

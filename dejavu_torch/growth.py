@@ -24,10 +24,12 @@ from dejavu_torch.maps.spectral_map import LARGEST, Chunk, SpectralMap
 from dejavu_torch.model import DejaVu, features_per_frame, require_map
 from dejavu_torch.model_file import ModelState, Recipe, difference, recipe_of, run_key, weights_of
 from dejavu_torch.motion.resampling import ResampledTraverse, source_of
+from dejavu_torch.teaching import place_drives
 from dejavu_torch.types import InputError, Traverse
 
 log = logging.getLogger("dejavu_torch")
 
+FEWEST = 30  # frames of a drive that is placed, at least
 EXACT = 2**24  # maximum number of even steps, with exact positions in float32
 
 
@@ -182,6 +184,17 @@ def associate(
     Raises:
         InputError: nothing says which places it shows, or it shows none.
     """
+    second, places, seen = _known_places(model, reference, second, truth)
+    if places is None:
+        raise InputError(f"{seen}; expected the same number, frame i at place i, or a truth for its places")
+    return LabelledFrames(second, places)
+
+
+def _known_places(
+    model: DejaVu, reference: Traverse | None, second: Traverse, truth: str | None
+) -> tuple[Traverse, Tensor | None, str]:
+    """As `associate`: the traverse at the map's steps and its places; None where nothing says them, with what
+    was seen."""
     if reference is None:
         table, shape, step = one_route(model, "average visits into").table, model.frame_shape, model.step
         name, source = "the map", None
@@ -201,11 +214,10 @@ def associate(
         places = torch.arange(frames)
     else:
         seen = f"{second.name} has {frames} frames and {name} {table.frames}"
-        seen += " at even steps" if step is not None else ""
-        raise InputError(f"{seen}; expected the same number, frame i at place i, or a truth for its places")
+        return second, None, seen + (" at even steps" if step is not None else "")
     if not (places >= 0).any():
         raise InputError(f"no frame of {second.name} shows a place of {name}; expected some")
-    return LabelledFrames(second, places)
+    return second, places, ""
 
 
 def second_traverse(
@@ -213,11 +225,16 @@ def second_traverse(
     reference: Traverse,
     second: Traverse | Sequence[Traverse],
     truth: str | Sequence[str | None] | None = None,
+    progress: bool = False,
 ) -> LabelledFrames:
     """As `associate`, for one or more traverses that whitening learns from, with one truth or one for each.
 
+    Where nothing says which places one shows, its frames have to be in order: a smoother places them on a map
+    of the reference, see `teaching.place_drives`.
+
     Raises:
-        InputError: no whitening that learns, another number of truths, other frame sizes, or as `associate`.
+        InputError: no whitening that learns, another number of truths, other frame sizes, fewer than 30
+            frames to place, or as `associate`.
     """
     visits = [second] if isinstance(second, Traverse) else [*second]
     model.descriptor.require_learning(" + ".join(traverse.name for traverse in visits))
@@ -226,8 +243,17 @@ def second_traverse(
     if len(truths) != len(visits):
         seen = f"{len(visits)} further traverses and {len(truths)} truths"
         raise InputError(f"{seen}; expected one for each, or one for all")
-    views = [associate(model, reference, *pair) for pair in zip(visits, truths, strict=True)]
-    return LabelledFrames(chained([v.traverse for v in views]), torch.cat([v.places for v in views]))
+    views = [_known_places(model, reference, *pair) for pair in zip(visits, truths, strict=True)]
+    drives = [(drive, places) for drive, places, _ in views]
+    known = [places for places in (places for _, places in drives) if places is not None]
+    if len(known) == len(drives):
+        return LabelledFrames(chained([drive for drive, _ in drives]), torch.cat(known))
+    for drive, places, seen in views:
+        if places is None and len(drive) < FEWEST:
+            expected = f"a truth for its places, or at least {FEWEST} frames in order"
+            raise InputError(f"{seen}; expected the same number, frame i at place i, {expected}")
+    model.descriptor.check_sizes(reference, *(drive for drive, _ in drives))
+    return place_drives(model, reference, drives, progress)
 
 
 def calibrate_if_possible(

@@ -141,7 +141,8 @@ def run_learn(
         if traverse is None:
             assert visits is not None
             checkpoint.check_unused()
-            count, traverse, places = growth.average(model, visits, progress=True), *visits
+            count = growth.average(model, visits, progress=True)
+            traverse, places = visits.traverse, visits.places
             done = f"{count} of the {start} places of {append}: averaged and coded again at the same step"
         elif append is not None:
             growth.append(model, traverse, True, checkpoint, map_tasks, visits)

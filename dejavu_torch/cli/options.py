@@ -293,7 +293,9 @@ class LearningOptions:
             reference = model.resample(reference, model.step, True, model.frame_shape)
             if self.second is not None:
                 truths = [None if truth is None else str(truth) for truth in several(self.second_truth)]
-                views = growth.second_traverse(model, reference, seconds, truths or None)
+                views = growth.second_traverse(model, reference, seconds, truths or None, True)
+                for line in views.placed_lines():
+                    print(line)
             if other is not None:
                 other = model.at_map_size(other, reference.frame_shape)
                 model.descriptor.check_sizes(reference, other)

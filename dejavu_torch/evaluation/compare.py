@@ -196,6 +196,7 @@ def compare(
         **_run_facts(run, seconds),
         **_match_facts(run, found, truth, interpolate, off_map),
         "centred": centring,
+        **({"second": second.placed_facts()} if second is not None and second.placed else {}),
         **{name: dict(picture.numbers) for name, picture in pictures.items() if picture.numbers},
     }
     if coded is not None and len(coded.chunks) == 1:

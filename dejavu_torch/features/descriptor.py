@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -21,7 +22,7 @@ from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.joined import Joined, groups_of
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import SAMPLE, AugmentedFrames, LabelledFrames, Sample, augmented_route
-from dejavu_torch.features.whitening import INDEPENDENT, MOST_VIEWS, WIDEST, Whitening
+from dejavu_torch.features.whitening import INDEPENDENT, MOST_VIEWS, WIDEST, Visits, Whitening
 from dejavu_torch.memory import IN_MEMORY, concatenate
 from dejavu_torch.types import BATCH_NUMBERS, BATCH_SIZE, InputError, Traverse
 
@@ -68,6 +69,7 @@ class Descriptor(nn.Module):
         self.batch_size, self.weight_bits = batch_size, weight_bits
         self.reduces = False  # whether the whitening was added for ready features that are too wide for a map
         self.warned: set[tuple[str, str]] = set()  # (traverse, line) of warnings that were logged
+        self.known: dict[Any, tuple[object, Tensor]] | None = None  # features, see `remembering`
         self.register_buffer("_where", torch.zeros(0), persistent=False)
 
     @property
@@ -97,7 +99,23 @@ class Descriptor(nn.Module):
         """Batches (B,D) of features, without gradients; see `feature_batches`."""
         height, width = own_size(self.features) or (1, 1)
         size = max(1, min(self.batch_size, BATCH_NUMBERS // (3 * height * width)))
-        return feature_batches(traverse, self, size, self.device, progress, verb, on_first, self.describe)
+        settings = self.device, progress, verb, on_first, self.describe
+        if self.known is None:
+            return feature_batches(traverse, self, size, *settings)
+        key = traverse.name if isinstance(traverse, AugmentedFrames) else id(traverse)
+        if key not in self.known:
+            features = concatenate(feature_batches(traverse, self, size, *settings))
+            self.known[key] = traverse, features  # which keeps its id
+        return (part.to(self.device) for part in self.known[key][1].split(ROWS))
+
+    @contextmanager
+    def remembering(self) -> Iterator[None]:
+        """In the block, the features of each traverse, and of the copies of one, are computed once."""
+        self.known = {}
+        try:
+            yield
+        finally:
+            self.known = None
 
     def batches(
         self,
@@ -130,7 +148,7 @@ class Descriptor(nn.Module):
 
         Args:
             second: another traverse of the same places, from which the whitening learns what changes between
-                visits, instead of from augmented copies; see `growth.second_traverse`.
+                visits, instead of from augmented copies, or besides; see `growth.second_traverse`.
             spectral: for a spectral map: ready features of over 256 dimensions are reduced to principal
                 components if there is no whitening, whitening learns from a sample if the features exceed
                 the memory, and many descriptors are kept in a temporary file, as float16 if they are
@@ -183,20 +201,29 @@ class Descriptor(nn.Module):
     ) -> None:
         if len(features) < 2:
             raise InputError(f"{traverse.name} has 1 frame; expected at least 2")
+        visits = second if second is not None and second.placed is not None else None
+        second = None if visits is not None else second
         source = "" if second is None else f"by {second.traverse.name}"
         if second is None and not is_ready(traverse) and whitening.views != 0:
             copies = whitening.copies(*features.shape)
             settings = copies, MOST_VIEWS, whitening.strengths, whitening.seed
             second, source = augmented_route(traverse, len(features), *settings)
         groups = None if is_ready(traverse) else groups_of(self.features)
-        if second is None:
-            whitening.learn(features, None, groups)
+        copied = second is not None and isinstance(second.traverse, AugmentedFrames)
+        samples = INDEPENDENT * len(features) if copied else None
+        views = None if second is None else self._shown(second, source, progress)
+        if visits is None or not (known := visits.places >= 0).any():
+            whitening.learn(features, views, groups, samples)
         else:
-            samples = INDEPENDENT * len(features) if isinstance(second.traverse, AugmentedFrames) else None
-            batches = self.features_in(second.traverse, progress, f"learning what changes: {source}")
-            shown = _with_places(batches, second.places.to(self.device))
-            whitening.learn(features, shown, groups, samples)
+            assert visits.placed is not None
+            shown = self._shown(visits, f"by {visits.traverse.name}", progress)
+            whitening.learn(features, views, groups, samples, Visits(shown, visits.placed.drive[known]))
         whitening.to(self.device)
+
+    def _shown(self, views: LabelledFrames, source: str, progress: bool) -> Iterator[tuple[Tensor, Tensor]]:
+        """Batches of features and the places that they show."""
+        batches = self.features_in(views.traverse, progress, f"learning what changes: {source}")
+        return _with_places(batches, views.places.to(self.device))
 
     @contextmanager
     def unchanged_by_errors(self) -> Iterator[None]:

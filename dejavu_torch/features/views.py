@@ -44,17 +44,48 @@ class Sample(NamedTuple):
     def views(self, second: LabelledFrames) -> LabelledFrames:
         """The views of the sample in a second traverse; InputError if there are none."""
         views = views_of(second, self.frame)
-        if not len(views.places):
+        if not len(views.places) and views.placed is None:
             seen = f"{second.traverse.name} shows none of the {len(self.frame)} frames that are learned from"
             raise InputError(f"{seen}, in segments of {self.segment} along the route; expected some")
         return views
 
 
+class Placed(NamedTuple):
+    """How a smoother placed the frames of drives, see `teaching.place_drives`.
+
+    drive: (n,) int64, the drive of each frame. names: of the drives that it placed, by number; the places of
+    others were known. probability: of a placed frame, at least. rounds: of placing.
+    """
+
+    drive: Tensor
+    names: Mapping[int, str]
+    probability: float
+    rounds: int
+
+
 class LabelledFrames(NamedTuple):
-    """Frames, and (n,) int64 the place of the reference that each shows, -1 for a frame to skip."""
+    """Frames, and (n,) int64 the place of the reference that each shows, -1 for a frame to skip. Whitening
+    learns from frames with `placed` and augmented copies, from others alone."""
 
     traverse: Traverse
     places: Tensor
+    placed: Placed | None = None
+
+    def placed_lines(self) -> Iterator[str]:
+        """What is said of each drive that a smoother has placed."""
+        drive, names, *_ = self.placed or (self.places, {})
+        for i, name in names.items():
+            own = self.places[drive == i] >= 0
+            left = f"{int((~own).sum())} left out" if own.any() else "nothing is learned from it"
+            yield f"{int(own.sum())} of {len(own)} frames of {name} placed; {left}"
+
+    def placed_facts(self) -> dict[str, Any] | None:
+        """The entry `second` of report.json; None if no smoother placed the frames."""
+        if self.placed is None:
+            return None
+        own = self.places[torch.isin(self.placed.drive, torch.tensor([*self.placed.names]))]
+        found = {"placed": int((own >= 0).sum()), "of": len(own)}
+        return {**found, "probability": self.placed.probability, "rounds": self.placed.rounds}
 
 
 def evenly_spaced(frames: int, length: int, count: int) -> Tensor:
@@ -68,7 +99,8 @@ def views_of(views: LabelledFrames, frames: Tensor) -> LabelledFrames:
     places = views.places.cpu()
     at = torch.searchsorted(frames, places).clamp(max=len(frames) - 1)
     shown = (frames[at] == places).nonzero().flatten()
-    return LabelledFrames(Part(views.traverse, shown), at[shown])
+    placed = views.placed and views.placed._replace(drive=views.placed.drive[shown])
+    return LabelledFrames(Part(views.traverse, shown), at[shown], placed)
 
 
 class AugmentedFrames:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor, nn
@@ -32,6 +32,8 @@ COPIES, MOST_OF_SHORT = 4000, 36  # of all frames, of each: chance decides less 
 BITS = (4, 8, 16)  # of a number of the projection
 FULL_BITS = 4 * DIMENSIONS  # per row of the projection of a long route
 SHRINKAGE = 0.03  # at least
+VISIT = 4.0  # how many augmented copies a frame of a drive counts as
+LIGHT = 50  # frames of a drive that its mean change is shrunk by
 SPARE = 32  # further directions of the randomised subspace, for accuracy
 ROUNDS = 3  # of its iteration
 STRENGTHS: Mapping[str, Any] = {  # defaults of `Augmentation`
@@ -44,26 +46,41 @@ ROUNDING = 1e-7  # of the largest variance: smaller ones count as 0
 _Components: TypeAlias = tuple[Tensor, Tensor, Tensor, int]  # mean, basis, variances, dimensions to keep
 
 
+class Visits(NamedTuple):
+    """Frames of drives that a smoother has placed: batches of descriptors (B,D) and places (B,), as of views,
+    and (n,) int64 the drive of each frame, in the order of the batches."""
+
+    batches: Iterable[tuple[Tensor, Tensor]]
+    drive: Tensor
+
+
 def learned_whitening(
-    views: Tensor, places: Tensor, kept: int, shrinkage: float | None = 0.5, samples: int | None = None
+    views: Tensor,
+    places: Tensor,
+    kept: int,
+    shrinkage: float | None = 0.5,
+    samples: int | None = None,
+    weight: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """The projection to directions that distinguish places but change little between two views of one.
 
     With d = (view - place) / 2, m = (view + place) / 2, C = E[d d^T], B = Cov[m], shrinkage a in (0, 1] (None
     is `oracle_shrinkage` of `samples` independent views, n if None, at least 0.03) and
     W = (1 - a) C + a tr(C) / K I, P has the `kept` directions with the largest p^T B p / p^T W p, scaled to
-    p^T W p = 1 (Mikolajczyk and Matas, ICCV 2007).
+    p^T W p = 1 (Mikolajczyk and Matas, ICCV 2007). A pair of `weight` (n,) w counts as w pairs.
 
     Shape: (n,K), (n,K) -> mean (K,), P (K,kept), float32.
     """
     n, k = views.shape
+    share = views.new_ones(n) if weight is None else weight.to(views) * n / weight.sum()
     within, second = views.new_zeros(2, k, k, dtype=torch.float64)
     mean = views.new_zeros(k, dtype=torch.float64)
-    for view, place in zip(views.split(ROWS), places.split(ROWS), strict=True):
+    for view, place, part in zip(views.split(ROWS), places.split(ROWS), share.split(ROWS), strict=True):
         change, middle = (view.double() - place.double()) / 2, (view.double() + place.double()) / 2
-        within += change.T @ change / n
-        second += middle.T @ middle / n
-        mean += middle.sum(0) / n
+        weighted = middle * part.double()[:, None]
+        within += (change * part.double()[:, None]).T @ change / n
+        second += weighted.T @ middle / n
+        mean += weighted.sum(0) / n
     scale, size = within.diagonal().mean(), second.diagonal().mean()
     if not scale.isfinite() or not scale > 1e-10 * size:
         seen = f"the mean square difference of {n} views from their places is {scale.item():.2g}"
@@ -243,6 +260,7 @@ class Whitening(nn.Module):
         views: Iterable[tuple[Tensor, Tensor]] | None = None,
         groups: Sequence[int] | None = None,
         samples: int | None = None,
+        visits: Visits | None = None,
     ) -> None:
         """Find the projection for one route.
 
@@ -251,34 +269,48 @@ class Whitening(nn.Module):
             views: batches of descriptors (B,D) and the places (B,) that they show, if any.
             groups: see `Joined`, if the constructor's groups are None.
             samples: number of independent views, for the shrinkage; None is all of them.
+            visits: frames of drives, which count `VISIT` times as much as views, without the mean change of
+                a drive, which is its own light.
         """
         groups = groups if self.groups is None else self.groups
         sizes = [places.shape[1]] if groups is None else [*groups]
         if sum(sizes) != places.shape[1]:
             seen = f"groups of {' + '.join(map(str, sizes))} dimensions, descriptors {tuple(places.shape)}"
             raise InputError(f"{seen}; expected (N, {sum(sizes)})")
-        bits = self.bits_of(len(places), views is not None)
+        compared = views is not None or visits is not None
+        bits = self.bits_of(len(places), compared)
         members = [self] if groups is None else [self._member() for _ in sizes]
         bases = []
         for member, group in zip(members, places.split(sizes, 1), strict=True):
-            kept = self.kept(len(places), group.shape[1], views is not None)
-            bases.append(member._components(group, kept, kept if views is None else self.components))
+            kept = self.kept(len(places), group.shape[1], compared)
+            bases.append(member._components(group, kept, self.components if compared else kept))
         pairs = None if views is None else _projected_views(places, views, bases)
+        weight = None
+        if visits is not None:
+            shown = _projected_visits(places, visits, bases)
+            weight = torch.ones(len(visits.drive)) * VISIT
+            if pairs is not None:
+                weight = torch.cat([torch.ones(pairs[0].shape[1]), weight])
+                samples = samples and samples + len(visits.drive)
+                shown = [torch.cat(both, 1) for both in zip(pairs, shown, strict=True)]
+            pairs = shown
         with torch.autocast(self.scale.device.type, enabled=False):
             if pairs is None:
                 for member, (mean, basis, variances, _) in zip(members, bases, strict=True):
                     member.take(mean, basis, variances.mean().sqrt(), bits)
             else:
                 for member, (mean, basis, _, kept), (shown, place) in zip(members, bases, pairs, strict=True):
-                    centre, projection = learned_whitening(shown, place, kept, self.shrinkage, samples)
+                    centre, projection = learned_whitening(
+                        shown, place, kept, self.shrinkage, samples, weight
+                    )
                     member.take(mean + basis @ centre, basis @ projection, None, bits)
             if groups is not None:
                 some = places[:: max(1, len(places) // SAMPLED)].to(self.scale.device).split(sizes, 1)
                 joined = torch.cat([member(group) for member, group in zip(members, some, strict=True)], 1)
-                kept = self.kept(len(places), joined.shape[1], views is not None)
+                kept = self.kept(len(places), joined.shape[1], compared)
                 # about zero, not the mean, to keep the inner products of all pairs, as cosines need
                 mean, basis, squares, _ = self._components(joined, kept, kept, centre=False)
-                if views is not None:
+                if compared:
                     basis = basis / (squares / squares.mean()) ** (LEVELLING / 2)
                 self.take(mean, basis, None, bits)
         self.members = nn.ModuleList([] if groups is None else members)
@@ -353,6 +385,17 @@ def _projected_views(
     if not pairs[0]:
         raise InputError("there are no views for whitening; expected at least one batch, or None")
     return [torch.cat(held, 1) for held in pairs]
+
+
+def _projected_visits(places: Tensor, visits: Visits, bases: Sequence[_Components]) -> list[Tensor]:
+    """As `_projected_views`, of visits, whose mean change is removed, drive by drive."""
+    pairs = _projected_views(places, visits.batches, bases)
+    for drive in visits.drive.unique():
+        own = (visits.drive == drive).nonzero()[:, 0].to(pairs[0].device)
+        for pair in pairs:
+            change = (pair[0, own] - pair[1, own]).sum(0) / (len(own) + LIGHT)
+            pair[0, own] -= change
+    return pairs
 
 
 @without_autocast
