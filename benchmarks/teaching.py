@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -18,17 +17,22 @@ from dejavu_torch.data.source import open_source
 from dejavu_torch.data.traverse import Part, fitted
 from dejavu_torch.evaluation.contenders import contend
 from dejavu_torch.features.views import LabelledFrames
+from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.centring import PRIOR, centred
-from dejavu_torch.teaching import place_drives
+from dejavu_torch.teaching import place_drives, refine
 from dejavu_torch.types import InputError
 
 COPIES, PLACED, TOLD = "augmented copies", "the drive, placed by itself", "the drive, true places"
-KEYS = ("asked", "placed", "of", "right", "rounds", "auc", "auc_by_confidence", "seconds", "skipped")
+REFINED = "the map refined, without its frames"
+KEYS = (
+    *("asked", "placed", "of", "right", "rounds", "auc", "auc_by_confidence", "gain", "error", "seconds"),
+    "skipped",
+)
 COLUMNS: dict[str, Column] = {
     **{"placed": ("placed", ".0f"), "of": ("of", ".0f"), "right": ("right", ".3f")},
     **{"rounds": ("rounds", ".0f"), "AUC": ("auc", ".3f"), "by confidence": ("auc_by_confidence", ".3f")},
-    "seconds": ("seconds", ".0f"),
+    **{"gain": ("gain", ".3f"), "error": ("error", ".3f"), "seconds": ("seconds", ".0f")},
 }
 
 
@@ -81,7 +85,8 @@ def bench_teaching(name: str, task: Task, data: Path) -> Iterator[Row]:
 
     Yields:
         placed, of: frames of the drive that teach, and all. right: share of those placed that are right, of
-        those whose place is known. auc, auc_by_confidence: of the queries, by single images.
+        those whose place is known. gain, error: see `Refinement`. auc,
+        auc_by_confidence: of the queries, by single images.
     """
     learned = task.learned.below(data)
     route = learned if task.asked is None else task.asked.below(data)
@@ -89,7 +94,7 @@ def bench_teaching(name: str, task: Task, data: Path) -> Iterator[Row]:
     shown = fitted(cut(open_source(learned.query), task.taught), reference.frame_shape)
     elsewhere = learned.truth is None  # a drive of another route
     truth = None if elsewhere else truth_of(reference, open_source(learned.query), learned.truth)
-    for way in (COPIES, PLACED, TOLD):
+    for way in (COPIES, PLACED, REFINED, TOLD):
         row, began = new_row(name, way, KEYS), time.perf_counter()
         if way == TOLD and elsewhere:
             continue
@@ -104,11 +109,17 @@ def bench_teaching(name: str, task: Task, data: Path) -> Iterator[Row]:
             row |= {"placed": int((views.places >= 0).sum()), "of": len(views.places)}
             row |= {"rounds": views.placed.rounds}
             row["right"] = None if truth is None else right_of(views, truth, task, learned.tolerance)
+        if way == REFINED:
+            found = refine(model, shown)
+            row |= {"placed": found.placed, "of": found.of, "gain": found.gain, "error": found.error}
         if task.asked is not None and route.reference != learned.reference:
-            whitening = copy.deepcopy(model.descriptor)
-            model = DejaVu()
-            model.descriptor.take(whitening, whitening=True)
+            taught, model = model, DejaVu()
+            model.descriptor.take(taught.descriptor, whitening=True)
             model.learn(open_source(route.reference))
+            assert isinstance(taught.map, SpectralMap)
+            assert isinstance(model.map, SpectralMap)
+            if len(taught.map.stage):
+                model.replace_map(model.map.refined(taught.map.stage * taught.map.stage_scale))
         yield row | asked(model, route, task) | {"seconds": time.perf_counter() - began}
 
 

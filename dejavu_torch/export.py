@@ -57,15 +57,19 @@ class Decoded(nn.Module):
 
     descriptors: Tensor
     norms: Tensor
+    stage: Tensor | None
 
     def __init__(self, place_map: SpectralMap) -> None:
         super().__init__()
         self.metric = place_map.metric
         decoded = torch.cat([place_map.decode(g) for g in range(len(place_map.chunks))])
-        self.register_buffer("descriptors", decoded.T.contiguous())
+        self.register_buffer("descriptors", place_map.staged(decoded).T.contiguous())
+        units = torch.eye(place_map.dimension, device=place_map.device) if len(place_map.stage) else None
+        self.register_buffer("stage", None if units is None else place_map.staged(units))
         self.register_buffer("norms", place_map.norms)
 
     def forward(self, queries: Tensor) -> Tensor:
+        queries = queries if self.stage is None else queries @ self.stage
         length: Tensor = torch.linalg.vector_norm(queries, dim=1, keepdim=True)
         if self.metric == "cosine":
             queries = queries / torch.where(length > 0, length, 1)

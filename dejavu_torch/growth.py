@@ -373,6 +373,11 @@ def _difference(first: DejaVu, other: DejaVu) -> str:
         if mine != yours:
             option = f", see --velocity.step {mine:g}" if isinstance(mine, float) else ""
             return f"their {what} differ: {mine} and {yours}; expected the same{option}"
+    stages = [(one.map.stage, one.map.stage_scale) for one in (first, other)]
+    if not all(map(torch.equal, *stages)):
+        return (
+            "different drives have refined them; expected maps that no drive refined, or that share a stage"
+        )
     shapes = first.frame_shape, other.frame_shape
     if None not in shapes and not _compatible(first, *shapes):  # type: ignore[arg-type]
         sizes = " and ".join(" x ".join(map(str, shape or ())) for shape in shapes)

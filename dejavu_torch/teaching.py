@@ -3,30 +3,45 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Sequence
+from itertools import accumulate
+from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
+from dejavu_torch.data.source import Source, as_traverse
 from dejavu_torch.data.traverse import chained
 from dejavu_torch.features.views import LabelledFrames, Placed
-from dejavu_torch.model import DejaVu
+from dejavu_torch.features.whitening import learned_whitening
+from dejavu_torch.maps.place_map import PlaceMap
+from dejavu_torch.maps.spectral_map import SpectralMap
+from dejavu_torch.memory import without_autocast
+from dejavu_torch.model import DejaVu, require_map
+from dejavu_torch.recognition.calibration import TOLERANCE, Calibration, calibrated_by_drive
 from dejavu_torch.recognition.centring import PRIOR, centred
+from dejavu_torch.recognition.evidence import spacing_of
 from dejavu_torch.recognition.smoother import PlaceSmoother
-from dejavu_torch.types import Traverse
+from dejavu_torch.types import InputError, Traverse
 
 SURE = 0.9  # probability of a frame that teaches
 FEWEST, SHARE = 60, 0.1  # frames of a drive that teaches, and their share of it, at least
 ROUNDS = 2  # of placing: the second time on a map that the first one taught
+LEAST = 30  # frames of a drive that is placed at all
+SHRINKAGE = 0.3  # of what a drive changes, when a stage is learned from it
+FOLDS = 4  # stretches of a drive, each asked after a stage that was learned from the others
+APART = 2  # correlation times between a stretch and what teaches its stage
+ERRORS = 1  # standard errors by which places have to rank higher after a new stage
+BLOCK = 2**22  # scores at a time
 
 
 @torch.no_grad()
 def place_drive(model: DejaVu, descriptors: Tensor) -> Tensor:
     """The place of each frame of a drive, as sure as `SURE`, by the drive as a whole: (Q,K) -> (Q,) int64, -1
     for the others. All are -1 if it is no drive of the map, or too few of its frames are sure."""
-    smoother, queries = PlaceSmoother(), descriptors
-    if len(queries) >= PRIOR:
-        queries = centred(model.map, queries)
+    smoother, queries = PlaceSmoother(), _in_its_light(model, descriptors)
     match = model.localize_descriptors(queries, model.matching(smoother)._replace(plain=descriptors))
     assert match.probability is not None
     places = torch.where(match.probability >= SURE, match.index, -1)
@@ -62,3 +77,119 @@ def place_drives(
                 break
     assert views is not None
     return views
+
+
+def _in_its_light(model: DejaVu, descriptors: Tensor) -> Tensor:
+    return centred(model.map, descriptors) if len(descriptors) >= PRIOR else descriptors
+
+
+class Refinement(NamedTuple):
+    """What a drive has taught a map.
+
+    placed, of: frames of the drive that teach, and all. gain: mean log ratio of the rank of a frame's place
+    by its image alone, before and after, in stretches that did not teach; error: its standard error.
+    accepted: whether the map is refined.
+    """
+
+    placed: int
+    of: int
+    gain: float = 0.0
+    error: float = 0.0
+    accepted: bool = False
+
+    def __str__(self) -> str:
+        if not self.placed:
+            return f"0 of {self.of} frames placed; nothing is learned, the map stays as it was"
+        told = f"its rank by one image, where it did not teach: {math.exp(-self.gain) - 1:+.1%}"
+        after = "the map is refined" if self.accepted else "the map stays as it was"
+        return f"{self.placed} of {self.of} frames placed; {told}; {after}"
+
+
+@torch.no_grad()
+def refine(model: DejaVu, drive: Source, progress: bool = False) -> Refinement:
+    """Learn what a drive changes from its frames and the map alone: a linear stage after which queries and
+    places are compared. The map's lines stay as they are.
+
+    The stage is learned from frames that a smoother has placed, see `place_drive`. It is taken if, in
+    stretches of the drive that did not teach it, places rank higher by `ERRORS` standard errors.
+
+    Args:
+        model: with a spectral map. If it is calibrated, that is done anew, by the drive.
+        drive: at least 30 frames in order, or descriptors as the map's.
+
+    Raises:
+        InputError: no spectral map, or a drive that does not fit it; the model stays unchanged.
+
+    Example:
+        >>> noise = torch.randn(300, 8, generator=torch.Generator().manual_seed(0))
+        >>> model = DejaVu(whitening="none").learn(noise)
+        >>> print(refine(model, torch.rand(40, 8)))
+        0 of 40 frames placed; nothing is learned, the map stays as it was
+    """
+    require_map(model, " to refine")
+    place_map = model.map
+    if not isinstance(place_map, SpectralMap):
+        raise InputError(f"the map is of kind {place_map.kind!r}; expected one of kind 'spectral' to refine")
+    traverse = model.resample(as_traverse(drive), model.step, progress, model.frame_shape)
+    if len(traverse) < LEAST:
+        raise InputError(f"{traverse.name} has {len(traverse)} frames; expected at least {LEAST}")
+    descriptors = model.descriptor.all_of(traverse, progress).float().to(place_map.device)
+    places = place_drive(model, descriptors).to(place_map.device)
+    sure = (places >= 0).nonzero()[:, 0]
+    count, queries = len(places), _in_its_light(model, descriptors)
+    if not len(sure):
+        return Refinement(0, count)
+    tau, gains = spacing_of(queries).correlation, torch.zeros(count)
+    before = _log_ranks(place_map, queries, places)
+    for fold in torch.arange(count).tensor_split(FOLDS):
+        far = (sure < int(fold[0]) - APART * tau) | (sure > int(fold[-1]) + APART * tau)
+        refined = place_map.refined(_stage(place_map, queries, places, sure[far]))
+        gains[fold] = (before - _log_ranks(refined, queries, places))[fold]
+    blocks = torch.stack([block.mean() for block in gains[sure.cpu()].split(math.ceil(tau))])
+    gain, error = float(blocks.mean()), float(blocks.std() / math.sqrt(len(blocks)))
+    if accepted := gain > ERRORS * error:
+        calibrated = model.calibration is not None
+        model.replace_map(place_map.refined(_stage(place_map, queries, places, sure)))
+        if calibrated:
+            model.calibration = _calibration(model.map, descriptors, queries, places)
+    return Refinement(len(sure), count, gain, error, accepted)
+
+
+def _calibration(place_map: PlaceMap, descriptors: Tensor, queries: Tensor, places: Tensor) -> Calibration:
+    """The calibration by a drive, with its queries as they are and centred."""
+    smoother, starts = PlaceSmoother(), (0, *accumulate(route.places for route in place_map.routes[:-1]))
+
+    def rows(numbers: Tensor) -> Tensor:
+        return place_map.scores(queries[numbers])
+
+    smoother.fit(rows, queries, starts)
+    drive = smoother.drive(rows, queries)
+    return calibrated_by_drive(place_map, descriptors, smoother, drive, places)
+
+
+@without_autocast
+def _stage(place_map: SpectralMap, queries: Tensor, places: Tensor, some: Tensor) -> Tensor:
+    """A stage (K,K) behind the map's own, from some (n,) of the queries (Q,K) and their places (Q,)."""
+    queries, places = queries[some], places[some]
+    rows = torch.empty_like(queries)
+    for g, (start, stop) in enumerate(place_map.chunks):
+        inside = (places >= start) & (places < stop)
+        if inside.any():
+            rows[inside] = place_map.decode(g)[places[inside] - start]
+    views, shown = (F.normalize(place_map.staged(one)) for one in (queries, rows))
+    _, projection = learned_whitening(views, shown, queries.shape[1], SHRINKAGE)
+    size: Tensor = torch.linalg.matrix_norm(projection)
+    return projection * (math.sqrt(len(projection)) / size)
+
+
+def _log_ranks(place_map: SpectralMap, queries: Tensor, places: Tensor) -> Tensor:
+    """The logarithm of the rank of each query's place, or the best within the tolerance of it: (Q,)."""
+    near, ranks = torch.arange(-TOLERANCE, TOLERANCE + 1, device=places.device), []
+    size = max(1, BLOCK // place_map.places)
+    for part, place in zip(queries.split(size), places.split(size), strict=True):
+        scores = place_map.scores(part)
+        window = (place[:, None] + near).clamp(0, place_map.places - 1)
+        own = scores.gather(1, window).amin(1, keepdim=True)
+        better = (scores < own).sum(1)
+        ranks.append((1.0 + better).log().cpu())
+    return torch.cat(ranks)

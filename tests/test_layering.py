@@ -28,7 +28,7 @@ ARROWS = {
     "learning": "text types memory data features maps recognition motion",
     "model_file": "text version types memory data features periods maps recognition motion",
     "model": "text types resize data features maps recognition motion learning model_file",
-    "teaching": "types data features recognition model",
+    "teaching": "types memory data features maps recognition model",
     "growth": "types data features maps motion learning model_file model teaching",
     "cluster": "text types data maps recognition",
     "live": "types data features recognition model",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +12,23 @@ from command_line import fails, report_of, run
 from helpers import refused
 from torch import Tensor
 
-from dejavu_torch import DejaVu, SpectralMapper, Whitening, compare, open_source
+from dejavu_torch import (
+    DejaVu,
+    ImposedPeriods,
+    SpectralMapper,
+    TemplateMapper,
+    Whitening,
+    compare,
+    open_source,
+)
 from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.export import export_onnx, run_session, session_of
 from dejavu_torch.features.views import LabelledFrames, Placed, Sample, views_of
 from dejavu_torch.features.whitening import LIGHT, VISIT, Visits, learned_whitening
-from dejavu_torch.growth import second_traverse
-from dejavu_torch.teaching import FEWEST, ROUNDS, SURE, place_drive
+from dejavu_torch.growth import append, merge, second_traverse
+from dejavu_torch.maps.spectral_map import SpectralMap
+from dejavu_torch.recognition.coarse import CoarseSearch, SamplingPlan
+from dejavu_torch.teaching import FEWEST, ROUNDS, SURE, place_drive, refine
 
 FRAMES, FIRST, LAST = 160, 20, 140
 
@@ -217,3 +229,170 @@ def test_a_report_and_the_command_tell_how_many_frames_teach(
     assert "few.npy has 20 frames" in fails(capsys, *words)
     plain = compare(road, ArrayTraverse(frames_of(2), "query"), "0", fresh(), calibration="none").report
     assert "second" not in plain.facts
+
+
+def model_of(rows: Tensor, **settings: object) -> DejaVu:
+    return DejaVu(whitening="none", mapper=SpectralMapper(16.0, chunk=100, **settings)).learn(rows)  # type: ignore[arg-type]
+
+
+def changed(rows: Tensor, seed: int = 3) -> Tensor:
+    """Another visit: the first half of the dimensions changes with the day and is noise there."""
+    noise = torch.randn(rows.shape, generator=torch.Generator().manual_seed(seed)) * rows.std()
+    return torch.cat([rows[:, :8] + 2 * noise[:, :8], rows[:, 8:] + 0.1 * noise[:, 8:]], 1)
+
+
+@pytest.mark.parametrize("metric", ["cosine", "l2"])
+def test_a_stage_compares_queries_and_places_after_it(metric: str) -> None:
+    rows, queries = waves(200), torch.randn(9, 16)
+    plain, first, second = model_of(rows, metric=metric).map, torch.randn(16, 16), torch.randn(16, 16)
+    assert isinstance(plain, SpectralMap)
+    decoded = torch.cat([plain.decode(g) for g in range(2)])
+    refined = plain.refined(first)
+    assert (refined.stage.dtype, refined.stage.abs().amax(0).tolist()) == (torch.int8, [127] * 16)
+    for place_map, stage in ((refined, refined.stage * refined.stage_scale), (refined.refined(second), None)):
+        if stage is None:  # both in one
+            stage = place_map.stage * place_map.stage_scale
+            close = {"rtol": 0, "atol": 0.02 * float((first @ second).abs().max())}
+            torch.testing.assert_close(stage, refined.stage * refined.stage_scale @ second, **close)
+        x, q = decoded @ stage, queries @ stage
+        if metric == "cosine":
+            expected = 1 - torch.nn.functional.cosine_similarity(q[:, None], x[None], dim=2)
+        else:
+            expected = (q[:, None] - x[None]).square().sum(2)
+        torch.testing.assert_close(place_map.scores(queries), expected, rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(place_map.norms, x.norm(dim=1), rtol=1e-4, atol=1e-4)
+        for name in ("streams", "steps", "lengths", "means"):
+            assert torch.equal(getattr(place_map, name), getattr(plain, name))
+    parts = [refined.between(0, 1), refined.between(1, 2)]
+    torch.testing.assert_close(
+        torch.cat([part.scores(queries) for part in parts], 1), refined.scores(queries)
+    )
+    torch.testing.assert_close(refined.of_chunks(refined.coded()).scores(queries), refined.scores(queries))
+
+
+def test_gradients_pass_the_stage() -> None:
+    place_map = model_of(waves(60)).map
+    assert isinstance(place_map, SpectralMap)
+    refined = place_map.refined(torch.eye(16) + 0.1 * torch.randn(16, 16))
+    queries = torch.randn(3, 16, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(refined.scores, queries)
+
+
+def test_a_drive_refines_a_map_and_the_next_one_is_found_better(tmp_path: Path) -> None:
+    rows = waves(300)
+    model = model_of(rows)
+    model.save(tmp_path / "before.safetensors")
+    drive, third = changed(rows), changed(rows, seed=4)
+    taught = refine(model, drive)
+    assert taught.accepted
+    assert taught.of == 300
+    assert taught.placed > 250
+    assert taught.gain > taught.error > 0
+    assert str(taught).endswith("the map is refined")
+    assert isinstance(model.map, SpectralMap)
+    assert len(model.map.stage) == 16
+    before, truth = DejaVu.load(tmp_path / "before.safetensors"), torch.arange(300)
+    right = [
+        float(((m.localize_descriptors(third).index - truth).abs() <= 2).float().mean())
+        for m in (before, model)
+    ]
+    assert right[1] > right[0] + 0.05
+    model.save(tmp_path / "after.safetensors")
+    again = DejaVu.load(tmp_path / "after.safetensors")
+    assert torch.equal(again.map.scores(third), model.map.scores(third))
+    grown = (tmp_path / "after.safetensors").stat().st_size - (tmp_path / "before.safetensors").stat().st_size
+    assert 16 * 16 + 16 * 4 <= grown <= 16 * 16 + 16 * 4 + 300  # the stage alone, with its names
+    assert again.summary().fixed["stage"] == 16 * 16 + 16 * 4
+    size = (tmp_path / "after.safetensors").stat().st_size
+    refine(again, third)
+    again.save(tmp_path / "after.safetensors")
+    assert abs((tmp_path / "after.safetensors").stat().st_size - size) < 50
+
+
+def test_another_route_refines_nothing(tmp_path: Path) -> None:
+    model = model_of(waves(300))
+    model.save(tmp_path / "before.safetensors")
+    found = refine(model, waves(200, seed=9))
+    assert (found.placed, found.accepted) == (0, False)
+    assert "nothing is learned" in str(found)
+    model.save(tmp_path / "after.safetensors")
+    assert (tmp_path / "after.safetensors").read_bytes() == (tmp_path / "before.safetensors").read_bytes()
+    same = refine(model, noisy(waves(300), size=1e-4))  # nothing changes that a stage could remove
+    assert same.placed > 250
+    assert not same.accepted
+    assert str(same).endswith("the map stays as it was")
+
+
+def test_what_refines_no_map_is_refused() -> None:
+    model = model_of(waves(100))
+    with refused("has 29 frames", "at least 30"):
+        refine(model, waves(29))
+    with refused("there is no map"):
+        refine(DejaVu(), waves(40))
+    templates = DejaVu(mapper=TemplateMapper(ImposedPeriods([3, 4, 5], bin=4))).learn(waves(100))
+    with refused("kind 'templates'", "expected one of kind 'spectral'"):
+        refine(templates, waves(40))
+    with refused("(1, 9)", "the map expects (Q, 16)"):
+        refine(model, torch.rand(40, 9))
+    assert isinstance(model.map, SpectralMap)
+    assert not len(model.map.stage)
+
+
+def test_what_knows_of_a_stage(tmp_path: Path) -> None:
+    rows = waves(400)
+    model = model_of(rows)
+    refine(model, changed(rows))
+    assert isinstance(model.map, SpectralMap)
+    assert len(model.map.stage)
+    queries = changed(rows, seed=5)[::7]
+    export_onnx(model, tmp_path / "m.onnx")
+    exported = run_session(session_of(str(tmp_path / "m.onnx")), queries)
+    torch.testing.assert_close(exported, model.map.scores(queries), rtol=0, atol=1e-4)
+    more = append(copy.deepcopy(model), waves(200, seed=8))
+    assert isinstance(more.map, SpectralMap)
+    assert torch.equal(more.map.stage, model.map.stage)
+    torch.testing.assert_close(more.map.scores(queries)[:, :400], model.map.scores(queries))
+    with refused("different drives have refined them"):
+        merge([model, model_of(waves(100, seed=2))], ["a", "b"])
+    both = merge([model, copy.deepcopy(model)], ["a", "b"])
+    torch.testing.assert_close(both.map.scores(queries)[:, :400], model.map.scores(queries))
+    score, place = CoarseSearch(model.map, SamplingPlan(4, 2, 64, 1.0, 0))(queries, [(1, 0)])
+    best, at = score.min(1, keepdim=True)
+    scores = model.map.scores(queries)
+    torch.testing.assert_close(best, scores.gather(1, place.gather(1, at)), rtol=0, atol=1e-5)
+    assert (best[:, 0] - scores.amin(1) < 1e-5).float().mean() > 0.9
+
+
+def test_a_calibration_is_learned_anew_from_all_of_a_drive() -> None:
+    rows = waves(300)
+    model, plain = model_of(rows), model_of(rows)
+    model.calibrate(None, LabelledFrames(ArrayTraverse(noisy(rows, size=0.1)), torch.arange(300)))
+    before = model.calibration
+    assert refine(model, changed(rows)).accepted
+    assert refine(plain, changed(rows)).accepted
+    assert plain.calibration is None
+    assert model.calibration not in (None, before)
+    third = changed(rows, seed=6)
+    match = model.localize_descriptors(third)
+    assert match.probability is not None
+    right = ((match.index - torch.arange(300)).abs() <= 5).double()
+    assert abs(float(match.probability.mean() - right.mean())) < 0.1
+
+
+def test_the_command_refines_a_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = waves(200)
+    for name, values in {"route": rows, "drive": changed(rows), "other": waves(90, seed=9)}.items():
+        np.save(tmp_path / f"{name}.npy", values.numpy())
+    run("learn", tmp_path / "route.npy", "--map", tmp_path / "m.safetensors")
+    before = (tmp_path / "m.safetensors").read_bytes()
+    run("refine", tmp_path / "m.safetensors", tmp_path / "other.npy")
+    assert "0 of 90 frames placed; nothing is learned, the map stays as it was" in capsys.readouterr().out
+    assert (tmp_path / "m.safetensors").read_bytes() == before
+    run("refine", tmp_path / "m.safetensors", tmp_path / "drive.npy", "--out", tmp_path / "n.safetensors")
+    assert "the map is refined" in capsys.readouterr().out
+    assert (tmp_path / "m.safetensors").read_bytes() == before
+    run("info", tmp_path / "n.safetensors")
+    assert "stage" in capsys.readouterr().out
+    words = ("refine", tmp_path / "m.safetensors", tmp_path / "route.npy")
+    assert "expected" in fails(capsys, *words, "--out", tmp_path / "n.pt")
+    assert "none.npy" in fails(capsys, "refine", tmp_path / "m.safetensors", tmp_path / "none.npy")

@@ -516,6 +516,36 @@ def run_export(
     _say(f"{size}; {written.difference:.1g} from torch at most, on noise; written to {onnx}")
 
 
+def run_refine(
+    map: Path,
+    drives: Sequence[str],
+    *,
+    out: Path | None = None,
+    loading: options.Loading,
+    command: str,
+) -> None:
+    """Learn from drives, whose places nobody tells, what changes along a map; its places stay as they are.
+
+    Args:
+        map: map file, which is overwritten unless --out names another one
+        drives: frames in order, as in `dejavu learn`, at least 30 in each; one after the other
+        out: map file to write instead (.safetensors)
+    """
+    from dejavu_torch.teaching import refine
+
+    out = map if out is None else out
+    _check_map_file(out, *drives)
+    device_of(loading.device)
+    model = loading.model(map)
+    found = {drive: refine(model, open_source(drive), progress=True) for drive in drives}
+    for drive, refinement in found.items():
+        print(f"{drive}: {refinement}")
+    if out != map or any(one.accepted for one in found.values()):
+        model.save(out)
+        print_map(model)
+        _print_localize(out, model, command)
+
+
 def run_merge(maps: Sequence[Path], *, map: Path, features: nn.Module | None = None, command: str) -> None:
     """Merge the maps of several routes with the same descriptors: an answer is then a route and its frame.
 

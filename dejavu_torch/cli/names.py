@@ -9,6 +9,7 @@ COMMANDS = {
     "evaluate": "evaluate the matches of any method from a csv",
     "reproduce": "repeat the paper's experiments on simulated routes",
     "train": "train features that repeat: fit, validate, test or export",
+    "refine": "learn from a drive, whose places nobody tells, what changes along a map",
     "merge": "merge the maps of several routes",
     "export": "write a map and its features as an ONNX file",
     "info": "show what a map holds",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar, Self
 
 import torch
@@ -49,6 +49,7 @@ class PlaceMap(nn.Module, ABC):
     kind: ClassVar[str]
     state: ClassVar[Any] = dict[str, Any]
     kept: ClassVar[tuple[str, ...]] = ("positions",)  # tensors that are always of the type of a file
+    optional: ClassVar[Mapping[str, tuple[int, ...]]] = {"visits": (0, 2)}  # that files may lack
     routes: tuple[Route, ...] = ()
     positions: Tensor
     visits: Tensor
@@ -205,10 +206,14 @@ class PlaceMap(nn.Module, ABC):
     def load_packed(self, tensors: dict[str, Tensor], extra: dict[str, Any]) -> None:
         """Load the results of `packed` and `get_extra_state`; other tensors are an InputError."""
         names = self.state_dict().keys() - {EXTRA}
-        if not names - {"visits"} <= tensors.keys() <= names:
+        if not names - {*self.optional} <= tensors.keys() <= names:
             seen = f"it holds {', '.join(sorted(tensors)) or 'nothing'}"
             raise InputError(f"{seen} of a map; expected {', '.join(sorted(names))}")
-        default = {"visits": self.visits[:0]} if "visits" in names else {}
+        default = {
+            name: getattr(self, name).new_zeros(shape)
+            for name, shape in self.optional.items()
+            if name in names
+        }
         self.load_state_dict({**default, **tensors, EXTRA: extra})
 
 

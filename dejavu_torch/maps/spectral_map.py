@@ -39,6 +39,8 @@ FILE = {  # dtype and dimensions of the tensors of a file
     "streams": (torch.uint8, 1),
     "means": (torch.bfloat16, 2),
     "visits": (torch.int32, 2),
+    "stage": (torch.int8, 2),
+    "stage_scale": (torch.float32, 1),
 }
 CHUNK_BYTES = 8 + 4 + 8 + 8  # a chunk's length, step, stream length and checksum in a file
 
@@ -83,10 +85,12 @@ class SpectralMap(PlaceMap):
         lengths: (G,) int64, places of each chunk. steps: (G,) float32, of each chunk.
         streams, stream_table: coded levels; bytes and checksum of each chunk.
         means: (R,K) bfloat16, subtracted from the descriptors of each route; small means are 0.
+        stage, stage_scale: (K,K) int8 and (K,), a linear map P that drives have taught, (0,0) if none has:
+            queries and coded descriptors are compared after it, see `refined`.
     Buffers derived from these:
         counts, feature, level: number of coefficients of each of N lines; for each of L coefficients its
             feature, ascending within a line, and its value in steps; in the smallest dtypes possible.
-        norms: (N,) float32, of the coded descriptors; tiny ones are 0 (`MIN_NORM`).
+        norms: (N,) float32, of the coded descriptors, staged; tiny ones are 0 (`MIN_NORM`).
 
     Attributes:
         chunks: the places [start, stop) of each.
@@ -106,13 +110,16 @@ class SpectralMap(PlaceMap):
 
     kind = "spectral"
     state = SpectralState
-    kept = ("positions", "steps", "means", "norms")
+    kept = ("positions", "steps", "means", "norms", "stage_scale")
+    optional = {"visits": (0, 2), "stage": (0, 0), "stage_scale": (0,)}  # noqa: RUF012
 
     lengths: Tensor
     steps: Tensor
     stream_table: Tensor
     streams: Tensor
     means: Tensor
+    stage: Tensor
+    stage_scale: Tensor
     counts: Tensor
     feature: Tensor
     level: Tensor
@@ -139,7 +146,7 @@ class SpectralMap(PlaceMap):
         for name in ("counts", "feature", "level", "norms"):
             self.register_buffer(name, None, persistent=False)
         for name, (dtype, ndim) in FILE.items():
-            self.register_buffer(name, torch.zeros([0, 2][:ndim], dtype=dtype))
+            self.register_buffer(name, torch.zeros(self.optional.get(name, (0, 2)[:ndim]), dtype=dtype))
         self._clear()
         if means is not None:
             self.means = means
@@ -199,8 +206,12 @@ class SpectralMap(PlaceMap):
             raise InputError("the map does not fit together: its descriptors are not finite")
 
     def _norms_of(self, chunk: int) -> Tensor:
-        norms = torch.stack([part.square_().sum(0) for part in self._features(chunk)]).sum(0).sqrt_()
-        mean = self.means[self._routes_of(range(chunk, chunk + 1))].to(norms)
+        mean = self.staged(self.means[self._routes_of(range(chunk, chunk + 1))].float())
+        norms: Tensor
+        if len(self.stage):
+            norms = torch.linalg.vector_norm(self.staged(self.decode(chunk)), dim=1)
+        else:
+            norms = torch.stack([part.square_().sum(0) for part in self._features(chunk)]).sum(0).sqrt_()
         least = MIN_NORM * torch.maximum(norms.square().mean().sqrt(), torch.linalg.vector_norm(mean))
         return norms * ~(norms <= least)
 
@@ -217,14 +228,42 @@ class SpectralMap(PlaceMap):
 
     def of_chunks(self, chunks: Iterable[Chunk]) -> SpectralMap:
         """A map of other chunks with this map's mean, settings and device."""
-        place_map = SpectralMap(self.means, **self.settings())
+        place_map = self._without_places(self.means)
         place_map.extend(chunks)
+        return place_map
+
+    def _without_places(self, means: Tensor) -> SpectralMap:
+        """A map without places, with this one's settings and stage."""
+        place_map = SpectralMap(means, **self.settings())
+        place_map.stage, place_map.stage_scale = self.stage, self.stage_scale
+        return place_map
+
+    def staged(self, descriptors: Tensor) -> Tensor:
+        """Descriptors (B,K) after the stage; themselves without one."""
+        if not len(self.stage):
+            return descriptors
+        staged: Tensor = (descriptors @ self.stage.to(descriptors)) * self.stage_scale.to(descriptors)
+        return staged
+
+    def refined(self, projection: Tensor) -> SpectralMap:
+        """A map of the same lines, whose descriptors are compared after a further stage, `projection` (K,K),
+        behind the present one. Both become one, rounded to 8 bits."""
+        both = projection
+        if len(self.stage):
+            both = self.staged(torch.eye(self.dimension).to(projection)) @ projection
+        place_map = self._without_places(self.means)
+        place_map.stage_scale = (both.abs().amax(0) / 127).float()
+        place_map.stage = (both / place_map.stage_scale).round().to(torch.int8)
+        place_map.routes = self.routes
+        place_map.extend(self.coded())
+        place_map.positions, place_map.visits = self.positions, self.visits
+        place_map.check()
         return place_map
 
     @classmethod
     def merged(cls, parts: Sequence[SpectralMap], names: Sequence[str]) -> SpectralMap:
         """The map of several routes, each with its own mean and steps; `growth.merge` checks the routes."""
-        place_map = cls(torch.cat([part.means for part in parts]), **parts[0].settings())
+        place_map = parts[0]._without_places(torch.cat([part.means for part in parts]))
         sizes = ((part.places, part.table.frames) for part in parts)
         place_map.routes = tuple(Route(name, *size) for name, size in zip(names, sizes, strict=True))
         place_map.extend(chunk for part in parts for chunk in part.coded())
@@ -252,7 +291,7 @@ class SpectralMap(PlaceMap):
         """A map of the chunks [first, last), with the same scores."""
         routes = self._routes_of(range(first, last))
         unique, counts = routes.unique_consecutive(return_counts=True)
-        part = SpectralMap(self.means[unique], **self.settings())
+        part = self._without_places(self.means[unique])
         if self.routes:
             sizes = [int(lengths.sum()) for lengths in self.lengths[first:last].split(counts.tolist())]
             part.routes = tuple(Route(self.routes[r].name, n, n) for r, n in zip(unique, sizes, strict=True))
@@ -287,7 +326,7 @@ class SpectralMap(PlaceMap):
         start, stop = self.chunks[chunk]
         units = torch.eye(self.dimension, dtype=torch.float32, device=self.device)
         for some in units.split(max(1, LONG // (stop - start))):
-            yield self.products(some, range(chunk, chunk + 1))
+            yield self._all_products(some, range(chunk, chunk + 1))
 
     def samples(self, chunk: int, count: int) -> Tensor:
         """Low-passed descriptors at M = `count` even positions of a chunk, from the first M lines: (M,K)."""
@@ -312,10 +351,17 @@ class SpectralMap(PlaceMap):
         return at.round().long().clamp(max=stop - start - 1)
 
     def products(self, queries: Tensor, chunks: range) -> Tensor:
-        """Inner products with all descriptors of G chunks of equal length W: (Q,K) -> (Q,W G).
+        """Inner products of staged queries with all staged descriptors of G chunks of equal length W:
+        (Q,K) -> (Q,W G).
 
         Inverse transforms of products with the lines: O(lines + W log W) per query, not O(W K). No autocast.
         """
+        if len(self.stage):
+            queries = (queries * self.stage_scale.to(queries)) @ self.stage.to(queries).T
+        return self._all_products(queries, chunks)
+
+    def _all_products(self, queries: Tensor, chunks: range) -> Tensor:
+        """As `products`, without the stage."""
         parts = [queries]
         if not torch.compiler.is_compiling():  # fewer queries at a time stay in the cache
             places = self.chunks[chunks.stop - 1][1] - self.chunks[chunks.start][0]
@@ -362,6 +408,7 @@ class SpectralMap(PlaceMap):
         if not queries.shape[0]:  # of which MKL has no transform
             yield 0, queries.new_zeros(0, self.places)
             return
+        queries = self.staged(queries)
         length: Tensor = torch.linalg.vector_norm(queries, dim=1, keepdim=True)
         if self.metric == "cosine":
             queries = queries / torch.where(length > 0, length, 1)
@@ -406,6 +453,10 @@ class SpectralMap(PlaceMap):
         shape = max(1, len(self.routes)), self.dimension
         fits = means.shape in (shape, (0, self.dimension)) and bool(means.isfinite().all())
         require(not self.places or fits, f"means {tuple(means.shape)}; expected {shape} finite numbers")
+        shape, k = tuple(self.stage.shape), self.dimension
+        fits = shape in ((0, 0), (k, k)) and self.stage_scale.shape == shape[:1]
+        fits = fits and bool(self.stage_scale.isfinite().all())
+        require(fits, f"a stage {shape} of {len(self.stage_scale)} scales; expected {(k, k)} of {k}, or none")
         if self.routes:
             names, places, frames = zip(*self.routes, strict=True)
             fits = len({*names}) == len(names) and all(names)
@@ -430,17 +481,20 @@ class SpectralMap(PlaceMap):
     def packed(self) -> dict[str, Tensor]:
         """See `PlaceMap`; means that are all 0 are omitted."""
         packed = super().packed()
+        if not len(self.stage):
+            del packed["stage"], packed["stage_scale"]
         return packed if bool(self.means.any()) else packed | {"means": self.means[:0]}
 
     def summary(self) -> MapSummary:
         chunks = [ChunkSummary(start, stop, self._periods(g)) for g, (start, stop) in enumerate(self.chunks)]
         packed = self.packed() if self.places else {}
         names = {"streams": "lines", "means": "mean", "positions": "positions", "visits": "visits"}
+        stage = sum(packed.pop(name).nbytes for name in ("stage", "stage_scale") if name in packed)
         route = {part: packed[name].nbytes for name, part in names.items() if name in packed}
         route = {name: size for name, size in route.items() if size}
         route["chunks"] = sum(tensor.nbytes for name, tensor in packed.items() if name not in names)
-        covered = int((self.norms > 0).sum())
-        return MapSummary(self.kind, self.places, covered, 0, 0, tuple(chunks), route, {}, len(self.level))
+        covered, fixed = int((self.norms > 0).sum()), {"stage": stage} if stage else {}
+        return MapSummary(self.kind, self.places, covered, 0, 0, tuple(chunks), route, fixed, len(self.level))
 
     def _periods(self, chunk: int) -> tuple[Fraction, ...]:
         """The periods of the strongest lines, sorted, with the cosine and sine of each frequency together."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from itertools import accumulate
 from typing import NamedTuple
 
 import torch
@@ -13,6 +14,7 @@ from torch import Tensor
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.recognition.filter import PlaceFilter, moments_of
 from dejavu_torch.recognition.select import best_candidates, best_match
+from dejavu_torch.recognition.smoother import Drive, PlaceSmoother
 from dejavu_torch.types import InputError, Match, SequenceModel
 
 TOLERANCE = 5  # places within which an answer is right
@@ -23,6 +25,7 @@ DECAY = 0.9  # of a track's running mean, per query
 ANSWER_RADIUS = 2  # places around an answer whose best score counts for a track
 MIN_PROBABILITY = 1e-6  # a filter's probabilities are clamped to [this, 1 - this]
 MAX_STEPS = 100  # of Newton's method
+AT_ONCE = 2**22  # scores
 
 
 class Platt(NamedTuple):
@@ -173,4 +176,54 @@ def calibrated(
         off_weight = max(0, MIN_WRONG - wrong) / max(1, int((~on_the_map).sum())) if another_visit else 1.0
         weight = torch.where(on_the_map, 1.0, confidences.new_tensor(off_weight))
         platts.append(fit(confidences, right, weight) if not platts or bool(right.any()) else None)
+    return Calibration(*platts)
+
+
+@torch.no_grad()
+def calibrated_by_drive(
+    place_map: PlaceMap, descriptors: Tensor, smoother: PlaceSmoother, drive: Drive, places: Tensor
+) -> Calibration:
+    """Fit on all queries of a drive whose places nobody told: each counts as right with the probability that
+    the others of the drive give its answer.
+
+    Args:
+        descriptors: (Q,K) of the queries, as they are. smoother, drive: fitted to them. places: (Q,), where
+            a smoother is sure, else -1: without the scores near these, queries stand for some off the map.
+    """
+    single: tuple[list[Tensor], ...] = [], [], []  # answers, confidences, and those off the map
+    filtered: tuple[list[Tensor], ...] = [], [], []
+    tracks, filters = (Track(), Track()), (PlaceFilter(), PlaceFilter())
+    starts = (0, *accumulate(route.places for route in place_map.routes[:-1]))
+    states = [filter.start(place_map.places).to(descriptors) for filter in filters]
+    size = max(1, AT_ONCE // place_map.places)
+    for part, place in zip(descriptors.split(size), places.split(size), strict=True):
+        scores = place_map.scores(part)
+        window = _window(place, 2 * TOLERANCE, scores)
+        hidden = torch.where((place >= 0)[:, None], scores.scatter(1, window, math.inf), scores)
+        for i, rows in enumerate((scores, hidden)):
+            belief, states[i] = filters[i].step(rows, states[i], starts)
+            pairs = (single, rows, confidence_of(rows)), (filtered, belief, tracks[i](belief, rows))
+            for found, scored, confidences in pairs:
+                if i:
+                    found[2].append(confidences[(place >= 0).to(confidences.device)].cpu())
+                else:
+                    found[0].append(best_match(scored).index.cpu())
+                    found[1].append(confidences.cpu())
+    answers = [torch.cat(found[0]) for found in (single, filtered)]
+    right: tuple[list[Tensor], list[Tensor]] = [], []
+    for block in smoother.blocks(drive, starts):
+        others = smoother.folded(block.before * block.after).cpu().double()
+        others = (others / others.sum(1, keepdim=True))[:, :-1]
+        own = slice(block.first, block.first + len(others))
+        for masses, index in zip(right, answers, strict=True):
+            near = torch.zeros_like(others).scatter(1, _window(index[own], TOLERANCE, others), 1.0)
+            masses.append(torch.where(index[own] >= 0, (near * others).sum(1), 0.0))
+    platts = []
+    for (_, sure, off), masses in zip((single, filtered), right, strict=True):
+        known, p = torch.cat(sure).double(), torch.cat(masses[::-1]).clamp(0, 1)
+        hidden = torch.cat(off).double()
+        weight = max(0.0, MIN_WRONG - float((1 - p).sum())) / max(1, len(hidden))
+        labels = torch.cat([torch.ones(len(p)), torch.zeros(len(p) + len(hidden))]).bool()
+        weights = torch.cat([p, 1 - p, torch.full_like(hidden, weight)])
+        platts.append(fit(torch.cat([known, known, hidden]), labels, weights))
     return Calibration(*platts)

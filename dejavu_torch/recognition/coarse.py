@@ -138,7 +138,7 @@ class Samples:
         # padding is 0, which is never the best
         self.rows, first = self.place.new_zeros(len(self.place), place_map.dimension, dtype=torch.int8), 0
         for chunk, (start, stop) in enumerate(place_map.chunks):
-            row = place_map.samples(chunk, -(-(stop - start) // spacing))
+            row = place_map.staged(place_map.samples(chunk, -(-(stop - start) // spacing)))
             self.rows[first : first + len(row)] = to_int8(F.normalize(row))
             first += len(places[chunk])
         norms = [torch.linalg.vector_norm(block.float(), dim=1) for block in self.rows.split(BLOCK)]
@@ -189,7 +189,8 @@ class CoarseSearch(Scan):
     def __call__(self, queries: Tensor, wanted: list[NmsSpec]) -> TopK:
         if not len(queries):
             return empty_topk(queries, max(k for k, _ in wanted))
-        units = F.normalize(queries.to(torch.promote_types(queries.dtype, torch.float32))).float()
+        queries = queries.to(torch.promote_types(queries.dtype, torch.float32))
+        units = F.normalize(self.place_map.staged(queries)).float()
         place = self._windows(units, self.coarse.best_of_groups(to_int8(units)), wanted)
         score = self._scores(units, place)
         far = self._incomplete(score, place, wanted) | ~(score.amin(1) <= 1 - MIN_COSINE)
