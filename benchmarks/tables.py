@@ -19,6 +19,7 @@ from benchmarks.measure import Row
 from benchmarks.results import FOOTAGE, rounded
 from benchmarks.storage import SHOWN, best, by, families, missed
 from benchmarks.storage_drives import drive_table
+from benchmarks.teaching import COPIES, PLACED, REFINED, TOLD
 from dejavu_torch.evaluation.contenders import LENGTHS
 
 FOLDER = Path(__file__).parents[1] / "docs" / "results"
@@ -248,6 +249,22 @@ def large_drives() -> str:
     return markdown(table)
 
 
+def taught() -> str:
+    """What another drive finds on maps that learned from a drive."""
+    rows = by("case", read("taught drives")["rows"])
+    table = [["learned from, then asked", COPIES, PLACED, REFINED, TOLD, "placed", "right"]]
+    for case, own in rows.items():
+        ways = {row["contender"]: row for row in own}
+        pairs = [
+            "" if row is None else f"{area(row['auc'])} / {area(row['auc_by_confidence'])}"
+            for row in (ways.get(way) for way in (COPIES, PLACED, REFINED, TOLD))
+        ]
+        placed = ways[PLACED]
+        right = area(placed["right"]) if placed.get("right") is not None else ""
+        table.append([case, *pairs, f"{placed['placed']} of {placed['of']}", right])
+    return markdown(table)
+
+
 def shown_pair(row: Row) -> str:
     """The areas of one image and of the whole drive; with a star, if that was answered by single images."""
     pair = [area(row[key]).removeprefix("0") for key in ("auc_one", "auc")]
@@ -297,7 +314,7 @@ TABLES: dict[str, Callable[[], str]] = {
     **{"routes": routes, "sizes": sizes, "descriptors": descriptors, "sequences": sequences},
     **{"rejection": rejection, "filtered": filtered, "drives": drives, "driven": driven},
     **{"trainings": trainings, "made drives": made_drives, "storage drives": storage_drives},
-    "large drives": large_drives,
+    **{"large drives": large_drives, "taught drives": taught},
     **{f"storage {name}": partial(storage, name) for name in ("aerial", "road1", "road2", "city", "railway")},
 }
 

@@ -41,7 +41,9 @@ FILE = {  # dtype and dimensions of the tensors of a file
     "visits": (torch.int32, 2),
     "stage": (torch.int8, 2),
     "stage_scale": (torch.float32, 1),
+    "drives": (torch.int32, 1),
 }
+STAGE = ("stage", "stage_scale", "drives")
 CHUNK_BYTES = 8 + 4 + 8 + 8  # a chunk's length, step, stream length and checksum in a file
 
 
@@ -85,8 +87,8 @@ class SpectralMap(PlaceMap):
         lengths: (G,) int64, places of each chunk. steps: (G,) float32, of each chunk.
         streams, stream_table: coded levels; bytes and checksum of each chunk.
         means: (R,K) bfloat16, subtracted from the descriptors of each route; small means are 0.
-        stage, stage_scale: (K,K) int8 and (K,), a linear map P that drives have taught, (0,0) if none has:
-            queries and coded descriptors are compared after it, see `refined`.
+        stage, stage_scale: (K,K) int8 and (K,), a linear map P that drives have taught: queries and coded
+            descriptors are compared after it, see `refined`. drives: (1,) int32, how many. Empty without.
     Buffers derived from these:
         counts, feature, level: number of coefficients of each of N lines; for each of L coefficients its
             feature, ascending within a line, and its value in steps; in the smallest dtypes possible.
@@ -111,7 +113,7 @@ class SpectralMap(PlaceMap):
     kind = "spectral"
     state = SpectralState
     kept = ("positions", "steps", "means", "norms", "stage_scale")
-    optional = {"visits": (0, 2), "stage": (0, 0), "stage_scale": (0,)}  # noqa: RUF012
+    optional = {"visits": (0, 2), "stage": (0, 0), "stage_scale": (0,), "drives": (0,)}  # noqa: RUF012
 
     lengths: Tensor
     steps: Tensor
@@ -120,6 +122,7 @@ class SpectralMap(PlaceMap):
     means: Tensor
     stage: Tensor
     stage_scale: Tensor
+    drives: Tensor
     counts: Tensor
     feature: Tensor
     level: Tensor
@@ -235,7 +238,8 @@ class SpectralMap(PlaceMap):
     def _without_places(self, means: Tensor) -> SpectralMap:
         """A map without places, with this one's settings and stage."""
         place_map = SpectralMap(means, **self.settings())
-        place_map.stage, place_map.stage_scale = self.stage, self.stage_scale
+        for name in STAGE:
+            setattr(place_map, name, getattr(self, name))
         return place_map
 
     def staged(self, descriptors: Tensor) -> Tensor:
@@ -255,6 +259,7 @@ class SpectralMap(PlaceMap):
         place_map.stage_scale = (both.abs().amax(0) / 127).float()
         place_map.stage = (both / place_map.stage_scale).round().to(torch.int8)
         place_map.routes = self.routes
+        place_map.drives = torch.cat([self.drives, self.drives.new_ones(1)]).sum(0, True, dtype=torch.int32)
         place_map.extend(self.coded())
         place_map.positions, place_map.visits = self.positions, self.visits
         place_map.check()
@@ -455,8 +460,11 @@ class SpectralMap(PlaceMap):
         require(not self.places or fits, f"means {tuple(means.shape)}; expected {shape} finite numbers")
         shape, k = tuple(self.stage.shape), self.dimension
         fits = shape in ((0, 0), (k, k)) and self.stage_scale.shape == shape[:1]
+        fits = fits and len(self.drives) == (shape != (0, 0)) and not (self.drives < 1).any()
         fits = fits and bool(self.stage_scale.isfinite().all())
-        require(fits, f"a stage {shape} of {len(self.stage_scale)} scales; expected {(k, k)} of {k}, or none")
+        require(
+            fits, f"a stage {shape}, {len(self.stage_scale)} scales; expected {(k, k)}, {k}, a drive, or none"
+        )
         if self.routes:
             names, places, frames = zip(*self.routes, strict=True)
             fits = len({*names}) == len(names) and all(names)
@@ -482,14 +490,14 @@ class SpectralMap(PlaceMap):
         """See `PlaceMap`; means that are all 0 are omitted."""
         packed = super().packed()
         if not len(self.stage):
-            del packed["stage"], packed["stage_scale"]
+            packed = {name: value for name, value in packed.items() if name not in STAGE}
         return packed if bool(self.means.any()) else packed | {"means": self.means[:0]}
 
     def summary(self) -> MapSummary:
         chunks = [ChunkSummary(start, stop, self._periods(g)) for g, (start, stop) in enumerate(self.chunks)]
         packed = self.packed() if self.places else {}
         names = {"streams": "lines", "means": "mean", "positions": "positions", "visits": "visits"}
-        stage = sum(packed.pop(name).nbytes for name in ("stage", "stage_scale") if name in packed)
+        stage = sum(packed.pop(name).nbytes for name in STAGE if name in packed)
         route = {part: packed[name].nbytes for name, part in names.items() if name in packed}
         route = {name: size for name, size in route.items() if size}
         route["chunks"] = sum(tensor.nbytes for name, tensor in packed.items() if name not in names)
