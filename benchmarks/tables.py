@@ -251,7 +251,9 @@ def large_drives() -> str:
 
 def taught() -> str:
     """What another drive finds on maps that learned from a drive."""
-    rows = by("case", read("taught drives")["rows"])
+    rows: dict[str, list[Row]] = {}
+    for row in read("taught drives")["rows"]:
+        rows.setdefault(row["case"], []).append(row)
     table = [["learned from, then asked", COPIES, PLACED, REFINED, TOLD, "placed", "right"]]
     for case, own in rows.items():
         ways = {row["contender"]: row for row in own}

@@ -57,7 +57,8 @@ TASKS = {
     "city, drive 2, then drive 1": Task(CITIES[1], asked=CITIES[0]),
     "laps, first, then last": Task(LAPS, (0, MIDDLE), None, (MIDDLE, None)),
     "laps, last, then first": Task(LAPS, (MIDDLE, None), None, (0, MIDDLE)),
-    "floors, every second, then the others": Task(ALIKE, (0, 200), None, (200, None)),
+    "floors, first, then last": Task(ALIKE, (0, 200), None, (200, None)),
+    "floors, one that the map lacks, then the others": Task(ALIKE, (300, None), None, (0, 300)),
     "laps by another route": Task(Route(LAPS.reference, FLOORS, 10, None), asked=LAPS),
     "city by another route": Task(Route(CITIES[0].reference, WINTER, 2, None), asked=CITIES[0]),
 }

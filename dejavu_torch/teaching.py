@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import accumulate
 from typing import NamedTuple
 
@@ -140,31 +140,38 @@ def refine(model: DejaVu, drive: Source, progress: bool = False) -> Refinement:
     if not len(sure):
         return Refinement(0, count)
     tau, gains = spacing_of(queries).correlation, torch.zeros(count)
-    before = _log_ranks(place_map, queries, places)
+    before, asked = _log_ranks(place_map, queries, places), []
     for fold in torch.arange(count).tensor_split(FOLDS):
         far = (sure < int(fold[0]) - APART * tau) | (sure > int(fold[-1]) + APART * tau)
         refined = place_map.refined(_stage(place_map, queries, places, sure[far]))
         gains[fold] = (before - _log_ranks(refined, queries, places))[fold]
+        asked.append((refined, descriptors[fold.to(descriptors.device)]))
     blocks = torch.stack([block.mean() for block in gains[sure.cpu()].split(math.ceil(tau))])
     gain, error = float(blocks.mean()), float(blocks.std() / math.sqrt(len(blocks)))
     if accepted := gain > ERRORS * error:
         calibrated = model.calibration is not None
         model.replace_map(place_map.refined(_stage(place_map, queries, places, sure)))
-        if calibrated:
-            model.calibration = _calibration(model.map, descriptors, queries, places)
+        if calibrated:  # by maps that have not learned from what they are asked
+            scores = (part.scores(rows) for part, own in asked for rows in own.split(_at_once(place_map)))
+            model.calibration = _calibration(model.map, queries, places, scores)
     return Refinement(len(sure), count, gain, error, accepted)
 
 
-def _calibration(place_map: PlaceMap, descriptors: Tensor, queries: Tensor, places: Tensor) -> Calibration:
-    """The calibration by a drive, with its queries as they are and centred."""
+def _calibration(
+    place_map: PlaceMap, queries: Tensor, places: Tensor, scores: Iterator[Tensor]
+) -> Calibration:
+    """The calibration by the scores of all queries of a drive, which the smoother has centred."""
     smoother, starts = PlaceSmoother(), (0, *accumulate(route.places for route in place_map.routes[:-1]))
 
     def rows(numbers: Tensor) -> Tensor:
         return place_map.scores(queries[numbers])
 
     smoother.fit(rows, queries, starts)
-    drive = smoother.drive(rows, queries)
-    return calibrated_by_drive(place_map, descriptors, smoother, drive, places)
+    return calibrated_by_drive(scores, places, smoother, smoother.drive(rows, queries), starts)
+
+
+def _at_once(place_map: PlaceMap) -> int:
+    return max(1, BLOCK // place_map.places)
 
 
 @without_autocast
@@ -185,7 +192,7 @@ def _stage(place_map: SpectralMap, queries: Tensor, places: Tensor, some: Tensor
 def _log_ranks(place_map: SpectralMap, queries: Tensor, places: Tensor) -> Tensor:
     """The logarithm of the rank of each query's place, or the best within the tolerance of it: (Q,)."""
     near, ranks = torch.arange(-TOLERANCE, TOLERANCE + 1, device=places.device), []
-    size = max(1, BLOCK // place_map.places)
+    size = _at_once(place_map)
     for part, place in zip(queries.split(size), places.split(size), strict=True):
         scores = place_map.scores(part)
         window = (place[:, None] + near).clamp(0, place_map.places - 1)

@@ -326,7 +326,7 @@ WRONG = {  # a line of words behind `dejavu`, and what its one line holds
     "learn a.npy --map m --config nowhere.yaml": ("nowhere.yaml is not there", "paper", "train_road"),
     "learn a.npy --map m --config": ("--config", "expected one argument"),
     "learn a.npy --map m --conf paper": ("--conf",),  # options are not guessed from their beginnings
-    "learn a.npy --map m.safetensors --second c.npy": ("6 frames", "or a truth for"),
+    "learn a.npy --map m.safetensors --second c.npy": ("6 frames", "a truth for", "30 frames in order"),
     "learn a.npy --map m.safetensors --average c.npy": ("6 frames", "or a truth for"),
     "learn a.npy --map m.safetensors --calibration c.npy": ("6 frames", "or a truth for"),
     "learn nan.npy --map m.safetensors": ("frame 70",),

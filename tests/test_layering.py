@@ -38,7 +38,7 @@ ARROWS = {
     "training": "lazy text types memory resize data features periods maps recognition "
     "motion model_file model evaluation",
     "cli": "text types data features periods maps recognition motion learning model_file model "
-    "growth cluster live export evaluation training",
+    "growth teaching cluster live export evaluation training",
 }
 
 

@@ -176,7 +176,7 @@ def test_two_features_beside_a_larger_drift_are_localized() -> None:
 
 
 def test_copies_are_those_of_the_seed_and_in_order(reference: Traverse) -> None:
-    (copies, places), _ = augmented_route(reference, FRAMES, copies=3, most=60, strengths={}, seed=4)
+    (copies, places, _), _ = augmented_route(reference, FRAMES, copies=3, most=60, strengths={}, seed=4)
     assert len(copies) == 60
     assert places.tolist() == 3 * list(range(0, FRAMES, 10))  # one block
     frames = all_of(copies, 12)

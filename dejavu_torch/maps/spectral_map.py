@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bisect
+import copy
 import math
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
@@ -255,13 +256,13 @@ class SpectralMap(PlaceMap):
         both = projection
         if len(self.stage):
             both = self.staged(torch.eye(self.dimension).to(projection)) @ projection
-        place_map = self._without_places(self.means)
+        place_map = copy.copy(self)  # which shares the lines
+        place_map._buffers = {**self._buffers}
+        place_map.chunks, place_map._bounds = [*self.chunks], [*self._bounds]
         place_map.stage_scale = (both.abs().amax(0) / 127).float()
         place_map.stage = (both / place_map.stage_scale).round().to(torch.int8)
-        place_map.routes = self.routes
         place_map.drives = torch.cat([self.drives, self.drives.new_ones(1)]).sum(0, True, dtype=torch.int32)
-        place_map.extend(self.coded())
-        place_map.positions, place_map.visits = self.positions, self.visits
+        place_map.norms = torch.cat([*map(place_map._norms_of, range(len(self.chunks)))])
         place_map.check()
         return place_map
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from itertools import accumulate
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -25,7 +24,6 @@ DECAY = 0.9  # of a track's running mean, per query
 ANSWER_RADIUS = 2  # places around an answer whose best score counts for a track
 MIN_PROBABILITY = 1e-6  # a filter's probabilities are clamped to [this, 1 - this]
 MAX_STEPS = 100  # of Newton's method
-AT_ONCE = 2**22  # scores
 
 
 class Platt(NamedTuple):
@@ -181,37 +179,42 @@ def calibrated(
 
 @torch.no_grad()
 def calibrated_by_drive(
-    place_map: PlaceMap, descriptors: Tensor, smoother: PlaceSmoother, drive: Drive, places: Tensor
+    blocks: Iterable[Tensor],
+    places: Tensor,
+    smoother: PlaceSmoother,
+    drive: Drive,
+    route_starts: Sequence[int] = (0,),
 ) -> Calibration:
     """Fit on all queries of a drive whose places nobody told: each counts as right with the probability that
     the others of the drive give its answer.
 
     Args:
-        descriptors: (Q,K) of the queries, as they are. smoother, drive: fitted to them. places: (Q,), where
-            a smoother is sure, else -1: without the scores near these, queries stand for some off the map.
+        blocks: the scores of consecutive queries, (B,N) each. places: (Q,), where a smoother is sure, else
+            -1: without the scores near these, queries stand for some off the map.
+        smoother, drive: fitted to all queries.
     """
     single: tuple[list[Tensor], ...] = [], [], []  # answers, confidences, and those off the map
     filtered: tuple[list[Tensor], ...] = [], [], []
-    tracks, filters = (Track(), Track()), (PlaceFilter(), PlaceFilter())
-    starts = (0, *accumulate(route.places for route in place_map.routes[:-1]))
-    states = [filter.start(place_map.places).to(descriptors) for filter in filters]
-    size = max(1, AT_ONCE // place_map.places)
-    for part, place in zip(descriptors.split(size), places.split(size), strict=True):
-        scores = place_map.scores(part)
-        window = _window(place, 2 * TOLERANCE, scores)
-        hidden = torch.where((place >= 0)[:, None], scores.scatter(1, window, math.inf), scores)
-        for i, rows in enumerate((scores, hidden)):
-            belief, states[i] = filters[i].step(rows, states[i], starts)
-            pairs = (single, rows, confidence_of(rows)), (filtered, belief, tracks[i](belief, rows))
+    tracks, filters, first = (Track(), Track()), (PlaceFilter(), PlaceFilter()), 0
+    states: list[Tensor] = []
+    for scores in blocks:
+        place = places[first : first + len(scores)].to(scores.device)
+        first, known = first + len(scores), place >= 0
+        states = states or [filter.start(scores.shape[1]).to(scores) for filter in filters]
+        near = scores.scatter(1, _window(place, 2 * TOLERANCE, scores), math.inf)
+        for i, rows in enumerate((scores, torch.where(known[:, None], near, scores))):
+            belief, states[i] = filters[i].step(rows, states[i], route_starts)
+            track = tracks[i](belief, rows)
+            pairs = (single, rows, confidence_of(rows).cpu()), (filtered, belief, track)
             for found, scored, confidences in pairs:
                 if i:
-                    found[2].append(confidences[(place >= 0).to(confidences.device)].cpu())
+                    found[2].append(confidences[known.cpu()])
                 else:
                     found[0].append(best_match(scored).index.cpu())
-                    found[1].append(confidences.cpu())
+                    found[1].append(confidences)
     answers = [torch.cat(found[0]) for found in (single, filtered)]
     right: tuple[list[Tensor], list[Tensor]] = [], []
-    for block in smoother.blocks(drive, starts):
+    for block in smoother.blocks(drive, route_starts):
         others = smoother.folded(block.before * block.after).cpu().double()
         others = (others / others.sum(1, keepdim=True))[:, :-1]
         own = slice(block.first, block.first + len(others))

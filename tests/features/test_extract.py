@@ -138,7 +138,7 @@ class Terminal(io.StringIO):
 
 def test_a_bar_counts_frames_however_often_they_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
     frames = ArrayTraverse(torch.rand(70, 1, 16, 16))
-    (copies, _), looks = augmented_route(frames, 70, 3, 10_000, {"noise": 0.01})
+    (copies, *_), looks = augmented_route(frames, 70, 3, 10_000, {"noise": 0.01})
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setattr("tqdm.std.time", iter(range(10**6)).__next__)  # each update is shown
