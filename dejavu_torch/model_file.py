@@ -432,7 +432,7 @@ def run_key(
     weights = weights_of(model, "features") | (weights_of(model, "whitening") if fixed else {})
     sums = checksums(weights, header)
     sources = {
-        name: views and [*_source(views.traverse), views.places.tolist()]
+        name: views and [*_source(views.traverse), views.places.tolist(), *["placed"] * bool(views.placed)]
         for name, views in (("second", second), ("visits", visits))
     }
     return digests(source=_source(traverse), **sources) | {"settings": sums.pop(FILE_HEADER), **sums}

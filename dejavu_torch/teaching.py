@@ -88,19 +88,20 @@ class Refinement(NamedTuple):
 
     placed, of: frames of the drive that teach, and all. gain: mean log ratio of the rank of a frame's place
     by its image alone, before and after, in stretches that did not teach; error: its standard error.
-    accepted: whether the map is refined.
+    NaN if there are too few frames to tell. accepted: whether the map is refined.
     """
 
     placed: int
     of: int
-    gain: float = 0.0
-    error: float = 0.0
+    gain: float = math.nan
+    error: float = math.nan
     accepted: bool = False
 
     def __str__(self) -> str:
         if not self.placed:
             return f"0 of {self.of} frames placed; nothing is learned, the map stays as it was"
-        told = f"its rank by one image, where it did not teach: {math.exp(-self.gain) - 1:+.1%}"
+        told = f"ranks by one image, where they did not teach: {math.exp(-self.gain) - 1:+.1%}"
+        told = "too few to tell whether they help" if math.isnan(self.gain) else told
         after = "the map is refined" if self.accepted else "the map stays as it was"
         return f"{self.placed} of {self.of} frames placed; {told}; {after}"
 
@@ -143,6 +144,8 @@ def refine(model: DejaVu, drive: Source, progress: bool = False) -> Refinement:
     before, asked = _log_ranks(place_map, queries, places), []
     for fold in torch.arange(count).tensor_split(FOLDS):
         far = (sure < int(fold[0]) - APART * tau) | (sure > int(fold[-1]) + APART * tau)
+        if int(far.sum()) < LEAST:
+            return Refinement(len(sure), count)
         refined = place_map.refined(_stage(place_map, queries, places, sure[far]))
         gains[fold] = (before - _log_ranks(refined, queries, places))[fold]
         asked.append((refined, descriptors[fold.to(descriptors.device)]))

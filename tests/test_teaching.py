@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from pathlib import Path
 
 import numpy as np
@@ -152,30 +153,52 @@ def test_a_weight_counts_as_so_many_pairs() -> None:
         torch.testing.assert_close(found.abs(), known.abs(), rtol=1e-4, atol=1e-5)
 
 
-def test_the_light_of_a_drive_is_no_change() -> None:
-    places, count = waves(100), 80
-    views = (noisy(places[:count]) - places[:count]) / 2
-    views = views - views.mean(0)  # what changes, without any light
-    batches = [(places[:count] + views, torch.arange(count))]
-    light = torch.rand(16) * (count + LIGHT) / LIGHT
-    shifted = [(places[:count] + views + light, torch.arange(count))]
-    found = []
-    for batch in (batches, shifted):
-        whitening = Whitening(numbers=8, bits=16)
-        copies = [(noisy(places), torch.arange(100))]
-        whitening.learn(places, copies, visits=Visits(batch, torch.zeros(count, dtype=torch.int64)))
-        found.append(whitening(places) @ whitening(places).T)
-    assert 0 < (found[0] - found[1]).abs().mean() < 0.1  # what the prior leaves
-    whitening = Whitening(numbers=8, bits=16)
-    several = [
-        (
-            torch.cat([places, places[:count] + views + light]),
-            torch.cat([torch.arange(100), torch.arange(count)]),
-        )
-    ]
-    whitening.learn(places, several)
-    assert (whitening(places) @ whitening(places).T - found[0]).abs().mean() > 0.02
-    assert VISIT > 1
+def test_a_frame_of_a_drive_counts_as_so_many_copies() -> None:
+    places = waves(100)
+    copies = (noisy(places), torch.arange(100))
+    drive = (changed(places)[:80], torch.arange(80))
+    placed, several = (Whitening(numbers=6, bits=16, shrinkage=0.1) for _ in range(2))
+    placed.learn(
+        places, [copies], samples=10**6, visits=Visits([drive], torch.arange(80))
+    )  # each its own drive
+    light = drive[0] - places[:80]
+    shown = drive[0] - light / (1 + LIGHT)
+    again = [(shown, drive[1])] * int(VISIT)
+    several.learn(places, [copies, *again])
+    products = [one(places) @ one(places).T for one in (placed, several)]
+    torch.testing.assert_close(*products, rtol=0, atol=2e-3)
+
+
+def test_drives_are_placed_on_what_they_have_taught(
+    road: ArrayTraverse, drive: ArrayTraverse, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    learn, taught = DejaVu.learn, []
+
+    def noted(model: DejaVu, source: object, progress: bool = False, second: object = None) -> DejaVu:
+        taught.append(second)
+        return learn(model, source, progress, second)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(DejaVu, "learn", noted)
+    second_traverse(fresh(), road, drive)
+    assert taught[0] is None
+    assert all(isinstance(views, LabelledFrames) for views in taught[1:])
+    assert len(taught) == ROUNDS
+
+
+def test_the_light_of_a_drive_is_no_change(monkeypatch: pytest.MonkeyPatch) -> None:
+    places, shown = waves(100), torch.arange(80)
+    views = noisy(places)[:80]
+    light = torch.rand(16)
+
+    def products(drive: Tensor) -> Tensor:
+        whitening = Whitening(numbers=8, bits=16, shrinkage=0.1)
+        copies = [(noisy(places, seed=2), torch.arange(100))]
+        whitening.learn(places, copies, visits=Visits([(drive, shown)], torch.zeros_like(shown)))
+        return whitening(places) @ whitening(places).T
+
+    assert (products(views + light) - products(views)).abs().mean() > 0.01  # of which a prior leaves some
+    monkeypatch.setattr("dejavu_torch.features.whitening.LIGHT", 0)
+    torch.testing.assert_close(products(views + light), products(views), rtol=0, atol=1e-3)
 
 
 def test_a_sample_keeps_the_drive_of_each_frame() -> None:
@@ -323,6 +346,15 @@ def test_another_route_refines_nothing(tmp_path: Path) -> None:
     assert str(same).endswith("the map stays as it was")
 
 
+def test_few_frames_cannot_tell_whether_a_stage_helps() -> None:
+    model = model_of(waves(300))
+    few = refine(model, noisy(waves(300)[:64]))
+    assert (few.placed >= 60, few.accepted) == (True, False)
+    assert str(few).endswith("too few to tell whether they help; the map stays as it was")
+    assert isinstance(model.map, SpectralMap)
+    assert not len(model.map.stage)
+
+
 def test_what_refines_no_map_is_refused() -> None:
     model = model_of(waves(100))
     with refused("has 29 frames", "at least 30"):
@@ -396,5 +428,7 @@ def test_the_command_refines_a_map(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "refined by 1 drive\n" in out
     assert "stage" in out
     words = ("refine", tmp_path / "m.safetensors", tmp_path / "route.npy")
-    assert "expected" in fails(capsys, *words, "--out", tmp_path / "n.pt")
+    assert f"--out {tmp_path / 'n.pt'} is not the name of a map" in fails(
+        capsys, *words, "--out", tmp_path / "n.pt"
+    )
     assert "none.npy" in fails(capsys, "refine", tmp_path / "m.safetensors", tmp_path / "none.npy")

@@ -534,7 +534,7 @@ def run_refine(
     from dejavu_torch.teaching import refine
 
     out = map if out is None else out
-    _check_map_file(out, *drives)
+    _check_map_file(out, *drives, option="--out")
     device_of(loading.device)
     model = loading.model(map)
     found = {drive: refine(model, open_source(drive), progress=True) for drive in drives}
@@ -624,11 +624,11 @@ def _check_cluster(cluster: str, device: str, mapper: Mapper | None = None) -> N
         raise InputError(f"{seen}; expected a spectral map")
 
 
-def _check_map_file(path: Path, *read: str | Path | None) -> None:
+def _check_map_file(path: Path, *read: str | Path | None, option: str = "--map") -> None:
     """Refuse early a map file that cannot be written or is also read."""
     if path.suffix != ".safetensors":
         expected = path.with_suffix(".safetensors") if path.name else "such as route.safetensors"
-        raise InputError(f"--map {path} is not the name of a map; expected {expected}")
+        raise InputError(f"{option} {path} is not the name of a map; expected {expected}")
     check_output_file(path)
     check_not_read(path, *read)
 
