@@ -293,7 +293,7 @@ def summary_of(model: Model) -> MapSummary:
     }
     fixed["names"] = len(header["names"] or "")
     summary = model.map.summary()
-    fixed["header"] = map_size(tensors, header) - summary.route_bytes - sum(fixed.values())
+    fixed["header"] = map_size(tensors, header) - summary.map_bytes - sum(fixed.values())
     return summary.with_parts(fixed=fixed)
 
 

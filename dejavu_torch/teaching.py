@@ -19,7 +19,7 @@ from dejavu_torch.features.whitening import learned_whitening
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.memory import without_autocast
-from dejavu_torch.model import DejaVu, require_map
+from dejavu_torch.model import DejaVu, check_queries, require_map
 from dejavu_torch.recognition.calibration import TOLERANCE, Calibration, calibrated_by_drive
 from dejavu_torch.recognition.centring import PRIOR, centred
 from dejavu_torch.recognition.evidence import spacing_of
@@ -100,7 +100,8 @@ class Refinement(NamedTuple):
     def __str__(self) -> str:
         if not self.placed:
             return f"0 of {self.of} frames placed; nothing is learned, the map stays as it was"
-        told = f"ranks by one image, where they did not teach: {math.exp(-self.gain) - 1:+.1%}"
+        ranks = f"ranks {abs(math.expm1(self.gain)):.1%} {'higher' if self.gain >= 0 else 'lower'}"
+        told = f"where it did not teach, a place {ranks} by one image"
         told = "too few to tell whether they help" if math.isnan(self.gain) else told
         after = "the map is refined" if self.accepted else "the map stays as it was"
         return f"{self.placed} of {self.of} frames placed; {told}; {after}"
@@ -134,6 +135,8 @@ def refine(model: DejaVu, drive: Source, progress: bool = False) -> Refinement:
     traverse = model.resample(as_traverse(drive), model.step, progress, model.frame_shape)
     if len(traverse) < LEAST:
         raise InputError(f"{traverse.name} has {len(traverse)} frames; expected at least {LEAST}")
+    features = model.descriptor.count_features(traverse)
+    check_queries(model, traverse.frame_shape, features, traverse.name)
     descriptors = model.descriptor.all_of(traverse, progress).float().to(place_map.device)
     places = place_drive(model, descriptors).to(place_map.device)
     sure = (places >= 0).nonzero()[:, 0]

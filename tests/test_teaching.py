@@ -326,6 +326,7 @@ def test_a_drive_refines_a_map_and_the_next_one_is_found_better(tmp_path: Path) 
     grown = (tmp_path / "after.safetensors").stat().st_size - (tmp_path / "before.safetensors").stat().st_size
     assert 16 * 16 + 16 * 4 + 4 <= grown <= 16 * 16 + 16 * 4 + 400  # the stage alone, with its names
     assert again.summary().fixed["stage"] == 16 * 16 + 16 * 4 + 4
+    assert again.summary().map_bytes == (tmp_path / "after.safetensors").stat().st_size
     size = (tmp_path / "after.safetensors").stat().st_size
     refine(again, third)
     again.save(tmp_path / "after.safetensors")
@@ -364,7 +365,7 @@ def test_what_refines_no_map_is_refused() -> None:
     templates = DejaVu(mapper=TemplateMapper(ImposedPeriods([3, 4, 5], bin=4))).learn(waves(100))
     with refused("kind 'templates'", "expected one of kind 'spectral'"):
         refine(templates, waves(40))
-    with refused("(1, 9)", "the map expects (Q, 16)"):
+    with refused("9 features", "16"):
         refine(model, torch.rand(40, 9))
     assert isinstance(model.map, SpectralMap)
     assert not len(model.map.stage)
