@@ -194,7 +194,7 @@ class DejaVu(nn.Module):
             traverse: the reference: a Traverse, what `open_source` opens, an array or tensor of frames or
                 features (see `ArrayTraverse`), or a list or dataset of frames (see `Frames`).
             second: another traverse of the same places, from which whitening learns what changes between
-                visits, instead of from augmented copies; see `growth.second_traverse`.
+                visits, instead of from augmented copies, or besides; see `growth.second_traverse`.
             progress: show a progress bar on a terminal, elsewhere a line per minute, on stderr.
             checkpoint: keeps the partial map of a long route, so that learning can resume after a kill; the
                 caller removes it.
