@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -112,7 +113,8 @@ def bench_teaching(name: str, task: Task, data: Path) -> Iterator[Row]:
             row["right"] = None if truth is None else right_of(views, truth, task, learned.tolerance)
         if way == REFINED:
             found = refine(model, shown)
-            row |= {"placed": found.placed, "of": found.of, "gain": found.gain, "error": found.error}
+            row |= {"placed": found.placed, "of": found.of}
+            row |= {} if math.isnan(found.gain) else {"gain": found.gain, "error": found.error}
         if task.asked is not None and route.reference != learned.reference:
             taught, model = model, DejaVu()
             model.descriptor.take(taught.descriptor, whitening=True)
