@@ -24,12 +24,11 @@ from dejavu_torch.maps.spectral_map import LARGEST, Chunk, SpectralMap
 from dejavu_torch.model import DejaVu, features_per_frame, require_map
 from dejavu_torch.model_file import ModelState, Recipe, difference, recipe_of, run_key, weights_of
 from dejavu_torch.motion.resampling import ResampledTraverse, source_of
-from dejavu_torch.teaching import place_drives
+from dejavu_torch.teaching import LEAST, place_drives
 from dejavu_torch.types import InputError, Traverse
 
 log = logging.getLogger("dejavu_torch")
 
-FEWEST = 30  # frames of a drive that is placed, at least
 EXACT = 2**24  # maximum number of even steps, with exact positions in float32
 
 
@@ -249,8 +248,8 @@ def second_traverse(
     if len(known) == len(drives):
         return LabelledFrames(chained([drive for drive, _ in drives]), torch.cat(known))
     for drive, places, seen in views:
-        if places is None and len(drive) < FEWEST:
-            expected = f"a truth for its places, or at least {FEWEST} frames in order"
+        if places is None and len(drive) < LEAST:
+            expected = f"a truth for its places, or at least {LEAST} frames in order"
             raise InputError(f"{seen}; expected the same number, frame i at place i, {expected}")
     model.descriptor.check_sizes(reference, *(drive for drive, _ in drives))
     return place_drives(model, reference, drives, progress)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Iterator, Sequence
-from itertools import accumulate
 from typing import NamedTuple
 
 import torch
@@ -167,7 +166,7 @@ def _calibration(
     place_map: PlaceMap, queries: Tensor, places: Tensor, scores: Iterator[Tensor]
 ) -> Calibration:
     """The calibration by the scores of all queries of a drive, which the smoother has centred."""
-    smoother, starts = PlaceSmoother(), (0, *accumulate(route.places for route in place_map.routes[:-1]))
+    smoother, starts = PlaceSmoother(), place_map.route_starts
 
     def rows(numbers: Tensor) -> Tensor:
         return place_map.scores(queries[numbers])

@@ -537,10 +537,11 @@ def run_refine(
     _check_map_file(out, *drives, option="--out")
     device_of(loading.device)
     model = loading.model(map)
-    found = {drive: refine(model, open_source(drive), progress=True) for drive in drives}
-    for drive, refinement in found.items():
-        print(f"{drive}: {refinement}")
-    if out != map or any(one.accepted for one in found.values()):
+    found = []
+    for drive in [open_source(one) for one in drives]:  # all are there before one is read
+        found.append(refine(model, drive, progress=True))
+        _say(f"{drive.name}: {found[-1]}")
+    if out != map or any(one.accepted for one in found):
         model.save(out)
         print_map(model)
         _print_localize(out, model, command)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
+from itertools import accumulate
 from typing import Any, ClassVar, Self
 
 import torch
@@ -105,6 +106,11 @@ class PlaceMap(nn.Module, ABC):
     def table(self) -> FrameTable:
         """The frame and route of each place."""
         return FrameTable(self.places, self.positions, self.routes)
+
+    @property
+    def route_starts(self) -> tuple[int, ...]:
+        """The first place of each route."""
+        return (0, *accumulate(route.places for route in self.routes[:-1]))
 
     def frame_of(self, places: Tensor) -> Tensor:
         """The reference frame of each place, see `FrameTable`."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from itertools import accumulate
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -78,13 +77,13 @@ class Localizer:
     ) -> None:
         self.place_map, self.matching, self.track = place_map, matching, Track()
         self.searcher = Scan(place_map) if searcher is None and place_map is not None else searcher
-        sequence, routes = matching.sequence, () if place_map is None else place_map.routes
+        sequence = matching.sequence
         self.own: Together = sequence.length if isinstance(sequence, SequenceMatcher) else "filter"
         self.models: dict[Together, SequenceModel] = {**matching.also}
         if isinstance(sequence, SequenceModel):
             self.models[self.own] = sequence
         self.states: dict[Together, Tensor] = {}  # of the models; empty before the first query
-        self.route_starts = (0, *accumulate(route.places for route in routes[:-1]))
+        self.route_starts = (0,) if place_map is None else place_map.route_starts
 
     @torch.no_grad()
     def __call__(self, descriptors: Tensor, progress: bool = False) -> Match:

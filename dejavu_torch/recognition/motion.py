@@ -209,15 +209,12 @@ class Motion:
         """
         (on, off), (on_after, off_after) = self._split(before), self._split(after)
         start, off, off_after = self._turned(on), off[..., 0], off_after[..., 0]
-        total, mean = (
-            before[..., :-1].sum(-1),
-            torch.lerp(off_after, after[..., :-1].mean(-1), self.layout.share),
-        )
+        total = before[..., :-1].sum(-1)
+        mean = torch.lerp(off_after, after[..., :-1].mean(-1), self.layout.share)
         _, jump, leave, enter = self.rates
         kinds = []
-        for move, reach, shifted in zip(
-            self.moves, self.reach, self._shifts(on_after, back=True), strict=True
-        ):
+        shifts = self._shifts(on_after, back=True)
+        for move, reach, shifted in zip(self.moves, self.reach, shifts, strict=True):
             lost = start.flatten(-2) @ (1 - reach).flatten()
             kinds.append(move * ((start * shifted).sum((-1, -2)) + off_after * lost))
         kinds += [jump * total * mean, leave * total * off_after]

@@ -433,9 +433,9 @@ MUTANTS = [
     ),
     Mutant(
         "The borders of routes that a sequence keeps are those of the places, through all routes.",
-        "dejavu_torch/recognition/localizer.py",
-        "accumulate(route.places for route in routes[:-1])",
-        "(route.places for route in routes[:-1])",
+        "dejavu_torch/maps/place_map.py",
+        "accumulate(route.places for route in self.routes[:-1])",
+        "(route.places for route in self.routes[:-1])",
         ("tests/test_growth.py::test_a_sequence_does_not_run_from_one_route_into_the_next",),
     ),
     Mutant(
