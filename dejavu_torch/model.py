@@ -7,7 +7,7 @@ import inspect
 import logging
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -394,15 +394,10 @@ class DejaVu(nn.Module):
             order: (N,) the frame of each place of a shuffled map; the match then counts frames.
         """
         matching = matching if isinstance(matching, Matching) else self.matching(matching)
-        score = None if order is None else self._shuffled(order)
+        score = None if order is None else self.scores_in(order)
         localizer, smoother = self.localizer(matching), matching.sequence
         if isinstance(smoother, PlaceSmoother):
             return localizer.drive(descriptors, smoother, score, progress)
-        if matching.smoother is not None:
-            match = self.localize_descriptors(descriptors, matching._replace(smoother=None), order, progress)
-            drive = localizer.drive(descriptors, copy.deepcopy(matching.smoother), score, progress)
-            drive = drive if matching.k is None else drive.map(lambda column: column[:, 0])
-            return replace(match, sequences={**match.sequences, "smoother": drive})
         if score is None:
             match = localizer(descriptors, progress)
             late = isinstance(smoother, PlaceFilter) and smoother.lag
@@ -413,7 +408,7 @@ class DejaVu(nn.Module):
             scores = map(score, with_progress(parts, "localizing", progress))
             return Match.joined(map(matcher.match, scores))
 
-    def _shuffled(self, order: Tensor) -> Scoring:
+    def scores_in(self, order: Tensor) -> Scoring:
         """The scores of a map whose places are the frames `order`, frame by frame."""
         device = self.map.device
         place = order.argsort().to(device)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import logging
 from collections.abc import Mapping
 from dataclasses import replace
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.evaluation.controls import leave_out_match, null_control
+from dejavu_torch.evaluation.controls import leave_out_match, null_map
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.preprocess import Preprocess
@@ -22,7 +21,9 @@ from dejavu_torch.maps.template_map import TemplateMap, TemplateMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import recipe_of
 from dejavu_torch.motion.resampling import ResampledTraverse
-from dejavu_torch.recognition.localizer import SINGLE, Localizer, Matching
+from dejavu_torch.recognition.drive import DriveQuery, localize_drives
+from dejavu_torch.recognition.localizer import SINGLE, Localizer, Matching, Scoring, asked_of
+from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.text import with_progress
 from dejavu_torch.types import InputError, Match, Traverse
 
@@ -38,7 +39,8 @@ class Baseline(NamedTuple):
     """The matches of another way to store the route.
 
     name: for tables. bytes: in all. k: the stride, if every k-th frame is stored. fixed: the part of the
-    bytes that does not grow with the route, such as a backbone.
+    bytes that does not grow with the route, such as a backbone. asked: the same queries as a drive, for
+    `localize_drives`, if a smoother is compared.
     """
 
     name: str
@@ -46,6 +48,7 @@ class Baseline(NamedTuple):
     bytes: int | None = None
     k: int | None = None
     fixed: int = 0
+    asked: DriveQuery | None = None
 
 
 def nearest_frames(
@@ -66,31 +69,35 @@ def nearest_frames(
     Returns:
         Match of (Q,). Single queries find stored frames only, sequences also frames between these.
     """
-    stored = reference[:: min(k, len(reference))]
-    nearest = ((torch.arange(len(reference), device=reference.device) + k // 2) // k).clamp(
-        max=len(stored) - 1
-    )
     parts = query.split(max(1, BLOCK_DISTANCES // len(reference)))
     batches = with_progress(parts, "baselines", progress)
-
-    def score(queries: Tensor) -> Tensor:
-        scores = phase_distances(queries.to(stored.device), stored, metric)
-        return scores if k == 1 else scores[:, nearest]
-
-    matcher = Localizer(None, matching)
-    match = Match.joined(map(matcher.match, map(score, batches)))
+    matcher, nearest = Localizer(None, matching), _nearest_stored(len(reference), k)
+    match = Match.joined(map(matcher.match, map(scores_of_stored(reference, k, metric), batches)))
 
     def stored_frame(frame: Tensor) -> Tensor:
-        return torch.where(frame >= 0, k * nearest.cpu()[frame], -1)
+        return torch.where(frame >= 0, k * nearest[frame], -1)
 
     sequences = dict(match.sequences)
     if 1 in sequences:
         sequences[1] = sequences[1].renumbered(stored_frame)
-    if matching.smoother is not None:
-        sequences["smoother"] = matcher.drive(query, copy.deepcopy(matching.smoother), score, progress)
     if matching.sequence is None or matcher.own == 1:  # single queries
         match = replace(match, index=stored_frame(match.index))
     return replace(match, probability=None, sequences=sequences)
+
+
+def scores_of_stored(reference: Tensor, k: int = 1, metric: Metric = "l1") -> Scoring:
+    """The distances of queries from the nearest stored frame of each place, see `nearest_frames`."""
+    stored, nearest = reference[:: min(k, len(reference))], _nearest_stored(len(reference), k)
+
+    def score(queries: Tensor) -> Tensor:
+        scores = phase_distances(queries.to(stored.device), stored, metric)
+        return scores if k == 1 else scores[:, nearest.to(stored.device)]
+
+    return score
+
+
+def _nearest_stored(frames: int, k: int) -> Tensor:
+    return ((torch.arange(frames) + k // 2) // k).clamp(max=-(-frames // min(k, frames)) - 1)
 
 
 def stride_bytes(frames: int, dimension: int, itemsize: int, k: int) -> int:
@@ -133,7 +140,8 @@ def baselines_of(
 
     def nearest(name: str, stored: Tensor, k: int, bytes: int, stride: int = 1) -> Baseline:
         match = run.match_by(lambda *how: nearest_frames(stored, how[0], stride, metric, progress, how[1]))
-        return Baseline(name, match, bytes + fixed, k, fixed)
+        asked = run.asked(scores_of_stored(stored, stride, metric))
+        return Baseline(name, match, bytes + fixed, k, fixed, asked)
 
     size, own = partial(stride_bytes, frames, dimension), reference.element_size()
     if spectral:
@@ -164,12 +172,23 @@ def baselines_of(
         found["leave_out"] = Baseline(f"reference on itself, +-{leave_out} left out", itself)
     pair, batch = (run.reference, run.query), model.batch_size
     if not _is_plain_hog(model):
-        found |= hog_baselines(*pair, batch, run.tolerance, progress, matching)
+        found |= hog_baselines(*pair, batch, run.tolerance, progress, matching, run.beside)
     if run.sequence is not None:  # SeqSLAM compares the grey pixels of small frames by L1
         plain = DejaVu(PatchPixels(), "none", batch_size=batch, preprocess=Preprocess("grey"))
         names = {"seqslam": ("SeqSLAM's pixels: grey, patches normalised", 1)}
-        found |= _described_baselines(plain, names, pair, progress, matching)
+        found |= _described_baselines(plain, names, pair, progress, matching, run.beside)
     return found
+
+
+def with_drives(found: Mapping[str, Baseline], progress: bool = False) -> dict[str, Baseline]:
+    """Baselines with the answers of a smoother, all in one pass."""
+    asked = {key: one.asked for key, one in found.items() if one.asked is not None}
+    matches, smoothed = localize_drives([*asked.values()], progress), dict(found)
+    for key, drive in zip(asked, matches, strict=True):
+        best, match = drive.map(lambda column: column[:, 0]), found[key].found
+        match = replace(match, sequences={**match.sequences, "smoother": best})
+        smoothed[key] = found[key]._replace(found=match, asked=None)
+    return smoothed
 
 
 def _null_controls(run: Localization, seed: int, one: str, progress: bool) -> dict[str, Baseline]:
@@ -178,10 +197,9 @@ def _null_controls(run: Localization, seed: int, one: str, progress: bool) -> di
     found = {}
 
     def null(name: str, same_plan: bool = False) -> Baseline:
-        def find(query: Tensor, matching: Matching) -> Match:
-            return null_control(model, run.reference_features, query, seed, same_plan, matching, progress)
-
-        return Baseline(f"null: {name}", run.match_by(find))
+        shuffled, order = null_map(model, run.reference_features, seed, same_plan)
+        match = run.match_by(lambda query, how: shuffled.localize_descriptors(query, how, order, progress))
+        return Baseline(f"null: {name}", match, asked=run.asked(shuffled.scores_in(order)))
 
     foreign = isinstance(model.mapper, TemplateMapper) and model.mapper.periods is None
     if foreign:
@@ -251,13 +269,14 @@ def hog_baselines(
     tolerance: int,
     progress: bool = False,
     matching: Matching = SINGLE,
+    smoother: PlaceSmoother | None = None,
 ) -> dict[str, Baseline]:
     """HOG of all frames and of every k-th, k = 2 x tolerance, by L1; empty if HOG cannot be computed."""
     one = "place" if isinstance(reference, ResampledTraverse) else "frame"
     strides = {"hog": 1, "hog_stride_coarsest": max(1, 2 * tolerance)}
     names = {key: (f"HOG, {every(k, one)}", k) for key, k in strides.items()}
     plain = DejaVu(whitening="none", batch_size=batch_size)
-    return _described_baselines(plain, names, (reference, query), progress, matching)
+    return _described_baselines(plain, names, (reference, query), progress, matching, smoother)
 
 
 def _described_baselines(
@@ -266,6 +285,7 @@ def _described_baselines(
     traverses: tuple[Traverse, Traverse],
     progress: bool,
     matching: Matching,
+    smoother: PlaceSmoother | None,
 ) -> dict[str, Baseline]:
     """Baselines by L1 that store every k-th reference frame, described by `plain`."""
     if len(traverses[0].frame_shape) != 3:
@@ -276,10 +296,16 @@ def _described_baselines(
         log.info("no %s to compare with: %s", type(plain.features).__name__, error)
         return {}
     size = partial(stride_bytes, len(stored), stored.shape[1], stored.element_size())
-    return {
-        key: Baseline(name, nearest_frames(stored, queries, k, "l1", progress, matching), size(k), k)
-        for key, (name, k) in names.items()
-    }
+
+    def baseline(name: str, k: int) -> Baseline:
+        match, score = (
+            nearest_frames(stored, queries, k, "l1", progress, matching),
+            scores_of_stored(stored, k),
+        )
+        asked = None if smoother is None else asked_of(queries, smoother, score)
+        return Baseline(name, match, size(k), k, asked=asked)
+
+    return {key: baseline(name, k) for key, (name, k) in names.items()}
 
 
 def every(k: int, one: str) -> str:

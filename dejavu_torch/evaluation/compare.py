@@ -26,7 +26,7 @@ from dejavu_torch.data.ground_truth import (
 from dejavu_torch.data.source import Source, as_traverse
 from dejavu_torch.data.traverse import fitted
 from dejavu_torch.evaluation.answers import answer_facts
-from dejavu_torch.evaluation.baselines import baselines_of
+from dejavu_torch.evaluation.baselines import Baseline, baselines_of, with_drives
 from dejavu_torch.evaluation.contenders import Contender, contend, models_beside
 from dejavu_torch.evaluation.curves import auc_error
 from dejavu_torch.evaluation.evaluate import RANKS, evaluation_facts
@@ -49,7 +49,7 @@ from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, r
 from dejavu_torch.periods.spectrogram import BACKEND
 from dejavu_torch.recognition.centring import PRIOR, centred
 from dejavu_torch.recognition.filter import PlaceFilter
-from dejavu_torch.recognition.localizer import Matching
+from dejavu_torch.recognition.localizer import SINGLE, Matching
 from dejavu_torch.recognition.select import check_candidates
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.recognition.smoother import PlaceSmoother
@@ -166,7 +166,7 @@ def compare(
         beside = beside and (given is not None or len(query) * model.map.places <= MAX_FILTERED)
         also = models_beside(sequence, beside, len(query), model.map.places, tolerance)
         alike = PlaceSmoother(within=tolerance) if beside and len(query) > 1 else None
-        matching = Matching(sequence, also, smoother=alike)
+        matching = Matching(sequence, also)
         centring = ordered and len(query) >= PRIOR if centre is None else centre
         settings = matching, centring, smoother is not None, tolerance, top, progress
         run, found = _localized(model, reference, query, places, *settings)
@@ -177,7 +177,7 @@ def compare(
             drive = model.localize_descriptors(run.query_features, own, progress=progress)
             best = drive.map(lambda column: column[:, 0])
             sequences = {**run.judged.sequences, "smoother": best}
-            run = run._replace(judged=replace(run.judged, sequences=sequences))
+            run = run._replace(judged=replace(run.judged, sequences=sequences), beside=alike)
         if smoother is not None:
             run = run._replace(match=best, smoother=smoother)
     off_map = _match_distractors(model, off, smoother or sequence, centring, progress)
@@ -290,17 +290,20 @@ def _other_contenders(
     run: Localization, others: OtherModels, leave_out: int | None, seed: int, progress: bool
 ) -> dict[str, Contender]:
     """The baselines, null controls and further models, scored."""
-    table, contenders = run.model.map.table, {}
+    table, judged = run.model.map.table, run.truth is not None
     itself = table.scored(torch.arange(table.places))[:, None]  # of the places as queries
-    if run.truth is not None or leave_out is not None:
-        for key, (name, match, bytes, k, fixed) in baselines_of(run, seed, leave_out, progress).items():
-            truth, match = itself if key == "leave_out" else run.truth, match.renumbered(table.scored)
-            contenders[key] = contend(name, match, truth, run.tolerance, bytes, k, fixed)
-    for key, (name, other) in others.items() if run.truth is not None else ():
+    found = baselines_of(run, seed, leave_out, progress) if judged or leave_out is not None else {}
+    for key, (name, other) in others.items() if judged else ():
         other.learn(run.reference, progress)
-        queries = other.descriptor.all_of(run.query, progress)
+        queries, size = other.descriptor.all_of(run.query, progress), other.summary()
         match = other.localize_descriptors(queries, run.matching, progress=progress)
-        contenders[key] = run.contend(name, match.renumbered(table.scored), other)
+        beside = copy.deepcopy(run.beside)
+        asked = None if beside is None else other.localizer(SINGLE).asked(queries, beside)
+        found[key] = Baseline(name, match, size.map_bytes, None, size.fixed_bytes, asked)
+    contenders = {}
+    for key, (name, match, bytes, k, fixed, _) in with_drives(found, progress).items():
+        truth, match = itself if key == "leave_out" else run.truth, match.renumbered(table.scored)
+        contenders[key] = contend(name, match, truth, run.tolerance, bytes, k, fixed)
     return contenders
 
 

@@ -42,19 +42,30 @@ def null_control(
     sequence: Matching | SequenceModel | None = None,
     progress: bool = False,
 ) -> Match:
-    """Matches of a map learned from the reference in shuffled order.
+    """Matches of a map learned from the reference in shuffled order, see `null_map`.
+
+    Args:
+        reference: (N,D) features. query: (Q,D) features.
+        sequence: as in `DejaVu.localize`. progress: show progress on stderr.
+
+    Returns:
+        Match of (Q,) whose index is the reference frame *stored* at the reported place, or -1.
+    """
+    null, order = null_map(model, reference, seed, same_plan)
+    return null.localize_descriptors(query, sequence, order, progress)
+
+
+def null_map(
+    model: DejaVu, reference: Tensor, seed: int = 0, same_plan: bool = False
+) -> tuple[DejaVu, Tensor]:
+    """A model with a map of the reference (N,D) in shuffled order, and this order (N,).
 
     Nothing repeats in time, so its right answers do not come from periods, but from templates that hold
     few frames each, as in any store of frames.
 
     Args:
-        reference: (N,D) features. query: (Q,D) features.
         same_plan: keep the layers of the model's template map and learn only the templates. Otherwise
             the periods are searched again too; a finder that tests them finds none in noise.
-        sequence: as in `DejaVu.localize`. progress: show progress on stderr.
-
-    Returns:
-        Match of (Q,) whose index is the reference frame *stored* at the reported place, or -1.
     """
     order, mixed = shuffled(reference, seed)
     mapper = model.mapper
@@ -70,7 +81,7 @@ def null_control(
             null.learn_features(mixed)
         finally:
             log.setLevel(level)
-    return null.localize_descriptors(query, sequence, order, progress)
+    return null, order
 
 
 def shuffled(reference: Tensor, seed: int = 0) -> tuple[Tensor, Tensor]:

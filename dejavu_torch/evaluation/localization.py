@@ -14,8 +14,9 @@ from dejavu_torch.data.positions import unit_of
 from dejavu_torch.evaluation.contenders import Contender, contend
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.resampling import ResampledTraverse
+from dejavu_torch.recognition.drive import DriveQuery
 from dejavu_torch.recognition.filter import PlaceFilter
-from dejavu_torch.recognition.localizer import SINGLE, Matching
+from dejavu_torch.recognition.localizer import SINGLE, Matching, Scoring, asked_of
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.types import Match, SequenceModel, Traverse
 
@@ -29,7 +30,7 @@ class Localization(NamedTuple):
     tolerance: in places, inclusive. matching: for the map and all baselines. causal_features: the queries
     for sequences and filters, if query_features are centred, which takes all of them. match: the answers.
     judged: the matches that the scores at top level judge, with those of other models. smoother: of the
-    answers, if they are those of the whole drive.
+    answers, if they are those of the whole drive. beside: one to compare all contenders by, if any.
 
     Convention 11: match and truth count places and queries, pictures show frames of the sources.
     """
@@ -46,6 +47,7 @@ class Localization(NamedTuple):
     causal_features: Tensor | None = None
     judged: Match = NOTHING
     smoother: PlaceSmoother | None = None
+    beside: PlaceSmoother | None = None
 
     def __repr__(self) -> str:
         return f"{self.query.name} on {self.reference.name}"
@@ -57,14 +59,19 @@ class Localization(NamedTuple):
 
     def match_by(self, match: Callable[[Tensor, Matching], Match]) -> Match:
         """The matches of a function of queries and matching, with those of all models in `sequences`."""
-        causal = self.causal_features
-        matching = self.matching._replace(plain=causal)
+        causal, matching = self.causal_features, self.matching
         if causal is None or not (matching.also or matching.sequence):
             return match(self.query_features, matching)
-        single = matching.sequence is None
-        found = match(causal, matching._replace(smoother=None))
-        whole = match(self.query_features, matching._replace(sequence=None, also={}))
-        return replace(whole if single else found, sequences={**found.sequences, **whole.sequences})
+        found = match(causal, matching)
+        if matching.sequence is not None:
+            return found
+        return replace(match(self.query_features, matching._replace(also={})), sequences=found.sequences)
+
+    def asked(self, score: Scoring) -> DriveQuery | None:
+        """The queries as a drive with the scores of another map, if a smoother is compared."""
+        if self.beside is None:
+            return None
+        return asked_of(self.query_features, self.beside, score, self.causal_features)
 
     @property
     def answers(self) -> str:

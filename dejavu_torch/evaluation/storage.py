@@ -38,8 +38,7 @@ def coded_at_sizes(
     Raises:
         InputError: the map is not spectral, or there is no ground truth.
     """
-    # without a filter and a smoother for each size
-    matching = SINGLE if run.sequence is None else run.matching._replace(smoother=None)
+    matching = SINGLE if run.sequence is None else run.matching  # without a filter for each size
     queries = run.query_features if run.sequence is None else run.causal_features
     run = run._replace(matching=matching, query_features=run.query_features if queries is None else queries)
     place_map = run.model.map

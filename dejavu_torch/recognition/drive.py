@@ -1,4 +1,4 @@
-"""The matches of a whole drive, from a smoother."""
+"""The matches of whole drives, from a smoother."""
 
 from __future__ import annotations
 
@@ -12,14 +12,17 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dejavu_torch.recognition.calibration import TOLERANCE, Platt, confidence_of
+from dejavu_torch.recognition.evidence import Spacing, spacing_of
 from dejavu_torch.recognition.filter import near_scores
 from dejavu_torch.recognition.large import TILE, LargeDrive, Tiles, is_large
+from dejavu_torch.recognition.motion import Layout
 from dejavu_torch.recognition.select import best_candidates
-from dejavu_torch.recognition.smoother import Drive, PlaceSmoother, Rows, normalised
+from dejavu_torch.recognition.smoother import Drive, PlaceSmoother, Rows, blocks_together, normalised
 from dejavu_torch.text import progress_of
 from dejavu_torch.types import Match
 
 DOUBT = 0.1  # nats for each deviation by which an answer's own score is worse than is usual in the drive
+KEPT = 2**26  # scores of drives that are smoothed together, up to which they are computed once
 NORMAL = 1.4826  # standard deviations of a Gaussian over its median absolute deviation
 
 
@@ -32,101 +35,161 @@ class Shown(NamedTuple):
     own: Tensor  # the score of the answer by its query alone
 
 
-@torch.no_grad()
-def localize_drive(
-    rows: Rows,
-    descriptors: Tensor,
-    smoother: PlaceSmoother,
-    k: int = 1,
-    radius: int = 5,
-    route_starts: Sequence[int] = (0,),
-    platt: Platt | None = None,
-    progress: bool = False,
-    single: Rows | None = None,
-    tiles: Tiles | None = None,
-) -> Match:
-    """Fit a smoother to a drive and match its queries.
+class DriveQuery(NamedTuple):
+    """A drive to match by a smoother, which is fitted to it.
 
-    If they are no drive of the map, the answers are those of single queries, and a probability is the lower
-    one of the single query and the smoother; of one query alone it is its own.
-
-    Args:
+    Attributes:
         rows: scores of queries by their numbers, (B,) -> (B,N). descriptors: (Q,K) of all queries.
-        single: likewise, of queries that are no drive, which are not centred; None is as `rows`.
         k: candidates. radius: suppression radius in places.
         platt: the calibration of single queries, if there is one.
+        single: as `rows`, of queries that are no drive, which are not centred; None is as `rows`.
         tiles: the scores of `rows` for large maps; None makes them of rows.
+    """
+
+    rows: Rows
+    descriptors: Tensor
+    smoother: PlaceSmoother
+    k: int = 1
+    radius: int = 5
+    route_starts: Sequence[int] = (0,)
+    platt: Platt | None = None
+    single: Rows | None = None
+    tiles: Tiles | None = None
+
+
+class Seen(NamedTuple):
+    """Some queries of a drive, the last of which come first.
+
+    mass: (B,n) of places, in double precision, so that answers that are nearly sure differ. scores: (B,n).
+    known: which places, (n,); None for all.
+    """
+
+    mass: Tensor
+    scores: Tensor
+    known: Tensor | None = None
+
+
+def localize_drive(asked: DriveQuery, progress: bool = False) -> Match:
+    """As `localize_drives`, of one."""
+    return localize_drives([asked], progress)[0]
+
+
+@torch.no_grad()
+def localize_drives(drives: Sequence[DriveQuery], progress: bool = False) -> list[Match]:
+    """Match the queries of drives. Those of as many queries and places, as of one drive on several maps, are
+    smoothed in one pass, which takes hardly longer than that of a single one.
+
+    Of queries that are no drive of the map, the answers are those of single queries, and a probability is the
+    lower one of the single query and the smoother; of one query alone it is its own.
 
     Returns:
-        Match of (Q,k) on the CPU, with probability and confidence; all accepted that have a finite score.
+        A Match of (Q,k) for each, on the CPU, with probability and confidence; all accepted that have a
+        finite score.
     """
-    queries = len(descriptors)
-    places = rows(torch.arange(min(1, queries))).shape[1]
-    if is_large(queries, places):
-        tiles = tiles or Tiles(lambda numbers: iter([(0, rows(numbers))]), places)
-        settings = places, smoother, route_starts, max(2, k), radius, progress
-        seen = _of_windows(LargeDrive(tiles, descriptors, *settings), single or rows)
-    else:
-        smoother.fit(rows, descriptors, route_starts)
-        seen = _of_all_places(smoother, smoother.drive(rows, descriptors), route_starts, single or rows)
-    parts: list[Shown] = []
+    shown: list[list[Shown]] = [[] for _ in drives]
+    queries = sum(len(asked.descriptors) for asked in drives)
     with progress_of("smoothing", queries, progress, "query") as update:
-        for mass, scores, known in seen:
-            scores = scores.masked_fill(scores.isnan(), math.inf)
-            ranked = near_scores(mass, scores, smoother.within) if smoother.is_drive else scores
-            columns = None if known is None else known.expand_as(ranked)
-            pair = best_candidates(ranked, min(2, ranked.shape[1]), TOLERANCE, columns)
-            match = best_candidates(ranked, k, radius, columns)
-            at = match.index[:, :1].clamp(min=0)
-            if known is not None:
-                at = torch.searchsorted(known, at).clamp(max=len(known) - 1)
-            probability = mass_around(mass, at, smoother.within)
-            if not smoother.is_drive and platt is not None:
-                by_itself = platt.probability(confidence_of(scores))
-                probability = by_itself if queries == 1 else torch.minimum(probability, by_itself)
-            probability = probability.masked_fill(match.index[:, 0] < 0, 0)
-            margin = pair.score[:, -1] - pair.score[:, 0] if places > 1 else pair.score[:, 0] * math.nan
-            parts.append(Shown(match, margin, probability, scores.gather(1, at)[:, 0]))
-            update(len(scores))
+        for i, seen in _seen(drives, progress):
+            shown[i].append(_shown(drives[i], seen))
+            update(len(seen.scores))
+    return [_joined(asked, parts[::-1]) for asked, parts in zip(drives, shown, strict=True)]
+
+
+def _shown(asked: DriveQuery, seen: Seen) -> Shown:
+    """The answers of some queries."""
+    mass, scores, known = seen
+    smoother, queries = asked.smoother, len(asked.descriptors)
+    scores = scores.masked_fill(scores.isnan(), math.inf)
+    ranked = near_scores(mass, scores, smoother.within) if smoother.is_drive else scores
+    columns = None if known is None else known.expand_as(ranked)
+    pair = best_candidates(ranked, min(2, ranked.shape[1]), TOLERANCE, columns)
+    match = best_candidates(ranked, asked.k, asked.radius, columns)
+    at = match.index[:, :1].clamp(min=0)
+    if known is not None:
+        at = torch.searchsorted(known, at).clamp(max=len(known) - 1)
+    probability = mass_around(mass, at, smoother.within)
+    if not smoother.is_drive and asked.platt is not None:
+        by_itself = asked.platt.probability(confidence_of(scores))
+        probability = by_itself if queries == 1 else torch.minimum(probability, by_itself)
+    probability = probability.masked_fill(match.index[:, 0] < 0, 0)
+    margin = pair.score[:, -1] - pair.score[:, 0] if pair.index.shape[1] > 1 else pair.score[:, 0] * math.nan
+    return Shown(match, margin, probability, scores.gather(1, at)[:, 0])
+
+
+def _joined(asked: DriveQuery, parts: list[Shown]) -> Match:
+    """The match of all queries of a drive."""
+    k = asked.k
     if not parts:
         empty = torch.zeros(0, k)
         return Match(empty.long(), empty, empty.bool(), empty.double(), confidence=empty)
-    parts.reverse()
     match = Match.joined(part.match for part in parts)
-    margin = torch.cat([part.margin for part in parts])
-    probability = torch.cat([part.probability for part in parts])
-    own = torch.cat([part.own for part in parts])
-    if smoother.is_drive:
+    margin, probability, own = (torch.cat(column) for column in [*zip(*parts, strict=True)][1:])
+    if asked.smoother.is_drive:
         match = replace(match, score=match.score + doubt(own)[:, None])
     match = replace(match, score=match.score.to(own.dtype))
     return replace(match, probability=first_of(probability, k), confidence=first_of(margin.to(own.dtype), k))
 
 
-# mass of places (B,n) in double precision, so that answers that are nearly sure differ; scores (B,n); which
-# places (n,), or None for all; the last queries come first
-Seen = Iterator[tuple[Tensor, Tensor, Tensor | None]]
+def _seen(drives: Sequence[DriveQuery], progress: bool) -> Iterator[tuple[int, Seen]]:
+    """Fit the smoothers; then the numbers of the drives with what is seen of each."""
+    spacings: dict[int, Spacing] = {}  # of descriptors that several drives share
+    fitted: dict[tuple[int, Layout, int], list[tuple[int, Drive]]] = {}
+    for i, asked in enumerate(drives):
+        rows, descriptors, smoother, _, _, starts, *_ = asked
+        places = rows(torch.arange(min(1, len(descriptors)))).shape[1]
+        if is_large(len(descriptors), places):
+            yield from ((i, seen) for seen in _of_windows(asked, places, progress))
+            continue
+        spacing = spacings.get(id(descriptors))
+        spacing = spacings[id(descriptors)] = spacing_of(descriptors) if spacing is None else spacing
+        smoother.fit(rows, descriptors, starts, spacing)
+        kind = len(descriptors), smoother.layout(places, starts), len(smoother.move_logits)
+        fitted.setdefault(kind, []).append((i, smoother.drive(rows, descriptors, spacing)))
+    for (queries, layout, _), alike in fitted.items():
+        every = len(alike) * queries * layout.places <= KEPT
+        alike = [(i, drive._replace(rows=_kept(drive.rows, every))) for i, drive in alike]
+        pairs = [(drives[i].smoother, drive) for i, drive in alike]
+        for block in blocks_together(pairs, drives[alike[0][0]].route_starts):
+            numbers = torch.arange(block.first, block.first + block.log.shape[-1])
+            for (i, drive), posterior in zip(alike, block.posterior, strict=True):
+                asked = drives[i]
+                rows = drive.rows if asked.smoother.is_drive else asked.single or drive.rows
+                yield i, Seen(_mass(posterior), rows(numbers).cpu())
+
+
+def _of_windows(asked: DriveQuery, places: int, progress: bool) -> Iterator[Seen]:
+    """What is seen of a drive on a large map."""
+    rows, descriptors, smoother, k, radius, starts, _, single, tiles = asked
+    tiles, single = tiles or Tiles(lambda numbers: iter([(0, rows(numbers))]), places), single or rows
+    settings = places, smoother, starts, max(2, k), radius, progress
+    for first, posterior, scores, known in LargeDrive(tiles, descriptors, *settings):
+        mass = _mass(posterior)
+        if smoother.is_drive:
+            yield Seen(mass, scores, known)
+            continue
+        for part in reversed(torch.arange(len(mass)).split(max(1, TILE // places))):
+            whole = mass.new_zeros(len(part), places).index_copy(1, known, mass[part])
+            yield Seen(whole, single(first + part).cpu())
+
+
+def _kept(rows: Rows, every: bool) -> Rows:
+    """The same rows of consecutive queries, which a sweep asks for again on its way back: the blocks that it
+    got, or the last one alone, are kept."""
+    blocks: dict[int, Tensor] = {}
+
+    def known(numbers: Tensor) -> Tensor:
+        first = int(numbers[0])
+        if first not in blocks or len(blocks[first]) != len(numbers):
+            if not every:
+                blocks.clear()
+            blocks[first] = rows(numbers)
+        return blocks[first]
+
+    return known
 
 
 def _mass(posterior: Tensor) -> Tensor:
     return normalised(PlaceSmoother.folded(posterior.cpu().double()))[:, :-1]
-
-
-def _of_all_places(smoother: PlaceSmoother, drive: Drive, route_starts: Sequence[int], single: Rows) -> Seen:
-    rows = drive.rows if smoother.is_drive else single
-    for block in smoother.blocks(drive, route_starts):
-        numbers = torch.arange(block.first, block.first + block.log.shape[-1])
-        yield _mass(block.posterior), rows(numbers).cpu(), None
-
-
-def _of_windows(drive: LargeDrive, single: Rows) -> Seen:
-    for first, posterior, scores, places in drive:
-        mass = _mass(posterior)
-        if drive.smoother.is_drive:
-            yield mass, scores, places
-            continue
-        for part in reversed(torch.arange(len(mass)).split(max(1, TILE // drive.places))):
-            whole = mass.new_zeros(len(part), drive.places).index_copy(1, places, mass[part])
-            yield whole, single(first + part).cpu(), None
 
 
 def mass_around(mass: Tensor, at: Tensor, radius: int) -> Tensor:

@@ -241,15 +241,15 @@ class LargeDrive:
             window = self.windows[i]
             sample = self._sample(window, slice(window.first, window.first + length))
             std = sample.std
-            ranks.add(std.z, (sample.weight * std.speaks)[:, None] * std.valid)
+            ranks.add(std.z, std.only((sample.weight * std.speaks)[:, None].expand_as(std.z), 0))
             samples.append(sample)
         self.smoother.means = self.means
         self.smoother.learn(samples, ranks, self.spacing)
 
     def _sample(self, window: Window, some: slice) -> Sample:
         z = window.z[some.start - window.start : some.stop - window.start].float()
-        valid, layout = z.isfinite(), self.layout.of(window.places)
-        std = Standardised(z.where(valid, 0), valid, self.speaks[some] > 0)
+        speaks, layout = self.speaks[some] > 0, self.layout.of(window.places)
+        std = Standardised(z.nan_to_num(0, 0, 0), speaks, z.isfinite() | ~speaks[:, None])
         return Sample(std, self.spacing.weight[some], self.spacing.still[some], layout)
 
     @torch.no_grad()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -14,7 +15,7 @@ from torch import Tensor
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.recognition.calibration import TOLERANCE, Platt, Track
 from dejavu_torch.recognition.calibration import confidence as confidence_of_pair
-from dejavu_torch.recognition.drive import first_of, localize_drive
+from dejavu_torch.recognition.drive import DriveQuery, first_of, localize_drive
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.large import Tiles
 from dejavu_torch.recognition.search import SCORES_AT_ONCE, NmsSpec, Scan, Search, Searcher, num_needed
@@ -36,7 +37,6 @@ class Matching(NamedTuple):
 
     sequence: SequenceModel | PlaceSmoother | None = None  # None matches each query by itself
     also: Mapping[Together, SequenceModel] = MappingProxyType({})  # further ways, see `Match.sequences`
-    smoother: PlaceSmoother | None = None  # another further way, where all queries are known
     plain: Tensor | None = None  # the queries as they are, if those of a smoother are centred
     k: int | None = None  # candidates per query; None gives matches (Q,)
     radius: int = 0  # suppression radius in places
@@ -117,11 +117,19 @@ class Localizer:
         score: Scoring | None = None,
         progress: bool = False,
     ) -> Match:
-        """Match all queries (Q,K) of a drive by a smoother, which is fitted to them; see `localize_drive`.
+        """Match all queries (Q,K) of a drive by a smoother, which is fitted to them; see `localize_drives`.
 
         Args:
             score: scores of queries, (B,K) -> (B,N); None are those of the map.
         """
+        match = localize_drive(self.asked(descriptors, smoother, score), progress)
+        acceptance = self.matching.acceptance
+        if acceptance.threshold is not None and not smoother.is_drive:  # whose scores are distances
+            acceptance = Acceptance(precision=math.exp(-acceptance.threshold))
+        return self._accepted(match, acceptance)
+
+    def asked(self, descriptors: Tensor, smoother: PlaceSmoother, score: Scoring | None = None) -> DriveQuery:
+        """What `drive` matches."""
         matching, place_map, tiles = self.matching, self.place_map, None
         if score is None:
             assert place_map is not None
@@ -134,20 +142,8 @@ class Localizer:
             return lambda numbers: score(queries[numbers])
 
         single = None if matching.plain is None else rows(matching.plain)
-        settings = (
-            matching.k or 1,
-            matching.radius,
-            self.route_starts,
-            matching.platt,
-            progress,
-            single,
-            tiles,
-        )
-        match = localize_drive(rows(descriptors), descriptors, smoother, *settings)
-        acceptance = matching.acceptance
-        if acceptance.threshold is not None and not smoother.is_drive:  # whose scores are distances
-            acceptance = Acceptance(precision=math.exp(-acceptance.threshold))
-        return self._accepted(match, acceptance)
+        settings = matching.k or 1, matching.radius, self.route_starts, matching.platt, single, tiles
+        return DriveQuery(rows(descriptors), descriptors, smoother, *settings)
 
     @torch.no_grad()
     def skip(self, queries: int) -> None:
@@ -228,6 +224,13 @@ class Localizer:
         score, place = self.searcher(descriptors, wanted)
         match, pair = (best_candidates(score, *spec, places=place) for spec in wanted)
         return self._answer(match, pair)
+
+
+def asked_of(
+    queries: Tensor, smoother: PlaceSmoother, score: Scoring, plain: Tensor | None = None
+) -> DriveQuery:
+    """Queries (Q,K) as a drive with scores of any kind, for a smoother like this one; see `Matching`."""
+    return Localizer(None, Matching(plain=plain)).asked(queries, copy.deepcopy(smoother), score)
 
 
 def pair_of(scores: Tensor) -> Match:

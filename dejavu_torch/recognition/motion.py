@@ -18,7 +18,7 @@ Link = tuple[int, int, float]  # a step from one place to another, with its prob
 
 
 class Rates(NamedTuple):
-    """Probabilities of a step, as tensors: moves (V+1,) add up to 1; jump, leave and enter ()."""
+    """Probabilities of a step, as tensors: moves (..., V+1) add up to 1; jump, leave and enter (...)."""
 
     moves: Tensor
     jump: Tensor
@@ -72,13 +72,15 @@ class Motion:
 
     A camera at a place moves on by 0 to V places, with turning round before, jumps to any place, or leaves
     the map; moving past the end of a route leaves it too. Off the map, it enters at any place.
+
+    Rates of several drives (C,) go with beliefs (C,S); `best_moved` and `counts` take those of one.
     """
 
     def __init__(self, layout: Layout, rates: Rates) -> None:
         self.layout, self.rates = layout, rates
         _, jump, leave, enter = rates
         self.each = layout.share / max(1, layout.directions * layout.places)
-        self.moves = ((1 - jump - leave) * rates.moves).unbind()
+        self.moves = ((1 - jump - leave)[..., None] * rates.moves)[..., None, None].unbind(-3)
         last, taken = layout.places - 1, rates.moves.new_zeros(layout.directions, layout.places)
         ways: list[tuple[int, int, int, float]] = []
         for first, second, share in layout.links:
@@ -95,10 +97,11 @@ class Motion:
         self.keep = None if plain else keep  # the share of a place's mass that moves on to the next one
         # the share of a move by 0, 1, .. V places that stays on the route
         self.reach = [*self._shifts(torch.ones_like(keep), back=True)]
-        self.lost = torch.einsum("v,vdn", torch.stack(self.moves), 1 - torch.stack(self.reach))
+        self.lost = (torch.stack(self.moves, -3) * (1 - torch.stack(self.reach))).sum(-3)
         # the shares of a state's mass (S,) that go anywhere, and off the map
-        self.free = torch.cat([jump.expand(keep.numel()), enter[None]])
-        left = torch.cat([self._turned(self.lost).flatten() + leave, 1 - enter[None]])
+        jump, leave, enter = (rate[..., None] for rate in (jump, leave, enter))
+        self.free = torch.cat([jump.expand(*jump.shape[:-1], keep.numel()), enter], -1)
+        left = torch.cat([self._turned(self.lost).flatten(-2) + leave, 1 - enter], -1)
         self.gone = left + (1 - layout.share) * self.free
 
     def _shifted(self, on: Tensor) -> Tensor:
@@ -152,11 +155,16 @@ class Motion:
         """The places (..., D, N), and being off the map (..., 1)."""
         return state[..., :-1].unflatten(-1, (self.layout.directions, -1)), state[..., -1:]
 
+    @staticmethod
+    def _share(belief: Tensor, goes: Tensor) -> Tensor:
+        """The mass (...) of a belief (..., S) of which shares (S,), or (..., S), go."""
+        return belief @ goes if goes.ndim == 1 else torch.linalg.vecdot(belief, goes)
+
     def moved(self, belief: Tensor) -> Tensor:
         """The belief before the next query."""
         on, _ = self._split(belief)
         moved = self._by_all_moves(self._turned(on), back=False).flatten(-2)
-        anywhere, off = (belief @ self.free)[..., None], (belief @ self.gone)[..., None]
+        anywhere, off = (self._share(belief, goes)[..., None] for goes in (self.free, self.gone))
         return torch.cat([moved + anywhere * self.each, off], -1)
 
     def expected(self, message: Tensor) -> Tensor:
@@ -197,8 +205,9 @@ class Motion:
         """The belief before the first query: on or off the map in the equilibrium of leaving and entering."""
         both = (self.rates.leave + self.rates.enter).clamp(min=MIN_PROBABILITY)
         off = (self.rates.leave / both).clamp(max=0.5)
-        on = ((1 - off) * self.each).expand(self.layout.directions * self.layout.places)
-        return torch.cat([on, 1 - (1 - off[None]) * self.layout.share])
+        on = 1 - off[..., None]
+        places = self.layout.directions * self.layout.places
+        return torch.cat([(on * self.each).expand(*off.shape, places), 1 - on * self.layout.share], -1)
 
     def counts(self, before: Tensor, after: Tensor) -> Counts:
         """Expected numbers of steps (the E-step of Baum and Welch).
@@ -216,7 +225,7 @@ class Motion:
         shifts = self._shifts(on_after, back=True)
         for move, reach, shifted in zip(self.moves, self.reach, shifts, strict=True):
             lost = start.flatten(-2) @ (1 - reach).flatten()
-            kinds.append(move * ((start * shifted).sum((-1, -2)) + off_after * lost))
+            kinds.append(move[0, 0] * ((start * shifted).sum((-1, -2)) + off_after * lost))
         kinds += [jump * total * mean, leave * total * off_after]
         kinds += [enter * off * mean, (1 - enter) * off * off_after]
         each = torch.stack(kinds, -1).flatten(0, -2)

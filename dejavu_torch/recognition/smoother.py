@@ -90,8 +90,7 @@ class Sample(NamedTuple):
 
     def part(self, first: int, last: int) -> Sample:
         """The queries [first, last) of each stretch."""
-        z, valid, speaks = self.std
-        std = Standardised(z[..., first:last, :], valid[..., first:last, :], speaks[..., first:last])
+        std = self.std.map(lambda column: column.narrow(self.weight.ndim - 1, first, last - first))
         return Sample(std, self.weight[..., first:last], self.still[..., first:last], self.layout)
 
 
@@ -291,10 +290,12 @@ class PlaceSmoother(SequenceModel):
         n = (states.shape[-1] - 1) // 2
         return torch.cat([states[..., :n] + states[..., n:-1].flip(-1), states[..., -1:]], -1)
 
-    def drive(self, scores: Tensor | Rows, descriptors: Tensor | None = None) -> Drive:
+    def drive(
+        self, scores: Tensor | Rows, descriptors: Tensor | None = None, spacing: Spacing | None = None
+    ) -> Drive:
         """The evidence of a drive's queries, by what was fitted; for a matrix, also if nothing was."""
         if not isinstance(scores, Tensor):
-            spacing = spacing_of(check_descriptors(descriptors))
+            spacing = spacing or spacing_of(check_descriptors(descriptors))
             return Drive(scores, self.means, self.values, spacing, self.separation, self.tempering)
         known = check_scores(scores, descriptors)
         given = known.detach()
@@ -303,9 +304,8 @@ class PlaceSmoother(SequenceModel):
         if len(means) != scores.shape[1]:
             means = place_means(given, spacing.weight.to(given))
         if not len(values):
-            z, valid, speaks = standardised(given, means)
-            table = RankTable()
-            table.add(z, valid * speaks[:, None])
+            std, table = standardised(given, means), RankTable()
+            table.add(std.z, std.only(std.speaks[:, None].expand_as(std.z), False))
             values = table.values
         return Drive(rows_of(known), means, values, spacing, self.separation, self.tempering)
 
@@ -318,15 +318,8 @@ class PlaceSmoother(SequenceModel):
         Args:
             size: queries of a block; None is about the root of their number, or more if they are small.
         """
-        queries, places = len(drive.spacing.still), len(drive.means)
-        if size is None:
-            size = max(1, math.isqrt(queries), BLOCK // (2 * places + 1))
-        motion = self.motion(places, route_starts, drive.means)
-
-        def likelihood(first: int, last: int) -> Tensor:
-            return self.wide(drive.log_likelihood(torch.arange(first, last)), 0.0).exp()
-
-        yield from sweep(motion, likelihood, queries, drive.spacing.still.to(drive.means.device), size)
+        for block in blocks_together([(self, drive)], route_starts, size):
+            yield Block(block.first, *(part[0] for part in block[1:]))
 
     @torch.no_grad()
     def fit(
@@ -334,6 +327,7 @@ class PlaceSmoother(SequenceModel):
         scores: Tensor | Rows,
         descriptors: Tensor | None = None,
         route_starts: Sequence[int] = (0,),
+        spacing: Spacing | None = None,
     ) -> Self:
         """Learn moves, rates, separation, tempering and ranks from the queries of a drive, without truth.
 
@@ -343,6 +337,7 @@ class PlaceSmoother(SequenceModel):
         Args:
             scores: (Q,N), or a function of the numbers of queries (B,) that returns their scores (B,N).
             descriptors: (Q,K) of the queries; needed with a function.
+            spacing: `spacing_of` these, if it is known.
 
         Returns:
             self; `is_drive` tells whether the queries are a drive of the map at all.
@@ -354,17 +349,16 @@ class PlaceSmoother(SequenceModel):
         self.is_drive, self.log_likelihood = False, None
         if not len(descriptors):
             return self
-        spacing = spacing_of(descriptors)
+        spacing = spacing or spacing_of(descriptors)
         places = scores(torch.zeros(1, dtype=torch.int64)).shape[1]
         repeated = len(descriptors) / float(spacing.weight.sum())  # where frames repeat, stretches are longer
         picked = stretches(len(descriptors), spacing.correlation, places, repeated)
         known = scores(picked.flatten())
         weight, still = spacing.weight.to(known), spacing.still.to(known.device)
         self.means = place_means(known, weight[picked.flatten()])
-        parts = standardised(known, self.means)
-        std = Standardised(*(part.unflatten(0, picked.shape) for part in parts))
+        std = standardised(known, self.means).map(lambda column: column.unflatten(0, picked.shape))
         ranks = RankTable()
-        ranks.add(std.z, (weight[picked] * std.speaks)[..., None] * std.valid)
+        ranks.add(std.z, std.only((weight[picked] * std.speaks)[..., None].expand_as(std.z), 0))
         layout = self.layout(places, route_starts)
         return self.learn([Sample(std, weight[picked], still[picked], layout)], ranks, spacing)
 
@@ -403,23 +397,24 @@ class PlaceSmoother(SequenceModel):
         for _ in range(ROUNDS):
             values, table, sums, counts = table.values, RankTable(ranks.counts), z.new_zeros(2), []
             for sample in samples:
-                motion, queries, later = Motion(sample.layout, rates), sample.weight.shape[-1], None
+                motion, later = Motion(sample.layout, rates), None
                 for block in self.explained(sample, values, separation, motion):
                     first, last = block.first, block.first + block.log.shape[-1]
                     std, weight, *_ = sample.part(first, last)
                     shares = (weight * std.speaks)[..., None]
                     near = near_mass(self.folded(block.posterior)[..., :-1], RADIUS)
-                    table.add(std.z, -shares * std.valid * near)  # right ones
+                    table.add(std.z, std.only(-shares * near, 0))  # right ones
                     # without its own evidence, that of a query is not mistaken for that of its place
                     others = self.folded(normalised(block.before * block.after))[..., :-1] * shares
-                    known = torch.where(std.valid, RankTable.look_up(values, std.z), 0)
+                    known = std.only(RankTable.look_up(values, std.z), 0)
                     sums += torch.stack([(others * known).sum(), others.sum()])
                     belief, after = block.before * block.likelihood, block.likelihood * block.after
                     later = after[..., 1:, :] if later is None else torch.cat([after[..., 1:, :], later], -2)
-                    moving = ~sample.still[..., first + 1 : last + 1]
-                    counts.append(
-                        motion.counts(belief[..., : min(last, queries - 1) - first, :][moving], later[moving])
-                    )
+                    pair = belief[..., : later.shape[-2], :], later
+                    still = sample.still[..., first + 1 : last + 1]
+                    if still.any():
+                        pair = pair[0][~still], pair[1][~still]
+                    counts.append(motion.counts(*pair))
                     later = after[..., :1, :]
             separation = max(MIN_SEPARATION, float(sums[0] / sums[1].clamp(min=MIN_PROBABILITY)))
             total = Counts(*(torch.stack(kind).sum(0) for kind in zip(*counts, strict=True)))
@@ -453,11 +448,11 @@ class PlaceSmoother(SequenceModel):
 
         def likelihood(first: int, last: int) -> Tensor:
             std, weight, *_ = sample.part(first, last)
-            log = log_likelihood(RankTable.look_up(values, std.z), std, weight, separation, self.tempering)
+            log = log_likelihood(values, std, weight, separation, self.tempering)
             if elsewhere is not None:
                 unlikely = log.clamp(max=-(separation**2) / 2 / self.tempering)
                 log = torch.where(elsewhere[..., first:last, :], log, unlikely)
-            return self.wide(log, 0.0).exp()
+            return self.wide(log.exp(), 1.0)
 
         return likelihood
 
@@ -500,9 +495,30 @@ class Drive(NamedTuple):
     def log_likelihood(self, numbers: Tensor) -> Tensor:
         """Log likelihood of the places for some queries, 0 being off the map: (B,) -> (B,N)."""
         std = standardised(self.rows(numbers), self.means)
-        x = RankTable.look_up(self.values, std.z)
-        weight = self.spacing.weight.cpu()[numbers].to(x)
-        return log_likelihood(x, std, weight, self.separation, self.tempering)
+        weight = self.spacing.weight.cpu()[numbers].to(std.z)
+        return log_likelihood(self.values, std, weight, self.separation, self.tempering)
+
+
+def blocks_together(
+    drives: Sequence[tuple[PlaceSmoother, Drive]], route_starts: Sequence[int] = (0,), size: int | None = None
+) -> Iterator[Block]:
+    """As `PlaceSmoother.blocks`, of C drives in one sweep: (C,B,S). All have as many queries, places and
+    moves, and the same links."""
+    means = [drive.means for _, drive in drives]
+    queries, places = len(drives[0][1].spacing.still), len(means[0])
+    if size is None:
+        size = max(1, math.isqrt(queries), BLOCK // (len(drives) * (2 * places + 1)))
+    rates = (smoother.rates(mean) for (smoother, _), mean in zip(drives, means, strict=True))
+    layout = drives[0][0].layout(places, route_starts)
+    motion = Motion(layout, Rates(*map(torch.stack, zip(*rates, strict=True))))
+
+    def likelihood(first: int, last: int) -> Tensor:
+        numbers = torch.arange(first, last)
+        logs = torch.stack([drive.log_likelihood(numbers) for _, drive in drives])
+        return PlaceSmoother.wide(logs.exp(), 1.0)
+
+    still = torch.stack([drive.spacing.still for _, drive in drives]).to(means[0].device)
+    yield from sweep(motion, likelihood, queries, still, size)
 
 
 def rows_of(scores: Tensor) -> Rows:
@@ -529,12 +545,12 @@ def check_descriptors(descriptors: Tensor | None) -> Tensor:
 
 
 def log_likelihood(
-    x: Tensor, std: Standardised, weight: Tensor, separation: float, tempering: float
+    values: Tensor, std: Standardised, weight: Tensor, separation: float, tempering: float
 ) -> Tensor:
-    """Tempered log likelihood ratio of normal scores (..., Q, N), right ones beside wrong ones: both Gaussian
-    with variance 1, and `separation` apart."""
-    log = (separation * x - separation**2 / 2) * (weight / tempering)[..., None]
-    return torch.where(std.speaks[..., None], log.masked_fill(~std.valid, -math.inf), 0)
+    """Tempered log likelihood ratio of scores (..., Q, N) by the `values` of a rank table, right ones beside
+    wrong ones: their normal scores are Gaussian with variance 1, and `separation` apart."""
+    ratio = RankTable.look_up((separation * values - separation**2 / 2) / tempering, std.z)
+    return std.only(ratio * (weight * std.speaks)[..., None], -math.inf)
 
 
 class Ahead(NamedTuple):

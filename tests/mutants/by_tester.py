@@ -567,8 +567,8 @@ MUTANTS = [
     Mutant(
         "No place is good for all queries: the mean of its scores is removed.",
         "dejavu_torch/recognition/evidence.py",
-        "torch.where(valid, scores - means, 0)",
-        "torch.where(valid, scores, 0)",
+        "scores - means, None",
+        "scores, None",
         ("tests/recognition/test_evidence.py::-k beside_those",),
     ),
     Mutant(
@@ -637,9 +637,23 @@ MUTANTS = [
     Mutant(
         "Queries that are no drive are answered as they are, not centred.",
         "dejavu_torch/recognition/drive.py",
-        "smoother.drive(rows, descriptors), route_starts, single or rows",
-        "smoother.drive(rows, descriptors), route_starts, rows",
+        "asked.single or drive.rows",
+        "drive.rows",
         ("tests/recognition/test_drive.py::-k as_they_are",),
+    ),
+    Mutant(
+        "Drives that are smoothed together each move at their own rates.",
+        "dejavu_torch/recognition/smoother.py",
+        "Rates(*map(torch.stack, zip(*rates, strict=True)))",
+        "next(rates)",
+        ("tests/recognition/test_drive.py::-k matched_together",),
+    ),
+    Mutant(
+        "A query without any score says nothing, whatever the others have.",
+        "dejavu_torch/recognition/evidence.py",
+        "valid | ~speaks[:, None]",
+        "valid",
+        ("tests/recognition/test_smoother.py::-k nothing", "tests/recognition/test_evidence.py"),
     ),
     Mutant(
         "Changes far slower than the noise of the queries make none say less.",

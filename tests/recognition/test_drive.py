@@ -15,9 +15,10 @@ from dejavu_torch import DejaVu, Whitening, open_source
 from dejavu_torch.data.traverse import fitted
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.motion.resampling import ground_truth_of
+from dejavu_torch.recognition import drive as driving
 from dejavu_torch.recognition import smoother as smoothing
 from dejavu_torch.recognition.calibration import Platt, confidence_of
-from dejavu_torch.recognition.drive import doubt, localize_drive
+from dejavu_torch.recognition.drive import DriveQuery, doubt, localize_drive, localize_drives
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.types import Match
 
@@ -27,7 +28,7 @@ PLATT = Platt(3.0, 0.5)
 def localized(scores: Tensor, smoother: PlaceSmoother, k: int = 1, platt: Platt | None = None) -> Match:
     """Of scores of which some are asked for at a time."""
     drive = noise(len(scores), 16, seed=8)
-    return localize_drive(lambda numbers: scores[numbers], drive, smoother, k, radius=4, platt=platt)
+    return localize_drive(DriveQuery(smoothing.rows_of(scores), drive, smoother, k, 4, platt=platt))
 
 
 def test_an_answer_has_the_most_mass_around_it() -> None:
@@ -130,11 +131,58 @@ def test_what_is_no_drive_is_answered_by_queries_as_they_are() -> None:
     centred, plain = noise(60, 80, seed=1), noise(60, 80, seed=2)
     descriptors = noise(60, 16, seed=8)
     rows, single = smoothing.rows_of(centred), smoothing.rows_of(plain)
-    match = localize_drive(rows, descriptors, PlaceSmoother(), single=single)
+    match = localize_drive(DriveQuery(rows, descriptors, PlaceSmoother(), single=single))
     assert torch.equal(match.index[:, 0], plain.argmin(1))
     drive = smoothing.rows_of(shown(80, range(60)))
-    match = localize_drive(drive, descriptors, PlaceSmoother(), single=single)
+    match = localize_drive(DriveQuery(drive, descriptors, PlaceSmoother(), single=single))
     assert (match.index[:, 0] - torch.arange(60)).abs().max() <= 1
+
+
+def test_drives_are_matched_together_as_each_by_itself() -> None:
+    path, descriptors = [*range(5, 65)], noise(60, 16, seed=8)
+    scores = [shown(80, path), shown(80, path[::-1]), noise(60, 80, seed=1), shown(90, path)]
+    scores[1][7] = math.nan
+    links = ((64, 5, 0.5),)
+
+    def asked() -> list[DriveQuery]:
+        rows = map(smoothing.rows_of, scores)
+        drives = [DriveQuery(one, descriptors, PlaceSmoother(within=3), 2, 4, platt=PLATT) for one in rows]
+        linked = PlaceSmoother(links=links)
+        return [
+            *drives,
+            drives[0]._replace(smoother=linked),
+            drives[0]._replace(smoother=PlaceSmoother(MOVES)),
+        ]
+
+    together, alone = asked(), asked()
+    for one, found, expected in zip(
+        together, localize_drives(together), map(localize_drive, alone), strict=True
+    ):
+        assert torch.equal(found.index, expected.index)
+        for name, column in expected.columns.items():
+            assert torch.allclose(found.columns[name], column, rtol=1e-4, equal_nan=True), name
+        assert one.smoother.links in ((), links)
+    assert [one.smoother.is_drive for one in together] == [True, True, False, True, True, True]
+
+
+@pytest.mark.parametrize("kept", [0, 2**26])
+def test_scores_are_computed_once_if_they_can_be_kept(kept: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(driving, "KEPT", kept)
+    monkeypatch.setattr(smoothing, "BLOCK", 2**12)
+    monkeypatch.setattr(smoothing, "HELD", 2**12)
+    scores, asked = shown(80, [*range(5, 75)]), torch.zeros(70)
+
+    def rows(numbers: Tensor) -> Tensor:
+        asked[numbers] += 1
+        return scores[numbers]
+
+    smoother, descriptors = PlaceSmoother().fit(rows, noise(70, 16, seed=8)), noise(70, 16, seed=8)
+    fitted = asked.clone()
+    expected = localize_drive(DriveQuery(smoothing.rows_of(scores), descriptors, PlaceSmoother()))
+    found = localize_drive(DriveQuery(rows, descriptors, PlaceSmoother()))
+    assert smoother.is_drive
+    assert torch.equal(found.index, expected.index)
+    assert int((asked - 2 * fitted)[1:].max()) == (1 if kept else 2)
 
 
 def test_a_threshold_is_of_a_probability_for_what_is_no_drive_too() -> None:
@@ -178,7 +226,7 @@ def test_a_device_finds_what_the_cpu_finds(clear: float) -> None:
 
     def found(scores: Tensor, descriptors: Tensor) -> Match:
         rows = smoothing.rows_of(scores)
-        return localize_drive(rows, descriptors, PlaceSmoother(MOVES), 2, 4, platt=PLATT)
+        return localize_drive(DriveQuery(rows, descriptors, PlaceSmoother(MOVES), 2, 4, platt=PLATT))
 
     expected = found(scores, descriptors)
     with pretend() as device:

@@ -15,7 +15,7 @@ from dejavu_torch.maps.place_map import ScoreBlocks
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.recognition import drive as driving
 from dejavu_torch.recognition import large
-from dejavu_torch.recognition.drive import localize_drive
+from dejavu_torch.recognition.drive import DriveQuery, localize_drive
 from dejavu_torch.recognition.large import LargeDrive, Tiles, is_large
 from dejavu_torch.recognition.localizer import Localizer, Matching
 from dejavu_torch.recognition.motion import Layout, Motion, Rates
@@ -39,7 +39,7 @@ def both(
         smoother = PlaceSmoother(within=3)
         tiles, rows = Tiles(blocks, 2**18), scores.__getitem__
         match = localize_drive(
-            rows, queries, smoother, radius=4, route_starts=starts, tiles=tiles, **settings
+            DriveQuery(rows, queries, smoother, radius=4, route_starts=starts, tiles=tiles, **settings)
         )  # type: ignore[arg-type]
         found.append((match, smoother))
     (one, first), (two, second) = found
