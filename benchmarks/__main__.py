@@ -19,6 +19,7 @@ from benchmarks import (
     teaching,
     train,
     trainings,
+    visits,
 )
 from dejavu_torch.cli import errors_of_one_line, fail, main
 from dejavu_torch.cli.parser import command_parser
@@ -32,6 +33,7 @@ BENCHES: dict[str, Any] = {  # each returns the lines to print
     "storage": storage.run_storage,
     "drives": drives.run_drives,
     "teaching": teaching.run_teaching,
+    "visits": visits.run_visits,
     "train": train.run_train,
     "trainings": trainings.run_trainings,
     "distil": distil.run_distil,

@@ -11,6 +11,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
+from itertools import groupby
 from pathlib import Path
 from statistics import mean
 from typing import Any
@@ -267,6 +268,18 @@ def taught() -> str:
     return markdown(table)
 
 
+def visits() -> str:
+    """What another drive finds after more and more drives."""
+    rows = read("visits")["rows"]
+    most = range(1 + max(row["drives"] for row in rows))
+    table = [["asked", "the map", *(f"{count} drives" for count in most), "bytes"]]
+    for (case, way), own in groupby(rows, lambda row: (row["case"], row["contender"])):
+        found = [*own]
+        cells = [area(row["auc"]) for row in found] + [""] * (len(most) - len(found))
+        table.append([case, way, *cells, f"{found[0]['map_bytes']:,} → {found[-1]['map_bytes']:,}"])
+    return markdown(table)
+
+
 def shown_pair(row: Row) -> str:
     """The areas of one image and of the whole drive; with a star, if that was answered by single images."""
     pair = [area(row[key]).removeprefix("0") for key in ("auc_one", "auc")]
@@ -316,7 +329,7 @@ TABLES: dict[str, Callable[[], str]] = {
     **{"routes": routes, "sizes": sizes, "descriptors": descriptors, "sequences": sequences},
     **{"rejection": rejection, "filtered": filtered, "drives": drives, "driven": driven},
     **{"trainings": trainings, "made drives": made_drives, "storage drives": storage_drives},
-    **{"large drives": large_drives, "taught drives": taught},
+    **{"large drives": large_drives, "taught drives": taught, "visits": visits},
     **{f"storage {name}": partial(storage, name) for name in ("aerial", "road1", "road2", "city", "railway")},
 }
 

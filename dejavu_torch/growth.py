@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import copy
 import logging
-from collections.abc import Sequence
-from itertools import count
+from collections.abc import Container, Sequence
+from itertools import accumulate, count
 
 import torch
 import torch.nn.functional as F
@@ -93,7 +93,7 @@ def append(
     grown.check()
     frames = len(positions) or places
     names = [model.frame_names, [*source_of(added).names]]
-    model.frame_names = _joined_names(names, [place_map.table.frames, frames])
+    model.frame_names = joined_names(names, [place_map.table.frames, frames])
     return model.replace_map(grown)
 
 
@@ -323,7 +323,7 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
             raise InputError(f"{names[0]} and {name} cannot be merged: {problem}")
         maps = [(route.name, place_map.part(route.name)) for route in place_map.routes] or [(name, place_map)]
         for wanted, part in maps:
-            parts[_free_name(wanted, parts)] = part
+            parts[free_name(wanted, parts)] = part
     _check_count(sum(part.places for part in parts.values()), first.step is not None)
     thresholds = {model.threshold for model in models}
     merged = DejaVu(
@@ -334,7 +334,7 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
     merged.weight_bits = first.weight_bits
     frames = [model.map.table.frames for model in models]
     trained = first.trained if all(model.trained == first.trained for model in models) else None
-    names = _joined_names([model.frame_names for model in models], frames)
+    names = joined_names([model.frame_names for model in models], frames)
     merged.state = ModelState(first.frame_shape, first.step, trained, names)
     dropped = [
         *["thresholds"] * (len(thresholds) > 1),
@@ -343,10 +343,17 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
     ]
     if dropped:
         log.warning("the merged map has no %s: each holds for one route only", ", ".join(dropped))
-    return merged.replace_map(SpectralMap.merged([*parts.values()], [*parts]))
+    place_map = SpectralMap.merged([*parts.values()], [*parts])
+    starts = accumulate(model.map.places for model in models)
+    links = [
+        (one + start, two + start, share)
+        for model, start in zip(models, [0, *starts], strict=False)
+        for one, two, share in model.map.connections
+    ]
+    return merged.replace_map(place_map.linked(links) if links else place_map)
 
 
-def _free_name(name: str, taken: dict[str, SpectralMap]) -> str:
+def free_name(name: str, taken: Container[str]) -> str:
     """The name itself, or with the first free number after it."""
     return name if name not in taken else next(f"{name}-{i}" for i in count(2) if f"{name}-{i}" not in taken)
 
@@ -384,7 +391,7 @@ def _difference(first: DejaVu, other: DejaVu) -> str:
     return ""
 
 
-def _joined_names(parts: list[list[str]], frames: list[int]) -> list[str]:
+def joined_names(parts: list[list[str]], frames: list[int]) -> list[str]:
     """The frame names of several parts; "" for frames of a part without names."""
     if not any(parts):
         return []

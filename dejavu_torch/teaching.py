@@ -40,7 +40,7 @@ BLOCK = 2**22  # scores at a time
 def place_drive(model: DejaVu, descriptors: Tensor) -> Tensor:
     """The place of each frame of a drive, as sure as `SURE`, by the drive as a whole: (Q,K) -> (Q,) int64, -1
     for the others. All are -1 if it is no drive of the map, or too few of its frames are sure."""
-    smoother, queries = PlaceSmoother(), _in_its_light(model, descriptors)
+    smoother, queries = PlaceSmoother(), in_its_light(model, descriptors)
     match = model.localize_descriptors(queries, model.matching(smoother)._replace(plain=descriptors))
     assert match.probability is not None
     places = torch.where(match.probability >= SURE, match.index, -1)
@@ -78,7 +78,8 @@ def place_drives(
     return views
 
 
-def _in_its_light(model: DejaVu, descriptors: Tensor) -> Tensor:
+def in_its_light(model: DejaVu, descriptors: Tensor) -> Tensor:
+    """The descriptors (Q,K) of a drive, centred if they are enough."""
     return centred(model.map, descriptors) if len(descriptors) >= PRIOR else descriptors
 
 
@@ -106,7 +107,6 @@ class Refinement(NamedTuple):
         return f"{self.placed} of {self.of} frames placed; {told}; {after}"
 
 
-@torch.no_grad()
 def refine(model: DejaVu, drive: Source, progress: bool = False) -> Refinement:
     """Learn what a drive changes from its frames and the map alone: a linear stage after which queries and
     places are compared. The map's lines stay as they are.
@@ -127,19 +127,31 @@ def refine(model: DejaVu, drive: Source, progress: bool = False) -> Refinement:
         >>> print(refine(model, torch.rand(40, 8)))
         0 of 40 frames placed; nothing is learned, the map stays as it was
     """
-    require_map(model, " to refine")
+    return refined_by(model, described(model, drive, "refine", progress)[1])
+
+
+def described(model: DejaVu, drive: Source, verb: str, progress: bool = False) -> tuple[Traverse, Tensor]:
+    """A drive, resampled as the map is, and its descriptors (Q,K); refuses one that does not fit."""
+    require_map(model, f" to {verb}")
     place_map = model.map
     if not isinstance(place_map, SpectralMap):
-        raise InputError(f"the map is of kind {place_map.kind!r}; expected one of kind 'spectral' to refine")
+        raise InputError(f"the map is of kind {place_map.kind!r}; expected one of kind 'spectral' to {verb}")
     traverse = model.resample(as_traverse(drive), model.step, progress, model.frame_shape)
     if len(traverse) < LEAST:
         raise InputError(f"{traverse.name} has {len(traverse)} frames; expected at least {LEAST}")
     features = model.descriptor.count_features(traverse)
     check_queries(model, traverse.frame_shape, features, traverse.name)
-    descriptors = model.descriptor.all_of(traverse, progress).float().to(place_map.device)
+    return traverse, model.descriptor.all_of(traverse, progress).float().to(place_map.device)
+
+
+@torch.no_grad()
+def refined_by(model: DejaVu, descriptors: Tensor) -> Refinement:
+    """As `refine`, by the descriptors (Q,K) of a drive."""
+    place_map = model.map
+    assert isinstance(place_map, SpectralMap)
     places = place_drive(model, descriptors).to(place_map.device)
     sure = (places >= 0).nonzero()[:, 0]
-    count, queries = len(places), _in_its_light(model, descriptors)
+    count, queries = len(places), in_its_light(model, descriptors)
     if not len(sure):
         return Refinement(0, count)
     tau, gains = spacing_of(queries).correlation, torch.zeros(count)
@@ -167,6 +179,7 @@ def _calibration(
 ) -> Calibration:
     """The calibration by the scores of all queries of a drive, which the smoother has centred."""
     smoother, starts = PlaceSmoother(), place_map.route_starts
+    smoother.map_links = place_map.connections
 
     def rows(numbers: Tensor) -> Tensor:
         return place_map.scores(queries[numbers])

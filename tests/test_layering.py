@@ -30,6 +30,7 @@ ARROWS = {
     "model": "text types resize data features maps recognition motion learning model_file",
     "teaching": "types memory data features maps recognition model",
     "growth": "types data features maps motion learning model_file model teaching",
+    "updating": "types data maps motion recognition model teaching growth",
     "cluster": "text types data maps recognition",
     "live": "types data features recognition model",
     "evaluation": "lazy text version types memory resize data features periods maps recognition motion "
@@ -38,7 +39,7 @@ ARROWS = {
     "training": "lazy text types memory resize data features periods maps recognition "
     "motion model_file model evaluation",
     "cli": "text types data features periods maps recognition motion learning model_file model "
-    "growth teaching cluster live export evaluation training",
+    "growth teaching updating cluster live export evaluation training",
 }
 
 

@@ -547,6 +547,37 @@ def run_refine(
         _print_localize(out, model, command)
 
 
+def run_update(
+    map: Path,
+    drives: Sequence[str],
+    *,
+    out: Path | None = None,
+    loading: options.Loading,
+    command: str,
+) -> None:
+    """Refine a map by drives, as `dejavu refine`, and append ground that it lacks as routes of their own.
+
+    Args:
+        map: map file, which is overwritten unless --out names another one
+        drives: frames in order, as in `dejavu learn`, at least 30 in each; one after the other
+        out: map file to write instead (.safetensors)
+    """
+    from dejavu_torch.updating import update
+
+    out = map if out is None else out
+    _check_map_file(out, *drives, option="--out")
+    device_of(loading.device)
+    model, changed = loading.model(map), False
+    for drive in [open_source(one) for one in drives]:  # all are there before one is read
+        found = update(model, drive, progress=True, own=map.stem)
+        _say(f"{drive.name}: {found}")
+        changed |= found.changed
+    if out != map or changed:
+        model.save(out)
+        print_map(model)
+        _print_localize(out, model, command)
+
+
 def run_merge(maps: Sequence[Path], *, map: Path, features: nn.Module | None = None, command: str) -> None:
     """Merge the maps of several routes with the same descriptors: an answer is then a route and its frame.
 

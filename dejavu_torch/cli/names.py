@@ -10,6 +10,7 @@ COMMANDS = {
     "reproduce": "repeat the paper's experiments on simulated routes",
     "train": "train features that repeat: fit, validate, test or export",
     "refine": "learn from a drive, whose places nobody tells, what changes along a map",
+    "update": "refine a map by a drive, and append ground that it lacks",
     "merge": "merge the maps of several routes",
     "export": "write a map and its features as an ONNX file",
     "info": "show what a map holds",

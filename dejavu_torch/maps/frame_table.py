@@ -11,6 +11,8 @@ from torch import Tensor
 from dejavu_torch.data.positions import borders, look_up, place_of, shown_frames
 from dejavu_torch.types import InputError
 
+Link = tuple[int, int, float]  # a step from one place to another, with its probability
+
 
 class Route(NamedTuple):
     """One of several routes of a map: its name and its numbers of places and frames."""

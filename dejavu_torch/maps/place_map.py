@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from dejavu_torch.data.files import LARGEST
 from dejavu_torch.data.positions import count_places
-from dejavu_torch.maps.frame_table import FrameTable, Route
+from dejavu_torch.maps.frame_table import FrameTable, Link, Route
 from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.types import InputError
 
@@ -111,6 +111,11 @@ class PlaceMap(nn.Module, ABC):
     def route_starts(self) -> tuple[int, ...]:
         """The first place of each route."""
         return (0, *accumulate(route.places for route in self.routes[:-1]))
+
+    @property
+    def connections(self) -> tuple[Link, ...]:
+        """Steps from one route to another, see `PlaceSmoother`."""
+        return ()
 
     def frame_of(self, places: Tensor) -> Tensor:
         """The reference frame of each place, see `FrameTable`."""

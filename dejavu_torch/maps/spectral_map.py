@@ -18,7 +18,7 @@ from torch import Tensor
 
 from dejavu_torch.maps.codec import Stream, decode
 from dejavu_torch.maps.file import checked
-from dejavu_torch.maps.frame_table import Route
+from dejavu_torch.maps.frame_table import Link, Route
 from dejavu_torch.maps.place_map import PlaceMap, ScoreBlocks, require
 from dejavu_torch.maps.spectrum import Transform, from_slots, half_cycles, slots
 from dejavu_torch.maps.summary import ChunkSummary, MapSummary
@@ -43,7 +43,9 @@ FILE = {  # dtype and dimensions of the tensors of a file
     "stage": (torch.int8, 2),
     "stage_scale": (torch.float32, 1),
     "drives": (torch.int32, 1),
+    "links": (torch.int32, 2),
 }
+LINK_SHARES = 1000  # the probability of a link is stored in thousandths
 STAGE = ("stage", "stage_scale", "drives")
 CHUNK_BYTES = 8 + 4 + 8 + 8  # a chunk's length, step, stream length and checksum in a file
 
@@ -90,6 +92,8 @@ class SpectralMap(PlaceMap):
         means: (R,K) bfloat16, subtracted from the descriptors of each route; small means are 0.
         stage, stage_scale: (K,K) int8 and (K,), a linear map P that drives have taught: queries and coded
             descriptors are compared after it, see `refined`. drives: (1,) int32, how many. Empty without.
+        links: (L,3) int32, steps from a place of a route to one of another, and their probability in
+            thousandths; see `connections`.
     Buffers derived from these:
         counts, feature, level: number of coefficients of each of N lines; for each of L coefficients its
             feature, ascending within a line, and its value in steps; in the smallest dtypes possible.
@@ -114,7 +118,7 @@ class SpectralMap(PlaceMap):
     kind = "spectral"
     state = SpectralState
     kept = ("positions", "steps", "means", "norms", "stage_scale")
-    optional = {"visits": (0, 2), "stage": (0, 0), "stage_scale": (0,), "drives": (0,)}  # noqa: RUF012
+    optional = {"visits": (0, 2), "stage": (0, 0), "stage_scale": (0,), "drives": (0,), "links": (0, 3)}  # noqa: RUF012
 
     lengths: Tensor
     steps: Tensor
@@ -124,6 +128,7 @@ class SpectralMap(PlaceMap):
     stage: Tensor
     stage_scale: Tensor
     drives: Tensor
+    links: Tensor
     counts: Tensor
     feature: Tensor
     level: Tensor
@@ -256,15 +261,44 @@ class SpectralMap(PlaceMap):
         both = projection
         if len(self.stage):
             both = self.staged(torch.eye(self.dimension).to(projection)) @ projection
-        place_map = copy.copy(self)  # which shares the lines
-        place_map._buffers = {**self._buffers}
-        place_map.chunks, place_map._bounds = [*self.chunks], [*self._bounds]
+        place_map = self._sharing()
         place_map.stage_scale = (both.abs().amax(0) / 127).float()
         place_map.stage = (both / place_map.stage_scale).round().to(torch.int8)
         place_map.drives = torch.cat([self.drives, self.drives.new_ones(1)]).sum(0, True, dtype=torch.int32)
         place_map.norms = torch.cat([*map(place_map._norms_of, range(len(self.chunks)))])
         place_map.check()
         return place_map
+
+    def _sharing(self) -> SpectralMap:
+        """A map that shares the lines, to be changed."""
+        place_map = copy.copy(self)
+        place_map._buffers = {**self._buffers}
+        place_map.chunks, place_map._bounds = [*self.chunks], [*self._bounds]
+        return place_map
+
+    def with_route(self, name: str, route: SpectralMap, own: str) -> SpectralMap:
+        """A map that has the places of another at the end, as a route of this name; `own`: what its own are
+        called, if they are one route."""
+        place_map = self._sharing()
+        known = self.routes or (Route(own, self.places, self.table.frames),)
+        place_map.routes = (*known, Route(name, route.places, route.table.frames))
+        place_map.means = torch.cat([self.means, route.means.to(self.means)])
+        place_map.extend(route.coded())
+        place_map.positions = torch.cat([self.positions, route.positions.to(self.positions)])
+        place_map.check()
+        return place_map
+
+    def linked(self, links: Sequence[Link]) -> SpectralMap:
+        """A map with these connections."""
+        place_map = self._sharing()
+        rows = [(one, two, round(LINK_SHARES * share)) for one, two, share in links]
+        place_map.links = torch.tensor(rows, dtype=torch.int32, device=self.device).view(-1, 3)
+        place_map.check()
+        return place_map
+
+    @property
+    def connections(self) -> tuple[Link, ...]:
+        return tuple((one, two, share / LINK_SHARES) for one, two, share in self.links.tolist())
 
     @classmethod
     def merged(cls, parts: Sequence[SpectralMap], names: Sequence[str]) -> SpectralMap:
@@ -466,6 +500,10 @@ class SpectralMap(PlaceMap):
         require(
             fits, f"a stage {shape}, {len(self.stage_scale)} scales; expected {(k, k)}, {k}, a drive, or none"
         )
+        links, most = self.links, self.links.new_tensor([self.places - 1, self.places - 1, LINK_SHARES])
+        fits = links.shape[1] == 3 and bool(((links >= 0) & (links <= most)).all())
+        row = f"rows of two places, and a number up to {LINK_SHARES}"
+        require(fits, f"links {links.tolist()!s:.100}; expected {row}")
         if self.routes:
             names, places, frames = zip(*self.routes, strict=True)
             fits = len({*names}) == len(names) and all(names)
@@ -492,6 +530,8 @@ class SpectralMap(PlaceMap):
         packed = super().packed()
         if not len(self.stage):
             packed = {name: value for name, value in packed.items() if name not in STAGE}
+        if not len(self.links):
+            del packed["links"]
         return packed if bool(self.means.any()) else packed | {"means": self.means[:0]}
 
     def summary(self) -> MapSummary:

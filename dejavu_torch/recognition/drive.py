@@ -30,6 +30,7 @@ class Shown(NamedTuple):
     """What an answer is made of: candidates (Q,k); the rest (Q,)."""
 
     match: Match
+    absent: Tensor  # probability of being off the map
     margin: Tensor  # to the best place elsewhere
     probability: Tensor
     own: Tensor  # the score of the answer by its query alone
@@ -69,13 +70,25 @@ class Seen(NamedTuple):
     known: Tensor | None = None
 
 
+class Answers(NamedTuple):
+    """The matches (Q,k) of a drive, and the probability that each query is off the map, (Q,)."""
+
+    match: Match
+    absent: Tensor
+
+
 def localize_drive(asked: DriveQuery, progress: bool = False) -> Match:
     """As `localize_drives`, of one."""
     return localize_drives([asked], progress)[0]
 
 
-@torch.no_grad()
 def localize_drives(drives: Sequence[DriveQuery], progress: bool = False) -> list[Match]:
+    """The matches of `answer_drives`."""
+    return [answers.match for answers in answer_drives(drives, progress)]
+
+
+@torch.no_grad()
+def answer_drives(drives: Sequence[DriveQuery], progress: bool = False) -> list[Answers]:
     """Match the queries of drives. Those of as many queries and places, as of one drive on several maps, are
     smoothed in one pass, which takes hardly longer than that of a single one.
 
@@ -83,8 +96,8 @@ def localize_drives(drives: Sequence[DriveQuery], progress: bool = False) -> lis
     lower one of the single query and the smoother; of one query alone it is its own.
 
     Returns:
-        A Match of (Q,k) for each, on the CPU, with probability and confidence; all accepted that have a
-        finite score.
+        For each a Match of (Q,k), with probability and confidence, all accepted that have a finite score;
+        on the CPU.
     """
     shown: list[list[Shown]] = [[] for _ in drives]
     queries = sum(len(asked.descriptors) for asked in drives)
@@ -113,21 +126,23 @@ def _shown(asked: DriveQuery, seen: Seen) -> Shown:
         probability = by_itself if queries == 1 else torch.minimum(probability, by_itself)
     probability = probability.masked_fill(match.index[:, 0] < 0, 0)
     margin = pair.score[:, -1] - pair.score[:, 0] if pair.index.shape[1] > 1 else pair.score[:, 0] * math.nan
-    return Shown(match, margin, probability, scores.gather(1, at)[:, 0])
+    return Shown(match, 1 - mass.sum(1), margin, probability, scores.gather(1, at)[:, 0])
 
 
-def _joined(asked: DriveQuery, parts: list[Shown]) -> Match:
-    """The match of all queries of a drive."""
+def _joined(asked: DriveQuery, parts: list[Shown]) -> Answers:
+    """The answers to all queries of a drive."""
     k = asked.k
     if not parts:
         empty = torch.zeros(0, k)
-        return Match(empty.long(), empty, empty.bool(), empty.double(), confidence=empty)
+        match = Match(empty.long(), empty, empty.bool(), empty.double(), confidence=empty)
+        return Answers(match, torch.zeros(0).double())
     match = Match.joined(part.match for part in parts)
-    margin, probability, own = (torch.cat(column) for column in [*zip(*parts, strict=True)][1:])
+    absent, margin, probability, own = (torch.cat(column) for column in [*zip(*parts, strict=True)][1:])
     if asked.smoother.is_drive:
         match = replace(match, score=match.score + doubt(own)[:, None])
     match = replace(match, score=match.score.to(own.dtype))
-    return replace(match, probability=first_of(probability, k), confidence=first_of(margin.to(own.dtype), k))
+    confidence = first_of(margin.to(own.dtype), k)
+    return Answers(replace(match, probability=first_of(probability, k), confidence=confidence), absent)
 
 
 def _seen(drives: Sequence[DriveQuery], progress: bool) -> Iterator[tuple[int, Seen]]:

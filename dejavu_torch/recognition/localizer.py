@@ -138,6 +138,8 @@ class Localizer:
             blocks = lambda numbers: score_blocks(descriptors[numbers].to(device))  # noqa: E731
             tiles = Tiles(blocks, place_map.block_places)
 
+        smoother.map_links = () if place_map is None else place_map.connections
+
         def rows(queries: Tensor) -> Rows:
             return lambda numbers: score(queries[numbers])
 

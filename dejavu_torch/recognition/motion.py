@@ -10,11 +10,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from dejavu_torch.maps.frame_table import Link
 from dejavu_torch.types import InputError
 
 MIN_PROBABILITY = 1e-30  # a probability of 0, with a finite gradient
-
-Link = tuple[int, int, float]  # a step from one place to another, with its probability
 
 
 class Rates(NamedTuple):

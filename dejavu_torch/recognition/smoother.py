@@ -10,6 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from dejavu_torch.maps.frame_table import Link
 from dejavu_torch.recognition.evidence import (
     RankTable,
     Spacing,
@@ -24,7 +25,6 @@ from dejavu_torch.recognition.motion import (
     MIN_PROBABILITY,
     Counts,
     Layout,
-    Link,
     Motion,
     Rates,
     checked_rates,
@@ -184,6 +184,7 @@ class PlaceSmoother(SequenceModel):
         self.turn, self.separation, self.tempering = turn, float(separation), float(tempering)
         self.within, self.threshold = within, threshold
         self.links, self.loop = tuple(links), loop
+        self.map_links: tuple[Link, ...] = ()  # likewise, of the map that a `Localizer` matches to
         self.log_likelihood: float | None = None  # nats above being off the map throughout, as fitted
         self.correlation = 1.0  # tau of these queries
         self.is_drive = True  # whether the queries that were fitted to are a drive of the map
@@ -269,7 +270,7 @@ class PlaceSmoother(SequenceModel):
         return Rates(moves, jump, leave, self.enter_logit.to(like).sigmoid())
 
     def layout(self, places: int, route_starts: Sequence[int] = (0,)) -> Layout:
-        links = self.links
+        links = self.links + self.map_links
         if self.loop:
             ends = (*route_starts[1:], places)
             links += tuple((end - 1, start, 1.0) for start, end in zip(route_starts, ends, strict=True))

@@ -325,7 +325,7 @@ MUTANTS = [
     Mutant(
         "Of routes of one name that are merged, each further one gets a number.",
         "dejavu_torch/growth.py",
-        "parts[_free_name(wanted, parts)] = part",
+        "parts[free_name(wanted, parts)] = part",
         "parts[wanted] = part",
         ("tests/test_growth.py::test_merging_merged_maps_and_names_that_are_there",),
     ),
