@@ -94,20 +94,21 @@ def plot_areas(cases: Mapping[str, Mapping[str, float]], kinds: Mapping[str, str
 def plot_visits(cases: Mapping[str, Mapping[str, Sequence[float]]]) -> Plot:
     """The AUC after 0, 1, .. drives, a panel for each case, a line for each way to learn."""
     figure, axes = canvas(1.9 * -(-len(cases) // 2) + 0.6, -(-len(cases) // 2), 2, squeeze=False, sharex=True)
+    most = max(len(areas) for ways in cases.values() for areas in ways.values())
     drawn: dict[str, Any] = {}
     for axis, (case, ways) in zip(axes.flat, cases.items(), strict=False):
         for (way, areas), style in zip(ways.items(), ("o-", "s--"), strict=True):
             colour = OURS if style == "o-" else COLOURS["hog"]
             (drawn[way],) = axis.plot(range(len(areas)), areas, style, color=colour, markersize=5)
-        middle = sum(sum(areas) / len(areas) for areas in ways.values()) / len(ways)
-        axis.set_ylim(min(middle - 0.13, axis.get_ylim()[0]), max(middle + 0.13, axis.get_ylim()[1]))
+        low, high = min(map(min, ways.values())), max(map(max, ways.values()))
+        axis.set_ylim(min(low - 0.03, high - 0.2), min(high + 0.03, 1.005))
         axis.set_title(label(case), loc="left", fontsize=9)
-        axis.set_xticks(range(1 + max(map(len, cases.values()))))
+        axis.set_xticks(range(most))
         axis.grid(alpha=0.3)
     for axis in axes[-1]:
         axis.set_xlabel("drives that taught", fontsize=9)
     axes[0, 0].set_ylabel("AUC, one image", fontsize=9)
-    figure.legend([*drawn.values()], [*drawn], loc="outside lower left", frameon=False, fontsize=9, ncols=2)
+    figure.legend([*drawn.values()], [*drawn], loc="outside lower left", frameon=False, fontsize=9)
     return figure, axes
 
 

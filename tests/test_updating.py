@@ -161,6 +161,22 @@ def test_what_fits_no_map_is_refused() -> None:
     assert model.map.routes == ()
 
 
+def test_connections_are_followed_by_a_whole_drive() -> None:
+    model = model_of(ROUTE[:END])
+    update(model, seen(torch.cat([ROUTE[40:120], ASIDE, ROUTE[120:200]])))
+    assert len(model.map.connections) == 2
+    drive = seen(torch.cat([ROUTE[60:120], ASIDE, ROUTE[120:180]]), seed=6)
+    with_links, without = PlaceSmoother(), PlaceSmoother()
+    match = model.localize_descriptors(drive, model.matching(with_links))
+    assert with_links.map_links == model.map.connections
+    model.replace_map(spectral(model).linked([]))
+    model.localize_descriptors(drive, model.matching(without))
+    assert with_links.log_likelihood > without.log_likelihood + 5  # type: ignore[operator]
+    ((end, start, _), (last, back, _)) = with_links.map_links
+    expected = [*range(60, end + 1), *range(start, last + 1), *range(back, 180)]
+    assert ((match.index[:60] - torch.tensor(expected[:60])).abs() <= 5).all()
+
+
 def test_maps_that_are_saved_merged_and_cut_keep_their_connections(tmp_path: Path) -> None:
     model = model_of(ROUTE[:END])
     update(model, seen(ROUTE[100:330]))
