@@ -92,7 +92,7 @@ def plot_areas(cases: Mapping[str, Mapping[str, float]], kinds: Mapping[str, str
 
 
 def plot_visits(cases: Mapping[str, Mapping[str, Sequence[float]]]) -> Plot:
-    """The AUC after 0, 1, .. drives, a panel for each case, a line for each way to learn."""
+    """The AUC after 0, 1, .. drives, a panel for each case, "WHAT asked", a line for each way to learn."""
     figure, axes = canvas(1.9 * -(-len(cases) // 2) + 0.6, -(-len(cases) // 2), 2, squeeze=False, sharex=True)
     most = max(len(areas) for ways in cases.values() for areas in ways.values())
     drawn: dict[str, Any] = {}
@@ -102,12 +102,12 @@ def plot_visits(cases: Mapping[str, Mapping[str, Sequence[float]]]) -> Plot:
             (drawn[way],) = axis.plot(range(len(areas)), areas, style, color=colour, markersize=5)
         low, high = min(map(min, ways.values())), max(map(max, ways.values()))
         axis.set_ylim(min(low - 0.03, high - 0.2), min(high + 0.03, 1.005))
-        axis.set_title(label(case), loc="left", fontsize=9)
+        axis.set_title(label(case.removesuffix(" asked")), loc="left", fontsize=9)
         axis.set_xticks(range(most))
         axis.grid(alpha=0.3)
     for axis in axes[-1]:
         axis.set_xlabel("drives that taught", fontsize=9)
-    axes[0, 0].set_ylabel("AUC, one image", fontsize=9)
+    axes[0, 0].set_ylabel("AUC of another, one image", fontsize=9)
     figure.legend([*drawn.values()], [*drawn], loc="outside lower left", frameon=False, fontsize=9)
     return figure, axes
 

@@ -272,7 +272,7 @@ def visits() -> str:
     """What another drive finds after more and more drives."""
     rows = read("visits")["rows"]
     most = range(1 + max(row["drives"] for row in rows))
-    table = [["asked", "the map", *(f"{count} drives" for count in most), "bytes"]]
+    table = [["asked", "the map", *(f"after {count}" for count in most), "bytes"]]
     for (case, way), own in groupby(rows, lambda row: (row["case"], row["contender"])):
         found = [*own]
         cells = [area(row["auc"]) for row in found] + [""] * (len(most) - len(found))
