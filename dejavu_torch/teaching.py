@@ -97,6 +97,11 @@ class Refinement(NamedTuple):
     error: float = math.nan
     accepted: bool = False
 
+    @property
+    def changed(self) -> bool:
+        """As `accepted`."""
+        return self.accepted
+
     def __str__(self) -> str:
         if not self.placed:
             return f"0 of {self.of} frames placed; nothing is learned, the map stays as it was"

@@ -63,7 +63,7 @@ class Update(NamedTuple):
     @property
     def changed(self) -> bool:
         """Whether the map is another one."""
-        return bool(self.stretches) or bool(self.refinement and self.refinement.accepted)
+        return bool(self.stretches) or (self.refinement is not None and self.refinement.changed)
 
     def __str__(self) -> str:
         if not self.is_drive:

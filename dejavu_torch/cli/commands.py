@@ -11,8 +11,9 @@ import json
 import shlex
 import threading
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, suppress
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -48,6 +49,8 @@ from dejavu_torch.types import InputError, Match, Traverse
 if TYPE_CHECKING:
     from dejavu_torch.evaluation.compare import Comparison
     from dejavu_torch.evaluation.report import Report
+    from dejavu_torch.teaching import Refinement
+    from dejavu_torch.updating import Update
 
 COMPARED = ("map.safetensors", "matches.csv")  # files next to the report of a comparison
 NO_DRIVE = "the queries are no drive of this map, as far as they show: each is matched by itself"
@@ -533,18 +536,7 @@ def run_refine(
     """
     from dejavu_torch.teaching import refine
 
-    out = map if out is None else out
-    _check_map_file(out, *drives, option="--out")
-    device_of(loading.device)
-    model = loading.model(map)
-    found = []
-    for drive in [open_source(one) for one in drives]:  # all are there before one is read
-        found.append(refine(model, drive, progress=True))
-        _say(f"{drive.name}: {found[-1]}")
-    if out != map or any(one.accepted for one in found):
-        model.save(out)
-        print_map(model)
-        _print_localize(out, model, command)
+    _teach(refine, map, drives, out, loading, command)
 
 
 def run_update(
@@ -564,15 +556,27 @@ def run_update(
     """
     from dejavu_torch.updating import update
 
+    _teach(partial(update, own=map.stem), map, drives, out, loading, command)
+
+
+def _teach(
+    learn: Callable[..., Refinement | Update],
+    map: Path,
+    drives: Sequence[str],
+    out: Path | None,
+    loading: options.Loading,
+    command: str,
+) -> None:
+    """Let drives teach a map, one after the other, and write it if it is another one."""
     out = map if out is None else out
     _check_map_file(out, *drives, option="--out")
     device_of(loading.device)
-    model, changed = loading.model(map), False
+    model, changed = loading.model(map), out != map
     for drive in [open_source(one) for one in drives]:  # all are there before one is read
-        found = update(model, drive, progress=True, own=map.stem)
+        found = learn(model, drive, progress=True)
         _say(f"{drive.name}: {found}")
         changed |= found.changed
-    if out != map or changed:
+    if changed:
         model.save(out)
         print_map(model)
         _print_localize(out, model, command)
