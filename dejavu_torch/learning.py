@@ -232,6 +232,12 @@ def append_places(
         raise InputError(f"{error}; {kept}") from error
 
 
+def count_drives(place_map: PlaceMap, second: LabelledFrames | None) -> None:
+    """Let a map know how many drives, whose places nobody told, have taught its whitening."""
+    if second is not None and second.drives and isinstance(place_map, SpectralMap):
+        place_map.drives = place_map.steps.new_tensor([second.drives]).int()
+
+
 @torch.no_grad()
 def learn_descriptors(mapper: Mapper, descriptors: Tensor) -> PlaceMap:
     """The map of descriptors (N,K); a map of other sizes is refused."""

@@ -238,17 +238,22 @@ class DejaVu(nn.Module):
                 learned = learning.learn_descriptors(mapper, rows)
             if counts is not None:
                 learned.count_visits(1 + counts)
+            learning.count_drives(learned, second)
         return self.replace_map(learned, _state_of(self, learned, traverse))
 
-    def learn_features(self, features: Tensor, traverse: Traverse | None = None) -> DejaVu:
+    def learn_features(
+        self, features: Tensor, traverse: Traverse | None = None, second: LabelledFrames | None = None
+    ) -> DejaVu:
         """As `learn`, from ready descriptors.
 
         Args:
             features: (N,K) float, whitened if the model whitens.
             traverse: their source, if known: it tells the map which frames to expect, and the frame of each
                 resampled place.
+            second: what the whitening has learned from; the map tells how many drives taught it.
         """
         learned = learning.learn_descriptors(self.mapper, features)
+        learning.count_drives(learned, second)
         return self.replace_map(learned, _state_of(self, learned, traverse))
 
     def resample(

@@ -99,6 +99,7 @@ def test_frames_are_placed_without_truth_and_teach(
         for m in (taught, untaught)
     ]
     assert found[0].float().mean() >= found[1].float().mean() > 0.5
+    assert [m.map.drives.tolist() for m in (taught, untaught)] == [[1], []]  # type: ignore[union-attr]
     projections = [m.state_dict()["descriptor.whitening.projection"] for m in (taught, untaught)]
     assert not torch.equal(*projections)
 

@@ -733,9 +733,9 @@ def print_map(model: DejaVu) -> None:
     if len(model.map.visits):
         counts = model.map.visit_counts.double()
         print(f"each place is the mean of {counts.mean():.3g} visits ({counts.min():g} to {counts.max():g})")
-    if isinstance(model.map, SpectralMap) and len(model.map.stage):
-        drives = int(model.map.drives)
-        print(f"refined by {drives} drive{'s' * (drives > 1)}")
+    if isinstance(model.map, SpectralMap) and len(model.map.drives):
+        drives, verb = int(model.map.drives), "refined" if len(model.map.stage) else "taught"
+        print(f"{verb} by {drives} drive{'s' * (drives > 1)}")
     whitening = model.whitening
     if whitening is not None:
         sizes = " + ".join(map(str, whitening.sizes))

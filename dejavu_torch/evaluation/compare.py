@@ -158,7 +158,7 @@ def compare(
         else:
             spectral = isinstance(model.mapper, SpectralMapper)
             places = model.descriptor.learn(reference, second, progress, spectral)
-            model.learn_features(places, reference)
+            model.learn_features(places, reference, second)
         if isinstance(calibration, LabelledFrames) or (calibration is None and not has_map):
             calibrate_if_possible(model, reference, calibration, progress=progress)
     with timed(seconds, "localize"):

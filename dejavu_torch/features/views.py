@@ -79,6 +79,12 @@ class LabelledFrames(NamedTuple):
             left = f"{int((~own).sum())} left out" if own.any() else "nothing is learned from it"
             yield f"{int(own.sum())} of {len(own)} frames of {name} placed; {left}"
 
+    @property
+    def drives(self) -> int:
+        """How many drives teach, of those that a smoother placed."""
+        drive, names, *_ = self.placed or (self.places, {})
+        return sum(bool((self.places[drive == i] >= 0).any()) for i in names)
+
     def placed_facts(self) -> dict[str, Any] | None:
         """The entry `second` of report.json; None if no smoother placed the frames."""
         if self.placed is None:

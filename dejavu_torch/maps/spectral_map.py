@@ -47,6 +47,7 @@ FILE = {  # dtype and dimensions of the tensors of a file
 }
 LINK_SHARES = 1000  # the probability of a link is stored in thousandths
 STAGE = ("stage", "stage_scale", "drives")
+TAUGHT = (*STAGE, "links")  # by drives; files of other maps lack them
 CHUNK_BYTES = 8 + 4 + 8 + 8  # a chunk's length, step, stream length and checksum in a file
 
 
@@ -91,7 +92,8 @@ class SpectralMap(PlaceMap):
         streams, stream_table: coded levels; bytes and checksum of each chunk.
         means: (R,K) bfloat16, subtracted from the descriptors of each route; small means are 0.
         stage, stage_scale: (K,K) int8 and (K,), a linear map P that drives have taught: queries and coded
-            descriptors are compared after it, see `refined`. drives: (1,) int32, how many. Empty without.
+            descriptors are compared after it, see `refined`. drives: (1,) int32, how many, and those that
+            taught the whitening without being told where they are. Empty without.
         links: (L,3) int32, steps from a place of a route to one of another, and their probability in
             thousandths; see `connections`.
     Buffers derived from these:
@@ -495,7 +497,7 @@ class SpectralMap(PlaceMap):
         require(not self.places or fits, f"means {tuple(means.shape)}; expected {shape} finite numbers")
         shape, k = tuple(self.stage.shape), self.dimension
         fits = shape in ((0, 0), (k, k)) and self.stage_scale.shape == shape[:1]
-        fits = fits and len(self.drives) == (shape != (0, 0)) and not (self.drives < 1).any()
+        fits = fits and (shape != (0, 0)) <= len(self.drives) <= 1 and not (self.drives < 1).any()
         fits = fits and bool(self.stage_scale.isfinite().all())
         require(
             fits, f"a stage {shape}, {len(self.stage_scale)} scales; expected {(k, k)}, {k}, a drive, or none"
@@ -528,17 +530,14 @@ class SpectralMap(PlaceMap):
     def packed(self) -> dict[str, Tensor]:
         """See `PlaceMap`; means that are all 0 are omitted."""
         packed = super().packed()
-        if not len(self.stage):
-            packed = {name: value for name, value in packed.items() if name not in STAGE}
-        if not len(self.links):
-            del packed["links"]
+        packed = {name: value for name, value in packed.items() if len(value) or name not in TAUGHT}
         return packed if bool(self.means.any()) else packed | {"means": self.means[:0]}
 
     def summary(self) -> MapSummary:
         chunks = [ChunkSummary(start, stop, self._periods(g)) for g, (start, stop) in enumerate(self.chunks)]
         packed = self.packed() if self.places else {}
         names = {"streams": "lines", "means": "mean", "positions": "positions", "visits": "visits"}
-        stage = sum(packed.pop(name).nbytes for name in STAGE if name in packed)
+        stage = sum(packed.pop(name).nbytes for name in STAGE if name in packed)  # with the count of drives
         route = {part: packed[name].nbytes for name, part in names.items() if name in packed}
         route = {name: size for name, size in route.items() if size}
         route["chunks"] = sum(tensor.nbytes for name, tensor in packed.items() if name not in names)
