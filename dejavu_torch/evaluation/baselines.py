@@ -298,11 +298,8 @@ def _described_baselines(
     size = partial(stride_bytes, len(stored), stored.shape[1], stored.element_size())
 
     def baseline(name: str, k: int) -> Baseline:
-        match, score = (
-            nearest_frames(stored, queries, k, "l1", progress, matching),
-            scores_of_stored(stored, k),
-        )
-        asked = None if smoother is None else asked_of(queries, smoother, score)
+        match = nearest_frames(stored, queries, k, "l1", progress, matching)
+        asked = None if smoother is None else asked_of(queries, smoother, scores_of_stored(stored, k))
         return Baseline(name, match, size(k), k, asked=asked)
 
     return {key: baseline(name, k) for key, (name, k) in names.items()}
