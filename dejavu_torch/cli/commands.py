@@ -403,6 +403,7 @@ def run_evaluate(
     map: Path | None = None,
     route: str | None = None,
     recall_values: Sequence[int] = (),
+    higher_is_better: bool = False,
     command: str,
 ) -> None:
     """Evaluate the matches of any method from a csv: scores, curve, coverage.
@@ -413,20 +414,22 @@ def run_evaluate(
         out: folder for report and pictures
         tolerance: answers up to this many places off are right
         interpolate: interpolate a --truth that lists only some queries
-        reference: source of the places, for their number and the coordinates of utm; as in `dejavu learn`
+        reference: source of the places, for their number and coordinates in names; as in `dejavu learn`
         query: source of the queries, likewise
         map: map of the matches, for its number of frames and, if they are resampled, their places
         route: route of a merged map that --truth, --reference and the queries belong to; answers on other
             routes are wrong
         recall_values: also print the share of queries with a right answer among their first N ranks, for each
             N, such as 1 5 10 20; with --tolerance 0 these are the figures of VPR-methods-evaluation
+        higher_is_better: the scores are similarities, not distances
     """
     from dejavu_torch.evaluation.evaluate import evaluate_file
     from dejavu_torch.evaluation.report import report_folder, write_report
 
     first, second = (None if source is None else open_source(source) for source in (reference, query))
     _check_report_folder(out, (), [reference, query], [matches, truth, map])
-    result = evaluate_file(matches, truth, tolerance, interpolate, first, second, map, route, recall_values)
+    given = first, second, map, route, recall_values, higher_is_better
+    result = evaluate_file(matches, truth, tolerance, interpolate, *given)
     with report_folder(out) as folder:
         title = f"{matches} evaluated by {truth}"
         write_report(folder, result.report, result.pictures, title, command)

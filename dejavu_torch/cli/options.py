@@ -364,7 +364,7 @@ class EvaluationOptions:
 
     Args:
         truth: offset (place = query + offset), csv of query,place[,place...], json with a list per query, npz
-            with GThard, or utm:25 by image names
+            with GThard, or by image names utm:25, degrees:25 or metres:25
         tolerance: answers up to this many places off are right
         interpolate: interpolate a --truth that lists only some queries
         leave_out: diagnostic for templates: the reference on itself, without this many frames on each side

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 import re
 import zipfile
@@ -18,15 +19,20 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
+from dejavu_torch.data.coordinates import FORMS as COORDINATES
+from dejavu_torch.data.coordinates import Near, named_coordinates
 from dejavu_torch.data.files import LARGEST, as_number, check_regular, read_rows, read_text, reading
 from dejavu_torch.memory import check_room
 from dejavu_torch.text import one_line
 from dejavu_torch.types import InputError, Traverse
 
+log = logging.getLogger("dejavu_torch")
+
 PAIRS_PER_BLOCK = 2**20
+OFTEN, FEW = 0.2, 20  # share of right pairs that a warning is due for, and places from which on
 EXPECTED = (
     "an integer offset such as 0, a .csv of query,place, a .json with a list of places for each query, an "
-    ".npz with GThard or utm:25 for coordinates in image names"
+    ".npz with GThard, or utm:25, degrees:25 or metres:25 for coordinates in image names"
 )
 FORMS = "integer places (Q,) or (Q,R), or a boolean matrix (Q,N)"
 BYTES_PER_PLACE = 32  # of a table of right places, including temporaries
@@ -217,7 +223,7 @@ def is_given(truth: Truth | None) -> TypeGuard[Tensor | NDArray[Any] | Sequence[
     return truth is not None and not isinstance(truth, str | Path | Real)
 
 
-def check_ground_truth(truth: Truth, interpolate: bool = False) -> int | float | Path | GroundTruth:
+def check_ground_truth(truth: Truth, interpolate: bool = False) -> int | Near | Path | GroundTruth:
     """Parse a ground truth as an offset, a radius in metres, or an existing file, before long work starts."""
     if is_given(truth):
         if interpolate:
@@ -235,9 +241,9 @@ def check_ground_truth(truth: Truth, interpolate: bool = False) -> int | float |
         return offset
     name, colon, radius = truth.partition(":")
     metres = as_number(radius) if colon else 25.0
-    if name != "utm" or metres is None or metres < 0:
+    if name not in COORDINATES or metres is None or metres < 0:
         raise InputError(f"truth {truth!r} is not known; expected {EXPECTED}")
-    return metres
+    return Near(name, metres)
 
 
 def find_ground_truth(
@@ -263,7 +269,8 @@ def find_ground_truth(
               as in the visual place recognition tutorial of Schubert et al. Places in GThard are right (in
               GTsoft, if that is the only one); places in GTsoft only are ignored;
             - `utm:25`: every reference frame within 25 metres (inclusive; `utm` alone means 25) by the UTM
-              coordinates in the names of both traverses' images, `@easting@northing@...@.jpg`;
+              coordinates in the names of both traverses' images, `@easting@northing@...@.jpg`; `degrees:25`
+              and `metres:25` likewise, see `named_coordinates`;
             - the places themselves, a row for each frame of the query, see `as_ground_truth`;
             - None: the positions that both traverses carry; else frame i is place i if they are of equal
               length, not resampled and aligned (see `are_aligned`); else there is no ground truth.
@@ -302,11 +309,13 @@ def find_ground_truth(
         ground_truth = GroundTruth(*rows)
     elif isinstance(parsed, int):
         ground_truth = _every(offset_truth(numbers, frames, parsed))
-    elif isinstance(parsed, float):
+    elif isinstance(parsed, Near):
         if reference is None or query is None:
-            raise InputError(f"truth utm:{parsed:g} reads the names of images; expected reference and query")
-        coordinates = _rows_of(utm_coordinates(query), numbers)
-        ground_truth = _every(near_truth(utm_coordinates(reference), coordinates, parsed))
+            raise InputError(f"truth {truth} reads the names of images; expected reference and query")
+        stored, asked = named_coordinates([reference, query], parsed.kind)
+        asked = _rows_of(asked, numbers)
+        ground_truth = _every(near_truth(stored, asked, parsed.radius))
+        ground_truth = ground_truth._replace(judged=~asked.isnan().any(1))
     elif parsed.suffix.lower() == ".npz":
         ground_truth = _read_matrices(parsed, numbers, frames, every)
     else:
@@ -317,12 +326,24 @@ def find_ground_truth(
             places = _read_json(parsed, frames, len(numbers) if every else length, int(numbers.max()) + 1)
         ground_truth = _from_table(parsed, places, numbers, length, interpolate, resampled)
     if (ground_truth.positives >= 0).any():
+        _warn_of_many(ground_truth, frames)
         return ground_truth
     if not isinstance(parsed, int):
         raise InputError(f"no query has a right answer: {describe_ground_truth(truth)}")
     last = "" if frames is None else f" to {frames - 1 - int(numbers.min())}"
     expected = f"an offset from {-int(numbers.max())}{last}"
     raise InputError(f"no query has a right answer with truth {parsed}; expected {expected}")
+
+
+def _warn_of_many(truth: GroundTruth, frames: int | None) -> None:
+    """Warn if so many pairs of a query and a place are right that any answer may be."""
+    if frames is None or frames < FEW or not truth.judged.any():
+        return
+    share = float((truth.positives[truth.judged] >= 0).sum(1).double().mean()) / frames
+    if share > OFTEN:
+        log.warning(
+            "%.0f %% of all pairs of a query and a place count as right; is this truth meant?", 100 * share
+        )
 
 
 def _rows_of(table: Tensor, numbers: Tensor) -> Tensor:
@@ -354,8 +375,8 @@ def describe_ground_truth(truth: Truth | None, interpolate: bool = False, positi
         return "the places that the caller gave"
     if isinstance(parsed, int):
         return "place = query" + (f" {'-' if parsed < 0 else '+'} {abs(parsed)}" if parsed else "")
-    if isinstance(parsed, float):
-        return f"within {parsed:g} m by the coordinates in image names"
+    if isinstance(parsed, Near):
+        return f"within {parsed.radius:g} m by the coordinates in image names"
     return f"{truth}, interpolated" if interpolate else str(truth)
 
 
@@ -368,19 +389,6 @@ def offset_of(truth: Truth | None, positions: bool = False) -> int | None:
     with suppress(ValueError):
         return offset if abs(offset := int(str(truth))) < LARGEST else None
     return None
-
-
-def utm_coordinates(traverse: Traverse) -> Tensor:
-    """Easting and northing in the names of a traverse's images, metres: (N,2) float64."""
-    names = traverse.names
-    if not names:
-        raise InputError(f"{traverse.name} has no image names; expected a folder of images for truth utm")
-    rows = [[as_number(part) for part in name.split("@")[1:3]] for name in names]
-    for name, row in zip(names, rows, strict=True):
-        if len(row) != 2 or None in row:
-            expected = "@easting@northing@...@.jpg"
-            raise InputError(f"{traverse.name}: {name} has no UTM coordinates; expected {expected}")
-    return torch.tensor(rows, dtype=torch.float64)
 
 
 def _from_table(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,9 +16,11 @@ from torch import Tensor
 from dejavu_torch.data.ground_truth import (
     GroundTruth,
     check_ground_truth,
+    counted,
     describe_ground_truth,
     find_ground_truth,
     ground_truth_in_places,
+    is_right,
     offset_of,
 )
 from dejavu_torch.data.positions import unit_of
@@ -36,6 +40,9 @@ from dejavu_torch.types import InputError, Match, Traverse
 from dejavu_torch.version import __version__
 
 RANKS = (5, 10)  # the N of recall@N
+TOLD = 10  # right and wrong answers, from which on their scores are compared
+
+log = logging.getLogger("dejavu_torch")
 
 
 class Evaluation(NamedTuple):
@@ -58,6 +65,7 @@ def evaluate_file(
     map: Path | None = None,
     route: str | None = None,
     recall_values: Sequence[int] = (),
+    higher_is_better: bool = False,
 ) -> Evaluation:
     """Scores and pictures of the matches in a csv.
 
@@ -73,6 +81,7 @@ def evaluate_file(
         route: for matches on a merged map, the route of `truth` and `reference`: answers on other routes are
             wrong.
         recall_values: see `recall_over_all`; each at most the ranks of a query.
+        higher_is_better: the scores are similarities.
 
     Raises:
         InputError: matches, ground truth or map that cannot be read, do not fit each other, or leave no query
@@ -94,7 +103,9 @@ def evaluate_file(
     if place_map is not None:
         places = place_map.places
         frames = len(positions) if resampled else places
-    queries, match, candidates = read_matches(matches, route)
+    queries, match, candidates = read_matches(matches, route, resampled)
+    if higher_is_better:
+        match = replace(match, score=torch.where(match.score.isfinite(), -match.score, math.inf))
     elsewhere = candidates == ELSEWHERE
     if frames is not None and int(candidates.max()) >= frames:
         raise InputError(f"{matches} reports place {int(candidates.max())}; expected one below {frames}")
@@ -121,12 +132,22 @@ def evaluate_file(
     if route is not None:
         facts |= {"route": route, "elsewhere": int(elsewhere[:, 0].sum())}
     ours = contend(printable(matches.name), match, known, tolerance)
+    if not higher_is_better and _look_similar(match, known, tolerance):
+        log.warning("right answers have higher scores than wrong ones; for similarities: --higher_is_better")
     seen = places or 1 + max(int(table.max()) for table in (here.index, known.positives))
     borders = torch.tensor([seen]) if place_map is None else place_map.table.borders
     pictures = draw_curves({"map": ours}, f"{tolerance} {facts['unit']}")
     pictures |= draw_coverage(here, known, tolerance, borders, queries, facts["unit"])
     pictures |= draw_reliability(match, known, tolerance)
     return Evaluation(Report(ours, {}, facts), queries, match, known, pictures)
+
+
+def _look_similar(match: Match, truth: GroundTruth, tolerance: int) -> bool:
+    """Whether scores may be similarities: most right answers have higher ones than most wrong ones."""
+    known, right = counted(match.index, truth, tolerance), is_right(match.index, truth.positives, tolerance)
+    finite = match.score.isfinite() & known
+    good, bad = match.score[finite & right], match.score[finite & ~right]
+    return min(len(good), len(bad)) >= TOLD and bool(good.median() > bad.median())
 
 
 def evaluation_facts(

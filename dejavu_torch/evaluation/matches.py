@@ -140,19 +140,20 @@ def _name(names: Sequence[str], frame: int) -> str:
     return printable(names[frame]) if names and frame >= 0 else ""
 
 
-def read_matches(path: Path, route: str | None = None) -> Matches:
+def read_matches(path: Path, route: str | None = None, repeats: bool = False) -> Matches:
     """Read the matches in a csv, from any method.
 
     Args:
         path: a csv whose header has these columns; others are ignored.
-            query: number of the query frame, in any order, each once or in consecutive lines (resampled
-            footage may show a frame several times). place: number of the reported reference frame, -1 for
-            none. score: lower is better, inf for none.
+            query: number of the query frame, in any order, each once; in consecutive lines with ranks, or
+            with `repeats`. place: number of the reported reference frame, -1 for none. score: lower is
+            better, inf for none.
             accepted: 1 or 0; without this column every match with a finite score is. probability: of being
             right. rank: the lines of a query are its candidates, ranks 1 to K in this order, with the same K
             for all queries; the first is its match, and only its probability is used.
             route: the route of the place.
         route: the route whose places can be right; needed if the file has that column.
+        repeats: whether a query may be there several times, as resampled footage shows a frame.
 
     Convention: a row with place -1 or score inf reports nothing: place -1, score inf, not accepted,
         probability 0.
@@ -171,8 +172,10 @@ def read_matches(path: Path, route: str | None = None) -> Matches:
         if rank > 1 and not (query == last and rank == len(ranked[-1]) + 1):
             follows = f" or rank {len(ranked[-1]) + 1} of query {last}" if ranked else ""
             raise InputError(f"{where}: rank {rank} of query {query}; expected rank 1{follows}")
-        if rank == 1 and query in seen and query != last:
-            raise InputError(f"{where}: query {query} is there twice; expected each once")
+        if rank == 1 and query in seen and not (query == last and (repeats or "rank" in cells)):
+            expected = "each once, a column rank 1, 2, .. for several answers"
+            expected += ", or --map MAP of a map at even steps" * (query == last)
+            raise InputError(f"{where}: query {query} is there twice; expected {expected}")
         if route is not None and "route" not in cells:
             raise InputError(f"{where}: no column route for --route {route}; expected no --route")
         if "route" in cells and answer.place >= 0:
@@ -248,6 +251,11 @@ def _rows(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
                 raise InputError(f"{where}: no column {missing[0]}; expected {EXPECTED}")
         elif len(cells) < len(names):
             raise InputError(f"{where}: {len(cells)} cells; expected {len(names)} as in the header")
+        elif any(cells[len(names) :]):
+            expected = (
+                f"expected {len(names)} as in the header, a dot in decimal numbers, or semicolons between"
+            )
+            raise InputError(f"{where}: {len(cells)} cells; {expected}")
         else:
             yield where, dict(zip(names, cells, strict=False))
 

@@ -554,9 +554,9 @@ def test_utm_makes_every_reference_frame_near_by_right() -> None:
 
 
 def test_utm_needs_two_folders_of_images_with_coordinates() -> None:
-    good = images((1, 2))
+    good = images((500_001, 2))
     for name in ("1.png", "@1@.png", "@x@3@.png"):
-        with refused(name, "@easting@northing@"):
+        with refused(name, "no coordinates", "@easting@northing@"):
             find_ground_truth("utm", good, Named([name]), 1, 1)
     with refused("no image names", "a folder of images"):
         find_ground_truth("utm", route(1), good, 1, 1)
@@ -565,6 +565,54 @@ def test_utm_needs_two_folders_of_images_with_coordinates() -> None:
             find_ground_truth("utm", None, query, 1, 1)
     with refused("query 1", "below 1"):
         find_ground_truth("utm", good, good, 1, torch.tensor([1]))
+
+
+def test_degrees_are_no_metres_of_utm() -> None:
+    degrees = named((48.137, 11.575), (48.1371, 11.575), (48.2, 11.6))
+    for text in ("utm", "utm:25"):
+        with refused("48.137, 11.575 look like degrees", "degrees:25 (lat, lon) or metres:25"):
+            find_ground_truth(text, degrees, degrees, 3, 3)
+    assert sets(known("degrees:25", degrees, degrees, 3, 3).positives) == [{0, 1}, {0, 1}, {2}]
+    assert sets(known("degrees:11", degrees, degrees, 3, 3).positives) == [{0}, {1}, {2}]  # 11.1 m apart
+    assert sets(known("metres:1", degrees, degrees, 3, 3).positives) == [{0, 1, 2}] * 3
+    east = named((0, 179.9999), (0, -179.9999))
+    assert sets(known("degrees:25", east, east, 2, 2).positives) == [{0, 1}] * 2  # 22.3 m
+    with refused("500000, 4e+06 are no degrees", "utm:25"):
+        find_ground_truth("degrees", images((500_000, 4_000_000)), degrees, 1, 3)
+
+
+def named(*fixes: tuple[float | str, ...]) -> Named:
+    return Named(["@" + "@".join(map(str, fix)) + "@.jpg" for fix in fixes])
+
+
+def test_equal_numbers_in_other_zones_are_other_places() -> None:
+    one = (500_000, 5_300_000, 32, "U", 47.85, 9.0)
+    other = (500_000, 5_300_000, 33, "U", 47.85, 15.0)  # 450 km east
+    assert sets(known("utm", named(one), named(one, other), 1, 2).positives) == [{0}, set()]
+    near = (730_000, 5_330_000, 32, "U", 48.0, 12.0001), (269_000, 5_330_000, 33, "U", 48.0, 11.9999)
+    assert sets(known("utm", named(*near), named(*near), 2, 2).positives) == [{0, 1}] * 2  # 14.9 m
+    with refused("UTM zones 32 and 33", "@lat@lon"):
+        find_ground_truth("utm", Named(["@5e5@53e5@32@U@.jpg"]), Named(["@5e5@53e5@33@U@.jpg"]), 1, 1)
+    south = (500_000, 9_990_000, 32, "M", -0.09, 9.0), (500_000, 10_000, 32, "N", 0.09, 9.0)
+    assert sets(known("utm:20000", named(*south), named(*south), 2, 2).positives) == [{0, 1}] * 2
+
+
+def test_frames_without_a_fix_are_not_scored(caplog: pytest.LogCaptureFixture) -> None:
+    reference = Named(["@500000@4000000@.jpg", "@@@.jpg", "@500010@4000000@.jpg"])
+    query = Named(["none.jpg", "@500000@4000000@.jpg"])
+    truth = known("utm", reference, query, 3, 2)
+    assert truth.judged.tolist() == [False, True]
+    assert sets(truth.positives) == [set(), {0, 2}]
+    assert "1 of 3 frames have no coordinates, such as @@@.jpg" in caplog.text
+    assert "1 of 2 frames have no coordinates, such as none.jpg" in caplog.text
+
+
+def test_a_truth_that_calls_nearly_all_right_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    road = images(*((500_000 + 10 * i, 4_000_000) for i in range(40)))
+    known("utm:25", road, road, 40, 40)
+    assert "count as right" not in caplog.text
+    known("utm:100", road, road, 40, 40)
+    assert "46 % of all pairs of a query and a place count as right" in caplog.text
 
 
 # real data

@@ -87,7 +87,7 @@ def test_by_hand(tmp_path: Path) -> None:
         PLAIN.replace("0,7,", "0.0,7.0,").replace("query", "Query"),
         PLAIN.replace(",1\n", ",True\n").replace(",0\n", ",false\n"),
         "name,accepted,score,place,query\nc,0,-2,3,2\na,1,0.5,7,0\nb,0,inf,-1,1\n",
-        'query,place,score,accepted,note\n0,7,0.5,1,"a, b"\n1,-1,Infinity,0,\n2,3,-2,0,x,y\n',
+        'query,place,score,accepted,note\n0,7,0.5,1,"a, b"\n1,-1,Infinity,0,\n2,3,-2,0,x,,\n',
     ],
 )
 def test_other_ways_to_write_the_same(tmp_path: Path, text: str) -> None:
@@ -186,8 +186,10 @@ def test_convention_11_the_file_counts_frames_of_the_sources(tmp_path: Path) -> 
         "4,-1,inf,0,q4.png,",
         "7,10,0.25,1,q7.png,0:00:10.000",
     ]
-    queries, match, _ = read_matches(path)
+    queries, match, _ = read_matches(path, repeats=True)
     assert (queries.tolist(), match.index.tolist()) == ([4, 4, 7], [19, -1, 10])
+    with refused("query 4 is there twice", "a column rank", "--map MAP"):
+        read_matches(path)
 
 
 @given(st.lists(st.text(st.characters(blacklist_characters="\0"), max_size=9), min_size=3, max_size=3))
