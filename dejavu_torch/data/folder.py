@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import logging
 import re
+from collections import Counter
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from functools import cache
+from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image, ImageOps
+from PIL import Image, ImageOps, features
 from torch import Tensor
 
 from dejavu_torch.data.files import reading
@@ -26,7 +29,11 @@ NATURAL, LEXICOGRAPHIC = "natural", "lexicographic"  # orders of names
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"}
 MAX_IMAGE_PIXELS = 2**28  # enough for a long strip; a small file can claim any number
 ROUNDING = 1e-3  # by which a value may lie outside [0, 1]
-FORMATS = "PNG", "JPEG", "BMP", "DIB", "TIFF", "WEBP", "PPM", "GIF"  # none that starts a program
+FORMATS = "PNG", "JPEG", "BMP", "DIB", "TIFF", "WEBP", "PPM", "GIF", "AVIF", "HEIF"  # none starts a program
+HEIF = {".heic", ".heif"}  # read by pillow-heif, if it is there
+if features.check("avif"):
+    IMAGE_SUFFIXES.add(".avif")
+UNREAD = {".avif", *HEIF, ".gif", ".jp2", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw"}
 BYTES_PER_PIXEL = 24  # peak while reading: decoded, as an array, and as floats
 
 
@@ -34,7 +41,9 @@ class ImageFolder(Traverse):
     """The images of a folder, sorted by name; numbers in names compare as numbers (9 before 10). If all names
     end in increasing numbers, such as frame_0001.png, the images are assumed to be in order along the route.
 
-    Grey images have one channel, others three. EXIF orientation is applied. A file's first image is read.
+    Grey images have one channel, others three; all have those of the first, as where a camera turns to
+    infrared at night. EXIF orientation is applied. A file's first image is read. A line tells of images that
+    are left out: of formats that are not read, broken links, and those in folders inside.
 
     Args:
         width, height: pixels to resize to, antialiased; 0 for both keeps the size, for one the aspect ratio.
@@ -52,17 +61,23 @@ class ImageFolder(Traverse):
         if not folder.is_dir():
             raise InputError(f"{folder} is not there; expected a folder of images")
         inside = list(folder.iterdir())
-        images = [file for file in inside if file.suffix.lower() in IMAGE_SUFFIXES and file.name[0] != "."]
+        seen = [file for file in inside if file.name[0] != "."]
+        suffixes = readable(file.suffix.lower() for file in seen)
+        images = [file for file in seen if file.suffix.lower() in suffixes]
         self.names = sort_names([file.name for file in images if file.is_file()], order, printable(folder))
+        left = left_out(seen, suffixes)
         if not self.names:
             folders = sorted((file.name for file in inside if file.is_dir()), key=natural)
-            inner = f" but folders such as {folders[0]}" if folders else ""
+            inner = f" but folders such as {folders[0]}" if folders else f" but {left}" if left else ""
             raise InputError(f"{folder} contains no images{inner}; expected files such as .png or .jpg")
+        if left:
+            _warn_left_out(printable(folder), left)
         self.width, self.height, self.sized = width, height, bool(width or height)
         self.path, self.name = folder, printable(folder)
         self.ordered = numbers_increase(self.names)
         self.same_aspect = False  # whether to refuse images of another aspect ratio, such as portraits
         self._first: tuple[str, str, tuple[int, int]] | None = None  # image read: name, shape, original size
+        self._channels: int | None = None  # of the first image
 
     def __len__(self) -> int:
         return len(self.names)
@@ -77,6 +92,14 @@ class ImageFolder(Traverse):
 
     def _image(self, file: Path) -> Tensor:
         image = read_image(file, max(self.width, self.height))
+        if self._channels is None:
+            self._channels = len(image)
+            if file.name != self.names[0]:
+                with suppress(InputError):  # it is told where it is asked for
+                    self._channels = len(read_image(self.path / self.names[0], 1))
+        if len(image) != self._channels:
+            _warn_channels(self.name, len(image))
+            image = image.expand(3, -1, -1) if self._channels == 3 else image.mean(0, keepdim=True)
         original = (image.shape[1], image.shape[2])
         size = fitted_size(file, *original, self.width, self.height)
         if size != image.shape[1:]:
@@ -91,6 +114,49 @@ class ImageFolder(Traverse):
             ratio = f"the aspect ratio of {name}, {first[0]} x {first[1]}"
             raise InputError(f"{file} is {original[0]} x {original[1]} pixels; expected {ratio}")
         return image
+
+
+def readable(suffixes: Iterable[str]) -> set[str]:
+    """The suffixes of images that are read; of HEIF only if there are some, and pillow-heif is there."""
+    return IMAGE_SUFFIXES | HEIF if not HEIF.isdisjoint(suffixes) and _has_heif() else IMAGE_SUFFIXES
+
+
+@cache
+def _has_heif() -> bool:
+    try:
+        import_module("pillow_heif").register_heif_opener()
+    except ImportError:
+        return False
+    return True
+
+
+def left_out(files: Iterable[Path], suffixes: set[str]) -> str:
+    """The images that a folder of these files leaves out, in words; "" for none."""
+    kinds: Counter[str] = Counter()
+    for file in files:
+        suffix = file.suffix.lower()
+        if suffix in suffixes and file.is_symlink() and not file.exists():
+            kinds["broken links"] += 1
+        elif suffix in UNREAD - suffixes:
+            kinds[suffix] += 1
+        elif file.is_dir():
+            with suppress(OSError):
+                kinds["folders of images"] += any(one.suffix.lower() in suffixes for one in file.iterdir())
+    one = {"broken links": "broken link", "folders of images": "folder of images"}
+    found = [f"{n} {one.get(kind, kind) if n == 1 else kind}" for kind, n in sorted(kinds.items()) if n]
+    return " and ".join([", ".join(found[:-1]), found[-1]] if len(found) > 1 else found)
+
+
+@cache  # a command may open a source several times
+def _warn_left_out(source: str, left: str) -> None:
+    remedy = "; pip install 'dejavu_torch[heif]' reads .heic" * (".heic" in left)
+    log.warning("%s: %s are left out%s", source, left, remedy)
+
+
+@cache
+def _warn_channels(source: str, channels: int) -> None:
+    seen = "grey images are read as colour" if channels == 1 else "images in colour are read as grey"
+    log.warning("%s: %s, as the first image is", source, seen)
 
 
 def check_size(path: Path, width: int, height: int) -> None:

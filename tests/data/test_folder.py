@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import shutil
+import sys
+import types
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +15,7 @@ from helpers import all_of, refused
 from PIL import EpsImagePlugin, Image
 
 from dejavu_torch import memory
-from dejavu_torch.data.folder import ImageFolder, read_image
+from dejavu_torch.data.folder import ImageFolder, _has_heif, read_image
 from dejavu_torch.types import InputError
 
 GREY = np.arange(20, dtype=np.uint8).reshape(4, 5) * 10
@@ -137,10 +140,66 @@ def test_what_is_no_folder_of_images_and_sizes_that_no_frame_has(
 
 def test_mixed_images_are_refused_by_name(tmp_path: Path) -> None:
     write(tmp_path, "0.png", "1.png", "2.png")
-    for odd, seen in (("L", (5, 6)), "6 x 5 pixels of 1 channel"), (("RGB", (5, 4)), "of 3 channels"):
-        Image.new(*odd).save(tmp_path / "1.png")
-        with refused("1.png", seen, "expected 4 x 5 pixels of 1 channel", "0.png"):
-            all_of(ImageFolder(tmp_path))
+    Image.new("L", (5, 6)).save(tmp_path / "1.png")
+    with refused("1.png", "6 x 5 pixels of 1 channel", "expected 4 x 5 pixels of 1 channel", "0.png"):
+        all_of(ImageFolder(tmp_path))
+
+
+def test_all_images_have_the_channels_of_the_first(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    colours = np.random.default_rng(0).integers(0, 256, (4, 5, 3), np.uint8)
+    for name, kinds in {"day": ("RGB", "L", "L"), "night": ("L", "RGB", "L")}.items():
+        (tmp_path / name).mkdir()
+        for i, kind in enumerate(kinds):
+            Image.fromarray(colours).convert(kind).save(tmp_path / name / f"{i}.png")
+    day, night = ImageFolder(tmp_path / "day"), ImageFolder(tmp_path / "night")
+    late = ImageFolder(tmp_path / "day")[1:3]  # the first is read for its channels alone
+    assert (all_of(day).shape, late.shape) == ((3, 3, 4, 5), (2, 3, 4, 5))
+    assert torch.equal(all_of(day)[1:], late)
+    assert torch.equal(late[0, 0], late[0, 2])
+    mean = torch.from_numpy(colours.astype(np.float32)).div(255).mean(2)
+    assert torch.allclose(all_of(night)[1, 0], mean, atol=1e-6)
+    assert caplog.text.count("grey images are read as colour, as the first image is") == 1
+    assert caplog.text.count("images in colour are read as grey, as the first image is") == 1
+
+
+def test_images_that_are_left_out_are_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    _has_heif.cache_clear()
+    write(tmp_path, "1.png", "2.png")
+    for name in ("3.heic", "4.HEIC", "notes.txt", ".5.heic"):
+        (tmp_path / name).touch()
+    (tmp_path / "6.png").symlink_to(tmp_path / "gone.png")
+    for name in ("cam0", "cam1", "other"):
+        (tmp_path / name).mkdir()
+    write(tmp_path / "cam0", "1.png")
+    write(tmp_path / "cam1", "1.png")
+    for _ in range(2):
+        assert ImageFolder(tmp_path).names == ["1.png", "2.png"]
+    (line,) = caplog.messages
+    assert "2 .heic" in line
+    assert "1 broken link" in line
+    assert "2 folders of images are left out" in line
+    assert "pip install 'dejavu_torch[heif]'" in line
+    for name in ("1.png", "2.png"):
+        (tmp_path / name).unlink()
+    for name in ("cam0", "cam1", "other"):
+        shutil.rmtree(tmp_path / name)
+    with refused("contains no images but 2 .heic and 1 broken link"):
+        ImageFolder(tmp_path)
+
+
+def test_heif_is_read_by_pillow_heif(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    called: list[bool] = []
+    opener = types.SimpleNamespace(register_heif_opener=lambda: called.append(True))
+    monkeypatch.setitem(sys.modules, "pillow_heif", opener)
+    _has_heif.cache_clear()
+    write(tmp_path, "1.png")
+    (tmp_path / "1.png").rename(tmp_path / "1.heic")
+    assert ImageFolder(tmp_path).names == ["1.heic"]
+    assert called == [True]
+    _has_heif.cache_clear()
 
 
 def test_only_the_images_asked_for_are_read(tmp_path: Path) -> None:
