@@ -7,6 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
+from decimal import Decimal
 from functools import cache
 from importlib import import_module
 from itertools import pairwise
@@ -28,6 +29,7 @@ log = logging.getLogger("dejavu_torch")
 NATURAL, LEXICOGRAPHIC = "natural", "lexicographic"  # orders of names
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"}
 MAX_IMAGE_PIXELS = 2**28  # enough for a long strip; a small file can claim any number
+NARROW = 0.1  # share of the range of 16 bits below which an image is told to use few of them
 ROUNDING = 1e-3  # by which a value may lie outside [0, 1]
 FORMATS = "PNG", "JPEG", "BMP", "DIB", "TIFF", "WEBP", "PPM", "GIF", "AVIF", "HEIF"  # none starts a program
 HEIF = {".heic", ".heif"}  # read by pillow-heif, if it is there
@@ -92,6 +94,8 @@ class ImageFolder(Traverse):
 
     def _image(self, file: Path) -> Tensor:
         image = read_image(file, max(self.width, self.height))
+        if self._first is None:
+            self._check_range(file, image)
         if self._channels is None:
             self._channels = len(image)
             if file.name != self.names[0]:
@@ -114,6 +118,24 @@ class ImageFolder(Traverse):
             ratio = f"the aspect ratio of {name}, {first[0]} x {first[1]}"
             raise InputError(f"{file} is {original[0]} x {original[1]} pixels; expected {ratio}")
         return image
+
+    def _check_range(self, file: Path, image: Tensor) -> None:
+        """Tell of an image of 16 bits that uses few of them, as of a thermal or depth camera."""
+        low, high = (float(value) for value in image.aminmax())
+        if high - low < NARROW and _is_deep(file):
+            _warn_narrow(self.name, file.name, round(65535 * low), round(65535 * high))
+
+
+def _is_deep(file: Path) -> bool:
+    """Whether an image file has more than 8 bits a pixel."""
+    with reading(file, "cannot be read as an image", "one"), Image.open(file, formats=FORMATS) as opened:
+        return opened.mode.startswith("I")
+
+
+@cache
+def _warn_narrow(source: str, name: str, low: int, high: int) -> None:
+    line = "%s: %s has values from %d to %d of 65535; --preprocess.contrast patch makes use of so few"
+    log.warning(line, source, name, low, high)
 
 
 def readable(suffixes: Iterable[str]) -> set[str]:
@@ -241,6 +263,8 @@ def _warn_order(source: str, example: str) -> None:
 
 
 def numbers_increase(names: Sequence[str]) -> bool:
-    """Whether all names, without their suffixes, end in increasing numbers."""
-    numbers = [re.search(r"\d{1,99}$", Path(name).stem) for name in names]  # int refuses thousands of digits
-    return None not in numbers and all(int(a[0]) < int(b[0]) for a, b in pairwise(filter(None, numbers)))
+    """Whether all names, without their suffixes, end in increasing numbers, such as 0012 or times with
+    decimals."""
+    found = [re.search(r"\d{1,99}(\.\d{1,99})?$", Path(name).stem) for name in names]
+    numbers = [Decimal(number[0]) for number in found if number]  # exact: floats lose digits of times
+    return len(numbers) == len(names) and all(a < b for a, b in pairwise(numbers))

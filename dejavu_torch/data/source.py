@@ -27,6 +27,11 @@ from dejavu_torch.types import InputError, Traverse
 
 # of frames or features: see `as_traverse`
 Source: TypeAlias = Traverse | Tensor | NDArray[Any] | str | Path | Sequence[Any] | Dataset[Any]
+CONVERTED = {  # kinds of files that other programs turn into images
+    ".gif": "an animation; expected it converted, as by `ffmpeg -i FILE FOLDER/%06d.png`",
+    ".zip": "an archive; expected it unpacked, as by `unzip FILE -d FOLDER`",
+    ".bag": "a ROS bag; expected its images exported, as by image_view's extract_images",
+}
 READERS: dict[str, Callable[..., Traverse]] = {".npy": read_array}  # by suffix
 READERS |= dict.fromkeys(VIDEO_SUFFIXES, Video) | dict.fromkeys(H5_SUFFIXES, DescriptorFile)
 KINDS = {int: "integer", float: "floating-point number"}  # types of option values
@@ -140,6 +145,8 @@ def _reader(text: str, address: str) -> Callable[..., Traverse]:
     if suffix in READERS:
         return partial(READERS[suffix], path)
     seen = "a single image" if suffix in IMAGE_SUFFIXES else "of an unknown kind"
+    if suffix in CONVERTED:
+        raise InputError(f"{path} is {CONVERTED[suffix]}, into a folder of images")
     raise InputError(f"{path} is {seen}; expected {EXPECTED}")
 
 

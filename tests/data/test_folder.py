@@ -290,3 +290,27 @@ def test_a_name_of_any_bytes_is_one_line(tmp_path: Path, name: bytes) -> None:
     folder.mkdir()
     write(folder, "1.png")
     assert ImageFolder(folder).name.isprintable()
+
+
+def test_times_with_decimals_are_in_order(tmp_path: Path) -> None:
+    write(tmp_path, "1305031102.175304.png", "1305031102.211214.png", "1305031103.011214.png")
+    assert ImageFolder(tmp_path).ordered
+    write(tmp_path, "1305031102.99.png")
+    names = ImageFolder(tmp_path).names
+    assert names[0] == "1305031102.99.png"  # by their digits: 99 before 175304
+    assert not ImageFolder(tmp_path).ordered
+
+
+def test_images_of_16_bits_that_use_few_of_them_are_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    noise = np.random.default_rng(0).integers(0, 900, (4, 5))
+    for name, values in {"thermal": 51_000 + noise, "depth": noise * 70, "grey": noise // 60}.items():
+        (tmp_path / name).mkdir()
+        pixels = values.astype(np.uint8 if name == "grey" else np.uint16)
+        for i in range(2):
+            Image.fromarray(pixels).save(tmp_path / name / f"{i}.png")
+        all_of(ImageFolder(tmp_path / name))
+    (line,) = caplog.messages
+    low, high = 51_000 + noise.min(), 51_000 + noise.max()
+    assert f"thermal: 0.png has values from {low} to {high} of 65535; --preprocess.contrast patch" in line

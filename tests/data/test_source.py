@@ -81,6 +81,16 @@ def test_what_cannot_be_opened_is_refused(sources: dict[str, str], source: str, 
         open_source(source.replace("{}", str(Path(sources["images"]).parent)))
 
 
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("a.gif", ("an animation", "ffmpeg")), ("a.ZIP", ("an archive", "unzip")), ("a.bag", ("a ROS bag",))],
+)
+def test_how_to_convert_what_is_no_source(tmp_path: Path, name: str, words: tuple[str, ...]) -> None:
+    (tmp_path / name).touch()
+    with refused(name, "into a folder of images", *words):
+        open_source(tmp_path / name)
+
+
 def test_a_folder_takes_the_options_of_a_video(tmp_path: Path) -> None:
     for i in range(4):
         Image.new("RGB", (60, 40), (i, i, i)).save(tmp_path / f"{i}.png")
