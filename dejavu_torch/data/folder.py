@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from decimal import Decimal
+from fnmatch import fnmatch
 from functools import cache
 from importlib import import_module
 from itertools import pairwise
@@ -51,26 +52,39 @@ class ImageFolder(Traverse):
         width, height: pixels to resize to, antialiased; 0 for both keeps the size, for one the aspect ratio.
         order: "natural", as above, or "lexicographic", by text (10 before 9); "" is natural with a warning
             if the two differ.
+        glob: only images whose names match it, such as "*.color.png"; "" is all.
+        recursive: images in folders inside too, named by their path from here.
 
     Raises:
         InputError: width, height or order out of range; no such folder, or no images in it; while reading,
             an image that cannot be read or differs in size from the first.
     """
 
-    def __init__(self, path: str | Path, width: int = 0, height: int = 0, order: str = "") -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        width: int = 0,
+        height: int = 0,
+        order: str = "",
+        glob: str = "",
+        recursive: bool = False,
+    ) -> None:
         folder = Path(path)
         check_size(folder, width, height)
         if not folder.is_dir():
             raise InputError(f"{folder} is not there; expected a folder of images")
-        inside = list(folder.iterdir())
-        seen = [file for file in inside if file.name[0] != "."]
+        inside = list(folder.rglob("*") if recursive else folder.iterdir())
+        names = {file: file.relative_to(folder).as_posix() for file in inside}
+        seen = [file for file in inside if "/." not in f"/{names[file]}"]
         suffixes = readable(file.suffix.lower() for file in seen)
         images = [file for file in seen if file.suffix.lower() in suffixes]
-        self.names = sort_names([file.name for file in images if file.is_file()], order, printable(folder))
-        left = left_out(seen, suffixes)
+        images = [file for file in images if not glob or fnmatch(names[file], glob)]
+        self.names = sort_names([names[file] for file in images if file.is_file()], order, printable(folder))
+        left = left_out([file for file in seen if not (recursive and file.is_dir())], suffixes)
         if not self.names:
             folders = sorted((file.name for file in inside if file.is_dir()), key=natural)
             inner = f" but folders such as {folders[0]}" if folders else f" but {left}" if left else ""
+            inner = f" that match {glob}" if glob else inner
             raise InputError(f"{folder} contains no images{inner}; expected files such as .png or .jpg")
         if left:
             _warn_left_out(printable(folder), left)

@@ -63,8 +63,8 @@ def open_source(source: str | Path, size: tuple[int, int] | None = None) -> Trav
     """Open a source of frames or features.
 
     Args:
-        source: a folder of images, `photos`, `photos?width=160&height=90` or `photos?order=lexicographic`
-            (see `ImageFolder`); a video file, `clip.mp4`, also with width and height; an `.npy` file of
+        source: a folder of images, `photos`, `photos?width=160&height=90`, `photos?order=lexicographic` or
+            `photos?glob=*.png&recursive=1` (see `ImageFolder`); a video file, `clip.mp4`, also with width and height; an `.npy` file of
             frames (N,H,W) or (N,H,W,3) uint8, or of features (N,D) float, with the names of their images in a
             `.txt` file next to it; an `.h5` file of hloc's global descriptors, also with `order=`;
             `sim:NAME?seed=0&traverse=0&frames=3072`, NAME being aerial, outdoor or underground; or

@@ -16,6 +16,7 @@ from PIL import EpsImagePlugin, Image
 
 from dejavu_torch import memory
 from dejavu_torch.data.folder import ImageFolder, _has_heif, read_image
+from dejavu_torch.data.source import open_source
 from dejavu_torch.types import InputError
 
 GREY = np.arange(20, dtype=np.uint8).reshape(4, 5) * 10
@@ -314,3 +315,20 @@ def test_images_of_16_bits_that_use_few_of_them_are_told(
     (line,) = caplog.messages
     low, high = 51_000 + noise.min(), 51_000 + noise.max()
     assert f"thermal: 0.png has values from {low} to {high} of 65535; --preprocess.contrast patch" in line
+
+
+def test_some_images_and_those_in_folders_inside(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for name in ("cam0", "cam1", ".thumbs"):
+        (tmp_path / name).mkdir()
+        write(tmp_path / name, "1.color.png", "1.depth.png")
+    write(tmp_path, "2.color.png")
+    every = ImageFolder(tmp_path, recursive=True)
+    inside = [f"{cam}/1.{kind}.png" for cam in ("cam0", "cam1") for kind in ("color", "depth")]
+    assert every.names == ["2.color.png", *inside]
+    assert all_of(every).shape[0] == 5
+    assert caplog.text == ""
+    some = open_source(f"{tmp_path}?glob=*.color.png&recursive=1")
+    assert [*some.names] == ["2.color.png", "cam0/1.color.png", "cam1/1.color.png"]
+    assert open_source(f"{tmp_path / 'cam0'}?glob=*.depth.png").names == ["1.depth.png"]
+    with refused("contains no images that match *.jpg"):
+        ImageFolder(tmp_path, glob="*.jpg")

@@ -68,7 +68,7 @@ def test_a_simulator() -> None:
         ("strip:road.png?path=3&width=3", ["unknown 'path'", "expected width, rows"]),
         ("{}/clip.mkv?width=", ["width is ''", "expected int"]),
         ("{}/clip.mkv?path=3", ["unknown 'path'", "expected width, height, start"]),
-        ("{}/images?wide=30", ["unknown 'wide'", "expected width, height, order, start"]),
+        ("{}/images?wide=30", ["unknown 'wide'", "expected width, height, order, glob, recursive, start"]),
         ("{}/images?order=size", ["images: order is 'size'", "expected natural or lexicographic"]),
         ("{}/frames.npy?width=4", ["unknown 'width'", "expected start, stop, step"]),
         ("{}/long.png", ["long.png is a single image", "expected a folder of images"]),
