@@ -196,7 +196,7 @@ def test_maps_that_are_saved_merged_and_cut_keep_their_connections(tmp_path: Pat
         place_map.linked([(0, place_map.places, 0.5)])
 
 
-@settings(deadline=None, max_examples=8)
+@settings(deadline=None, max_examples=4)
 @given(st.integers(60, 200), st.integers(80, 140), st.booleans())
 def test_places_of_the_map_score_as_before(start: int, length: int, back: bool) -> None:
     model = model_of(ROUTE[:END])
