@@ -306,7 +306,8 @@ def calibration_of(
             raise InputError("no reference and no views to calibrate by; expected one of them")
         strengths = STRENGTHS if descriptor.whitening is None else descriptor.whitening.strengths
         places = torch.arange(place_map.places) if places is None else places
-        segments = augmented_segments(reference, len(places), strengths, place_map.places)
+        sizes = len(places), strengths, place_map.places
+        segments = augmented_segments(reference, *sizes, span=descriptor.preprocess.span)
         views = LabelledFrames(cast(Traverse, segments), places[segments.places])
     observation_counts(views, place_map.places)  # refuses what does not fit
     another = not isinstance(views.traverse, AugmentedFrames)

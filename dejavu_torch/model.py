@@ -220,6 +220,7 @@ class DejaVu(nn.Module):
             descriptor.check_sizes(traverse, visits.traverse)
             counts = learning.observation_counts(visits, len(traverse))
         with descriptor.unchanged_by_errors():
+            descriptor.set_range(traverse)
             if isinstance(mapper, SpectralMapper) and learning.is_long(traverse, mapper.chunk):
                 descriptor.reduce_if_wide(traverse)  # for a partial map with its whitening
                 place_map = mapper.empty().to(descriptor.device)

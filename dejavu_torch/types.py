@@ -55,6 +55,7 @@ class Traverse(Dataset[Tensor], ABC):
         places: (N,) float64, the true position of each in reference frames; None if unknown.
         ordered: whether they are known to be consecutive, as in a video; see the filter and sequences.
         sized: whether the user asked for their size, as with `width=` of a video.
+        deep: whether its images have more than 8 bits a pixel.
         cut: of windows of one long image, its size, the window's, and their range; equal: the same places.
 
     Raises:
@@ -74,6 +75,10 @@ class Traverse(Dataset[Tensor], ABC):
     ordered: bool = False
     sized: bool = False
     cut: tuple[tuple[int, ...], range] | None = None
+
+    @property
+    def deep(self) -> bool:
+        return False
 
     @abstractmethod
     def __len__(self) -> int: ...

@@ -30,7 +30,6 @@ log = logging.getLogger("dejavu_torch")
 NATURAL, LEXICOGRAPHIC = "natural", "lexicographic"  # orders of names
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"}
 MAX_IMAGE_PIXELS = 2**28  # enough for a long strip; a small file can claim any number
-NARROW = 0.1  # share of the range of 16 bits below which an image is told to use few of them
 ROUNDING = 1e-3  # by which a value may lie outside [0, 1]
 FORMATS = "PNG", "JPEG", "BMP", "DIB", "TIFF", "WEBP", "PPM", "GIF", "AVIF", "HEIF"  # none starts a program
 HEIF = {".heic", ".heif"}  # read by pillow-heif, if it is there
@@ -108,8 +107,6 @@ class ImageFolder(Traverse):
 
     def _image(self, file: Path) -> Tensor:
         image = read_image(file, max(self.width, self.height))
-        if self._first is None:
-            self._check_range(file, image)
         if self._channels is None:
             self._channels = len(image)
             if file.name != self.names[0]:
@@ -133,23 +130,11 @@ class ImageFolder(Traverse):
             raise InputError(f"{file} is {original[0]} x {original[1]} pixels; expected {ratio}")
         return image
 
-    def _check_range(self, file: Path, image: Tensor) -> None:
-        """Tell of an image of 16 bits that uses few of them, as of a thermal or depth camera."""
-        low, high = (float(value) for value in image.aminmax())
-        if high - low < NARROW and _is_deep(file):
-            _warn_narrow(self.name, file.name, round(65535 * low), round(65535 * high))
-
-
-def _is_deep(file: Path) -> bool:
-    """Whether an image file has more than 8 bits a pixel."""
-    with reading(file, "cannot be read as an image", "one"), Image.open(file, formats=FORMATS) as opened:
-        return opened.mode.startswith("I")
-
-
-@cache
-def _warn_narrow(source: str, name: str, low: int, high: int) -> None:
-    line = "%s: %s has values from %d to %d of 65535; --preprocess.contrast patch makes use of so few"
-    log.warning(line, source, name, low, high)
+    @property
+    def deep(self) -> bool:
+        file = self.path / self.names[0]
+        with reading(file, "cannot be read as an image", "one"), Image.open(file, formats=FORMATS) as opened:
+            return opened.mode.startswith("I")
 
 
 def readable(suffixes: Iterable[str]) -> set[str]:

@@ -60,6 +60,10 @@ class Part(Traverse):
     def frame_shape(self) -> tuple[int, ...]:
         return self.traverse.frame_shape
 
+    @property
+    def deep(self) -> bool:
+        return self.traverse.deep
+
 
 def frame_range(traverse: Traverse, start: int = 0, stop: int = 0, step: int = 1) -> Part:
     """Every step-th of the frames [start, stop) of a traverse; a stop of 0 is its end.
@@ -117,6 +121,10 @@ class Chain(Traverse):
     @cached_property
     def frame_shape(self) -> tuple[int, ...]:
         return self.traverses[0].frame_shape
+
+    @property
+    def deep(self) -> bool:
+        return any(traverse.deep for traverse in self.traverses)
 
     @cached_property
     def names(self) -> Sequence[str]:  # type: ignore[override]

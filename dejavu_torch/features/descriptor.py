@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -20,12 +21,15 @@ from dejavu_torch.features.extract import (
 )
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.joined import Joined, groups_of
-from dejavu_torch.features.preprocess import Preprocess
+from dejavu_torch.features.preprocess import DEEP, Preprocess, measured_range
 from dejavu_torch.features.views import SAMPLE, AugmentedFrames, LabelledFrames, Sample, augmented_route
 from dejavu_torch.features.whitening import INDEPENDENT, MOST_VIEWS, WIDEST, Visits, Whitening
 from dejavu_torch.memory import IN_MEMORY, concatenate
 from dejavu_torch.types import BATCH_NUMBERS, BATCH_SIZE, InputError, Traverse
 
+log = logging.getLogger("dejavu_torch")
+
+NARROW = 0.1  # share of the values of 16 bits below which it is told that frames use few of them
 ROWS = 4096  # descriptors on the device at a time
 DESCRIPTOR_MEMORY = IN_MEMORY // 4  # bytes of descriptors kept in memory
 
@@ -163,9 +167,11 @@ class Descriptor(nn.Module):
 
         def check_first(frames: Tensor, features: Tensor) -> None:
             self.warn_of_bright(frames, traverse.name)
+            self._warn_of_narrow(frames, traverse)
             check_alone(self, self.describe, frames, features, traverse.name)
 
         with self.unchanged_by_errors():
+            self.set_range(traverse)
             self.reduce_if_wide(traverse, spectral)
             whitening = self.whitening
             if whitening is not None and not whitening.fixed:
@@ -179,6 +185,13 @@ class Descriptor(nn.Module):
                 self.learn(Part(traverse, sample.frame), views, progress, verb="sampling")
             storage = (DESCRIPTOR_MEMORY, self.whitening is not None) if spectral else ()
             return concatenate(self.batches(traverse, progress, verb, check_first), *storage)
+
+    def set_range(self, traverse: Traverse) -> None:
+        """Measure a range that is "auto" on the frames of a reference."""
+        if self.preprocess.range == "auto" and not is_ready(traverse):
+            self.preprocess.range = low, high = measured_range(traverse)
+            known = f"{round(DEEP * low)} to {round(DEEP * high)} of {DEEP}" if traverse.deep else ""
+            log.warning("%s: values from %s are used", traverse.name, known or f"{low:.3g} to {high:.3g}")
 
     def reduce_if_wide(self, traverse: Traverse, spectral: bool = True) -> None:
         """Without whitening of the user's: one for ready features that are too wide for a spectral map."""
@@ -206,7 +219,7 @@ class Descriptor(nn.Module):
         source = "" if second is None else f"by {second.traverse.name}"
         if second is None and not is_ready(traverse) and whitening.views != 0:
             copies = whitening.copies(*features.shape)
-            settings = copies, MOST_VIEWS, whitening.strengths, whitening.seed
+            settings = copies, MOST_VIEWS, whitening.strengths, whitening.seed, self.preprocess.span
             second, source = augmented_route(traverse, len(features), *settings)
         groups = None if is_ready(traverse) else groups_of(self.features)
         copied = second is not None and isinstance(second.traverse, AugmentedFrames)
@@ -227,11 +240,13 @@ class Descriptor(nn.Module):
 
     @contextmanager
     def unchanged_by_errors(self) -> Iterator[None]:
-        """Restores the whitening if the block raises."""
+        """Restores the whitening and the range if the block raises."""
+        own_range = self.preprocess.range
         before = self.whitening, self.reduces, None if self.whitening is None else self.whitening.state_dict()
         try:
             yield
         except BaseException:
+            self.preprocess.range = own_range
             self.whitening, self.reduces, state = before
             if self.whitening is not None and state is not None:
                 self.whitening.load_state_dict(state)
@@ -266,6 +281,15 @@ class Descriptor(nn.Module):
         """`warn_of_bright`, once for each traverse."""
         if (name, "bright") not in self.warned and warn_of_bright(frames, name):
             self.warned.add((name, "bright"))
+
+    def _warn_of_narrow(self, frames: Tensor, traverse: Traverse) -> None:
+        """Tell of frames of 16 bits that use few of them, as of a thermal or depth camera."""
+        if is_ready(traverse) or self.preprocess.contrast or self.preprocess.range or not traverse.deep:
+            return
+        low, high = (float(value) for value in frames.aminmax())
+        if high - low < NARROW:
+            seen = f"values from {round(DEEP * low)} to {round(DEEP * high)} of {DEEP}"
+            log.warning("%s has %s; --preprocess.range auto makes use of so few", traverse.name, seen)
 
     def count_features(self, traverse: Traverse) -> int:
         """D, from the first frame."""

@@ -1,9 +1,9 @@
-"""Preprocessing of frames: selection of a channel, normalisation of the contrast."""
+"""Preprocessing of frames: range of values, selection of a channel, normalisation of the contrast."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import permutations
 from typing import Literal, get_args
 
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from dejavu_torch.text import settings_of
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, Traverse
 
 MOST_CLIP = 1e6
 Contrast = Literal["patch", "clahe"]
@@ -19,6 +19,9 @@ COLOURS = "RGB"
 CHANNELS = ("grey", *COLOURS, *map("-".join, permutations(COLOURS, 2)))
 SIZE = 160  # default of the longer side of a frame, pixels
 FLAT = 1 / 255  # least standard deviation: one step of an 8-bit image
+DEEP = 65535  # white in 16 bits
+OUTSIDE = 0.5  # per cent of the values at either end that an automatic range leaves outside
+DRAWN = 32  # frames that it is measured on
 VALUES_AT_ONCE = 2**19  # of frames, so that intermediate results stay in the cache
 
 
@@ -61,6 +64,32 @@ def select_channel(frames: Tensor, channel: str) -> Tensor:
         return grey
     first, *second = (frames[:, COLOURS.index(colour), None] for colour in name.split("-"))
     return first - second[0] if second else first
+
+
+def range_of(given: Sequence[float] | str | None) -> tuple[float, float] | Literal["auto"] | None:
+    """A range of values, as two numbers or text, in [0, 1]; see `Preprocess`."""
+    if given is None or given == "auto":
+        return given  # type: ignore[return-value]
+    try:
+        low, high = map(float, given.split(",") if isinstance(given, str) else given)
+    except (TypeError, ValueError):
+        low = high = math.nan
+    low, high = (low / DEEP, high / DEEP) if high > 1 else (low, high)
+    if not 0 <= low < high <= 1:
+        expected = "LOW,HIGH in [0, 1], or up to 65535 as of 16 bits, or auto"
+        raise InputError(f"preprocess got range={given!r}; expected {expected}")
+    return low, high
+
+
+def measured_range(traverse: Traverse) -> tuple[float, float]:
+    """The values between which all but .5 % at either end of 32 frames lie, evenly drawn; at least one apart
+    in 16 bits."""
+    drawn = torch.linspace(0, len(traverse) - 1, min(DRAWN, len(traverse))).round().long()
+    values = torch.cat([traverse[i].flatten()[:: max(1, traverse[i].numel() // 2**16)] for i in drawn])
+    last = len(values) - 1
+    ordered = values.double().clamp(0, 1).sort().values
+    low, high = (float(ordered[round(last * share / 100)]) for share in (OUTSIDE, 100 - OUTSIDE))
+    return (low, high) if high - low >= 1 / DEEP else (0.0, 1.0)
 
 
 def box_mean(frames: Tensor, side: int) -> Tensor:
@@ -121,7 +150,7 @@ def equalise(frames: Tensor, clip_limit: float = 2.0, grid: tuple[int, int] = (8
 
 
 class Preprocess(nn.Module):
-    """`select_channel`, then `normalise_patches` ("patch") or `equalise` ("clahe"), as one module.
+    """Range, `select_channel`, then `normalise_patches` ("patch") or `equalise` ("clahe"), as one module.
 
     Args:
         channel: "grey" (luminance, 0.299 R + 0.587 G + 0.114 B), "R", "G", "B", or a difference such as
@@ -132,11 +161,14 @@ class Preprocess(nn.Module):
         grid: (rows, columns) of tiles for "clahe"; they need not divide the frame.
         size: pixels of the longer side to which `DejaVu.fit` reduces frames, but not below the features' own
             `resize`; None keeps their size.
+        range: (low, high), or "low,high", which become 0 and 1, with what lies outside: for frames that use
+            few of 16 bits, as of a thermal or depth camera. In [0, 1], or up to 65535 as of 16 bits. "auto"
+            is measured when a route is learned, see `measured_range`, and then kept, for queries too.
 
     Shape: (B,C,H,W) -> (B,1,H,W), or (B,C,H,W) if `channel` is None.
 
-    Convention: without channel and contrast any input passes unchanged. Before "clahe" a difference d becomes
-        (d + 1) / 2.
+    Convention: without range, channel and contrast any input passes unchanged. Before "clahe" a difference d
+        becomes (d + 1) / 2.
 
     Raises:
         InputError: settings out of range; forward: frames that do not fit them.
@@ -154,6 +186,7 @@ class Preprocess(nn.Module):
         clip_limit: float = 2.0,
         grid: tuple[int, int] = (8, 8),
         size: int | None = SIZE,
+        range: Sequence[float] | str | None = None,
     ) -> None:
         super().__init__()
         sized = size is None or (isinstance(size, int) and size >= 1)
@@ -171,11 +204,20 @@ class Preprocess(nn.Module):
         self.contrast: Contrast | None = contrast
         self.patch, self.clip_limit, self.size = patch, float(clip_limit), size
         self.grid = (int(grid[0]), int(grid[1]))  # a map file holds a list
+        self.range = range_of(range)
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """The values that become 0 and 1; (0, 1) while they are not known."""
+        return self.range if isinstance(self.range, tuple) else (0.0, 1.0)
 
     def forward(self, frames: Tensor) -> Tensor:
-        if self.channel is None and self.contrast is None:
+        low, high = self.span
+        if self.channel is None and self.contrast is None and (low, high) == (0, 1):
             return frames
         check_frames(frames, "preprocess got")
+        if (low, high) != (0, 1):
+            frames = ((frames - low) / (high - low)).clamp(0, 1)
         if self.channel is not None:
             frames = select_channel(frames, self.channel)
         if self.contrast == "patch":

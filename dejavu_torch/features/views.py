@@ -115,7 +115,8 @@ class AugmentedFrames:
 
     Args:
         traverse: frames (B,C,H,W). runs: the frames, increasing. block: most frames augmented together.
-        copies: of each frame. strengths: arguments of `Augmentation`. factor: to multiply them by.
+        copies: of each frame. strengths: arguments of `Augmentation`. factor: to multiply them by. span:
+            values that stand for 0 and 1 while frames are changed, see `Preprocess`.
 
     Raises:
         InputError: ready features, or strengths that `Augmentation` refuses.
@@ -130,6 +131,7 @@ class AugmentedFrames:
         strengths: Mapping[str, Any],
         seed: int = 0,
         factor: float = 1.0,
+        span: tuple[float, float] = (0.0, 1.0),
     ) -> None:
         if len(traverse.frame_shape) != 3:
             raise InputError(f"{traverse.name} holds ready features; expected frames to augment")
@@ -139,6 +141,7 @@ class AugmentedFrames:
             names = ", ".join(LARGEST)
             raise InputError(f"the strengths of whitening are {strengths}; expected {names}") from error
         self.traverse, self.runs, self.block, self.copies, self.seed = traverse, runs, block, copies, seed
+        self.span = span
         blocks = (part for run in runs for part in torch.tensor(run).split(block))
         self.places = torch.cat([part.repeat(copies) for part in blocks])
         self.name = f"augmented copies of {traverse.name}"
@@ -152,12 +155,15 @@ class AugmentedFrames:
         state = torch.Generator().manual_seed(self.seed).get_state()
         size = self.traverse.at_once(size)
         for block in (run[i : i + self.block] for run in self.runs for i in range(0, len(run), self.block)):
-            frames = self.traverse[block]
+            frames, (low, high) = self.traverse[block], self.span
+            if self.span != (0, 1):
+                frames = ((frames - low) / (high - low)).clamp(0, 1)
             for _ in range(self.copies):
                 with torch.random.fork_rng(devices=[]):
                     torch.set_rng_state(state)
                     copies: Tensor = self.augmentation.train()(frames)
                     state = torch.get_rng_state()
+                copies = copies if self.span == (0, 1) else low + (high - low) * copies
                 yield from (as_shape(part, self.frame_shape) for part in copies.split(size))
 
     def fitted(self, shape: tuple[int, ...]) -> AugmentedFrames:
@@ -168,11 +174,17 @@ class AugmentedFrames:
 
 
 def augmented_route(
-    traverse: Traverse, frames: int, copies: int, most: int, strengths: Mapping[str, Any], seed: int = 0
+    traverse: Traverse,
+    frames: int,
+    copies: int,
+    most: int,
+    strengths: Mapping[str, Any],
+    seed: int = 0,
+    span: tuple[float, float] = (0.0, 1.0),
 ) -> tuple[LabelledFrames, str]:
     """At most `most` augmented copies of N `frames`, evenly drawn, and a phrase for the log about them."""
     shown = range(0, frames, max(1, -(-frames * copies // most)))
-    views = AugmentedFrames(traverse, [shown], traverse.at_once(BLOCK), copies, strengths, seed)
+    views = AugmentedFrames(traverse, [shown], traverse.at_once(BLOCK), copies, strengths, seed, span=span)
     each = "each frame" if shown.step == 1 else f"{len(shown)} of the frames"
     return LabelledFrames(cast(Traverse, views), views.places), f"{copies} look{'s' * (copies > 1)} at {each}"
 
@@ -183,6 +195,7 @@ def augmented_segments(
     strengths: Mapping[str, Any],
     places: int | None = None,
     starts: Sequence[int] | None = None,
+    span: tuple[float, float] = (0.0, 1.0),
 ) -> AugmentedFrames:
     """Augmented segments of a traverse, as another visit may show them, to calibrate a map.
 
@@ -199,4 +212,4 @@ def augmented_segments(
     most = min(MOST, max(LEAST, SCORES // (places or frames)))
     runs = [range(start, start + length) for start in starts[:: max(1, -(-len(starts) * length // most))]]
     copies = max(1, -(-min(FEWEST, MAX_COPIES * frames, most) // (len(runs) * length)))
-    return AugmentedFrames(traverse, runs, length, copies, strengths, factor=STRONGER)
+    return AugmentedFrames(traverse, runs, length, copies, strengths, factor=STRONGER, span=span)

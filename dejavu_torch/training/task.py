@@ -138,6 +138,9 @@ class PlaceRecognitionTask(Trainee):
         if made and (embedding := coded(backbone)):
             backbone = embedding.without_code()
         whitening = "none" if whitening is None and rate else whitening
+        if preprocess is not None and preprocess.range is not None:
+            seen = f"preprocess.range {preprocess.range} in training, which keeps frames as 8 bits"
+            raise InputError(f"{seen}; expected frames that use the values from 0 to 1")
         model = DejaVu(backbone, whitening, mapper, batch_size=batch_size, preprocess=preprocess)
         super().__init__(model, made, feature_weights, weight_bits)
         if start is not None:

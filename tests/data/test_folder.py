@@ -17,6 +17,10 @@ from PIL import EpsImagePlugin, Image
 from dejavu_torch import memory
 from dejavu_torch.data.folder import ImageFolder, _has_heif, read_image
 from dejavu_torch.data.source import open_source
+from dejavu_torch.data.traverse import Chain, Part
+from dejavu_torch.features.descriptor import Descriptor
+from dejavu_torch.features.pixels import PatchPixels
+from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.types import InputError
 
 GREY = np.arange(20, dtype=np.uint8).reshape(4, 5) * 10
@@ -305,16 +309,21 @@ def test_times_with_decimals_are_in_order(tmp_path: Path) -> None:
 def test_images_of_16_bits_that_use_few_of_them_are_told(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    noise = np.random.default_rng(0).integers(0, 900, (4, 5))
+    noise = np.random.default_rng(0).integers(0, 900, (12, 15))
+    traverses = {}
     for name, values in {"thermal": 51_000 + noise, "depth": noise * 70, "grey": noise // 60}.items():
         (tmp_path / name).mkdir()
         pixels = values.astype(np.uint8 if name == "grey" else np.uint16)
         for i in range(2):
             Image.fromarray(pixels).save(tmp_path / name / f"{i}.png")
-        all_of(ImageFolder(tmp_path / name))
+        traverses[name] = ImageFolder(tmp_path / name)
+        Descriptor(features=PatchPixels((12, 15), 3)).learn(traverses[name])
     (line,) = caplog.messages
     low, high = 51_000 + noise.min(), 51_000 + noise.max()
-    assert f"thermal: 0.png has values from {low} to {high} of 65535; --preprocess.contrast patch" in line
+    assert f"thermal has values from {low} to {high} of 65535; --preprocess.range auto" in line
+    Descriptor(Preprocess(range="51000,51900"), PatchPixels((12, 15), 3)).learn(traverses["thermal"])
+    assert caplog.messages == [line]
+    assert Part(Chain([traverses["thermal"]]), range(1)).deep
 
 
 def test_some_images_and_those_in_folders_inside(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -15,7 +15,12 @@ from hypothesis import strategies as st
 from kornia.enhance import equalize_clahe
 from torch import Tensor
 
+from dejavu_torch import DejaVu, SpectralMapper
+from dejavu_torch.data.source import as_traverse
+from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.preprocess import Preprocess, equalise, normalise_patches
+from dejavu_torch.features.views import augmented_segments
+from dejavu_torch.features.whitening import Whitening
 
 
 def patch_oracle(image: np.ndarray, patch: int) -> np.ndarray:
@@ -145,6 +150,45 @@ def test_module_equals_functions() -> None:
     torch.testing.assert_close(difference, equalise((frames[:, :1] - frames[:, 2:] + 1) / 2, grid=(2, 2)))
 
 
+def test_a_range_of_values_becomes_0_to_1() -> None:
+    frames = torch.tensor([0.0, 0.2, 0.3, 0.6, 0.9]).view(1, 1, 1, 5)
+    expected = torch.tensor([0.0, 0.0, 0.25, 1.0, 1.0]).view(1, 1, 1, 5)
+    for given_range in ("0.2,0.6", (0.2, 0.6), f"{0.2 * 65535},{0.6 * 65535}"):
+        torch.testing.assert_close(Preprocess(range=given_range)(frames), expected)
+    patch = Preprocess(contrast="patch", patch=3, range=(0.2, 0.6))
+    wide = torch.rand(1, 1, 5, 7)
+    assert torch.equal(patch(wide), normalise_patches(((wide - 0.2) / (0.6 - 0.2)).clamp(0, 1), 3))
+
+
+def test_frames_of_few_values_are_learned_as_if_they_used_all(caplog: pytest.LogCaptureFixture) -> None:
+    frames = torch.rand(60, 1, 24, 24)
+    frames[:, :, 0, 0] = torch.rand(60, 1).round()  # some percentiles lie at the ends
+    narrow = 0.75 + frames / 64  # exact in float32 but for the last bits
+
+    def learned(values: Tensor, **settings: Any) -> DejaVu:
+        model = DejaVu(HOG(), Whitening(8), SpectralMapper(), preprocess=Preprocess(**settings))
+        return model.learn(values).calibrate(values)
+
+    full, few = learned(frames, range=(0.1, 0.9)), learned(narrow, range=(0.75 + 0.1 / 64, 0.75 + 0.9 / 64))
+    own, other = full.localize(frames, sequence=None), few.localize(narrow, sequence=None)
+    assert torch.equal(own.index, other.index)
+    copies = [
+        augmented_segments(as_traverse(values), 60, {}, span=model.preprocess.span)
+        for model, values in ((full, frames), (few, narrow))
+    ]
+    seen = [model.preprocess(next(one.batches(60))) for model, one in zip((full, few), copies, strict=True)]
+    torch.testing.assert_close(*seen, rtol=0, atol=1e-4)  # they are changed within the range
+    model = learned(narrow, range="auto")
+    low, high = model.preprocess.span  # of all but .5 % of the values at either end
+    assert 0 < low - 0.75 < 0.01 / 64
+    assert 0.99 / 64 < high - 0.75 < 1 / 64
+    assert any(f"values from {low:.3g} to {high:.3g} are used" in line for line in caplog.messages)
+    again = DejaVu(HOG(), Whitening(8), SpectralMapper(), preprocess=Preprocess(range="auto"))
+    with refused("1 frame"):  # and what was measured is forgotten
+        again.learn(narrow[:1])
+    assert again.preprocess.range == "auto"
+
+
 def applied(frames: Tensor, **choice: Any) -> Tensor:
     return Preprocess(**choice)(frames)
 
@@ -168,6 +212,10 @@ CHANNELS, WIDE = torch.rand(1, 4, 8, 8), torch.rand(1, 1, 8, 20)
         (lambda: Preprocess(grid=(2.5, 2)), ("grid=(2.5, 2)", "(rows, columns)")),
         (lambda: Preprocess(clip_limit=-1.0), ("clip_limit=-1.0", "expected 0 (no limit)")),
         (lambda: Preprocess(clip_limit=math.nan), ("clip_limit=nan", "expected 0 (no limit)")),
+        (lambda: Preprocess(range="0.3"), ("range='0.3'", "LOW,HIGH", "auto")),
+        (lambda: Preprocess(range=(0.4, 0.4)), ("range=(0.4, 0.4)", "LOW,HIGH")),
+        (lambda: Preprocess(range="-1,0.5"), ("range='-1,0.5'", "[0, 1]")),
+        (lambda: Preprocess(range="51000,70000"), ("range='51000,70000'", "65535")),
         (lambda: applied(CHANNELS[:, :1], channel="R"), ("'R'", "1 channels", "RGB")),
         (lambda: applied(CHANNELS, channel="G-B"), ("'G-B'", "4 channels", "RGB")),
         (lambda: applied(WIDE, contrast="patch"), ("8 x 20 pixels", "9 x 9")),
