@@ -115,7 +115,12 @@ class Graph(nn.Module):
 
     def forward(self, frames: Tensor, *states: Tensor) -> Tensor | tuple[Tensor, ...]:
         after: list[Tensor] = []
+        shows = None
         for name, part in self.parts.items():
+            if name == "preprocess" and part.blank > 0:
+                shows = part.shows(frames)[:, None]
+            if name == "map" and shows is not None:
+                frames = frames * shows.to(frames)
             if name == "map" and self.centring is not None:
                 frames, mean = self.centring(frames, states[-1])
                 after.append(mean)

@@ -39,6 +39,7 @@ from dejavu_torch.types import InputError, Traverse
 
 MAX_SEGMENT = 512  # consecutive queries in a calibration
 SEGMENT_SCORES = 2**22  # maximum, queries of a segment x places
+OWN = 300  # frames of the reference whose look-alikes are asked for
 CALIBRATION_SCORES = 2**30  # maximum, frames of a calibration x places
 SAVE_INTERVAL = 60  # seconds between two versions of a partial map
 
@@ -301,15 +302,18 @@ def calibration_of(
     progress: bool = False,
 ) -> Calibration:
     """See `DejaVu.calibrate`."""
+    places = torch.arange(place_map.places) if places is None else places
     if views is None:
         if reference is None:
             raise InputError("no reference and no views to calibrate by; expected one of them")
         strengths = STRENGTHS if descriptor.whitening is None else descriptor.whitening.strengths
-        places = torch.arange(place_map.places) if places is None else places
         sizes = len(places), strengths, place_map.places
         segments = augmented_segments(reference, *sizes, span=descriptor.preprocess.span)
         views = LabelledFrames(cast(Traverse, segments), places[segments.places])
     observation_counts(views, place_map.places)  # refuses what does not fit
+    views = views.renumbered(
+        torch.where(place_map.visit_counts > 0, torch.arange(place_map.places), -1).cpu()
+    )
     another = not isinstance(views.traverse, AugmentedFrames)
     if isinstance(views.traverse, AugmentedFrames):
         length = views.traverse.block
@@ -319,8 +323,14 @@ def calibration_of(
     name = views.traverse.name
     descriptors = concatenate(descriptor.batches(views.traverse, progress, "calibrating"))
     parts = zip(descriptors.split(length), views.places.split(length), strict=True)
+    own = None
+    if reference is not None and isinstance(place_map, SpectralMap):
+        drawn = evenly_spaced(len(places), 1, min(OWN, len(places)))
+        drawn = drawn[(places[drawn] >= 0) & (place_map.visit_counts.cpu()[places[drawn]] > 0)]
+        rows = descriptor.batches(Part(reference, drawn), progress, "calibrating")
+        own = (concatenate(rows), places[drawn]) if len(drawn) else None
     try:
-        return calibrated(place_map, parts, another)
+        return calibrated(place_map, parts, another, own)
     except InputError as error:
         raise InputError(f"calibrating by {name}: {error}") from error
 

@@ -220,7 +220,7 @@ class DejaVu(nn.Module):
             descriptor.check_sizes(traverse, visits.traverse)
             counts = learning.observation_counts(visits, len(traverse))
         with descriptor.unchanged_by_errors():
-            descriptor.set_range(traverse)
+            descriptor.adapt(traverse)
             if isinstance(mapper, SpectralMapper) and learning.is_long(traverse, mapper.chunk):
                 descriptor.reduce_if_wide(traverse)  # for a partial map with its whitening
                 place_map = mapper.empty().to(descriptor.device)
@@ -238,7 +238,7 @@ class DejaVu(nn.Module):
                     rows = learning.averaged(descriptor, rows, visits, progress)
                 learned = learning.learn_descriptors(mapper, rows)
             if counts is not None:
-                learned.count_visits(1 + counts)
+                learned.count_visits(learned.visit_counts + counts.to(learned.device))
             learning.count_drives(learned, second)
         return self.replace_map(learned, _state_of(self, learned, traverse))
 

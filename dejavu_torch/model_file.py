@@ -26,7 +26,7 @@ from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.pixels import PatchPixels
-from dejavu_torch.features.preprocess import Preprocess
+from dejavu_torch.features.preprocess import BLANK, Preprocess
 from dejavu_torch.features.views import SAMPLE, AugmentedFrames, LabelledFrames
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.maps.file import HEADER as FILE_HEADER
@@ -137,6 +137,7 @@ STATE = {
     "names": str | None,
     "calibration": Calibration | None,
 }
+LATER = {"Preprocess": {"range": None, "blank": BLANK}}  # arguments that files lack at their defaults
 HEADER = {name: kind for name, (_, kind) in PARTS.items()} | SETTINGS | STATE | {"map": dict[str, Any]}
 
 
@@ -151,6 +152,9 @@ def recipe_of(module: nn.Module) -> Recipe:
             arguments[name] = [recipe_of(member)._asdict() for member in value]
         elif isinstance(value, nn.Module):
             arguments[name] = recipe_of(value)._asdict()
+    for name, default in LATER.get(cls.__name__, {}).items():
+        if arguments[name] == default:
+            del arguments[name]
     return Recipe(cls.__name__, json.loads(json.dumps(arguments)))  # compares equal to one from a file
 
 
@@ -260,7 +264,8 @@ def state_to_json(state: ModelState) -> dict[str, Any]:
     """A model's state as JSON values."""
     names = encode_names(state.frame_names) if state.frame_names else None
     calibration = state.calibration and {
-        name: platt and platt._asdict() for name, platt in state.calibration._asdict().items()
+        name: platt and {key: value for key, value in platt._asdict().items() if value != ()}
+        for name, platt in state.calibration._asdict().items()
     }
     trained = state.trained and state.trained._asdict()
     values = {"frame_shape": state.frame_shape, "step": state.step, "trained": trained, "names": names}

@@ -566,6 +566,6 @@ def test_visits_that_cannot_be_averaged() -> None:
     route.visits = torch.tensor([[89, 2]], dtype=torch.int32)
     with refused("visits of 89 places", "90"):
         route.check()
-    route.visits = torch.tensor([[90, 0]], dtype=torch.int32)
-    with refused("at least 1"):
+    route.visits = torch.tensor([[90, -1]], dtype=torch.int32)
+    with refused("runs and counts"):
         route.check()

@@ -735,7 +735,12 @@ def print_map(model: DejaVu) -> None:
         start = stop
     if len(model.map.visits):
         counts = model.map.visit_counts.double()
-        print(f"each place is the mean of {counts.mean():.3g} visits ({counts.min():g} to {counts.max():g})")
+        if counts.min() == 0:
+            print(f"{int((counts == 0).sum())} places are never reported: their frames are covered or black")
+        if counts.max() > 1:
+            print(
+                f"each place is the mean of {counts.mean():.3g} visits ({counts.min():g} to {counts.max():g})"
+            )
     if isinstance(model.map, SpectralMap) and len(model.map.drives):
         drives, verb = int(model.map.drives), "refined" if len(model.map.stage) else "taught"
         print(f"{verb} by {drives} drive{'s' * (drives > 1)}")

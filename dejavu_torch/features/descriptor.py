@@ -21,7 +21,7 @@ from dejavu_torch.features.extract import (
 )
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.joined import Joined, groups_of
-from dejavu_torch.features.preprocess import DEEP, Preprocess, measured_range
+from dejavu_torch.features.preprocess import BLANK, DEEP, Preprocess, measured_range
 from dejavu_torch.features.views import SAMPLE, AugmentedFrames, LabelledFrames, Sample, augmented_route
 from dejavu_torch.features.whitening import INDEPENDENT, MOST_VIEWS, WIDEST, Visits, Whitening
 from dejavu_torch.memory import IN_MEMORY, concatenate
@@ -29,6 +29,7 @@ from dejavu_torch.types import BATCH_NUMBERS, BATCH_SIZE, InputError, Traverse
 
 log = logging.getLogger("dejavu_torch")
 
+DRAWN = 32  # frames that the preprocessing adapts to
 NARROW = 0.1  # share of the values of 16 bits below which it is told that frames use few of them
 ROWS = 4096  # descriptors on the device at a time
 DESCRIPTOR_MEMORY = IN_MEMORY // 4  # bytes of descriptors kept in memory
@@ -82,13 +83,19 @@ class Descriptor(nn.Module):
         return self._where.device
 
     def describe(self, frames: Tensor) -> Tensor:
-        """Preprocess, then features: (B,C,H,W) -> (B,D)."""
+        """Preprocess, then features: (B,C,H,W) -> (B,D); 0 for frames that show nothing."""
         features: Tensor = self.features(as_weights(self.preprocess(frames), self.features))
-        return features
+        fits = isinstance(features, Tensor) and features.ndim == 2 and features.shape[0] == frames.shape[0]
+        if self.preprocess.blank == 0 or not fits:
+            return features
+        return features * self.preprocess.shows(frames)[:, None].to(features)
 
     def whitened(self, features: Tensor) -> Tensor:
-        """Features (B,D) -> descriptors (B,K)."""
-        return features if self.whitening is None else self.whitening(features)
+        """Features (B,D) -> descriptors (B,K); 0 for features of 0."""
+        if self.whitening is None:
+            return features
+        whitened: Tensor = self.whitening(features)
+        return whitened * features.any(1, keepdim=True).to(whitened)
 
     def forward(self, frames: Tensor) -> Tensor:
         return self.whitened(features_of(frames, self.describe, "the input"))
@@ -171,7 +178,7 @@ class Descriptor(nn.Module):
             check_alone(self, self.describe, frames, features, traverse.name)
 
         with self.unchanged_by_errors():
-            self.set_range(traverse)
+            self.adapt(traverse)
             self.reduce_if_wide(traverse, spectral)
             whitening = self.whitening
             if whitening is not None and not whitening.fixed:
@@ -186,12 +193,20 @@ class Descriptor(nn.Module):
             storage = (DESCRIPTOR_MEMORY, self.whitening is not None) if spectral else ()
             return concatenate(self.batches(traverse, progress, verb, check_first), *storage)
 
-    def set_range(self, traverse: Traverse) -> None:
-        """Measure a range that is "auto" on the frames of a reference."""
-        if self.preprocess.range == "auto" and not is_ready(traverse):
-            self.preprocess.range = low, high = measured_range(traverse)
+    def adapt(self, traverse: Traverse) -> None:
+        """Measure a range that is "auto" on 32 frames of a reference, evenly drawn. If most of them count as
+        blank, as where values have another unit, none does."""
+        own = self.preprocess
+        if is_ready(traverse) or not (own.range == "auto" or own.blank == BLANK):
+            return
+        drawn = torch.linspace(0, len(traverse) - 1, min(DRAWN, len(traverse))).round().long()
+        frames = [traverse[i] for i in drawn]
+        if own.range == "auto":
+            own.range = low, high = measured_range(frames)
             known = f"{round(DEEP * low)} to {round(DEEP * high)} of {DEEP}" if traverse.deep else ""
             log.warning("%s: values from %s are used", traverse.name, known or f"{low:.3g} to {high:.3g}")
+        if 2 * sum(bool(own.shows(frame[None])) for frame in frames) < len(frames):
+            own.blank = 0.0
 
     def reduce_if_wide(self, traverse: Traverse, spectral: bool = True) -> None:
         """Without whitening of the user's: one for ready features that are too wide for a spectral map."""
@@ -221,6 +236,10 @@ class Descriptor(nn.Module):
             copies = whitening.copies(*features.shape)
             settings = copies, MOST_VIEWS, whitening.strengths, whitening.seed, self.preprocess.span
             second, source = augmented_route(traverse, len(features), *settings)
+        shows = features.any(1)
+        if 2 <= int(shows.sum()) < len(features):  # nothing is learned from blank frames
+            features, number = features[shows], torch.where(shows, shows.cumsum(0) - 1, -1).cpu()
+            visits, second = (views and views.renumbered(number) for views in (visits, second))
         groups = None if is_ready(traverse) else groups_of(self.features)
         copied = second is not None and isinstance(second.traverse, AugmentedFrames)
         samples = INDEPENDENT * len(features) if copied else None

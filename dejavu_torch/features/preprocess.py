@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from dejavu_torch.text import settings_of
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.types import InputError
 
 MOST_CLIP = 1e6
 Contrast = Literal["patch", "clahe"]
@@ -21,7 +21,7 @@ SIZE = 160  # default of the longer side of a frame, pixels
 FLAT = 1 / 255  # least standard deviation: one step of an 8-bit image
 DEEP = 65535  # white in 16 bits
 OUTSIDE = 0.5  # per cent of the values at either end that an automatic range leaves outside
-DRAWN = 32  # frames that it is measured on
+BLANK = 2 / 255  # standard deviation below which a frame shows nothing
 VALUES_AT_ONCE = 2**19  # of frames, so that intermediate results stay in the cache
 
 
@@ -81,11 +81,10 @@ def range_of(given: Sequence[float] | str | None) -> tuple[float, float] | Liter
     return low, high
 
 
-def measured_range(traverse: Traverse) -> tuple[float, float]:
-    """The values between which all but .5 % at either end of 32 frames lie, evenly drawn; at least one apart
-    in 16 bits."""
-    drawn = torch.linspace(0, len(traverse) - 1, min(DRAWN, len(traverse))).round().long()
-    values = torch.cat([traverse[i].flatten()[:: max(1, traverse[i].numel() // 2**16)] for i in drawn])
+def measured_range(frames: Sequence[Tensor]) -> tuple[float, float]:
+    """The values between which all but .5 % of those of some frames lie at either end; at least one apart in
+    16 bits."""
+    values = torch.cat([frame.flatten()[:: max(1, frame.numel() // 2**16)] for frame in frames])
     last = len(values) - 1
     ordered = values.double().clamp(0, 1).sort().values
     low, high = (float(ordered[round(last * share / 100)]) for share in (OUTSIDE, 100 - OUTSIDE))
@@ -164,6 +163,8 @@ class Preprocess(nn.Module):
         range: (low, high), or "low,high", which become 0 and 1, with what lies outside: for frames that use
             few of 16 bits, as of a thermal or depth camera. In [0, 1], or up to 65535 as of 16 bits. "auto"
             is measured when a route is learned, see `measured_range`, and then kept, for queries too.
+        blank: standard deviation, in this range and of the channel with most, below which a frame counts as
+            covered or black: no query finds it, and it finds nothing; 0 for none.
 
     Shape: (B,C,H,W) -> (B,1,H,W), or (B,C,H,W) if `channel` is None.
 
@@ -187,6 +188,7 @@ class Preprocess(nn.Module):
         grid: tuple[int, int] = (8, 8),
         size: int | None = SIZE,
         range: Sequence[float] | str | None = None,
+        blank: float = BLANK,
     ) -> None:
         super().__init__()
         sized = size is None or (isinstance(size, int) and size >= 1)
@@ -196,6 +198,7 @@ class Preprocess(nn.Module):
             (contrast in (None, *get_args(Contrast)), f"{contrast=}", "'patch', 'clahe' or None"),
             (patch >= 3 and patch % 2 == 1, f"{patch=}", "an odd number of pixels, at least 3"),
             (0 <= clip_limit <= MOST_CLIP, f"{clip_limit=}", f"0 (no limit) to {MOST_CLIP:g}"),
+            (0 <= blank < 1, f"{blank=}", "a standard deviation of at least 0, below 1"),
             (tiled, f"grid={tuple(grid)}", "(rows, columns), integers of at least 1"),
         ):
             if not fits:
@@ -204,7 +207,7 @@ class Preprocess(nn.Module):
         self.contrast: Contrast | None = contrast
         self.patch, self.clip_limit, self.size = patch, float(clip_limit), size
         self.grid = (int(grid[0]), int(grid[1]))  # a map file holds a list
-        self.range = range_of(range)
+        self.range, self.blank = range_of(range), blank
 
     @property
     def span(self) -> tuple[float, float]:
@@ -226,5 +229,10 @@ class Preprocess(nn.Module):
             difference = self.channel is not None and "-" in self.channel
             return equalise((frames + 1) / 2 if difference else frames, self.clip_limit, self.grid)
         return frames
+
+    def shows(self, frames: Tensor) -> Tensor:
+        """Which frames (B,C,H,W) show something, (B,) bool: their contrast is at least `blank`."""
+        low, high = self.span
+        return frames.flatten(2).var(2, correction=0).amax(1) >= (self.blank * (high - low)) ** 2
 
     extra_repr = settings_of

@@ -71,6 +71,10 @@ class LabelledFrames(NamedTuple):
     places: Tensor
     placed: Placed | None = None
 
+    def renumbered(self, number: Tensor) -> LabelledFrames:
+        """The same frames, with a new number (N,) int64 of each place, -1 for places to skip."""
+        return self._replace(places=torch.where(self.places >= 0, number[self.places.cpu()], -1))
+
     def placed_lines(self) -> Iterator[str]:
         """What is said of each drive that a smoother has placed."""
         drive, names, *_ = self.placed or (self.places, {})

@@ -125,7 +125,8 @@ def checked(value: Any, kind: Any, where: str) -> Any:
 
     Args:
         kind: int, float, str, bool, None, Any, a Literal, a union, a sequence or mapping of these, or a
-            NamedTuple, for a mapping with exactly its fields; any other type means a mapping.
+            NamedTuple, for a mapping with exactly its fields, but those with a default may lack; any other
+            type means a mapping.
         where: name of the value in messages.
 
     Example:
@@ -135,7 +136,10 @@ def checked(value: Any, kind: Any, where: str) -> Any:
     """
     origin, inner = get_origin(kind) or kind, get_args(kind)
     if hasattr(kind, "_fields"):
-        return kind(**checked_fields(value, get_type_hints(kind), where))
+        known = value if isinstance(value, dict) else {}
+        default = {key: of for key, of in kind._field_defaults.items() if key not in known}
+        hints = {key: hint for key, hint in get_type_hints(kind).items() if key not in default}
+        return kind(**checked_fields(value, hints, where), **default)
     if origin in (Union, types.UnionType):
         for member in inner:
             with suppress(InputError):

@@ -132,7 +132,7 @@ class PlaceMap(nn.Module, ABC):
 
     @property
     def visit_counts(self) -> Tensor:
-        """(N,) int64, number of visits that each place averages."""
+        """(N,) int64, number of visits that each place averages; 0 if no frame shows it."""
         if not len(self.visits):
             return torch.ones(self.places, dtype=torch.int64, device=self.device)
         runs, counts = self.visits.long().unbind(1)
@@ -163,8 +163,9 @@ class PlaceMap(nn.Module, ABC):
         positions, visits = self.positions, self.visits
         fits = positions.ndim == 1 and positions.is_floating_point() and bool(positions.isfinite().all())
         require(fits, f"positions {tuple(positions.shape)} {positions.dtype}; expected finite floats (F,)")
-        fits = visits.shape[1:] == (2,) and visits.dtype == torch.int32 and not (visits < 1).any()
-        require(fits, f"visits {tuple(visits.shape)} {visits.dtype}; expected int32 (V,2) of at least 1")
+        fits = visits.shape[1:] == (2,) and visits.dtype == torch.int32
+        fits = fits and not (visits[:, 0] < 1).any() and not (visits[:, 1] < 0).any()
+        require(fits, f"visits {tuple(visits.shape)} {visits.dtype}; expected int32 (V,2), runs and counts")
         if len(visits):
             seen = int(visits[:, 0].sum())
             require(seen == self.places, f"visits of {seen} places; expected {self.places}")

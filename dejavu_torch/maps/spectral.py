@@ -88,7 +88,8 @@ class SpectralMapper(Mapper):
     def forward(self, features: Tensor) -> SpectralMap:
         place_map, lines = self._fitted(features, self.chunk)
         for (start, stop), levels in zip(lines.chunks, lines.levels(place_map.step), strict=True):
-            place_map.extend([Chunk(stop - start, place_map.step, encode(levels))], [levels])
+            chunk = stop - start, place_map.step, encode(levels), unseen(features[start:stop])
+            place_map.extend([Chunk(*chunk)], [levels])
         return place_map
 
     @torch.no_grad()
@@ -151,7 +152,12 @@ def encode_chunk(
     check_descriptors(descriptors, len(mean))
     lines = RouteLines(descriptors, [len(descriptors)], transform, resolution, mean)
     (levels,) = lines.levels(step)
-    return Chunk(len(descriptors), step, encode(levels))
+    return Chunk(len(descriptors), step, encode(levels), unseen(descriptors))
+
+
+def unseen(descriptors: Tensor) -> tuple[int, ...]:
+    """Which descriptors (W,K) are 0, as those of covered or black frames, see `Descriptor`."""
+    return tuple((~descriptors.any(1)).nonzero()[:, 0].tolist())
 
 
 def check_descriptors(features: Tensor, dimension: int | None = None) -> None:

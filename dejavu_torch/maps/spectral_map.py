@@ -52,11 +52,12 @@ CHUNK_BYTES = 8 + 4 + 8 + 8  # a chunk's length, step, stream length and checksu
 
 
 class Chunk(NamedTuple):
-    """Consecutive places as a file stores them."""
+    """Consecutive places as a file stores them; `unseen` are those whose descriptors are 0, from 0."""
 
     places: int
     step: float
     stream: Stream
+    unseen: tuple[int, ...] = ()
 
 
 class SpectralState(NamedTuple):
@@ -99,7 +100,8 @@ class SpectralMap(PlaceMap):
     Buffers derived from these:
         counts, feature, level: number of coefficients of each of N lines; for each of L coefficients its
             feature, ascending within a line, and its value in steps; in the smallest dtypes possible.
-        norms: (N,) float32, of the coded descriptors, staged; tiny ones are 0 (`MIN_NORM`).
+        norms: (N,) float32, of the coded descriptors, staged; tiny ones are 0 (`MIN_NORM`); infinite for
+            places that no frame shows (0 visits), whose scores are +inf.
 
     Attributes:
         chunks: the places [start, stop) of each.
@@ -111,7 +113,8 @@ class SpectralMap(PlaceMap):
 
     Shape: scores: descriptors (Q,K) -> (Q,N), lower is better.
 
-    Convention: norm 0, of a place or a query, means cosine 0 and no gradient. Gradients reach the queries.
+    Convention: norm 0, of a place or a query, means cosine 0 and no gradient; a place whose descriptor was 0
+        has 0 visits, by cosine. Gradients reach the queries.
 
     Raises:
         InputError: settings out of range, inconsistent buffers; scores: another dimension.
@@ -206,8 +209,12 @@ class SpectralMap(PlaceMap):
         append("steps", self.steps.new_tensor([chunk.step for chunk in chunks]))
         append("stream_table", torch.tensor([[len(c.stream.bytes), c.stream.checksum] for c in chunks]))
         append("streams", *(chunk.stream.bytes for chunk in chunks))
-        if len(self.visits):
-            self.count_visits(torch.cat([self.visit_counts, self.lengths.new_ones(sum(places))]))
+        hides = self.metric == "cosine"  # a descriptor of 0 has no direction
+        if len(self.visits) or (hides and any(chunk.unseen for chunk in chunks)):
+            counts = self.lengths.new_ones(sum(places))
+            for start, chunk in zip(accumulate(places, initial=0), chunks, strict=False):
+                counts[[start + i for i in chunk.unseen if hides]] = 0
+            self.count_visits(torch.cat([self.visit_counts, counts]))
         for chunk, (*_, level) in zip(chunks, parts, strict=True):
             self.chunks.append((self.places, self.places + chunk.places))
             self._bounds.append(self._bounds[-1] + len(level))
@@ -215,6 +222,17 @@ class SpectralMap(PlaceMap):
         append("norms", *map(self._norms_of, range(len(self.chunks) - len(chunks), len(self.chunks))))
         if not self.norms.isfinite().all():
             raise InputError("the map does not fit together: its descriptors are not finite")
+        self._hide()
+
+    def count_visits(self, counts: Tensor) -> None:
+        super().count_visits(counts)
+        if len(counts) == len(self.norms):
+            self._hide()
+
+    def _hide(self) -> None:
+        """Let no query find the places that no frame shows."""
+        if (self.visits[:, 1:] == 0).any():
+            self.norms = self.norms.masked_fill(self.visit_counts == 0, math.inf)
 
     def _norms_of(self, chunk: int) -> Tensor:
         mean = self.staged(self.means[self._routes_of(range(chunk, chunk + 1))].float())
@@ -235,7 +253,11 @@ class SpectralMap(PlaceMap):
         """The chunks as a file stores them, for `extend`."""
         sizes, checksums = self.stream_table.T.tolist()
         streams = map(Stream, self.streams.cpu().split(sizes), checksums)
-        return [*map(Chunk, self.lengths.tolist(), self.steps.tolist(), streams)]
+        lengths = self.lengths.tolist()
+        unseen = [
+            tuple((counts == 0).nonzero()[:, 0].tolist()) for counts in self.visit_counts.split(lengths)
+        ]
+        return [*map(Chunk, lengths, self.steps.tolist(), streams, unseen)]
 
     def of_chunks(self, chunks: Iterable[Chunk]) -> SpectralMap:
         """A map of other chunks with this map's mean, settings and device."""
@@ -268,6 +290,7 @@ class SpectralMap(PlaceMap):
         place_map.stage = (both / place_map.stage_scale).round().to(torch.int8)
         place_map.drives = torch.cat([self.drives, self.drives.new_ones(1)]).sum(0, True, dtype=torch.int32)
         place_map.norms = torch.cat([*map(place_map._norms_of, range(len(self.chunks)))])
+        place_map._hide()
         place_map.check()
         return place_map
 
@@ -526,6 +549,7 @@ class SpectralMap(PlaceMap):
         self._clear()
         self.extend(chunks)
         self.visits = visits
+        self._hide()
 
     def packed(self) -> dict[str, Tensor]:
         """See `PlaceMap`; means that are all 0 are omitted."""
@@ -541,7 +565,10 @@ class SpectralMap(PlaceMap):
         route = {part: packed[name].nbytes for name, part in names.items() if name in packed}
         route = {name: size for name, size in route.items() if size}
         route["chunks"] = sum(tensor.nbytes for name, tensor in packed.items() if name not in names)
-        covered, fixed = int((self.norms > 0).sum()), {"stage": stage} if stage else {}
+        covered, fixed = (
+            int(((self.norms > 0) & self.norms.isfinite()).sum()),
+            {"stage": stage} if stage else {},
+        )
         return MapSummary(self.kind, self.places, covered, 0, 0, tuple(chunks), route, fixed, len(self.level))
 
     def _periods(self, chunk: int) -> tuple[Fraction, ...]:
@@ -568,7 +595,8 @@ def scores_of(products: Tensor, norms: Tensor, length: Tensor, metric: SpectralM
     """
     if metric == "cosine":
         inverse = torch.where(norms > 0, 1 / norms, 0).to(products)
-        return torch.addcmul(products.new_ones(()), products, inverse, value=-1)
+        unrelated = torch.where(norms.isinf(), norms, 1).to(products)
+        return torch.addcmul(unrelated, products, inverse, value=-1)
     return (norms.to(products).square() - 2 * products + length.square()).clamp(min=0)
 
 

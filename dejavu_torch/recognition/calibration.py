@@ -24,18 +24,24 @@ DECAY = 0.9  # of a track's running mean, per query
 ANSWER_RADIUS = 2  # places around an answer whose best score counts for a track
 MIN_PROBABILITY = 1e-6  # a filter's probabilities are clamped to [this, 1 - this]
 MAX_STEPS = 100  # of Newton's method
+STRETCH = 50  # places on each side that are held out with a place, for its look-alikes to answer
+AGAIN, SURE = 0.05, 0.9  # more places than this, with look-alikes as sure as this: roads passed again
 
 
 class Platt(NamedTuple):
-    """p = 1 / (1 + exp(-(slope * confidence + offset)))"""
+    """p = 1 / (1 + exp(-(slope * confidence + offset))), but at most p_k for confidences up to c_k, where
+    `most` is ((c_1, p_1), ..): what `look_alikes` allow."""
 
     slope: float
     offset: float
+    most: tuple[tuple[float, float], ...] = ()
 
     def probability(self, confidence: Tensor) -> Tensor:
         """(Q,) -> (Q,) float64 on the CPU, 0 for a confidence of -inf."""
         confidence = confidence.cpu().double()  # not every device has double precision
         p = torch.sigmoid(self.slope * confidence.nan_to_num(neginf=0.0) + self.offset)
+        for upper, most in self.most:
+            p = torch.where(confidence <= upper, p.clamp(max=most), p)
         return torch.where(confidence.isneginf(), 0.0, p)
 
 
@@ -95,6 +101,27 @@ def fit(confidence: Tensor, right: Tensor, weight: Tensor | None = None) -> Plat
     return Platt(slope / spread, offset - slope / spread * mean)
 
 
+def look_alikes(platt: Platt, right: Tensor, own: Tensor, others: Tensor) -> Platt:
+    """The same, but no more than the share of right answers among all at least as confident, if half of the
+    queries are on the map, and the other half look like some place of it.
+
+    Args:
+        right: (r,) confidences in right answers, -inf for wrong ones. own: (n,), of the map's own frames.
+        others: (n,), of these without the places around each, whose look-alikes then answer.
+
+    Convention: where the latter are often sure, a route passes places twice: nothing changes.
+    """
+    most, again = [], float((platt.probability(others) >= SURE).double().mean())
+    ordered = others[others.isfinite()].double().sort(descending=True).values
+    for k in (2**i for i in range(1, len(ordered).bit_length()) if again <= AGAIN):  # one is chance
+        upper = float(ordered[k - 1])
+        found = sum(float((known.cpu() >= upper).double().mean()) for known in (right, own)) / 2
+        limit = found / (found + k / len(others))
+        if limit < float(platt.probability(others.new_tensor([upper]))):
+            most.append((round(upper, 3), round(limit, 3)))
+    return platt._replace(most=tuple(most))
+
+
 def confidence_of(scores: Tensor) -> Tensor:
     """Confidence in the best place of each query, (Q,N) -> (Q,): -score + `MARGIN` x margin, or -inf if no
     place is found. The margin is the difference to the best score beyond `TOLERANCE` places."""
@@ -142,7 +169,10 @@ def _window(index: Tensor, radius: int, scores: Tensor) -> Tensor:
 
 @torch.no_grad()
 def calibrated(
-    place_map: PlaceMap, segments: Iterable[tuple[Tensor, Tensor]], another_visit: bool = False
+    place_map: PlaceMap,
+    segments: Iterable[tuple[Tensor, Tensor]],
+    another_visit: bool = False,
+    own: tuple[Tensor, Tensor] | None = None,
 ) -> Calibration:
     """Fit on queries with known places, once as they are and once without the scores near these places. The
     latter stand for queries off the map, whose answers are all wrong.
@@ -151,6 +181,8 @@ def calibrated(
         segments: consecutive queries: descriptors (T,K) and places (T,) int64, -1 for unknown.
         another_visit: the queries are of another visit, whose own wrong answers show how frequent they are.
             The answers off the map then weigh, in total, only `MIN_WRONG` minus the number of these.
+        own: descriptors (n,K) of the map's own frames, and their places: what look like them elsewhere limits
+            the probability of single queries, see `look_alikes`.
     """
     answers: tuple[list[tuple[Tensor, ...]], ...] = [], []  # of single queries, of a filter
     for descriptors, places in segments:
@@ -174,6 +206,14 @@ def calibrated(
         off_weight = max(0, MIN_WRONG - wrong) / max(1, int((~on_the_map).sum())) if another_visit else 1.0
         weight = torch.where(on_the_map, 1.0, confidences.new_tensor(off_weight))
         platts.append(fit(confidences, right, weight) if not platts or bool(right.any()) else None)
+        if own is not None and len(platts) == 1 and platts[0] is not None:
+            known = torch.where(right, confidences, -math.inf)[on_the_map]
+            scores = torch.cat([place_map.scores(part) for part in own[0].split(64)])
+            places, reach = own[1].to(scores.device), min(STRETCH, place_map.places // 4)
+            near = places[:, None] + torch.arange(-reach, reach + 1, device=scores.device)
+            near = near.remainder(place_map.places)  # a route may end where it begins
+            pair = (confidence_of(one).cpu() for one in (scores, scores.scatter(1, near, math.inf)))
+            platts[0] = look_alikes(platts[0], known, *pair)
     return Calibration(*platts)
 
 

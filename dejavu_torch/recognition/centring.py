@@ -17,8 +17,8 @@ def centred(place_map: PlaceMap, queries: Tensor) -> Tensor:
     """Queries without what all of them have and the map has not: q - sum w (q - m) / (sum w + 50).
 
     m is the mean descriptor of the map; w is 1 over the length of the stop that a query belongs to. For a map
-    by cosine the results have norm 1. Queries of maps that are not spectral, and so have no mean, stay as
-    they are.
+    by cosine the results have norm 1. Queries of 0, as of blank frames, stay 0 and do not count. Those of
+    maps that are not spectral, and so have no mean, stay as they are.
 
     Shape: (Q,K) -> (Q,K).
 
@@ -26,7 +26,7 @@ def centred(place_map: PlaceMap, queries: Tensor) -> Tensor:
     """
     if not isinstance(place_map, SpectralMap) or not len(queries):
         return queries
-    weight = 1 / run_lengths(unchanged(queries)).to(queries)
+    weight = queries.any(1) / run_lengths(unchanged(queries)).to(queries)
     shift = weight @ (queries - place_map.mean.to(queries))
     return _without(place_map.metric, queries, shift / (weight.sum() + PRIOR))
 
@@ -47,7 +47,8 @@ class RunningMean(nn.Module):
 
     def forward(self, queries: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         mean = self.mean.to(queries)
-        sums = state + F.pad(queries - mean, (0, 1), value=1.0).cumsum(0)
+        shows = queries.any(1, keepdim=True).to(queries)
+        sums = state + (F.pad(queries - mean, (0, 1), value=1.0) * shows).cumsum(0)
         return _without(self.metric, queries, sums[:, :-1] / (sums[:, -1:] + PRIOR)), sums[-1]
 
 
@@ -60,5 +61,5 @@ def running_mean(place_map: PlaceMap) -> RunningMean:
 
 
 def _without(metric: str, queries: Tensor, mean: Tensor) -> Tensor:
-    moved = queries - mean
+    moved = (queries - mean) * queries.any(1, keepdim=True).to(queries)
     return F.normalize(moved, dim=1) if metric == "cosine" else moved

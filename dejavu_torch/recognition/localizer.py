@@ -100,8 +100,15 @@ class Localizer:
         parts = descriptors.split(max(1, min(ROWS, SCORES_AT_ONCE // size)))
         moved = (part.to(place_map.device) for part in with_progress(parts, "localizing", progress))
         if searches:
-            return Match.joined(self._search(part, wanted) for part in moved)
-        return Match.joined(self.match(place_map.scores(part)) for part in moved)
+            match = Match.joined(self._search(part, wanted) for part in moved)
+        else:
+            match = Match.joined(self.match(place_map.scores(part)) for part in moved)
+        if (
+            matching.sequence is None and getattr(place_map, "metric", "") == "cosine"
+        ):  # blank frames find nothing by themselves
+            shows = descriptors.any(1).cpu()
+            match = replace(match, accepted=match.accepted & shows.view(-1, *[1] * (match.accepted.ndim - 1)))
+        return match
 
     @torch.no_grad()
     def match(self, scores: Tensor) -> Match:

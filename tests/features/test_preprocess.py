@@ -189,6 +189,24 @@ def test_frames_of_few_values_are_learned_as_if_they_used_all(caplog: pytest.Log
     assert again.preprocess.range == "auto"
 
 
+def test_covered_frames_are_never_found_and_find_nothing() -> None:
+    generator = torch.Generator().manual_seed(0)
+    frames = torch.rand(80, 3, 24, 24, generator=generator)
+    covered = torch.arange(30, 42)
+    frames[covered] = 0.02 + 0.5 / 255 * torch.rand(len(covered), 3, 24, 24, generator=generator)
+    queries = frames * (1 + 0.05 * torch.rand(frames.shape, generator=generator)) / 1.05
+    model = DejaVu(HOG(), Whitening(8), SpectralMapper()).learn(frames).calibrate(frames)
+    assert model.map.visit_counts.tolist() == [int(i not in covered) for i in range(80)]
+    shown = torch.ones(80, dtype=torch.bool)
+    shown[covered] = False
+    for threshold in (math.inf, None):
+        model.threshold = threshold
+        match = model.localize(queries, sequence=None)
+        assert not torch.isin(match.index, covered).any()
+        assert torch.equal(match.index[shown], torch.arange(80)[shown])
+        assert not match.accepted[covered].any()
+
+
 def applied(frames: Tensor, **choice: Any) -> Tensor:
     return Preprocess(**choice)(frames)
 

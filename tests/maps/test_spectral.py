@@ -258,15 +258,25 @@ def test_phase_means_are_the_spectrum_at_the_harmonics_of_the_period() -> None:
 
 
 @pytest.mark.usefixtures("way")
-def test_a_place_without_a_descriptor_scores_cosine_0() -> None:
+def test_a_place_without_a_descriptor_is_never_found() -> None:
     descriptors = torch.cat([torch.eye(4)[[0, 1]], torch.zeros(1, 4), -torch.eye(4)[[0, 1]]]).repeat(20, 1)
     learned = SpectralMapper(None, step=3e-7)(descriptors)
     assert learned.summary().covered == 80
     queries = torch.randn(3, 4, requires_grad=True)
     scores = learned.scores(queries)
-    assert torch.equal(scores[:, 2::5], torch.ones(3, 20))
-    (gradient,) = torch.autograd.grad(scores[:, 2::5].sum(), queries)
-    assert torch.equal(gradient, torch.zeros(3, 4))
+    assert torch.equal(scores[:, 2::5], torch.full((3, 20), math.inf))
+    assert scores[:, 1::5].isfinite().all()
+    (gradient,) = torch.autograd.grad((-scores).softmax(1)[:, 0].sum(), queries)
+    assert gradient.isfinite().all()
+    assert learned.visit_counts.tolist() == [1, 1, 0, 1, 1] * 20
+    for other in (
+        learned.of_chunks(learned.coded()),
+        copied(learned, SpectralMapper().empty()),
+        learned.between(0, 1),
+    ):
+        assert torch.equal(other.scores(queries), scores)
+    squared = SpectralMapper(None, step=3e-7, metric="l2")(descriptors)  # where 0 is a descriptor like any
+    assert squared.scores(queries).isfinite().all()
     nothing = torch.zeros(2, 4, requires_grad=True)
     (gradient,) = torch.autograd.grad(learned.scores(nothing).sum(), nothing)
     assert gradient.isfinite().all()

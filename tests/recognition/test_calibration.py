@@ -27,6 +27,7 @@ from dejavu_torch.recognition.calibration import (
     calibrated,
     confidence_of,
     fit,
+    look_alikes,
 )
 
 INF = math.inf
@@ -52,7 +53,7 @@ def test_the_fit_is_the_most_likely_one() -> None:
         return -float((aim * p.log() + (1 - aim) * (1 - p).log()).sum())
 
     expected = minimize(loss, [1.0, 0.0], tol=1e-12).x
-    assert fit(evidence, right) == pytest.approx(tuple(expected), abs=1e-3)
+    assert fit(evidence, right)[:2] == pytest.approx(tuple(expected), abs=1e-3)
 
 
 @given(st.floats(1e-3, 1e3), st.floats(-1e3, 1e3))
@@ -163,6 +164,46 @@ def test_long_routes_are_looked_at_in_fewer_frames() -> None:
         assert int(changed.places.max()) > 0.8 * frames
 
 
+def test_what_looks_like_a_map_elsewhere_limits_the_probability() -> None:
+    """Of 200 own frames, 4 have look-alikes as sure as 2, and 8 as sure as 1: half of the right answers are
+    above either."""
+    right, own = torch.tensor([0.5, 3.0]).repeat(50), torch.full((200,), 3.0)
+    others = torch.full((200,), -9.0)
+    others[::50], others[1::50] = 2.0, 1.0
+    limited = look_alikes(Platt(5.0, 0.0), right, own, others)
+    found = (0.5 + 1.0) / 2
+    two, four, eight = (found / (found + k / 200) for k in (2, 4, 8))
+    assert limited.most == ((2.0, round(two, 3)), (2.0, round(four, 3)), (1.0, round(eight, 3)))
+    p = limited.probability(torch.tensor([3.0, 2.0, 1.5, 1.0, 0.0, -math.inf]))
+    assert p.tolist() == pytest.approx([1, four, four, eight, 0.5, 0], abs=1e-3)
+    assert (
+        look_alikes(Platt(5.0, 0.0), right, own, others[2::50]).most == ()
+    )  # none of them looks like another
+    again = torch.where(torch.arange(100) < 6, 2.0, -9.0)  # as of a road that is passed twice
+    assert look_alikes(Platt(5.0, 0.0), right, own, again).most == ()
+
+
+def test_limits_are_kept_in_files(tmp_path: Path) -> None:
+    route = torch.randn(60, 6)
+    model = DejaVu(whitening="none", mapper=SpectralMapper(12.0)).learn(route)
+    for most in ((), ((1.5, 0.98), (0.25, 0.9))):
+        model.calibration = Calibration(Platt(2.0, 0.5, most), None)
+        model.save(tmp_path / "a.safetensors")
+        assert DejaVu.load(tmp_path / "a.safetensors").calibration == model.calibration
+
+
+def test_a_floor_that_was_never_learned_is_known_by_look_alikes(data_dir: Path) -> None:
+    """Three floors of one plan are learned; a fourth looks like them."""
+    floors, queries = (
+        open_source(f"{data_dir}/floors_rejection/{name}.npy") for name in ("reference", "query")
+    )
+    match = DejaVu(precision=0.99).learn(floors).calibrate(floors).localize(queries, sequence=None)
+    right = (match.index - torch.arange(400)).abs() <= 1
+    right[300:] = False
+    assert float(right[match.accepted].double().mean()) >= 0.95
+    assert int((right & match.accepted).sum()) >= 250
+
+
 def test_of_many_views_evenly_spaced_stretches_are_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     route, seen = torch.randn(2000, 6), list[Tensor]()
     views = LabelledFrames(as_traverse(route + 0.2 * torch.randn_like(route)), torch.arange(2000))
@@ -170,7 +211,7 @@ def test_of_many_views_evenly_spaced_stretches_are_taken(monkeypatch: pytest.Mon
     monkeypatch.setattr("dejavu_torch.learning.MAX_SEGMENT", 20)
     monkeypatch.setattr("dejavu_torch.learning.CALIBRATION_SCORES", 400 * 2000)
 
-    def noted(_: object, segments: Iterable[tuple[Tensor, Tensor]], another: bool) -> Calibration:
+    def noted(_: object, segments: Iterable[tuple[Tensor, Tensor]], *more: object) -> Calibration:
         seen.extend(places for _, places in segments)
         return Calibration()
 
