@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from dejavu_torch.data.output import check_output_file, whole_file
 from dejavu_torch.features.extract import in_mode
+from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.maps.spectral_map import SpectralMap, scores_of
 from dejavu_torch.model import DejaVu, require_map
 from dejavu_torch.recognition.calibration import MARGIN
@@ -117,7 +118,7 @@ class Graph(nn.Module):
         after: list[Tensor] = []
         shows = None
         for name, part in self.parts.items():
-            if name == "preprocess" and part.blank > 0:
+            if isinstance(part, Preprocess) and part.blank > 0:
                 shows = part.shows(frames)[:, None]
             if name == "map" and shows is not None:
                 frames = frames * shows.to(frames)

@@ -53,6 +53,7 @@ class Traverse(Dataset[Tensor], ABC):
         names: of the frames, such as file names or times in a video, "" for none; empty if all have none.
         times: (N,) float64, when each was taken, in seconds; None if unknown.
         places: (N,) float64, the true position of each in reference frames; None if unknown.
+        coordinates: where each was taken, see `Coordinates`; None if unknown.
         ordered: whether they are known to be consecutive, as in a video; see the filter and sequences.
         sized: whether the user asked for their size, as with `width=` of a video.
         deep: whether its images have more than 8 bits a pixel.
@@ -72,6 +73,7 @@ class Traverse(Dataset[Tensor], ABC):
     names: Sequence[str] = ()
     times: Tensor | None = None
     places: Tensor | None = None
+    coordinates: Coordinates | None = None
     ordered: bool = False
     sized: bool = False
     cut: tuple[tuple[int, ...], range] | None = None
@@ -157,6 +159,14 @@ def as_range(numbers: list[int]) -> range | list[int]:
         return numbers
     run = range(numbers[0], numbers[-1] + 1, step)
     return run if len(run) == len(numbers) and all(map(operator.eq, run, numbers)) else numbers
+
+
+class Coordinates(NamedTuple):
+    """Where frames were taken: (N,2) or (N,3) float64 in metres, or latitude and longitude in degrees (N,2);
+    NaN where that is unknown."""
+
+    values: Tensor
+    degrees: bool = False
 
 
 @dataclass(frozen=True)

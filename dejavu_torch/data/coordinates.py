@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 from collections.abc import Sequence
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
 from typing import Literal, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.files import as_number
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.data.files import as_number, read_rows
+from dejavu_torch.types import Coordinates, InputError, Traverse
 
 log = logging.getLogger("dejavu_torch")
 
@@ -19,6 +24,14 @@ Kind = Literal["utm", "degrees", "metres"]
 FORMS: dict[Kind, str] = {"utm": "@easting@northing@...", "degrees": "@lat@lon@...", "metres": "@x@y@..."}
 MAJOR, ECCENTRICITY = 6_378_137.0, 0.081819190842622  # of the WGS84 ellipsoid: metres, and e
 NAN = (math.nan, math.nan)
+EXPECTED = (
+    "a csv with the columns x,y or lat,lon, and name or time where rows are not frames; poses of KITTI, "
+    "12 numbers a line; or of TUM or EuRoC, with times"
+)
+PAIRS = ("x", "y"), ("lat", "lon"), ("latitude", "longitude"), ("easting", "northing")  # columns
+TIMES = "time", "timestamp"
+UNITS = (1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3)  # times above are in nano-, micro- or milliseconds
+GAP = 1.0  # seconds between two rows within which no frame has coordinates
 
 
 class Near(NamedTuple):
@@ -35,6 +48,133 @@ class Fix(NamedTuple):
     second: float
     zone: str = ""  # of UTM, with its hemisphere
     degrees: tuple[float, float] = NAN
+
+
+def coordinates_of(traverses: Sequence[Traverse], kind: Kind) -> list[Tensor]:
+    """Coordinates of traverses in one frame, (N,2) or (N,3) float64 metres each, NaN for frames without. They
+    are those that the traverses carry, for "metres", if one does, else those in names.
+
+    Raises:
+        InputError: as `named_coordinates`; only some traverses that carry some, or of different kinds.
+    """
+    carried = [traverse.coordinates for traverse in traverses]
+    if kind != "metres" or not any(carried):
+        return named_coordinates(traverses, kind)
+    for own, traverse in zip(carried, traverses, strict=True):
+        if own is None:
+            other = next(one.name for one in traverses if one.coordinates is not None)
+            seen = f"{other} has coordinates and {traverse.name} none"
+            raise InputError(f"{seen}; expected 'SOURCE?coordinates=FILE' for both")
+    known = [own for own in carried if own is not None]
+    if len({own.degrees for own in known}) > 1:
+        raise InputError("coordinates in metres and in degrees; expected one kind for all sources")
+    if known[0].degrees:
+        return in_metres([own.values for own in known])
+    shared = min(own.values.shape[1] for own in known)
+    return [own.values[:, :shared] for own in known]
+
+
+def read_coordinates(path: Path, traverse: Traverse) -> Coordinates:
+    """Where the frames of a traverse were taken, from a file of one row a frame, or with names or times.
+
+    Args:
+        path: a csv whose header has x,y[,z], easting,northing or lat,lon, and may have `name`, of images, or
+            `time`; poses of KITTI (12 numbers: the 4th, 8th and 12th), TUM (`time x y z`, a quaternion), or
+            EuRoC (the same between commas, in nanoseconds). Times are compared with those of a video, or with
+            image names that are times; both in seconds, or in the unit that their size tells. Between rows up
+            to a second apart they are interpolated.
+
+    Raises:
+        InputError: another file, or rows that fit no frames.
+    """
+    rows = [
+        (line, re.split(r"[\s,]+", cells[0]) if len(cells) == 1 else cells)
+        for line, cells in read_rows(path, EXPECTED)
+        if not cells[0].startswith("#")
+    ]
+    if not rows:
+        raise InputError(f"{path} has no rows; expected {EXPECTED}")
+    key, degrees, columns = _columns(path, rows)
+    for line, cells in rows:
+        if len(cells) < max(columns) + 1:
+            raise InputError(
+                f"{path}, line {line}: {len(cells)} columns; expected {max(columns) + 1} or more"
+            )
+    values = np.array([[_value(cells[column]) for column in columns] for _, cells in rows])
+    if degrees and not (np.abs(np.nan_to_num(values)) <= (90, 180)).all():
+        raise InputError(f"{path} has latitudes beyond 90 or longitudes beyond 180; expected degrees")
+    keys = None if key is None else [cells[key[0]] for _, cells in rows]
+    if keys is None:
+        if len(values) != len(traverse):
+            seen = f"{path} has {len(values)} rows, {traverse.name} {len(traverse)} frames"
+            raise InputError(f"{seen}; expected as many, or a column name or time")
+    elif key is not None and key[1] == "name":
+        known = dict(zip(keys, values, strict=True))
+        values = np.array([known.get(name, np.full(len(columns), math.nan)) for name in traverse.names])
+    else:
+        values = _at_times(path, np.array([_value(one) for one in keys]), values, traverse)
+    missing = int(np.isnan(values).any(1).sum()) if len(values) else len(traverse)
+    if missing == len(traverse):
+        raise InputError(f"{path} tells of no frame of {traverse.name}; expected its names or times")
+    if missing:
+        log.warning("%s: %d of %d frames have no coordinates", traverse.name, missing, len(traverse))
+    return Coordinates(torch.from_numpy(values), degrees)
+
+
+def _columns(
+    path: Path, rows: list[tuple[int, list[str]]]
+) -> tuple[tuple[int, str] | None, bool, tuple[int, ...]]:
+    """The column of names or times, whether coordinates are degrees, and their columns; a header is removed
+    from the rows."""
+    first = rows[0][1]
+    if not any(math.isnan(_value(cell)) for cell in first):
+        if len(first) == 12:  # KITTI
+            return None, False, (3, 7, 11)
+        if len(first) in (8, 17):  # TUM, EuRoC
+            return (0, "time"), False, (1, 2, 3)
+        raise InputError(f"{path} has {len(first)} columns without a header; expected {EXPECTED}")
+    header = [cell.strip().lower() for cell in rows.pop(0)[1]]
+    pair = next((pair for pair in PAIRS if {*pair} <= {*header}), None)
+    if pair is None or not rows:
+        raise InputError(f"{path} has the columns {', '.join(header)}; expected {EXPECTED}")
+    degrees = pair[0].startswith("lat")
+    names = (*pair, "z") if not degrees and "z" in header else pair
+    key = next(((header.index(one), one) for one in ("name", *TIMES) if one in header), None)
+    return key, degrees, tuple(header.index(name) for name in names)
+
+
+def _value(text: str) -> float:
+    """A number of any size; NaN for anything else."""
+    try:
+        value = float(text)
+    except ValueError:
+        return math.nan
+    return value if math.isfinite(value) else math.nan
+
+
+def _seconds(times: np.ndarray) -> np.ndarray:
+    """Times in seconds, whatever their unit."""
+    largest = float(np.nanmax(times))
+    return times * next((factor for least, factor in UNITS if largest > least), 1.0)
+
+
+def _at_times(path: Path, times: np.ndarray, values: np.ndarray, traverse: Traverse) -> np.ndarray:
+    """The values (M,K) at times (M,), at the times of the frames: (N,K), NaN in gaps."""
+    if traverse.times is not None:
+        asked = traverse.times.numpy()
+    else:
+        asked = np.array([_value(Path(name).stem) for name in traverse.names])
+    if not len(asked) or np.isnan(asked).all() or np.isnan(times).any():
+        why = f"{path} has a row without a time" if np.isnan(times).any() else f"{traverse.name} has no times"
+        raise InputError(f"{why}; expected a video, image names such as 1305031102.975.png, or a row a frame")
+    asked, times = _seconds(asked), _seconds(times)
+    if any(a >= b for a, b in pairwise(times.tolist())):
+        raise InputError(f"{path} has times that do not rise; expected rows in order")
+    at = np.column_stack([np.interp(asked, times, column, math.nan, math.nan) for column in values.T])
+    after = np.searchsorted(times, asked).clip(1, max(1, len(times) - 1))
+    gap = times[after % len(times)] - times[after - 1] if len(times) > 1 else np.zeros(len(asked))
+    exact = np.isin(asked, times)
+    return np.where(((gap <= GAP) | exact)[:, None], at, math.nan)
 
 
 def named_coordinates(traverses: Sequence[Traverse], kind: Kind) -> list[Tensor]:
@@ -104,9 +244,14 @@ def _fixes(traverse: Traverse, kind: Kind) -> list[Fix]:
     if len(missing) == len(names):
         raise InputError(f"{traverse.name}: {missing[0]} has no coordinates; expected {FORMS[kind]}")
     if missing:
-        line = "%s: %d of %d frames have no coordinates, such as %s, and are not scored"
-        log.warning(line, traverse.name, len(missing), len(names), missing[0])
+        _warn_missing(traverse.name, len(missing), len(names), missing[0])
     return fixes
+
+
+@cache  # a report asks twice
+def _warn_missing(source: str, missing: int, frames: int, example: str) -> None:
+    line = "%s: %d of %d frames have no coordinates, such as %s, and are not scored"
+    log.warning(line, source, missing, frames, example)
 
 
 def _fix(name: str) -> Fix:

@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from dejavu_torch.data.coordinates import FORMS as COORDINATES
-from dejavu_torch.data.coordinates import Near, named_coordinates
+from dejavu_torch.data.coordinates import Near, coordinates_of
 from dejavu_torch.data.files import LARGEST, as_number, check_regular, read_rows, read_text, reading
 from dejavu_torch.memory import check_room
 from dejavu_torch.text import one_line
@@ -32,7 +32,8 @@ PAIRS_PER_BLOCK = 2**20
 OFTEN, FEW = 0.2, 20  # share of right pairs that a warning is due for, and places from which on
 EXPECTED = (
     "an integer offset such as 0, a .csv of query,place, a .json with a list of places for each query, an "
-    ".npz with GThard, or utm:25, degrees:25 or metres:25 for coordinates in image names"
+    ".npz with GThard, metres:25 for sources with coordinates, or utm:25, degrees:25 or metres:25 for those "
+    "in image names"
 )
 FORMS = "integer places (Q,) or (Q,R), or a boolean matrix (Q,N)"
 BYTES_PER_PLACE = 32  # of a table of right places, including temporaries
@@ -270,7 +271,8 @@ def find_ground_truth(
               GTsoft, if that is the only one); places in GTsoft only are ignored;
             - `utm:25`: every reference frame within 25 metres (inclusive; `utm` alone means 25) by the UTM
               coordinates in the names of both traverses' images, `@easting@northing@...@.jpg`; `degrees:25`
-              and `metres:25` likewise, see `named_coordinates`;
+              and `metres:25` likewise, or for the latter those that the traverses carry, see
+              `coordinates_of`;
             - the places themselves, a row for each frame of the query, see `as_ground_truth`;
             - None: the positions that both traverses carry; else frame i is place i if they are of equal
               length, not resampled and aligned (see `are_aligned`); else there is no ground truth.
@@ -312,7 +314,7 @@ def find_ground_truth(
     elif isinstance(parsed, Near):
         if reference is None or query is None:
             raise InputError(f"truth {truth} reads the names of images; expected reference and query")
-        stored, asked = named_coordinates([reference, query], parsed.kind)
+        stored, asked = coordinates_of([reference, query], parsed.kind)
         asked = _rows_of(asked, numbers)
         ground_truth = _every(near_truth(stored, asked, parsed.radius))
         ground_truth = ground_truth._replace(judged=~asked.isnan().any(1))
@@ -376,7 +378,8 @@ def describe_ground_truth(truth: Truth | None, interpolate: bool = False, positi
     if isinstance(parsed, int):
         return "place = query" + (f" {'-' if parsed < 0 else '+'} {abs(parsed)}" if parsed else "")
     if isinstance(parsed, Near):
-        return f"within {parsed.radius:g} m by the coordinates in image names"
+        where = "" if parsed.kind == "metres" else " in image names"
+        return f"within {parsed.radius:g} m by the coordinates{where}"
     return f"{truth}, interpolated" if interpolate else str(truth)
 
 

@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from dejavu_torch.data.arrays import ArrayTraverse, read_array
+from dejavu_torch.data.coordinates import read_coordinates
 from dejavu_torch.data.folder import IMAGE_SUFFIXES, ImageFolder, natural
 from dejavu_torch.data.h5 import H5_SUFFIXES, DescriptorFile
 from dejavu_torch.data.simulate import SIMULATORS
@@ -36,6 +37,7 @@ READERS: dict[str, Callable[..., Traverse]] = {".npy": read_array}  # by suffix
 READERS |= dict.fromkeys(VIDEO_SUFFIXES, Video) | dict.fromkeys(H5_SUFFIXES, DescriptorFile)
 KINDS = {int: "integer", float: "floating-point number"}  # types of option values
 PART = {"start": 0, "stop": 0, "step": 1}  # options of every source, see `frame_range`
+EVERY = PART | {"coordinates": ""}
 EXPECTED = (
     "a folder of images or a video, such as clip.mp4?width=160, an .npy file of frames or features, an .h5 "
     "file of hloc, sim:aerial?seed=0&traverse=0&frames=3072, sim:outdoor, sim:underground, or "
@@ -70,7 +72,8 @@ def open_source(source: str | Path, size: tuple[int, int] | None = None) -> Trav
             also with `order=`;
             `sim:NAME?seed=0&traverse=0&frames=3072`, NAME being aerial, outdoor or underground; or
             `strip:IMAGE?width=96&rows=32:128&halve=1&grey=1`, a window sliding along one long image. For all
-            sources, `start=`, `stop=` and `step=` select every step-th of the frames [start, stop).
+            sources, `start=`, `stop=` and `step=` select every step-th of the frames [start, stop), and
+            `coordinates=FILE` tells where they were taken, see `read_coordinates`.
         size: (height, width) in pixels to resize images and videos to if the source sets neither.
 
     Raises:
@@ -87,10 +90,14 @@ def open_source(source: str | Path, size: tuple[int, int] | None = None) -> Trav
     reader = _reader(text, address)
     arguments = _arguments(text, query, reader)
     part = {name: arguments.pop(name) for name in PART if name in arguments}
+    file = arguments.pop("coordinates", "")
     resizes = getattr(reader, "func", None) in (ImageFolder, Video)
     if size is not None and resizes and not {"height", "width"} & arguments.keys():
         arguments["height"], arguments["width"] = size
-    return frame_range(reader(**arguments), **part) if part else reader(**arguments)
+    traverse = reader(**arguments)
+    if file:
+        traverse.coordinates = read_coordinates(Path(file), traverse)
+    return frame_range(traverse, **part) if part else traverse
 
 
 def routes_of(source: str | Path) -> list[str]:
@@ -152,9 +159,9 @@ def _reader(text: str, address: str) -> Callable[..., Traverse]:
 
 
 def _arguments(text: str, query: str, reader: Callable[..., Traverse]) -> dict[str, Any]:
-    """`a=1&b=2` as keyword arguments of the reader and of `frame_range`, each of the type of its default."""
+    """`a=1&b=2` as arguments of the reader, and options in `EVERY`, each of the type of its default."""
     empty = inspect.Parameter.empty
-    defaults = {name: option.default for name, option in inspect.signature(reader).parameters.items()} | PART
+    defaults = {name: option.default for name, option in inspect.signature(reader).parameters.items()} | EVERY
     arguments: dict[str, Any] = {}
     for name, value in parse_qsl(query, keep_blank_values=True):
         if name not in defaults or name in arguments:

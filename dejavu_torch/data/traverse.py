@@ -16,7 +16,7 @@ from torch import Tensor
 
 from dejavu_torch.data.files import LARGEST
 from dejavu_torch.resize import is_stretched, resize_frames
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.types import Coordinates, InputError, Traverse
 
 log = logging.getLogger("dejavu_torch")
 
@@ -35,6 +35,9 @@ class Part(Traverse):
             None if values is None else values[torch.as_tensor(frame)]
             for values in (traverse.times, traverse.places)
         )
+        if traverse.coordinates is not None:
+            values, degrees = traverse.coordinates
+            self.coordinates = Coordinates(values[torch.as_tensor(frame)], degrees)
         if traverse.cut is not None and isinstance(frame, range):
             image, cuts = traverse.cut
             self.cut = image, cuts[frame.start : frame.stop : frame.step]
@@ -109,6 +112,10 @@ class Chain(Traverse):
             unknown = (torch.full((n,), torch.nan, dtype=torch.float64) for n in map(len, self.traverses))
             times = zip((traverse.times for traverse in self.traverses), unknown, strict=True)
             self.times = torch.cat([nan if known is None else known for known, nan in times])
+        known = [traverse.coordinates for traverse in self.traverses if traverse.coordinates is not None]
+        kinds = {(one.degrees, one.values.shape[1]) for one in known}
+        if len(known) == len(self.traverses) and len(kinds) == 1:
+            self.coordinates = Coordinates(torch.cat([one.values for one in known]), known[0].degrees)
 
     def __len__(self) -> int:
         return self.starts[-1]

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.arrays import UNNAMED
+from dejavu_torch.data.coordinates import Near, coordinates_of
 from dejavu_torch.data.ground_truth import (
     Truth,
     check_ground_truth,
@@ -57,7 +58,9 @@ from dejavu_torch.types import InputError, Match, SequenceModel, Traverse
 
 log = logging.getLogger("dejavu_torch")
 
+QUANTILES = 0.5, 0.9, 0.99  # of errors in metres
 SAMPLED = 256  # reference frames that a given map is checked with
+STANDING, FAR = 0.01, 256  # of the distance between places drawn at random: a camera that stands still
 NEAR = 10  # places within which it should find them, at least
 MAX_FILTERED = 2**25  # scores up to which ordered queries are also filtered by default
 
@@ -196,6 +199,8 @@ def compare(
         **_run_facts(run, seconds),
         **_match_facts(run, found, truth, interpolate, off_map),
         "centred": centring,
+        **_metric_facts(run, truth),
+        "standing": 0 if isinstance(reference, ResampledTraverse) else count_standing(run.reference_features),
         **({"second": second.placed_facts()} if second is not None and second.placed else {}),
         **{name: dict(picture.numbers) for name, picture in pictures.items() if picture.numbers},
     }
@@ -414,6 +419,33 @@ def _match_facts(
     ranked, shown = place_map.table.scored(candidates.index), run.match.renumbered(place_map.frame_of)
     facts = evaluation_facts(run.scored, ranked, run.truth, tolerance, place_map.positions, words, off)
     return facts | answer_facts(shown, run.query_frames, tolerance, run.truth is not None, offset)
+
+
+def _metric_facts(run: Localization, truth: Truth | None) -> dict[str, Any]:
+    """The entry `error_metres` of report.json: quantiles of the distances between queries and the places
+    reported for them, where the truth is by coordinates."""
+    parsed = None if truth is None else check_ground_truth(truth)
+    if not isinstance(parsed, Near):
+        return {}
+    stored, asked = coordinates_of([source_of(run.reference), source_of(run.query)], parsed.kind)
+    index = run.match.index
+    distance = (asked[run.query_frames] - stored[run.model.map.frame_of(index)]).norm(dim=1)
+    known = distance.isfinite() & (index >= 0)
+    facts: dict[str, Any] = {}
+    for name, chosen in (("all", known), ("accepted", known & run.match.accepted)):
+        if chosen.any():
+            quantiles = distance[chosen].quantile(torch.tensor(QUANTILES, dtype=torch.float64)).tolist()
+            facts[name] = {f"{share:g}": round(at, 3) for share, at in zip(QUANTILES, quantiles, strict=True)}
+    return {"error_metres": facts}
+
+
+def count_standing(descriptors: Tensor) -> int:
+    """How many of the places (N,K) look like the one before, as where the camera stands."""
+    drawn = torch.linspace(0, len(descriptors) - 1, min(FAR, len(descriptors))).round().long()
+    some = descriptors[drawn].float()
+    far = float((some - some.flip(0)).square().sum(1).median())
+    steps = descriptors.float().diff(dim=0).square().sum(1)
+    return int((steps < STANDING * far).sum())
 
 
 def plain_number(period: object) -> int | float:

@@ -1,0 +1,144 @@
+"""Where frames were taken, from files: formats, names, times, and what does not fit."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers import refused
+from PIL import Image
+
+from dejavu_torch import compare, open_source
+from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.data.coordinates import coordinates_of, read_coordinates
+from dejavu_torch.data.ground_truth import find_ground_truth
+from dejavu_torch.data.traverse import Chain, Part
+from dejavu_torch.evaluation.compare import count_standing
+from dejavu_torch.types import Traverse
+
+NAN = math.nan
+
+
+def images(folder: Path, *names: str) -> Path:
+    folder.mkdir()
+    for name in names:
+        Image.new("L", (12, 12)).save(folder / name)
+    return folder
+
+
+def values(text: str, traverse: Traverse, tmp_path: Path) -> list[list[float]]:
+    (tmp_path / "where.csv").write_text(text)
+    return read_coordinates(tmp_path / "where.csv", traverse).values.tolist()
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("x,y\n1,2\n3,4\n", [[1, 2], [3, 4]]),
+        ("x;y;z\n1,5;2;9\n3;4;8\n".replace("1,5", "1.5"), [[1.5, 2, 9], [3, 4, 8]]),
+        ("id,Y,X\n0,1,2\n1,,4\n", [[2, 1], [4, NAN]]),
+        ("1 0 0 10 0 1 0 20 0 0 1 30\n1 0 0 11 0 1 0 21 0 0 1 31\n", [[10, 20, 30], [11, 21, 31]]),  # KITTI
+        ("lat,lon,alt\n48,11,500\n49,-12,501\n", [[48, 11], [49, -12]]),
+    ],
+)
+def test_a_row_for_each_frame(text: str, expected: list[list[float]], tmp_path: Path) -> None:
+    two = ArrayTraverse(torch.rand(2, 4), "two")
+    np.testing.assert_array_equal(values(text, two, tmp_path), expected)
+
+
+def test_rows_by_the_names_of_images(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    folder = images(tmp_path / "a", "1.png", "2.png", "3.png")
+    found = values("name,x,y\n3.png,30,0\n1.png,10,0\nother.png,0,0\n", open_source(folder), tmp_path)
+    np.testing.assert_array_equal(found, [[10, 0], [NAN, NAN], [30, 0]])
+    assert "1 of 3 frames have no coordinates" in caplog.text
+    with refused("no frame of", "names or times"):
+        values("name,x,y\nother.png,0,0\n", open_source(folder), tmp_path)
+
+
+@pytest.mark.parametrize(("unit", "sign"), [(1, " "), (10**9, ",")])  # TUM, EuRoC
+def test_poses_with_times(unit: int, sign: str, tmp_path: Path) -> None:
+    """Poses every half second at 1 m/s, images a quarter of a second later, and one after the end."""
+    first = 1403636579
+    names = [
+        f"{first + i + 0.25}" if unit == 1 else f"{first * unit + i * unit + unit // 4}" for i in (0, 1, 9)
+    ]
+    folder = images(tmp_path / "a", *(f"{name}.png" for name in names))
+    rows = [
+        sign.join(
+            map(str, (first + i / 2 if unit == 1 else first * unit + i * unit // 2, i / 2, 2, 3, 0, 0, 0, 1))
+        )
+        for i in range(5)
+    ]
+    found = values("#timestamp, p_x, p_y\n" + "\n".join(rows), open_source(folder), tmp_path)
+    np.testing.assert_allclose(found, [[0.25, 2, 3], [1.25, 2, 3], [NAN] * 3], atol=1e-6)
+
+
+def test_rows_by_time(tmp_path: Path) -> None:
+    folder = images(tmp_path / "a", "100.25.png", "101.0.png", "103.0.png", "105.png")
+    found = values(
+        "time,x,y\n100,7,2\n100.5,8,4\n101,9,6\n103,1,1\n104.5,2,2\n", open_source(folder), tmp_path
+    )
+    np.testing.assert_allclose(found, [[7.5, 3], [9, 6], [1, 1], [NAN, NAN]])
+    for text, words in (
+        ("time,x,y\n2,0,0\n1,0,0\n", ("do not rise",)),
+        ("time,x,y\nnoon,0,0\n", ("a row without a time",)),
+    ):
+        with refused(*words):
+            values(text, open_source(folder), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("x,y\n1,2\n", ("1 rows", "2 frames", "name or time")),
+        ("a,b\n1,2\n3,4\n", ("columns a, b", "lat,lon")),
+        ("x,y\n", ("columns x, y",)),
+        ("", ("no rows",)),
+        ("1,2\n3,4\n", ("2 columns without a header",)),
+        ("x,y\n1,2\n3\n", ("line 3", "1 columns")),
+        ("lat,lon\n480000,11\n490000,12\n", ("latitudes beyond 90",)),
+        ("x,y\n,\n,\n", ("columns x, y",)),
+    ],
+)
+def test_what_is_refused(text: str, words: tuple[str, ...], tmp_path: Path) -> None:
+    with refused(*words):
+        values(text, ArrayTraverse(torch.rand(2, 4), "two"), tmp_path)
+
+
+def test_parts_and_chains_keep_coordinates(tmp_path: Path) -> None:
+    (tmp_path / "w.csv").write_text("x,y\n" + "\n".join(f"{i},0" for i in range(9)))
+    np.save(tmp_path / "f.npy", np.random.default_rng(0).random((9, 5), np.float32))
+    whole = open_source(f"{tmp_path}/f.npy?coordinates={tmp_path}/w.csv")
+    part = open_source(f"{tmp_path}/f.npy?coordinates={tmp_path}/w.csv&start=3&step=2")
+    assert part.coordinates is not None
+    assert part.coordinates.values[:, 0].tolist() == [3, 5, 7]
+    both = Chain([whole, Part(whole, range(2))]).coordinates
+    assert both is not None
+    assert both.values[:, 0].tolist() == [*range(9), 0, 1]
+    plain = open_source(f"{tmp_path}/f.npy")
+    assert Chain([whole, plain]).coordinates is None
+    with refused("has coordinates and", "none", "coordinates=FILE"):
+        coordinates_of([whole, plain], "metres")
+    truth = find_ground_truth("metres:1", whole, part, 9, 3)
+    assert truth is not None
+    assert truth.positives.tolist() == [[2, 3, 4], [4, 5, 6], [6, 7, 8]]
+
+
+def test_a_report_tells_errors_in_metres(tmp_path: Path) -> None:
+    """Each query shows the place 1 m beside it: all errors are 1 m."""
+    rows = torch.nn.functional.normalize(torch.randn(60, 8), dim=1)
+    reference, query = ArrayTraverse(rows, "one"), ArrayTraverse(rows.clone(), "two")
+    for traverse, y in ((reference, 0), (query, 1)):
+        (tmp_path / "w.csv").write_text("x,y\n" + "\n".join(f"{10 * i},{y}" for i in range(60)))
+        traverse.coordinates = read_coordinates(tmp_path / "w.csv", traverse)
+    facts = compare(reference, query, "metres:2", tolerance=0).report.facts
+    assert facts["error_metres"]["all"] == {"0.5": 1.0, "0.9": 1.0, "0.99": 1.0}
+
+
+def test_places_where_the_camera_stands_are_counted() -> None:
+    moving = torch.nn.functional.normalize(torch.randn(40, 16), dim=1)
+    assert count_standing(moving) == 0
+    assert count_standing(torch.cat([moving, moving[-1:].repeat(29, 1)])) == 29
