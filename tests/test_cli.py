@@ -50,6 +50,35 @@ def test_localize_writes_one_row_a_query_as_python_finds_them(small_map: Path, t
     assert torch.allclose(torch.tensor([float(row["score"]) for row in rows]), match.score, rtol=1e-5)
 
 
+def test_one_damaged_image_does_not_stop_the_others(
+    small_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    images = (255 * open_source(QUERY)[:].permute(0, 2, 3, 1)).round().byte().numpy()
+    folder = write_images(tmp_path / "q", images)
+    damaged = folder / "40.png"
+    damaged.write_bytes(b"no image")
+    words = ("localize", small_map, folder, "--unordered", "--out", tmp_path / "m.csv")
+    assert damaged.name in fails(capsys, *words)
+    run(*words, "--skip_damaged")
+    assert f"1 frames could not be read, such as 40: {damaged}" in capsys.readouterr().out
+    rows = list(csv.DictReader((tmp_path / "m.csv").open()))
+    assert len(rows) == 96
+    assert rows[40]["accepted"] == "0"
+    assert sum(row["accepted"] == "1" for row in rows) > 80
+
+
+@pytest.mark.parametrize(
+    ("words", "hint"),
+    [
+        ("--features hog", "not hog; did you mean HOG?"),
+        ("--velocity none", "not none; did you mean null?"),
+        ("--preprocess.size none", "--preprocess.size is none; expected null, or int"),
+    ],
+)
+def test_what_a_wrong_word_may_mean(words: str, hint: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert hint in fails(capsys, "learn", SMALL, "--map", "a.safetensors", *words.split())
+
+
 def test_convention_4_threshold_option_then_map_then_probability_then_all(
     small_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -26,7 +26,7 @@ from dejavu_torch.cli import options
 from dejavu_torch.cli.device import device_of
 from dejavu_torch.data.output import check_output_file, check_output_folder, whole_folder
 from dejavu_torch.data.source import check_not_read, open_source
-from dejavu_torch.data.traverse import chained
+from dejavu_torch.data.traverse import Whole, chained
 from dejavu_torch.evaluation.answers import describe_line, describe_probable, next_steps, probable_counts
 from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.views import SAMPLE as SHORT
@@ -182,6 +182,7 @@ def run_localize(
     ordering: options.Ordering,
     searching: options.Searching,
     cluster: str | None = None,
+    skip_damaged: bool = False,
     loading: options.Loading,
 ) -> None:
     """Find the frames of a source on a map.
@@ -195,6 +196,7 @@ def run_localize(
         pairs: also write lines `query_name place_name` for hloc and COLMAP, one per place
         corners: where this camera sees the patch of ground that the map's --velocity.corners describe
         cluster: divide the map among Ray workers, as in `dejavu learn`; for single queries only
+        skip_damaged: frames that cannot be read find nothing, and do not stop the others
     """
     from dejavu_torch.evaluation.matches import check_pair_names
 
@@ -219,7 +221,9 @@ def run_localize(
     acceptance.of(model)
     if top is not None:
         check_candidates(top, SUPPRESSION, model.map.places)
-    query = model.at_map_size(open_source(source), model.frame_shape or ())
+    query, damaged = open_source(source), dict[int, str]()
+    query = Whole(query, damaged) if skip_damaged else query
+    query = model.at_map_size(query, model.frame_shape or ())
     if pairs is not None:
         check_pair_names(model.frame_names, f"the map {map}")
         check_pair_names(query.names, query.name)
@@ -255,6 +259,8 @@ def run_localize(
         print(chosen)
     if isinstance(matcher, PlaceSmoother) and not matcher.is_drive:
         print(NO_DRIVE)
+    if damaged:
+        print(f"{len(damaged)} frames could not be read, such as {min(damaged)}: {damaged[min(damaged)]}")
     _say(f"{total} queries, {accepted} accepted; written to {out}")
     if counts:
         steps = next_steps(matcher is not None, chosen.given)

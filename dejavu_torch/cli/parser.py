@@ -348,8 +348,13 @@ def _by_options(message: str, error: Exception | None, positional: Collection[st
     others = ", none or a map file" * ("MapFile" in message)
     wanted = f"expected the import path of a class{others}, not"
     text = text.replace("Expected a dot import path string:", wanted)
+    if text.startswith(wanted) and not others:
+        word = text.removeprefix(wanted).strip().lower()
+        meant = "null" if word == "none" else next((name for name in REGISTRY if name.lower() == word), None)
+        text += f"; did you mean {meant}?" if meant else ""
     value = re.match(r"Expected an? (.*)\. Got value: (.*)", text, re.DOTALL)
-    return f"{option} is {value[2]}; expected {value[1]}" if value else f"{option}: {text}"
+    none = "null, or " if value and value[2].lower() == "none" else ""
+    return f"{option} is {value[2]}; expected {none}{value[1]}" if value else f"{option}: {text}"
 
 
 @cache

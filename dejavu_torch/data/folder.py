@@ -133,8 +133,17 @@ class ImageFolder(Traverse):
     @property
     def deep(self) -> bool:
         file = self.path / self.names[0]
-        with reading(file, "cannot be read as an image", "one"), Image.open(file, formats=FORMATS) as opened:
+        with (
+            reading(file, "cannot be read as an image", "one"),
+            Image.open(file, formats=formats()) as opened,
+        ):
             return opened.mode.startswith("I")
+
+
+def formats() -> list[str]:
+    """Those of `FORMATS` that Pillow reads here."""
+    Image.init()
+    return [name for name in FORMATS if name in Image.OPEN]
 
 
 def readable(suffixes: Iterable[str]) -> set[str]:
@@ -215,7 +224,7 @@ def read_image(path: Path, least: int = 0) -> Tensor:
         InputError: not an image, over 2^28 pixels, more than fit in memory, or values outside [0, 1].
     """
     unread, expected = "cannot be read as an image", "an image such as .png or .jpg"
-    with reading(path, unread, expected), Image.open(path, formats=FORMATS) as opened:
+    with reading(path, unread, expected), Image.open(path, formats=formats()) as opened:
         if least:
             opened.draft(None, (least, least))
         check_pixels(path, opened.height, opened.width, MAX_IMAGE_PIXELS)

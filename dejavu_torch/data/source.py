@@ -18,11 +18,12 @@ from torch.utils.data import Dataset
 
 from dejavu_torch.data.arrays import ArrayTraverse, read_array
 from dejavu_torch.data.coordinates import read_coordinates
-from dejavu_torch.data.folder import IMAGE_SUFFIXES, ImageFolder, natural
+from dejavu_torch.data.files import as_number
+from dejavu_torch.data.folder import IMAGE_SUFFIXES, ImageFolder, natural, read_image
 from dejavu_torch.data.h5 import H5_SUFFIXES, DescriptorFile
 from dejavu_torch.data.simulate import SIMULATORS
 from dejavu_torch.data.strip import read_strip
-from dejavu_torch.data.traverse import Frames, frame_range
+from dejavu_torch.data.traverse import Cropped, Frames, frame_range
 from dejavu_torch.data.video import VIDEO_SUFFIXES, Video
 from dejavu_torch.types import InputError, Traverse
 
@@ -37,7 +38,7 @@ READERS: dict[str, Callable[..., Traverse]] = {".npy": read_array}  # by suffix
 READERS |= dict.fromkeys(VIDEO_SUFFIXES, Video) | dict.fromkeys(H5_SUFFIXES, DescriptorFile)
 KINDS = {int: "integer", float: "floating-point number"}  # types of option values
 PART = {"start": 0, "stop": 0, "step": 1}  # options of every source, see `frame_range`
-EVERY = PART | {"coordinates": ""}
+EVERY = PART | {"coordinates": "", "crop": "", "mask": ""}
 EXPECTED = (
     "a folder of images or a video, such as clip.mp4?width=160, an .npy file of frames or features, an .h5 "
     "file of hloc, sim:aerial?seed=0&traverse=0&frames=3072, sim:outdoor, sim:underground, or "
@@ -73,7 +74,8 @@ def open_source(source: str | Path, size: tuple[int, int] | None = None) -> Trav
             `sim:NAME?seed=0&traverse=0&frames=3072`, NAME being aerial, outdoor or underground; or
             `strip:IMAGE?width=96&rows=32:128&halve=1&grey=1`, a window sliding along one long image. For all
             sources, `start=`, `stop=` and `step=` select every step-th of the frames [start, stop), and
-            `coordinates=FILE` tells where they were taken, see `read_coordinates`.
+            `coordinates=FILE` tells where they were taken, see `read_coordinates`. `mask=IMAGE` makes what is
+            black in an image black in all frames, then `crop=TOP,BOTTOM,LEFT,RIGHT` removes pixels.
         size: (height, width) in pixels to resize images and videos to if the source sets neither.
 
     Raises:
@@ -90,14 +92,26 @@ def open_source(source: str | Path, size: tuple[int, int] | None = None) -> Trav
     reader = _reader(text, address)
     arguments = _arguments(text, query, reader)
     part = {name: arguments.pop(name) for name in PART if name in arguments}
-    file = arguments.pop("coordinates", "")
-    resizes = getattr(reader, "func", None) in (ImageFolder, Video)
+    file, crop, mask = (arguments.pop(name, "") for name in ("coordinates", "crop", "mask"))
+    resizes = getattr(reader, "func", None) in (ImageFolder, Video) and not crop
     if size is not None and resizes and not {"height", "width"} & arguments.keys():
         arguments["height"], arguments["width"] = size
     traverse = reader(**arguments)
+    if crop or mask:
+        hidden = read_image(Path(mask)).mean(0, keepdim=True) if mask else None
+        traverse = Cropped(traverse, _sides(text, crop), hidden)
     if file:
         traverse.coordinates = read_coordinates(Path(file), traverse)
     return frame_range(traverse, **part) if part else traverse
+
+
+def _sides(text: str, crop: str) -> list[int]:
+    """The pixels to remove at the top, bottom, left and right."""
+    sides = [as_number(one) for one in crop.split(",")] if crop else [0, 0, 0, 0]
+    whole = [int(side) for side in sides if side is not None and side >= 0 and side % 1 == 0]
+    if len(sides) != 4 or len(whole) != 4:
+        raise InputError(f"{text}: crop is {crop!r}; expected pixels as in crop=TOP,BOTTOM,LEFT,RIGHT")
+    return whole
 
 
 def routes_of(source: str | Path) -> list[str]:

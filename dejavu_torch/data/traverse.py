@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from bisect import bisect_right
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import cached_property
 from itertools import accumulate, groupby
 from pathlib import Path
@@ -148,6 +149,73 @@ def chained(traverses: Sequence[Traverse]) -> Traverse:
 def parts_of(traverse: Traverse) -> list[Traverse]:
     """The traverses of a chain; [traverse] of any other."""
     return traverse.traverses if isinstance(traverse, Chain) else [traverse]
+
+
+class Cropped(Part):
+    """Frames without their outermost pixels, and with those that a mask hides black.
+
+    Args:
+        crop: (top, bottom, left, right), pixels to remove. mask: (1,H,W), 0 hides; resized to the frames.
+
+    Raises:
+        InputError: no frames, or nothing left of them.
+    """
+
+    def __init__(
+        self, traverse: Traverse, crop: Sequence[int] = (0, 0, 0, 0), mask: Tensor | None = None
+    ) -> None:
+        super().__init__(traverse, range(len(traverse)))
+        shape, (top, bottom, left, right) = traverse.frame_shape, crop
+        fits = len(shape) == 3 and min(crop) >= 0 and top + bottom < shape[1] and left + right < shape[2]
+        if not fits:
+            seen = f"{traverse.name}: crop={','.join(map(str, crop))} of {' x '.join(map(str, shape))}"
+            raise InputError(f"{seen}; expected frames, of which some pixels are left")
+        self.box = slice(top, shape[1] - bottom), slice(left, shape[2] - right)
+        size = shape[1], shape[2]
+        self.mask = None if mask is None else (resize_frames(mask[None], size) >= 0.5).float()
+
+    def read(self, frames: range | list[int]) -> Tensor:
+        seen = super().read(frames)
+        return (seen if self.mask is None else seen * self.mask)[..., self.box[0], self.box[1]]
+
+    @cached_property
+    def frame_shape(self) -> tuple[int, ...]:
+        return tuple(self.read(range(1)).shape[1:])
+
+
+class Whole(Part):
+    """Frames of which those that cannot be read are black, so that one damaged file does not stop the others;
+    `damaged` has the numbers of these so far, and why. Frames of 0 find nothing, see `Descriptor`."""
+
+    def __init__(self, traverse: Traverse, damaged: dict[int, str] | None = None) -> None:
+        super().__init__(traverse, range(len(traverse)))
+        self.damaged: dict[int, str] = {} if damaged is None else damaged
+
+    def decoded_at(self, height: int, width: int) -> Whole:
+        return Whole(at_size(self.traverse, (height, width)), self.damaged)
+
+    def read(self, frames: range | list[int]) -> Tensor:
+        if self.damaged.keys().isdisjoint(frames):
+            with suppress(InputError):
+                return super().read(frames)
+        return torch.stack([self._one(i) for i in frames])
+
+    def _one(self, i: int) -> Tensor:
+        if i not in self.damaged:
+            try:
+                return self.traverse[i]
+            except InputError as error:
+                self.damaged[i] = str(error)
+        return torch.zeros(self.frame_shape)
+
+    @cached_property
+    def frame_shape(self) -> tuple[int, ...]:
+        for i in range(len(self)):
+            try:
+                return tuple(self.traverse[i].shape)
+            except InputError as error:
+                self.damaged[i] = str(error)
+        raise InputError(f"none of the {len(self)} frames of {self.name} can be read: {self.damaged[0]}")
 
 
 class Fitted(Part):

@@ -79,6 +79,7 @@ class Video(Traverse):
         check_regular(self.path, "a video file")
         with self._open() as (container, stream):
             whole, kind = _is_whole(self.path), container.format.name
+            self.pixels = stream.sample_aspect_ratio or Fraction(1)  # width over height
             # only this family lists every frame, and which ones an edit list hides
             if kind.startswith("mov") and stream.frames:
                 entries = stream.index_entries

@@ -20,13 +20,18 @@ OVER_CHANCE = 2  # times as many answers near a line as with places and queries 
 
 
 class Line(NamedTuple):
-    """The line place = query + offset, in frames, near which `answers` of the `confident` answers lie."""
+    """The line place = query + offset, in frames, near which `answers` of the `confident` answers lie; or
+    place = offset - query, if they run `backwards`."""
 
     offset: int
     answers: int
     confident: int
+    backwards: bool = False
 
     def __str__(self) -> str:
+        if self.backwards:
+            lie = f"{self.answers} of {self.confident} confident answers lie at place = {self.offset} - query"
+            return f"the queries run backwards along the route: {lie}"
         sign = "-" if self.offset < 0 else "+"
         line = f"place = query {sign} {abs(self.offset)}" if self.offset else "place = query"
         return f"most confident answers ({self.answers} of {self.confident}) lie at {line}"
@@ -107,9 +112,13 @@ def answer_facts(
     if scored and offset is None:
         return facts
     within, sure = max(tolerance, MIN_WIDTH), confident(match) & (match.index >= 0)
-    line = line_of(match.index[sure], queries[sure], within, max(MIN_ANSWERS, MIN_SHARE * len(queries)))
+    least = max(MIN_ANSWERS, MIN_SHARE * len(queries))
+    places, frames = match.index[sure], queries[sure]
+    line = line_of(places, frames, within, least)
+    if line is None and not scored and (mirrored := line_of(places, -frames, within, least)) is not None:
+        line = mirrored._replace(backwards=True)
     if line is not None and not (scored and abs(line.offset - (offset or 0)) <= within):
-        facts["line"] = line._asdict()
+        facts["line"] = {name: value for name, value in line._asdict().items() if value is not False}
     return facts
 
 
@@ -118,5 +127,7 @@ def describe_line(facts: Mapping[str, Any], scored: bool) -> str:
     if "line" not in facts:
         return ""
     line = Line(**facts["line"])
+    if line.backwards:
+        return str(line)
     text = f"{line}: is it --truth {line.offset}?"
     return f"the answers contradict the truth ({facts['truth']}): {text}" if scored else text

@@ -321,11 +321,19 @@ class Descriptor(nn.Module):
             if count != counts[0]:
                 seen = " and ".join(
                     f"{traverse.name} gives {number} features per frame of "
-                    f"{' x '.join(map(str, traverse.frame_shape))}"
+                    f"{' x '.join(map(str, traverse.frame_shape))}{_pixels(traverse)}"
                     for traverse, number in ((reference, counts[0]), (query, count))
                 )
                 raise InputError(f"{seen}; expected the same number, from frames of the same size")
         return counts[0]
+
+
+def _pixels(traverse: Traverse) -> str:
+    """The shape of the pixels of a video, if they are not square, in words."""
+    while isinstance(traverse, Part):
+        traverse = traverse.traverse
+    pixels = getattr(traverse, "pixels", 1)
+    return "" if pixels == 1 else f", whose pixels are {pixels.numerator}:{pixels.denominator}, not square,"
 
 
 def is_ready(traverse: Traverse | AugmentedFrames | None) -> bool:

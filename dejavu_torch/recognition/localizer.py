@@ -6,7 +6,6 @@ import copy
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from types import MappingProxyType
 from typing import NamedTuple
 
 import torch
@@ -36,7 +35,7 @@ class Matching(NamedTuple):
     """How queries are matched."""
 
     sequence: SequenceModel | PlaceSmoother | None = None  # None matches each query by itself
-    also: Mapping[Together, SequenceModel] = MappingProxyType({})  # further ways, see `Match.sequences`
+    also: Mapping[Together, SequenceModel] = {}  # further ways, see `Match.sequences`; never changed
     plain: Tensor | None = None  # the queries as they are, if those of a smoother are centred
     k: int | None = None  # candidates per query; None gives matches (Q,)
     radius: int = 0  # suppression radius in places

@@ -23,7 +23,18 @@ from videos import clip, numbers, pictures
 from dejavu_torch import DejaVu, types
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.source import as_traverse, open_source
-from dejavu_torch.data.traverse import Chain, Fitted, Frames, Part, at_size, chained, frame_range, runs
+from dejavu_torch.data.traverse import (
+    Chain,
+    Cropped,
+    Fitted,
+    Frames,
+    Part,
+    Whole,
+    at_size,
+    chained,
+    frame_range,
+    runs,
+)
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.resize import is_stretched, reduced_size, resize_frames
 from dejavu_torch.types import Traverse
@@ -32,6 +43,53 @@ VALUES = torch.arange(40.0)[:, None]
 PARTS = st.tuples(st.integers(0, 39), st.integers(0, 40), st.integers(1, 45)).filter(
     lambda part: part[1] == 0 or part[0] < part[1]
 )
+
+
+# cropped, masked and damaged frames
+
+
+def test_crop_and_mask(tmp_path: Path) -> None:
+    write_images(tmp_path / "a", frames(3, size=12))
+    Image.fromarray(np.repeat([[0, 255]], 12, 1).astype(np.uint8).repeat(6, 0).reshape(6, 24)).save(
+        tmp_path / "half.png"
+    )
+    plain = open_source(tmp_path / "a")[:]
+    cropped = open_source(f"{tmp_path}/a?crop=1,2,3,4&start=1")
+    assert torch.equal(cropped[:], plain[1:, :, 1:10, 3:8])
+    assert at_size(cropped, (3, 4)).frame_shape == (1, 3, 4)
+    masked = open_source(f"{tmp_path}/a?mask={tmp_path}/half.png&crop=0,0,1,0")[:]
+    assert torch.equal(masked[..., :5], torch.zeros_like(masked[..., :5]))
+    assert torch.equal(masked[..., 5:], plain[..., 6:])
+    assert torch.equal(Cropped(open_source(tmp_path / "a"), [0, 0, 0, 0])[:], plain)
+    for option, words in (
+        ("crop=1,2,3", ("'1,2,3'", "TOP,BOTTOM,LEFT,RIGHT")),
+        ("crop=-1,2,3,4", ("'-1,2,3,4'",)),
+        ("crop=6,6,0,0", ("crop=6,6,0,0 of 1 x 12 x 12", "some pixels are left")),
+        (f"mask={tmp_path}/no.png", ("no.png is not there",)),
+    ):
+        with refused(*words):
+            open_source(f"{tmp_path}/a?{option}")
+
+
+def test_damaged_frames_are_black_and_counted(tmp_path: Path) -> None:
+    write_images(tmp_path / "a", frames(6, size=12))
+    plain = open_source(tmp_path / "a")
+    names = [*plain.names]
+    before = plain[:]
+    for i in (0, 4):
+        (tmp_path / "a" / names[i]).write_bytes(b"no image")
+    whole = Whole(open_source(tmp_path / "a"))
+    assert whole.frame_shape == (1, 12, 12)
+    half = at_size(whole, (6, 6))
+    assert half[:].flatten(1).any(1).tolist() == [False, True, True, True, False, True]
+    assert sorted(whole.damaged) == [0, 4]
+    assert names[4] in whole.damaged[4]
+    before[[0, 4]] = 0
+    assert torch.equal(whole[:], before)
+    for name in names:
+        (tmp_path / "a" / name).write_bytes(b"no image")
+    with refused("none of the 6 frames"):
+        Whole(open_source(tmp_path / "a"))[:]
 
 
 # the sequence protocol

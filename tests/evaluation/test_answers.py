@@ -109,6 +109,14 @@ def test_what_is_asked_of_a_line(scored: bool, offset: int | None, asks: bool) -
     assert ("contradict the truth (place = query + 0)" in told) == (asks and scored)
 
 
+def test_queries_that_run_backwards_are_told() -> None:
+    queries = torch.arange(60)
+    facts = answer_facts(answers(80 - queries), queries, 5, False)
+    assert facts["line"] == {"offset": 80, "answers": 60, "confident": 60, "backwards": True}
+    assert "run backwards" in describe_line(facts, False)
+    assert "place = 80 - query" in describe_line(facts, False)
+
+
 @pytest.mark.parametrize(
     ("offset", "line"), [(-7, "query - 7: is it --truth -7?"), (0, "query: is it --truth 0?")]
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from typing import Any
 
@@ -212,6 +213,14 @@ def test_frames_left_out_move_the_filter_on(route: Tensor) -> None:
         )
 
     assert posteriors(True)[10:].mean() > posteriors(False)[10:].mean() + 0.2
+
+
+def test_a_copy_goes_on_by_itself(spectral: DejaVu, drive: Tensor) -> None:
+    localizer = LiveLocalizer(spectral)
+    answers(localizer, drive[:5])
+    other = copy.deepcopy(localizer)
+    expected = answers(localizer, drive[5:9])
+    assert [one.place for one in answers(other, drive[5:9])] == [one.place for one in expected]
 
 
 def test_names_and_interruption(spectral: DejaVu, drive: Tensor, monkeypatch: pytest.MonkeyPatch) -> None:
