@@ -414,6 +414,35 @@ class DejaVu(nn.Module):
             scores = map(score, with_progress(parts, "localizing", progress))
             return Match.joined(map(matcher.match, scores))
 
+    def loops(self, traverse: Source, apart: int = 50, drive: bool = True, progress: bool = False) -> Match:
+        """Where a drive comes back to places that it has passed before: the best earlier place of each frame.
+
+        Args:
+            traverse: what the map was learned from. apart: frames before a frame that are no answers, nor
+                those after it: each pair counts once.
+            drive: the frames are in order, and the whole drive has to agree.
+
+        Shape: -> Match of (N,) on the CPU; index -1 for the first frames.
+
+        Raises:
+            InputError: another traverse than the map's, or `apart` out of range.
+        """
+        require_map(self)
+        traverse = self.resample(as_traverse(traverse), self.step, progress, self.frame_shape)
+        if len(traverse) != self.map.places:
+            seen = f"{traverse.name} has {len(traverse)} places, the map {self.map.places}"
+            raise InputError(f"{seen}; expected the traverse that the map was learned from")
+        if not 1 <= apart < len(traverse):
+            raise InputError(f"loops: {apart}; expected a number of places from 1 to {len(traverse) - 1}")
+        descriptors = self.descriptor.all_of(traverse, progress)
+        matching = self.matching(None)._replace(acceptance=self.loop_acceptance(drive))
+        return Localizer(self.map, matching).loops(descriptors, apart, drive, progress)
+
+    def loop_acceptance(self, drive: bool) -> Acceptance:
+        """Which answers of `loops` are accepted: as of single queries, else those that a drive finds likely."""
+        own = self.acceptance()
+        return self.acceptance(PlaceSmoother()) if drive and not own.given else own
+
     def scores_in(self, order: Tensor) -> Scoring:
         """The scores of a map whose places are the frames `order`, frame by frame."""
         device = self.map.device

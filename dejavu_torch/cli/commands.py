@@ -176,6 +176,7 @@ def run_localize(
     out: Path,
     acceptance: options.Acceptance,
     top: int | None = None,
+    loops: int | None = None,
     pairs: Path | None = None,
     corners: list[list[float]] | None = None,
     sequences: options.Sequences,
@@ -193,6 +194,8 @@ def run_localize(
         out: csv of query,place,score,accepted[,probability],confidence[,rank][,route],query_name,place_name
         top: write this many places per query, no two within 5 of each other, each in a row with its rank; a
             probability is that of the first
+        loops: find where a drive comes back to places it has passed, if the map was learned from it: this
+            many frames before each, and those after it, are no answers
         pairs: also write lines `query_name place_name` for hloc and COLMAP, one per place
         corners: where this camera sees the patch of ground that the map's --velocity.corners describe
         cluster: divide the map among Ray workers, as in `dejavu learn`; for single queries only
@@ -236,7 +239,14 @@ def run_localize(
     chosen = model.matching(matcher).acceptance
     smooths = isinstance(matcher, PlaceSmoother)
     centre = (smooths or matcher is None) and ordering.centring(ordered, len(query))
-    matches = model.matches(query, True, matcher, None, top, SUPPRESSION, centre)
+    if loops is not None:
+        given = {"top": top, "cluster": cluster, "match": sequences.way not in (None, "drive", "single")}
+        options.refuse_with(f"--loops {loops}", **given)
+        chosen = model.loop_acceptance(smooths)
+        matches = iter([model.loops(query, loops, smooths, True)])
+        matcher = None
+    else:
+        matches = model.matches(query, True, matcher, None, top, SUPPRESSION, centre)
     if top is not None:
         matches = (part.map(Tensor.flatten) for part in matches)
     counts: Counter[str] = Counter()
@@ -410,6 +420,7 @@ def run_evaluate(
     route: str | None = None,
     recall_values: Sequence[int] = (),
     higher_is_better: bool = False,
+    loops: int | None = None,
     command: str,
 ) -> None:
     """Evaluate the matches of any method from a csv: scores, curve, coverage.
@@ -428,13 +439,14 @@ def run_evaluate(
         recall_values: also print the share of queries with a right answer among their first N ranks, for each
             N, such as 1 5 10 20; with --tolerance 0 these are the figures of VPR-methods-evaluation
         higher_is_better: the scores are similarities, not distances
+        loops: as in localize: only places over this many frames before a query are right
     """
     from dejavu_torch.evaluation.evaluate import evaluate_file
     from dejavu_torch.evaluation.report import report_folder, write_report
 
     first, second = (None if source is None else open_source(source) for source in (reference, query))
     _check_report_folder(out, (), [reference, query], [matches, truth, map])
-    given = first, second, map, route, recall_values, higher_is_better
+    given = first, second, map, route, recall_values, higher_is_better, loops
     result = evaluate_file(matches, truth, tolerance, interpolate, *given)
     with report_folder(out) as folder:
         title = f"{matches} evaluated by {truth}"

@@ -98,9 +98,7 @@ def follow(
                     raise
                 tell(localizer.finish())
                 if page is not None and not is_stream(source):
-                    _log(f"that was the last frame; the page stays at {page.url} until Ctrl-C")
-                    while True:
-                        time.sleep(3600)
+                    _stay(page.url)
         finally:
             if count:
                 p50, p99 = percentiles(recent)
@@ -108,6 +106,12 @@ def follow(
                 acceptance = model.acceptance(sequence)
                 default = "" if acceptance.given else f"; {acceptance}"
                 _log(f"{count} frames, {reader.dropped} dropped; {times}{default}")
+
+
+def _stay(url: str) -> None:
+    _log(f"that was the last frame; the page stays at {url} until Ctrl-C")
+    while True:
+        time.sleep(3600)
 
 
 def frames_from(

@@ -187,6 +187,14 @@ def near_truth(reference: Tensor, query: Tensor, radius: float) -> Tensor:
     return padded(rows)
 
 
+def of_loops(truth: GroundTruth, queries: Tensor, apart: int) -> GroundTruth:
+    """A ground truth (Q,R) of which only places over `apart` frames before the query (Q,) are right."""
+    positives = torch.where(truth.positives < queries[:, None] - apart, truth.positives, -1)
+    if not (positives >= 0).any():
+        raise InputError(f"no query comes back to a place over {apart} frames before; expected loops")
+    return truth._replace(positives=positives)
+
+
 def is_right(index: Tensor, truth: Tensor, tolerance: int) -> Tensor:
     """Whether each reported place is within the tolerance of any of its correct places.
 

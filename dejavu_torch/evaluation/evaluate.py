@@ -21,6 +21,7 @@ from dejavu_torch.data.ground_truth import (
     find_ground_truth,
     ground_truth_in_places,
     is_right,
+    of_loops,
     offset_of,
 )
 from dejavu_torch.data.positions import unit_of
@@ -66,6 +67,7 @@ def evaluate_file(
     route: str | None = None,
     recall_values: Sequence[int] = (),
     higher_is_better: bool = False,
+    loops: int | None = None,
 ) -> Evaluation:
     """Scores and pictures of the matches in a csv.
 
@@ -82,6 +84,7 @@ def evaluate_file(
             wrong.
         recall_values: see `recall_over_all`; each at most the ranks of a query.
         higher_is_better: the scores are similarities.
+        loops: see `DejaVu.loops`; only places this many frames before a query can be right.
 
     Raises:
         InputError: matches, ground truth or map that cannot be read, do not fit each other, or leave no query
@@ -112,6 +115,7 @@ def evaluate_file(
     known = find_ground_truth(truth, reference, query, frames, queries, interpolate, resampled)
     if known is None:
         raise InputError("there is no ground truth; expected one, or traverses that carry positions")
+    known = known if loops is None else of_loops(known, queries, loops)
     carried = all(traverse is not None and traverse.places is not None for traverse in (reference, query))
     alone = answer_facts(match, queries, tolerance, True, offset_of(truth, carried))
     if place_map is not None:

@@ -141,7 +141,12 @@ class Descriptor(nn.Module):
             progress: show a bar on stderr, or lines if it is no terminal. verb: its name.
             on_first: called with the first batch of frames and its features.
         """
-        return map(self.whitened, self.features_in(traverse, progress, verb, on_first))
+        for features in self.features_in(traverse, progress, verb, on_first):
+            descriptors = self.whitened(features)
+            if not descriptors.isfinite().all():
+                seen = f"the whitening makes NaN or infinity of the features of {traverse.name}"
+                raise InputError(f"{seen}; expected a map of such frames")
+            yield descriptors
 
     def all_of(self, traverse: Traverse, progress: bool = False, on_first: OnFirst | None = None) -> Tensor:
         """Descriptors (N,K) of a whole traverse; many are kept in a temporary file, see `concatenate`."""

@@ -20,7 +20,7 @@ from dejavu_torch.recognition.large import Tiles
 from dejavu_torch.recognition.search import SCORES_AT_ONCE, NmsSpec, Scan, Search, Searcher, num_needed
 from dejavu_torch.recognition.select import Acceptance, accept, best_candidates, best_match
 from dejavu_torch.recognition.sequence import SequenceMatcher
-from dejavu_torch.recognition.smoother import PlaceSmoother, Rows
+from dejavu_torch.recognition.smoother import LoopSmoother, PlaceSmoother, Rows
 from dejavu_torch.text import with_progress
 from dejavu_torch.types import Match, SequenceModel, Together
 
@@ -133,6 +133,26 @@ class Localizer:
         if acceptance.threshold is not None and not smoother.is_drive:  # whose scores are distances
             acceptance = Acceptance(precision=math.exp(-acceptance.threshold))
         return self._accepted(match, acceptance)
+
+    def loops(self, descriptors: Tensor, apart: int, drive: bool = True, progress: bool = False) -> Match:
+        """Match the places of a map, as queries (N,K), to places passed over `apart` places before. With
+        `drive`, an answer is only as probable as the whole drive says, too: look-alikes seldom last."""
+        place_map = self.place_map
+        assert place_map is not None
+
+        @torch.no_grad()
+        def rows(numbers: Tensor) -> Tensor:
+            scores = place_map.scores(descriptors[numbers].to(place_map.device))
+            earlier = torch.arange(scores.shape[1])[None] < numbers[:, None] - apart
+            return scores.masked_fill(~earlier.to(scores.device), math.inf)
+
+        if not drive:
+            parts = torch.arange(len(descriptors)).split(max(1, SCORES_AT_ONCE // place_map.places))
+            return Match.joined(
+                self.match(rows(part)) for part in with_progress(parts, "localizing", progress)
+            )
+        asked = self.asked(descriptors, LoopSmoother())._replace(rows=rows, single=None, tiles=None)
+        return self._accepted(localize_drive(asked, progress))
 
     def asked(self, descriptors: Tensor, smoother: PlaceSmoother, score: Scoring | None = None) -> DriveQuery:
         """What `drive` matches."""

@@ -258,6 +258,18 @@ def test_phase_means_are_the_spectrum_at_the_harmonics_of_the_period() -> None:
 
 
 @pytest.mark.usefixtures("way")
+def test_a_place_without_a_descriptor_scores_cosine_0() -> None:
+    tiny = torch.full((1, 4), 1e-12)
+    descriptors = torch.cat([torch.eye(4)[[0, 1]], tiny, -torch.eye(4)[[0, 1]]]).repeat(20, 1)
+    learned = SpectralMapper(None, step=3e-7)(descriptors)
+    assert learned.summary().covered == 80
+    queries = torch.randn(3, 4, requires_grad=True)
+    scores = learned.scores(queries)
+    assert torch.equal(scores[:, 2::5], torch.ones(3, 20))
+    (gradient,) = torch.autograd.grad(scores[:, 2::5].sum(), queries)
+    assert torch.equal(gradient, torch.zeros(3, 4))
+
+
 def test_a_place_without_a_descriptor_is_never_found() -> None:
     descriptors = torch.cat([torch.eye(4)[[0, 1]], torch.zeros(1, 4), -torch.eye(4)[[0, 1]]]).repeat(20, 1)
     learned = SpectralMapper(None, step=3e-7)(descriptors)

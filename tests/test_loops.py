@@ -1,0 +1,106 @@
+"""Loops within one drive: what may answer, which truth counts, and real drives with and without."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from command_line import fails, report_of, run
+from helpers import refused
+
+from dejavu_torch import DejaVu, open_source
+from dejavu_torch.data.ground_truth import as_ground_truth, of_loops
+
+
+def twice(length: int = 120) -> torch.Tensor:
+    """A drive over `length` places, and over the same again, with other noise."""
+    places = F.normalize(torch.randn(length, 16), dim=1)
+    return F.normalize(torch.cat([places, places]) + 0.05 * torch.randn(2 * length, 16), dim=1)
+
+
+@pytest.mark.parametrize("drive", [False, True])
+def test_a_second_lap_finds_the_first(drive: bool) -> None:
+    rows = twice()
+    match = DejaVu(whitening="none").learn(rows).loops(rows, 30, drive)
+    assert len(match) == 240
+    assert (match.index[:31] == -1).all()
+    assert not match.accepted[:31].any()
+    assert ((match.index < torch.arange(240) - 30) | (match.index < 0)).all()
+    assert torch.equal(match.index[120:], torch.arange(120))
+    if drive:
+        assert match.accepted[130:230].all()
+        assert not match.accepted[:120].any()
+
+
+def test_what_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = twice()
+    model = DejaVu(whitening="none").learn(rows)
+    with refused("100 places, the map 240", "learned from"):
+        model.loops(rows[:100])
+    for apart in (0, 240):
+        with refused(f"loops: {apart}", "from 1 to 239"):
+            model.loops(rows, apart)
+    model.save(tmp_path / "m.safetensors")
+    np.save(tmp_path / "d.npy", rows.numpy())
+    words = (
+        "localize",
+        tmp_path / "m.safetensors",
+        tmp_path / "d.npy",
+        "--loops",
+        30,
+        "--out",
+        tmp_path / "m.csv",
+    )
+    for option in ("--top 3", "--match filter"):
+        assert f"--loops 30 and {option.split()[0]}" in fails(capsys, *words, *option.split())
+
+
+def test_only_earlier_places_are_right() -> None:
+    truth = as_ground_truth([[0, 1, 90], [5], [], [88]])
+    queries = torch.tensor([60, 6, 2, 100])
+    assert of_loops(truth, queries, 20).positives.tolist() == [[0, 1, -1], [-1] * 3, [-1] * 3, [-1] * 3]
+    with refused("over 70 frames before"):
+        of_loops(truth, queries, 70)
+
+
+def test_the_commands_find_and_score_loops(tmp_path: Path) -> None:
+    drive, where = tmp_path / "d.npy", tmp_path / "d.csv"
+    np.save(drive, twice().numpy())
+    where.write_text("x,y\n" + "\n".join(f"{i % 120},0" for i in range(240)))
+    run("learn", drive, "--map", tmp_path / "m.safetensors", "--calibration", "none")
+    run(
+        "localize", tmp_path / "m.safetensors", drive, "--loops", 30, "--ordered", "--out", tmp_path / "m.csv"
+    )
+    pairs = [row for row in csv.DictReader((tmp_path / "m.csv").open()) if row["accepted"] == "1"]
+    assert {int(row["query"]) - int(row["place"]) for row in pairs} == {120}
+    source = f"{drive}?coordinates={where}"
+    words = ("--truth", "metres:.5", "--tolerance", 0, "--reference", source, "--query", source)
+    run("evaluate", tmp_path / "m.csv", *words, "--loops", 30, "--out", tmp_path / "scores")
+    report = report_of(tmp_path / "scores")
+    assert report["with_answer"] == 120
+    assert report["recall_at_1"] == 1
+    assert report["accepted_right"] == report["accepted"] == len(pairs)
+
+
+def test_real_drives_with_and_without_loops(data_dir: Path) -> None:
+    """Four laps of a small car on a track of 390 frames; a road in a city, driven once."""
+    laps = open_source(data_dir / "rc_car_laps" / "frames")
+    match = DejaVu().learn(laps).calibrate(laps).loops(laps, 50)
+    found = match.accepted.nonzero()[:, 0]
+    starts = torch.tensor([194, 590, 982, 1356, 1750.0])
+    judged = found[(found >= 590) & (match.index[found] >= 194)]
+
+    def around(frames: torch.Tensor) -> torch.Tensor:
+        lap = torch.searchsorted(starts, frames.float(), right=True) - 1
+        return (frames - starts[lap]) / (starts[lap + 1] - starts[lap])
+
+    off = ((around(judged) - around(match.index[judged]) + 0.5) % 1 - 0.5).abs()
+    assert len(judged) > 120
+    assert float((off < 0.1).double().mean()) > 0.98
+    once = open_source(data_dir / "robotcar" / "t1" / "reference.npy")
+    match = DejaVu().learn(once).calibrate(once).loops(once, 50)
+    assert int(match.accepted.sum()) == 0
