@@ -439,7 +439,7 @@ class DejaVu(nn.Module):
         return Localizer(self.map, matching).loops(descriptors, apart, drive, progress)
 
     def loop_acceptance(self, drive: bool) -> Acceptance:
-        """Which answers of `loops` are accepted: as of single queries, else those that a drive finds likely."""
+        """Which answers of `loops` are accepted: as of single queries, else those a drive finds likely."""
         own = self.acceptance()
         return self.acceptance(PlaceSmoother()) if drive and not own.given else own
 

@@ -200,7 +200,7 @@ def compare(
         **_match_facts(run, found, truth, interpolate, off_map),
         "centred": centring,
         **_metric_facts(run, truth),
-        "standing": 0 if isinstance(reference, ResampledTraverse) else count_standing(run.reference_features),
+        **_standing_facts(run),
         **({"second": second.placed_facts()} if second is not None and second.placed else {}),
         **{name: dict(picture.numbers) for name, picture in pictures.items() if picture.numbers},
     }
@@ -437,6 +437,14 @@ def _metric_facts(run: Localization, truth: Truth | None) -> dict[str, Any]:
             quantiles = distance[chosen].quantile(torch.tensor(QUANTILES, dtype=torch.float64)).tolist()
             facts[name] = {f"{share:g}": round(at, 3) for share, at in zip(QUANTILES, quantiles, strict=True)}
     return {"error_metres": facts}
+
+
+def _standing_facts(run: Localization) -> dict[str, int]:
+    """The entry `standing` of report.json: places where the camera stands, if there are some."""
+    if isinstance(run.reference, ResampledTraverse):
+        return {}
+    count = count_standing(run.reference_features)
+    return {"standing": count} if count else {}
 
 
 def count_standing(descriptors: Tensor) -> int:
