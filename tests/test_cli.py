@@ -67,6 +67,17 @@ def test_one_damaged_image_does_not_stop_the_others(
     assert sum(row["accepted"] == "1" for row in rows) > 80
 
 
+def test_wide_descriptors_are_told_to_be_reduced_not_whitened(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    np.save(tmp_path / "wide.npy", np.random.default_rng(0).normal(size=(120, 300)).astype(np.float32))
+    run("learn", tmp_path / "wide.npy", "--whitening", "none", "--map", tmp_path / "m.safetensors")
+    run("info", tmp_path / "m.safetensors")
+    told = capsys.readouterr().out
+    assert told.count("descriptors of 300 dimensions are reduced to ") == 2
+    assert "Whitening, " not in told
+
+
 @pytest.mark.parametrize(
     ("words", "hint"),
     [

@@ -765,7 +765,11 @@ def print_map(model: DejaVu) -> None:
     whitening = model.whitening
     if whitening is not None:
         sizes = " + ".join(map(str, whitening.sizes))
-        print(f"Whitening, {sizes} to {len(whitening.scale)} dimensions: {whitening.extra_repr()}")
+        numbers = len(whitening.scale)
+        if whitening.views == 0:
+            print(f"descriptors of {sizes} dimensions are reduced to {numbers} by principal components")
+        else:
+            print(f"Whitening, {sizes} to {numbers} dimensions: {whitening.extra_repr()}")
 
 
 def _print_localize(map: Path, model: DejaVu, command: str, query: str = "QUERY", lead: str = "next") -> None:
