@@ -311,9 +311,8 @@ def calibration_of(
         segments = augmented_segments(reference, *sizes, span=descriptor.preprocess.span)
         views = LabelledFrames(cast(Traverse, segments), places[segments.places])
     observation_counts(views, place_map.places)  # refuses what does not fit
-    views = views.renumbered(
-        torch.where(place_map.visit_counts > 0, torch.arange(place_map.places), -1).cpu()
-    )
+    counts = place_map.visit_counts.cpu()
+    views = views.renumbered(torch.where(counts > 0, torch.arange(place_map.places), -1))
     another = not isinstance(views.traverse, AugmentedFrames)
     if isinstance(views.traverse, AugmentedFrames):
         length = views.traverse.block
@@ -326,7 +325,7 @@ def calibration_of(
     own = None
     if reference is not None and isinstance(place_map, SpectralMap):
         drawn = evenly_spaced(len(places), 1, min(OWN, len(places)))
-        drawn = drawn[(places[drawn] >= 0) & (place_map.visit_counts.cpu()[places[drawn]] > 0)]
+        drawn = drawn[(places[drawn] >= 0) & (counts[places[drawn]] > 0)]
         rows = descriptor.batches(Part(reference, drawn), progress, "calibrating")
         own = (concatenate(rows), places[drawn]) if len(drawn) else None
     try:

@@ -60,7 +60,7 @@ def test_one_damaged_image_does_not_stop_the_others(
     words = ("localize", small_map, folder, "--unordered", "--out", tmp_path / "m.csv")
     assert damaged.name in fails(capsys, *words)
     run(*words, "--skip_damaged")
-    assert f"1 frames could not be read, such as 40: {damaged}" in capsys.readouterr().out
+    assert f"1 frame could not be read, such as 40: {damaged}" in capsys.readouterr().out
     rows = list(csv.DictReader((tmp_path / "m.csv").open()))
     assert len(rows) == 96
     assert rows[40]["accepted"] == "0"

@@ -270,7 +270,8 @@ def run_localize(
     if isinstance(matcher, PlaceSmoother) and not matcher.is_drive:
         print(NO_DRIVE)
     if damaged:
-        print(f"{len(damaged)} frames could not be read, such as {min(damaged)}: {damaged[min(damaged)]}")
+        one, many = min(damaged), len(damaged)
+        print(f"{many} frame{'s' * (many > 1)} could not be read, such as {one}: {damaged[one]}")
     _say(f"{total} queries, {accepted} accepted; written to {out}")
     if counts:
         steps = next_steps(matcher is not None, chosen.given)

@@ -130,11 +130,14 @@ def check_not_read(out: Path, *sources: str | Path | None) -> None:
     """Refuse an output that would overwrite an input, such as an image of a folder or the names of an array;
     sources may be any text."""
     for source in filter(None, sources):
-        path = Path(_split(str(source))[0].removeprefix("strip:"))
-        read = False
+        address, query = _split(str(source))
+        path, read = Path(address.removeprefix("strip:")), False
+        beside = [Path(file) for name, file in parse_qsl(query) if name in ("coordinates", "mask")]
         with suppress(OSError, ValueError, RuntimeError):  # missing, not a valid path, or a link to itself
             names = [path.with_suffix(".txt")] if path.suffix.lower() == ".npy" else []
-            read = any(out.resolve() == file.resolve() for file in (path, *names)) or out.samefile(path)
+            read = any(out.resolve() == file.resolve() for file in (path, *names, *beside)) or out.samefile(
+                path
+            )
             read = read or (out.suffix.lower() in IMAGE_SUFFIXES and out.parent.samefile(path))
         if read:
             raise InputError(f"{out} is an input; expected another name for the output")

@@ -264,13 +264,13 @@ class Descriptor(nn.Module):
 
     @contextmanager
     def unchanged_by_errors(self) -> Iterator[None]:
-        """Restores the whitening and the range if the block raises."""
-        own_range = self.preprocess.range
+        """Restores the whitening and what the preprocessing adapts if the block raises."""
+        adapted = self.preprocess.range, self.preprocess.blank
         before = self.whitening, self.reduces, None if self.whitening is None else self.whitening.state_dict()
         try:
             yield
         except BaseException:
-            self.preprocess.range = own_range
+            self.preprocess.range, self.preprocess.blank = adapted
             self.whitening, self.reduces, state = before
             if self.whitening is not None and state is not None:
                 self.whitening.load_state_dict(state)

@@ -73,7 +73,8 @@ class LabelledFrames(NamedTuple):
 
     def renumbered(self, number: Tensor) -> LabelledFrames:
         """The same frames, with a new number (N,) int64 of each place, -1 for places to skip."""
-        return self._replace(places=torch.where(self.places >= 0, number[self.places.cpu()], -1))
+        places = torch.where(self.places >= 0, number.to(self.places.device)[self.places], -1)
+        return self._replace(places=places)
 
     def placed_lines(self) -> Iterator[str]:
         """What is said of each drive that a smoother has placed."""

@@ -565,10 +565,8 @@ class SpectralMap(PlaceMap):
         route = {part: packed[name].nbytes for name, part in names.items() if name in packed}
         route = {name: size for name, size in route.items() if size}
         route["chunks"] = sum(tensor.nbytes for name, tensor in packed.items() if name not in names)
-        covered, fixed = (
-            int(((self.norms > 0) & self.norms.isfinite()).sum()),
-            {"stage": stage} if stage else {},
-        )
+        covered = int(((self.norms > 0) & self.norms.isfinite()).sum())
+        fixed = {"stage": stage} if stage else {}
         return MapSummary(self.kind, self.places, covered, 0, 0, tuple(chunks), route, fixed, len(self.level))
 
     def _periods(self, chunk: int) -> tuple[Fraction, ...]:

@@ -15,6 +15,7 @@ from dejavu_torch import compare, open_source
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.coordinates import coordinates_of, read_coordinates
 from dejavu_torch.data.ground_truth import find_ground_truth
+from dejavu_torch.data.source import check_not_read
 from dejavu_torch.data.traverse import Chain, Part
 from dejavu_torch.evaluation.compare import count_standing
 from dejavu_torch.types import Traverse
@@ -125,6 +126,12 @@ def test_parts_and_chains_keep_coordinates(tmp_path: Path) -> None:
     truth = find_ground_truth("metres:1", whole, part, 9, 3)
     assert truth is not None
     assert truth.positives.tolist() == [[2, 3, 4], [4, 5, 6], [6, 7, 8]]
+
+
+def test_a_file_of_coordinates_is_never_an_output(tmp_path: Path) -> None:
+    for name in ("coordinates", "mask"):
+        with refused("w.csv is an input"):
+            check_not_read(tmp_path / "w.csv", f"{tmp_path}/a?start=3&{name}={tmp_path}/w.csv")
 
 
 def test_a_report_tells_errors_in_metres(tmp_path: Path) -> None:
