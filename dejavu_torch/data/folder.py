@@ -28,6 +28,9 @@ from dejavu_torch.types import InputError, Traverse
 log = logging.getLogger("dejavu_torch")
 
 NATURAL, LEXICOGRAPHIC = "natural", "lexicographic"  # orders of names
+TIME = "time"  # order of photos by when they were taken
+DRAWN, TIMELESS = 100, 3  # images whose times are compared with their names; first ones without that end it
+EXIF, TAKEN, FRACTION = 0x8769, 36867, 37521  # the block of EXIF, DateTimeOriginal, SubSecTimeOriginal
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"}
 MAX_IMAGE_PIXELS = 2**28  # enough for a long strip; a small file can claim any number
 ROUNDING = 1e-3  # by which a value may lie outside [0, 1]
@@ -49,8 +52,8 @@ class ImageFolder(Traverse):
 
     Args:
         width, height: pixels to resize to, antialiased; 0 for both keeps the size, for one the aspect ratio.
-        order: "natural", as above, or "lexicographic", by text (10 before 9); "" is natural with a warning
-            if the two differ.
+        order: "natural", as above, "lexicographic", by text (10 before 9), or "time", by when photos were
+            taken, of EXIF; "" is natural with a warning if another differs.
         glob: only images whose names match it, such as "*.color.png"; "" is all.
         recursive: images in folders inside too, named by their path from here.
 
@@ -78,7 +81,11 @@ class ImageFolder(Traverse):
         suffixes = readable(file.suffix.lower() for file in seen)
         images = [file for file in seen if file.suffix.lower() in suffixes]
         images = [file for file in images if not glob or fnmatch(names[file], glob)]
-        self.names = sort_names([names[file] for file in images if file.is_file()], order, printable(folder))
+        kept = [names[file] for file in images if file.is_file()]
+        if order == TIME:
+            self.names = _by_time(folder, sort_names(kept, NATURAL, printable(folder)))
+        else:
+            self.names = sort_names(kept, order, printable(folder))
         left = left_out([file for file in seen if not (recursive and file.is_dir())], suffixes)
         if not self.names:
             folders = sorted((file.name for file in inside if file.is_dir()), key=natural)
@@ -89,7 +96,9 @@ class ImageFolder(Traverse):
             _warn_left_out(printable(folder), left)
         self.width, self.height, self.sized = width, height, bool(width or height)
         self.path, self.name = folder, printable(folder)
-        self.ordered = numbers_increase(self.names)
+        self.ordered = order == TIME or numbers_increase(self.names)
+        if not order:
+            _warn_time(folder, self.names)
         self.same_aspect = False  # whether to refuse images of another aspect ratio, such as portraits
         self._first: tuple[str, str, tuple[int, int]] | None = None  # image read: name, shape, original size
         self._channels: int | None = None  # of the first image
@@ -187,6 +196,43 @@ def _warn_left_out(source: str, left: str) -> None:
 def _warn_channels(source: str, channels: int) -> None:
     seen = "grey images are read as colour" if channels == 1 else "images in colour are read as grey"
     log.warning("%s: %s, as the first image is", source, seen)
+
+
+def taken(file: Path) -> str:
+    """When a photo was taken, as text that sorts by time; "" if its EXIF does not say."""
+    with suppress(Exception), Image.open(file, formats=formats()) as opened:  # decoders raise anything
+        block = opened.getexif().get_ifd(EXIF)
+        if time := str(block.get(TAKEN, "")).strip(" \0"):
+            return f"{time}.{block.get(FRACTION, '')}"
+    return ""
+
+
+def _by_time(folder: Path, names: list[str]) -> list[str]:
+    times = {name: taken(folder / name) for name in names}
+    timeless = [name for name in names if not times[name]]
+    if timeless:
+        seen = f"{printable(folder)}: {len(timeless)} of {len(names)} images, such as {timeless[0]}"
+        raise InputError(f"{seen}, do not tell when they were taken; expected order=natural")
+    return sorted(names, key=times.__getitem__)
+
+
+def _warn_time(folder: Path, names: Sequence[str]) -> None:
+    """Tell of photos whose names are in another order than they were taken, as after DSC_9999."""
+    drawn = [names[i * (len(names) - 1) // max(1, DRAWN - 1)] for i in range(DRAWN)] if names else []
+    known: list[tuple[str, str]] = []
+    for seen, name in enumerate(dict.fromkeys(drawn)):
+        if seen == TIMELESS and not known:
+            return
+        known += [(time, name)] if (time := taken(folder / name)) else []
+    for (before, one), (after, two) in pairwise(known):
+        if after < before:
+            _warn_taken(printable(folder), f"{one} was taken after {two}")
+            return
+
+
+@cache
+def _warn_taken(source: str, example: str) -> None:
+    log.warning("%s is in the order of its names, but %s; ?order=%s follows the times", source, example, TIME)
 
 
 def check_size(path: Path, width: int, height: int) -> None:

@@ -326,6 +326,36 @@ def test_images_of_16_bits_that_use_few_of_them_are_told(
     assert Part(Chain([traverses["thermal"]]), range(1)).deep
 
 
+def photo(file: Path, time: str = "", fraction: str = "") -> None:
+    exif = Image.Exif()
+    if time:
+        exif.get_ifd(0x8769).update({36867: f"2026:05:03 {time}", 37521: fraction})
+    Image.new("L", (5, 4)).save(file, exif=exif)
+
+
+def test_photos_by_when_they_were_taken(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """A camera that counts to 9999 and goes on from 0."""
+    times = {"DSC_9998": "12:00:01", "DSC_9999": "12:00:02", "DSC_0000": "12:00:03", "DSC_0001": "12:00:03"}
+    (tmp_path / "a").mkdir()
+    for name, time in times.items():
+        photo(tmp_path / "a" / f"{name}.jpg", time, {"DSC_0000": "25", "DSC_0001": "3"}.get(name, ""))
+    plain = ImageFolder(tmp_path / "a")
+    assert [*plain.names] == [f"DSC_{n}.jpg" for n in ("0000", "0001", "9998", "9999")]
+    (line,) = caplog.messages
+    assert "DSC_0001.jpg was taken after DSC_9998.jpg; ?order=time" in line
+    by_time = ImageFolder(tmp_path / "a", order="time")
+    assert [*by_time.names] == [f"{name}.jpg" for name in times]
+    assert by_time.ordered
+    photo(tmp_path / "a" / "DSC_0002.jpg")
+    with refused("1 of 5 images, such as DSC_0002.jpg", "order=natural"):
+        ImageFolder(tmp_path / "a", order="time")
+    (tmp_path / "b").mkdir()
+    for i in range(3):
+        photo(tmp_path / "b" / f"{i}.jpg", f"12:00:0{i}")
+    ImageFolder(tmp_path / "b")
+    assert caplog.messages == [line]
+
+
 def test_some_images_and_those_in_folders_inside(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     for name in ("cam0", "cam1", ".thumbs"):
         (tmp_path / name).mkdir()
