@@ -227,6 +227,8 @@ class DejaVu(nn.Module):
                 key = checkpoint and model_file.run_key(self, traverse, second, visits)
                 if not (checkpoint and key and checkpoint.open(key, place_map, descriptor)):
                     place_map = learning.fit(mapper, descriptor, traverse, second, visits, progress)
+                else:
+                    descriptor.adapt(traverse, resumed=True)
                 settings = visits, progress, checkpoint, map_tasks
                 learning.append_places(place_map, descriptor, traverse, 0, *settings)
                 learned: PlaceMap = place_map

@@ -182,6 +182,7 @@ class Descriptor(nn.Module):
             self._warn_of_narrow(frames, traverse)
             check_alone(self, self.describe, frames, features, traverse.name)
 
+        again = traverse, second, progress, spectral, verb
         with self.unchanged_by_errors():
             self.adapt(traverse)
             self.reduce_if_wide(traverse, spectral)
@@ -189,6 +190,8 @@ class Descriptor(nn.Module):
             if whitening is not None and not whitening.fixed:
                 if not (spectral and self._exceeds_memory(traverse)):
                     features = concatenate(self.features_in(traverse, progress, verb, check_first))
+                    if self._mostly_blank(features, traverse):
+                        return self.learn(*again)
                     self._learn_whitening(whitening, features, traverse, second, progress)
                     parts = features.split(ROWS)
                     return concatenate(self.whitened(part.to(self.device)) for part in parts)
@@ -196,13 +199,23 @@ class Descriptor(nn.Module):
                 views = second and sample.views(second)
                 self.learn(Part(traverse, sample.frame), views, progress, verb="sampling")
             storage = (DESCRIPTOR_MEMORY, self.whitening is not None) if spectral else ()
-            return concatenate(self.batches(traverse, progress, verb, check_first), *storage)
+            rows = concatenate(self.batches(traverse, progress, verb, check_first), *storage)
+            return self.learn(*again) if self._mostly_blank(rows, traverse) else rows
 
-    def adapt(self, traverse: Traverse) -> None:
-        """Measure a range that is "auto" on 32 frames of a reference, evenly drawn. If most of them count as
-        blank, as where values have another unit, none does."""
+    def _mostly_blank(self, rows: Tensor, traverse: Traverse) -> bool:
+        """Whether most frames count as blank, as where values have another unit; from then on none does."""
+        if is_ready(traverse) or self.preprocess.blank != BLANK or 2 * int(rows.any(1).sum()) >= len(rows):
+            return False
+        self.preprocess.blank = 0.0
+        if self.known is not None:
+            self.known.clear()
+        return True
+
+    def adapt(self, traverse: Traverse, resumed: bool = False) -> None:
+        """Measure a range that is "auto" on 32 frames of a reference, evenly drawn; for a run that is
+        resumed, also whether most count as blank, which the run before has found."""
         own = self.preprocess
-        if is_ready(traverse) or not (own.range == "auto" or own.blank == BLANK):
+        if is_ready(traverse) or not (own.range == "auto" or (resumed and own.blank == BLANK)):
             return
         drawn = torch.linspace(0, len(traverse) - 1, min(DRAWN, len(traverse))).round().long()
         frames = [traverse[i] for i in drawn]
@@ -210,7 +223,7 @@ class Descriptor(nn.Module):
             own.range = low, high = measured_range(frames)
             known = f"{round(DEEP * low)} to {round(DEEP * high)} of {DEEP}" if traverse.deep else ""
             log.warning("%s: values from %s are used", traverse.name, known or f"{low:.3g} to {high:.3g}")
-        if 2 * sum(bool(own.shows(frame[None])) for frame in frames) < len(frames):
+        if resumed and 2 * sum(bool(own.shows(frame[None])) for frame in frames) < len(frames):
             own.blank = 0.0
 
     def reduce_if_wide(self, traverse: Traverse, spectral: bool = True) -> None:

@@ -207,6 +207,15 @@ def test_covered_frames_are_never_found_and_find_nothing() -> None:
         assert not match.accepted[covered].any()
 
 
+def test_frames_that_are_all_of_little_contrast_are_none_of_them_covered() -> None:
+    frames = 0.5 + torch.rand(60, 1, 24, 24) / 1000
+    for whitening in (Whitening(8), None):
+        model = DejaVu(HOG(), whitening, SpectralMapper()).learn(frames)
+        assert model.preprocess.blank == 0
+        assert model.map.summary().covered == 60
+        assert torch.equal(model.localize(frames, sequence=None).index, torch.arange(60))
+
+
 def applied(frames: Tensor, **choice: Any) -> Tensor:
     return Preprocess(**choice)(frames)
 
