@@ -119,7 +119,7 @@ def learn_mean(
             fit.
 
     Example:
-        >>> wave = torch.sin(torch.arange(200.0)[:, None] * torch.tensor([0.1, 0.23, 0.37]))
+        >>> wave = torch.cos(torch.arange(200.0)[:, None] * torch.tensor([0.1, 0.23, 0.37]))
         >>> again = LabelledFrames(as_traverse(wave[50:] + 0.1), torch.arange(50, 200))
         >>> learn_mean(DejaVu(whitening="none"), wave, again).map.visits
         tensor([[ 50,   1],

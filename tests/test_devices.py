@@ -231,8 +231,8 @@ def test_a_map_calibrated_on_a_gpu_is_as_sure_as_that_of_the_cpu(device: str, vi
     assert expected is not None
     assert found is not None
     assert expected.single is not None
-    assert found.single == pytest.approx(expected.single, rel=1e-2)
-    assert found.filter == pytest.approx(expected.filter, rel=1e-2)
+    assert found.single[:2] == pytest.approx(expected.single[:2], rel=1e-2)
+    assert found.filter[:2] == pytest.approx(expected.filter[:2], rel=1e-2)
 
 
 @pytest.mark.parametrize("kind", models())

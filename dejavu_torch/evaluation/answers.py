@@ -84,7 +84,7 @@ def line_of(places: Tensor, queries: Tensor, within: int, min_answers: float = M
 
     Example:
         >>> line_of(torch.arange(40) + 7, torch.arange(40), within=5)
-        Line(offset=7, answers=40, confident=40)
+        Line(offset=7, answers=40, confident=40, backwards=False)
     """
     n = len(places)
     if n < min_answers:

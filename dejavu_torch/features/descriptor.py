@@ -84,11 +84,16 @@ class Descriptor(nn.Module):
 
     def describe(self, frames: Tensor) -> Tensor:
         """Preprocess, then features: (B,C,H,W) -> (B,D); 0 for frames that show nothing."""
-        features: Tensor = self.features(as_weights(self.preprocess(frames), self.features))
+        features = self.describe_all(frames)
         fits = isinstance(features, Tensor) and features.ndim == 2 and features.shape[0] == frames.shape[0]
         if self.preprocess.blank == 0 or not fits:
             return features
         return features * self.preprocess.shows(frames)[:, None].to(features)
+
+    def describe_all(self, frames: Tensor) -> Tensor:
+        """As `describe`, also of frames that show nothing."""
+        features: Tensor = self.features(as_weights(self.preprocess(frames), self.features))
+        return features
 
     def whitened(self, features: Tensor) -> Tensor:
         """Features (B,D) -> descriptors (B,K); 0 for features of 0."""
@@ -324,7 +329,8 @@ class Descriptor(nn.Module):
         if is_ready(traverse) or self.preprocess.contrast or self.preprocess.range or not traverse.deep:
             return
         low, high = (float(value) for value in frames.aminmax())
-        if high - low < NARROW:
+        if high - low < NARROW and (traverse.name, "narrow") not in self.warned:
+            self.warned.add((traverse.name, "narrow"))
             seen = f"values from {round(DEEP * low)} to {round(DEEP * high)} of {DEEP}"
             log.warning("%s has %s; --preprocess.range auto makes use of so few", traverse.name, seen)
 

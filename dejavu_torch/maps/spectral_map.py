@@ -219,8 +219,9 @@ class SpectralMap(PlaceMap):
             self.chunks.append((self.places, self.places + chunk.places))
             self._bounds.append(self._bounds[-1] + len(level))
             self.places += chunk.places
-        append("norms", *map(self._norms_of, range(len(self.chunks) - len(chunks), len(self.chunks))))
-        if not self.norms.isfinite().all():
+        norms = [*map(self._norms_of, range(len(self.chunks) - len(chunks), len(self.chunks)))]
+        append("norms", *norms)
+        if not all(bool(part.isfinite().all()) for part in norms):
             raise InputError("the map does not fit together: its descriptors are not finite")
         self._hide()
 

@@ -80,7 +80,7 @@ class Trainee(pl.LightningModule):
         """Descriptors of frames, without a code: (B,C,H,W) -> (B,K)."""
         embedding = coded(self.features)
         if embedding is None:
-            return self.dejavu.descriptor.describe(frames)
+            return self.dejavu.descriptor.describe_all(frames)
         return embedding.describe(self.dejavu.preprocess(frames))
 
     def scores(self, distances: Sequence[Tensor]) -> Tensor:

@@ -287,6 +287,9 @@ def test_a_place_without_a_descriptor_is_never_found() -> None:
         learned.between(0, 1),
     ):
         assert torch.equal(other.scores(queries), scores)
+    grown = SpectralMapper(None, step=3e-7, chunk=30)(descriptors)  # chunk after chunk
+    assert grown.visit_counts.tolist() == [1, 1, 0, 1, 1] * 20
+    assert grown.scores(queries)[:, 2::5].isinf().all()
     squared = SpectralMapper(None, step=3e-7, metric="l2")(descriptors)  # where 0 is a descriptor like any
     assert squared.scores(queries).isfinite().all()
     nothing = torch.zeros(2, 4, requires_grad=True)
