@@ -430,7 +430,9 @@ class DejaVu(nn.Module):
             InputError: another traverse than the map's, or `apart` out of range.
         """
         require_map(self)
-        traverse = self.resample(as_traverse(traverse), self.step, progress, self.frame_shape)
+        traverse = self.at_map_size(as_traverse(traverse), self.frame_shape or ())
+        if self.step is not None:
+            traverse = self.resample(traverse, self.step, progress, self.frame_shape)
         if len(traverse) != self.map.places:
             seen = f"{traverse.name} has {len(traverse)} places, the map {self.map.places}"
             raise InputError(f"{seen}; expected the traverse that the map was learned from")

@@ -36,6 +36,15 @@ def test_a_second_lap_finds_the_first(drive: bool) -> None:
         assert not match.accepted[:120].any()
 
 
+def test_a_blank_frame_comes_back_to_nothing() -> None:
+    rows = twice()
+    rows[[50, 170]] = 0
+    match = DejaVu(whitening="none").learn(rows).loops(rows, 30, drive=False)
+    assert match.index[170] == -1
+    assert not match.accepted[170]
+    assert not (match.index == 50).any()
+
+
 def test_what_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rows = twice()
     model = DejaVu(whitening="none").learn(rows)
@@ -55,8 +64,8 @@ def test_what_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
         "--out",
         tmp_path / "m.csv",
     )
-    for option in ("--top 3", "--match filter"):
-        assert f"--loops 30 and {option.split()[0]}" in fails(capsys, *words, *option.split())
+    for option in ("--top 3", "--match filter", "--centre mean"):
+        assert f"--loops 30 and {option}" in fails(capsys, *words, *option.split())
 
 
 def test_only_earlier_places_are_right() -> None:

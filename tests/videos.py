@@ -34,6 +34,7 @@ def clip(
     turn: int | None = None,
     options: dict[str, str] | None = None,
     base: Fraction = Fraction(1, 25),
+    aspect: Fraction | None = None,
 ) -> Path:
     """Write frames at 25 per second, or at the given multiples of the time base, `group` from one key frame
     to the next."""
@@ -42,6 +43,8 @@ def clip(
         stream.height, stream.width = frames.shape[1:3]
         stream.pix_fmt, stream.bit_rate = pixels, 4_000_000
         stream.codec_context.time_base = base
+        if aspect is not None:  # of a pixel
+            stream.codec_context.sample_aspect_ratio = aspect
         if bframes is not None:
             stream.codec_context.max_b_frames = bframes
         if group is not None:

@@ -224,15 +224,15 @@ def run_localize(
     acceptance.of(model)
     if top is not None:
         check_candidates(top, SUPPRESSION, model.map.places)
-    query, damaged = open_source(source), dict[int, str]()
-    query = Whole(query, damaged) if skip_damaged else query
-    query = model.at_map_size(query, model.frame_shape or ())
+    damaged: dict[int, str] = {}
+    query = Whole(open_source(source), damaged) if skip_damaged else open_source(source)
     if pairs is not None:
         check_pair_names(model.frame_names, f"the map {map}")
         check_pair_names(query.names, query.name)
+    query = model.at_map_size(query, model.frame_shape or ())
     if model.step is not None:
         query = model.resample(query, model.step, True, model.frame_shape)
-        _print_steps(query)
+    _print_steps(query)
     ordered = source_of(query).ordered if ordered is None else ordered
     if isinstance(matcher, str):
         matcher = PlaceSmoother(within=SUPPRESSION, threshold=acceptance.threshold) if ordered else None
@@ -240,7 +240,8 @@ def run_localize(
     smooths = isinstance(matcher, PlaceSmoother)
     centre = (smooths or matcher is None) and ordering.centring(ordered, len(query))
     if loops is not None:
-        given = {"top": top, "cluster": cluster, "match": sequences.way not in (None, "drive", "single")}
+        together = sequences.way not in (None, "drive", "single") and sequences.way
+        given = {"top": top, "cluster": cluster, "match": together, "centre": ordering.centre}
         options.refuse_with(f"--loops {loops}", **given)
         chosen = model.loop_acceptance(smooths)
         matches = iter([model.loops(query, loops, smooths, True)])

@@ -103,16 +103,15 @@ def read_coordinates(path: Path, traverse: Traverse) -> Coordinates:
     values = np.array([[_value(cells[column]) for column in columns] for _, cells in rows])
     if degrees and not (np.abs(np.nan_to_num(values)) <= (90, 180)).all():
         raise InputError(f"{path} has latitudes beyond 90 or longitudes beyond 180; expected degrees")
-    keys = None if key is None else [cells[key[0]] for _, cells in rows]
-    if keys is None:
+    if key is None:
         if len(values) != len(traverse):
             seen = f"{path} has {len(values)} rows, {traverse.name} {len(traverse)} frames"
             raise InputError(f"{seen}; expected as many, or a column name or time")
-    elif key is not None and key[1] == "name":
-        known = dict(zip(keys, values, strict=True))
+    elif key[1] == "name":
+        known = dict(zip((cells[key[0]] for _, cells in rows), values, strict=True))
         values = np.array([known.get(name, np.full(len(columns), math.nan)) for name in traverse.names])
     else:
-        values = _at_times(path, np.array([_value(one) for one in keys]), values, traverse)
+        values = _at_times(path, np.array([_value(cells[key[0]]) for _, cells in rows]), values, traverse)
     missing = int(np.isnan(values).any(1).sum()) if len(values) else len(traverse)
     if missing == len(traverse):
         raise InputError(f"{path} tells of no frame of {traverse.name}; expected its names or times")

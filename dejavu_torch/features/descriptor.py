@@ -357,7 +357,7 @@ def _pixels(traverse: Traverse) -> str:
     while isinstance(traverse, Part):
         traverse = traverse.traverse
     pixels = getattr(traverse, "pixels", 1)
-    return "" if pixels == 1 else f", whose pixels are {pixels.numerator}:{pixels.denominator}, not square,"
+    return "" if pixels == 1 else f" (its pixels are {pixels.numerator}:{pixels.denominator}, not square)"
 
 
 def is_ready(traverse: Traverse | AugmentedFrames | None) -> bool:

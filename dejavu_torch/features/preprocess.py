@@ -81,6 +81,12 @@ def range_of(given: Sequence[float] | str | None) -> tuple[float, float] | Liter
     return low, high
 
 
+def spread(values: Tensor, span: tuple[float, float]) -> Tensor:
+    """Values in a span (low, high) as values in [0, 1]; what lies outside becomes 0 or 1."""
+    low, high = span
+    return values if span == (0, 1) else ((values - low) / (high - low)).clamp(0, 1)
+
+
 def measured_range(frames: Sequence[Tensor]) -> tuple[float, float]:
     """The values between which all but .5 % of those of some frames lie at either end; at least one apart in
     16 bits."""
@@ -215,12 +221,10 @@ class Preprocess(nn.Module):
         return self.range if isinstance(self.range, tuple) else (0.0, 1.0)
 
     def forward(self, frames: Tensor) -> Tensor:
-        low, high = self.span
-        if self.channel is None and self.contrast is None and (low, high) == (0, 1):
+        if self.channel is None and self.contrast is None and self.span == (0, 1):
             return frames
         check_frames(frames, "preprocess got")
-        if (low, high) != (0, 1):
-            frames = ((frames - low) / (high - low)).clamp(0, 1)
+        frames = spread(frames, self.span)
         if self.channel is not None:
             frames = select_channel(frames, self.channel)
         if self.contrast == "patch":

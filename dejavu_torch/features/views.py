@@ -11,6 +11,7 @@ from torch import Tensor
 
 from dejavu_torch.data.traverse import Part, as_shape
 from dejavu_torch.features.augmentation import LARGEST, Augmentation
+from dejavu_torch.features.preprocess import spread
 from dejavu_torch.types import InputError, Traverse
 
 SAMPLE = 10_000  # frames that a longer route is fitted on
@@ -160,9 +161,7 @@ class AugmentedFrames:
         state = torch.Generator().manual_seed(self.seed).get_state()
         size = self.traverse.at_once(size)
         for block in (run[i : i + self.block] for run in self.runs for i in range(0, len(run), self.block)):
-            frames, (low, high) = self.traverse[block], self.span
-            if self.span != (0, 1):
-                frames = ((frames - low) / (high - low)).clamp(0, 1)
+            frames, (low, high) = spread(self.traverse[block], self.span), self.span
             for _ in range(self.copies):
                 with torch.random.fork_rng(devices=[]):
                     torch.set_rng_state(state)

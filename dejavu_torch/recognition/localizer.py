@@ -102,9 +102,8 @@ class Localizer:
             match = Match.joined(self._search(part, wanted) for part in moved)
         else:
             match = Match.joined(self.match(place_map.scores(part)) for part in moved)
-        if (
-            matching.sequence is None and getattr(place_map, "metric", "") == "cosine"
-        ):  # blank frames find nothing by themselves
+        # blank frames find nothing by themselves
+        if matching.sequence is None and getattr(place_map, "metric", "") == "cosine":
             shows = descriptors.any(1).cpu()
             match = replace(match, accepted=match.accepted & shows.view(-1, *[1] * (match.accepted.ndim - 1)))
         return match
@@ -144,6 +143,7 @@ class Localizer:
         def rows(numbers: Tensor) -> Tensor:
             scores = place_map.scores(descriptors[numbers].to(place_map.device))
             earlier = torch.arange(scores.shape[1])[None] < numbers[:, None] - apart
+            earlier &= descriptors[numbers].any(1, keepdim=True).cpu()  # blank frames find nothing
             return scores.masked_fill(~earlier.to(scores.device), math.inf)
 
         if not drive:
