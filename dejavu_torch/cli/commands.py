@@ -201,14 +201,8 @@ def run_localize(
         cluster: divide the map among Ray workers, as in `dejavu learn`; for single queries only
         skip_damaged: frames that cannot be read find nothing, and do not stop the others
     """
-    from dejavu_torch.evaluation.matches import check_pair_names
-
     device_of(loading.device)
-    for written in filter(None, (out, pairs)):
-        check_output_file(written)
-        check_not_read(written, map, source)
-    if pairs is not None and pairs.resolve() == out.resolve():
-        raise InputError(f"--pairs {pairs} is --out as well; expected another name")
+    _check_written(out, pairs, map, source)
     matcher = sequences.matcher(SUPPRESSION, acceptance.threshold)
     ordered = ordering.of(matcher)
     acceptance.check(matcher)
@@ -224,15 +218,8 @@ def run_localize(
     acceptance.of(model)
     if top is not None:
         check_candidates(top, SUPPRESSION, model.map.places)
-    damaged: dict[int, str] = {}
-    query = Whole(open_source(source), damaged) if skip_damaged else open_source(source)
-    if pairs is not None:
-        check_pair_names(model.frame_names, f"the map {map}")
-        check_pair_names(query.names, query.name)
-    query = model.at_map_size(query, model.frame_shape or ())
-    if model.step is not None:
-        query = model.resample(query, model.step, True, model.frame_shape)
-    _print_steps(query)
+    damaged: dict[int, str] | None = {} if skip_damaged else None
+    query = _open_query(model, source, map if pairs else None, damaged)
     ordered = source_of(query).ordered if ordered is None else ordered
     if isinstance(matcher, str):
         matcher = PlaceSmoother(within=SUPPRESSION, threshold=acceptance.threshold) if ordered else None
@@ -280,6 +267,36 @@ def run_localize(
     table: tuple[str | Path, ...] = () if model.step is None else ("--map", map)
     table += ("--route", "ROUTE") if model.map.routes else ()
     print_next("evaluate", out, "--truth", "TRUTH", *table, "--out", "scores")
+
+
+def _check_written(out: Path, pairs: Path | None, *read: str | Path) -> None:
+    """Refuse files that cannot be written, are read, or are the same."""
+    for written in filter(None, (out, pairs)):
+        check_output_file(written)
+        check_not_read(written, *read)
+    if pairs is not None and pairs.resolve() == out.resolve():
+        raise InputError(f"--pairs {pairs} is --out as well; expected another name")
+
+
+def _open_query(model: DejaVu, source: str, paired: Path | None, damaged: dict[int, str] | None) -> Traverse:
+    """The queries as a model localizes them.
+
+    Args:
+        paired: the map's file, if its and their names have to fit a file of pairs. damaged: gets the frames
+            that cannot be read; None refuses them.
+    """
+    from dejavu_torch.evaluation.matches import check_pair_names
+
+    query = open_source(source)
+    if paired is not None:
+        check_pair_names(model.frame_names, f"the map {paired}")
+        check_pair_names(query.names, query.name)
+    query = query if damaged is None else Whole(query, damaged)
+    query = model.at_map_size(query, model.frame_shape or ())
+    if model.step is not None:
+        query = model.resample(query, model.step, True, model.frame_shape)
+    _print_steps(query)
+    return query
 
 
 def _set_corners(model: DejaVu, corners: list[list[float]], why: str) -> None:
