@@ -436,16 +436,17 @@ class DejaVu(nn.Module):
         if len(traverse) != self.map.places:
             seen = f"{traverse.name} has {len(traverse)} places, the map {self.map.places}"
             raise InputError(f"{seen}; expected the traverse that the map was learned from")
-        if not 1 <= apart < len(traverse):
-            raise InputError(f"loops: {apart}; expected a number of places from 1 to {len(traverse) - 1}")
+        check_apart(apart, len(traverse))
         descriptors = self.descriptor.all_of(traverse, progress)
-        matching = self.matching(None)._replace(acceptance=self.loop_acceptance(drive))
-        return Localizer(self.map, matching).loops(descriptors, apart, drive, progress)
+        matching = self.loop_matching(apart, PlaceSmoother() if drive else None)
+        return self.localize_descriptors(descriptors, matching, progress=progress)
 
-    def loop_acceptance(self, drive: bool) -> Acceptance:
-        """Which answers of `loops` are accepted: as of single queries, else those a drive finds likely."""
-        own = self.acceptance()
-        return self.acceptance(PlaceSmoother()) if drive and not own.given else own
+    def loop_matching(self, apart: int, smoother: PlaceSmoother | None) -> Matching:
+        """How `loops` matches. Accepted as of single queries, else those that a drive finds likely."""
+        single = self.matching(None)
+        likely = smoother is not None and not single.acceptance.given
+        acceptance = self.acceptance(smoother) if likely else single.acceptance
+        return single._replace(sequence=smoother, apart=apart, acceptance=acceptance)
 
     def scores_in(self, order: Tensor) -> Scoring:
         """The scores of a map whose places are the frames `order`, frame by frame."""
@@ -631,6 +632,12 @@ def features_per_frame(model: DejaVu) -> int:
     """D, the number of features per frame that the map was learned from."""
     whitening = model.descriptor.whitening
     return sum(whitening.sizes) if whitening is not None and whitening.learned else model.map.dimension
+
+
+def check_apart(apart: int, places: int) -> None:
+    """Refuse loops closer than a place, or none."""
+    if not 1 <= apart < places:
+        raise InputError(f"loops: {apart}; expected a number of places from 1 to {places - 1}")
 
 
 def check_queries(model: DejaVu, shape: tuple[int, ...], dimension: int, name: str) -> None:

@@ -12,8 +12,9 @@ import torch.nn.functional as F
 from command_line import fails, report_of, run
 from helpers import refused
 
-from dejavu_torch import DejaVu, open_source
+from dejavu_torch import DejaVu, PlaceFilter, open_source
 from dejavu_torch.data.ground_truth import as_ground_truth, of_loops
+from dejavu_torch.evaluation.compare import compare
 
 
 def twice(length: int = 120) -> torch.Tensor:
@@ -40,7 +41,6 @@ def test_a_blank_frame_comes_back_to_nothing() -> None:
     rows = twice()
     rows[[50, 170]] = 0
     match = DejaVu(whitening="none").learn(rows).loops(rows, 30, drive=False)
-    assert match.index[170] == -1
     assert not match.accepted[170]
     assert not (match.index == 50).any()
 
@@ -93,6 +93,38 @@ def test_the_commands_find_and_score_loops(tmp_path: Path) -> None:
     assert report["with_answer"] == 120
     assert report["recall_at_1"] == 1
     assert report["accepted_right"] == report["accepted"] == len(pairs)
+
+
+def test_a_comparison_of_loops_asks_all_contenders_for_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drive, where = tmp_path / "d.npy", tmp_path / "d.csv"
+    np.save(drive, twice().numpy())
+    where.write_text("x,y\n" + "\n".join(f"{i % 120},0" for i in range(240)))
+    words = ["--loops", "30", "--ordered", "--truth", "metres:.5", "--tolerance", "0", "--out"]
+    run("compare", f"{drive}?coordinates={where}", *words, tmp_path / "r")
+    assert "is it --truth" not in capsys.readouterr().out
+    report = report_of(tmp_path / "r")
+    assert (report["answers"], report["loops"], report["with_answer"]) == ("loops", 30, 120)
+    assert report["accepted"] == report["accepted_right"] == 120
+    # without the mask each place would be its own answer, and none a loop
+    for one in (report, report["uncompressed"], report["null"]):
+        assert one["recall_at_1"] > 0.9
+    rows = [*csv.DictReader((tmp_path / "r" / "matches.csv").open())]
+    assert all(int(row["place"]) < int(row["query"]) - 30 for row in rows if row["accepted"] == "1")
+    assert report["error_metres"]["all"]["0.99"] < 1
+
+    assert "compare without QUERY" in fails(capsys, "compare", drive, "--out", tmp_path / "x")
+    assert "expected the reference alone" in fails(capsys, "compare", drive, drive, *words, tmp_path / "x")
+    for option in ("--top 3", "--match filter", "--centre mean", "--leave_out 2"):
+        failed = fails(capsys, "compare", drive, *words, tmp_path / "x", *option.split())
+        assert f"--loops 30 and {option}" in failed
+    with refused("expected a second traverse, or loops"):
+        compare(twice(), None)
+    with refused("without query"):
+        compare(twice(), twice(), loops=5)
+    with refused("expected a smoother"):
+        compare(twice(), None, loops=5, sequence=PlaceFilter())
 
 
 def test_real_drives_with_and_without_loops(data_dir: Path) -> None:

@@ -230,7 +230,7 @@ def run_localize(
         together = sequences.way not in (None, "drive", "single") and sequences.way
         given = {"top": top, "cluster": cluster, "match": together, "centre": ordering.centre}
         options.refuse_with(f"--loops {loops}", **given)
-        chosen = model.loop_acceptance(smooths)
+        chosen = model.loop_matching(loops, PlaceSmoother() if smooths else None).acceptance
         matches = iter([model.loops(query, loops, smooths, True)])
         matcher = None
     else:
@@ -356,9 +356,10 @@ def run_live(
 
 def run_compare(
     reference: str,
-    query: str,
+    query: str | None = None,
     *,
     out: Path,
+    loops: int | None = None,
     judging: options.EvaluationOptions,
     learning: options.LearningOptions,
     map: Path | None = None,
@@ -372,12 +373,14 @@ def run_compare(
 
     Args:
         reference: traverse to learn, a source as in `dejavu learn`
-        query: traverse to localize, likewise
+        query: traverse to localize, likewise; none with --loops
+        loops: find where the reference comes back to its own places, as in localize
         out: folder for report, pictures, matches.csv and map.safetensors
         map: evaluate this map of the reference instead of learning one
     """
     from dejavu_torch.evaluation.compare import compare
 
+    _check_loops(loops, query, sequences, ordering, judging)
     where = device_of(learning.device, learns=map is None)
     acceptance = options.Acceptance(model.threshold, model.precision)
     matcher = sequences.matcher(max(0, judging.tolerance), acceptance.threshold)
@@ -390,14 +393,17 @@ def run_compare(
             raise InputError(f"--map {map} has the routes {names}; expected a map of {reference} alone")
         acceptance.of(model)
     searching.of(model.to(where))
-    first, queries = open_source(reference), open_source(query)
+    first = open_source(reference)
+    queries = first if query is None else open_source(query)
     if isinstance(matcher, str):
         in_order, within = queries.ordered if ordered is None else ordered, max(0, judging.tolerance)
         matcher = PlaceSmoother(within=within, threshold=acceptance.threshold) if in_order else None
-    if isinstance(matcher, PlaceFilter | PlaceSmoother) and acceptance.threshold is not None:
+    if isinstance(matcher, PlaceFilter | PlaceSmoother) and acceptance.threshold is not None and query:
         model.threshold = None  # it is for a probability, so the map must not keep it
     seconds = options.several(learning.second)
-    _check_report_folder(out, COMPARED, [reference, query, *seconds], [judging.truth, *learning.files])
+    _check_report_folder(
+        out, COMPARED, [reference, *filter(None, [query]), *seconds], [judging.truth, *learning.files]
+    )
     others = [open_source(one) for one in (*seconds, learning.calibration) if one not in options.UNREAD]
     distractors = judging.off_map([first, queries, *others])
     if not isinstance(matcher, PlaceSmoother):  # which has probabilities of its own
@@ -406,7 +412,7 @@ def run_compare(
     first, views, known = learning.with_views(model, first, queries)
     result = compare(
         first,
-        queries,
+        None if query is None else queries,
         judging.truth,
         model,
         tolerance=judging.tolerance,
@@ -421,9 +427,31 @@ def run_compare(
         storage_curve=judging.storage_curve,
         ordered=ordered,
         centre=None if ordering.centre is None else ordering.centre == "mean",
+        loops=loops,
         progress=True,
     )
-    _publish(result, out, f"{query} found on {reference}", command, map, judging.top)
+    title = f"loops within {reference}" if query is None else f"{query} found on {reference}"
+    _publish(result, out, title, command, map, judging.top)
+
+
+def _check_loops(
+    loops: int | None,
+    query: str | None,
+    sequences: options.Sequences,
+    ordering: options.Ordering,
+    judging: options.EvaluationOptions,
+) -> None:
+    """Refuse a comparison without a query, and loops with what needs one."""
+    if loops is None:
+        if query is None:
+            raise InputError("compare without QUERY; expected a second traverse, or --loops within the first")
+        return
+    if query is not None:
+        raise InputError(f"--loops {loops} and the query {query}; expected the reference alone")
+    together = sequences.way not in (None, "drive", "single") and sequences.way
+    alone = {"match": together, "centre": ordering.centre, "top": judging.top}
+    of_routes = {"distractors": judging.distractors, "storage_curve": judging.storage_curve}
+    options.refuse_with(f"--loops {loops}", **alone, **of_routes, leave_out=judging.leave_out)
 
 
 def run_evaluate(

@@ -22,6 +22,7 @@ from dejavu_torch.data.ground_truth import (
     check_ground_truth,
     describe_ground_truth,
     ground_truth_in_places,
+    of_loops,
     offset_of,
 )
 from dejavu_torch.data.source import Source, as_traverse
@@ -45,7 +46,7 @@ from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.maps.template_map import TemplateMapper
-from dejavu_torch.model import DejaVu, check_queries, features_per_frame
+from dejavu_torch.model import DejaVu, check_apart, check_queries, features_per_frame
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, resampled, source_of
 from dejavu_torch.periods.spectrogram import BACKEND
 from dejavu_torch.recognition.centring import PRIOR, centred
@@ -88,7 +89,7 @@ class Comparison(NamedTuple):
 
 def compare(
     reference: Source,
-    query: Source,
+    query: Source | None,
     truth: Truth | None = None,
     model: DejaVu | None = None,
     *,
@@ -105,12 +106,13 @@ def compare(
     distractors: Sequence[Traverse] = (),
     storage_curve: bool = False,
     ordered: bool | None = None,
+    loops: int | None = None,
     progress: bool = False,
 ) -> Comparison:
     """Learn the reference, localize the queries on it, and compare with other ways to store the route.
 
     Args:
-        reference: the traverse to learn. query: a second traverse of the route.
+        reference: the traverse to learn. query: a second traverse of the route; None with `loops`.
         truth: see `find_ground_truth`. Without any, there are matches and pictures, but no scores and no
             baselines.
         model: settings; None is DejaVu with its defaults. A map that it already has is evaluated as it is; it
@@ -134,6 +136,8 @@ def compare(
             the report gets `storage` and its picture. Needs a ground truth.
         ordered: whether the queries are consecutive. If so, the report also has the scores of a filter and
             of a smoother, on the map and on all baselines. None: as their source says.
+        loops: also the query is the reference: find where it comes back to places of this many places before,
+            see `DejaVu.loops`. The baselines are asked for the same.
         progress: show progress bars on a terminal.
 
     Raises:
@@ -142,7 +146,17 @@ def compare(
     model = DejaVu() if model is None else model
     has_map, seconds = model.map.places > 0, dict.fromkeys(("describe", "learn", "localize"), 0.0)
     _check_settings(model, truth, interpolate, tolerance, top, leave_out)
-    reference, query, off = _prepared(model, reference, query, distractors, seconds, progress)
+    if loops is not None:
+        if query is not None or distractors or storage_curve or leave_out is not None or top != 1:
+            expected = "without query, distractors, storage_curve, leave_out and top"
+            raise InputError(f"loops: {loops}; expected the reference alone, {expected}")
+        if sequence is not None and not isinstance(sequence, str | PlaceSmoother):
+            raise InputError(f"loops: {loops} and {sequence}; expected a smoother, or None")
+        reference, centre = as_traverse(reference), False  # the mean is that of the map
+    elif query is None:
+        raise InputError("there is no query; expected a second traverse, or loops within the reference")
+    query = reference if query is None else query
+    reference, query, off = _prepared(model, reference, query, distractors, seconds, progress, loops)
     check_candidates(top, tolerance, len(reference))
     given, ordered = ordered, source_of(query).ordered if ordered is None else ordered
     if isinstance(sequence, str):
@@ -152,7 +166,9 @@ def compare(
         sequence = None
     elif sequence is not None:
         sequence.check(None, len(reference))
-    known = ground_truth_of(truth, reference, query, interpolate)
+    itself = loops is not None
+    # without a given truth, each place would be its own answer
+    known = None if itself and truth is None else ground_truth_of(truth, reference, query, interpolate)
 
     with timed(seconds, "describe" if has_map else "learn"):
         if has_map:
@@ -165,28 +181,20 @@ def compare(
         if isinstance(calibration, LabelledFrames) or (calibration is None and not has_map):
             calibrate_if_possible(model, reference, calibration, progress=progress)
     with timed(seconds, "localize"):
-        beside = ordered and known is not None  # without truth they have no scores
+        beside = ordered and known is not None and not itself  # without truth they have no scores
         beside = beside and (given is not None or len(query) * model.map.places <= MAX_FILTERED)
         also = models_beside(sequence, beside, len(query), model.map.places, tolerance)
         alike = PlaceSmoother(within=tolerance) if beside and len(query) > 1 else None
-        matching = Matching(sequence, also)
+        matching = Matching(sequence, also, apart=loops)
         centring = ordered and len(query) >= PRIOR if centre is None else centre
         settings = matching, centring, smoother is not None, tolerance, top, progress
         run, found = _localized(model, reference, query, places, *settings)
-        whole = smoother or alike
-        if whole is not None:
-            own = model.matching(whole)._replace(k=found.index.shape[1], radius=tolerance)
-            own = own._replace(plain=run.causal_features)
-            drive = model.localize_descriptors(run.query_features, own, progress=progress)
-            best = drive.map(lambda column: column[:, 0])
-            sequences = {**run.judged.sequences, "smoother": best}
-            run = run._replace(judged=replace(run.judged, sequences=sequences), beside=alike)
-        if smoother is not None:
-            run = run._replace(match=best, smoother=smoother)
+        run, candidates = _smoothed(run, found, smoother, alike, progress)
     off_map = _match_distractors(model, off, smoother or sequence, centring, progress)
 
     model.cpu()
     known = known and ground_truth_in_places(known, model.map.place_of)
+    known = of_loops(known, torch.arange(len(query)), loops) if known and loops is not None else known
     run = run._replace(truth=known, reference_features=places.cpu(), query_features=run.query_features.cpu())
     ours = run.contend("this map", run.judged.renumbered(model.map.table.scored), model)
     contenders = _other_contenders(run, others or {}, leave_out, seed, progress)
@@ -206,7 +214,6 @@ def compare(
     }
     if coded is not None and len(coded.chunks) == 1:
         facts["noise_over_map"] = noise_over_map(coded, run.reference_features, seed)
-    candidates = found if smoother is None else drive
     return Comparison(Report(ours, contenders, facts), pictures, run, candidates)
 
 
@@ -231,12 +238,18 @@ def _check_settings(
 
 
 def _prepared(
-    model: DejaVu, reference: Source, query: Source, off: Sequence[Traverse], seconds: Seconds, progress: bool
+    model: DejaVu,
+    reference: Source,
+    query: Source,
+    off: Sequence[Traverse],
+    seconds: Seconds,
+    progress: bool,
+    loops: int | None = None,
 ) -> tuple[Traverse, Traverse, list[Traverse]]:
     """The reference, the query and routes off the map, at the map's size and at even steps."""
     itself, has_map = reference is query, model.map.places > 0
     reference, query = as_traverse(reference), as_traverse(query)
-    if itself or (reference.name == query.name != UNNAMED):
+    if loops is None and (itself or (reference.name == query.name != UNNAMED)):
         line = "%s is matched with itself, each frame with its own copy; expected a second traverse"
         log.warning(line, query.name)
     reference = model.at_map_size(reference, model.frame_shape if has_map else None)
@@ -251,7 +264,9 @@ def _prepared(
         reference = even(reference, step=model.step if has_map else None)
     step = getattr(reference, "step", None)
     with timed(seconds, "localize"):
-        query = even(query, step=step)
+        query = reference if loops is not None else even(query, step=step)
+    if loops is not None:
+        check_apart(loops, len(reference))
     if has_map:
         check_places(model, len(reference), reference.name)
         check_queries(model, reference.frame_shape, features, reference.name)
@@ -272,7 +287,7 @@ def _localized(
 ) -> tuple[Localization, Match]:
     """The run, and the best places of each query as far as recall@N or `top` needs."""
     check_queries(model, query.frame_shape, features_per_frame(model), query.name)
-    queries = model.descriptor.all_of(query, progress)
+    queries = places if query is reference else model.descriptor.all_of(query, progress)
     if matching.sequence is not None:
         matching.sequence.check(len(queries), model.map.places)
     ranks = max(top, min(max(RANKS), model.map.places))
@@ -283,12 +298,39 @@ def _localized(
     def match(queries: Tensor, how: Matching) -> Match:
         # whose acceptance is not asked for beside a drive
         own = Matching(how.sequence) if drive else model.matching(how.sequence)
-        own = own._replace(also=how.also, k=ranks, radius=tolerance)
+        own = own._replace(also=how.also, k=ranks, radius=tolerance, apart=how.apart)
         return model.localize_descriptors(queries, own, progress=progress)
 
     found = run.match_by(match)
     best = found.map(lambda column: column[:, 0])
     return run._replace(match=best, judged=best), found
+
+
+def _smoothed(
+    run: Localization,
+    found: Match,
+    smoother: PlaceSmoother | None,
+    beside: PlaceSmoother | None,
+    progress: bool,
+) -> tuple[Localization, Match]:
+    """The run with the answers of a whole drive, and the best places of each query for its answer.
+
+    Args:
+        found: the places by single queries. smoother: if it answers. beside: if it is only compared.
+    """
+    whole, model, apart = smoother or beside, run.model, run.matching.apart
+    if whole is None:
+        return run, found
+    own = model.matching(whole) if apart is None else model.loop_matching(apart, whole)
+    own = own._replace(k=found.index.shape[1], radius=run.tolerance, plain=run.causal_features)
+    drive = model.localize_descriptors(run.query_features, own, progress=progress)
+    best = drive.map(lambda column: column[:, 0])
+    if apart is None:
+        judged = replace(run.judged, sequences={**run.judged.sequences, "smoother": best})
+        run = run._replace(judged=judged, beside=beside)
+    if smoother is None:
+        return run, found
+    return run._replace(match=best, smoother=smoother), drive
 
 
 def _other_contenders(
@@ -400,6 +442,8 @@ def _run_facts(run: Localization, seconds: Seconds) -> dict[str, Any]:
         if run.truth is not None:
             block = math.ceil(run.smoother.correlation)
             drive["auc_error"] = auc_error(run.scored, run.truth, run.tolerance, block)
+    if run.matching.apart is not None:
+        facts["loops"] = run.matching.apart
     if isinstance(reference, ResampledTraverse):
         facts["resampling"] = {
             "step": reference.step,
@@ -418,7 +462,10 @@ def _match_facts(
     words, offset = describe_ground_truth(truth, interpolate, carried), offset_of(truth, carried)
     ranked, shown = place_map.table.scored(candidates.index), run.match.renumbered(place_map.frame_of)
     facts = evaluation_facts(run.scored, ranked, run.truth, tolerance, place_map.positions, words, off)
-    return facts | answer_facts(shown, run.query_frames, tolerance, run.truth is not None, offset)
+    alone = answer_facts(shown, run.query_frames, tolerance, run.truth is not None, offset)
+    if run.matching.apart is not None:
+        alone.pop("line", None)  # a second lap lies on one
+    return facts | alone
 
 
 def _metric_facts(run: Localization, truth: Truth | None) -> dict[str, Any]:
@@ -431,6 +478,8 @@ def _metric_facts(run: Localization, truth: Truth | None) -> dict[str, Any]:
     index = run.match.index
     distance = (asked[run.query_frames] - stored[run.model.map.frame_of(index)]).norm(dim=1)
     known = distance.isfinite() & (index >= 0)
+    if run.truth is not None and run.matching.apart is not None:
+        known &= (run.truth.positives >= 0).any(1)  # most places are no loop
     facts: dict[str, Any] = {}
     for name, chosen in (("all", known), ("accepted", known & run.match.accepted)):
         if chosen.any():

@@ -115,12 +115,13 @@ def evaluate_file(
     known = find_ground_truth(truth, reference, query, frames, queries, interpolate, resampled)
     if known is None:
         raise InputError("there is no ground truth; expected one, or traverses that carry positions")
-    known = known if loops is None else of_loops(known, queries, loops)
     carried = all(traverse is not None and traverse.places is not None for traverse in (reference, query))
     alone = answer_facts(match, queries, tolerance, True, offset_of(truth, carried))
     if place_map is not None:
         known = ground_truth_in_places(known, place_map.place_of)
         candidates = place_map.place_of(candidates)
+    if loops is not None:
+        known = of_loops(known, queries if place_map is None else place_map.place_of(queries), loops)
     here = replace(match, index=candidates[:, 0].masked_fill(elsewhere[:, 0], -1))
     if route is not None:  # number places on other routes beyond every place of this one and its truth
         highest = max(int(table.max()) for table in (candidates, known.positives) if table.numel())

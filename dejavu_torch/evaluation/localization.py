@@ -16,7 +16,7 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.recognition.drive import DriveQuery
 from dejavu_torch.recognition.filter import PlaceFilter
-from dejavu_torch.recognition.localizer import SINGLE, Matching, Scoring, asked_of
+from dejavu_torch.recognition.localizer import SINGLE, Matching, Scoring, asked_of, earlier
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.types import Match, SequenceModel, Traverse
 
@@ -75,7 +75,9 @@ class Localization(NamedTuple):
 
     @property
     def answers(self) -> str:
-        """How the answers were found: drive, filter, sequence or single."""
+        """How the answers were found: loops, drive, filter, sequence or single."""
+        if self.matching.apart is not None:
+            return "loops"
         if self.smoother is not None:
             return "drive" if self.smoother.is_drive else "single"
         together = isinstance(self.sequence, PlaceFilter)
@@ -116,8 +118,9 @@ class Localization(NamedTuple):
     @torch.no_grad()
     def scores(self, numbers: Tensor) -> Tensor:
         """Scores of single queries, on the CPU: their indices (B,) -> (B,N)."""
-        place_map = self.model.map
-        return place_map.scores(self.query_features[numbers].to(place_map.device)).float().cpu()
+        place_map, apart = self.model.map, self.matching.apart
+        scores = place_map.scores(self.query_features[numbers].to(place_map.device)).float().cpu()
+        return scores if apart is None else earlier(scores, numbers, apart)
 
     def example_query(self, start: int, stop: int) -> tuple[int, list[int]]:
         """A query near the middle of a chunk, and its right places there; without truth the middle query."""

@@ -197,7 +197,7 @@ def steps_after(facts: Mapping[str, Any]) -> str:
     """What to try next if there are probabilities; else ""."""
     if "probably_right" not in facts:
         return ""
-    together = bool(facts.get("filter")) or facts.get("sequence", 1) > 1
+    together = bool(facts.get("filter") or facts.get("drive")) or facts.get("sequence", 1) > 1
     strict = facts.get("threshold") is not None or (facts.get("least_probability") or 0) > PROBABLE
     return "; ".join([*next_steps(together, strict), "--truth evaluates the answers"])
 

@@ -45,6 +45,8 @@ class DriveQuery(NamedTuple):
         platt: the calibration of single queries, if there is one.
         single: as `rows`, of queries that are no drive, which are not centred; None is as `rows`.
         tiles: the scores of `rows` for large maps; None makes them of rows.
+        checks: the drive only checks the answers of single queries: it lowers their probability. Where ground
+            repeats, as lane dashes do, a drive alone finds loops that are none.
     """
 
     rows: Rows
@@ -56,6 +58,12 @@ class DriveQuery(NamedTuple):
     platt: Platt | None = None
     single: Rows | None = None
     tiles: Tiles | None = None
+    checks: bool = False
+
+    @property
+    def answers(self) -> bool:
+        """Whether the drive answers, once the smoother is fitted."""
+        return self.smoother.is_drive and not self.checks
 
 
 class Seen(NamedTuple):
@@ -113,7 +121,7 @@ def _shown(asked: DriveQuery, seen: Seen) -> Shown:
     mass, scores, known = seen
     smoother, queries = asked.smoother, len(asked.descriptors)
     scores = scores.masked_fill(scores.isnan(), math.inf)
-    ranked = near_scores(mass, scores, smoother.within) if smoother.is_drive else scores
+    ranked = near_scores(mass, scores, smoother.within) if asked.answers else scores
     columns = None if known is None else known.expand_as(ranked)
     pair = best_candidates(ranked, min(2, ranked.shape[1]), TOLERANCE, columns)
     match = best_candidates(ranked, asked.k, asked.radius, columns)
@@ -121,7 +129,7 @@ def _shown(asked: DriveQuery, seen: Seen) -> Shown:
     if known is not None:
         at = torch.searchsorted(known, at).clamp(max=len(known) - 1)
     probability = mass_around(mass, at, smoother.within)
-    if not smoother.is_drive and asked.platt is not None:
+    if not asked.answers and asked.platt is not None:
         by_itself = asked.platt.probability(confidence_of(scores))
         probability = by_itself if queries == 1 else torch.minimum(probability, by_itself)
     probability = probability.masked_fill(match.index[:, 0] < 0, 0)
@@ -138,7 +146,7 @@ def _joined(asked: DriveQuery, parts: list[Shown]) -> Answers:
         return Answers(match, torch.zeros(0).double())
     match = Match.joined(part.match for part in parts)
     absent, margin, probability, own = (torch.cat(column) for column in [*zip(*parts, strict=True)][1:])
-    if asked.smoother.is_drive:
+    if asked.answers:
         match = replace(match, score=match.score + doubt(own)[:, None])
     match = replace(match, score=match.score.to(own.dtype))
     confidence = first_of(margin.to(own.dtype), k)
@@ -168,18 +176,18 @@ def _seen(drives: Sequence[DriveQuery], progress: bool) -> Iterator[tuple[int, S
             numbers = torch.arange(block.first, block.first + block.log.shape[-1])
             for (i, drive), posterior in zip(alike, block.posterior, strict=True):
                 asked = drives[i]
-                rows = drive.rows if asked.smoother.is_drive else asked.single or drive.rows
+                rows = drive.rows if asked.answers else asked.single or drive.rows
                 yield i, Seen(_mass(posterior), rows(numbers).cpu())
 
 
 def _of_windows(asked: DriveQuery, places: int, progress: bool) -> Iterator[Seen]:
     """What is seen of a drive on a large map."""
-    rows, descriptors, smoother, k, radius, starts, _, single, tiles = asked
+    rows, descriptors, smoother, k, radius, starts, _, single, tiles, _ = asked
     tiles, single = tiles or Tiles(lambda numbers: iter([(0, rows(numbers))]), places), single or rows
     settings = places, smoother, starts, max(2, k), radius, progress
     for first, posterior, scores, known in LargeDrive(tiles, descriptors, *settings):
         mass = _mass(posterior)
-        if smoother.is_drive:
+        if asked.answers:
             yield Seen(mass, scores, known)
             continue
         for part in reversed(torch.arange(len(mass)).split(max(1, TILE // places))):

@@ -20,7 +20,7 @@ from dejavu_torch.recognition.large import Tiles
 from dejavu_torch.recognition.search import SCORES_AT_ONCE, NmsSpec, Scan, Search, Searcher, num_needed
 from dejavu_torch.recognition.select import Acceptance, accept, best_candidates, best_match
 from dejavu_torch.recognition.sequence import SequenceMatcher
-from dejavu_torch.recognition.smoother import LoopSmoother, PlaceSmoother, Rows
+from dejavu_torch.recognition.smoother import PlaceSmoother, Rows
 from dejavu_torch.text import with_progress
 from dejavu_torch.types import Match, SequenceModel, Together
 
@@ -43,6 +43,7 @@ class Matching(NamedTuple):
     platt: Platt | None = None  # gives probabilities; for a smoother, that of single queries
     callback: Callable[[Tensor], None] | None = None  # receives the final scores (B,N)
     search: Search = "auto"  # of single queries, see `DejaVu.localize`
+    apart: int | None = None  # queries are the places themselves; only those over this many before answer
 
 
 SINGLE = Matching()  # each query by itself
@@ -82,6 +83,7 @@ class Localizer:
         if isinstance(sequence, SequenceModel):
             self.models[self.own] = sequence
         self.states: dict[Together, Tensor] = {}  # of the models; empty before the first query
+        self.matched = 0  # queries so far
         self.route_starts = (0,) if place_map is None else place_map.route_starts
 
     @torch.no_grad()
@@ -94,7 +96,8 @@ class Localizer:
         wanted = [(matching.k or 1, matching.radius), (min(2, places), TOLERANCE)]
         n = num_needed(wanted, places)
         few = n <= max(1, MAX_SHARE * min(places, place_map.block_places)) or places > SCORES_AT_ONCE
-        searches = not self.models and matching.callback is None and (few or type(self.searcher) is not Scan)
+        searches = not self.models and matching.callback is None and matching.apart is None
+        searches = searches and (few or type(self.searcher) is not Scan)
         size = max(PER_BEST * n, places // PLACES_PER_NUMBER) if searches else places
         parts = descriptors.split(max(1, min(ROWS, SCORES_AT_ONCE // size)))
         moved = (part.to(place_map.device) for part in with_progress(parts, "localizing", progress))
@@ -111,6 +114,10 @@ class Localizer:
     @torch.no_grad()
     def match(self, scores: Tensor) -> Match:
         """Match the next queries by their scores: (B,N) -> (B,), or (B,k)."""
+        if self.matching.apart is not None:
+            numbers = self.matched + torch.arange(len(scores))
+            scores = earlier(scores, numbers, self.matching.apart)
+            self.matched += len(scores)
         if not self.models:
             return self._answer(self._candidates(scores), pair_of(scores))
         return Match.joined(map(self._in_sequence, scores.split(max(1, CACHED // scores.shape[1]))))
@@ -127,32 +134,13 @@ class Localizer:
         Args:
             score: scores of queries, (B,K) -> (B,N); None are those of the map.
         """
-        match = localize_drive(self.asked(descriptors, smoother, score), progress)
+        asked = self.asked(descriptors, smoother, score)
+        match = localize_drive(asked, progress)
         acceptance = self.matching.acceptance
-        if acceptance.threshold is not None and not smoother.is_drive:  # whose scores are distances
+        # whose scores are distances
+        if acceptance.threshold is not None and not smoother.is_drive and not asked.checks:
             acceptance = Acceptance(precision=math.exp(-acceptance.threshold))
         return self._accepted(match, acceptance)
-
-    def loops(self, descriptors: Tensor, apart: int, drive: bool = True, progress: bool = False) -> Match:
-        """Match the places of a map, as queries (N,K), to places passed over `apart` places before. With
-        `drive`, an answer is only as probable as the whole drive says, too: look-alikes seldom last."""
-        place_map = self.place_map
-        assert place_map is not None
-
-        @torch.no_grad()
-        def rows(numbers: Tensor) -> Tensor:
-            scores = place_map.scores(descriptors[numbers].to(place_map.device))
-            earlier = torch.arange(scores.shape[1])[None] < numbers[:, None] - apart
-            earlier &= descriptors[numbers].any(1, keepdim=True).cpu()  # blank frames find nothing
-            return scores.masked_fill(~earlier.to(scores.device), math.inf)
-
-        if not drive:
-            parts = torch.arange(len(descriptors)).split(max(1, SCORES_AT_ONCE // place_map.places))
-            return Match.joined(
-                self.match(rows(part)) for part in with_progress(parts, "localizing", progress)
-            )
-        asked = self.asked(descriptors, LoopSmoother())._replace(rows=rows, single=None, tiles=None)
-        return self._accepted(localize_drive(asked, progress))
 
     def asked(self, descriptors: Tensor, smoother: PlaceSmoother, score: Scoring | None = None) -> DriveQuery:
         """What `drive` matches."""
@@ -169,9 +157,17 @@ class Localizer:
         def rows(queries: Tensor) -> Rows:
             return lambda numbers: score(queries[numbers])
 
+        def loops(numbers: Tensor) -> Tensor:
+            assert matching.apart is not None
+            found = earlier(score(descriptors[numbers]), numbers, matching.apart)
+            blank = ~descriptors[numbers].any(1, keepdim=True)  # such frames find nothing
+            return found.masked_fill(blank.to(found.device), math.inf)
+
+        single, settings = None, (matching.k or 1, matching.radius, self.route_starts, matching.platt)
+        if matching.apart is not None:
+            return DriveQuery(loops, descriptors, smoother, *settings, checks=True)
         single = None if matching.plain is None else rows(matching.plain)
-        settings = matching.k or 1, matching.radius, self.route_starts, matching.platt, single, tiles
-        return DriveQuery(rows(descriptors), descriptors, smoother, *settings)
+        return DriveQuery(rows(descriptors), descriptors, smoother, *settings, single, tiles)
 
     @torch.no_grad()
     def skip(self, queries: int) -> None:
@@ -259,6 +255,12 @@ def asked_of(
 ) -> DriveQuery:
     """Queries (Q,K) as a drive with scores of any kind, for a smoother like this one; see `Matching`."""
     return Localizer(None, Matching(plain=plain)).asked(queries, copy.deepcopy(smoother), score)
+
+
+def earlier(scores: Tensor, numbers: Tensor, apart: int) -> Tensor:
+    """Scores (B,N) of the places `numbers` (B,) as queries, infinite but for those over `apart` before."""
+    place = torch.arange(scores.shape[1], device=scores.device)
+    return scores.masked_fill(place >= (numbers[:, None] - apart).to(scores.device), math.inf)
 
 
 def pair_of(scores: Tensor) -> Match:

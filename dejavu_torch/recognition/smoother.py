@@ -663,16 +663,3 @@ def check_scores(scores: Tensor, descriptors: Tensor | None = None) -> Tensor:
     if descriptors is not None and len(descriptors) != len(scores):
         raise InputError(f"{len(descriptors)} descriptors of {len(scores)} queries; expected as many")
     return scores if scores.dtype == torch.float64 else scores.float()
-
-
-class LoopSmoother(PlaceSmoother):
-    """A smoother whose drive checks the answers of single images, but gives none: where ground repeats, as
-    lane dashes do, a drive alone finds loops that are none."""
-
-    @property
-    def is_drive(self) -> bool:
-        return False
-
-    @is_drive.setter
-    def is_drive(self, found: bool) -> None:
-        """What a fit finds does not matter."""
