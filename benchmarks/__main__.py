@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from benchmarks import (
+    alike,
     cluster,
     distil,
     drives,
@@ -34,6 +35,7 @@ BENCHES: dict[str, Any] = {  # each returns the lines to print
     "drives": drives.run_drives,
     "teaching": teaching.run_teaching,
     "visits": visits.run_visits,
+    "alike": alike.run_alike,
     "train": train.run_train,
     "trainings": trainings.run_trainings,
     "distil": distil.run_distil,

@@ -16,6 +16,7 @@ from pathlib import Path
 from statistics import mean
 from typing import Any
 
+from benchmarks.alike import CAPPED, CHECKED, PRECISIONS, SINGLE, UNCAPPED
 from benchmarks.measure import Row
 from benchmarks.results import FOOTAGE, rounded
 from benchmarks.storage import SHOWN, best, by, families, missed
@@ -280,6 +281,36 @@ def visits() -> str:
     return markdown(table)
 
 
+def look_alikes() -> str:
+    """What is accepted where places look alike, and without the limits of the map's look-alikes."""
+    table = [["right of accepted at a precision of", *(f"{one:g}" for one in PRECISIONS)]]
+    for case, own in by_case(lambda row: not row["case"].startswith("loops: ")).items():
+        known, without = (own[way] for way in (CAPPED, UNCAPPED))
+        pairs = zip(known, without, strict=True)
+        table.append([case, *(one + f" ({other})" * (one != other) for one, other in pairs)])
+    return markdown(table)
+
+
+def loops() -> str:
+    """Accepted loops of laps, and of drives that have none."""
+    asked = [f"{one:g}" for one in PRECISIONS]
+    table = [["right of accepted loops", *(f"{way}, {one}" for way in (SINGLE, CHECKED) for one in asked)]]
+    for case, own in by_case(lambda row: row["case"].startswith("loops: ")).items():
+        cells = [own[way] if len(own[way]) > 1 else [*own[way], "", ""] for way in (SINGLE, CHECKED)]
+        table.append([case.removeprefix("loops: "), *cells[0], *cells[1]])
+    return markdown(table)
+
+
+def by_case(wanted: Callable[[Row], bool]) -> dict[str, dict[str, list[str]]]:
+    """Right of accepted answers by precision, of each way in a case of `benchmarks alike`."""
+    found: dict[str, dict[str, list[str]]] = {}
+    for row in filter(wanted, read("alike")["rows"]):
+        text = f"{row['right']} of {row['judged']}"
+        text += f", {row['accepted'] - row['judged']} more" if row["accepted"] > row["judged"] else ""
+        found.setdefault(row["case"], {}).setdefault(row["contender"], []).append(text)
+    return found
+
+
 def shown_pair(row: Row) -> str:
     """The areas of one image and of the whole drive; with a star, if that was answered by single images."""
     pair = [area(row[key]).removeprefix("0") for key in ("auc_one", "auc")]
@@ -330,6 +361,7 @@ TABLES: dict[str, Callable[[], str]] = {
     **{"rejection": rejection, "filtered": filtered, "drives": drives, "driven": driven},
     **{"trainings": trainings, "made drives": made_drives, "storage drives": storage_drives},
     **{"large drives": large_drives, "taught drives": taught, "visits": visits},
+    **{"alike": lambda: f"{look_alikes()}\n{loops()}"},
     **{f"storage {name}": partial(storage, name) for name in ("aerial", "road1", "road2", "city", "railway")},
 }
 

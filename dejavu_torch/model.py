@@ -502,10 +502,14 @@ class DejaVu(nn.Module):
             yield from map(localizer, self.descriptor.batches(queries, progress, "localizing", on_first))
             return
         descriptors = self.descriptor.all_of(queries, progress, on_first)
-        if centre or (centre is None and len(descriptors) >= PRIOR):
+        if self.centres(len(descriptors)) if centre is None else centre:
             matching = matching._replace(plain=descriptors)
             descriptors = centred(self.map, descriptors)
         yield self.localize_descriptors(descriptors, matching, progress=progress)
+
+    def centres(self, queries: int) -> bool:
+        """Whether so many consecutive queries are centred by default."""
+        return queries >= PRIOR and not self.descriptor.keeps_lengths
 
     def candidates(
         self,

@@ -137,7 +137,11 @@ STATE = {
     "names": str | None,
     "calibration": Calibration | None,
 }
-LATER = {"Preprocess": {"range": None, "blank": BLANK}}  # arguments that files lack at their defaults
+# arguments that files lack at their defaults
+LATER: Mapping[str, Mapping[str, Any]] = {
+    "Preprocess": {"range": None, "blank": BLANK},
+    "Whitening": {"lengths": None},
+}
 HEADER = {name: kind for name, (_, kind) in PARTS.items()} | SETTINGS | STATE | {"map": dict[str, Any]}
 
 

@@ -20,7 +20,7 @@ from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.memory import without_autocast
 from dejavu_torch.model import DejaVu, check_queries, require_map
 from dejavu_torch.recognition.calibration import TOLERANCE, Calibration, calibrated_by_drive
-from dejavu_torch.recognition.centring import PRIOR, centred
+from dejavu_torch.recognition.centring import centred
 from dejavu_torch.recognition.evidence import spacing_of
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.types import InputError, Traverse
@@ -80,7 +80,7 @@ def place_drives(
 
 def in_its_light(model: DejaVu, descriptors: Tensor) -> Tensor:
     """The descriptors (Q,K) of a drive, centred if they are enough."""
-    return centred(model.map, descriptors) if len(descriptors) >= PRIOR else descriptors
+    return centred(model.map, descriptors) if model.centres(len(descriptors)) else descriptors
 
 
 class Refinement(NamedTuple):

@@ -32,6 +32,7 @@ CALLS: dict[str, tuple[tuple[str, str], dict[str, Any], tuple[int, int], int]] =
     "megaloc": (("gmberton/MegaLoc", "get_trained_model"), {}, (322, 322), 8448),
     "eigenplaces": (("gmberton/eigenplaces", "get_trained_model"), RESNET, (480, 640), 2048),
     "cosplace": (("gmberton/cosplace", "get_trained_model"), RESNET, (480, 640), 2048),
+    "sage": (("chenshunpeng/SAGE", "sage_vitb"), {}, (322, 322), 8448),
     "salad": (("serizba/salad", "dinov2_salad"), {}, (322, 322), 8448),
     "boq": (
         ("amaralibey/bag-of-queries", "get_trained_boq"),

@@ -225,7 +225,7 @@ def run_localize(
         matcher = PlaceSmoother(within=SUPPRESSION, threshold=acceptance.threshold) if ordered else None
     chosen = model.matching(matcher).acceptance
     smooths = isinstance(matcher, PlaceSmoother)
-    centre = (smooths or matcher is None) and ordering.centring(ordered, len(query))
+    centre = (smooths or matcher is None) and ordering.centring(model, ordered, len(query))
     if loops is not None:
         together = sequences.way not in (None, "drive", "single") and sequences.way
         given = {"top": top, "cluster": cluster, "match": together, "centre": ordering.centre}

@@ -20,7 +20,6 @@ from dejavu_torch.features.views import LabelledFrames
 from dejavu_torch.model import DejaVu, check_precision
 from dejavu_torch.model_file import NO_MAP, recipe_of
 from dejavu_torch.motion.resampling import source_of
-from dejavu_torch.recognition.centring import PRIOR
 from dejavu_torch.recognition.coarse import searcher
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.search import Search, check_search
@@ -142,9 +141,9 @@ class Ordering:
         ordered = self.ordered or isinstance(matcher, PlaceSmoother)
         return ordered if ordered or self.unordered else None
 
-    def centring(self, ordered: bool, queries: int) -> bool:
+    def centring(self, model: DejaVu, ordered: bool, queries: int) -> bool:
         """Whether single queries and those of a smoother are centred."""
-        return self.centre == "mean" if self.centre else ordered and queries >= PRIOR
+        return self.centre == "mean" if self.centre else ordered and model.centres(queries)
 
 
 @dataclass

@@ -49,7 +49,7 @@ from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import DejaVu, check_apart, check_queries, features_per_frame
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, resampled, source_of
 from dejavu_torch.periods.spectrogram import BACKEND
-from dejavu_torch.recognition.centring import PRIOR, centred
+from dejavu_torch.recognition.centring import centred
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.localizer import SINGLE, Matching
 from dejavu_torch.recognition.select import check_candidates
@@ -186,7 +186,7 @@ def compare(
         also = models_beside(sequence, beside, len(query), model.map.places, tolerance)
         alike = PlaceSmoother(within=tolerance) if beside and len(query) > 1 else None
         matching = Matching(sequence, also, apart=loops)
-        centring = ordered and len(query) >= PRIOR if centre is None else centre
+        centring = ordered and model.centres(len(query)) if centre is None else centre
         settings = matching, centring, smoother is not None, tolerance, top, progress
         run, found = _localized(model, reference, query, places, *settings)
         run, candidates = _smoothed(run, found, smoother, alike, progress)

@@ -274,6 +274,9 @@ class Descriptor(nn.Module):
             shown = self._shown(visits, f"by {visits.traverse.name}", progress)
             whitening.learn(features, views, groups, samples, Visits(shown, visits.placed.drive[known]))
         whitening.to(self.device)
+        if whitening.lengths and whitening.decides:
+            found = "the lengths of its descriptors are kept: places are told apart by them"
+            log.warning("%s: %s (--whitening.lengths false leaves them out)", traverse.name, found)
 
     def _shown(self, views: LabelledFrames, source: str, progress: bool) -> Iterator[tuple[Tensor, Tensor]]:
         """Batches of features and the places that they show."""
@@ -333,6 +336,11 @@ class Descriptor(nn.Module):
             self.warned.add((traverse.name, "narrow"))
             seen = f"values from {round(DEEP * low)} to {round(DEEP * high)} of {DEEP}"
             log.warning("%s has %s; --preprocess.range auto makes use of so few", traverse.name, seen)
+
+    @property
+    def keeps_lengths(self) -> bool:
+        """Whether the lengths of ready features count, which a drive's own mean would change."""
+        return self.whitening is not None and bool(self.whitening.lengths)
 
     def count_features(self, traverse: Traverse) -> int:
         """D, from the first frame."""

@@ -32,6 +32,7 @@ NETWORKS = {
     "cricavpr": embedding("Lu-Feng/CricaVPR", "trained_model", (224, 224)),
     "eigenplaces": embedding("gmberton/eigenplaces", "get_trained_model", **RESNET),
     "megaloc": embedding("gmberton/MegaLoc", "get_trained_model"),
+    "sage": embedding("chenshunpeng/SAGE", "sage_vitb"),
     "salad": embedding("serizba/salad", "dinov2_salad"),
     "selavpr++": embedding("Lu-Feng/SelaVPRplusplus", "SelaVPRplusplus", output=1, **SELA),
 }

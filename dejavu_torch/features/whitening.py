@@ -42,6 +42,9 @@ STRENGTHS: Mapping[str, Any] = {  # defaults of `Augmentation`
     if max(strength)
 }
 LEVELLING = 0.25  # joined dimensions are divided by this power of their root mean square
+STRETCH = 2000  # places of a stretch that shows whether lengths count
+STRIDES = 4, 8  # of which one place is kept there, to find the others
+VARYING, CLEARLY = 0.05, 0.05  # deviation of such lengths over their mean; share by which they miss less
 ROUNDING = 1e-7  # of the largest variance: smaller ones count as 0
 _Components: TypeAlias = tuple[Tensor, Tensor, Tensor, int]  # mean, basis, variances, dimensions to keep
 
@@ -123,11 +126,15 @@ class Whitening(nn.Module):
         groups: D_1, D_2, .. of concatenated descriptors, each whitened by itself and scaled to length 1; then
             follow the K dimensions that best keep their inner products, the largest lowered a little. None
             is the groups of `Joined` features, or one group.
+        lengths: without views, whether the lengths of descriptors count, as of field strengths or ranges, or
+            only their directions. None: if that finds clearly more places of a stretch of the route, of which
+            every 4th or 8th is kept.
 
     Shape: (B,D) -> (B,K).
 
     Convention: descriptors have length 1. Without views they are the principal components, not scaled, and a
-        constant, the root mean square of these. Before `learn` descriptors pass unchanged.
+        constant: the root mean square of these or, if lengths count, of their length. Before `learn`
+        descriptors pass unchanged.
 
     Raises:
         InputError: settings out of range; learn: constant descriptors, views equal to places, `numbers` above
@@ -155,12 +162,14 @@ class Whitening(nn.Module):
         seed: int = 0,
         bits: Literal[4, 8, 16] | None = None,
         groups: list[int] | None = None,
+        lengths: bool | None = None,
     ) -> None:
         super().__init__()
         if not isinstance(strengths, Mapping | None):
             raise InputError(f"the strengths are {strengths!r}; expected arguments of Augmentation by name")
         self.numbers, self.components, self.shrinkage, self.views = numbers, components, shrinkage, views
         self.seed, self.bits, self.groups = seed, bits, None if groups is None else [*groups]
+        self.lengths, self.decides = lengths, lengths is None
         counts = 1 <= (1 if numbers is None else numbers) <= components and (views or 0) >= 0
         if not counts or bits not in (None, *BITS) or not 0 < (1 if shrinkage is None else shrinkage) <= 1:
             expected = "1 <= numbers <= components, views >= 0, shrinkage above 0 and at most 1, "
@@ -296,8 +305,15 @@ class Whitening(nn.Module):
             pairs = shown
         with torch.autocast(self.scale.device.type, enabled=False):
             if pairs is None:
-                for member, (mean, basis, variances, _) in zip(members, bases, strict=True):
-                    member.take(mean, basis, variances.mean().sqrt(), bits)
+                parts = places.split(sizes, 1)
+                for member, group, (mean, basis, variances, _) in zip(members, parts, bases, strict=True):
+                    each, whole = variances.mean().sqrt(), variances.sum().sqrt()
+                    if member.decides:
+                        middle = group[max(0, len(group) - STRETCH) // 2 :][:STRETCH].to(mean)
+                        member.lengths = _lengths_find_more(
+                            middle, _projected(middle, mean, basis), each, whole
+                        )
+                    member.take(mean, basis, whole if member.lengths else each, bits)
             else:
                 for member, (mean, basis, _, kept), (shown, place) in zip(members, bases, pairs, strict=True):
                     centre, projection = learned_whitening(
@@ -368,7 +384,8 @@ class Whitening(nn.Module):
         super()._load_from_state_dict(state, prefix, *args)
 
     def extra_repr(self) -> str:
-        return settings_of(self, *(["strengths"] if self.strengths == STRENGTHS else []))
+        hidden = ["strengths"] * (self.strengths == STRENGTHS) + ["lengths"] * (self.lengths is None)
+        return settings_of(self, *hidden)
 
 
 def _projected_views(
@@ -396,6 +413,31 @@ def _projected_visits(places: Tensor, visits: Visits, bases: Sequence[_Component
             change = (pair[0, own] - pair[1, own]).sum(0) / (len(own) + LIGHT)
             pair[0, own] -= change
     return pairs
+
+
+def _lengths_find_more(rows: Tensor, projected: Tensor, each: Tensor, whole: Tensor) -> bool | None:
+    """Whether a constant `whole`, with which lengths count, finds more of a route than `each`; else None.
+
+    Shape: rows (N,D), their components (N,C).
+    """
+    length = rows.float().norm(dim=1)
+    if len(rows) < 4 * max(STRIDES) or not length.std() > VARYING * length.mean():
+        return None
+    missed = [sum(1 - _found(projected, constant, k) for k in STRIDES) for constant in (each, whole)]
+    return missed[1] < (1 - CLEARLY) * missed[0] or None
+
+
+def _found(rows: Tensor, constant: Tensor, stride: int) -> float:
+    """Average precision at which rows, with a constant and length 1, find one of both beside them, if only
+    every k-th is stored."""
+    rows = nn.functional.normalize(nn.functional.pad(rows, (0, 1), value=float(constant)), dim=1)
+    query = torch.arange((len(rows) - 1) // stride * stride, device=rows.device)
+    query = query[query % stride > 0]
+    score, stored = (rows[query] @ rows[::stride].T).max(1)
+    beside = stored - query // stride
+    right = ((beside == 0) | (beside == 1))[score.argsort(descending=True, stable=True)].double()
+    precision = right.cumsum(0) / torch.arange(1, len(right) + 1, device=rows.device)
+    return float((precision * right).mean())
 
 
 @without_autocast

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -15,6 +16,7 @@ from hypothesis import strategies as st
 from reference import joined_rows
 from torch import Tensor
 
+from dejavu_torch import DejaVu
 from dejavu_torch.features.embedding import Coder
 from dejavu_torch.features.whitening import (
     Whitening,
@@ -146,6 +148,42 @@ def test_without_views_components_keep_their_variances() -> None:
     components = described[:, :-1] / described[:, -1:] * number
     distances = torch.cdist(components, components)
     torch.testing.assert_close(distances, torch.cdist(PLACES, PLACES), rtol=1e-2, atol=5e-2)
+
+
+def ranges(turns: float = 3.3) -> Tensor:
+    """A route of 256 features whose lengths, 1 to 3, tell the place, and whose directions repeat."""
+    at = torch.arange(256.0)
+    around = 2 * math.pi * turns * at / 256
+    return torch.stack([around.cos(), around.sin()], 1) * torch.linspace(1, 3, 256)[:, None]
+
+
+def test_lengths_that_tell_the_place_are_kept(caplog: pytest.LogCaptureFixture) -> None:
+    whitening = Whitening(views=0)
+    whitening.learn(ranges())
+    assert whitening.lengths is True
+    rows = whitening(ranges())
+    found = (rows @ rows.T).masked_fill(torch.eye(256).bool(), -1).argmax(1)
+    assert float(((found - torch.arange(256)).abs() <= 2).float().mean()) > 0.9
+    for same in (torch.nn.functional.normalize(ranges(), dim=1), ranges()[:20]):  # unit length; too short
+        whitening.learn(same)
+        assert whitening.lengths is None
+    for lengths in (True, False):
+        settled = Whitening(views=0, lengths=lengths)
+        settled.learn(ranges())
+        assert settled.lengths is lengths
+    model = DejaVu().learn(ranges())
+    assert "lengths of its descriptors are kept" in caplog.text
+    assert not model.centres(1000)
+    assert DejaVu().learn(torch.nn.functional.normalize(ranges(), dim=1)).centres(1000)
+
+
+def test_kept_lengths_are_told_by_the_file(tmp_path: Path) -> None:
+    DejaVu().learn(ranges()).save(tmp_path / "map.safetensors")
+    model = DejaVu.load(tmp_path / "map.safetensors")
+    assert model.descriptor.keeps_lengths
+    assert torch.equal(model.localize(ranges()).index, torch.arange(256))
+    model.learn(torch.randn(60, 12))  # which a file settles
+    assert model.descriptor.keeps_lengths
 
 
 def test_numbers_follow_the_rank_and_the_length_of_the_route(caplog: pytest.LogCaptureFixture) -> None:
