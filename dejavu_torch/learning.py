@@ -7,7 +7,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
-from typing import NoReturn, cast
+from typing import Any, NoReturn, cast
 
 import torch
 from torch import Tensor
@@ -123,6 +123,7 @@ class Checkpoint:
             self._refuse(f": its {', '.join(other)} {'differs' if len(other) == 1 else 'differ'}")
         if descriptor.whitening is not None:
             descriptor.whitening.load_state_dict(part_of(tensors, "whitening"))
+            descriptor.whitening.lengths = header.get("lengths")
         place_map.load_packed(part_of(tensors, "map"), state)
         return True
 
@@ -140,10 +141,12 @@ class Checkpoint:
         """Write the partial map, with the first `places` places of a traverse. InputError if this fails; an
         earlier file then stays."""
         tensors = {f"map.{name}": tensor for name, tensor in place_map.packed().items()}
+        header: dict[str, Any] = {"run": dict(self.key), "map": place_map.get_extra_state()}
         if descriptor.whitening is not None:
             learned = descriptor.whitening.state_dict()
             tensors |= {f"whitening.{name}": tensor for name, tensor in learned.items()}
-        write_map(self.path, tensors, {"run": dict(self.key), "map": place_map.get_extra_state()})
+            header["lengths"] = descriptor.whitening.lengths
+        write_map(self.path, tensors, header)
         self.written, self.kept = monotonic(), places
 
     def remove(self) -> None:

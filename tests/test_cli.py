@@ -273,7 +273,7 @@ def test_help_reads_well(command: str, capsys: pytest.CaptureFixture[str]) -> No
     assert stop.value.code == 0
     assert "known subclasses" not in out
     assert "<class" not in out
-    assert len(out.splitlines()) < 165
+    assert len(out.splitlines()) < 170
     assert out.splitlines()[0].startswith(f"usage: dejavu {command}")
 
 
