@@ -281,6 +281,22 @@ def visits() -> str:
     return markdown(table)
 
 
+def features() -> str:
+    """The mean AUC over seeds with further features: of one image, of the null, of the whole drive."""
+    found: dict[str, dict[str, list[Row]]] = {}
+    for row in read("features")["rows"]:
+        found.setdefault(row["case"], {}).setdefault(row["contender"], []).append(row)
+    ways = [*next(iter(found.values()))]
+    kinds = {"one image": "auc_one", "null": "null", "whole drive": "auc"}
+    table = [["AUC", *(f"{way}: {kind}" for way in ways for kind in kinds), "lowest and highest gain"]]
+    for case, own in found.items():
+        cells = [area(mean(row[key] for row in own[way])) for way in ways for key in kinds.values()]
+        first, *_, last = own.values()
+        gains = [b["auc_one"] - a["auc_one"] for a, b in zip(first, last, strict=True)]
+        table.append([case, *cells, f"{min(gains):+.3f}, {max(gains):+.3f}"])
+    return markdown(table)
+
+
 def look_alikes() -> str:
     """What is accepted where places look alike, and without the limits of the map's look-alikes."""
     table = [["right of accepted at a precision of", *(f"{one:g}" for one in PRECISIONS)]]
@@ -361,7 +377,7 @@ TABLES: dict[str, Callable[[], str]] = {
     **{"rejection": rejection, "filtered": filtered, "drives": drives, "driven": driven},
     **{"trainings": trainings, "made drives": made_drives, "storage drives": storage_drives},
     **{"large drives": large_drives, "taught drives": taught, "visits": visits},
-    **{"alike": lambda: f"{look_alikes()}\n{loops()}"},
+    **{"features": features, "alike": lambda: f"{look_alikes()}\n{loops()}"},
     **{f"storage {name}": partial(storage, name) for name in ("aerial", "road1", "road2", "city", "railway")},
 }
 

@@ -29,6 +29,7 @@ from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.preprocess import BLANK, Preprocess
 from dejavu_torch.features.views import SAMPLE, AugmentedFrames, LabelledFrames
 from dejavu_torch.features.whitening import Whitening
+from dejavu_torch.features.xfeat import XFeat
 from dejavu_torch.maps.file import HEADER as FILE_HEADER
 from dejavu_torch.maps.file import (
     checked,
@@ -65,6 +66,7 @@ CLASSES: tuple[type[nn.Module], ...] = (
     HOG,
     PatchPixels,
     Distilled,
+    XFeat,
     SmallCNN,
     Embedding,
     Joined,

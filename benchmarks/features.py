@@ -1,0 +1,87 @@
+"""`benchmarks features`: features beside the default ones, on all routes, with several seeds."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from torch import nn
+from tqdm import tqdm
+
+from benchmarks.drives import ROUTES
+from benchmarks.measure import Column, Row, failure, new_row, table, truth_of, write_bench
+from benchmarks.trainings import Route, drive, road
+from dejavu_torch.data.source import open_source
+from dejavu_torch.evaluation.controls import null_control
+from dejavu_torch.evaluation.curves import evaluate
+from dejavu_torch.features.distilled import Distilled
+from dejavu_torch.features.hog import HOG
+from dejavu_torch.features.joined import Joined
+from dejavu_torch.features.whitening import Whitening
+from dejavu_torch.features.xfeat import XFeat
+from dejavu_torch.model import DejaVu
+from dejavu_torch.recognition.centring import PRIOR, centred
+from dejavu_torch.recognition.smoother import PlaceSmoother
+from dejavu_torch.types import InputError
+
+FEATURES: dict[str, Callable[[], list[nn.Module]]] = {
+    "HOG, Distilled": lambda: [HOG(), Distilled()],
+    "HOG, Distilled, XFeat": lambda: [HOG(), Distilled(), XFeat()],
+}
+FOOTAGE: dict[str, Route] = {  # with frames
+    **{
+        name: route for name, (route, _) in ROUTES.items() if name not in ("magnetometer", "lidar", "gardens")
+    },
+    **{"corridor laps": drive("corridor_laps", 0)},
+    **{"road, first half": road("&stop=1348"), "road, second half": road("&start=1348")},
+}
+KEYS = ("seed", "auc_one", "auc", "null", "map_bytes", "seconds", "skipped")
+COLUMNS: dict[str, Column] = {
+    **{"seed": ("seed", ".0f"), "one image": ("auc_one", ".3f"), "null": ("null", ".3f")},
+    **{"whole drive": ("auc", ".3f"), "kB": ("map_bytes", ".0f", 1000.0), "seconds": ("seconds", ".0f")},
+}
+
+
+def run_features(data: Path, *, out: Path, seeds: int = 3) -> list[str]:
+    """XFeat beside the default features: AUC of one image and of the whole drive, and of the null.
+
+    Args:
+        data: folder of the footage, as for the tests
+        out: folder for bench.json
+        seeds: of the whitening and of the null, from 0 on
+    """
+    rows: list[Row] = []
+    for name, route in tqdm(FOOTAGE.items(), "features", disable=None, leave=False):
+        for seed in range(seeds):
+            rows += bench_features(name, route.below(data), seed)
+            write_bench(out, rows)
+    return [table(rows, COLUMNS), "AUC, centred where there are enough queries"]
+
+
+def bench_features(name: str, route: Route, seed: int) -> Iterator[Row]:
+    """A row for each of `FEATURES`."""
+    reference, query = open_source(route.reference), open_source(route.query)
+    truth, tolerance = truth_of(reference, query, route.truth), route.tolerance
+    for way, features in FEATURES.items():
+        began = time.perf_counter()
+        try:
+            model = DejaVu(Joined(features()), whitening=Whitening(seed=seed))
+        except InputError as error:  # the package is missing
+            yield new_row(name, way, KEYS, seed=seed, skipped=failure(error))
+            continue
+        rows = model.descriptor.learn(reference)
+        model.learn_features(rows, reference)
+        queries = model.descriptor.all_of(query)
+        moved = centred(model.map, queries) if len(queries) >= PRIOR else queries
+        smoother = model.matching(PlaceSmoother(within=tolerance))._replace(radius=tolerance, plain=queries)
+        matches = {
+            "auc_one": model.localize_descriptors(moved),
+            "auc": model.localize_descriptors(moved, smoother),
+            "null": null_control(model, rows, moved, seed),
+        }
+        figures = {key: evaluate(match, truth, tolerance).auc for key, match in matches.items()}
+        size = model.summary().map_bytes
+        yield new_row(
+            name, way, KEYS, seed=seed, **figures, map_bytes=size, seconds=time.perf_counter() - began
+        )
