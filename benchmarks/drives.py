@@ -22,8 +22,8 @@ from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.rejection import calibration_error, judged
 from dejavu_torch.growth import calibrate_if_possible
 from dejavu_torch.model import DejaVu
-from dejavu_torch.recognition.centring import PRIOR, centred
 from dejavu_torch.recognition.smoother import PlaceSmoother
+from dejavu_torch.teaching import in_its_light
 from dejavu_torch.types import InputError, Match
 
 SUMMER, WINTER = "{data}/nordland/summer?", "{data}/nordland/winter?"
@@ -190,7 +190,7 @@ def facts_of(known: Known, numbers: Tensor) -> dict[str, Any]:
     """The figures of a drive; see `bench_drives`."""
     model, tolerance = known.model, known.tolerance
     queries, truth = asked(known, numbers)
-    moved = centred(model.map, queries) if len(queries) >= PRIOR else queries
+    moved = in_its_light(model, queries)
     smoother = PlaceSmoother(within=tolerance)
     single = model.matching()._replace(radius=tolerance)
     together = model.matching(smoother)._replace(radius=tolerance, plain=queries)

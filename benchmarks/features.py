@@ -21,8 +21,8 @@ from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.features.xfeat import XFeat
 from dejavu_torch.model import DejaVu
-from dejavu_torch.recognition.centring import PRIOR, centred
 from dejavu_torch.recognition.smoother import PlaceSmoother
+from dejavu_torch.teaching import in_its_light
 from dejavu_torch.types import InputError
 
 FEATURES: dict[str, Callable[[], list[nn.Module]]] = {
@@ -73,7 +73,7 @@ def bench_features(name: str, route: Route, seed: int) -> Iterator[Row]:
         rows = model.descriptor.learn(reference)
         model.learn_features(rows, reference)
         queries = model.descriptor.all_of(query)
-        moved = centred(model.map, queries) if len(queries) >= PRIOR else queries
+        moved = in_its_light(model, queries)
         smoother = model.matching(PlaceSmoother(within=tolerance))._replace(radius=tolerance, plain=queries)
         matches = {
             "auc_one": model.localize_descriptors(moved),
