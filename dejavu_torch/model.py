@@ -49,6 +49,7 @@ log = logging.getLogger("dejavu_torch")
 
 MANY_FEATURES = 50_000  # per frame: more are warned of
 DESCRIBES = ("preprocess", "features", "whitening", "batch_size", "weight_bits")  # of the descriptor
+REMOVED = 0.5  # of each place's mean score where lengths count: without it only inner products would remain
 STATE = [field.name for field in fields(model_file.ModelState)]
 
 
@@ -548,7 +549,9 @@ class DejaVu(nn.Module):
             seen = f"the precision is {self.precision}, but the map is "
             raise InputError(f"{seen}{only if self.calibration else 'not calibrated'}; expected a threshold")
         accepts = self.acceptance(sequence)
-        return Matching(sequence, acceptance=accepts, platt=platt, search=search or "auto")
+        removed = REMOVED if self.descriptor.keeps_lengths else 1.0
+        ways = search or "auto"
+        return Matching(sequence, acceptance=accepts, platt=platt, search=ways, removed=removed)
 
     def acceptance(self, sequence: SequenceModel | None = None) -> Acceptance:
         """Which answers are accepted, for single queries or for a sequence (convention 4).

@@ -327,6 +327,8 @@ def _smoothed(
     best = drive.map(lambda column: column[:, 0])
     if apart is None:
         judged = replace(run.judged, sequences={**run.judged.sequences, "smoother": best})
+        if beside is not None:
+            beside.removed = own.removed
         run = run._replace(judged=judged, beside=beside)
     if smoother is None:
         return run, found

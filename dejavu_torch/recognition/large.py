@@ -113,7 +113,7 @@ class LargeDrive:
                 valid = scores.isfinite()
                 total[some] += weight @ scores.where(valid, 0)
                 share[some] += weight @ valid.float()
-        means: Tensor = total / share.clamp(min=MIN_SHARE)
+        means: Tensor = self.smoother.removed * total / share.clamp(min=MIN_SHARE)
         return means
 
     def _scores(self, verb: str) -> Iterator[tuple[Tensor, Iterator[tuple[int, Tensor]]]]:

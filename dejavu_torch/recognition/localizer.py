@@ -43,6 +43,7 @@ class Matching(NamedTuple):
     platt: Platt | None = None  # gives probabilities; for a smoother, that of single queries
     callback: Callable[[Tensor], None] | None = None  # receives the final scores (B,N)
     search: Search = "auto"  # of single queries, see `DejaVu.localize`
+    removed: float = 1.0  # of each place's mean score, by a smoother
     apart: int | None = None  # queries are the places themselves; only those over this many before answer
 
 
@@ -153,6 +154,7 @@ class Localizer:
             tiles = Tiles(blocks, place_map.block_places)
 
         smoother.map_links = () if place_map is None else place_map.connections
+        smoother.removed = matching.removed
 
         def rows(queries: Tensor) -> Rows:
             return lambda numbers: score(queries[numbers])
@@ -254,7 +256,8 @@ def asked_of(
     queries: Tensor, smoother: PlaceSmoother, score: Scoring, plain: Tensor | None = None
 ) -> DriveQuery:
     """Queries (Q,K) as a drive with scores of any kind, for a smoother like this one; see `Matching`."""
-    return Localizer(None, Matching(plain=plain)).asked(queries, copy.deepcopy(smoother), score)
+    matching = Matching(plain=plain, removed=smoother.removed)
+    return Localizer(None, matching).asked(queries, copy.deepcopy(smoother), score)
 
 
 def earlier(scores: Tensor, numbers: Tensor, apart: int) -> Tensor:

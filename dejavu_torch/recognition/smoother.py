@@ -185,6 +185,7 @@ class PlaceSmoother(SequenceModel):
         self.within, self.threshold = within, threshold
         self.links, self.loop = tuple(links), loop
         self.map_links: tuple[Link, ...] = ()  # likewise, of the map that a `Localizer` matches to
+        self.removed = 1.0  # share of each place's mean score that is removed
         self.log_likelihood: float | None = None  # nats above being off the map throughout, as fitted
         self.correlation = 1.0  # tau of these queries
         self.is_drive = True  # whether the queries that were fitted to are a drive of the map
@@ -303,7 +304,7 @@ class PlaceSmoother(SequenceModel):
         spacing = spacing_of(spoken(given) if descriptors is None else check_descriptors(descriptors))
         means, values = self.means.to(given), self.values
         if len(means) != scores.shape[1]:
-            means = place_means(given, spacing.weight.to(given))
+            means = self.removed * place_means(given, spacing.weight.to(given))
         if not len(values):
             std, table = standardised(given, means), RankTable()
             table.add(std.z, std.only(std.speaks[:, None].expand_as(std.z), False))
@@ -356,7 +357,7 @@ class PlaceSmoother(SequenceModel):
         picked = stretches(len(descriptors), spacing.correlation, places, repeated)
         known = scores(picked.flatten())
         weight, still = spacing.weight.to(known), spacing.still.to(known.device)
-        self.means = place_means(known, weight[picked.flatten()])
+        self.means = self.removed * place_means(known, weight[picked.flatten()])
         std = standardised(known, self.means).map(lambda column: column.unflatten(0, picked.shape))
         ranks = RankTable()
         ranks.add(std.z, std.only((weight[picked] * std.speaks)[..., None].expand_as(std.z), 0))
