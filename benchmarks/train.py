@@ -69,10 +69,10 @@ def trained(
     from pytorch_lightning.callbacks import Timer
 
     from dejavu_torch.training.datamodule import RouteData
-    from dejavu_torch.training.task import PlaceRecognitionTask
+    from dejavu_torch.training.descriptors import DescriptorTask
 
     pl.seed_everything(seed, verbose=False)
-    task = PlaceRecognitionTask(
+    task = DescriptorTask(
         rung.backbone(), SpectralMapper(BUDGETS[0]), rate=rung.rate, lr=rung.lr, weight_decay=WEIGHT_DECAY
     )
     data = RouteData(reference, tolerance=TOLERANCE, augmentation=rung.augmentation(), held_out=0.0)

@@ -81,17 +81,8 @@ ROUTES = {
     "corridor": Route("{data}/corridor/ref", "{data}/corridor/query", 0, "{data}/corridor/truth.csv"),
     "laps": drive("donkey_lap", 10),
 }
-# the other presets, each on the kind of route it is for
-PRESETS = {
-    "train_small, sim:aerial": simulated("aerial", "train_small"),
-    "train_railway, sim:outdoor": simulated("outdoor", "train_railway"),
-    "train_residues, road": road(preset="train_residues"),
-    "train_nordland, railway": nordland(
-        "start=900&stop=1800",
-        "--data.held_out 0",
-        nordland("stop=900", "--data.second {winter} --data.held_out 0 --trainer.max_steps 100"),
-    ),
-}
+# the other preset, which starts with the descriptor of a training with the first
+PRESETS = {"train_residues, road": road(preset="train_residues")._replace(start=road())}
 
 
 def trained(name: str, route: Route, seed: int, out: Path, options: Sequence[str]) -> Path | str:

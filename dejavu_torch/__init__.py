@@ -25,7 +25,8 @@ Supportive Feature Frequencies" (IROS 2017). From the paper's sections to the co
     VI     (ours) probabilities along the way    PlaceFilter         recognition.filter
     VI     (ours) given the whole drive          PlaceSmoother       recognition.smoother
     VI     (ours) frames from a camera           LiveLocalizer       live.localizer
-    VI     (ours) features trained to repeat     PlaceRecognitionTask training.task
+    VI     (ours) features of few frequencies    DescriptorTask       training.descriptors
+    VI     (ours) features trained to repeat     TemplateTask         training.templates
            frames to train on                    RouteData           training.datamodule
            any backbone                          Embedding           features.embedding
            imposed instead of found periods      ImposedPeriods      periods.imposed
@@ -33,6 +34,7 @@ Supportive Feature Frequencies" (IROS 2017). From the paper's sections to the co
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING
 
 from dejavu_torch.lazy import homes_of, lazily
@@ -64,7 +66,8 @@ if TYPE_CHECKING:
     from dejavu_torch.recognition.sequence import SequenceMatcher as SequenceMatcher
     from dejavu_torch.recognition.smoother import PlaceSmoother as PlaceSmoother
     from dejavu_torch.training.datamodule import RouteData as RouteData
-    from dejavu_torch.training.task import PlaceRecognitionTask as PlaceRecognitionTask
+    from dejavu_torch.training.descriptors import DescriptorTask as DescriptorTask
+    from dejavu_torch.training.templates import TemplateTask as TemplateTask
     from dejavu_torch.types import FrequencyLayer as FrequencyLayer
     from dejavu_torch.types import InputError as InputError
     from dejavu_torch.types import Match as Match
@@ -94,9 +97,16 @@ _NAMES = {
     "recognition.sequence": "SequenceMatcher",
     "recognition.smoother": "PlaceSmoother",
     "training.datamodule": "RouteData",
-    "training.task": "PlaceRecognitionTask",
+    "training.descriptors": "DescriptorTask",
+    "training.templates": "TemplateTask",
     "types": "FrequencyLayer InputError Match Traverse",
 }
 _HOMES = homes_of(_NAMES)
 __all__ = sorted(_HOMES)
-__getattr__, __dir__ = lazily(__name__, _NAMES)
+_of_name, __dir__ = lazily(__name__, _NAMES)
+
+
+def __getattr__(name: str) -> object:
+    if name == "PlaceRecognitionTask":  # says what took its place
+        return import_module("dejavu_torch.training.task").PlaceRecognitionTask
+    return _of_name(name)

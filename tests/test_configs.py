@@ -88,7 +88,7 @@ def test_a_preset_is_found_by_name_from_anywhere(tmp_path: Path, monkeypatch: py
     assert find_config("paper") == ROOT / "configs" / "paper.yaml"
     (tmp_path / "mine.yaml").write_text("batch_size: 9")
     assert find_config("mine.yaml") == Path("mine.yaml")
-    with pytest.raises(InputError, match=r"mine is not there.*train_small"):
+    with pytest.raises(InputError, match=r"mine is not there.*train_road"):
         find_config("mine")
 
 
@@ -119,10 +119,10 @@ def test_the_wheel_holds_package_and_presets(tmp_path: Path) -> None:
     assert {path for path in files if not (tmp_path / "installed" / path).is_file()} == set()
     presets = {path.relative_to(ROOT) for path in (ROOT / "configs").rglob("*.yaml")}
     assert {path for path in presets if not (package / path).is_file()} == set()
-    code = "import dejavu_torch.cli.presets as p; print(p.find_config('train_small'))"
+    code = "import dejavu_torch.cli.presets as p; print(p.find_config('train_road'))"
     python = [sys.executable, "-P", "-c", f"import sys; sys.path.insert(0, {str(package.parent)!r}); {code}"]
     ran = subprocess.run(python, cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert Path(ran.stdout.strip()) == package / "configs" / "train_small.yaml"
+    assert Path(ran.stdout.strip()) == package / "configs" / "train_road.yaml"
 
 
 def aliases(levels: int) -> str:

@@ -19,6 +19,7 @@ import torch
 import yaml
 
 from benchmarks.__main__ import BENCHES
+from dejavu_torch import DescriptorTask, TemplateTask
 from dejavu_torch.cli import COMMANDS, commands, completion, train
 from dejavu_torch.cli.parser import command_parser
 from dejavu_torch.features.augmentation import Augmentation
@@ -194,7 +195,7 @@ def options() -> set[str]:
     """Names of options of all commands, and of the arguments of the classes that they take."""
     parsers = [parser_of("dejavu", name) for name in COMMANDS if name != "train"]
     parsers += [parser_of("python -m benchmarks", name) for name in BENCHES]
-    classes = [*CLASSES, Augmentation, train.RouteData, train.PlaceRecognitionTask]
+    classes = [*CLASSES, Augmentation, train.RouteData, DescriptorTask, TemplateTask]
     printed = io.StringIO()
     with redirect_stdout(printed), pytest.raises(SystemExit):
         train.run_train(["fit", "--help"])

@@ -223,6 +223,9 @@ def test_the_dash_of_the_road_is_the_strongest_layer_in_the_difference_of_red_an
     assert (ours > null + 0.08) == (channel == "R-B")
 
 
+RATED = ("--model.rate", "0", "--model.mapper.route_bytes_per_place", "12")
+
+
 def test_a_stretch_of_the_road_trained_on_one_flight_is_known_on_the_other(
     data_dir: Path, tmp_path: Path
 ) -> None:
@@ -232,12 +235,14 @@ def test_a_stretch_of_the_road_trained_on_one_flight_is_known_on_the_other(
             tmp_path / f"{flight}.png"
         )
     first, second = (f"strip:{tmp_path}/{flight}.png?halve=1&rows=32:128&width=96" for flight in (1, 2))
-    config = ["--config", str(ROOT / "configs" / "train_residues.yaml"), "--seed_everything", "0"]
-    small = ["--data.resize", "[48,48]", "--model.backbone.resize", "[48,48]"]
-    small += ["--model.backbone.network.resize", "[48,48]"]
-    short = ["--trainer.max_steps", "300", "--trainer.limit_val_batches", "0"]
-    silent = ["--trainer.enable_progress_bar", "false", "--trainer.default_root_dir", str(tmp_path)]
-    main(["train", "fit", *config, "--data.source", first, *small, *short, *silent])
+    shared = ["--seed_everything", "0", "--data.source", first, "--data.resize", "[48,48]"]
+    shared += ["--trainer.limit_val_batches", "0", "--trainer.enable_progress_bar", "false"]
+    shared += ["--model.backbone.resize", "[48,48]", "--trainer.default_root_dir"]
+    train = ["train", "fit", "--config"]
+    main([*train, "train_road", *shared, str(tmp_path / "one"), "--trainer.max_steps", "120", *RATED])
+    start = ["--model.start", str(tmp_path / "one" / "map.safetensors"), "--trainer.max_steps", "200"]
+    start += ["--model.backbone.network.resize", "[48,48]"]
+    main([*train, "train_residues", *shared, str(tmp_path), *start])
     report = compare(tmp_path / "report", first, second, "--map", tmp_path / "map.safetensors")
     assert min(report["auc"], report["recall_at_1"]) > 0.8  # .87 to .95 on five processors
     assert report["null"]["auc"] < 0.2

@@ -1,10 +1,11 @@
-"""`dejavu train`: Lightning's command line for our task and data."""
+"""`dejavu train`: Lightning's command line for our tasks and data."""
 
 from __future__ import annotations
 
 import logging
 import os
 import shlex
+import sys
 import warnings
 from collections.abc import Sequence
 from functools import partialmethod
@@ -13,32 +14,29 @@ from typing import Any, ClassVar
 
 import torch
 from jsonargparse import Namespace
-from lightning_fabric.plugins import CheckpointIO
 from lightning_fabric.utilities.exceptions import MisconfigurationException
 from lightning_fabric.utilities.rank_zero import _get_rank
-from pytorch_lightning import LightningModule, Trainer
-from pytorch_lightning.callbacks import Checkpoint, ModelCheckpoint, ProgressBar
-from pytorch_lightning.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
+from pytorch_lightning import Trainer
+from pytorch_lightning.callbacks import Checkpoint, ModelCheckpoint, ProgressBar, TQDMProgressBar
+from pytorch_lightning.cli import LightningArgumentParser, LightningCLI
 
 from dejavu_torch.cli.commands import features_words, print_map, print_next
 from dejavu_torch.cli.options import several
 from dejavu_torch.cli.parser import Parser, Preset, refusal, with_hub
 from dejavu_torch.cli.process import interrupts_raise
-from dejavu_torch.data.output import check_output_folder, make_output_folder, remove_empty_folders, whole_file
+from dejavu_torch.data.output import check_output_folder, make_output_folder, remove_empty_folders
 from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.model import DejaVu
 from dejavu_torch.text import one_line
-from dejavu_torch.training.checkpoint import EXPECTED, CheckpointFiles, taking_over
+from dejavu_torch.training.checkpoint import EXPECTED, taking_over
 from dejavu_torch.training.datamodule import RouteData
-from dejavu_torch.training.export import DESCRIPTOR, LastCheckpoint, MapExport, StepBar, has_bf16
-from dejavu_torch.training.losses import NothingLearned
-from dejavu_torch.training.task import TEMPERATURE, PlaceRecognitionTask, load_weights
+from dejavu_torch.training.descriptors import DescriptorTask
+from dejavu_torch.training.export import DESCRIPTOR, MapExport, has_bf16
+from dejavu_torch.training.task import RouteTask, load_weights
 from dejavu_torch.types import InputError
 
-# minima of settings, or null, that Lightning accepts and fails on later
-MINIMA = {"val_check_interval": 1e-9, "check_val_every_n_epoch": 1, "accumulate_grad_batches": 1}
 BF16 = ("bf16-mixed", "bf16")
-EVERY = 500  # steps between two validations, and between two checkpoints
+EVERY = 500  # steps between two checkpoints
 TOLERANCE = 5  # default of `dejavu compare`
 TRAINER = {
     "max_steps": 3000,
@@ -50,20 +48,21 @@ TRAINER = {
     "num_sanity_val_steps": 0,
     "log_every_n_steps": 10,
 }
-# default classes of parts, whose options can be given without the class
+# default classes, whose options can be given without the class
 PARTS: dict[str, dict[str, Any]] = {
-    "model.backbone": {"class_path": "dejavu_torch.features.cnn.SmallCNN"},
-    "model.mapper": {
-        "class_path": "dejavu_torch.TemplateMapper",
-        "init_args": {"periods": {"class_path": "dejavu_torch.ImposedPeriods"}, "temperature": TEMPERATURE},
+    "model": {
+        "class_path": f"{DescriptorTask.__module__}.{DescriptorTask.__name__}",
+        "init_args": {
+            "backbone": {"class_path": "dejavu_torch.features.cnn.SmallCNN"},
+            "mapper": {"class_path": "dejavu_torch.SpectralMapper"},
+        },
     },
-    "model.preprocess": {"class_path": "dejavu_torch.Preprocess"},
     "data.augmentation": {"class_path": "dejavu_torch.features.augmentation.Augmentation"},
 }
 QUIET = (  # warnings of Lightning that need no action
     "args parameter is intended|num_workers|tensorboard|training batches|isinstance.treespec|"
     "exists and is not empty|your dataloader is not resumable|not supported by the model summary|"
-    "in eval mode at the start of training"
+    "in eval mode at the start of training|The `srun` command"
 )
 log = logging.getLogger("dejavu_torch")
 
@@ -75,7 +74,7 @@ class MapTrainer(Trainer):
 
     def export(
         self,
-        model: PlaceRecognitionTask,
+        model: RouteTask,
         datamodule: RouteData,
         ckpt_path: str | None = None,
         weights_only: bool | None = None,
@@ -87,16 +86,12 @@ class MapTrainer(Trainer):
             weights_only: accepted, since configs have it; no code of a checkpoint is ever run.
         """
         assert ckpt_path is not None  # TrainCLI found one
+        self.strategy.connect(model)
+        model.trainer, self.datamodule, datamodule.trainer = self, datamodule, self
+        datamodule.setup("export")
+        model.setup("export")
         load_weights(model, ckpt_path)
-        model.require_map()
-        model.dejavu.velocity = datamodule.velocity
-        if model.made:  # from the frames of the reference
-            self.strategy.connect(model)
-            model.trainer, self.datamodule, datamodule.trainer = self, datamodule, self
-            datamodule.setup("export")
-            model.setup("export")
-            model.relearn()
-        else:
+        if not model.made:
             log.warning("the map is not calibrated: for templates only `dejavu train fit` does that")
         folder, export = Path(self.default_root_dir), MapExport()
         make_output_folder(folder)
@@ -144,7 +139,7 @@ class TrainCLI(LightningCLI):
     @staticmethod
     def add_core_arguments_to_parser(parser: LightningArgumentParser) -> None:
         """Our options, before Lightning's."""
-        parser.add_lightning_class_args(PlaceRecognitionTask, "model")
+        parser.add_lightning_class_args(RouteTask, "model", subclass_mode=True)
         parser.add_lightning_class_args(RouteData, "data")
         parser.add_lightning_class_args(MapTrainer, "trainer")
         parser.set_defaults({f"trainer.{name}": value for name, value in TRAINER.items()} | PARTS)
@@ -158,23 +153,23 @@ class TrainCLI(LightningCLI):
         return parser
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
-        """Refuse numbers that Lightning fails on later."""
+        """Refuse what Lightning fails on later."""
         super().parse_arguments(parser, args)
         chosen = self.config[self.config["subcommand"]]
         for part in ("trainer", "model", "data"):
             if not isinstance(chosen[part], Namespace):
                 raise InputError(f"{part} is {chosen[part]!r:.40}; expected options, as KEY: VALUE")
-        seed, trainer = chosen["seed_everything"], chosen["trainer"]
-        for name, minimum in MINIMA.items():
-            value = trainer[name]
-            if isinstance(value, (int, float)) and value < minimum:
-                raise InputError(f"trainer.{name} is {value}; expected a number of at least {minimum:g}")
-        if not isinstance(seed, bool | None) and not 0 <= seed < 2**32:
-            raise InputError(f"seed_everything is {seed}; expected a number from 0 to 2^32 - 1")
-        if trainer["max_steps"] is None:
-            raise InputError("trainer.max_steps is null; expected a number of at least 1, or -1 for no end")
-        if trainer["strategy"] not in ("auto", "ddp"):
-            raise InputError(f"trainer.strategy is {trainer['strategy']!s:.40}; expected auto or ddp")
+        trainer, seed = chosen["trainer"], chosen["seed_everything"]
+        interval, steps = trainer["val_check_interval"], "a number of at least 1, or -1 for no end"
+        for name, value, fits, expected in (
+            ("trainer.max_steps", trainer["max_steps"], trainer["max_steps"] is not None, steps),
+            ("trainer.strategy", trainer["strategy"], trainer["strategy"] in ("auto", "ddp"), "auto or ddp"),
+            ("trainer.val_check_interval", interval, interval != 0, "a number above 0"),
+            ("trainer.overfit_batches", trainer["overfit_batches"], not trainer["overfit_batches"], "0"),
+            ("seed_everything", seed, seed is None or 0 <= seed < 2**32, "a number from 0 to 2^32 - 1"),
+        ):
+            if not fits:
+                raise InputError(f"{name} is {value!s:.40}; expected {expected}")
         if trainer["num_nodes"] != 1 and not {"MASTER_ADDR", "SLURM_JOB_ID"} & os.environ.keys():
             raise InputError(  # the machines would wait for each other forever
                 f"trainer.num_nodes is {trainer['num_nodes']}, but no address of the first is set; expected "
@@ -185,15 +180,11 @@ class TrainCLI(LightningCLI):
         """Do nothing: Lightning would read settings from the checkpoint, and import the classes it names."""
 
     def before_instantiate_classes(self) -> None:
-        """Use one device, and validate by steps by default; at the end only if that makes a map."""
-        chosen = self.config[self.subcommand]
-        trainer, mapper = chosen["trainer"], chosen["model"]["mapper"]
-        made = isinstance(mapper, Namespace) and not mapper["class_path"].endswith("TemplateMapper")
+        """Use one device, and validate at the end by default."""
+        trainer = self.config[self.subcommand]["trainer"]
         trainer["devices"] = 1 if trainer["devices"] == "auto" else trainer["devices"]
         if trainer["check_val_every_n_epoch"] is None and trainer["val_check_interval"] is None:
-            steps = trainer["max_steps"]
-            every = steps if made else min(EVERY, steps)
-            trainer["val_check_interval"] = every if steps > 0 else EVERY
+            trainer["val_check_interval"] = trainer["max_steps"] if trainer["max_steps"] > 0 else EVERY
 
     def instantiate_classes(self) -> None:
         """Report the errors of constructors in one line."""
@@ -201,25 +192,29 @@ class TrainCLI(LightningCLI):
             super().instantiate_classes()
         except Exception as error:
             raise refusal(error) from error
-        self.model.gives_way = not any("route_bytes_per_place" in word for word in self.words)
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         """A trainer with our callbacks."""
         asked = self.config_init[self.subcommand]["trainer"]
-        own = several(asked["callbacks"])
-        root = Path(asked["default_root_dir"])
+        own, folder = several(asked["callbacks"]), str(Path(asked["default_root_dir"]) / "checkpoints")
         for callback in own:
             if isinstance(callback, ModelCheckpoint) and callback.dirpath is None:
-                callback.dirpath = str(root / "checkpoints")  # in the same folder as all files of a run
+                callback.dirpath = folder  # with all files of a run
         if self.subcommand == "fit" and not asked["fast_dev_run"]:  # a trial keeps an earlier run
             own.append(MapExport())
-            chosen = asked["enable_checkpointing"] is False or any(isinstance(c, Checkpoint) for c in own)
-            own += [] if chosen else [LastCheckpoint(EVERY)]
-        if self.subcommand == "fit" and asked["enable_progress_bar"] in (None, True):
-            own += [] if any(isinstance(c, ProgressBar) for c in own) else [StepBar()]
-        for plugin in several(asked["plugins"]):
-            if isinstance(plugin, CheckpointIO) and getattr(plugin, "checkpoint_io", plugin) is None:
-                plugin.checkpoint_io = CheckpointFiles()  # type: ignore[attr-defined]  # the wrapped one
+            if asked["enable_checkpointing"] is not False and not any(isinstance(c, Checkpoint) for c in own):
+                last = ModelCheckpoint(
+                    folder,
+                    None,
+                    save_last=True,
+                    save_top_k=0,
+                    save_on_exception=True,
+                    every_n_train_steps=EVERY,
+                )
+                own.append(last)
+        bars = asked["enable_progress_bar"] in (None, True)
+        if bars and not sys.stderr.isatty() and not any(isinstance(c, ProgressBar) for c in own):
+            own.append(TQDMProgressBar(refresh_rate=EVERY))  # lines of a log
         accelerators = torch.cuda.is_available() or torch.backends.mps.is_available()
         on_cpu = asked["accelerator"] == "cpu" or (asked["accelerator"] == "auto" and not accelerators)
         if asked["precision"] in BF16 and on_cpu and not has_bf16():
@@ -236,8 +231,6 @@ class TrainCLI(LightningCLI):
             raise InputError("the training has no end; expected trainer.max_steps or trainer.max_epochs")
         if 0 in (asked["max_steps"], asked["max_epochs"]):
             raise InputError("the training has no steps; expected trainer.max_steps above 0")
-        if asked["overfit_batches"]:
-            raise InputError("trainer.overfit_batches does not fit; expected trainer.limit_train_batches")
         root = Path(self.trainer.default_root_dir)
         check_output_folder(root)
         resumed = self.config_init[self.subcommand].get("ckpt_path") is not None
@@ -247,28 +240,6 @@ class TrainCLI(LightningCLI):
             log.warning("%s holds an earlier run, which this one replaces", root)
 
     def fit(self, **arguments: Any) -> None:
-        """Train; if nothing is learned, start again with a third of the learning rate."""
-        try:
-            self._fit(**arguments)
-        except NothingLearned as error:
-            if self.trainer.world_size > 1:  # its processes cannot start again
-                raise
-            model = self.config[self.subcommand]["model"]
-            first, model["lr"] = model["lr"], model["lr"] / 3
-            log.warning("%s; starting again with --model.lr %.3g instead of %.3g", error, model["lr"], first)
-            self._set_seed()
-            self.instantiate_classes()
-            again = {"model": self.model, "datamodule": self.datamodule, "ckpt_path": None}
-            try:
-                self._fit(**arguments | again)
-            except NothingLearned as last:
-                text = f"{last}, with --model.lr {first:.3g} and {model['lr']:.3g}: no map is written"
-                routes = self.datamodule.listed["source"]
-                if len(routes) == 1:
-                    text += f"; `dejavu learn {shlex.quote(str(routes[0]))} --map FILE` makes one untrained"
-                raise InputError(text) from last
-
-    def _fit(self, **arguments: Any) -> None:
         """Train, and print what was written, even if the user interrupts."""
         root, failed = self.trainer.default_root_dir, False
         try:
@@ -343,25 +314,6 @@ class TrainCLI(LightningCLI):
         return max(found, key=lambda path: path.stat().st_mtime, default=None)
 
 
-class ConfigFile(SaveConfigCallback):
-    """Saves the config of a run next to its figures, completely or not at all."""
-
-    def __init__(self, parser: LightningArgumentParser, config: Any, **_: Any) -> None:
-        super().__init__(parser, config, save_to_log_dir=False)
-        self.folder = Path()
-
-    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Find the folder in all processes, of which one writes."""
-        self.folder = Path(trainer.log_dir or trainer.default_root_dir)
-        super().setup(trainer, pl_module, stage)
-
-    def save_config(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        make_output_folder(self.folder)
-        with whole_file(self.folder / self.config_filename) as temporary:
-            # the fourth argument, whose name changed, keeps null values
-            self.parser.save(self.config, temporary, "yaml", False, overwrite=True, multifile=False)
-
-
 def print_written(export: MapExport, data: RouteData, words: Sequence[str]) -> None:
     """Print what was written, its figures if they are known, and the next command."""
     if export.written is None:
@@ -422,12 +374,13 @@ def run_train(arguments: Sequence[str]) -> None:
     try:
         TrainCLI(
             list(arguments),
-            model_class=PlaceRecognitionTask,
+            model_class=RouteTask,
+            subclass_mode_model=True,
             datamodule_class=RouteData,
             trainer_class=MapTrainer,
             parser_kwargs={"prog": "dejavu train", "description": "Train features that repeat, end to end."},
             seed_everything_default=0,
-            save_config_callback=ConfigFile,
+            save_config_kwargs={"overwrite": True},
             load_from_checkpoint_support=False,  # which would write out the config for each part
         )
     except InputError:

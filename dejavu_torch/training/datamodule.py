@@ -89,6 +89,8 @@ class Clips(DistributedSampler[list[int]]):
     ) -> None:
         super().__init__(cast(Any, range(sum(map(len, runs)))), processes, process)
         self.runs, self.clip = runs, clip
+        # the same in all processes, whose other random numbers differ
+        self.generator = torch.Generator().manual_seed(torch.initial_seed() % 2**63)
         self.total = sum(len(run) // clip for run in runs)
         self.clips = min(batch_size // clip, self.total) // processes  # of a process's part of a batch
         if not self.clips:
@@ -101,9 +103,9 @@ class Clips(DistributedSampler[list[int]]):
     def __iter__(self) -> Iterator[list[int]]:
         starts = []
         for run in self.runs:
-            offset = int(torch.randint(len(run) % self.clip + 1, ()))
+            offset = int(torch.randint(len(run) % self.clip + 1, (), generator=self.generator))
             starts.append(run.start + offset + torch.arange(len(run) // self.clip) * self.clip)
-        order = torch.cat(starts)[torch.randperm(self.total)]
+        order = torch.cat(starts)[torch.randperm(self.total, generator=self.generator)]
         frames = order[:, None] + torch.arange(self.clip)
         batches = frames.split(self.clips * self.num_replicas)[: len(self)]  # complete ones only
         return iter([batch.split(self.clips)[self.rank].flatten().tolist() for batch in batches])

@@ -1,19 +1,15 @@
-"""The callbacks of a training: progress, checkpoints, and at the end the map and its scores."""
+"""At the end of a training: the map and its scores."""
 
 from __future__ import annotations
 
 import copy
 import logging
-import math
 import shlex
-import sys
-import time
 from pathlib import Path
 from typing import Any, cast
 
 import pytorch_lightning as pl
-from pytorch_lightning.callbacks import Callback, Checkpoint, ModelCheckpoint, ProgressBar
-from tqdm import tqdm
+from pytorch_lightning.callbacks import Callback, ModelCheckpoint
 
 from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth
 from dejavu_torch.data.traverse import fitted
@@ -28,12 +24,11 @@ from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.localizer import SINGLE
 from dejavu_torch.training.datamodule import MIN_FRAMES, RouteData
-from dejavu_torch.training.task import PlaceRecognitionTask, load_weights
+from dejavu_torch.training.task import RouteTask, load_weights
 from dejavu_torch.types import InputError, Match, Traverse
 
 DESCRIPTOR = "descriptor.safetensors"  # of several routes
 TRAINED, HOG, UNTRAINED = "the trained map", "HOG of all frames", "the untrained map"
-LINES, INTERVAL = 10, 60.0  # lines of progress without a terminal, and seconds between two at most
 CPU_FLAGS = Path("/proc/cpuinfo")
 BF16_FLAGS = {"avx512_bf16", "amx_bf16", "bf16"}  # the last one on ARM
 
@@ -63,7 +58,7 @@ class MapExport(Callback):
 
     def on_fit_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Load the best weights and write the map."""
-        if not isinstance(pl_module, PlaceRecognitionTask) or not trainer.is_global_zero:
+        if not isinstance(pl_module, RouteTask) or not trainer.is_global_zero:
             return
         step = trainer.global_step
         if not step:
@@ -102,13 +97,9 @@ class MapExport(Callback):
         if interrupted and trainer.global_step and self.written is None:
             self.write(pl_module, Path(trainer.default_root_dir))
 
-    def write(self, task: PlaceRecognitionTask, folder: Path, data: RouteData | None = None) -> None:
-        """Write the task's map, calibrated with unseen data if `data` is given; warn if there is none yet."""
-        try:
-            model = task.deployed()
-        except InputError as error:
-            log.warning("no map is written: %s", error)
-            return
+    def write(self, task: RouteTask, folder: Path, data: RouteData | None = None) -> None:
+        """Write the task's map, calibrated with unseen data if `data` is given."""
+        model = task.deployed()
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / (self.name if model.map.places else DESCRIPTOR)
         model.save(path)  # before the calibration, which may fail
@@ -146,36 +137,6 @@ def calibrate(model: DejaVu, data: RouteData, starts: list[int]) -> None:
         log.warning(seen, data.held_out)
     elif isinstance(model.mapper, TemplateMapper) and model.map.places >= MIN_FRAMES:
         log.warning("the map is not calibrated: templates have no held-out segments; give data.validation")
-
-
-class LastCheckpoint(Checkpoint):
-    """Keeps `checkpoints/last.ckpt` in the trainer's default_root_dir, also if a training is interrupted.
-
-    Args:
-        every: steps between two.
-    """
-
-    def __init__(self, every: int = 500) -> None:
-        self.every, self.saved = every, 0
-
-    def on_train_batch_end(self, trainer: pl.Trainer, *_: Any) -> None:
-        """Save every `every` steps."""
-        if trainer.global_step % self.every == 0:
-            self._save(trainer)
-
-    def on_exception(self, trainer: pl.Trainer, pl_module: Any, exception: BaseException) -> None:
-        """Save the last step if the user interrupts."""
-        if isinstance(exception, KeyboardInterrupt):
-            self._save(trainer)
-
-    def on_train_end(self, trainer: pl.Trainer, pl_module: Any) -> None:
-        """Save the last step."""
-        self._save(trainer)
-
-    def _save(self, trainer: pl.Trainer) -> None:
-        if trainer.state.fn == "fit" and trainer.global_step not in (0, self.saved):
-            trainer.save_checkpoint(Path(trainer.default_root_dir) / "checkpoints" / "last.ckpt")
-            self.saved = trainer.global_step
 
 
 def compare_with_untrained(
@@ -217,58 +178,6 @@ def _of_shape(query: Traverse, shape: tuple[int, ...] | None) -> Traverse:
 def _match(model: DejaVu, query: Traverse) -> Match:
     descriptors = model.descriptor.all_of(_of_shape(query, model.frame_shape))
     return model.localize_descriptors(descriptors, SINGLE).renumbered(model.map.table.scored)
-
-
-class StepBar(ProgressBar):
-    """Shows the steps, the loss and the remaining time on stderr."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.shown = True
-        self.bar: tqdm[Any] | None = None
-        self.total = self.began = self.last_step = 0
-        self.since = self.last_time = 0.0
-
-    def disable(self) -> None:
-        self.shown = False
-
-    def enable(self) -> None:
-        self.shown = True
-
-    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Begin at the current step, which a checkpoint may set."""
-        self.total, self.began = int(trainer.estimated_stepping_batches), trainer.global_step
-        self.last_step = self.began
-        self.last_time = self.since = time.monotonic()
-        if self.shown and sys.stderr.isatty():
-            given = {"total": self.total, "initial": self.began, "unit": " steps", "file": sys.stderr}
-            self.bar = tqdm(desc="training", **given)
-
-    def on_train_batch_end(self, trainer: pl.Trainer, *_: Any) -> None:
-        """Update the bar, or print a line if one is due."""
-        step, now = trainer.global_step, time.monotonic()
-        if self.bar is not None:
-            self.bar.update(step - self.bar.n)
-            if now - self.last_time > 1:
-                self.last_time = now
-                self.bar.set_postfix_str(_loss(trainer), refresh=False)
-            return
-        due = (step - self.last_step) * LINES >= self.total or now - self.last_time >= INTERVAL
-        if self.shown and (due or step == self.total) and step > self.last_step:
-            self.last_step, self.last_time = step, now
-            left = tqdm.format_interval((now - self.since) * (self.total - step) / (step - self.began))
-            line = f"dejavu: training: step {step} of {self.total}, {_loss(trainer)}, {left} left"
-            tqdm.write(line, file=sys.stderr)
-
-    def teardown(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
-        """Close the bar."""
-        if self.bar is not None:
-            self.bar.close()
-            self.bar = None
-
-
-def _loss(trainer: pl.Trainer) -> str:
-    return f"loss {float(trainer.callback_metrics.get('train/loss', math.nan)):.3g}"
 
 
 def has_bf16() -> bool:

@@ -23,7 +23,7 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.training.datamodule import RouteData
-from dejavu_torch.training.task import PlaceRecognitionTask
+from dejavu_torch.training.templates import TemplateTask
 from dejavu_torch.types import Training
 
 
@@ -112,23 +112,25 @@ def videos(folder: Path) -> None:
 
 TRAIN = """
 model:
-  backbone:
-    class_path: dejavu_torch.features.cnn.SmallCNN
-    init_args: {dimension: 8, channels: 1, resize: [16, 16], widths: [4, 8], squeeze: 4}
-  mapper:
-    class_path: dejavu_torch.TemplateMapper
-    init_args:
-      periods:
-        class_path: dejavu_torch.ImposedPeriods
-        init_args: {periods: [3, 4, 5], bin: 2}
+  class_path: dejavu_torch.TemplateTask
+  init_args:
+    backbone:
+      class_path: dejavu_torch.features.cnn.SmallCNN
+      init_args: {dimension: 8, channels: 1, resize: [16, 16], widths: [4, 8], squeeze: 4}
+    mapper:
+      class_path: dejavu_torch.TemplateMapper
+      init_args:
+        periods:
+          class_path: dejavu_torch.ImposedPeriods
+          init_args: {periods: [3, 4, 5], bin: 2}
 data: {source: in/frames.npy, batch_size: 20, tolerance: 2}
 trainer: {max_steps: 2, accelerator: cpu, logger: false, default_root_dir: out/run}
 """
 
 
-def new_task() -> PlaceRecognitionTask:
+def new_task() -> TemplateTask:
     backbone = SmallCNN(8, channels=1, resize=(16, 16), widths=(4, 8), squeeze=4)
-    return PlaceRecognitionTask(backbone=backbone, mapper=TemplateMapper(ImposedPeriods([3, 4, 5], bin=2)))
+    return TemplateTask(backbone=backbone, mapper=TemplateMapper(ImposedPeriods([3, 4, 5], bin=2)))
 
 
 def checkpoints(folder: Path) -> None:

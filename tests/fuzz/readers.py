@@ -54,26 +54,22 @@ from dejavu_torch.model_file import read_place_map
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.sequence import SequenceMatcher
-from dejavu_torch.training.export import load_weights
+from dejavu_torch.training.checkpoint import read_checkpoint
 from dejavu_torch.types import InputError, Match, Traverse
 
 from .inputs import (
     TRAIN,
     checkpoints,
-    frames_of,
     images,
     inputs,
     maps,
     matches_text,
-    new_task,
     pictures,
     videos,
 )
 from .mutations import (
     BOMB,
-    CANARY,
     NUMBERS,
-    PICKLES,
     TAGS,
     TEXTS,
     json_text,
@@ -82,7 +78,6 @@ from .mutations import (
     mutate_tensors,
     mutate_text,
     mutate_words,
-    odd_value,
 )
 
 
@@ -299,56 +294,15 @@ def rewritten(data: bytes, packing: int, change: Callable[[str, bytes], bytes]) 
 # checkpoints ----------------------------------------------------------------------------------------------
 
 
-def mutated_checkpoint(random: Random, data: bytes) -> tuple[bytes, bool]:
-    """A checkpoint with other bytes or content, and whether a training could have written it so."""
-    act = random.random()
-    if act < 0.4:
-        return mutate_bytes(random, data), False
-    if act < 0.6:
-        names = zipfile.ZipFile(io.BytesIO(data)).namelist()
-        chosen, pickle = random.choice(names), random.choice((*PICKLES, *[b""] * 7))
-
-        def change(name: str, held: bytes) -> bytes:
-            return held if name != chosen else pickle or mutate_bytes(random, held)
-
-        return rewritten(data, zipfile.ZIP_STORED, change), True
-    held = torch.load(io.BytesIO(data), weights_only=True)
-    state = held["state_dict"]
-    tensors = {name: value for name, value in state.items() if isinstance(value, Tensor)}
-    others = {name: value for name, value in state.items() if name not in tensors}
-    if act < 0.8:
-        held["state_dict"] = others | mutate_tensors(random, tensors)
-    elif act < 0.9:
-        name = random.choice(sorted(held))
-        held[name] = odd_value(random, held[name])
-        if random.random() < 0.2:
-            held["hyper_parameters"] = {"_class_path": f"{CANARY}.Module", "_instantiator": f"{CANARY}.run"}
-    else:
-        plain = {name: held[name] for name in held if name not in ("state_dict", "optimizer_states")}
-        held |= mutate_json(random, plain)
-        held["state_dict"] = tensors | mutate_json(random, others)
-    written = io.BytesIO()
-    torch.save(held, written)
-    return written.getvalue(), True
-
-
 @reader("checkpoint", checkpoints, share=1)
 def checkpoint(case: Case) -> None:
+    """Damage is seen; settings that a file names import nothing."""
     path, data = case.made(checkpoints) / "last.ckpt", Path("in/last.ckpt")
-    mutated, crafted = mutated_checkpoint(case.random, path.read_bytes())
-    data.write_bytes(mutated)
+    data.write_bytes(mutate_bytes(case.random, path.read_bytes()))
     case.begin()
-    task = new_task()
-    load_weights(task, data)
-    if crafted:
-        with torch.no_grad():
-            task.eval()(frames_of(pictures(3)))
-        return
-    whole = new_task()
-    load_weights(whole, path)
-    for name, value in whole.state_dict().items():
-        other = task.state_dict()[name]
-        if not (same_tensor(value, other) if isinstance(value, Tensor) else value == other):
+    read, whole = read_checkpoint(data)["state_dict"], read_checkpoint(path)["state_dict"]
+    for name, value in whole.items():
+        if not (same_tensor(value, read[name]) if isinstance(value, Tensor) else value == read[name]):
             raise Wrong(f"a damaged checkpoint loads as another: {name}")
 
 
@@ -362,7 +316,7 @@ def train_commands(case: Case) -> None:
     words = random.choice((fit, [*fit, *resume], *others))
     act = random.random()
     if act < 0.4:
-        data.write_bytes(mutated_checkpoint(random, data.read_bytes())[0])
+        data.write_bytes(mutate_bytes(random, data.read_bytes()))
     elif act < 0.7:
         Path("in/train.yaml").write_bytes(mutated_yaml(random, TRAIN))
     else:

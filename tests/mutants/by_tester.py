@@ -520,14 +520,14 @@ MUTANTS = [
         "dejavu_torch/features/embedding.py",
         "projection * largest.sign()",
         "projection",
-        ("tests/training/test_training_on_gpu.py::-k stages",),
+        ("tests/training/test_training_on_gpu.py::-k code",),
     ),
     Mutant(
         "The noise of a code is the same on every device.",
         "dejavu_torch/features/embedding.py",
         "torch.randn(components.shape, dtype=torch.float32).to(components)",
         "torch.randn_like(components)",
-        ("tests/training/test_training_on_gpu.py::-k stages",),
+        ("tests/training/test_training_on_gpu.py::-k code",),
     ),
     Mutant(
         "Links that part from or meet at one place share its mass.",

@@ -9,7 +9,7 @@ import pytest
 from small_training import CONFIG, MINE, footage, train
 
 from dejavu_torch import DejaVu
-from dejavu_torch.training.task import PlaceRecognitionTask
+from dejavu_torch.training.task import RouteTask
 
 CALIBRATED = ("test_export", "test_train_command")
 
@@ -44,7 +44,7 @@ def _without_calibration(request: pytest.FixtureRequest, monkeypatch: pytest.Mon
 def _without_a_word_on_short_routes(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """As all of these are; test_held_out.py is about it."""
     if request.path.stem != "test_held_out":
-        monkeypatch.setattr(PlaceRecognitionTask, "_say_few", lambda _: None)
+        monkeypatch.setattr(RouteTask, "_say_few", lambda _: None)
 
 
 @pytest.fixture

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import math
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from helpers import Fixed
 from pytorch_lightning import Callback, Trainer
+from pytorch_lightning.callbacks import ModelCheckpoint
 from torch import Tensor, nn
 
-from dejavu_torch import DejaVu, ImposedPeriods, TemplateMapper
+from dejavu_torch import DejaVu, ImposedPeriods, SpectralMapper, TemplateMapper
 from dejavu_torch.cli import main
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.evaluation.curves import evaluate
@@ -22,9 +21,10 @@ from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.training.datamodule import RouteData
+from dejavu_torch.training.descriptors import DescriptorTask
 from dejavu_torch.training.export import MapExport
-from dejavu_torch.training.task import PlaceRecognitionTask
-from dejavu_torch.types import FrequencyLayer, Plan
+from dejavu_torch.training.task import RouteTask
+from dejavu_torch.training.templates import TemplateTask
 
 FRAMES = 40
 
@@ -53,8 +53,12 @@ def mapper(periods: PeriodFinder | None = None, **settings: Any) -> TemplateMapp
     return TemplateMapper(ImposedPeriods([3, 4, 5], bin=2) if periods is None else periods, **settings)
 
 
-def new_task(**settings: Any) -> PlaceRecognitionTask:
-    return PlaceRecognitionTask(**{"backbone": backbone(), "mapper": mapper()} | settings)
+def new_task(**settings: Any) -> TemplateTask:
+    return TemplateTask(**{"backbone": backbone(), "mapper": mapper()} | settings)
+
+
+def new_descriptor(**settings: Any) -> DescriptorTask:
+    return DescriptorTask(**{"backbone": coded(), "mapper": SpectralMapper(20.0)} | settings)
 
 
 def still(**strengths: Any) -> Augmentation:
@@ -75,14 +79,19 @@ def trainer(folder: Path, *callbacks: Callback, **settings: Any) -> Trainer:
     return Trainer(default_root_dir=folder, callbacks=[*callbacks, MapExport()], **quiet, **given)
 
 
+def last(folder: Path, **settings: Any) -> ModelCheckpoint:
+    """Keeps `checkpoints/last.ckpt`, as the command does."""
+    return ModelCheckpoint(folder / "checkpoints", save_last=True, save_top_k=0, **settings)
+
+
 def heights(steps: int) -> list[float]:
-    """The learning rates of a stage of so many steps, beside the highest."""
+    """The learning rates of so many steps, beside the highest."""
     rise = max(1, steps // 10)
     falls = [0.5 + 0.5 * math.cos(math.pi * k / (steps - rise)) for k in range(steps - rise)]
     return [(k + 1) / rise for k in range(rise)] + falls
 
 
-def fit(folder: Path, task: PlaceRecognitionTask, data: RouteData, **settings: Any) -> DejaVu:
+def fit(folder: Path, task: RouteTask, data: RouteData, **settings: Any) -> DejaVu:
     """The map that a training writes."""
     trainer(folder, **settings).fit(task, data)
     return DejaVu.load(folder / "map.safetensors")
@@ -99,7 +108,7 @@ def recall(model: DejaVu, query: Tensor) -> float:
     return evaluate(model.localize(ArrayTraverse(query)), truth, tolerance=2).recall_at_1
 
 
-def assert_same_scores(task: PlaceRecognitionTask, model: DejaVu) -> None:
+def assert_same_scores(task: RouteTask, model: DejaVu) -> None:
     """Of the task, of its map, and of the exported program."""
     frames = footage(0.1)[:7, None] / 255
     with torch.no_grad():
@@ -111,17 +120,6 @@ def assert_same_scores(task: PlaceRecognitionTask, model: DejaVu) -> None:
         torch.testing.assert_close(program.module()(frames), scores, rtol=1e-5, atol=1e-5)
     assert scores.shape == (7, FRAMES)
     assert not list(model.map.parameters())
-
-
-class Later(Fixed):
-    """Other layers whenever it is asked again."""
-
-    asked = 0
-
-    def plan(self, features: Tensor) -> Plan:
-        self.asked += 1
-        periods = (3, 4) if self.asked == 1 else (5, 7, 9)
-        return tuple(FrequencyLayer(Fraction(p), p, 0, len(features), tuple(range(8))) for p in periods)
 
 
 class Stop(Callback):
@@ -141,15 +139,17 @@ class Stop(Callback):
 
 CONFIG = """
 model:
-  backbone:
-    class_path: dejavu_torch.features.cnn.SmallCNN
-    init_args: {dimension: 8, channels: 1, resize: [16, 16], widths: [4, 8], squeeze: 4}
-  mapper:
-    class_path: dejavu_torch.TemplateMapper
-    init_args:
-      periods:
-        class_path: dejavu_torch.ImposedPeriods
-        init_args: {periods: [3, 4, 5], bin: 2}
+  class_path: dejavu_torch.TemplateTask
+  init_args:
+    backbone:
+      class_path: dejavu_torch.features.cnn.SmallCNN
+      init_args: {dimension: 8, channels: 1, resize: [16, 16], widths: [4, 8], squeeze: 4}
+    mapper:
+      class_path: dejavu_torch.TemplateMapper
+      init_args:
+        periods:
+          class_path: dejavu_torch.ImposedPeriods
+          init_args: {periods: [3, 4, 5], bin: 2}
 data: {source: one.npy, batch_size: 20, tolerance: 2}
 trainer: {max_steps: 4, accelerator: cpu, enable_progress_bar: false, default_root_dir: run}
 """
@@ -193,6 +193,9 @@ class Interrupted(Plain):
             raise KeyboardInterrupt
         return super().forward(frames)
 """
+
+
+DESCRIPTOR = ["--model", "DescriptorTask", "--model.mapper", "SpectralMapper"]
 
 
 def train(command: str, *options: object, config: str = "train.yaml") -> None:

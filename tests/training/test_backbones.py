@@ -26,12 +26,12 @@ from torch import Tensor, nn
 from dejavu_torch import HOG, DejaVu
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.embedding import Embedding
-from dejavu_torch.training.task import PlaceRecognitionTask, freeze_parts, start_from
+from dejavu_torch.training.task import RouteTask, freeze_parts, start_from
 
 RUNNING = ("running_mean", "running_var", "num_batches_tracked")
 
 
-def changed(tmp_path: Path, module: nn.Module, **settings: Any) -> tuple[set[str], PlaceRecognitionTask]:
+def changed(tmp_path: Path, module: nn.Module, **settings: Any) -> tuple[set[str], RouteTask]:
     """The names in the backbone's state that a training changes."""
     before = {name: value.clone() for name, value in module.state_dict().items()}
     task = new_task(backbone=module, **settings)
@@ -40,7 +40,7 @@ def changed(tmp_path: Path, module: nn.Module, **settings: Any) -> tuple[set[str
     return {name for name, value in before.items() if not torch.equal(value, after[name])}, task
 
 
-def trained(task: PlaceRecognitionTask) -> set[str]:
+def trained(task: RouteTask) -> set[str]:
     return {name for name, parameter in task.named_parameters() if parameter.requires_grad}
 
 
@@ -115,11 +115,9 @@ def test_a_foreign_network_learns(tmp_path: Path) -> None:
 
 
 def test_hog_has_nothing_to_train_but_the_map_is(tmp_path: Path) -> None:
-    task = new_task(backbone=HOG(cell=4, block=1), feature_weights=True)
+    task = new_task(backbone=HOG(cell=4, block=1))
     model = fit(tmp_path, task, data_of())
-    assert trained(task) == {"log_temperature", "dejavu.map.templates", "dejavu.map.weights"}
-    assert len(model.map.weights) == model.map.dimension
-    assert not (model.map.weights == 1).all()
+    assert trained(task) == {"log_temperature", "dejavu.map.templates"}
     assert recall(model, footage(0.02)) > 0.5
 
 

@@ -1,20 +1,15 @@
-"""A training that learns nothing is begun again once, and given up; one that learns goes on."""
+"""A training that learns nothing is given up; one that learns goes on."""
 
 from __future__ import annotations
 
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
 import torch
-import yaml
-from command_line import fails
 from helpers import refused
-from small_training import FRAMES, backbone, data_of, new_task, trainer, warned
+from small_training import FRAMES, backbone, data_of, new_descriptor, new_task, trainer
 
-from dejavu_torch import SpectralMapper
 from dejavu_torch.training.losses import (
     LAST,
     LastLosses,
@@ -23,7 +18,7 @@ from dejavu_torch.training.losses import (
     place_chance,
     place_cross_entropy,
 )
-from dejavu_torch.training.task import PlaceRecognitionTask
+from dejavu_torch.training.task import RouteTask
 from dejavu_torch.types import FrequencyLayer
 
 FEW, STEPS = 20, 30  # steps that tell, and of a training
@@ -36,8 +31,8 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("dejavu_torch.training.losses.LAST", FEW)
 
 
-def task_of(kind: str) -> PlaceRecognitionTask:
-    return new_task(mapper=SpectralMapper(20.0), backbone=backbone(32)) if kind == "spectral" else new_task()
+def task_of(kind: str) -> RouteTask:
+    return new_descriptor(backbone=backbone(32)) if kind == "spectral" else new_task()
 
 
 @pytest.mark.parametrize("tolerance", [0, 3])
@@ -94,40 +89,3 @@ def test_frames_that_are_all_alike_end_a_training_ahead_of_its_last_step(tmp_pat
         running.fit(task_of(kind), data_of(ALIKE))
     assert FEW < running.global_step < 9 * FEW
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.usefixtures("few")
-def test_what_forgets_all_is_told_at_the_end(tmp_path: Path) -> None:
-    task = task_of("spectral")
-
-    def forget(*_: Any) -> None:
-        if task.last.learned:
-            with torch.no_grad():
-                task.stage.proxies.zero_()  # type: ignore[union-attr]
-
-    task.dejavu.features.register_forward_hook(forget)
-    running = trainer(tmp_path, max_steps=2 * STEPS, limit_val_batches=0)
-    with refused("nothing is learned"):
-        running.fit(task, data_of())
-    assert running.global_step == 2 * STEPS
-    assert not (tmp_path / "map.safetensors").exists()
-
-
-@pytest.mark.usefixtures("few")
-def test_the_command_begins_again_once_and_then_gives_up(
-    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
-) -> None:
-    """And names a command that takes one route."""
-    path, root = tmp_path / "alike.npy", tmp_path / "run"
-    np.save(path, ALIKE.numpy())
-    words = ["--config", "train.yaml", "--data.source", path, "--model.mapper", "SpectralMapper"]
-    words += ["--trainer.max_steps", STEPS, "--trainer.limit_val_batches", 0, "--model.lr", 0.003]
-    error = fails(capfd, "train", "fit", *words, "--seed_everything", 2, "--trainer.default_root_dir", root)
-    (again,) = warned(caplog)
-    assert "nothing is learned" in again
-    assert "--model.lr 0.001 instead of 0.003" in again
-    assert "nothing is learned" in error
-    assert f"`dejavu learn {path} --map FILE`" in error
-    assert not list(root.rglob("*.safetensors"))
-    logs = sorted(root.rglob("config.yaml"))  # of both
-    assert [yaml.safe_load(one.read_text())["model"]["lr"] for one in logs] == [0.003, 0.001]

@@ -10,12 +10,10 @@ import pytest
 import torch
 from pytorch_lightning import Callback, Trainer
 from pytorch_lightning.callbacks import EarlyStopping, ModelCheckpoint
-from small_training import Stop, data_of, footage, new_task, trainer, warned
+from small_training import Stop, data_of, footage, last, new_task, trainer, warned
 
 from dejavu_torch import DejaVu
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.training.export import LastCheckpoint
-from dejavu_torch.training.task import load_weights
 
 
 class Wreck(Callback):
@@ -60,7 +58,7 @@ def test_what_leaves_no_map_or_another_than_expected_warns(
     assert not (tmp_path / "map.safetensors").exists()
     caplog.clear()
     best, task = ModelCheckpoint(tmp_path, monitor="val/auc_augmented", mode="max"), new_task()
-    trainer(tmp_path, best, Tidy(), LastCheckpoint()).fit(task, data_of())
+    trainer(tmp_path, best, Tidy(), last(tmp_path)).fit(task, data_of())
     assert warned(caplog) == [f"{best.best_model_path} is gone: the map is from the last step"]
     caplog.clear()
     trainer(tmp_path).fit(new_task(), data_of(), ckpt_path=tmp_path / "checkpoints" / "last.ckpt")
@@ -70,26 +68,16 @@ def test_what_leaves_no_map_or_another_than_expected_warns(
 
 
 def test_an_interrupt_leaves_the_map_and_the_checkpoint_of_the_last_step(tmp_path: Path) -> None:
+    kept = last(tmp_path, save_on_exception=True)
     stop, handler = Stop(3, exception=KeyboardInterrupt()), signal.getsignal(signal.SIGINT)
+    running = trainer(tmp_path, kept, stop, max_steps=9)
     try:
         with pytest.raises(SystemExit):
-            trainer(tmp_path, stop, LastCheckpoint(every=2), max_steps=9).fit(new_task(), data_of())
+            running.fit(new_task(), data_of())
     finally:
         signal.signal(signal.SIGINT, handler)
-    model, task = DejaVu.load(tmp_path / "map.safetensors"), new_task()
-    load_weights(task, tmp_path / "checkpoints" / "last.ckpt")
-    assert torch.equal(task.route.templates, model.map.templates)
-    assert [one.trained and one.trained.steps for one in (model, task.deployed())] == [3, 3]
-
-
-def test_the_last_checkpoint_is_by_steps_and_of_the_end(tmp_path: Path) -> None:
-    saved: list[int] = []
-
-    class Counted(LastCheckpoint):
-        def _save(self, trainer: Trainer) -> None:
-            saved.append(trainer.global_step)
-            super()._save(trainer)
-
-    trainer(tmp_path, Counted(every=4), max_steps=9).fit(new_task(), data_of())
-    assert saved == [4, 8, 9]
-    assert torch.load(tmp_path / "checkpoints" / "last.ckpt", weights_only=True)["global_step"] == 9
+    model = DejaVu.load(tmp_path / "map.safetensors")
+    written = torch.load(tmp_path / "checkpoints" / "last.ckpt", weights_only=True)
+    assert torch.equal(written["state_dict"]["dejavu.map.templates"], model.map.templates)
+    assert model.trained is not None
+    assert model.trained.steps == written["global_step"] == 3

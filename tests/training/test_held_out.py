@@ -10,8 +10,18 @@ import numpy as np
 import pytest
 import torch
 from command_line import fails
-from helpers import refused
-from small_training import backbone, data_of, footage, new_task, train, trainer, warned
+from small_training import (
+    DESCRIPTOR,
+    backbone,
+    data_of,
+    footage,
+    last,
+    new_descriptor,
+    new_task,
+    train,
+    trainer,
+    warned,
+)
 
 from dejavu_torch import DejaVu, Preprocess, RouteData, SpectralMapper
 from dejavu_torch.cli.train import MapTrainer
@@ -19,7 +29,7 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.features.views import SEGMENT, LabelledFrames
 from dejavu_torch.training import export
-from dejavu_torch.training.export import UNTRAINED, LastCheckpoint, compare_with_untrained
+from dejavu_torch.training.export import UNTRAINED, compare_with_untrained
 from dejavu_torch.types import Match
 
 FRAMES = 320
@@ -99,7 +109,7 @@ def test_what_training_has_not_seen_calibrates(
     tmp_path: Path, calibrations: list[set[int]], validated: bool
 ) -> None:
     data = long(validation=ArrayTraverse(footage(0.1, FRAMES)), validation_truth="0") if validated else long()
-    trainer(tmp_path, **SHORT).fit(new_task(**MADE), data)
+    trainer(tmp_path, **SHORT).fit(new_descriptor(backbone=backbone(), **MADE), data)
     assert calibrations == [set(range(FRAMES)) if validated else held(data)]
 
 
@@ -110,10 +120,16 @@ def test_what_the_checkpoint_s_training_saw_does_not_calibrate(
     calibrations: list[set[int]],
     first: dict[str, Any],
 ) -> None:
-    trainer(tmp_path / "one", LastCheckpoint(), **SHORT).fit(new_task(**MADE), long(**first))
+    trainer(tmp_path / "one", last(tmp_path / "one"), **SHORT).fit(
+        new_descriptor(backbone=backbone(), **MADE), long(**first)
+    )
     calibrations.clear()
     running = MapTrainer(accelerator="cpu", logger=False, default_root_dir=tmp_path / "two")
-    running.export(new_task(**MADE), long(), str(tmp_path / "one" / "checkpoints" / "last.ckpt"))
+    running.export(
+        new_descriptor(backbone=backbone(), **MADE),
+        long(),
+        str(tmp_path / "one" / "checkpoints" / "last.ckpt"),
+    )
     assert (tmp_path / "two" / "map.safetensors").is_file()
     assert len(calibrations) == ("held_out" not in first)
     assert len([line for line in warned(caplog) if "not calibrated" in line]) == len(first)
@@ -127,8 +143,8 @@ def test_at_the_end_the_map_is_calibrated_and_set_beside_the_untrained_one(
     monkeypatch.setattr("dejavu_torch.features.views.FEWEST", 40)
     np.save(tmp_path / "long.npy", footage(frames=FRAMES, side=32).numpy())
     words = ["--data.source", tmp_path / "long.npy", "--trainer.max_steps=2", "--trainer.limit_val_batches=0"]
-    words += ["--data.resize", "[16,16]", "--model.backbone", "mine.Plain", "--model.whitening", "none"]
-    words += ["--model.mapper", "SpectralMapper", "--model.mapper.route_bytes_per_place", 8]
+    words += ["--data.resize", "[16,16]", *DESCRIPTOR, "--model.backbone", "mine.Plain"]
+    words += ["--model.whitening", "none", "--model.mapper.route_bytes_per_place", 8]
     train("fit", *words, "--trainer.default_root_dir", tmp_path / "run")
     said = capsys.readouterr().out
     assert "segments that training never saw" in said
@@ -145,7 +161,7 @@ def test_a_calibration_that_fails_loses_no_training(tmp_path: Path, monkeypatch:
 
     monkeypatch.setattr(DejaVu, "calibrate", failing)
     with pytest.raises(RuntimeError, match="shapes"):
-        trainer(tmp_path, **SHORT).fit(new_task(**MADE), long())
+        trainer(tmp_path, **SHORT).fit(new_descriptor(backbone=backbone(), **MADE), long())
     assert DejaVu.load(tmp_path / "map.safetensors").map.places == FRAMES
 
 
@@ -190,38 +206,20 @@ def test_a_short_route_is_told_before_the_training(tmp_path: Path, caplog: pytes
     assert DejaVu.load(tmp_path / "map.safetensors").calibration is None
 
 
-def test_bytes_that_nobody_asked_for_give_way(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    task = new_task(mapper=SpectralMapper(0.3), whitening="none")
-    task.gives_way = True
-    trainer(tmp_path, **SHORT).fit(task, data_of())
-    assert [line for line in warned(caplog) if "route_bytes_per_place 0.3" in line and "1.43" in line]
-    summary = DejaVu.load(tmp_path / "map.safetensors").summary()
-    assert summary.lines > 0
-    assert summary.route_bytes / 40 <= 1.43
-    with refused("route_bytes_per_place is 0.3"):
-        trainer(tmp_path, **SHORT).fit(new_task(mapper=SpectralMapper(0.3), whitening="none"), data_of())
-
-
-def test_the_command_tells_what_was_asked_for(
+def test_too_few_bytes_are_told_before_the_training(
     folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    config = (folder / "train.yaml").read_text()
-    head, tail = config.split("  mapper:")[0], config[config.index("data:") :]
-    mapper = "  mapper: {class_path: SpectralMapper, init_args: {route_bytes_per_place: 0.3}}\n"
-    (tmp_path / "tight.yaml").write_text(f"{head}{mapper}{tail}")
-    words = ["--trainer.default_root_dir", tmp_path / "run", "--trainer.max_steps=1"]
-    asked = ["--config", tmp_path / "tight.yaml", *words, "--model.mapper.route_bytes_per_place", "0.3"]
-    assert "route_bytes_per_place is 0.3; expected more than" in fails(capfd, "train", "fit", *asked)
-    for command in ("fit", "export"):
-        train(command, *words, config=str(tmp_path / "tight.yaml"))
-    assert (tmp_path / "run" / "map.safetensors").is_file()
+    words = ["--config", "train.yaml", *DESCRIPTOR, "--model.mapper.route_bytes_per_place", "0.3"]
+    words += ["--trainer.default_root_dir", tmp_path / "run"]
+    assert "route_bytes_per_place is 0.3; expected more than" in fails(capfd, "train", "fit", *words)
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("channels", [1, 3])
 def test_a_network_takes_as_many_channels_as_the_frames_have(tmp_path: Path, channels: int) -> None:
     frames = footage()[..., None].expand(-1, -1, -1, channels)
     network, again = (type(backbone())(8, resize=(16, 16), widths=(4, 8), squeeze=4) for _ in range(2))
-    trainer(tmp_path, LastCheckpoint(), **SHORT).fit(new_task(backbone=network), data_of(frames))
+    trainer(tmp_path, last(tmp_path), **SHORT).fit(new_task(backbone=network), data_of(frames))
     model = DejaVu.load(tmp_path / "map.safetensors")
     assert model.features.channels == channels
     assert model(torch.rand(2, channels, 16, 16)).shape == (2, 40)

@@ -12,11 +12,12 @@ import torch
 from small_training import FRAMES, footage, mapper, warned
 from torch import nn
 
-from dejavu_torch import DejaVu, PlaceRecognitionTask, RouteData, SpectralMapper, evaluate
+from dejavu_torch import DejaVu, DescriptorTask, RouteData, SpectralMapper, TemplateTask, evaluate
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.evaluation import Scores
 from dejavu_torch.training.export import MapExport
 from dejavu_torch.training.losses import NothingLearned
+from dejavu_torch.training.task import RouteTask
 
 PAGE = Path(__file__).parents[2] / "docs" / "howto" / "own_loop.md"
 SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.figures) for seed in (1, 2))]
@@ -49,7 +50,7 @@ def ordinary() -> nn.Module:
     return nn.Sequential(*layers, nn.Flatten(), nn.Linear(64, 32))
 
 
-def trained(task: PlaceRecognitionTask, folder: Path, steps: int, **given: Any) -> MapExport:
+def trained(task: RouteTask, folder: Path, steps: int, **given: Any) -> MapExport:
     export = MapExport()
     silent: dict[str, Any] = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False}
     settings = silent | {"enable_checkpointing": False, "accelerator": "cpu", "limit_val_batches": 0}
@@ -61,7 +62,7 @@ def trained(task: PlaceRecognitionTask, folder: Path, steps: int, **given: Any) 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_recipe_learns_with_an_ordinary_backbone(seed: int, tmp_path: Path) -> None:
     torch.manual_seed(seed)
-    task = PlaceRecognitionTask(ordinary(), mapper=SpectralMapper(8.0), rate=0.3)  # as on the page
+    task = DescriptorTask(ordinary(), mapper=SpectralMapper(8.0), rate=0.3)  # as on the page
     export = trained(task, tmp_path, 200)
     assert export.written is not None
     torch.manual_seed(seed)
@@ -77,8 +78,8 @@ def test_templates_of_features_without_scale_name_the_cure(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("dejavu_torch.training.losses.BELOW", 0.0)  # nothing counts as learned
-    task = PlaceRecognitionTask(ordinary(), mapper=mapper())
-    with pytest.raises(NothingLearned, match=r"BatchNorm1d\(D, affine=False\).*SpectralMapper"):
+    task = TemplateTask(ordinary(), mapper=mapper())
+    with pytest.raises(NothingLearned, match=r"BatchNorm1d\(D, affine=False\).*DescriptorTask"):
         trained(task, tmp_path, 120)
 
 
@@ -89,6 +90,6 @@ def test_python_is_warned_of_a_map_that_lost_to_the_untrained_one(
     scores = {"the trained map": lost, "the untrained map": won}
     monkeypatch.setattr("dejavu_torch.training.export.compare_with_untrained", lambda *_: scores)
     given = {"validation": ArrayTraverse(footage(0.1)), "validation_truth": "0"}
-    trained(PlaceRecognitionTask(ordinary(), mapper=SpectralMapper(8.0), rate=0.3), tmp_path, 2, **given)
+    trained(DescriptorTask(ordinary(), mapper=SpectralMapper(8.0), rate=0.3), tmp_path, 2, **given)
     (line,) = [one for one in warned(caplog) if "worse" in one]
     assert "the trained map is worse than the untrained map" in line

@@ -12,18 +12,18 @@ import torch
 from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
-from small_training import Stop, coded, data_of, fit, footage, new_task, recall, trainer
+from small_training import Stop, data_of, fit, footage, new_descriptor, recall, trainer
 from torch import Tensor
 
 from dejavu_torch import SpectralMapper
 from dejavu_torch.maps.quantisation import quantise
 from dejavu_torch.maps.spectrum import Transform, from_spectrum, spectrum
+from dejavu_torch.training.descriptors import DescriptorTask
 from dejavu_torch.training.losses import bands_of, coded_proxies, laplace_bits
-from dejavu_torch.training.task import PlaceRecognitionTask
 
 
-def rated(rate: float = 1.0, **settings: Any) -> PlaceRecognitionTask:
-    return new_task(**{"backbone": coded(), "mapper": SpectralMapper(20.0), "rate": rate} | settings)
+def rated(rate: float = 1.0, **settings: Any) -> DescriptorTask:
+    return new_descriptor(rate=rate, **settings)
 
 
 # ------------------------------------------------------------------------ bits

@@ -18,8 +18,7 @@ from dejavu_torch import DejaVu, RouteData, SpectralMapper, open_source
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.source import routes_of
 from dejavu_torch.features.embedding import to_length
-from dejavu_torch.training.stages import DescriptorStage, similar_span
-from dejavu_torch.training.task import PlaceRecognitionTask
+from dejavu_torch.training.descriptors import DescriptorTask, similar_span
 
 LENGTHS = [40, 31, 23]
 WEIGHTS = "out/descriptor.safetensors"
@@ -39,8 +38,8 @@ def listed(source: object = None, **settings: Any) -> RouteData:
     return RouteData(routes() if source is None else source, **{"tolerance": 2, "batch_size": 16} | settings)
 
 
-def task_of(**settings: Any) -> PlaceRecognitionTask:
-    return PlaceRecognitionTask(**{"backbone": backbone(), "mapper": SpectralMapper(20.0)} | settings)
+def task_of(**settings: Any) -> DescriptorTask:
+    return DescriptorTask(**{"backbone": backbone(), "mapper": SpectralMapper(20.0)} | settings)
 
 
 # what is trained on --------------------------------------------------------------------------------------
@@ -64,32 +63,29 @@ def test_neither_stretches_nor_the_tolerance_cross_from_one_route_to_the_next(tm
     data, task = listed(tolerance=3), task_of()
     running = trainer(tmp_path, max_steps=1)
     running.fit(task, data)
-    stage = task.stage
-    assert isinstance(stage, DescriptorStage)
-    stage.begin(task)
     every = similar_span(data.sets["reference"], data.lengths, 3)
     assert every == 2  # shorter than the tolerance
     places = [(route, i) for route, length in enumerate(LENGTHS) for i in range(length)]
     stretches = list(dict.fromkeys((route, i // every) for route, i in places))
-    assert len(stage.proxies) == len(stretches)
+    assert len(task.proxies) == len(stretches)
     shown = [0, 38, 39, 40, 41, 70, 71, 93]
     batch = data.sets["reference"][shown]
     data.augmented = lambda frames, clip: frames  # type: ignore[method-assign]
     torch.manual_seed(1)
-    loss = stage.losses(task, batch).total
+    loss = task.losses(batch).total
     torch.manual_seed(1)
     described = to_length(task.dejavu.descriptor.describe(batch.frames).float())
     noisy = described + 0.5 * torch.randn_like(described)
-    distance = 1 - nn.functional.cosine_similarity(noisy[:, None], stage.proxies[None], dim=2)
+    distance = 1 - nn.functional.cosine_similarity(noisy[:, None], task.proxies[None], dim=2)
     surprise = []
-    for row, place in zip(-distance / stage.log_temperature.exp(), shown, strict=True):
+    for row, place in zip(-distance / task.log_temperature.exp(), shown, strict=True):
         logits = torch.stack([row[stretches.index((route, i // every))] for route, i in places])
         here, at = places[place]
         right = [k for k, (route, i) in enumerate(places) if route == here and abs(i - at) <= every]
         surprise.append(logits.logsumexp(0) - logits[right].logsumexp(0))
     torch.testing.assert_close(loss, torch.stack(surprise).mean(), rtol=1e-4, atol=1e-4)
     loss.backward()
-    assert all(bool(p.grad.isfinite().all()) for p in stage.parameters() if p.grad is not None)
+    assert all(bool(p.grad.isfinite().all()) for p in task.parameters() if p.grad is not None)
 
 
 def test_an_answer_within_the_tolerance_beyond_the_end_of_a_route_is_wrong(tmp_path: Path) -> None:
@@ -197,9 +193,8 @@ POOLED = nn.Sequential(nn.AdaptiveAvgPool2d(4), nn.Flatten(), nn.Linear(16, 8))
         (None, {"query": [routes()[0]] * 3}, {}, ("query is given", "3 routes", "--descriptor")),
         (routes((16, 20, 16))[:2], {}, {"backbone": POOLED}, ("1 has frames of (1, 20, 20)", "data.resize")),
         (None, {}, {"rate": 1.0}, ("model.rate is 1.0", "3 routes", "model.rate 0")),
-        (None, {}, {"mapper": None}, ("3 routes", "SpectralMapper")),
     ],
-    ids=["empty", "none", "twice", "one second", "one truth", "query", "sizes", "rate", "templates"],
+    ids=["empty", "none", "twice", "one second", "one truth", "query", "sizes", "rate"],
 )
 def test_what_does_not_fit_several_routes_is_refused(
     tmp_path: Path, source: object, settings: dict[str, Any], task: dict[str, Any], facts: tuple[str, ...]
@@ -219,8 +214,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for i, route in enumerate(routes()[:2]):
         write_images(folder / "photos" / f"day{9 + i}", np.asarray(route.values))
     np.save(folder / "third.npy", np.asarray(routes()[2].values))
-    head, tail = CONFIG.partition("  mapper:")[0], CONFIG[CONFIG.index("data:") :].replace("run", "out")
-    mapper = "  mapper: {class_path: SpectralMapper, init_args: {route_bytes_per_place: 20}}\n"
+    head, tail = CONFIG.partition("    mapper:")[0], CONFIG[CONFIG.index("data:") :].replace("run", "out")
+    head = head.replace("TemplateTask", "DescriptorTask")
+    mapper = "    mapper: {class_path: SpectralMapper, init_args: {route_bytes_per_place: 20}}\n"
     (folder / "train.yaml").write_text(head + mapper + tail)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)

@@ -13,7 +13,6 @@ from helpers import Fixed, refused
 from pytorch_lightning import Callback, Trainer
 from small_training import (
     FRAMES,
-    Later,
     assert_same_scores,
     data_of,
     fit,
@@ -26,13 +25,14 @@ from small_training import (
 )
 from torch import Tensor, nn
 
+import dejavu_torch
 from dejavu_torch import DejaVu, Preprocess, TemplateMap
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import find_ground_truth
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.training.datamodule import RouteData
-from dejavu_torch.training.task import PlaceRecognitionTask
+from dejavu_torch.training.task import RouteTask
 from dejavu_torch.types import FrequencyLayer, Training
 
 EPOCHS = {"max_steps": -1, "enable_checkpointing": False}
@@ -41,7 +41,7 @@ EPOCHS = {"max_steps": -1, "enable_checkpointing": False}
 @pytest.mark.parametrize(
     "settings",
     [
-        {"feature_weights": True},
+        {},
         {"mapper": mapper(metric="l2", reduction="sum", temperature=0.5)},
         {"mapper": mapper(metric="cosine", trainable=True), "batch_size": 1},
     ],
@@ -85,53 +85,13 @@ def test_a_seed_repeats_a_training_and_a_validation_changes_nothing_in_it(tmp_pa
     for seed, batches in ((1, 1.0), (1, 0), (2, 0)):
         torch.manual_seed(seed)
         given = EPOCHS | {"max_epochs": 2, "limit_val_batches": batches, "num_sanity_val_steps": 0}
-        states.append(fit(tmp_path, new_task(refresh=1), data_of(), **given).state_dict())
+        states.append(fit(tmp_path, new_task(), data_of(), **given).state_dict())
     one, same, other = ({n: t for n, t in s.items() if isinstance(t, Tensor)} for s in states)
     assert all(torch.equal(one[name], same[name]) for name in one)
     assert not torch.equal(one["map.templates"], other["map.templates"])
 
 
-# templates, weights, layers ------------------------------------------------------------------------------
-
-
-def test_weights_are_learned_and_written_with_their_signs_turned(tmp_path: Path) -> None:
-    task = new_task(feature_weights=True, lr=2.0)
-    model = fit(tmp_path, task, data_of())
-    weights, frames = task.route.weights.detach(), footage(0.1)[:7, None] / 255
-    assert weights.min() < 0  # so large a step, and nothing holds it back
-    assert torch.equal(model.map.weights, weights.abs())
-    with torch.no_grad():
-        torch.testing.assert_close(model(frames), task.eval()(frames), rtol=1e-5, atol=1e-5)
-
-
-class Watch(Callback):
-    """At the first step of each epoch: how often the layers were asked for, and the templates."""
-
-    def __init__(self) -> None:
-        self.times: list[int] = []
-        self.templates = torch.zeros(0)
-
-    def on_train_batch_start(self, trainer: Trainer, pl_module: Any, batch: Any, batch_idx: int) -> None:
-        if batch_idx == 0:
-            self.times.append(pl_module.dejavu.mapper.periods.asked)
-            self.templates = pl_module.route.templates.detach().clone()
-
-
-@pytest.mark.parametrize(("refresh", "times"), [(0, [1] * 4), (1, [1, 2, 3, 4]), (3, [1, 1, 1, 2])])
-@pytest.mark.parametrize("weights", [False, True])
-def test_layers_are_found_anew_every_few_epochs_and_trained(
-    tmp_path: Path, refresh: int, times: list[int], weights: bool
-) -> None:
-    watch = Watch()
-    task = new_task(mapper=mapper(Later()), refresh=refresh, feature_weights=weights)
-    running = trainer(tmp_path, watch, **EPOCHS, max_epochs=4)
-    running.fit(task, data_of())
-    assert watch.times == times
-    assert [layer.phases for layer in task.route.plan] == ([5, 7, 9] if refresh else [3, 4])
-    assert not torch.equal(watch.templates, task.route.templates)
-    optimised = {id(p) for group in running.optimizers[0].param_groups for p in group["params"]}
-    assert optimised == {id(p) for p in task.parameters()}
-    assert {id(p) for p in running.optimizers[0].state} <= optimised
+# layers --------------------------------------------------------------------------------------------------
 
 
 def test_places_without_a_layer_are_left_out(tmp_path: Path) -> None:
@@ -156,6 +116,11 @@ def test_what_cannot_be_trained_is_refused(
 ) -> None:
     with refused(*facts):
         fit(tmp_path, new_task(**settings), data_of(), **steps)
+
+
+def test_the_task_of_before_names_those_that_took_its_place() -> None:
+    with refused("DescriptorTask for a spectral map", "TemplateTask for templates"):
+        dejavu_torch.PlaceRecognitionTask(backbone=nn.Identity())  # type: ignore[operator]
 
 
 # frames --------------------------------------------------------------------------------------------------
@@ -193,7 +158,7 @@ def test_frames_are_resized_when_they_are_stored(
 # figures -------------------------------------------------------------------------------------------------
 
 
-def assert_figures(running: Trainer, task: PlaceRecognitionTask, noisy: Tensor, truth: str = "0") -> None:
+def assert_figures(running: Trainer, task: RouteTask, noisy: Tensor, truth: str = "0") -> None:
     """The figures of a test are those of `evaluate` on the map in the trainer's folder."""
     data = data_of(query=ArrayTraverse(noisy), truth=truth)
     (figures,) = running.test(task, data, verbose=False)
@@ -214,7 +179,7 @@ def test_the_figures_are_those_of_evaluate_on_the_map(tmp_path: Path) -> None:
 
 
 def test_figures_are_made_in_32_bits(tmp_path: Path) -> None:
-    running, task = trainer(tmp_path, precision="bf16-mixed", max_steps=30), new_task(feature_weights=True)
+    running, task = trainer(tmp_path, precision="bf16-mixed", max_steps=30), new_task()
     running.fit(task, data_of())
     assert_figures(running, task, footage(0.2))
 

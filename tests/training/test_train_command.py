@@ -17,7 +17,7 @@ import torch
 import yaml
 from command_line import fails, run
 from pytorch_lightning import Trainer
-from small_training import CONFIG, FRAMES, MINE, footage, train, warned
+from small_training import CONFIG, DESCRIPTOR, FRAMES, MINE, footage, train, warned
 
 from dejavu_torch import DejaVu, RouteData, TemplateMap
 from dejavu_torch.data.arrays import ArrayTraverse
@@ -25,8 +25,6 @@ from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.maps.file import read_map
 from dejavu_torch.maps.spectral_map import SpectralMap
-
-SPECTRAL = ["--model.mapper", "SpectralMapper"]
 
 
 def figures(folder: Path) -> dict[str, list[float]]:
@@ -82,13 +80,15 @@ def test_a_source_alone_is_enough(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr("dejavu_torch.cli.train.MapTrainer.fit", taken)
     run("train", "fit", "--data.source", "photos.npy", "--trainer.accelerator", "cpu")
-    assert seen == {"steps": 3000, "every": 500, "epochs": None}
+    assert seen == {"steps": 3000, "every": 3000, "epochs": None}
     assert DejaVu.load("dejavu_train/map.safetensors").frame_shape == (3, 120, 160)
 
 
 def test_options_of_our_own_parts_need_no_class_name(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "short.yaml").write_text(
-        "model: {backbone: {init_args: {dimension: 8, channels: 1, resize: [16, 16], widths: [4]}}}\n"
+        "model: {class_path: TemplateTask, init_args: {mapper: {class_path: TemplateMapper,\n"
+        "  init_args: {periods: {class_path: dejavu_torch.ImposedPeriods}}}, backbone:\n"
+        "  {class_path: SmallCNN, init_args: {dimension: 8, channels: 1, resize: [16, 16], widths: [4]}}}}\n"
         "data: {source: one.npy, batch_size: 20}\n"
         "trainer: {max_steps: 2, accelerator: cpu, enable_progress_bar: false, devices: auto}\n"
     )
@@ -170,7 +170,7 @@ def test_export_makes_a_map_of_a_checkpoint(
 def test_a_spectral_map_whatever_mapper_a_preset_has(
     folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
-    chosen = [*SPECTRAL, "--model.mapper.route_bytes_per_place", 12]
+    chosen = [*DESCRIPTOR, "--model.mapper.route_bytes_per_place", 12]
     train("fit", *chosen, "--trainer.default_root_dir", tmp_path / "fit")
     assert warned(caplog) == []
     said = capfd.readouterr()
@@ -190,11 +190,11 @@ def test_a_spectral_map_whatever_mapper_a_preset_has(
 def test_a_preset_by_name_and_options_that_have_the_last_word(tmp_path: Path) -> None:
     options = ["--trainer.max_steps=2", "--data.source=sim:aerial?frames=40", "--trainer.accelerator=cpu"]
     options += ["--trainer.precision", "32-true", "--trainer.default_root_dir", str(tmp_path)]
-    run("train", "fit", *options, "--config", "train_small")
+    run("train", "fit", *options, "--config", "train_road")
     model = DejaVu.load(tmp_path / "map.safetensors")
     assert model.trained is not None
     assert model.trained.steps == 2
-    assert model.features.resize == (64, 64)
+    assert model.features.squeeze == 24
 
 
 def test_help_has_our_options_first(capsys: pytest.CaptureFixture[str]) -> None:
@@ -203,7 +203,7 @@ def test_help_has_our_options_first(capsys: pytest.CaptureFixture[str]) -> None:
     assert stop.value.code == 0
     usage, _, options = capsys.readouterr().out.partition("options:")
     assert usage.startswith("usage: dejavu train ")
-    expected = ("--model.backbone", "--data.second_truth", "--trainer.max_steps")
+    expected = ("--model.help", "--data.second_truth", "--trainer.max_steps")
     places = [options.index(word) for word in expected]
     assert places == sorted(places)
 
@@ -307,7 +307,10 @@ def test_an_interrupt_is_one_line_and_130_and_leaves_a_map(
 @pytest.mark.parametrize(
     ("options", "facts"),
     [
-        ([*SPECTRAL, "--model.mapper.periods", "ImposedPeriods"], ["--model.mapper.periods is not accepted"]),
+        (
+            [*DESCRIPTOR, "--model.mapper.periods", "ImposedPeriods"],
+            ["--model.mapper.periods is not accepted"],
+        ),
         (["--model.mapper", "Nix"], ["model.mapper", "Nix"]),
         (["--model.backbone", "mine.Broken"], ["cannot be built", "no weights to be had"]),
         (["--trainer.max_steps", "0"], ["no steps", "above 0"]),
@@ -322,7 +325,7 @@ def test_an_interrupt_is_one_line_and_130_and_leaves_a_map(
         (["--seed_everything", str(2**63)], ["seed_everything", "expected whole numbers of at most"]),
         (["--data.resize", "[1000000,1000000]"], ["frames of 1000000 x 1000000", "GB free"]),
         (["--model.backbone.widths", "[1000000,1000000]"], ["cannot be built", "memory"]),
-        (["--trainer.overfit_batches", "2"], ["overfit_batches", "trainer.limit_train_batches"]),
+        (["--trainer.overfit_batches", "2"], ["overfit_batches is 2", "expected 0"]),
         (["--data.source", "gone.npy"], ["gone.npy is not there", "expected a folder"]),
         (["--data.augmentation.clop", "3"], ["clop"]),
         (["--trainer.default_root_dir", "a_file"], ["a_file cannot be made a folder"]),
@@ -332,9 +335,9 @@ def test_an_interrupt_is_one_line_and_130_and_leaves_a_map(
         ),
         (["--trainer.accelerator", "mps"], ["mps", "not available"]),
         (["--model.backbone", "mine.Nothing"], ["model.backbone", "no attribute 'Nothing'"]),
-        (["--config", "train_smal"], ["train_smal is not there", "train_small"]),
+        (["--config", "train_roa"], ["train_roa is not there", "train_road"]),
         (["--data.source", "short.npy"], ["longer route"]),
-        (["--ckpt_path", "run/map.safetensors"], ["cannot be read"]),
+        (["--ckpt_path", "run/map.safetensors"], ["map.safetensors", "dejavu train fit"]),
     ],
     ids=str,
 )

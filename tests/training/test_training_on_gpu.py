@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -9,18 +10,37 @@ from typing import Any
 import pytest
 import torch
 from devices import DEVICE, pretend
+from pytorch_lightning import Callback
 from pytorch_lightning.accelerators import CPUAccelerator
 from pytorch_lightning.strategies import SingleDeviceStrategy
-from small_training import backbone, data_of, footage, still, trainer
-from test_several_processes import CASES, Steps, residues
+from small_training import backbone, coded, data_of, footage, mapper, still, trainer
 
-from dejavu_torch import DejaVu
+from dejavu_torch import DejaVu, SpectralMapper
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.features.augmentation import Augmentation
-from dejavu_torch.training.task import PlaceRecognitionTask
+from dejavu_torch.training.descriptors import DescriptorTask
+from dejavu_torch.training.task import RouteTask
+from dejavu_torch.training.templates import TemplateTask
 
 CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
 GPU = pytest.param("cuda", marks=[pytest.mark.gpu, CUDA])
+
+
+CASES: dict[str, Callable[[], RouteTask]] = {
+    "templates": lambda: TemplateTask(backbone(), mapper(), lr=1e-2, freeze=["linear.bias"]),
+    "rate": lambda: DescriptorTask(backbone(), SpectralMapper(8.0), rate=0.3, lr=1e-2),
+    "code": lambda: TemplateTask(coded(noise=0.3), mapper(), lr=1e-2),
+}
+
+
+class Steps(Callback):
+    """What each step logs."""
+
+    def __init__(self) -> None:
+        self.figures: list[dict[str, float]] = []
+
+    def on_train_batch_end(self, trainer: Any, *_: Any) -> None:
+        self.figures.append({name: float(value) for name, value in trainer.callback_metrics.items()})
 
 
 class Accelerator(CPUAccelerator):
@@ -33,8 +53,7 @@ class Accelerator(CPUAccelerator):
 def trained(case: str, device: str, folder: Path, **settings: Any) -> tuple[list[dict[str, float]], DejaVu]:
     """What the steps log, and the map that is written."""
     torch.manual_seed(0)
-    network = residues(noise=0.3) if case == "stages" else backbone()
-    task = PlaceRecognitionTask(network, **CASES[case], lr=1e-2)
+    task = CASES[case]()
     steps, where = Steps(), {"accelerator": device}
     if device == DEVICE.type:
         where = {"accelerator": "auto", "strategy": SingleDeviceStrategy(DEVICE, Accelerator())}
@@ -46,7 +65,7 @@ def trained(case: str, device: str, folder: Path, **settings: Any) -> tuple[list
 
 
 @pytest.mark.parametrize("device", [DEVICE.type, GPU])
-@pytest.mark.parametrize("case", ["templates", "rate", "stages"])
+@pytest.mark.parametrize("case", CASES)
 def test_losses_are_those_of_the_cpu(
     case: str, device: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -54,7 +73,7 @@ def test_losses_are_those_of_the_cpu(
     steps, _ = trained(case, "cpu", tmp_path / "here")
     found, model = trained(case, device, tmp_path / "there")
     assert len(steps) == len(found)
-    near = 1e-3 if case == "stages" else 1e-4  # whitening amplifies what rounds descriptors
+    near = 1e-3 if case == "code" else 1e-4  # whitening amplifies what rounds descriptors
     for step, other in zip(steps, found, strict=True):
         losses = {name: value for name, value in step.items() if name.startswith("train/")}
         assert {name: other[name] for name in losses} == pytest.approx(losses, rel=near, abs=near)
@@ -67,7 +86,7 @@ def test_a_map_trained_on_a_gpu_scores_alike_on_both(
 ) -> None:
     monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
     given = {"validation": footage(0.05), "validation_truth": "0"}
-    _, model = trained("augmented", device, tmp_path, augmentation=Augmentation(), **given)
+    _, model = trained("templates", device, tmp_path, augmentation=Augmentation(), **given)
     query = ArrayTraverse(footage(0.1))
     here = model.localize(query)
     with pretend() if device == DEVICE.type else nullcontext():

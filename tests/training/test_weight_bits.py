@@ -9,13 +9,15 @@ import pytest
 import torch
 from helpers import refused
 from pytorch_lightning import Callback
-from small_training import assert_same_scores, backbone, data_of, footage, new_task, trainer
+from small_training import assert_same_scores, backbone, data_of, footage, mapper, trainer
 
 from dejavu_torch import DejaVu, SpectralMapper
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.maps.file import read_map, write_map
 from dejavu_torch.maps.weights import is_rounded
-from dejavu_torch.training.task import PlaceRecognitionTask, start_from
+from dejavu_torch.training.descriptors import DescriptorTask
+from dejavu_torch.training.task import RouteTask, start_from
+from dejavu_torch.training.templates import TemplateTask
 
 
 class Watch(Callback):
@@ -29,9 +31,10 @@ class Watch(Callback):
         self.weights.append(pl_module.dejavu.features.linear.weight.detach().clone())
 
 
-def trained(folder: Path, **settings: Any) -> tuple[PlaceRecognitionTask, list[torch.Tensor], DejaVu]:
+def trained(folder: Path, **settings: Any) -> tuple[RouteTask, list[torch.Tensor], DejaVu]:
     torch.manual_seed(0)
-    task, watch = new_task(**settings), Watch()
+    kind = DescriptorTask if settings.get("mapper") else TemplateTask
+    task, watch = kind(**{"backbone": backbone(), "mapper": mapper()} | settings), Watch()
     task.dejavu.features.load_state_dict(backbone().state_dict())
     trainer(folder, watch, max_steps=6, val_check_interval=1).fit(task, data_of())
     return task, watch.weights, DejaVu.load(folder / "map.safetensors")
