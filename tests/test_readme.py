@@ -231,9 +231,9 @@ TRAINING = [
 
 @pytest.mark.parametrize("option", TRAINING)
 def test_options_of_training_in_prose_are_understood(option: str) -> None:
-    """By a preset of phase templates, or by one of spectral maps."""
-    spectral = ".mapper.route_bytes" in option
-    preset = "train_road" if spectral else "train_small"
+    """By the preset of phase templates, or by that of spectral maps."""
+    templates = ".mapper.periods" in option
+    preset = "train_residues" if templates else "train_road"
     understand(f"dejavu train fit --config {preset} --data.source sim:aerial {option}")
 
 
@@ -241,7 +241,7 @@ def test_options_of_training_in_prose_are_understood(option: str) -> None:
 def test_yaml_is_understood(shown: str, tmp_path: Path) -> None:
     (tmp_path / "shown.yaml").write_text(shown)
     if {*yaml.safe_load(shown)} & {"trainer", "model", "data"}:
-        config = f"--config train_small --config {tmp_path / 'shown.yaml'}"
+        config = f"--config train_road --config {tmp_path / 'shown.yaml'}"
         understand(f"dejavu train fit {config} --data.source sim:aerial")
     else:
         understand(f"dejavu learn morning/ --map route.safetensors --config {tmp_path / 'shown.yaml'}")

@@ -33,8 +33,10 @@ from dejavu_torch.training.datamodule import RouteData
 from dejavu_torch.training.descriptors import DescriptorTask
 from dejavu_torch.training.export import DESCRIPTOR, MapExport, has_bf16
 from dejavu_torch.training.task import RouteTask, load_weights
+from dejavu_torch.training.templates import TemplateTask
 from dejavu_torch.types import InputError
 
+TASKS = DescriptorTask, TemplateTask  # which --model names
 BF16 = ("bf16-mixed", "bf16")
 EVERY = 500  # steps between two checkpoints
 TOLERANCE = 5  # default of `dejavu compare`
@@ -52,10 +54,7 @@ TRAINER = {
 PARTS: dict[str, dict[str, Any]] = {
     "model": {
         "class_path": f"{DescriptorTask.__module__}.{DescriptorTask.__name__}",
-        "init_args": {
-            "backbone": {"class_path": "dejavu_torch.features.cnn.SmallCNN"},
-            "mapper": {"class_path": "dejavu_torch.SpectralMapper"},
-        },
+        "init_args": {"backbone": {"class_path": "dejavu_torch.features.cnn.SmallCNN"}},
     },
     "data.augmentation": {"class_path": "dejavu_torch.features.augmentation.Augmentation"},
 }

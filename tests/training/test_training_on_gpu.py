@@ -73,7 +73,7 @@ def test_losses_are_those_of_the_cpu(
     steps, _ = trained(case, "cpu", tmp_path / "here")
     found, model = trained(case, device, tmp_path / "there")
     assert len(steps) == len(found)
-    near = 1e-3 if case == "code" else 1e-4  # whitening amplifies what rounds descriptors
+    near = 1e-4 if case == "rate" else 1e-3  # means of phases and whitening amplify what rounds features
     for step, other in zip(steps, found, strict=True):
         losses = {name: value for name, value in step.items() if name.startswith("train/")}
         assert {name: other[name] for name in losses} == pytest.approx(losses, rel=near, abs=near)
