@@ -15,6 +15,7 @@ from typing import Any, Literal, NoReturn, cast
 import pytorch_lightning as pl
 import torch
 from lightning_fabric.plugins.io.torch_io import TorchCheckpointIO
+from pytorch_lightning.strategies import DDPStrategy
 from torch import Tensor, nn
 from torch.optim import AdamW
 from torch.optim.lr_scheduler import LambdaLR
@@ -147,6 +148,8 @@ class RouteTask(pl.LightningModule):
         strategy = self.trainer.strategy
         if type(strategy.checkpoint_io) is TorchCheckpointIO:
             strategy.checkpoint_io = CheckpointFiles()
+        if isinstance(strategy, DDPStrategy):  # each process makes the same map, and none is sent
+            strategy._ddp_kwargs["broadcast_buffers"] = False
         data, model = self.data, self.dejavu
         frames = data.sets["reference"]
         if isinstance(model.features, SmallCNN) and frames.values.ndim == 4:
@@ -305,6 +308,8 @@ class RouteTask(pl.LightningModule):
         self.resumed = False
         self._check_places()
         if self.made:
+            if self.trainer.world_size > 1:  # whose running statistics are their own until the next step
+                self.features.load_state_dict(self.trainer.strategy.broadcast(self.features.state_dict()))
             with torch.inference_mode(False):  # since its parameters may be trained later
                 self.relearn()
 
