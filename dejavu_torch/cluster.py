@@ -22,7 +22,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from dejavu_torch.data.output import SIGNALS
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.maps.spectral_map import Chunk, SpectralMap
 from dejavu_torch.recognition.coarse import searcher
@@ -30,6 +29,7 @@ from dejavu_torch.recognition.search import NmsSpec, Search, TopK
 from dejavu_torch.text import one_line
 from dejavu_torch.types import InputError
 
+SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 AUTO = "auto"
 RETRIES = 3  # of a task whose worker died
 AHEAD = 2  # submitted tasks per worker

@@ -4,27 +4,15 @@ from __future__ import annotations
 
 import os
 import shutil
-import signal
-import socket
-import stat
 import tempfile
-import threading
-import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-try:
-    import fcntl
-except ImportError:  # Windows: folders of killed processes are not removed
-    fcntl = None  # type: ignore[assignment]
-
 from dejavu_torch.types import InputError
 
 PREFIX = ".dejavu-"  # of the temporary folders for incomplete files
-HOST_PREFIX = f"{PREFIX}{zlib.crc32(os.fsencode(socket.gethostname())):08x}-"  # of those of this host
 MAX_NAME_BYTES, MAX_PATH_BYTES = 255, 4096 - 64  # a folder's path leaves room for its files
-SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 _temporary: set[Path] = set()  # this process's temporary folders
 
 
@@ -44,22 +32,6 @@ def check_output_file(path: Path) -> None:
         for place in (target.parent, target):
             if place.exists() and not os.access(place, os.W_OK):
                 raise InputError(f"{path} cannot be written: no permission to write in {place}")
-        if target.exists():
-            _check_replaceable(path, target)
-
-
-def _check_replaceable(path: Path, target: Path) -> None:
-    """Refuse to replace a file that is open as a stream or owned by somebody else."""
-    old, folder = target.stat(), target.parent.stat()
-    for stream in range(3):
-        with suppress(OSError):  # a closed stream
-            if os.path.samestat(old, os.fstat(stream)):
-                raise InputError(f"{path} is a standard stream of this process; expected another file")
-    if Path("/proc") in _target(path.parent).parents:  # such as /dev/fd
-        raise InputError(f"{path} is an open file of a process; expected another file")
-    user = os.geteuid() if hasattr(os, "geteuid") else 0
-    if folder.st_mode & stat.S_ISVTX and user not in (0, old.st_uid, folder.st_uid):
-        raise InputError(f"{path} cannot be written: in {target.parent} only its owner may replace it")
 
 
 def check_output_folder(path: Path) -> None:
@@ -93,7 +65,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     """A temporary path whose file replaces `path` when the block ends without an exception.
 
     It has the name of `path`, in a `temporary_folder` next to it. An existing file keeps its mode; links are
-    followed. The disk always has the complete old or new file.
+    followed. The disk always has the complete old or new file; of two writers the last one wins.
 
     Example:
         >>> target = Path(tempfile.mkdtemp()) / "note.txt"
@@ -105,11 +77,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     check_output_file(path)
     with _refusing(path, "was not written"), temporary_folder(_target(path).parent) as folder:
         yield folder / path.name
-        _finish(folder / path.name, path)
-        with _delayed_signals():
-            (folder / path.name).replace(_target(path))
-        with suppress(OSError):
-            _sync(_target(path).parent)
+        _replace(folder / path.name, path)
 
 
 @contextmanager
@@ -123,24 +91,20 @@ def whole_folder(path: Path, earlier: Iterable[str] = ()) -> Iterator[Path]:
     with _refusing(path, "was not written"), temporary_folder(_existing(path)) as folder:
         yield folder
         names = sorted(file.name for file in folder.iterdir())
-        for name in names:
-            if path.is_dir():
+        if path.is_dir():
+            for name in names:
                 check_output_file(path / name)
-            _finish(folder / name, path / name)
-        with _delayed_signals():
-            if not path.is_dir():
-                path.parent.mkdir(parents=True, exist_ok=True)
-                mode = _default_mode(folder)
-                with suppress(OSError):  # another process has created it meanwhile
-                    folder.rename(path)
-                    path.chmod(mode)  # after the rename, which needs write permission
-            for name in names if folder.is_dir() else ():
-                (folder / name).replace(_target(path / name))
-            for name in {*earlier} - {*names}:
-                (path / name).unlink(missing_ok=True)
-        for place in (path, path.parent):
-            with suppress(OSError):
-                _sync(place)
+        else:
+            for name in names:
+                _finish(folder / name, path / name)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with suppress(OSError):  # another process has created it meanwhile
+                folder.rename(path)
+                path.chmod(0o777 & ~_umask())
+        for name in names if folder.is_dir() else ():
+            _replace(folder / name, path / name)
+        for name in {*earlier} - {*names}:
+            (path / name).unlink(missing_ok=True)
 
 
 def remove_temporaries() -> None:
@@ -151,56 +115,30 @@ def remove_temporaries() -> None:
 
 @contextmanager
 def temporary_folder(parent: Path) -> Iterator[Path]:
-    """A new folder in `parent`, locked while in use. It is removed after the block, by `remove_temporaries`,
-    or, if the process was killed, by the next call for `parent`."""
-    # the prefix names the host: on a network file system, locks may hold on one host only
-    for old in parent.glob(f"{HOST_PREFIX}{'?' * 8}"):  # 8 characters of tempfile
-        if old.is_dir() and not old.is_symlink():
-            with _locked(old, wait=False) as abandoned:  # the system releases locks of killed processes
-                if abandoned:
-                    shutil.rmtree(old, ignore_errors=True)
-    while True:
-        folder = Path(tempfile.mkdtemp(prefix=HOST_PREFIX, dir=parent))
-        _temporary.add(folder)
-        with suppress(FileNotFoundError):  # see below
-            folder.chmod(0o700)  # whatever the umask
-        with _locked(folder):
-            if not folder.is_dir():  # another process removed it before it was locked
-                continue
-            try:
-                yield folder
-            finally:
-                shutil.rmtree(folder, ignore_errors=True)
-                _temporary.discard(folder)
-            return
-
-
-@contextmanager
-def _locked(folder: Path, wait: bool = True) -> Iterator[bool]:
-    """Lock a folder; yields False if another process has locked it, or the system has no locks."""
-    descriptor, locked = -1, False
+    """A new folder in `parent`, removed after the block or by `remove_temporaries`."""
+    folder = Path(tempfile.mkdtemp(prefix=PREFIX, dir=parent))
+    _temporary.add(folder)
     try:
-        with suppress(OSError, AttributeError):
-            descriptor = os.open(folder, os.O_RDONLY)
-            fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-            locked = True
-        yield locked
+        yield folder
     finally:
-        if descriptor >= 0:
-            os.close(descriptor)
+        shutil.rmtree(folder, ignore_errors=True)
+        _temporary.discard(folder)
+
+
+def _replace(written: Path, path: Path) -> None:
+    """Flush a file to disk and let it replace `path`."""
+    _finish(written, path)
+    written.replace(_target(path))
+    with suppress(OSError):
+        _sync(_target(path).parent)
 
 
 def _finish(written: Path, path: Path) -> None:
-    """Flush a file to disk that will replace `path`, with the mode of `path` and, if allowed, its owner."""
-    written.chmod(0o600)  # whatever the umask
+    """Flush a file to disk, with the mode of the one at `path`; some writers make private files."""
     _sync(written)
-    mode = _default_mode(written.parent) & 0o666  # some writers make private files
+    written.chmod(0o666 & ~_umask())
     with suppress(FileNotFoundError):
-        old = path.stat()
-        mode = stat.S_IMODE(old.st_mode)
-        with suppress(OSError, AttributeError):
-            os.chown(written, old.st_uid, old.st_gid)
-    written.chmod(mode)
+        shutil.copymode(path, written)
 
 
 def _sync(path: Path) -> None:
@@ -210,23 +148,6 @@ def _sync(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-@contextmanager
-def _delayed_signals() -> Iterator[None]:
-    """Handle signals after the block, which is short."""
-    received: list[int] = []
-    main = threading.current_thread() is threading.main_thread()  # the only thread that handles signals
-    old = {number: handler for number in SIGNALS if main and callable(handler := signal.getsignal(number))}
-    for number in old:
-        signal.signal(number, lambda number, _: received.append(number))
-    try:
-        yield
-    finally:
-        for number, handler in old.items():
-            signal.signal(number, handler)
-        for number in received:
-            signal.raise_signal(number)
 
 
 @contextmanager
@@ -259,10 +180,7 @@ def _check_name(path: Path) -> None:
         raise InputError(f"{seen}; expected at most {MAX_NAME_BYTES}, {MAX_PATH_BYTES} in all")
 
 
-def _default_mode(folder: Path) -> int:
-    """The mode of a new folder. Querying the umask instead would change it for a moment."""
-    fresh = Path(tempfile.mktemp(dir=folder))  # an unused name; nobody else writes in this folder
-    fresh.mkdir()
-    mode = fresh.stat().st_mode & 0o777
-    fresh.rmdir()
-    return mode
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
