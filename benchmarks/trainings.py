@@ -82,11 +82,7 @@ ROUTES = {
     "laps": drive("donkey_lap", 10),
 }
 # the other preset, which starts with the descriptor of a training with the first
-PRESETS = {
-    "train_residues, road": road(preset="train_residues")._replace(
-        start=road()._replace(options="--model.rate 0")
-    )
-}
+PRESETS = {"train_residues, road": road(preset="train_residues")._replace(start=road())}
 
 
 def trained(name: str, route: Route, seed: int, out: Path, options: Sequence[str]) -> Path | str:

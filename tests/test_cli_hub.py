@@ -209,7 +209,8 @@ def test_a_config_does_not_take_it_and_says_what_does(
     text = f"features: {value}" if option == "--features" else f"model: {{backbone: {value}}}"
     (tmp_path / "own.yaml").write_text(text)
     words = learn if option == "--features" else train
-    expected = f"{option}: hub:megaloc; expected a short name only as value of --features"
+    where = option if option == "--features" else "--model"
+    expected = f"{where}: hub:megaloc; expected a short name only as value of --features"
     assert expected in fails(capsys, *words, "--config", str(tmp_path / "own.yaml"))
     if value.startswith("{"):
         assert expected in fails(capsys, *words, option, value)
