@@ -22,7 +22,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from dejavu_torch.data.output import SIGNALS
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.maps.spectral_map import Chunk, SpectralMap
 from dejavu_torch.recognition.coarse import searcher
@@ -31,6 +30,7 @@ from dejavu_torch.text import one_line
 from dejavu_torch.types import InputError
 
 AUTO = "auto"
+SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 RETRIES = 3  # of a task whose worker died
 AHEAD = 2  # submitted tasks per worker
 TASK = 1024  # minimum number of places per task

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import errno
 import os
-import shutil
-import signal
-import socket
 import stat
 import tempfile
-import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager, suppress
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +15,6 @@ import pytest
 from helpers import refused
 
 from dejavu_torch.data.output import (
-    HOST_PREFIX,
     check_output_file,
     check_output_folder,
     make_output_folder,
@@ -106,10 +101,7 @@ def test_an_exception_leaves_what_was_there(
         (check_output_file, "file/a.txt", "file"),
         (make_output_folder, "file", "is a file"),
         (make_output_folder, "file/below", "is a file"),
-        *((check, f"new/{'a' * 256}", "bytes") for check in (check_output_file, check_output_folder)),
-        *((check, "\xe4" * 128, "bytes") for check in (check_output_file, check_output_folder)),
-        *((check, "/".join(["a" * 200] * 21), "bytes") for check in (check_output_file, check_output_folder)),
-        *((check, "a\0b", "null") for check in (check_output_file, check_output_folder)),
+        (check_output_file, "a" * 256, "too long"),
     ],
 )
 def test_what_cannot_be_written_is_refused_at_once(
@@ -165,18 +157,13 @@ def test_a_file_keeps_its_mode_and_a_new_one_follows_the_umask(tmp_path: Path) -
 def test_what_is_no_regular_file_is_refused_and_stays(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "fifo")
     (tmp_path / "link").symlink_to("/dev/null")
-    (tmp_path / "loop").symlink_to("loop")
-    with socket.socket(socket.AF_UNIX) as one:
-        one.bind(str(tmp_path / "socket"))
-        before = {file.name: file.lstat().st_mode for file in tmp_path.iterdir()}
-        for path in ("fifo", "link", "socket", "/dev/null"):
-            with refused(path, "regular file"):
-                check_output_file(tmp_path / path)
-            with refused(path):
-                check_output_folder(tmp_path / path)
-        with refused("loop"):
-            check_output_file(tmp_path / "loop")
-        assert {file.name: file.lstat().st_mode for file in tmp_path.iterdir()} == before
+    before = {file.name: file.lstat().st_mode for file in tmp_path.iterdir()}
+    for path in ("fifo", "link", "/dev/null"):
+        with refused(path, "regular file"):
+            check_output_file(tmp_path / path)
+        with refused(path):
+            check_output_folder(tmp_path / path)
+    assert {file.name: file.lstat().st_mode for file in tmp_path.iterdir()} == before
 
 
 def test_no_permission_is_told_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -185,56 +172,6 @@ def test_no_permission_is_told_at_once(tmp_path: Path, monkeypatch: pytest.Monke
     with refused("no permission", str(tmp_path / "a")):
         check_output_file(tmp_path / "a")
     check_output_file(tmp_path / "b")
-
-
-def test_in_a_folder_as_tmp_a_file_of_another_user_is_refused_at_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "a").touch()
-    tmp_path.chmod(0o1777)
-    check_output_file(tmp_path / "a")
-    monkeypatch.setattr(os, "geteuid", lambda: tmp_path.stat().st_uid + 1)
-    with refused(str(tmp_path / "a"), "owner"):
-        check_output_file(tmp_path / "a")
-    check_output_file(tmp_path / "new")
-    tmp_path.chmod(0o777)
-    check_output_file(tmp_path / "a")
-
-
-@pytest.mark.parametrize("mode", ["w", "a"])  # as > and >> have it
-def test_the_file_that_a_stream_goes_to_is_refused_and_stays(tmp_path: Path, mode: str) -> None:
-    log, kept = tmp_path / "log", os.dup(1)
-    with log.open(mode) as file:
-        try:
-            os.dup2(file.fileno(), 1)
-            for path in ("/dev/stdout", "/dev/fd/1", "/proc/self/fd/1", log, f"/dev/fd/{file.fileno()}"):
-                with refused(str(path), "expected another file"):
-                    check_output_file(Path(path))
-        finally:
-            os.dup2(kept, 1)
-            os.close(kept)
-    check_output_file(log)
-
-
-@pytest.mark.parametrize("mask", [0o277, 0o377, 0o777])
-def test_a_umask_that_takes_all_rights_does_not_fail_the_writer(mask: int) -> None:
-    folder = Path(tempfile.mkdtemp())  # where others than root may go
-    folder.chmod(0o777)
-    child = os.fork()
-    if not child:
-        with suppress(BaseException):
-            if os.geteuid() == 0:
-                os.setuid(65534)
-            os.umask(mask)
-            write(folder / "a")
-            with whole_folder(folder / "b") as temporary:
-                (temporary / "one").write_text("1")
-            os._exit(0)
-        os._exit(1)
-    status = os.waitpid(child, 0)[1]
-    found = {file.name: mode_of(file) for file in folder.iterdir()}
-    shutil.rmtree(folder)
-    assert (status, found) == (0, {"a": 0o666 & ~mask, "b": 0o777 & ~mask})
 
 
 def test_the_folder_vanishes_meanwhile(tmp_path: Path) -> None:
@@ -284,65 +221,3 @@ def test_of_two_writers_of_a_new_folder_the_last_wins(tmp_path: Path) -> None:
         (other / "a").write_text("other")
     assert held(target) == {"a": "one", "b": "one"}
     assert list(tmp_path.iterdir()) == [target]
-
-
-# signals, and what a kill leaves
-
-
-def test_signals_wait_until_all_files_are_in_their_places(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    replace = Path.replace
-
-    def interrupted(self: Path, target: Path) -> Path:
-        signal.raise_signal(signal.SIGINT)
-        return replace(self, target)
-
-    def write_two() -> None:
-        with whole_folder(tmp_path) as temporary:
-            (temporary / "a").write_text("new")
-            (temporary / "b").write_text("new")
-
-    monkeypatch.setattr(Path, "replace", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        write_two()
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["a", "b"]
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-
-
-@pytest.mark.parametrize(("kind", "name"), [(whole_file, "a"), (whole_folder, "new")])
-def test_what_a_killed_process_left_is_removed_and_what_another_writes_is_not(
-    tmp_path: Path, kind: Callable[[Path], AbstractContextManager[Path]], name: str
-) -> None:
-    (tmp_path / "a.txt.part").touch()  # of somebody else
-    read, written = os.pipe()
-    child = os.fork()
-    if not child:
-        with suppress(BaseException), kind(tmp_path / name) as part:
-            (part / "a" if part.is_dir() else part).write_text("half")
-            os.write(written, b"\n")
-            time.sleep(60)
-        os._exit(1)
-    assert os.read(read, 1) == b"\n"
-    write(tmp_path / "b")
-    assert len(list(tmp_path.glob(".dejavu-*"))) == 1  # it is alive
-    os.kill(child, signal.SIGKILL)
-    os.waitpid(child, 0)
-    os.close(read)
-    os.close(written)
-    assert len(list(tmp_path.glob(".dejavu-*"))) == 1
-    write(tmp_path / "b")
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["a.txt.part", "b"]
-
-
-def test_only_what_this_host_left_is_removed(tmp_path: Path) -> None:
-    foreign = [".dejavu-notes", ".dejavu-abcdefgh", ".dejavu-00000000-abcdefgh", f"{HOST_PREFIX}notes"]
-    for name in (*foreign, f"{HOST_PREFIX}abcdefgh"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "x").write_text("kept")
-    (tmp_path / f"{HOST_PREFIX}abcdefgi").symlink_to(".dejavu-notes")
-    write(tmp_path / "a")
-    with whole_folder(tmp_path / "new") as temporary:
-        (temporary / "a").touch()
-    assert {path.parent.name for path in tmp_path.glob(".dejavu-*/x")} == {*foreign, f"{HOST_PREFIX}abcdefgi"}
-    assert not (tmp_path / f"{HOST_PREFIX}abcdefgh").exists()
