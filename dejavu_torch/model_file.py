@@ -44,7 +44,6 @@ from dejavu_torch.text import one_line
 from dejavu_torch.types import InputError, Training, Traverse
 from dejavu_torch.version import __version__
 
-M = TypeVar("M", bound=nn.Module)
 R = TypeVar("R", bound="Model")
 NO_MAP = "a descriptor without a map; expected a map, as from `dejavu learn SOURCE --descriptor FILE`"
 
@@ -110,13 +109,8 @@ class Model(Protocol):
     state: ModelState
 
 
-PARTS: dict[str, type[nn.Module]] = {  # of a model, whose recipes are in the header of its file
-    "preprocess": Preprocess,
-    "features": nn.Module,
-    "whitening": Whitening,
-    "mapper": Mapper,
-    "velocity": GroundOdometry,
-}
+# the header of a map file: a model's parts as recipes, settings and state, and the state of its map
+PARTS = ("preprocess", "features", "whitening", "mapper", "velocity")
 SETTINGS = ("threshold", "precision", "batch_size")
 # arguments that files lack at their defaults
 LATER: Mapping[str, Mapping[str, Any]] = {
@@ -172,16 +166,17 @@ def _parts(recipe: Recipe) -> dict[str, list[Recipe]]:
 
 
 def without_gone(recipe: Recipe) -> Recipe:
-    """The recipe, and those nested in it, without the arguments in `GONE`; InputError for another value."""
-    name, gone = recipe.class_path, GONE.get(recipe.class_path, {})
-    arguments = {key: value for key, value in recipe.init_args.items() if key not in gone}
-    for key in gone.keys() & recipe.init_args.keys():
-        if gone[key] not in (..., seen := recipe.init_args[key]):
-            raise InputError(f"the map's {name} has {key} {seen!r:.40}; expected {gone[key]}")
+    """The recipe, and those nested in it, without the arguments in `GONE`."""
+    gone = GONE.get(recipe.class_path, {})
+    arguments = {
+        key: value
+        for key, value in recipe.init_args.items()
+        if key not in gone or gone[key] not in (..., value)
+    }
     for key, parts in _parts(recipe).items():
         built = [without_gone(part)._asdict() for part in parts]
         arguments[key] = built if isinstance(arguments[key], list) else built[0]
-    return Recipe(name, arguments)
+    return Recipe(recipe.class_path, arguments)
 
 
 def difference(stored: Recipe, given: Recipe) -> str:
@@ -193,10 +188,10 @@ def difference(stored: Recipe, given: Recipe) -> str:
     return f"{stored.class_path} with {'; got '.join(values)}"
 
 
-def build(recipe: Recipe, kind: type[M], given: nn.Module | None = None) -> M:
-    """A module of base class `kind` from its recipe; `given` if it has the same recipe."""
+def build(recipe: Recipe, given: nn.Module | None = None) -> Any:
+    """A module from its recipe; `given` if it has the same recipe."""
     name = recipe.class_path
-    if isinstance(given, kind) and recipe_of(given) == recipe:
+    if given is not None and recipe_of(given) == recipe:
         return given
     if name not in REGISTRY:
         seen = f"the map's features are of class {name}, which only the caller can load"
@@ -205,15 +200,15 @@ def build(recipe: Recipe, kind: type[M], given: nn.Module | None = None) -> M:
     for key, parts in _parts(recipe).items():
         # only learning needs the period finder: a foreign one is omitted
         foreign = key == "periods" and parts[0].class_path not in REGISTRY
-        built = [None if foreign else build(part, nn.Module, given) for part in parts]
+        built = [None if foreign else build(part, given) for part in parts]
         if given is not None and sum(member is given for member in built) > 1:
             seen = f"several members of the features are {recipe_of(given).class_path}"
             raise InputError(f"{seen}, and one was given; expected all members, as a list")
         arguments[key] = built if isinstance(arguments[key], list) else built[0]
-    module: Any = REGISTRY[name](**arguments)
+    module = REGISTRY[name](**arguments)
     if "periods" in arguments:
         module.periods = arguments["periods"]
-    return module  # type: ignore[no-any-return]
+    return module
 
 
 def weights_of(model: Model, part: str) -> dict[str, Tensor]:
@@ -288,8 +283,7 @@ def summary_of(model: Model) -> MapSummary:
 def write_model(path: Path, model: Model) -> None:
     """See `DejaVu.save`."""
     check_rounded(model.descriptor)
-    tensors, header = contents(model)
-    write_map(path, tensors, header)
+    write_map(path, *contents(model))
 
 
 def read_model(make: Callable[..., R], path: Path, features: nn.Module | None) -> R:
@@ -303,21 +297,15 @@ def read_model(make: Callable[..., R], path: Path, features: nn.Module | None) -
         weights = unpacked(tensors, "features.")
         if features is None:
             with torch.device("meta"):  # large layers in a bad header allocate nothing
-                probe = nn.ModuleDict({"features": build(header["features"], nn.Module)})
-                stored = {name: tensor for name, tensor in weights.items() if name.startswith("features.")}
-                probe.load_state_dict(stored, assign=True)
+                build(header["features"]).load_state_dict(part_of(weights, "features"), assign=True)
         with in_float32():
-            parts = {name: _part(header, name, features) for name in PARTS}
+            parts = {name: header[name] and build(header[name], features) for name in PARTS}
         parts["whitening"] = parts["whitening"] or "none"
         model = make(**parts, **{name: header[name] for name in SETTINGS})
         _fill(model.map, tensors, header["map"])
-        parts = {
-            name: part
-            for name, part in parts_of(model).items()
-            if part is not None and name in ("features", "whitening")
-        }
-        rest = {name: weight for name, weight in weights.items() if not name.startswith("map.")}
-        nn.ModuleDict(parts).load_state_dict(rest)  # refuses others, by their whole names
+        for name in ("features", "whitening"):
+            if (part := parts_of(model)[name]) is not None:
+                part.load_state_dict(part_of(weights, name))
         model.descriptor.weight_bits = 8 if len(weights) < len(tensors) else 32
         model.state = state_from_json(header, model.map.table.frames)
         return model
@@ -326,7 +314,7 @@ def read_model(make: Callable[..., R], path: Path, features: nn.Module | None) -
 def read_place_map(path: Path) -> PlaceMap:
     """The map of a file without its feature modules; InputError as in `DejaVu.load`."""
     with opened(path) as (tensors, header):
-        place_map: PlaceMap = _part(header, "mapper", None).empty()
+        place_map: PlaceMap = build(header["mapper"]).empty()
         if header["map"].get("places") == 0:
             raise InputError(NO_MAP)
         _fill(place_map, tensors, header["map"])
@@ -349,10 +337,6 @@ def opened(path: Path) -> Iterator[tuple[dict[str, Tensor], dict[str, Any]]]:
         raise InputError(f"{path}: {error}") from error
     except Exception as error:  # of torch for other tensors, of a module for arguments of another version
         raise InputError(f"{path} does not fit its modules: {one_line(error)}") from error
-
-
-def _part(header: Mapping[str, Any], name: str, features: nn.Module | None) -> Any:
-    return None if header[name] is None else build(header[name], PARTS[name], features)
 
 
 def _fill(place_map: PlaceMap, tensors: Mapping[str, Tensor], state: dict[str, Any]) -> None:

@@ -461,7 +461,7 @@ def test_a_limit_on_files_is_one_line(folder: Path, capfd: pytest.CaptureFixture
     assert (names_in(folder), (folder / "m.csv").read_text()) == (before, "old")
 
 
-# kills and several writers
+# kills
 
 
 def test_a_kill_leaves_a_whole_map_and_a_whole_report(folder: Path) -> None:
@@ -486,23 +486,3 @@ def test_a_kill_leaves_a_whole_map_and_a_whole_report(folder: Path) -> None:
         DejaVu.load(folder / "map.safetensors")
         # fewer are there where the removal was killed, never a part of one
         assert {file.read_bytes() for file in target.glob("*")} <= {whole}
-
-
-def test_two_writers_of_a_map_and_a_folder_both_end_well(folder: Path) -> None:
-    from dejavu_torch.data.output import whole_file, whole_folder
-
-    def write(text: str) -> None:
-        for _ in range(100):
-            with whole_file(folder / "one") as temporary:
-                temporary.write_text(text)
-            with whole_folder(folder / "new") as temporary:
-                (temporary / "a").write_text(text)
-                (temporary / "b").write_text(text)
-
-    before = names_in(folder)
-    children = [forked(lambda text=text: write(text * 10_000)) for text in "xyz"]
-    assert [os.waitpid(child, 0)[1] for child in children] == [0, 0, 0]
-    texts = {text * 10_000 for text in "xyz"}
-    assert {(folder / "one").read_text(), (folder / "new" / "a").read_text()} <= texts
-    assert names_in(folder) == before | {"one", "new"}
-    assert names_in(folder / "new") == {"a", "b"}
