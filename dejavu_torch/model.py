@@ -23,7 +23,6 @@ from dejavu_torch.features.extract import features_of
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import LabelledFrames
 from dejavu_torch.features.whitening import Whitening
-from dejavu_torch.maps.file import checked_fields
 from dejavu_torch.maps.place_map import Mapper, PlaceMap
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.summary import MapSummary
@@ -603,9 +602,11 @@ class DejaVu(nn.Module):
         return model_file.state_to_json(self.state)
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore the result of `get_extra_state`; InputError if its entries or types differ."""
-        values = checked_fields(state, model_file.STATE, "the model's state")
-        self.state = model_file.state_from_json(values)
+        """Restore the result of `get_extra_state`; InputError if it lacks an entry."""
+        try:
+            self.state = model_file.state_from_json(state)
+        except KeyError as error:
+            raise InputError(f"the model's state has no {error}; expected one of this version") from error
         self.searcher = None  # of the map before
 
 

@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import inspect
 import json
-import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, TypeVar, get_type_hints
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -31,16 +30,7 @@ from dejavu_torch.features.views import SAMPLE, AugmentedFrames, LabelledFrames
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.features.xfeat import XFeat
 from dejavu_torch.maps.file import HEADER as FILE_HEADER
-from dejavu_torch.maps.file import (
-    checked,
-    checked_fields,
-    checksums,
-    digests,
-    map_size,
-    part_of,
-    read_map,
-    write_map,
-)
+from dejavu_torch.maps.file import checksums, digests, map_size, part_of, read_map, write_map
 from dejavu_torch.maps.place_map import Mapper, PlaceMap
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.summary import MapSummary
@@ -50,14 +40,12 @@ from dejavu_torch.memory import in_float32
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
-from dejavu_torch.recognition.calibration import Calibration
+from dejavu_torch.recognition.calibration import Calibration, Platt
 from dejavu_torch.text import one_line
-from dejavu_torch.types import FRAME_NUMBERS, InputError, Training, Traverse
+from dejavu_torch.types import InputError, Training, Traverse
 from dejavu_torch.version import __version__
 
-M = TypeVar("M", bound=nn.Module)
 R = TypeVar("R", bound="Model")
-MAX_PARTS = 16  # of a recipe
 NO_MAP = "a descriptor without a map; expected a map, as from `dejavu learn SOURCE --descriptor FILE`"
 
 # the classes that a map file may name
@@ -123,28 +111,14 @@ class Model(Protocol):
     state: ModelState
 
 
-# the header of a map file: a model's parts, settings and state, and the state of its map
-PARTS: dict[str, tuple[type[nn.Module], Any]] = {
-    "preprocess": (Preprocess, Recipe),
-    "features": (nn.Module, Recipe),
-    "whitening": (Whitening, Recipe | None),
-    "mapper": (Mapper, Recipe),
-    "velocity": (GroundOdometry, Recipe | None),
-}
-SETTINGS = {"threshold": float | None, "precision": float | None, "batch_size": int}
-STATE = {
-    "frame_shape": tuple[int, ...] | None,
-    "step": float | None,
-    "trained": Training | None,
-    "names": str | None,
-    "calibration": Calibration | None,
-}
+# the header of a map file: a model's parts as recipes, settings and state, and the state of its map
+PARTS = ("preprocess", "features", "whitening", "mapper", "velocity")
+SETTINGS = ("threshold", "precision", "batch_size")
 # arguments that files lack at their defaults
 LATER: Mapping[str, Mapping[str, Any]] = {
     "Preprocess": {"range": None, "blank": BLANK},
     "Whitening": {"lengths": None},
 }
-HEADER = {name: kind for name, (_, kind) in PARTS.items()} | SETTINGS | STATE | {"map": dict[str, Any]}
 
 
 def recipe_of(module: nn.Module) -> Recipe:
@@ -187,23 +161,24 @@ def _parts(recipe: Recipe) -> dict[str, list[Recipe]]:
     """The arguments that are recipes, or lists of them, by name."""
     named = {name: value if isinstance(value, list) else [value] for name, value in recipe.init_args.items()}
     return {
-        name: checked(values, list[Recipe], name)
+        name: [Recipe(**value) for value in values]
         for name, values in named.items()
         if any(isinstance(value, dict) and "class_path" in value for value in values)
     }
 
 
 def without_gone(recipe: Recipe) -> Recipe:
-    """The recipe, and those nested in it, without the arguments in `GONE`; InputError for another value."""
-    name, gone = recipe.class_path, GONE.get(recipe.class_path, {})
-    arguments = {key: value for key, value in recipe.init_args.items() if key not in gone}
-    for key in gone.keys() & recipe.init_args.keys():
-        if gone[key] not in (..., seen := recipe.init_args[key]):
-            raise InputError(f"the map's {name} has {key} {seen!r:.40}; expected {gone[key]}")
+    """The recipe, and those nested in it, without the arguments in `GONE`."""
+    gone = GONE.get(recipe.class_path, {})
+    arguments = {
+        key: value
+        for key, value in recipe.init_args.items()
+        if key not in gone or gone[key] not in (..., value)
+    }
     for key, parts in _parts(recipe).items():
         built = [without_gone(part)._asdict() for part in parts]
         arguments[key] = built if isinstance(arguments[key], list) else built[0]
-    return Recipe(name, arguments)
+    return Recipe(recipe.class_path, arguments)
 
 
 def difference(stored: Recipe, given: Recipe) -> str:
@@ -215,39 +190,27 @@ def difference(stored: Recipe, given: Recipe) -> str:
     return f"{stored.class_path} with {'; got '.join(values)}"
 
 
-def build(recipe: Recipe, kind: type[M], given: nn.Module | None = None) -> M:
-    """A module of base class `kind` from its recipe; `given` if it has the same recipe."""
+def build(recipe: Recipe, given: nn.Module | None = None) -> Any:
+    """A module from its recipe; `given` if it has the same recipe."""
     name = recipe.class_path
-    if isinstance(given, kind) and recipe_of(given) == recipe:
+    if given is not None and recipe_of(given) == recipe:
         return given
     if name not in REGISTRY:
         seen = f"the map's features are of class {name}, which only the caller can load"
         raise InputError(f"{seen}; expected it as `features`, with its original arguments")
-    cls = REGISTRY[name]
-    if not issubclass(cls, kind):
-        raise InputError(f"the map names {name}; expected a {kind.__name__}")
-    hints = get_type_hints(cls.__init__)
-    kinds = {  # an argument that is newer than the file gets its default
-        key: hints[key]
-        for key, parameter in inspect.signature(cls).parameters.items()
-        if key in recipe.init_args or parameter.default is parameter.empty
-    }
-    arguments = checked_fields(recipe.init_args, kinds, f"the map's {name}")
-    count = len(with_parts(recipe))
-    if count > MAX_PARTS:
-        raise InputError(f"the map's {name} has {count} parts; expected at most {MAX_PARTS}")
+    arguments = dict(recipe.init_args)
     for key, parts in _parts(recipe).items():
         # only learning needs the period finder: a foreign one is omitted
         foreign = key == "periods" and parts[0].class_path not in REGISTRY
-        built = [None if foreign else build(part, nn.Module, given) for part in parts]
+        built = [None if foreign else build(part, given) for part in parts]
         if given is not None and sum(member is given for member in built) > 1:
             seen = f"several members of the features are {recipe_of(given).class_path}"
             raise InputError(f"{seen}, and one was given; expected all members, as a list")
         arguments[key] = built if isinstance(arguments[key], list) else built[0]
-    module: Any = cls(**arguments)
+    module = REGISTRY[name](**arguments)
     if "periods" in arguments:
         module.periods = arguments["periods"]
-    return module  # type: ignore[no-any-return]
+    return module
 
 
 def weights_of(model: Model, part: str) -> dict[str, Tensor]:
@@ -279,10 +242,21 @@ def state_to_json(state: ModelState) -> dict[str, Any]:
 
 
 def state_from_json(values: Mapping[str, Any], frames: int | None = None) -> ModelState:
-    """The state from the result of `state_to_json`, whose types are checked."""
-    names = [] if values["names"] is None else decode_names(values["names"], frames)
-    shape, step, trained = values["frame_shape"], values["step"], values["trained"]
-    return ModelState(shape, step, trained, names, values["calibration"])
+    """The state from the result of `state_to_json`; `frames`: the number of names, None for any."""
+    shape, trained, calibration = values["frame_shape"], values["trained"], values["calibration"]
+    if calibration is not None:
+        calibration = Calibration(**{name: platt and _platt(**platt) for name, platt in calibration.items()})
+    return ModelState(
+        None if shape is None else tuple(shape),
+        values["step"],
+        trained and Training(**trained),
+        [] if values["names"] is None else decode_names(values["names"], frames),
+        calibration,
+    )
+
+
+def _platt(slope: float, offset: float, most: Sequence[Sequence[float]] = ()) -> Platt:
+    return Platt(slope, offset, tuple((upper, limit) for upper, limit in most))
 
 
 def contents(model: Model) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -311,10 +285,7 @@ def summary_of(model: Model) -> MapSummary:
 def write_model(path: Path, model: Model) -> None:
     """See `DejaVu.save`."""
     check_rounded(model.descriptor)
-    tensors, header = contents(model)
-    checked_fields(header, HEADER, "the model")  # as reading will
-    checked(header["map"], model.map.state, "the map")
-    write_map(path, tensors, header)
+    write_map(path, *contents(model))
 
 
 def read_model(make: Callable[..., R], path: Path, features: nn.Module | None) -> R:
@@ -328,33 +299,24 @@ def read_model(make: Callable[..., R], path: Path, features: nn.Module | None) -
         weights = unpacked(tensors, "features.")
         if features is None:
             with torch.device("meta"):  # large layers in a bad header allocate nothing
-                probe = nn.ModuleDict({"features": build(header["features"], nn.Module)})
-                stored = {name: tensor for name, tensor in weights.items() if name.startswith("features.")}
-                probe.load_state_dict(stored, assign=True)
+                build(header["features"]).load_state_dict(part_of(weights, "features"), assign=True)
         with in_float32():
-            parts = {name: _part(header, name, features) for name in PARTS}
+            parts = {name: header[name] and build(header[name], features) for name in PARTS}
         parts["whitening"] = parts["whitening"] or "none"
         model = make(**parts, **{name: header[name] for name in SETTINGS})
         _fill(model.map, tensors, header["map"])
-        check_types(weights, model.descriptor.features)
-        parts = {
-            name: part
-            for name, part in parts_of(model).items()
-            if part is not None and name in ("features", "whitening")
-        }
-        rest = {name: weight for name, weight in weights.items() if not name.startswith("map.")}
-        nn.ModuleDict(parts).load_state_dict(rest)  # refuses others, by their whole names
+        for name in ("features", "whitening"):
+            if (part := parts_of(model)[name]) is not None:
+                part.load_state_dict(part_of(weights, name))
         model.descriptor.weight_bits = 8 if len(weights) < len(tensors) else 32
-        check_rounded(model.descriptor)
         model.state = state_from_json(header, model.map.table.frames)
-        _check(model)
         return model
 
 
 def read_place_map(path: Path) -> PlaceMap:
     """The map of a file without its feature modules; InputError as in `DejaVu.load`."""
     with opened(path) as (tensors, header):
-        place_map: PlaceMap = _part(header, "mapper", None).empty()
+        place_map: PlaceMap = build(header["mapper"]).empty()
         if header["map"].get("places") == 0:
             raise InputError(NO_MAP)
         _fill(place_map, tensors, header["map"])
@@ -366,8 +328,8 @@ def opened(path: Path) -> Iterator[tuple[dict[str, Tensor], dict[str, Any]]]:
     """Tensors and header of a map file; errors within the block are raised with the file's name."""
     tensors, values = read_map(path)
     try:
-        header = checked_fields(values, HEADER, "its header")
-        header |= {name: without_gone(header[name]) for name in PARTS if header[name] is not None}
+        recipes = {name: values[name] and without_gone(Recipe(**values[name])) for name in PARTS}
+        header = values | recipes
         kinds = [cls.kind for cls in REGISTRY.values() if issubclass(cls, Mapper)]
         if header["map"].get("kind") not in kinds:
             seen = f"a map of kind {header['map'].get('kind')!r:.40}"
@@ -375,18 +337,12 @@ def opened(path: Path) -> Iterator[tuple[dict[str, Tensor], dict[str, Any]]]:
         yield tensors, header
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    except (RuntimeError, RecursionError) as error:  # torch cannot load tensors, or the nesting is too deep
+    except Exception as error:  # of torch for other tensors, of a module for arguments of another version
         raise InputError(f"{path} does not fit its modules: {one_line(error)}") from error
-
-
-def _part(header: Mapping[str, Any], name: str, features: nn.Module | None) -> Any:
-    kind, _ = PARTS[name]
-    return None if header[name] is None else build(header[name], kind, features)
 
 
 def _fill(place_map: PlaceMap, tensors: Mapping[str, Tensor], state: dict[str, Any]) -> None:
     """Fill an empty map from a file; it stays empty if the file has only a descriptor."""
-    checked(state, place_map.state, "its map")
     stored = part_of(tensors, "map")
     if stored or state.get("places"):
         place_map.load_packed(stored, state)
@@ -410,21 +366,6 @@ def check_rounded(descriptor: Descriptor) -> None:
         name = type(descriptor.features).__name__
         seen = f"weights of {name} are not rounded to 8 bits, or changed since then"
         raise InputError(f"{seen}; expected a DejaVu constructed from them with weight_bits=8")
-
-
-def _check(model: Model) -> None:
-    """Refuse inconsistent parts of a model."""
-    positions, step, shape = model.map.positions, model.state.step, model.state.frame_shape
-    resampled = model.velocity is not None and step is not None and step > 0
-    if (len(positions) > 0) != resampled or (step is not None) != resampled:
-        raise InputError(f"it has step {step} and {len(positions)} frame positions")
-    whitening = model.descriptor.whitening
-    if whitening is not None and whitening.learned:
-        dimension, expected = whitening.dimension, model.map.dimension
-        if dimension != (expected or dimension):
-            raise InputError(f"its whitening makes {dimension} dimensions; expected the map's {expected}")
-    if shape is not None and (len(shape) not in (1, 3) or min(shape) < 1 or math.prod(shape) > FRAME_NUMBERS):
-        raise InputError(f"its frames are {shape}; expected (C,H,W) or (D,)")
 
 
 def run_key(

@@ -31,7 +31,7 @@ ARROWS = {
     "teaching": "types memory data features maps recognition model",
     "growth": "types data features maps motion learning model_file model teaching",
     "updating": "types data maps motion recognition model teaching growth",
-    "cluster": "text types data maps recognition",
+    "cluster": "text types maps recognition",
     "live": "types data features recognition model",
     "evaluation": "lazy text version types memory resize data features periods maps recognition motion "
     "model_file model growth",

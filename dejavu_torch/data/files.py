@@ -7,7 +7,6 @@ import stat
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from hashlib import blake2b
 from pathlib import Path
 
 from dejavu_torch.memory import check_room
@@ -30,18 +29,6 @@ def check_regular(path: Path, expected: str) -> int:
         kind = "a folder" if stat.S_ISDIR(status.st_mode) else "not a regular file"
         raise InputError(f"{path} is {kind}; expected {expected}")
     return status.st_size
-
-
-def state_of(*paths: Path) -> str:
-    """A digest of the names, sizes and modification times of files."""
-    digest = blake2b(digest_size=8)
-    for path in paths:
-        try:
-            status = path.stat()
-        except OSError as error:
-            raise InputError(f"{path} cannot be read: {why(error)}; expected the file as before") from error
-        digest.update(f"{path.name}/{status.st_size}/{status.st_mtime_ns}/".encode(errors="surrogateescape"))
-    return digest.hexdigest()
 
 
 @contextmanager

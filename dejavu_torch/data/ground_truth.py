@@ -509,17 +509,16 @@ def _read_matrices(path: Path, numbers: Tensor, frames: int | None, every: bool)
         for name in ("GThard", "GTsoft"):
             if name not in stored:
                 continue
-            entry = archive.getinfo(f"{name}.npy")
-            if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                raise ValueError("a compression other than numpy's")  # may unpack a few bytes without end
-            check_room(2.0 * entry.file_size, f"{path}: {name}")
-            with archive.open(entry) as file:  # reads at most file_size bytes
-                matrix = np.lib.format.read_array(file, allow_pickle=False)
-                if file.read(1):
-                    raise ValueError(f"{name} is longer than its shape")
-            _check_shape(f"{path}: {name} is {matrix.shape} {matrix.dtype}", matrix, numbers, frames, every)
-            check_room(16.0 * matrix.size, f"{path}: {name} {matrix.shape}")
-            matrices.append(matrix)
+            with archive.open(f"{name}.npy") as file:
+                np.lib.format.read_magic(file)
+                shape, by_columns, dtype = np.lib.format.read_array_header_1_0(file)  # of a plain matrix
+                _check_shape(f"{path}: {name} is {shape} {dtype}", shape, dtype, numbers, frames, every)
+                size = math.prod(shape) * dtype.itemsize
+                check_room(2.0 * size + 16.0 * math.prod(shape), f"{path}: {name} {shape}")
+                data = file.read(size + 1)
+            if len(data) != size:
+                raise ValueError(f"{name} has {len(data)} bytes or more instead of {size}")
+            matrices.append(np.frombuffer(data, dtype).reshape(shape, order="F" if by_columns else "C"))
     if not matrices:
         raise InputError(f"{path} contains {', '.join(stored) or 'nothing'}; expected {expected}")
     if matrices[0].shape != matrices[-1].shape:
@@ -531,7 +530,9 @@ def _read_matrices(path: Path, numbers: Tensor, frames: int | None, every: bool)
     return truth._replace(ignored=padded(row.nonzero()[:, 0] for row in soft[0] & ~hard)) if soft else truth
 
 
-def _check_shape(seen: str, matrix: np.ndarray, numbers: Tensor, frames: int | None, every: bool) -> None:
+def _check_shape(
+    seen: str, shape: tuple[int, ...], dtype: np.dtype[Any], numbers: Tensor, frames: int | None, every: bool
+) -> None:
     """Refuse anything but a matrix (reference frames, query frames), with a hint if it is transposed."""
     count = int(numbers.max()) + 1
 
@@ -539,10 +540,10 @@ def _check_shape(seen: str, matrix: np.ndarray, numbers: Tensor, frames: int | N
         # queries given by number may be a subset of the columns
         return frames in (None, rows) and (columns == count or (columns > count and not every))
 
-    plain = matrix.ndim == 2 and matrix.dtype.kind in "biuf"
+    plain = len(shape) == 2 and dtype.kind in "biuf"
     # without a known reference, a row for each query suggests that the matrix is transposed
-    transposed = plain and frames is None and matrix.shape[1] != count == matrix.shape[0]
-    if not plain or transposed or not fits(*matrix.shape):
+    transposed = plain and frames is None and shape[1] != count == shape[0]
+    if not plain or transposed or not fits(*shape):
         rows = "reference frames" if frames is None else frames
-        hint = "; its transpose fits" if plain and fits(*matrix.shape[::-1]) else ""
+        hint = "; its transpose fits" if plain and fits(*shape[::-1]) else ""
         raise InputError(f"{seen}; expected a matrix of ({rows}, {count}), one column per query frame{hint}")

@@ -364,23 +364,10 @@ class Whitening(nn.Module):
 
     def _load_from_state_dict(self, state: dict[str, Any], prefix: str, *args: Any) -> None:
         inner = f"{prefix}members."
-        inside = {name.removeprefix(inner): value for name, value in state.items() if name.startswith(inner)}
-        groups = {name.partition(".")[0] for name in inside}
+        groups = {name.removeprefix(inner).partition(".")[0] for name in state if name.startswith(inner)}
         self.members = nn.ModuleList(self._member() for _ in groups)  # torch loads them next
-        buffers = {name: state.get(prefix + name, own) for name, own in self.named_buffers(recurse=False)}
-        dtype, seen = buffers["projection"].dtype, [tuple(buffer.shape) for buffer in buffers.values()]
-        width = tuple((count + 1) // 2 if dtype == torch.uint8 else count for count in seen[1])
-        fits = len(seen[0]) == 2 and seen[0][1:] == width and seen[2] == seen[1] and seen[3] in ((0,), (1,))
-        joined = sum(value.numel() for name, value in inside.items() if name.endswith((".scale", ".length")))
-        fits = fits and (not groups or joined == seen[0][0])
-        finite = all(bool(stored.isfinite().all()) for stored in buffers.values())
-        if not fits or not finite or dtype not in (torch.uint8, torch.int8, torch.int16):
-            expected = "finite (D,K), two numbers to a byte in uint8, (K,), (K,), and one number or none"
-            expected += f"; D is {joined}, of its {len(groups)} groups" if groups else ""
-            sizes = f"the whitening has a projection, scale, offset and length of {seen}"
-            raise InputError(f"{sizes}; expected {expected}")
-        for name, stored in buffers.items():
-            setattr(self, name, torch.empty_like(stored, device=self.scale.device))
+        for name, own in [*self.named_buffers(recurse=False)]:
+            setattr(self, name, torch.empty_like(state.get(prefix + name, own), device=own.device))
         super()._load_from_state_dict(state, prefix, *args)
 
     def extra_repr(self) -> str:

@@ -6,18 +6,19 @@ import logging
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from itertools import accumulate
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, TypeVar, get_args
 
 import torch
 from torch import Tensor, nn
 
-from dejavu_torch.data.files import LARGEST
 from dejavu_torch.data.positions import count_places
 from dejavu_torch.maps.frame_table import FrameTable, Link, Route
 from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.types import InputError
 
 log = logging.getLogger("dejavu_torch")
+
+L = TypeVar("L")
 
 ScoreBlocks = Iterator[tuple[int, Tensor]]  # the first place of each block, and its scores (Q,n)
 EXTRA = "_extra_state"  # torch's key for the result of `get_extra_state`
@@ -29,12 +30,18 @@ def require(fits: bool, seen: str) -> None:
         raise InputError(f"the map does not fit together: {seen}")
 
 
+def one_of(value: L, kind: Any, name: str) -> L:
+    """A value that a Literal names, else an InputError; `name`: of the value in the message."""
+    if value not in get_args(kind):
+        raise InputError(f"{name} is {value!r:.60}; expected {str(kind).removeprefix('typing.')}")
+    return value
+
+
 class PlaceMap(nn.Module, ABC):
     """A route that scores queries. A new kind of map subclasses it; a `Mapper` makes it from descriptors.
 
     Attributes:
         kind: name of the kind, stored with the map.
-        state: NamedTuple of the entries of `get_extra_state`, to check a file.
         places, dimension: N, and D features per frame.
         positions: (F,) float32, even steps of each reference frame from the first place of its route, if
             resampled (section IV-B); (0,) if place i is reference frame i.
@@ -48,7 +55,6 @@ class PlaceMap(nn.Module, ABC):
     """
 
     kind: ClassVar[str]
-    state: ClassVar[Any] = dict[str, Any]
     kept: ClassVar[tuple[str, ...]] = ("positions",)  # tensors that are always of the type of a file
     optional: ClassVar[Mapping[str, tuple[int, ...]]] = {"visits": (0, 2)}  # that files may lack
     routes: tuple[Route, ...] = ()
@@ -160,16 +166,10 @@ class PlaceMap(nn.Module, ABC):
 
     def check(self) -> None:
         """`require` that the buffers are consistent; a subclass checks its own first."""
-        positions, visits = self.positions, self.visits
-        fits = positions.ndim == 1 and positions.is_floating_point() and bool(positions.isfinite().all())
-        require(fits, f"positions {tuple(positions.shape)} {positions.dtype}; expected finite floats (F,)")
-        fits = visits.shape[1:] == (2,) and visits.dtype == torch.int32
-        fits = fits and not (visits[:, 0] < 1).any() and not (visits[:, 1] < 0).any()
-        require(fits, f"visits {tuple(visits.shape)} {visits.dtype}; expected int32 (V,2), runs and counts")
-        if len(visits):
-            seen = int(visits[:, 0].sum())
+        if len(self.visits):
+            seen = int(self.visits[:, 0].sum())
             require(seen == self.places, f"visits of {seen} places; expected {self.places}")
-        if len(positions):
+        if len(self.positions):
             seen = count_places(self.table.steps)
             require(seen == self.places, f"positions of {seen} places; expected {self.places}")
 
@@ -179,14 +179,9 @@ class PlaceMap(nn.Module, ABC):
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore the result of `get_extra_state`; another kind or other settings are an InputError."""
-        if not isinstance(state, dict):
-            raise InputError(f"the map's state is a {type(state).__name__}; expected its kind and settings")
         for name, value in {"kind": self.kind, **self.settings()}.items():
             if state.get(name) != value:
                 raise InputError(f"the map's {name} is {state.get(name)!r}; expected {value!r}")
-        sizes = state.get("places"), state.get("dimension")
-        if not all(type(size) is int and 0 <= size < LARGEST for size in sizes):
-            raise InputError(f"the map's places and dimension are {sizes!r}; expected integers from 0")
         self.places, self.dimension = state["places"], state["dimension"]
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
@@ -205,7 +200,7 @@ class PlaceMap(nn.Module, ABC):
             super()._load_from_state_dict(state_dict, prefix, *args)
             self.check()
             self.loaded()
-        except InputError:  # a refused state leaves the map as it was
+        except Exception:  # a refused state leaves the map as it was
             self.__dict__.clear()
             self.__dict__.update(before)
             raise

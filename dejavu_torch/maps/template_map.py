@@ -14,8 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from dejavu_torch.maps.distance import Metric, phase_distances
-from dejavu_torch.maps.file import checked
-from dejavu_torch.maps.place_map import Mapper, PlaceMap, require
+from dejavu_torch.maps.place_map import Mapper, PlaceMap, one_of, require
 from dejavu_torch.maps.summary import ChunkSummary, MapSummary
 from dejavu_torch.maps.templates import PhaseTemplates, check_plan
 from dejavu_torch.periods.finder import PeriodFinder
@@ -110,8 +109,8 @@ class TemplateMap(PlaceMap):
         weights: Tensor | None = None,
     ) -> None:
         super().__init__(places, dimension)
-        self.metric: Metric = checked(metric, Metric, "metric")
-        self.reduction: Reduction = checked(reduction, Reduction, "reduction")
+        self.metric: Metric = one_of(metric, Metric, "metric")
+        self.reduction: Reduction = one_of(reduction, Reduction, "reduction")
         self.temperature = temperature
         for layer, block in zip(plan, templates, strict=True):
             shape = layer.phases, len(layer.features)
@@ -151,23 +150,11 @@ class TemplateMap(PlaceMap):
         self.segments = tuple(segments(self.plan, self.places))
 
     def check(self) -> None:
-        count, last = self.layers.numel() // 5, self.feature_index.numel()
-        shapes = {"layers": (count, 5), "feature_ptr": (count + 1,), "feature_index": (last,)}
-        for name, shape in shapes.items():
-            seen = getattr(self, name)
-            fits = seen.shape == shape and seen.dtype in (torch.int32, torch.int64)
-            require(fits, f"{name} {tuple(seen.shape)} {seen.dtype}; expected {shape} int32 or int64")
-        sizes, ends = self.feature_ptr.diff(), self.feature_ptr[[0, -1]].tolist()
-        rises = ends == [0, last] and not (sizes < 0).any()
-        require(rises, f"feature_ptr does not rise from 0 to {last}")
-        require(not (self.layers[:, 1] < 1).any(), "a period with a denominator below 1")
-        numbers = int((self.layers[:, 2] * sizes).sum())
+        numbers = int((self.layers[:, 2] * self.feature_ptr.diff()).sum())
         for name, lengths in (("templates", [numbers]), ("weights", [self.dimension, 0])):
             seen, expected = getattr(self, name), " or ".join(f"({n},)" for n in lengths)
-            fits = seen.ndim == 1 and len(seen) in lengths
-            require(fits, f"{name} {tuple(seen.shape)}; expected {expected}")
-            fits = seen.is_floating_point() and bool(seen.isfinite().all())
-            require(fits, f"{name} that are not finite floats")
+            require(len(seen) in lengths, f"{name} {tuple(seen.shape)}; expected {expected}")
+            require(bool(seen.isfinite().all()), f"{name} that are not finite floats")
         T = self.temperature
         fits = T is None or (isinstance(T, (int, float)) and 0 < T < math.inf)
         require(fits, f"the temperature is {T!r}; expected a number above 0")

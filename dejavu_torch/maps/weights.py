@@ -12,8 +12,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn.parameter import is_lazy
 
-from dejavu_torch.types import InputError
-
 BITS = (8, 32)
 LARGEST = 127  # of the integers
 HUGE = 1e38  # larger weights, which could round to infinity, keep 32 bits
@@ -94,18 +92,9 @@ def packed(module: nn.Module) -> dict[str, Tensor]:
 
 
 def unpacked(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """The tensors of a file; those of `quantised`, below a prefix, become weights, others are refused."""
+    """The tensors of a file; those of `quantised`, below a prefix, become weights."""
     plain = dict(tensors)
     for name, whole in tensors.items():
-        if not name.startswith(prefix) or name + SCALE not in tensors:
-            continue
-        scale = plain.pop(name + SCALE)
-        dtypes = whole.dtype == torch.int8 and scale.dtype == torch.bfloat16
-        fitting = dtypes and scale.shape == whole.shape[:1]
-        weight = whole * _broadcast(scale, whole) if fitting else None
-        if weight is None or not fits(weight) or not all(map(torch.equal, quantised(weight), (whole, scale))):
-            shapes = " and ".join(f"{tensor.dtype} {tuple(tensor.shape)}" for tensor in (whole, scale))
-            expected = "int8 (O,...) and bfloat16 (O,), finite, the largest of each channel"
-            raise InputError(f"{name} and its scale are {shapes}; expected {expected} {LARGEST}, or all 0")
-        plain[name] = weight
+        if name.startswith(prefix) and name + SCALE in tensors:
+            plain[name] = whole * _broadcast(plain.pop(name + SCALE), whole)
     return plain

@@ -137,45 +137,34 @@ def test_pickled_objects_are_refused_and_not_run(tmp_path: Path) -> None:
     assert not (tmp_path / "ran").exists()
 
 
-def written(path: Path, header: str, version: int = 1) -> Path:
-    """A file with any header."""
-    text = header.encode().ljust(118) + b"\n"
-    length = len(text).to_bytes(2 if version == 1 else 4, "little")
-    path.write_bytes(b"\x93NUMPY" + bytes([version, 0]) + length + text + bytes(256))
+def written(path: Path, kind: str, shape: str) -> Path:
+    """A file that says that it is of any type and shape."""
+    text = f"{{'descr': {kind}, 'fortran_order': False, 'shape': {shape}}}".encode().ljust(118) + b"\n"
+    path.write_bytes(b"\x93NUMPY\1\0" + len(text).to_bytes(2, "little") + text + bytes(256))
     return path
 
 
-@pytest.mark.parametrize("version", [1, 2])
 @pytest.mark.parametrize(
     ("kind", "shape"),
     [
-        ("'<f4'", "(-4, -4)"),
         ("'<f4'", f"({2**62}, 4)"),
         ("'<f4'", f"({10**40}, 1)"),
         ("'<f4'", "(9, 9)"),
-        ("'<f4'", "(" + "1," * 70 + ")"),
-        ("'<f4'", "(" * 5000),
-        ("'V0'", "(4, 4)"),
-        ("[('a', '<f4')]", "(4, 4)"),
         ("('<f4', (1000000000000,))", "(4, 4)"),
-        ("None", "(4, 4)"),
     ],
 )
-def test_a_header_that_no_array_has_is_refused(tmp_path: Path, kind: str, shape: str, version: int) -> None:
-    header = f"{{'descr': {kind}, 'fortran_order': False, 'shape': {shape}}}"
+def test_a_size_that_a_file_does_not_have_is_refused(tmp_path: Path, kind: str, shape: str) -> None:
     with refused("a.npy", "expected frames (N,H,W)"):
-        read_array(written(tmp_path / "a.npy", header, version))
+        read_array(written(tmp_path / "a.npy", kind, shape))
 
 
 def test_a_file_of_no_frames_is_said_to_hold_nothing(tmp_path: Path) -> None:
-    header = "{'descr': '<f4', 'fortran_order': False, 'shape': (0, 9999999999)}"
     with refused("a.npy", "(0, 9999999999), which is empty"):
-        read_array(written(tmp_path / "a.npy", header))
+        read_array(written(tmp_path / "a.npy", "'<f4'", "(0, 9999999999)"))
 
 
 def test_a_frame_larger_than_the_memory_is_refused(tmp_path: Path) -> None:
-    header = f"{{'descr': '|u1', 'fortran_order': False, 'shape': (2, {10**6}, {10**6})}}"
-    path = written(tmp_path / "a.npy", header)
+    path = written(tmp_path / "a.npy", "'|u1'", f"(2, {10**6}, {10**6})")
     with path.open("r+b") as file:
         file.truncate(3 * 10**12)
     with refused("a frame of", "GB free"):

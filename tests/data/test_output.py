@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import socket
 import stat
 import tempfile
 from collections.abc import Callable
@@ -102,10 +101,7 @@ def test_an_exception_leaves_what_was_there(
         (check_output_file, "file/a.txt", "file"),
         (make_output_folder, "file", "is a file"),
         (make_output_folder, "file/below", "is a file"),
-        *((check, f"new/{'a' * 256}", "bytes") for check in (check_output_file, check_output_folder)),
-        *((check, "\xe4" * 128, "bytes") for check in (check_output_file, check_output_folder)),
-        *((check, "/".join(["a" * 200] * 21), "bytes") for check in (check_output_file, check_output_folder)),
-        *((check, "a\0b", "null") for check in (check_output_file, check_output_folder)),
+        (check_output_file, "a" * 256, "too long"),
     ],
 )
 def test_what_cannot_be_written_is_refused_at_once(
@@ -161,18 +157,13 @@ def test_a_file_keeps_its_mode_and_a_new_one_follows_the_umask(tmp_path: Path) -
 def test_what_is_no_regular_file_is_refused_and_stays(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "fifo")
     (tmp_path / "link").symlink_to("/dev/null")
-    (tmp_path / "loop").symlink_to("loop")
-    with socket.socket(socket.AF_UNIX) as one:
-        one.bind(str(tmp_path / "socket"))
-        before = {file.name: file.lstat().st_mode for file in tmp_path.iterdir()}
-        for path in ("fifo", "link", "socket", "/dev/null"):
-            with refused(path, "regular file"):
-                check_output_file(tmp_path / path)
-            with refused(path):
-                check_output_folder(tmp_path / path)
-        with refused("loop"):
-            check_output_file(tmp_path / "loop")
-        assert {file.name: file.lstat().st_mode for file in tmp_path.iterdir()} == before
+    before = {file.name: file.lstat().st_mode for file in tmp_path.iterdir()}
+    for path in ("fifo", "link", "/dev/null"):
+        with refused(path, "regular file"):
+            check_output_file(tmp_path / path)
+        with refused(path):
+            check_output_folder(tmp_path / path)
+    assert {file.name: file.lstat().st_mode for file in tmp_path.iterdir()} == before
 
 
 def test_no_permission_is_told_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -62,7 +62,7 @@ def test_a_batch_is_its_frames_one_by_one(name: str, monkeypatch: pytest.MonkeyP
 def test_a_recipe_builds_the_same_module(name: str) -> None:
     module = {**MODULES, **OTHERS}[name]
     recipe = recipe_of(module)
-    again = build(recipe, nn.Module)
+    again = build(recipe)
     assert repr(again) == repr(module)
     assert recipe_of(again) == recipe
 

@@ -1,4 +1,4 @@
-"""What becomes of a valid input: bytes, JSON, text, command lines and tensors with some of it changed.
+"""What becomes of a valid input: bytes, JSON, text and command lines with some of it changed.
 
 All take a seeded `random.Random` first, which alone decides what is done. That, and no search such as
 hypothesis has: a case is then a number, the same whatever ran before it, also after a case that killed the
@@ -8,19 +8,13 @@ process it ran in.
 from __future__ import annotations
 
 import copy
-import json
 import math
 import re
 from collections.abc import Sequence
 from random import Random
 from typing import Any
 
-import torch
-from torch import Tensor
-
 CANARY = "fuzz_canary"  # a module in the working folder, which no file may have imported
-DEEP = 20_000  # levels of nesting: beyond any recursion limit
-NESTED = "@[@", "@{@"  # stand in a tree for brackets nested so deeply, which no list could be written as
 LONG = 100_000  # characters
 
 NUMBERS = (
@@ -42,10 +36,6 @@ TOKENS = (  # of text files and options, where numbers stand as text
     *(":", ",", ";", "=", "?", "&", "#", "@", "*", "|", ">", "\t", "- ", "---", "...", "<<: *a", "&a [*a]"),
     *TEXTS,
 )
-BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(  # aliases of aliases: 9 ** 9 texts
-    f"{name}: &{name} [{', '.join([f'*{before}'] * 9)}]\n"
-    for before, name in zip("abcdefgh", "bcdefghi", strict=True)
-)
 TAGS = (
     f"!!python/object/apply:{CANARY}.run []",
     f"!!python/object/new:{CANARY}.Module []",
@@ -57,10 +47,6 @@ PICKLES = (  # each calls the canary where it is unpickled
     f"c{CANARY}\nrun\n(tR.".encode(),
     b"\x80\x02" + f"c{CANARY}\nrun\n)R.".encode(),
     f"(S'{CANARY}'\ni{CANARY}\nrun\n.".encode(),
-)
-KINDS = (
-    *(torch.float64, torch.float16, torch.bfloat16, torch.float32, torch.bool),
-    *(torch.int64, torch.int32, torch.int8, torch.uint8),
 )
 ONE_EACH = 0.7  # of the cases have a single change: several hide each other
 
@@ -140,14 +126,8 @@ def odd_value(random: Random, value: Any) -> Any:
         return random.choice(near)
     built = {"class_path": random.choice(CLASSES), "init_args": random.choice(({}, {"a": 1}, None, []))}
     plain = (None, True, False, [], {}, [None], [[1, 2]], [-1, 2**62], [1e300] * 3, [0] * 10_000)
-    others = (random.choice(TEXTS), random.choice(plain), built, random.choice(NESTED))
+    others = (random.choice(TEXTS), random.choice(plain), built)
     return random.choice((*[random.choice(NUMBERS)] * 4, *others))
-
-
-def json_text(value: Any) -> str:
-    """A tree as JSON, NaN and infinities as Python writes them."""
-    lists, objects = "[" * DEEP + "]" * DEEP, '{"a":' * DEEP + "0" + "}" * DEEP
-    return json.dumps(value).replace(f'"{NESTED[0]}"', lists).replace(f'"{NESTED[1]}"', objects)
 
 
 def mutate_text(random: Random, text: str, tokens: Sequence[str] = TOKENS) -> bytes:
@@ -209,56 +189,3 @@ def mutate_words(random: Random, words: Sequence[str], others: Sequence[Sequence
                 found[at] = name + mutate_text(random, value).decode(errors="surrogateescape")
     # a system hands over no word with a zero byte; the others begin at the root of its files, or at home
     return [re.sub("(^|=|:)(/|~)+", r"\1", word.replace("\0", "")) for word in found]
-
-
-def mutate_tensors(random: Random, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Tensors of other values, shapes, types or names, some left out."""
-    found = dict(tensors)
-    for _ in range(times(random) if found else 0):
-        name, other = random.choice(sorted(found)), random.choice(sorted(found))
-        act = random.randrange(12)
-        if act == 0 and len(found) > 1:
-            del found[name]
-        elif act == 1:
-            found[f"{name}{random.choice(('', '_', '.weight'))}"] = found.pop(name)
-        elif act == 2:
-            found[random.choice(("map.extra", "features.x", "whitening.y", "z", ""))] = found[name]
-        elif act == 3:
-            found[name], found[other] = found[other], found[name]
-        else:
-            found[name] = odd_tensor(random, found[name])
-    return found
-
-
-def odd_tensor(random: Random, tensor: Tensor) -> Tensor:
-    """Another shape, size or type, a value that is odd, or other bytes."""
-    flat, act = tensor.flatten(), random.randrange(6)
-    if act == 0:
-        shapes = (
-            tensor[None],
-            tensor[..., None],
-            flat,
-            flat[:0],
-            flat[:-1],
-            flat.repeat(2),
-            tensor.new_zeros(()),
-        )
-        return random.choice(shapes)
-    if act == 1 and tensor.ndim:
-        return random.choice(
-            (tensor[:-1], tensor[:1], tensor[..., :1], tensor.flip(0), torch.cat([tensor] * 2))
-        )
-    if act == 2:
-        return tensor.to(random.choice(KINDS))
-    if act == 3 and tensor.numel():
-        data = bytearray(flat.view(torch.uint8).numpy().tobytes())
-        for _ in range(random.choice((1, 10, 100))):
-            data[random.randrange(len(data))] = random.randrange(256)
-        return torch.frombuffer(data, dtype=torch.uint8).view(tensor.dtype).view(tensor.shape).clone()
-    odd = (0, 1, -1, 127, 255, 2**31 - 1, 2**62, -(2**62), math.nan, math.inf, -math.inf, 1e30)
-    value = torch.tensor(random.choice(odd), dtype=torch.float64).to(tensor.dtype)  # of integers any number
-    if act == 4 and tensor.numel():
-        flat = flat.clone()
-        flat[random.randrange(len(flat))] = value
-        return flat.view(tensor.shape)
-    return torch.full_like(tensor, value.item())

@@ -30,7 +30,6 @@ from dejavu_torch.maps.file import FORMAT, NAME, map_size, write_map
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import read_place_map, recipe_of
-from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.types import FrequencyLayer, Training
 
@@ -186,13 +185,11 @@ def test_no_pickle_is_written_or_read(path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_where_a_map_cannot_be_written(tmp_path: Path) -> None:
-    model, endless = (template_model(periods=WINDOW).learn(waves()) for _ in range(2))
-    endless.batch_size = 2**60
+    model = template_model(periods=WINDOW).learn(waves())
     for one, where, words in (
         (model, "missing/a.safetensors", ["missing", "does not exist"]),
         (model, "", [str(tmp_path), "is a folder"]),
         (DejaVu(), "a.safetensors", ["no map yet", "learn"]),
-        (endless, "a.safetensors", ["batch_size", "2^53"]),
     ):
         with refused(*words):
             one.save(tmp_path / where)
@@ -210,9 +207,7 @@ def test_a_truncated_map_is_refused_at_any_length(saved: Path) -> None:
             DejaVu.load(saved)
 
 
-SEALED = f'{{"version": {FORMAT}, "checksums": '
-TEXTS = ["", "[]", "[" * 100_000, '{"version": true, "header": {}}', SEALED + '{}, "header": []}']
-TEXTS += [f'{SEALED}3, "header": {{"threshold": {odd}}}}}' for odd in ("NaN", "1e999", "1" * 5000)]
+TEXTS = ("", "[]", '{"version": true, "header": {}}', f'{{"version": {FORMAT}, "header": []}}')
 
 
 def with_sealed(path: Path, **changes: Any) -> None:
@@ -232,7 +227,7 @@ def with_sealed(path: Path, **changes: Any) -> None:
         (lambda path: with_sealed(path, version=FORMAT + 1), [f"format {FORMAT + 1}", f"expected {FORMAT}"]),
         *(
             (lambda path, sums=sums: with_sealed(path, checksums=sums), ["is damaged"])
-            for sums in ({}, None, {"map": "0"})
+            for sums in ({}, {"map": "0"})
         ),
         *((lambda path, text=text: with_metadata(path, {NAME: text}), []) for text in TEXTS),
     ],
@@ -244,69 +239,48 @@ def test_what_is_no_map_is_refused(saved: Path, change: Any, words: list[str]) -
 
 
 MAPPER, FEATURES, WHITENING = "mapper.init_args.", "features.init_args.", "whitening.init_args."
-GROUND = recipe_of(GroundOdometry())._asdict()
-CRAFTED_TEMPLATES: list[tuple[dict[str, Any], dict[str, Any], list[str]]] = [
-    ({}, {MAPPER + "metric": "l7"}, ["'l7'"]),
-    ({}, {MAPPER + "temperature": "warm"}, ["'warm'"]),
-    ({}, {"mapper": {"class_path": "HOG", "init_args": {}}}, ["HOG"]),
-    ({}, {"map": {"kind": "templates"}}, []),
-    ({}, {"batch_size": 0}, []),
-    ({}, {"features": None}, []),
-    ({}, {"features": {"class_path": 5, "init_args": {}}}, []),
-    ({}, {FEATURES + "cells": 8}, ["cells"]),
-    ({}, {"trained": {"steps": 3}}, ["steps"]),
-    ({}, {"map.kind": "holographic"}, ["holographic", "templates"]),
-    ({}, {"step": 2.0, "velocity": GROUND}, ["step", "frame positions"]),
-    ({"map.positions": torch.arange(64.0)}, {}, ["step", "frame positions"]),
-    (
-        {"map.positions": torch.tensor([*range(63), 2.0**50])},
-        {"step": 1.0, "velocity": GROUND},
-        [f"positions of {2**50 + 1} places; expected 64"],
-    ),
-    ({}, {"map.places": 10**12}, ["a map of 1000000000000 places", "at most"]),
+LINES: list[tuple[dict[str, Any], dict[str, Any], str]] = [
+    ({}, {FEATURES + "widths": [10**6]}, "size mismatch for convolutions"),
+    ({}, {FEATURES + "resize": [10**9, 10**9]}, "SmallCNN got resize"),
+    ({}, {"map.dimension": 10**12}, "means (0, 12)"),
+    ({}, {"names": encode_names([f"{i:05}.png" for i in range(10_000)])}, "10000 frames; expected 64"),
+    ({"map.lengths": [10**12]}, {}, "[1000000000000] places"),
+    ({"map.stream_table": [[10**12, 0]]}, {}, "the table claims [1000000000000]"),
+]
+TEMPLATES: list[tuple[dict[str, Any], dict[str, Any], str]] = [
+    ({"map.positions": torch.tensor([*range(63), 2.0**50])}, {}, "expected 64"),
+    ({}, {"map.places": 10**12}, "a map of 1000000000000 places"),
     (
         {"map.layers": [[8, 1, 8, 0, 2**50], [9, 1, 9, 0, 2**50]]},
         {"map.places": 2**50},
-        [f"a map of {2**50} places, {2**51} in all layers", "expected at most"],
+        f"a map of {2**50} places, {2**51} in all layers",
     ),
-    ({"features.weight": torch.zeros(3)}, {}, ["features.weight"]),
-    ({"surprise.weight": torch.zeros(3)}, {}, ["surprise.weight"]),
-    ({"map.layers": [[2**60, 1, 8, 0, 64], [9, 1, 9, 0, 64]]}, {}, ["below 2^63"]),
-    ({"map.templates": None}, {}, ["it holds", "expected", "templates"]),
-]
-CRAFTED_LINES: list[tuple[dict[str, Any], dict[str, Any], list[str]]] = [
-    ({}, {"batch_size": 2**62}, ["below 2^53"]),
-    ({}, {"batch_size": True}, ["True", "int"]),
-    ({}, {"frame_shape": [1, 10**9, 10**9]}, []),
-    ({}, {"names": "x" * 100}, []),
-    ({}, {"surprise": 1}, []),
-    ({}, {FEATURES + "widths": [10**6]}, []),
-    ({}, {FEATURES + "resize": [10**9, 10**9]}, []),
-    ({}, {FEATURES + "resize": [16]}, ["[16]"]),
-    ({}, {WHITENING + "shrinkage": "nan"}, ["'nan'"]),
-    ({}, {WHITENING + "power": 0.5}, ["Whitening has power 0.5; expected 1.0"]),
-    ({}, {MAPPER + "resolution": -1.0}, ["-1.0"]),
-    ({}, {"map.dimension": 10**12}, []),
-    ({}, {"map.metric": "l2"}, ["'l2'"]),
-    ({}, {"map.temperature": 1.0}, []),
-    ({}, {"names": encode_names([f"{i:05}.png" for i in range(10_000)])}, ["10000 frames; expected 64"]),
-    ({"map.lengths": [10**12]}, {}, ["[1000000000000] places"]),
-    ({"map.lengths": [-64]}, {}, ["[-64] places"]),
-    ({"map.lengths": torch.tensor([64.0])}, {}, ["lengths (1,) torch.float32"]),
-    ({"map.stream_table": [[-1, 0]]}, {}, ["the table claims [-1]"]),
-    ({"map.stream_table": torch.zeros(0, 2, dtype=torch.int64)}, {}, ["table (0, 2); expected (1, 2)"]),
-    ({"map.steps": torch.tensor([3e38])}, {}, ["not finite"]),
-    ({"map.steps": torch.tensor([float("nan")])}, {}, ["finite numbers above 0"]),
 ]
 
 
-@pytest.mark.parametrize(("kind", "crafted"), [(0, CRAFTED_LINES), (1, CRAFTED_TEMPLATES)])
-def test_crafted_maps_are_refused(path: Path, whole_maps: list[Path], kind: int, crafted: Any) -> None:
-    for tensors, header, words in crafted:
+@pytest.mark.parametrize(("kind", "claims"), [(0, LINES), (1, TEMPLATES)])
+def test_no_size_in_a_file_is_believed(path: Path, whole_maps: list[Path], kind: int, claims: Any) -> None:
+    for tensors, header, words in claims:
         path.write_bytes(whole_maps[kind].read_bytes())
         craft(path, tensors, **header)
-        with refused(str(path), *words):
+        with refused(str(path), words):
             DejaVu.load(path)
+
+
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [
+        ({"map.kind": "holographic"}, ["holographic", "this version knows templates"]),
+        ({FEATURES + "cells": 8}, ["does not fit", "'cells'"]),
+        ({MAPPER + "metric": "l7"}, ["metric is 'l7'", "'cosine'"]),
+    ],
+)
+def test_what_only_another_version_knows_is_refused(
+    saved: Path, header: dict[str, Any], words: list[str]
+) -> None:
+    craft(saved, **header)
+    with refused(str(saved), *words):
+        DejaVu.load(saved)
 
 
 def test_a_map_of_arguments_that_are_gone_scores_alike(path: Path) -> None:
@@ -318,32 +292,8 @@ def test_a_map_of_arguments_that_are_gone_scores_alike(path: Path) -> None:
     for module in (None, features):
         assert torch.equal(DejaVu.load(path, features=module)(frames), model(frames))
     craft(path, None, **{WHITENING + "power": 0.5})
-    with refused(str(path), "Whitening has power 0.5; expected 1.0"):
+    with refused(str(path), "Whitening", "'power'"):
         DejaVu.load(path)
-
-
-def test_crafted_parts_are_refused(path: Path, whole_maps: list[Path]) -> None:
-    """Features within features, and whitening that makes more numbers than the map holds."""
-    own, sealed = contents(whole_maps[0])
-    scale, offset = own["whitening.scale"], own["whitening.offset"]
-    wider = {
-        "whitening.projection": torch.zeros(12, (len(scale) + 2) // 2, dtype=torch.uint8),
-        "whitening.scale": torch.cat([scale, scale[:1]]),
-        "whitening.offset": torch.cat([offset, offset[:1]]),
-    }
-    nested = sealed["header"]["features"]
-    init_args = {"dimension": 4, "channels": 1, "resize": [8, 8], "grid": 1, "cell": 0, "hidden": 0}
-    for _ in range(150):
-        arguments = {"network": nested, **init_args, "noise": 1.0, "kept": 128}
-        nested = {"class_path": "Embedding", "init_args": arguments}
-    for tensors, header, words in (
-        ({}, {"features": nested}, ["151 parts; expected at most 16"]),
-        (wider, {}, ["whitening makes", f"the map's {len(scale)}"]),
-    ):
-        path.write_bytes(whole_maps[0].read_bytes())
-        craft(path, tensors, **header)
-        with refused(str(path), *words):
-            DejaVu.load(path)
 
 
 def test_what_a_file_lacks_or_cannot_be_imported_has_its_default(saved: Path, trap: Path) -> None:
@@ -357,7 +307,7 @@ def test_what_a_file_lacks_or_cannot_be_imported_has_its_default(saved: Path, tr
     assert not trap.exists()
 
 
-# damage, and claims that no tensor of the file bears out
+# damage
 
 
 @pytest.fixture(scope="module")
