@@ -17,3 +17,10 @@ COMMANDS = {
     "completion": "print a completion script for bash or zsh",
 }
 FIRST_DAY = ("demo", "compare", "learn", "localize", "info")  # listed first by `dejavu --help`
+# the options that README and the first how-tos use, which --help shows; --help_all shows all
+FIRST_OPTIONS = {
+    "compare": ("out", "truth", "tolerance", "loops", "top", "second", "device", "map", "config", "features"),
+    "learn": ("map", "append", "second", "calibration", "device", "config", "features"),
+    "localize": ("out", "top", "precision", "match", "ordered"),
+    "live": ("page", "reference", "realtime", "match"),
+}
