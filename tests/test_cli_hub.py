@@ -16,8 +16,10 @@ from command_line import fails, run
 from torch import Tensor, nn
 
 from dejavu_torch import HOG, DejaVu
-from dejavu_torch.cli.commands import run_compare, run_learn, run_live, run_localize
+from dejavu_torch.cli.commands import run_learn
+from dejavu_torch.cli.localize import run_live, run_localize
 from dejavu_torch.cli.parser import parse
+from dejavu_torch.cli.reports import run_compare
 from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.features.hub import NETWORKS, Network
 from dejavu_torch.features.joined import Joined
