@@ -38,7 +38,7 @@ def help_of(lines: str) -> str:
         printed = io.StringIO()
         with redirect_stdout(printed), suppress(SystemExit):
             program(words)
-        shown += [f"## {line.removesuffix(' --help')}"] if words[-1] == "--help" else []
+        shown += [f"## {line.partition(' --help')[0]}"] if words[-1].startswith("--help") else []
         text = printed.getvalue().strip().replace(" \b", "")  # jsonargparse takes a blank back
         shown.append(f"```text\n{text}\n```")
     return "\n\n".join(shown)

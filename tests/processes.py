@@ -15,7 +15,7 @@ from typing import Any
 
 Done = subprocess.CompletedProcess[str]
 run = subprocess.run  # tests put `forked` in its place
-TORCH, PACKAGE = "torch", "dejavu_torch.cli.commands"
+TORCH, PACKAGE = "torch", "dejavu_torch.cli.reports"
 SERVER = """
 import importlib, json, os, socket, sys
 importlib.import_module(sys.argv[1])

@@ -20,6 +20,7 @@ from videos import H264, clip, pictures
 
 from dejavu_torch import DejaVu, SpectrogramAnalysis, TemplateMapper, open_source
 from dejavu_torch.cli import COMMANDS, commands
+from dejavu_torch.cli.names import FIRST_OPTIONS
 from dejavu_torch.features.joined import Joined
 from dejavu_torch.types import Training
 
@@ -267,14 +268,24 @@ def test_a_negative_offset_and_a_map_that_is_given(
 
 @pytest.mark.parametrize("command", [name for name in COMMANDS if name != "train"])
 def test_help_reads_well(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as stop:
-        run(command, "--help")
-    out = capsys.readouterr().out
-    assert stop.value.code == 0
-    assert "known subclasses" not in out
-    assert "<class" not in out
-    assert len(out.splitlines()) < 170
-    assert out.splitlines()[0].startswith(f"usage: dejavu {command}")
+    first, lines = FIRST_OPTIONS.get(command), {}
+    for word in ("--help", "--help_all")[: 1 + (first is not None)]:
+        with pytest.raises(SystemExit) as stop:
+            run(command, word)
+        out = capsys.readouterr().out
+        assert stop.value.code == 0
+        assert "known subclasses" not in out
+        assert "<class" not in out
+        lines[word] = out.splitlines()
+        assert lines[word][0].startswith(f"usage: dejavu {command}")
+    if first is None:
+        assert len(lines["--help"]) < 165
+        return
+    listed = re.findall(r"^  (?:-\w.*, )?--(\w+)\b", "\n".join(lines["--help"]), re.MULTILINE)
+    assert {*listed} == {*first, "help", "help_all"}
+    assert len(lines["--help"]) < 70 < len(lines["--help_all"]) < 190
+    assert f"`dejavu {command} --help_all` shows all options" in " ".join(lines["--help"])
+    assert FIRST_OPTIONS.keys() <= COMMANDS.keys()
 
 
 @pytest.fixture(scope="module")

@@ -16,10 +16,12 @@ from command_line import fails, run
 from torch import Tensor, nn
 
 from dejavu_torch import HOG, DejaVu
-from dejavu_torch.cli.commands import run_compare, run_learn, run_live, run_localize
+from dejavu_torch.cli.commands import run_learn
+from dejavu_torch.cli.localize import run_live, run_localize
 from dejavu_torch.cli.parser import parse
+from dejavu_torch.cli.reports import run_compare
 from dejavu_torch.features.embedding import Embedding
-from dejavu_torch.features.hub import NETWORKS, embedding
+from dejavu_torch.features.hub import NETWORKS, Network
 from dejavu_torch.features.joined import Joined
 
 ROUTE = "sim:aerial?frames=40"
@@ -156,10 +158,11 @@ def test_a_member_has_arguments_of_its_own(asked: list[dict[str, Any]]) -> None:
     page = (Path(__file__).parents[1] / "docs" / "howto" / "pretrained.md").read_text().replace("\n", " ")
     shown = re.findall(r"`(\[HOG, \{class_path: hub.*?\}\])`", page)
     assert len(shown) == 1
-    net = features_of("--features", shown[0]).members[1]
-    assert (net.resize, net.mean) == ((224, 224), MEAN)
+    for value in (shown[0], shown[0].replace("{domain: aerial}", "{init_args: {domain: aerial}}")):
+        net = features_of("--features", value).members[1]
+        assert (net.resize, net.mean) == ((224, 224), MEAN)
     call = {"repository": "AnyLoc/DINO", "entry": "get_vlad_model", "trust_repo": True}
-    assert asked == [call | ANYLOC | {"domain": "aerial"}]
+    assert asked == [call | ANYLOC | {"domain": "aerial"}] * 2
 
 
 @pytest.mark.parametrize(
@@ -168,7 +171,6 @@ def test_a_member_has_arguments_of_its_own(asked: list[dict[str, Any]]) -> None:
         ("dict_kwargs: {domain: aerial}", "hub:anyloc with dict_kwargs;"),
         ("network: {domain: aerial}", "hub:anyloc with network;"),
         ("init_args: {network.domain: aerial}", "hub:anyloc with network.domain;"),
-        ("init_args: {network: {domain: aerial}}", "torch.hub.load with domain;"),
     ],
 )
 def test_what_stands_beside_a_member_is_not_dropped(
@@ -200,26 +202,11 @@ def test_settings_of_a_config_are_not_its_own(
     assert asked[0] == asked[1]
 
 
-@pytest.mark.parametrize("value", ["hub:megaloc", "[HOG, hub:megaloc]", "{class_path: hub:megaloc}"])
-@pytest.mark.parametrize("option", ["--features", "--model.backbone"])
-def test_a_config_does_not_take_it_and_says_what_does(
-    option: str, value: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    learn, train = ("learn", ROUTE, "--map", "map.safetensors"), ("train", "fit", "--data.source", ROUTE)
-    text = f"features: {value}" if option == "--features" else f"model: {{backbone: {value}}}"
-    (tmp_path / "own.yaml").write_text(text)
-    words = learn if option == "--features" else train
-    where = option if option == "--features" else "--model"
-    expected = f"{where}: hub:megaloc; expected a short name only as value of --features"
-    assert expected in fails(capsys, *words, "--config", str(tmp_path / "own.yaml"))
-    if value.startswith("{"):
-        assert expected in fails(capsys, *words, option, value)
-
-
-def test_two_of_them_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    words = "--features", "hub:boq", "--features=hub:salad"
-    error = fails(capsys, "learn", ROUTE, "--map", "map.safetensors", *words)
-    assert "hub:boq and hub:salad; expected one of them" in error
+@pytest.mark.parametrize("value", ["hub:megaloc", "[hub:megaloc]", "{class_path: hub:megaloc}"])
+def test_a_config_takes_it(value: str, asked: list[dict[str, Any]], tmp_path: Path) -> None:
+    (tmp_path / "own.yaml").write_text(f"features: {value}")
+    net = features_of("--config", str(tmp_path / "own.yaml"))
+    assert repr(net) == repr(features_of("--features", value))
 
 
 @pytest.mark.parametrize("value", ["hub:megalock", "[HOG, hub:megalock]", "hub:"])
@@ -303,7 +290,7 @@ def test_a_repository_that_is_really_loaded(tmp_path: Path, monkeypatch: pytest.
         "    return nn.Conv2d(3, width, 3)\n"
     )
     (tmp_path / "hubconf.py").write_text(code)
-    local = embedding(str(tmp_path), "get_trained_model", source="local", width=5)
+    local = Network(str(tmp_path), "get_trained_model", {"source": "local", "width": 5})
     monkeypatch.setitem(NETWORKS, "megaloc", local)
     for value in ("hub:megaloc", "[hub:megaloc]"):
         net = features_of("--features", value)

@@ -23,7 +23,7 @@ from processes import PACKAGE, Forked
 from videos import H264, clip, piped
 
 from dejavu_torch import DejaVu, LiveLocalizer, PlaceFilter, SpectralMapper, Whitening, open_source
-from dejavu_torch.cli.commands import run_live
+from dejavu_torch.cli.localize import run_live
 from dejavu_torch.cli.parser import parse
 from dejavu_torch.live.localizer import LiveMatch
 from dejavu_torch.live.page import Page

@@ -92,6 +92,16 @@ def test_functions_methods_and_classes(words: str, channels: int) -> None:
     assert net(torch.rand(2, 3, 20, 20)).shape == (2, channels)
 
 
+def test_a_config_names_functions_likewise(tmp_path: Path) -> None:
+    network = "{class_path: zoo.load, init_args: {repo: a, model: m, note: [1]}}"
+    settings = f"{{dimension: null, network: {network}}}"
+    (tmp_path / "own.yaml").write_text(f"features: {{class_path: Embedding, init_args: {settings}}}")
+    features_of("--config", "own.yaml")
+    import zoo
+
+    assert zoo.asked == {"repo": "a", "model": "m", "source": "github", "note": [1]}
+
+
 def test_the_next_line_brings_the_network_back(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run(
         "learn",

@@ -20,7 +20,8 @@ import yaml
 
 from benchmarks.__main__ import BENCHES
 from dejavu_torch import DescriptorTask, TemplateTask
-from dejavu_torch.cli import COMMANDS, commands, completion, train
+from dejavu_torch.cli import COMMANDS, train
+from dejavu_torch.cli.names import function_of
 from dejavu_torch.cli.parser import command_parser
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.cnn import SmallCNN
@@ -136,7 +137,7 @@ def parser_of(program: str, name: str) -> Any:
     """The parser of a command, which takes as long to make as to read a line with."""
     if program != "dejavu":
         return command_parser(name, BENCHES[name])
-    return command_parser(name, getattr(completion if name == "completion" else commands, f"run_{name}"))
+    return command_parser(name, function_of(name))
 
 
 def understand(line: str) -> None:
@@ -171,7 +172,7 @@ def lines_shown(page: str) -> list[str]:
     return [
         line
         for line in dict.fromkeys(shown)
-        if not re.search(r"help\b|--version|\.\.\.|COMMAND|my_module", line)
+        if not re.search(r"help(_all)?\b|--version|\.\.\.|COMMAND|my_module", line)
     ]
 
 

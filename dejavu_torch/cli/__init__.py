@@ -12,7 +12,7 @@ from typing import NoReturn
 
 from dejavu_torch import __version__
 from dejavu_torch.cli import process
-from dejavu_torch.cli.names import COMMANDS, FIRST_DAY
+from dejavu_torch.cli.names import COMMANDS, FIRST_DAY, function_of
 from dejavu_torch.text import one_line, printable
 
 LONGEST = 300  # characters kept of torch's messages
@@ -89,8 +89,7 @@ def run_command(given: Sequence[str]) -> None:
     if not given or given[0] not in COMMANDS:
         overview(given[0] if given else "--help")
     with errors_of_one_line(given):
-        from dejavu_torch.cli import commands  # and with it torch, which takes seconds to import
-        from dejavu_torch.cli.parser import COMMAND, parse
+        from dejavu_torch.cli.parser import COMMAND, parse  # and with it torch, which takes seconds to import
 
         name, words = given[0], given[1:]
         if name == "train":  # Lightning's own command line
@@ -98,9 +97,7 @@ def run_command(given: Sequence[str]) -> None:
 
             run_train(words)
             return
-        if name == "completion":
-            from dejavu_torch.cli import completion as commands  # type: ignore[no-redef]
-        function = getattr(commands, f"run_{name}")
+        function = function_of(name)
         chosen = parse(name, function, words)
         if COMMAND in function.__annotations__:
             chosen[COMMAND] = shlex.join(["dejavu", *given])

@@ -11,8 +11,7 @@ from typing import Any, Literal, get_args
 from jsonargparse import ArgumentParser
 from torch import nn
 
-from dejavu_torch.cli import commands
-from dejavu_torch.cli.names import COMMANDS
+from dejavu_torch.cli.names import COMMANDS, function_of
 from dejavu_torch.cli.parser import Preset, command_parser
 from dejavu_torch.cli.presets import preset_names
 from dejavu_torch.features.cnn import SmallCNN
@@ -52,8 +51,7 @@ def run_completion(shell: Literal["bash", "zsh"] = "bash") -> None:
     for name, text in COMMANDS.items():
         parser = added.add_parser(name, help=text)
         if name != "train":
-            function = run_completion if name == "completion" else getattr(commands, f"run_{name}")
-            _copy(command_parser(name, function), parser)
+            _copy(command_parser(name, function_of(name)), parser)
             continue
         stages = parser.add_subparsers()
         for stage in TrainCLI.subcommands():

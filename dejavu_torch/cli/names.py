@@ -1,5 +1,10 @@
 """The commands in the order of messages, with their lines in `dejavu --help`."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib import import_module
+
 COMMANDS = {
     "demo": "learn the built-in route, localize a second traverse, write a report",
     "learn": "learn a map",
@@ -17,3 +22,20 @@ COMMANDS = {
     "completion": "print a completion script for bash or zsh",
 }
 FIRST_DAY = ("demo", "compare", "learn", "localize", "info")  # listed first by `dejavu --help`
+# the options that README and the first how-tos use, which --help shows; --help_all shows all
+FIRST_OPTIONS = {
+    "compare": ("out", "truth", "tolerance", "loops", "top", "second", "device", "map", "config", "features"),
+    "learn": ("map", "append", "second", "calibration", "device", "config", "features"),
+    "localize": ("out", "top", "precision", "match", "ordered"),
+    "live": ("page", "reference", "realtime", "match"),
+}
+# the modules of this folder that have their functions; commands has all others
+MODULES = {"localize": ("localize", "live"), "reports": ("demo", "compare", "evaluate", "reproduce")}
+MODULES["completion"] = ("completion",)
+
+
+def function_of(name: str) -> Callable[..., None]:
+    """The function of a command; its module imports torch, which takes seconds."""
+    module = next((module for module, names in MODULES.items() if name in names), "commands")
+    function: Callable[..., None] = getattr(import_module(f"dejavu_torch.cli.{module}"), f"run_{name}")
+    return function

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import argparse
 import inspect
-import json
 import os
-import pydoc
 import re
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import redirect_stdout, suppress
 from dataclasses import is_dataclass
 from functools import cache
 from pathlib import Path
@@ -18,16 +15,14 @@ from typing import Any, NoReturn, cast, get_args, get_origin
 
 import docstring_parser
 import jsonargparse
-import yaml
 from jsonargparse.typing import restricted_string_type
-from torch import nn
 
+from dejavu_torch.cli.names import FIRST_OPTIONS
+from dejavu_torch.cli.networks import accept_networks, is_made, made, names_network, with_hub
 from dejavu_torch.cli.options import named_features, refuse_with
-from dejavu_torch.cli.presets import check_config, check_word, find_config
+from dejavu_torch.cli.presets import check_config, find_config
 from dejavu_torch.data.files import LARGEST
 from dejavu_torch.data.source import check_not_read
-from dejavu_torch.features import hub
-from dejavu_torch.features.joined import Joined
 from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import REGISTRY
 from dejavu_torch.text import one_line
@@ -48,7 +43,7 @@ HINT = (
 )
 BARE = {"velocity": "GroundOdometry", "page": 8765}  # values of options given without one
 MapFile = restricted_string_type("MapFile", r".*\.safetensors")
-NETWORKS = ("features", "backbone", "network")  # options that name a class or a function that makes one
+__all__ = ["made", "with_hub"]  # the first is named here by config files
 LONGEST = 300  # characters of a message; longer ones are cut
 
 
@@ -81,156 +76,6 @@ def whole_numbers(value: object) -> Iterator[int]:
             yield from whole_numbers(part)
 
 
-def made(function: str, **arguments: Any) -> nn.Module:
-    """The network that a function of any signature makes, such as torch.hub.load; see `with_made`.
-
-    Args:
-        function: its import path as the user typed it, never from a map or checkpoint.
-    """
-    try:
-        maker: Any = pydoc.locate(function)
-    except pydoc.ErrorDuringImport as error:
-        raise InputError(f"{function} cannot be imported: {one_line(error.value)}") from error
-    if not callable(maker):
-        raise InputError(f"{function} is no function that can be imported; expected one, or a class")
-    try:
-        with redirect_stdout(sys.stderr):  # keeps stdout to lines of JSON
-            network = maker(**arguments)
-    except SystemExit as stop:  # it would end the command silently
-        raise InputError(f"{function} ends the program ({stop}); expected one that makes a network") from stop
-    if not isinstance(network, nn.Module):
-        raise InputError(f"{function} made a {type(network).__name__}; expected an nn.Module")
-    # DataParallel would use the first GPU, wherever the model is
-    return network.module.cpu() if isinstance(network, nn.DataParallel) else network
-
-
-def _function_at(path: str) -> Callable[..., Any] | None:
-    """The function or method of that name, or None."""
-    try:
-        found = pydoc.locate(path) if "." in path else None
-    except pydoc.ErrorDuringImport:  # the parser reports it
-        return None
-    return found if inspect.isroutine(found) else None
-
-
-def with_made(words: Sequence[str]) -> list[str]:
-    """The command line with a call of `made` for a function that is named instead of a class.
-
-    `--features timm.create_model --features.model_name NAME` calls that function; jsonargparse itself only
-    accepts functions with annotated arguments and return value.
-    """
-    words = list(_with_members(_joined(with_hub(words))))
-    configured = any(word.startswith(("--config=", "-c")) or word == "--config" for word in words)
-    named = (word.partition("=") for word in words if _names_network(word))
-    makers = {option: path if _function_at(path) is not None else "" for option, _, path in named}
-    spelt: list[str] = []
-    for word in words:
-        option = word.partition("=")[0]
-        part = option.rpartition(".")[0]
-        own = part if makers.get(part) and not makers.get(option) else option
-        path = makers.get(own, "")
-        made_by = [f"{own}={__name__}.made", f"{own}.function={path}"] if path else []
-        if made_by and made_by[1] in spelt:
-            made_by = []
-        elif not configured and own in ("--features", "--model.backbone"):
-            spelt.append(f"{own}=null")  # else arguments of the default class would be kept
-        spelt += made_by  # before its arguments, wherever they are typed
-        if not path:
-            spelt.append(word)
-        elif option != own:
-            spelt.append(f"{own}.dict_kwargs.{word.removeprefix(own + '.')}")
-    return spelt
-
-
-def _names_network(word: str) -> bool:
-    """Whether a word is an option that names a class, or a function that makes one."""
-    return word.startswith("--") and word.partition("=")[0].lstrip("-").rpartition(".")[2] in NETWORKS
-
-
-def _joined(given: Sequence[str]) -> list[str]:
-    """The command line with `--features=NAME` for `--features NAME`, and so for all networks."""
-    words = [*given]
-    for at in range(len(words) - 2, -1, -1):
-        if _names_network(words[at]) and "=" not in words[at] and not words[at + 1].startswith("-"):
-            words[at : at + 2] = [f"{words[at]}={words[at + 1]}"]
-    return words
-
-
-def with_hub(given: Sequence[str]) -> Sequence[str]:
-    """The command line with the settings that `hub:NAME` stands for, except those that are typed."""
-    words = _joined(given)
-    typed = [word.partition("=")[0] for word in words]
-    values = {at: word.partition("=")[2] for at, word in enumerate(words) if _names_network(word)}
-    short = [
-        at
-        for at, value in values.items()
-        if value.startswith(hub.PREFIX) and not typed[at].endswith("network")
-    ]
-    if not short:
-        return given
-    if len(short) > 1:
-        raise UsageError(f"{' and '.join(values[at] for at in short)}; expected one of them, or a list")
-    at, option, whole = short[0], typed[short[0]], hub.known(values[short[0]])
-    settings = whole["init_args"] | {"network": "torch.hub.load"}
-    settings |= {f"network.{key}": one for key, one in whole["init_args"]["network"]["init_args"].items()}
-    named = {f"{option}.{k}": v if type(v) is str else json.dumps(v) for k, v in settings.items()}
-    spelt = [f"{option}=null", f"{option}={whole['class_path']}"]  # drops settings of a config
-    spelt += [f"{k}={v}" for k, v in named.items() if k not in typed]
-    first = next(i for i, one in enumerate(typed) if one.startswith(f"{option}.") or i == at)
-    return [*words[:first], *spelt, *words[first:at], *words[at + 1 :]]
-
-
-def _with_members(words: Sequence[str]) -> Iterator[str]:
-    """The command line with `Joined` for a list of features."""
-    for word in words:
-        option, _, value = word.partition("=")
-        if not _names_network(word) or not value.lstrip().startswith("["):
-            yield f"{option}={_path_of(value)}" if _names_network(word) and value in REGISTRY else word
-            continue
-        try:
-            members = yaml.safe_load(value)
-            made_in = _made_in(members)
-            value = value if made_in == members else json.dumps(made_in)
-        except InputError:
-            raise
-        except (yaml.YAMLError, ValueError, TypeError) as error:
-            expected = "expected a list of classes, such as [HOG, PatchPixels]"
-            raise UsageError(f"{option} is {value!r}; {expected}") from error
-        yield from (f"{option}={Joined.__module__}.{Joined.__name__}", f"{option}.members={value}")
-
-
-def _made_in(value: Any) -> Any:
-    """A YAML value with import paths of our classes, and calls of `made` for each function in it."""
-    if isinstance(value, list):
-        members = [{"class_path": one} if str(one).startswith(hub.PREFIX) else one for one in value]
-        return [_path_of(one) if isinstance(one, str) else _made_in(one) for one in members]
-    if not isinstance(value, dict):
-        return value
-    path, given = str(value.get("class_path")), value.get("init_args") or {}
-    short = path.startswith(hub.PREFIX)
-    if not short and (_function_at(path) is None or path == f"{__name__}.made"):
-        return {key: _made_in(one) for key, one in value.items()}
-    odd = [key for key in value if key not in ("class_path", "init_args")]
-    odd += [key for key in given if "." in str(key)]
-    if odd:
-        raise UsageError(f"{path} with {odd[0]}; expected settings under init_args, without dots in names")
-    if short:
-        return _made_in(_merged(hub.known(path), {"init_args": given}))
-    return {"class_path": f"{__name__}.made", "init_args": {"function": path}, "dict_kwargs": _made_in(given)}
-
-
-def _merged(base: Any, over: Any) -> Any:
-    """Two nested mappings, of which the second overrides the first; another class discards the settings."""
-    if not isinstance(base, dict) or not isinstance(over, dict) or "class_path" in over:
-        return over
-    return base | {key: _merged(base.get(key), one) for key, one in over.items()}
-
-
-def _path_of(name: str) -> str:
-    """The import path of one of our classes; other names are left to jsonargparse."""
-    return f"{REGISTRY[name].__module__}.{name}" if name in REGISTRY else name
-
-
 class HelpFormatter(jsonargparse.DefaultHelpFormatter):
     """Help without lists of all installed classes, and without defaults of null."""
 
@@ -238,6 +83,18 @@ class HelpFormatter(jsonargparse.DefaultHelpFormatter):
         text, cut, _ = super()._expand_help(action).partition(", known subclasses: ")
         text = text.replace("<class '", "").replace("'>", "").replace(" | null, default: null", "")
         return text + (")" if cut else "")
+
+
+class HelpAll(argparse.Action):
+    """--help_all: the help of all options."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str, **settings: Any) -> None:
+        super().__init__(option_strings, argparse.SUPPRESS, 0, default=argparse.SUPPRESS, **settings)
+
+    def __call__(self, parser: Any, *_: Any) -> None:
+        parser.whole = True
+        parser.print_help()
+        parser.exit()
 
 
 class Preset(jsonargparse.ActionConfigFile):  # type: ignore[name-defined, misc]
@@ -251,6 +108,10 @@ class Preset(jsonargparse.ActionConfigFile):  # type: ignore[name-defined, misc]
 
 class Parser(jsonargparse.ArgumentParser):
     """A parser whose errors are UsageErrors of one line, and whose options override its --config."""
+
+    first: Collection[str] = ()  # options that --help shows; all if empty
+    hint = ""  # that is shown with all of them
+    whole = False  # whether all are shown
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, formatter_class=HelpFormatter, allow_abbrev=False, **kwargs)
@@ -269,46 +130,62 @@ class Parser(jsonargparse.ArgumentParser):
             sys.path.remove(here)
             raise
 
+    def format_help(self, *given: Any) -> str:
+        """The help of the first options with a line on the others, or of the whole."""
+        shown = {"-h", "--help", "--help_all", *(f"--{name}" for name in self.first)}
+        hidden = [one for one in self._actions if one.option_strings and not shown & {*one.option_strings}]
+        texts, description = [one.help for one in hidden], self.description
+        try:
+            if self.whole or not self.first:
+                self.description = f"{description} {self.hint}".strip() if description else None
+                return str(super().format_help(*given))
+            part = ", `--features.help HOG` those of a part" * bool(self.hint)
+            self.epilog = f"`{self.prog} --help_all` shows all options{part}."
+            for one in hidden:
+                one.help = argparse.SUPPRESS
+            return str(super().format_help(*given))
+        finally:
+            self.description, self.epilog, self.whole = description, None, False
+            for one, text in zip(hidden, texts, strict=True):
+                one.help = text
+
+    def parse_object(self, *args: Any, **settings: Any) -> Any:
+        accept_networks(self)
+        return super().parse_object(*args, **settings)
+
     def _parsed(self, args: Any, *rest: Any, **settings: Any) -> Any:
-        for word in args or ():
-            check_word(word)
+        accept_networks(self)
         # a nested null reaches the parser of its part as None
-        words = with_made([f"{w[:-4]}null" if w.endswith("=None") else w for w in args or ()])
+        words = [f"{word[:-4]}null" if word.endswith("=None") else word for word in args or ()]
         start = 1 if self._subparsers is not None else 0  # after the subcommand
-        configs, others = self._configs(words[start:])
-        if features := self._option_string_actions.get("--features"):  # of this command line alone
-            hog = {"class_path": _path_of("HOG")} if self._need_class(configs, others) else None
-            features.default = hog
-        words[start:] = [*(f"--config={name}" for name in configs), *others]
+        words[start:] = self._in_order(words[start:])
         parsed = super().parse_args(words, *rest, **settings)
         for key, value in vars(parsed.as_flat()).items():
             if any(abs(number) > LARGEST for number in whole_numbers(value)):
                 self.error(f"--{key} is {value}; expected whole numbers of at most {LARGEST}")
         return parsed
 
-    def _configs(self, words: Sequence[str]) -> tuple[Sequence[str], Sequence[str]]:
-        """The values of --config, and the other words."""
-        names = [name for name in ("-c", "--config") if name in self._option_string_actions]
-        if not names:
-            return [], words
+    def _in_order(self, words: Sequence[str]) -> Sequence[str]:
+        """The words, with configs and then classes ahead of their settings, wherever these are typed."""
+        names = {name for name in ("-c", "--config") if name in self._option_string_actions}
+        classes = {word.partition("=")[0] for word in words if names_network(word)}
+        if not names | classes:
+            return words
         reader = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
         reader.error = self.error  # type: ignore[method-assign]
-        reader.add_argument(*names, action="append", default=[])
+        for name in sorted(classes, key=lambda name: name.count(".")):
+            reader.add_argument(name, action="append", default=[], dest=name)
+        if names:
+            reader.add_argument(*names, action="append", default=[], dest="--config")
         found, others = reader.parse_known_args(words)
-        return found.config, others
-
-    @staticmethod
-    def _need_class(configs: Sequence[str], words: Sequence[str]) -> bool:
-        """Whether arguments of the features are given, maybe without a class, which is then HOG."""
-        if any(word.startswith("--features.") for word in words):
-            return True
-        for name in configs:
-            with suppress(InputError):  # parsing the config reports it
-                check_config(path := find_config(name))
-                given = yaml.safe_load(path.read_text("utf-8")).get("features")
-                if isinstance(given, dict) and "class_path" not in given:
-                    return True
-        return False
+        first = ["--config"] if names else []
+        first += sorted(classes, key=lambda name: name.count("."))
+        pairs = [(name, value) for name in first for value in vars(found)[name]]
+        spelled = [f"{name}={value}" for name, value in pairs]
+        # within a part, what is made would keep settings of the class before
+        dropped = [f"{name}=null" for name, value in pairs if name == "--model.backbone" and is_made(value)]
+        configs = len(vars(found)["--config"]) if names else 0
+        return [*spelled[:configs], *dropped, *spelled[configs:], *others]
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         head, required, names = message.partition("required: ")
@@ -332,19 +209,18 @@ def _by_options(message: str, error: Exception | None, positional: Collection[st
             return f"no stage given; expected one of {stages[1].replace(',', ', ')}"
         return re.sub(r"^Option '([\w.]+)'", r"--\1", message)
     option = "--" * (key[1] not in positional) + key[1].replace(".init_args", "")
-    short = re.search(rf"\b{hub.PREFIX}[\w+.-]*", message)
-    if short:
-        where = "--features or --model.backbone on the command line, alone or in a list"
-        return f"{option}: {short[0]}; expected a short name only as value of {where}"
     chain = list(causes(error))
     part = next((one for one in chain if isinstance(one, UsageError)), None)
     if part is not None:
         inner = re.sub(r"(?<![\w-])--(?=\w)", f"{option}.", str(part))  # of the part's own parser
         return inner if inner.startswith(option) else f"{option}: {inner}"
+    own = [one for one in chain if isinstance(one, InputError)]
     setting = re.search(r"NestedArg\(key='([\w.]+)'", message)
     if setting:
         return f"{option}.{setting[1]}: the value of {option} has no settings; expected one or the other"
-    text = re.sub(r"<class '(?:\w+\.)*(\w+)'>", r"\1", str(chain[-1])).replace("typing.Literal", "one of ")
+    text = re.sub(r"<class '(?:\w+\.)*(\w+)'>", r"\1", str((own or chain)[-1])).replace(
+        "typing.Literal", "one of "
+    )
     others = ", none or a map file" * ("MapFile" in message)
     wanted = f"expected the import path of a class{others}, not"
     text = text.replace("Expected a dot import path string:", wanted)
@@ -354,7 +230,9 @@ def _by_options(message: str, error: Exception | None, positional: Collection[st
         text += f"; did you mean {meant}?" if meant else ""
     value = re.match(r"Expected an? (.*)\. Got value: (.*)", text, re.DOTALL)
     none = "null, or " if value and value[2].lower() == "none" else ""
-    return f"{option} is {value[2]}; expected {none}{value[1]}" if value else f"{option}: {text}"
+    if value:
+        return f"{option} is {value[2]}; expected {none}{value[1]}"
+    return f"{option} {text}" if text.startswith("is ") else f"{option}: {text}"
 
 
 @cache
@@ -368,14 +246,19 @@ def command_parser(name: str, function: Callable[..., None], program: str = "dej
     """
     text, helps = described(function)
     parser = Parser(prog=f"{program} {name}", description=text)
+    if name in FIRST_OPTIONS and program == "dejavu":
+        parser.first = FIRST_OPTIONS[name]
+        parser.add_argument("--help_all", action=HelpAll, help="show all options and exit")
     for key, parameter in inspect.signature(function, eval_str=True).parameters.items():
         if key == COMMAND:
             continue
         if key == MODEL:
             add_model(parser)
         elif is_dataclass(options := parameter.annotation):
+            title, own = described(cast(type, options))
+            group = parser.add_argument_group(str(title).strip().rstrip("."))
             for one in inspect.signature(cast(type, options), eval_str=True).parameters.values():
-                add_option(parser, one.replace(kind=one.KEYWORD_ONLY), described(cast(type, options))[1])
+                add_option(group, one.replace(kind=one.KEYWORD_ONLY), own)
         else:
             add_option(parser, parameter, helps)
     return parser
@@ -390,8 +273,8 @@ def described(thing: Callable[..., Any]) -> tuple[str | None, dict[str, str | No
     return text.description, helps
 
 
-def add_option(parser: Parser, parameter: inspect.Parameter, helps: Mapping[str, str | None]) -> None:
-    """Add an option or a positional argument, see `command_parser`."""
+def add_option(parser: Any, parameter: inspect.Parameter, helps: Mapping[str, str | None]) -> None:
+    """Add an option or a positional argument to a parser or a group of it, see `command_parser`."""
     keyword, default = parameter.kind is parameter.KEYWORD_ONLY, parameter.default
     settings: dict[str, Any] = {"help": helps.get(parameter.name, argparse.SUPPRESS)}  # hidden
     if parameter.annotation is bool:
@@ -423,16 +306,18 @@ def grouped(function: Callable[..., None], arguments: dict[str, Any]) -> dict[st
 
 def add_model(parser: Parser) -> None:
     """Add --config, and every argument of DejaVu as an option."""
-    parser.description = f"{parser.description} {HINT}"
+    parser.hint = HINT
     parser.add_argument(
         "-c", "--config", action=Preset, help="preset (default, local_maxima, paper) or YAML file"
     )
     parser.add_class_arguments(DejaVu, None, skip={"whitening", "velocity"})
+    group = parser._action_groups[-1]
+    group.title = "The model"
     helps = described(DejaVu)[1]
     parameters = inspect.signature(DejaVu, eval_str=True).parameters
     for name, also in (("whitening", MapFile), ("velocity", None)):
         one = parameters[name]
-        add_option(parser, one.replace(kind=one.KEYWORD_ONLY, annotation=one.annotation | also), helps)
+        add_option(group, one.replace(kind=one.KEYWORD_ONLY, annotation=one.annotation | also), helps)
     parser.set_defaults(DEFAULT_PARTS)
 
 

@@ -13,12 +13,12 @@ from command_line import benchmark, benchmark_fails, run_here
 
 from benchmarks import results, tables
 from benchmarks.results import FOOTAGE, SEEDS, WAYS, Footage, runs
-from dejavu_torch.cli import commands
 from dejavu_torch.cli.parser import command_parser
+from dejavu_torch.cli.reports import run_compare
 
 
 def test_every_command_is_understood_and_every_way_is_used() -> None:
-    parser = command_parser("compare", commands.run_compare)
+    parser = command_parser("compare", run_compare)
     planned = list(runs(list(WAYS)))
     for run in planned:
         parser.parse_args([word.replace("{data}", "data") for word in run.words[1:]] + ["--out", "out"])

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from dejavu_torch.cli import commands, main
+from dejavu_torch.cli import main, reports
 from dejavu_torch.data.source import open_source
 from dejavu_torch.evaluation import reproduce
 from dejavu_torch.evaluation.reproduce import paper_model
@@ -29,7 +29,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     paper.mapper.periods.window = FRAMES  # type: ignore[union-attr]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(reproduce, "paper_model", lambda: paper)
-        patch.setattr(commands, "open_source", lambda source: open_source(f"{source}&frames={FRAMES}"))
+        patch.setattr(reports, "open_source", lambda source: open_source(f"{source}&frames={FRAMES}"))
         with (out / "printed.txt").open("w") as printed, redirect_stdout(printed):
             main(["demo", "--out", str(out)])
     return out

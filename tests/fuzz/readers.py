@@ -29,7 +29,8 @@ from PIL import Image
 from torch import Tensor
 
 from dejavu_torch import cli
-from dejavu_torch.cli import commands, live, train
+from dejavu_torch.cli import live, train
+from dejavu_torch.cli.names import function_of
 from dejavu_torch.cli.parser import parse
 from dejavu_torch.cli.presets import FOLDER
 from dejavu_torch.data.arrays import ArrayTraverse
@@ -288,7 +289,7 @@ def config(case: Case) -> None:
         chosen = mutate_text(random, "local_maxima").decode(errors="surrogateescape").replace("\0", "")
     name, *words = random.choice((LINES[0], SLOW_LINES[0])).split()
     case.begin()
-    parse(name, getattr(commands, f"run_{name}"), [*words, "--config", chosen])
+    parse(name, function_of(name), [*words, "--config", chosen])
 
 
 LINES = """

@@ -1,0 +1,219 @@
+"""`dejavu localize` and `dejavu live`: frames found on a map."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+from torch import Tensor
+
+from dejavu_torch.cli import options
+from dejavu_torch.cli.commands import (
+    SUPPRESSION,
+    check_cluster,
+    print_next,
+    print_steps,
+    say,
+    write_matches,
+)
+from dejavu_torch.cli.device import device_of
+from dejavu_torch.data.output import check_output_file
+from dejavu_torch.data.source import check_not_read, open_source
+from dejavu_torch.data.traverse import Whole
+from dejavu_torch.evaluation.answers import describe_probable, next_steps, probable_counts
+from dejavu_torch.model import DejaVu
+from dejavu_torch.motion.ground_plane import check_corners
+from dejavu_torch.motion.resampling import source_of
+from dejavu_torch.recognition.select import check_candidates
+from dejavu_torch.recognition.smoother import PlaceSmoother
+from dejavu_torch.types import InputError, Match, Traverse
+
+NO_DRIVE = "the queries are no drive of this map, as far as they show: each is matched by itself"
+
+
+def run_localize(
+    map: Path,
+    source: str,
+    *,
+    out: Path,
+    acceptance: options.Acceptance,
+    top: int | None = None,
+    loops: int | None = None,
+    pairs: Path | None = None,
+    corners: list[list[float]] | None = None,
+    sequences: options.Sequences,
+    ordering: options.Ordering,
+    searching: options.Searching,
+    cluster: str | None = None,
+    skip_damaged: bool = False,
+    loading: options.Loading,
+) -> None:
+    """Find the frames of a source on a map.
+
+    Args:
+        map: map file
+        source: frames to find, as in `dejavu learn`
+        out: csv of query,place,score,accepted[,probability],confidence[,rank][,route],query_name,place_name
+        top: write this many places per query, no two within 5 of each other, each in a row with its rank; a
+            probability is that of the first
+        loops: find where a drive comes back to places it has passed, if the map was learned from it: this
+            many frames before each, and those after it, are no answers
+        pairs: also write lines `query_name place_name` for hloc and COLMAP, one per place
+        corners: where this camera sees the patch of ground that the map's --velocity.corners describe
+        cluster: divide the map among Ray workers, as in `dejavu learn`; for single queries only
+        skip_damaged: frames that cannot be read find nothing, and do not stop the others
+    """
+    device_of(loading.device)
+    _check_written(out, pairs, map, source)
+    matcher = sequences.matcher(SUPPRESSION, acceptance.threshold)
+    ordered = ordering.of(matcher)
+    acceptance.check(matcher)
+    if cluster is not None:
+        check_cluster(cluster, loading.device)
+        options.refuse_with(f"--cluster {cluster}", match=matcher not in (None, "auto") and sequences.way)
+        matcher = None
+    model = loading.model(map)
+    searching.of(model)
+    if corners is not None:
+        why = "--as_is measures no ground" if loading.as_is else f"{map} was learned without --velocity"
+        _set_corners(model, corners, why)
+    acceptance.of(model)
+    if top is not None:
+        check_candidates(top, SUPPRESSION, model.map.places)
+    damaged: dict[int, str] | None = {} if skip_damaged else None
+    query = _open_query(model, source, map if pairs else None, damaged)
+    ordered = source_of(query).ordered if ordered is None else ordered
+    if isinstance(matcher, str):
+        matcher = PlaceSmoother(within=SUPPRESSION, threshold=acceptance.threshold) if ordered else None
+    chosen = model.matching(matcher).acceptance
+    smooths = isinstance(matcher, PlaceSmoother)
+    centre = (smooths or matcher is None) and ordering.centring(model, ordered, len(query))
+    if loops is not None:
+        together = sequences.way not in (None, "drive", "single") and sequences.way
+        given = {"top": top, "cluster": cluster, "match": together, "centre": ordering.centre}
+        options.refuse_with(f"--loops {loops}", **given)
+        chosen = model.loop_matching(loops, PlaceSmoother() if smooths else None).acceptance
+        matches = iter([model.loops(query, loops, smooths, True)])
+        matcher = None
+    else:
+        matches = model.matches(query, True, matcher, None, top, SUPPRESSION, centre)
+    if top is not None:
+        matches = (part.map(Tensor.flatten) for part in matches)
+    counts: Counter[str] = Counter()
+
+    def counted() -> Iterator[Match]:
+        for match in matches:
+            counts.update(probable_counts(match))
+            yield match
+
+    with ExitStack() as stack:
+        if cluster is not None:
+            from dejavu_torch.cluster import Cluster, ClusterSearch
+
+            workers = stack.enter_context(Cluster(cluster))
+            model.searcher = ClusterSearch(workers, model.map, searching.search, searching.bytes)
+        total, accepted = write_matches(out, counted(), query, model, top, pairs)
+    if not model.map.summary().covered:
+        print("the map has no layers, so no place can be reported")
+    elif not chosen.given:
+        print(chosen)
+    if isinstance(matcher, PlaceSmoother) and not matcher.is_drive:
+        print(NO_DRIVE)
+    if damaged:
+        one, many = min(damaged), len(damaged)
+        print(f"{many} frame{'s' * (many > 1)} could not be read, such as {one}: {damaged[one]}")
+    say(f"{total} queries, {accepted} accepted; written to {out}")
+    if counts:
+        steps = next_steps(matcher is not None, chosen.given)
+        say(describe_probable(counts, total) + (f"; next: {'; '.join(steps)}" if steps else ""))
+    table: tuple[str | Path, ...] = () if model.step is None else ("--map", map)
+    table += ("--route", "ROUTE") if model.map.routes else ()
+    print_next("evaluate", out, "--truth", "TRUTH", *table, "--out", "scores")
+
+
+def _check_written(out: Path, pairs: Path | None, *read: str | Path) -> None:
+    """Refuse files that cannot be written, are read, or are the same."""
+    for written in filter(None, (out, pairs)):
+        check_output_file(written)
+        check_not_read(written, *read)
+    if pairs is not None and pairs.resolve() == out.resolve():
+        raise InputError(f"--pairs {pairs} is --out as well; expected another name")
+
+
+def _open_query(model: DejaVu, source: str, paired: Path | None, damaged: dict[int, str] | None) -> Traverse:
+    """The queries as a model localizes them.
+
+    Args:
+        paired: the map's file, if its and their names have to fit a file of pairs. damaged: gets the frames
+            that cannot be read; None refuses them.
+    """
+    from dejavu_torch.evaluation.matches import check_pair_names
+
+    query = open_source(source)
+    if paired is not None:
+        check_pair_names(model.frame_names, f"the map {paired}")
+        check_pair_names(query.names, query.name)
+    query = query if damaged is None else Whole(query, damaged)
+    query = model.at_map_size(query, model.frame_shape or ())
+    if model.step is not None:
+        query = model.resample(query, model.step, True, model.frame_shape)
+    print_steps(query)
+    return query
+
+
+def _set_corners(model: DejaVu, corners: list[list[float]], why: str) -> None:
+    """Let a model measure another camera's ground; `why` it measures none is for the message."""
+    if model.velocity is None or model.step is None:
+        raise InputError(f"--corners {corners}: {why}; expected a map and frames at even steps")
+    check_corners(corners)
+    model.velocity.corners = tuple((float(x), float(y)) for x, y in corners)
+
+
+def run_live(
+    map: Path,
+    source: str,
+    *,
+    sequences: options.LiveSequences,
+    searching: options.Searching,
+    acceptance: options.Acceptance,
+    page: int | None = None,
+    reference: str | None = None,
+    realtime: bool = False,
+    timeout: float = 10.0,
+    loading: options.Loading,
+) -> None:
+    """Find frames as they arrive: a line of JSON for each on stdout, a summary on stderr at the end.
+
+    Frames are resized to the size of the map's frames.
+
+    Args:
+        map: map file
+        source: a camera (/dev/video0), an address (rtsp://host/path), a named pipe, - for standard input, or
+            a source as in `dejavu learn`. Cameras, addresses and pipes always give their newest frame and
+            drop those that arrived meanwhile; files drop none
+        page: show frame, reference frame and posterior at http://127.0.0.1:PORT; 8765 if no port is given, 0
+            for any free port. A file then plays in real time, and the page stays until Ctrl-C
+        reference: what the map was learned from, a source as in `dejavu learn`, for the pictures of the page
+        realtime: play a video in real time, and drop frames that arrive too fast
+        timeout: seconds without a frame after which a camera, address or pipe has stalled
+    """
+    from dejavu_torch.cli.live import follow
+    from dejavu_torch.data.camera import without_password
+
+    device_of(loading.device)
+    if reference is not None and page is None:
+        raise InputError(f"--reference {reference} without --page; expected both")
+    if not 0 < timeout <= threading.TIMEOUT_MAX:
+        raise InputError(f"--timeout {timeout:g}; expected seconds, above 0")
+    matcher = sequences.matcher(SUPPRESSION, acceptance.threshold)
+    assert not isinstance(matcher, str)  # the default is the filter
+    acceptance.check(matcher)
+    model = loading.model(map)
+    searching.of(model)
+    acceptance.of(model)
+    model.matching(matcher)
+    title, centre = f"{without_password(source)} on {map}", sequences.centre == "mean"
+    follow(model, matcher, source, title, page, reference, realtime, timeout, centre)

@@ -1,0 +1,332 @@
+"""The commands that write a report: demo, compare, evaluate and reproduce."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dejavu_torch.cli import options
+from dejavu_torch.cli.commands import (
+    print_localize,
+    print_map,
+    print_next,
+    say,
+    write_matches,
+)
+from dejavu_torch.cli.device import device_of
+from dejavu_torch.data.output import check_output_file, check_output_folder, whole_folder
+from dejavu_torch.data.source import check_not_read, open_source
+from dejavu_torch.evaluation.answers import describe_line
+from dejavu_torch.model import DejaVu
+from dejavu_torch.model_file import recipe_of
+from dejavu_torch.recognition.filter import PlaceFilter
+from dejavu_torch.recognition.smoother import PlaceSmoother
+from dejavu_torch.types import InputError
+
+if TYPE_CHECKING:
+    from dejavu_torch.evaluation.compare import Comparison
+    from dejavu_torch.evaluation.report import Report
+
+COMPARED = ("map.safetensors", "matches.csv")  # files next to the report of a comparison
+
+
+def run_demo(
+    *,
+    out: Path = Path("dejavu_demo"),
+    seed: int = 0,
+    second: list[str] | str | None = None,
+    model: DejaVu,
+    command: str,
+) -> None:
+    """Learn the built-in route, localize a second traverse of it, and write a report.
+
+    Args:
+        out: folder for report and pictures
+        seed: seed of the route, the whitening and the null control
+        second: second traverse from which to learn what changes, or several, '[A,B]'
+    """
+    from dejavu_torch.evaluation.compare import compare
+    from dejavu_torch.evaluation.reproduce import paper_model
+
+    _check_report_folder(out, COMPARED, options.several(second))
+    given = options.LearningOptions(seed, second)
+    given.seed_whitening(model)
+    learned, localized = f"sim:aerial?seed={seed}", f"sim:aerial?seed={seed}&traverse=1"
+    reference, query = open_source(learned), open_source(localized)
+    print(f"learning {reference.name}, then finding {query.name} on it")
+    reference, views, _ = given.with_views(model, reference, query)
+    paper = paper_model()
+    same = recipe_of(model.mapper) == recipe_of(paper.mapper)
+    others = {} if same else {"paper": ("the paper to the letter", paper)}
+    settings: dict[str, Any] = {"seed": seed, "second": views, "others": others, "progress": True}
+    result = compare(reference, query, model=model, storage_curve=True, **settings)
+    _publish(result, out, "dejavu demo: the built-in route", command)
+    print_localize(out / "map.safetensors", model, command, localized, "or try")
+    for pair in ((learned, localized, "--config", "local_maxima"), ("MORNING", "EVENING")):
+        print_next("compare", *pair, "--out", "report", lead="or try")
+
+
+def run_compare(
+    reference: str,
+    query: str | None = None,
+    *,
+    out: Path,
+    loops: int | None = None,
+    judging: options.EvaluationOptions,
+    learning: options.LearningOptions,
+    map: Path | None = None,
+    sequences: options.Sequences,
+    ordering: options.Ordering,
+    searching: options.Searching,
+    model: DejaVu,
+    command: str,
+) -> None:
+    """Learn one traverse, localize another on it, and evaluate, with baselines and a null control.
+
+    Args:
+        reference: traverse to learn, a source as in `dejavu learn`
+        query: traverse to localize, likewise; none with --loops
+        loops: find where the reference comes back to its own places, as in localize
+        out: folder for report, pictures, matches.csv and map.safetensors
+        map: evaluate this map of the reference instead of learning one
+    """
+    from dejavu_torch.evaluation.compare import compare
+
+    _check_loops(loops, query, sequences, ordering, judging)
+    where = device_of(learning.device, learns=map is None)
+    acceptance = options.Acceptance(model.threshold, model.precision)
+    matcher = sequences.matcher(max(0, judging.tolerance), acceptance.threshold)
+    ordered = ordering.of(matcher)
+    acceptance.check(matcher, judging.distractors)
+    if map is not None:
+        model = options.load_map(map, options.named_features(model))
+        if model.map.routes:
+            names = ", ".join(route.name for route in model.map.routes)
+            raise InputError(f"--map {map} has the routes {names}; expected a map of {reference} alone")
+        acceptance.of(model)
+    searching.of(model.to(where))
+    first = open_source(reference)
+    queries = first if query is None else open_source(query)
+    if isinstance(matcher, str):
+        in_order, within = queries.ordered if ordered is None else ordered, max(0, judging.tolerance)
+        matcher = PlaceSmoother(within=within, threshold=acceptance.threshold) if in_order else None
+    if isinstance(matcher, PlaceFilter | PlaceSmoother) and acceptance.threshold is not None and query:
+        model.threshold = None  # it is for a probability, so the map must not keep it
+    seconds = options.several(learning.second)
+    _check_report_folder(
+        out, COMPARED, [reference, *filter(None, [query]), *seconds], [judging.truth, *learning.files]
+    )
+    others = [open_source(one) for one in (*seconds, learning.calibration) if one not in options.UNREAD]
+    distractors = judging.off_map([first, queries, *others])
+    if not isinstance(matcher, PlaceSmoother):  # which has probabilities of its own
+        learning.check_calibrated(model, first, map, judging.distractors)
+    learning.seed_whitening(model)
+    first, views, known = learning.with_views(model, first, queries)
+    result = compare(
+        first,
+        None if query is None else queries,
+        judging.truth,
+        model,
+        tolerance=judging.tolerance,
+        leave_out=judging.leave_out,
+        seed=learning.seed,
+        interpolate=judging.interpolate,
+        second=views,
+        sequence=matcher,
+        top=1 if judging.top is None else judging.top,
+        calibration="none" if learning.calibration == options.NO_CALIBRATION else known,
+        distractors=distractors,
+        storage_curve=judging.storage_curve,
+        ordered=ordered,
+        centre=None if ordering.centre is None else ordering.centre == "mean",
+        loops=loops,
+        progress=True,
+    )
+    title = f"loops within {reference}" if query is None else f"{query} found on {reference}"
+    _publish(result, out, title, command, map, judging.top)
+
+
+def _check_loops(
+    loops: int | None,
+    query: str | None,
+    sequences: options.Sequences,
+    ordering: options.Ordering,
+    judging: options.EvaluationOptions,
+) -> None:
+    """Refuse a comparison without a query, and loops with what needs one."""
+    if loops is None:
+        if query is None:
+            raise InputError("compare without QUERY; expected a second traverse, or --loops within the first")
+        return
+    if query is not None:
+        raise InputError(f"--loops {loops} and the query {query}; expected the reference alone")
+    together = sequences.way not in (None, "drive", "single") and sequences.way
+    alone = {"match": together, "centre": ordering.centre, "top": judging.top}
+    of_routes = {"distractors": judging.distractors, "storage_curve": judging.storage_curve}
+    options.refuse_with(f"--loops {loops}", **alone, **of_routes, leave_out=judging.leave_out)
+
+
+def run_evaluate(
+    matches: Path,
+    *,
+    truth: str,
+    out: Path,
+    tolerance: int = 5,
+    interpolate: bool = False,
+    reference: str | None = None,
+    query: str | None = None,
+    map: Path | None = None,
+    route: str | None = None,
+    recall_values: Sequence[int] = (),
+    higher_is_better: bool = False,
+    loops: int | None = None,
+    command: str,
+) -> None:
+    """Evaluate the matches of any method from a csv: scores, curve, coverage.
+
+    Args:
+        matches: csv of query,place,score[,accepted][,probability][,rank][,route]
+        truth: right places, as in `dejavu compare`
+        out: folder for report and pictures
+        tolerance: answers up to this many places off are right
+        interpolate: interpolate a --truth that lists only some queries
+        reference: source of the places, for their number and coordinates in names; as in `dejavu learn`
+        query: source of the queries, likewise
+        map: map of the matches, for its number of frames and, if they are resampled, their places
+        route: route of a merged map that --truth, --reference and the queries belong to; answers on other
+            routes are wrong
+        recall_values: also print the share of queries with a right answer among their first N ranks, for each
+            N, such as 1 5 10 20; with --tolerance 0 these are the figures of VPR-methods-evaluation
+        higher_is_better: the scores are similarities, not distances
+        loops: as in localize: only places over this many frames before a query are right
+    """
+    from dejavu_torch.evaluation.evaluate import evaluate_file
+    from dejavu_torch.evaluation.report import report_folder, write_report
+
+    first, second = (None if source is None else open_source(source) for source in (reference, query))
+    _check_report_folder(out, (), [reference, query], [matches, truth, map])
+    given = first, second, map, route, recall_values, higher_is_better, loops
+    result = evaluate_file(matches, truth, tolerance, interpolate, *given)
+    with report_folder(out) as folder:
+        title = f"{matches} evaluated by {truth}"
+        write_report(folder, result.report, result.pictures, title, command)
+    _print_contradiction(result.report)
+    if recall_values:
+        recalls = result.report.facts["recall_values"]
+        print(", ".join(f"R@{first}: {100 * recall:.1f}" for first, recall in recalls.items()))
+        if tolerance:
+            off = f"{tolerance} {result.report.facts['unit']}"
+            print(f"answers may be {off} off here; in VPR-methods-evaluation they may not")
+    _print_scores(result.report, out)
+
+
+def run_reproduce(
+    dataset: str = "all", *, out: Path, seed: int = 0, tolerance: int = 5, command: str
+) -> None:
+    """Repeat the paper's experiments on simulated routes, and compare with its published numbers.
+
+    Args:
+        dataset: aerial, outdoor, underground or all
+        out: folder for the reports
+        seed: seed of the routes
+        tolerance: answers up to this many places off are right
+    """
+    from dejavu_torch.evaluation import paper_tables as tables
+    from dejavu_torch.evaluation.report import report_folder, text_table, write_index, write_report
+    from dejavu_torch.evaluation.reproduce import lengths_picture, reproduce
+
+    names = list(tables.PUBLISHED) if dataset == "all" else [dataset]
+    if not {*names} <= {*tables.PUBLISHED}:
+        raise InputError(f"there is no dataset {dataset!r}; expected {', '.join(tables.PUBLISHED)} or all")
+    check_output_folder(out)
+    reports: dict[str, Report] = {}
+    for name in names:
+        print(f"{name}: a second traverse, the reference itself, other chunk lengths", flush=True)
+        result = reproduce(name, tolerance=tolerance, seed=seed, progress=True)
+        run, title = result.run, f"dejavu reproduce: {name}"
+        plan = str(run.model.summary())
+        with report_folder(out / name) as folder:
+            write_report(folder, result.report, result.pictures, title, command, plan)
+            write_matches(folder / "matches.csv", [run.match], run.query, run.model)
+        reports[name] = result.report
+    rows = tables.section_five(reports)
+    notes = [*tables.route_lines(reports), *tables.boundary_lines(reports), tables.FOOTAGE]
+    pages = {name: f"{name}/index.html" for name in names}
+    with whole_folder(out) as folder:
+        write_index(folder, rows, notes, lengths_picture(reports), pages, "the paper's experiments", command)
+    print("\n".join([text_table(rows), *notes]))
+    say(f"right within {tolerance} places; next: open {out / 'index.html'}")
+
+
+def _check_report_folder(
+    out: Path, others: Sequence[str], sources: Sequence[str | None], files: Sequence[str | Path | None] = ()
+) -> None:
+    """Refuse early a folder that cannot be written, or in which files that are read would be lost.
+
+    Args:
+        others: files written there besides the report. sources, files: that are read.
+    """
+    check_not_read(out, *sources)
+    check_output_folder(out)
+    if out.is_dir():
+        from dejavu_torch.evaluation.report import PICTURES
+
+        for name in ("index.html", "report.json", *others, *(f"{name}.png" for name in PICTURES)):
+            check_output_file(out / name)
+            check_not_read(out / name, *sources, *files)
+
+
+def _publish(
+    result: Comparison, out: Path, title: str, command: str, given: Path | None = None, top: int | None = None
+) -> None:
+    """Write map, matches and report of a comparison, and print its scores.
+
+    Args:
+        given: file of the map, unless it was learned.
+        top: candidates of each query to write; None writes the matches.
+    """
+    from dejavu_torch.evaluation.report import report_folder, write_report
+
+    run, kept = result.run, out / "map.safetensors"
+    acceptance = run.model.acceptance(run.smoother or run.sequence)
+    _print_contradiction(result.report)
+    print_map(run.model)
+    if run.truth is None:
+        print("no ground truth (see --truth): matches and pictures, but no scores")
+    if not acceptance.given:
+        print(acceptance)
+    match = run.match
+    if top is not None:
+        match = result.candidates.map(lambda column: column[:, :top].flatten())
+    with report_folder(out) as folder:
+        if given is None or given.resolve() != kept.resolve():
+            run.model.save(folder / kept.name)
+        write_matches(folder / "matches.csv", [match], run.query, run.model, top)
+        write_report(folder, result.report, result.pictures, title, command, str(run.model.summary()))
+    _print_scores(result.report, out)
+
+
+def _print_contradiction(report: Report) -> None:
+    """Say first if the answers contradict the ground truth."""
+    if report.ours.scores is not None and "line" in report.facts:
+        say(describe_line(report.facts, True))
+
+
+def _print_scores(report: Report, out: Path) -> None:
+    from dejavu_torch.evaluation import report as page
+    from dejavu_torch.evaluation.rejection import rejection_table
+
+    rejection = rejection_table(report.facts.get("rejection", {}))
+    for rows in (page.score_table(report), page.sequence_table(report), rejection):
+        if rows:
+            print(page.text_table(rows))
+    say(page.summary(report))
+    if report.ours.scores is not None:
+        say(page.verdict(report))
+    else:
+        if line := describe_line(report.facts, False):
+            say(line)
+        if steps := page.steps_after(report.facts):
+            say(f"next: {steps}")
+    say(f"next: open {out / 'index.html'}")
