@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,6 @@ from torch import Tensor
 
 from dejavu_torch.data.files import read_text, reading
 from dejavu_torch.data.folder import ROUNDING, numbers_increase
-from dejavu_torch.memory import check_room
 from dejavu_torch.text import printable
 from dejavu_torch.types import InputError, Traverse
 
@@ -93,13 +91,11 @@ def read_array(path: Path) -> ArrayTraverse:
     Features (N,D) take the names of their images from `X.txt` next to `X.npy`, one per line, if it exists.
 
     Raises:
-        InputError: not a complete .npy file, an array of another shape or type, a frame that does not fit in
-            memory, or a wrong number of names.
+        InputError: not a complete .npy file, an array of another shape or type, or a wrong number of names.
     """
     with reading(path, "is not a complete .npy array", EXPECTED):
         values = np.lib.format.open_memmap(path, mode="r")
         traverse = ArrayTraverse(values, printable(path))
-        check_room(24.0 * math.prod(values.shape[1:]), f"a frame of {path}")
     traverse.path = path
     text = path.with_suffix(".txt")
     if values.ndim == 2 and text.exists():

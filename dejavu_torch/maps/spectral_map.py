@@ -497,6 +497,10 @@ class SpectralMap(PlaceMap):
         fits = means.shape in (shape, (0, self.dimension)) and bool(means.isfinite().all())
         require(not self.places or fits, f"means {tuple(means.shape)}; expected {shape} finite numbers")
         require(bool(self.stage_scale.isfinite().all()), "a stage that is not finite")
+        links, most = self.links, self.links.new_tensor([self.places - 1, self.places - 1, LINK_SHARES])
+        row = f"rows of two places, and a number up to {LINK_SHARES}"
+        fits = bool(((links >= 0) & (links <= most)).all())
+        require(fits, f"links {links.tolist()!s:.100}; expected {row}")
         if self.routes:
             names = [route.name for route in self.routes]
             fits = len({*names}) == len(names) and all(names)

@@ -163,14 +163,6 @@ def test_a_file_of_no_frames_is_said_to_hold_nothing(tmp_path: Path) -> None:
         read_array(written(tmp_path / "a.npy", "'<f4'", "(0, 9999999999)"))
 
 
-def test_a_frame_larger_than_the_memory_is_refused(tmp_path: Path) -> None:
-    path = written(tmp_path / "a.npy", "'|u1'", f"(2, {10**6}, {10**6})")
-    with path.open("r+b") as file:
-        file.truncate(3 * 10**12)
-    with refused("a frame of", "GB free"):
-        read_array(path)
-
-
 @pytest.mark.parametrize("bad", [-0.01, 1.01, np.nan, np.inf])
 def test_float_frames_of_a_file_lie_from_0_to_1(tmp_path: Path, bad: float) -> None:
     frames = FRAMES.copy()

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from reference import joined_rows
 from torch import Tensor
 
-from dejavu_torch import DejaVu
+from dejavu_torch import DejaVu, PlaceSmoother
 from dejavu_torch.features.embedding import Coder
 from dejavu_torch.features.whitening import (
     Whitening,
@@ -181,6 +181,9 @@ def test_kept_lengths_are_told_by_the_file(tmp_path: Path) -> None:
     model = DejaVu.load(tmp_path / "map.safetensors")
     assert model.descriptor.keeps_lengths
     assert torch.equal(model.localize(ranges()).index, torch.arange(256))
+    smoother = PlaceSmoother()
+    model.localize(ranges(), smoother)
+    assert smoother.removed == 0.5  # else nothing but inner products would be left of distances
     model.learn(torch.randn(60, 12))  # which a file settles
     assert model.descriptor.keeps_lengths
 

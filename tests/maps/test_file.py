@@ -240,7 +240,7 @@ def test_what_is_no_map_is_refused(saved: Path, change: Any, words: list[str]) -
 
 MAPPER, FEATURES, WHITENING = "mapper.init_args.", "features.init_args.", "whitening.init_args."
 LINES: list[tuple[dict[str, Any], dict[str, Any], str]] = [
-    ({}, {FEATURES + "widths": [10**6]}, "size mismatch for convolutions"),
+    ({}, {FEATURES + "widths": [10**9]}, "size mismatch for convolutions"),
     ({}, {FEATURES + "resize": [10**9, 10**9]}, "SmallCNN got resize"),
     ({}, {"map.dimension": 10**12}, "means (0, 12)"),
     ({}, {"names": encode_names([f"{i:05}.png" for i in range(10_000)])}, "10000 frames; expected 64"),

@@ -199,8 +199,8 @@ MUTANTS = [
         "Without views the constant number of a whitened descriptor is the root mean square of the kept "
         "ones.",
         "dejavu_torch/features/whitening.py",
-        "member.take(mean, basis, variances.mean().sqrt(), bits)",
-        "member.take(mean, basis, variances.sum().sqrt(), bits)",
+        "each, whole = variances.mean().sqrt(), variances.sum().sqrt()",
+        "each = whole = variances.sum().sqrt()",
         ("tests/features/test_whitening.py::test_without_views_components_keep_their_variances",),
     ),
     Mutant(

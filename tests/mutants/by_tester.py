@@ -644,9 +644,16 @@ MUTANTS = [
     Mutant(
         "A frame finds no loop to itself, or to the frames just before it.",
         "dejavu_torch/recognition/localizer.py",
-        "[None] < numbers[:, None] - apart",
-        "[None] <= numbers[:, None] - apart",
+        "place >= (numbers[:, None] - apart)",
+        "place > (numbers[:, None] - apart)",
         ("tests/test_loops.py::-k second_lap",),
+    ),
+    Mutant(
+        "Where lengths count, half of each place's mean score stays.",
+        "dejavu_torch/recognition/localizer.py",
+        "smoother.removed = matching.removed",
+        "smoother.removed = 1.0",
+        ("tests/features/test_whitening.py::-k told_by_the_file",),
     ),
     Mutant(
         "A stop counts once in the mean of the queries.",
