@@ -42,10 +42,6 @@ TOKENS = (  # of text files and options, where numbers stand as text
     *(":", ",", ";", "=", "?", "&", "#", "@", "*", "|", ">", "\t", "- ", "---", "...", "<<: *a", "&a [*a]"),
     *TEXTS,
 )
-BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(  # aliases of aliases: 9 ** 9 texts
-    f"{name}: &{name} [{', '.join([f'*{before}'] * 9)}]\n"
-    for before, name in zip("abcdefgh", "bcdefghi", strict=True)
-)
 TAGS = (
     f"!!python/object/apply:{CANARY}.run []",
     f"!!python/object/new:{CANARY}.Module []",
