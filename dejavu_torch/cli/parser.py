@@ -217,9 +217,8 @@ def _by_options(message: str, error: Exception | None, positional: Collection[st
     setting = re.search(r"NestedArg\(key='([\w.]+)'", message)
     if setting:
         return f"{option}.{setting[1]}: the value of {option} has no settings; expected one or the other"
-    text = re.sub(r"<class '(?:\w+\.)*(\w+)'>", r"\1", str((own or chain)[-1])).replace(
-        "typing.Literal", "one of "
-    )
+    text = str((own or chain)[-1]).replace("typing.Literal", "one of ")
+    text = re.sub(r"<class '(?:\w+\.)*(\w+)'>", r"\1", text)
     others = ", none or a map file" * ("MapFile" in message)
     wanted = f"expected the import path of a class{others}, not"
     text = text.replace("Expected a dot import path string:", wanted)
