@@ -86,15 +86,12 @@ def run_localize(
     damaged: dict[int, str] | None = {} if skip_damaged else None
     query = _open_query(model, source, map if pairs else None, damaged)
     ordered = source_of(query).ordered if ordered is None else ordered
-    if isinstance(matcher, str):
-        matcher = PlaceSmoother(within=SUPPRESSION, threshold=acceptance.threshold) if ordered else None
+    matcher = ordering.chosen(matcher, ordered, SUPPRESSION, acceptance.threshold)
     chosen = model.matching(matcher).acceptance
     smooths = isinstance(matcher, PlaceSmoother)
     centre = (smooths or matcher is None) and ordering.centring(model, ordered, len(query))
     if loops is not None:
-        together = sequences.way not in (None, "drive", "single") and sequences.way
-        given = {"top": top, "cluster": cluster, "match": together, "centre": ordering.centre}
-        options.refuse_with(f"--loops {loops}", **given)
+        sequences.check_loops(loops, top=top, cluster=cluster, centre=ordering.centre)
         chosen = model.loop_matching(loops, PlaceSmoother() if smooths else None).acceptance
         matches = iter([model.loops(query, loops, smooths, True)])
         matcher = None

@@ -86,6 +86,11 @@ class Sequences:
             return (PlaceSmoother if way == "drive" else PlaceFilter)(within=within, threshold=threshold)
         return "auto" if way is None else None
 
+    def check_loops(self, loops: int, **others: object) -> None:
+        """Refuse loops with a way of matching that they have not, and with other options."""
+        together = self.way not in (None, "drive", "single") and self.way
+        refuse_with(f"--loops {loops}", match=together, **others)
+
 
 @dataclass
 class LiveSequences(Sequences):
@@ -140,6 +145,15 @@ class Ordering:
             raise InputError("--centre mean with a filter or a sequence; expected --match drive or single")
         ordered = self.ordered or isinstance(matcher, PlaceSmoother)
         return ordered if ordered or self.unordered else None
+
+    @staticmethod
+    def chosen(
+        matcher: SequenceModel | Literal["auto"] | None, ordered: bool, within: int, threshold: float | None
+    ) -> SequenceModel | None:
+        """The given way of matching, else by the whole drive if queries are in order."""
+        if matcher != "auto":
+            return matcher
+        return PlaceSmoother(within=within, threshold=threshold) if ordered else None
 
     def centring(self, model: DejaVu, ordered: bool, queries: int) -> bool:
         """Whether single queries and those of a smoother are centred."""

@@ -18,9 +18,11 @@ import jsonargparse
 from jsonargparse.typing import restricted_string_type
 
 from dejavu_torch.cli.names import FIRST_OPTIONS
-from dejavu_torch.cli.networks import accept_networks, is_made, made, names_network, with_hub
+from dejavu_torch.cli.networks import accept_networks, is_made, names_network
+from dejavu_torch.cli.networks import made as made  # config files name it here
+from dejavu_torch.cli.networks import with_hub as with_hub
 from dejavu_torch.cli.options import named_features, refuse_with
-from dejavu_torch.cli.presets import check_config, find_config
+from dejavu_torch.cli.presets import find_config, read_config
 from dejavu_torch.data.files import LARGEST
 from dejavu_torch.data.source import check_not_read
 from dejavu_torch.model import DejaVu
@@ -43,7 +45,6 @@ HINT = (
 )
 BARE = {"velocity": "GroundOdometry", "page": 8765}  # values of options given without one
 MapFile = restricted_string_type("MapFile", r".*\.safetensors")
-__all__ = ["made", "with_hub"]  # the first is named here by config files
 LONGEST = 300  # characters of a message; longer ones are cut
 
 
@@ -102,7 +103,7 @@ class Preset(jsonargparse.ActionConfigFile):  # type: ignore[name-defined, misc]
 
     def __call__(self, parser: Any, cfg: Any, values: Any, option_string: str | None = None) -> None:
         path = find_config(values)
-        check_config(path)
+        read_config(path)
         super().__call__(parser, cfg, str(path), option_string)
 
 
@@ -155,6 +156,9 @@ class Parser(jsonargparse.ArgumentParser):
 
     def _parsed(self, args: Any, *rest: Any, **settings: Any) -> Any:
         accept_networks(self)
+        for word in args or ():
+            if not word or (word.startswith("--") and word.endswith("=")):
+                raise InputError(f"{word or 'a word'} is empty; expected a name or a value")
         # a nested null reaches the parser of its part as None
         words = [f"{word[:-4]}null" if word.endswith("=None") else word for word in args or ()]
         start = 1 if self._subparsers is not None else 0  # after the subcommand
@@ -218,9 +222,8 @@ def _by_options(message: str, error: Exception | None, positional: Collection[st
     setting = re.search(r"NestedArg\(key='([\w.]+)'", message)
     if setting:
         return f"{option}.{setting[1]}: the value of {option} has no settings; expected one or the other"
-    text = re.sub(r"<class '(?:\w+\.)*(\w+)'>", r"\1", str((own or chain)[-1])).replace(
-        "typing.Literal", "one of "
-    )
+    text = str((own or chain)[-1]).replace("typing.Literal", "one of ")
+    text = re.sub(r"<class '(?:\w+\.)*(\w+)'>", r"\1", text)
     others = ", none or a map file" * ("MapFile" in message)
     wanted = f"expected the import path of a class{others}, not"
     text = text.replace("Expected a dot import path string:", wanted)

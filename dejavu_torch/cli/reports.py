@@ -108,9 +108,8 @@ def run_compare(
     searching.of(model.to(where))
     first = open_source(reference)
     queries = first if query is None else open_source(query)
-    if isinstance(matcher, str):
-        in_order, within = queries.ordered if ordered is None else ordered, max(0, judging.tolerance)
-        matcher = PlaceSmoother(within=within, threshold=acceptance.threshold) if in_order else None
+    in_order = queries.ordered if ordered is None else ordered
+    matcher = ordering.chosen(matcher, in_order, max(0, judging.tolerance), acceptance.threshold)
     if isinstance(matcher, PlaceFilter | PlaceSmoother) and acceptance.threshold is not None and query:
         model.threshold = None  # it is for a probability, so the map must not keep it
     seconds = options.several(learning.second)
@@ -161,10 +160,10 @@ def _check_loops(
         return
     if query is not None:
         raise InputError(f"--loops {loops} and the query {query}; expected the reference alone")
-    together = sequences.way not in (None, "drive", "single") and sequences.way
-    alone = {"match": together, "centre": ordering.centre, "top": judging.top}
-    of_routes = {"distractors": judging.distractors, "storage_curve": judging.storage_curve}
-    options.refuse_with(f"--loops {loops}", **alone, **of_routes, leave_out=judging.leave_out)
+    of_routes = {
+        name: getattr(judging, name) for name in ("top", "distractors", "storage_curve", "leave_out")
+    }
+    sequences.check_loops(loops, centre=ordering.centre, **of_routes)
 
 
 def run_evaluate(
