@@ -123,11 +123,13 @@ def spelt(value: Any) -> Any:
     if isinstance(value, str):
         if value.lstrip().startswith(("[", "{")):
             try:
-                value = yaml.safe_load(value)
+                return spelt(yaml.safe_load(value))
+            except InputError:
+                raise
             except (yaml.YAMLError, ValueError, TypeError) as error:
                 expected = "expected a list of classes, such as [HOG, PatchPixels]"
-                raise InputError(f"is {value!r}; {expected}") from error
-            return spelt(value)
+                if value.lstrip()[0] == "[":
+                    raise InputError(f"is {value!r}; {expected}") from error
         return spelt({"class_path": value}) if is_made(value) else path_of(value)
     if isinstance(value, list):
         members = [spelt({"class_path": one} if isinstance(one, str) else one) for one in value]
@@ -153,7 +155,7 @@ def spelt(value: Any) -> Any:
 def _inside(key: str, value: Any) -> Any:
     """The value of a class's argument, in which there may be networks."""
     if isinstance(value, list):
-        return [spelt(one) if isinstance(one, str | dict) else one for one in value]
+        return [spelt(one) if isinstance(one, dict) or key == "members" else one for one in value]
     return spelt(value) if key in OPTIONS or isinstance(value, dict) else value
 
 

@@ -830,4 +830,26 @@ MUTANTS = [
         "()",
         ("tests/test_updating.py::-k connections_are_followed",),
     ),
+    Mutant(
+        "A network's class on the command line drops the settings that a config has for another class.",
+        "dejavu_torch/cli/networks.py",
+        "                cfg[self.dest] = None  #",
+        "                pass  #",
+        ("tests/test_cli_hub.py::-k settings_of_a_config",),
+    ),
+    Mutant(
+        "A class on the command line may stand behind its settings.",
+        "dejavu_torch/cli/parser.py",
+        "for name in first for value in vars(found)[name]), *others]",
+        "for name in first[:1] for value in vars(found)[name]), *others, *(f'{name}={value}' "
+        "for name in first[1:] for value in vars(found)[name])]",
+        ("tests/test_cli_hub.py::-k overrule_it", "tests/test_cli_networks.py::-k functions_methods"),
+    ),
+    Mutant(
+        "--help shows the options of a first day only.",
+        "dejavu_torch/cli/parser.py",
+        "if self.whole or not self.first:",
+        "if True:",
+        ("tests/test_cli.py::-k reads_well",),
+    ),
 ]
