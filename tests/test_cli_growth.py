@@ -23,11 +23,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     run("learn", FIRST, "--map", folder / "first.safetensors", *CHUNKS)
     np.save(folder / "a.npy", frames(40, seed=1))
     np.save(folder / "d.npy", np.random.default_rng(0).normal(size=(96, 8)).astype(np.float32))
-    np.save(folder / "wide.npy", np.random.default_rng(0).normal(size=(9, 5)).astype(np.float32))
     none = ("--calibration", "none", "--whitening", "none")
     for name, options in {
         "whole": none,
-        "templates": ("--config", "local_maxima", "--calibration", "none"),
         "f": (*none, "--mapper.chunk", "32"),
     }.items():
         run("learn", folder / "d.npy", "--map", folder / f"{name}.safetensors", *options)
@@ -173,17 +171,13 @@ def test_a_visit_is_averaged_into_a_map_that_is_there(
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("learn d.npy --append templates.safetensors", ["kind 'templates'", "append to"]),
-        ("learn wide.npy --append f.safetensors", ["wide.npy", "5 features", "expected 8"]),
         ("learn d.npy --append f.safetensors --seed 4", ["--seed", "--append"]),
         ("learn d.npy --append f.safetensors --config=paper", ["--config", "--append"]),
         ("learn d.npy --append f.safetensors --features.cell 4", ["f.safetensors", "cell"]),
         ("learn d.npy --append f.safetensors --precision .9", ["a precision, 0.9", "--calibration SOURCE"]),
         ("learn d.npy --append sure.safetensors", ["a precision, 0.9", "d.npy", "--threshold"]),
-        ("learn a.npy --append both.safetensors", ["routes first, other"]),
         ("learn --append f.safetensors", ["no source"]),
         ("learn --map m.safetensors --average d.npy", ["no source"]),
-        ("learn --append f.safetensors --average wide.npy", ["wide.npy has 9 frames", "96"]),
         ("learn --append f.safetensors --average d.npy --map d.npy", ["--map d.npy"]),
         ("learn d.npy --map m.safetensors --average ./d.npy", ["--average ./d.npy is", "itself"]),
         ("learn d.npy --map m.safetensors --average e.npy --calibration ./e.npy", ["e.npy itself"]),
@@ -191,7 +185,6 @@ def test_a_visit_is_averaged_into_a_map_that_is_there(
         ("learn d.npy --map m.safetensors --average_truth 0", ["--average SOURCE"]),
         ("merge first.safetensors --map m.safetensors", ["first.safetensors", "at least two"]),
         ("merge first.safetensors ./first.safetensors --map m.safetensors", ["the same file"]),
-        ("merge first.safetensors f.safetensors --map m.safetensors", ["first", "f cannot be merged"]),
         ("merge first.safetensors f.safetensors --map f.safetensors", ["f.safetensors is an input"]),
         ("compare a.npy a.npy --map both.safetensors --out e", ["both.safetensors has", "first, other"]),
         ("export both.safetensors --onnx both.onnx", ["routes first, other"]),

@@ -5,51 +5,22 @@ from __future__ import annotations
 import inspect
 import json
 import pydoc
-import sys
 from collections.abc import Callable, Sequence
-from contextlib import redirect_stdout
 from typing import Any
 
 import yaml
 from jsonargparse import ArgumentParser, Namespace
 from jsonargparse._typehints import ActionTypeHint  # whose values no public hook reaches
-from torch import nn
 
 from dejavu_torch.features import hub
 from dejavu_torch.features.joined import Joined
 from dejavu_torch.model_file import REGISTRY
-from dejavu_torch.text import one_line
 from dejavu_torch.types import InputError
 
 OPTIONS = ("features", "backbone", "network")  # last parts of the names of such options
 MADE = "dejavu_torch.cli.parser.made"  # as config files name it
 HUB = f"{hub.__name__}.hub"
 SPEC = {"class_path", "init_args", "dict_kwargs"}
-
-
-def made(function: str, **arguments: Any) -> nn.Module:
-    """The network that a function of any signature makes, such as torch.hub.load.
-
-    jsonargparse itself only accepts functions with annotated arguments and return value.
-
-    Args:
-        function: its import path as the user typed it, never from a map or checkpoint.
-    """
-    try:
-        maker: Any = pydoc.locate(function)
-    except pydoc.ErrorDuringImport as error:
-        raise InputError(f"{function} cannot be imported: {one_line(error.value)}") from error
-    if not callable(maker):
-        raise InputError(f"{function} is no function that can be imported; expected one, or a class")
-    try:
-        with redirect_stdout(sys.stderr):  # keeps stdout to lines of JSON
-            network = maker(**arguments)
-    except SystemExit as stop:  # it would end the command silently
-        raise InputError(f"{function} ends the program ({stop}); expected one that makes a network") from stop
-    if not isinstance(network, nn.Module):
-        raise InputError(f"{function} made a {type(network).__name__}; expected an nn.Module")
-    # DataParallel would use the first GPU, wherever the model is
-    return network.module.cpu() if isinstance(network, nn.DataParallel) else network
 
 
 def names_network(word: str) -> bool:
@@ -81,9 +52,10 @@ class NetworkAction(ActionTypeHint):
         base = next((one for one in self.option_strings if str(option).startswith(f"{one}.")), None)
         if base is not None and option is not None:  # a setting
             name = option.removeprefix(f"{base}.")
-            if before is None:
+            path = None if before is None else before.get("class_path")
+            if path is None and self.dest == "features":
                 cfg[self.dest] = Namespace({"class_path": path_of("HOG")})  # type: ignore[no-untyped-call]
-            elif before.get("class_path") == MADE and name.partition(".")[0] not in {*SPEC, "function"}:
+            elif path == MADE and name.partition(".")[0] not in {*SPEC, "function"}:
                 option = f"{base}.dict_kwargs.{name}"
         else:
             try:

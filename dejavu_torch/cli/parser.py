@@ -19,12 +19,12 @@ from jsonargparse.typing import restricted_string_type
 
 from dejavu_torch.cli.names import FIRST_OPTIONS
 from dejavu_torch.cli.networks import accept_networks, is_made, names_network
-from dejavu_torch.cli.networks import made as made  # config files name it here
 from dejavu_torch.cli.networks import with_hub as with_hub
 from dejavu_torch.cli.options import named_features, refuse_with
 from dejavu_torch.cli.presets import find_config, read_config
 from dejavu_torch.data.files import LARGEST
 from dejavu_torch.data.source import check_not_read
+from dejavu_torch.features.hub import made as made  # config files name it here
 from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import REGISTRY
 from dejavu_torch.text import one_line

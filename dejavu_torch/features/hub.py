@@ -1,14 +1,16 @@
-"""Short names for place recognition networks of torch.hub, and the `Embedding` that each stands for."""
+"""Networks that functions make, and short names for those of torch.hub that recognise places."""
 
 from __future__ import annotations
 
+import pydoc
 import sys
 from contextlib import redirect_stdout
 from typing import Any, NamedTuple
 
-import torch
+from torch import nn
 
 from dejavu_torch.features.embedding import Embedding
+from dejavu_torch.text import one_line
 from dejavu_torch.types import InputError
 
 PREFIX = "hub:"
@@ -73,9 +75,32 @@ def hub(
         dimension, mean, std: of `Embedding`, as are all others
         resize, output: likewise; those of the name if not given
     """
-    made = known(name)
-    with redirect_stdout(sys.stderr):  # stdout may be read by a program
-        net = torch.hub.load(**made.call | (network or {}))
-    net = net.module.cpu() if isinstance(net, torch.nn.DataParallel) else net
-    size, chosen = made.size if resize is None else resize, made.output if output is None else output
+    own = known(name)
+    net = made("torch.hub.load", **own.call | (network or {}))
+    size, chosen = own.size if resize is None else resize, own.output if output is None else output
     return Embedding(net, dimension=dimension, resize=size, mean=mean, std=std, output=chosen, **settings)
+
+
+def made(function: str, **arguments: Any) -> nn.Module:
+    """The network that a function of any signature makes, such as torch.hub.load.
+
+    jsonargparse itself only accepts functions with annotated arguments and return value.
+
+    Args:
+        function: its import path as the user typed it, never from a map or checkpoint.
+    """
+    try:
+        maker: Any = pydoc.locate(function)
+    except pydoc.ErrorDuringImport as error:
+        raise InputError(f"{function} cannot be imported: {one_line(error.value)}") from error
+    if not callable(maker):
+        raise InputError(f"{function} is no function that can be imported; expected one, or a class")
+    try:
+        with redirect_stdout(sys.stderr):  # keeps stdout to lines of JSON
+            network = maker(**arguments)
+    except SystemExit as stop:  # it would end the command silently
+        raise InputError(f"{function} ends the program ({stop}); expected one that makes a network") from stop
+    if not isinstance(network, nn.Module):
+        raise InputError(f"{function} made a {type(network).__name__}; expected an nn.Module")
+    # DataParallel would use the first GPU, wherever the model is
+    return network.module.cpu() if isinstance(network, nn.DataParallel) else network
