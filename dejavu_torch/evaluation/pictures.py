@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dejavu_torch.evaluation.contenders import Contender
 from dejavu_torch.evaluation.controls import template_map_of
 from dejavu_torch.evaluation.localization import Localization
-from dejavu_torch.evaluation.map_plots import draw_motion, draw_spectrum
+from dejavu_torch.evaluation.map_plots import draw_motion
 from dejavu_torch.evaluation.match_plots import (
     draw_coverage,
     draw_frames,
@@ -18,7 +18,6 @@ from dejavu_torch.evaluation.match_plots import (
 from dejavu_torch.evaluation.plots import Pictures
 from dejavu_torch.evaluation.score_plots import Stored, draw_curves, draw_sequences, draw_storage
 from dejavu_torch.evaluation.template_plots import draw_paper, draw_template_map
-from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.template_map import TemplateMap
 from dejavu_torch.memory import in_float32
 
@@ -38,8 +37,6 @@ def draw_pictures(
     pictures |= draw_storage(contenders, storage, tolerance)
     pictures |= draw_sequences(contenders, storage.get("map", ()), place_map.places, tolerance)
     pictures |= draw_motion(run)
-    if isinstance(place_map, SpectralMap):
-        pictures |= draw_spectrum(run, place_map)
     if isinstance(place_map, TemplateMap):
         pictures |= draw_template_map(run, place_map)
     return pictures

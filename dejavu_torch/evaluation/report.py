@@ -25,10 +25,10 @@ from dejavu_torch.text import printable
 from dejavu_torch.types import Together
 
 PICTURES = (
-    *("frames", "pairs", "coverage", "scores", "pr", "auc", "storage", "sequences"),
+    *("frames", "pairs", "coverage", "scores", "pr", "storage", "sequences"),
     *("ground", "velocity", "chunks"),
     *("spectrogram", "templates", "features", "activations", "autocorrelogram", "layers"),
-    *("spectrum", "posterior", "reliability"),
+    *("posterior", "reliability"),
 )
 LATE = 0.1  # a curve that starts at a higher recall starts late
 HEADING = 11  # letters in a line of a heading

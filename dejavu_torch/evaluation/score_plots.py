@@ -1,4 +1,4 @@
-"""Pictures of scores: curves, areas, storage, sequences and chunk lengths."""
+"""Pictures of scores: curves, storage, sequences and chunk lengths."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ SHOWN = (1.0, 2.5, 5.0)  # route bytes per place at which the map is also drawn
 MIN_RATIO = 1.1  # of bytes, between two sizes that are drawn
 LOWEST, HIGHEST = 0.01, 0.999  # limits at which areas are drawn
 _LINES = {"hog": "--", "null": ":"}  # by the first part of a key
-_HATCHES = {"hog": "...", "null": "///"}
 
 
 class Stored(NamedTuple):
@@ -57,36 +56,23 @@ def _style(key: str) -> dict[str, Any]:
 
 
 def draw_curves(contenders: Mapping[str, Contender], tolerance: str) -> Pictures:
-    """Precision over recall (figures 8 to 10 of the paper) and, for several curves, the areas under them."""
+    """Precision over recall (figures 8 to 10 of the paper)."""
     shown = [
-        (key, label(one.name), one.curve, one.scores.auc)
+        (key, label(one.name), one.curve)
         for key, one in distinct(contenders).items()
         if one.curve and one.scores and key != "leave_out"  # its queries are others
     ]
     if not shown:
         return {}
-    figure, axis = canvas(3.4 + 1.1 * LINE * sum(len(wrap(name, LETTERS - 8)) for _, name, *_ in shown))
-    for key, name, curve, _ in reversed(shown):  # the first on top
+    figure, axis = canvas(3.4 + 1.1 * LINE * sum(len(wrap(name, LETTERS - 8)) for _, name, _ in shown))
+    for key, name, curve in reversed(shown):  # the first on top
         name += " (reports nothing)" * (len(curve.recall) == 0)
         axis.plot(curve.recall, curve.precision, label=fill(name, LETTERS - 8), **_style(key))
     axis.set(xlim=(0, 1.01), ylim=(0, 1.02), xlabel="recall (of all queries)", ylabel="precision")
     axis.set_title(f"right within {tolerance}", fontsize=10)
     axis.grid(alpha=0.25)
     figure.legend(reverse=True, loc="outside lower left", frameon=False, fontsize=9)
-    pictures = picture("pr", (figure, axis))
-    if len(shown) == 1:
-        return pictures
-    figure, axis = canvas(0.9 + 0.55 * len(shown))
-    for row, (key, name, _, area) in enumerate(shown):
-        hatch = _HATCHES.get(key.partition("_")[0])
-        axis.barh(row, area, height=0.42, facecolor=colour_of(key), hatch=hatch, edgecolor="white")
-        axis.text(0.008, row - 0.24, fill(name, LETTERS), fontsize=9, va="bottom")
-        axis.text(area + 0.01, row, f"{area:.3f}", fontsize=9, va="center")
-    axis.invert_yaxis()
-    axis.set(xlim=(0, 1.1), yticks=[], xticks=[0, 0.25, 0.5, 0.75, 1])
-    axis.set_xlabel("area under the precision-recall curve")
-    axis.spines["bottom"].set_bounds(0, 1)
-    return pictures | picture("auc", (figure, axis))
+    return picture("pr", (figure, axis))
 
 
 def plot_lengths(datasets: Mapping[str, Sequence[Length]]) -> Plot:

@@ -15,10 +15,7 @@ from dejavu_torch.evaluation import reproduce
 from dejavu_torch.evaluation.reproduce import paper_model
 
 FRAMES = 256
-PICTURES = (
-    *("pairs", "coverage", "scores", "pr", "auc", "storage", "sequences", "spectrum"),
-    "reliability",
-)
+PICTURES = ("pairs", "coverage", "scores", "pr", "storage", "sequences", "reliability")
 OF_TEMPLATES = {"chunks", "spectrogram", "templates", "features", "activations"}
 
 

@@ -106,4 +106,4 @@ def test_without_truth_there_is_no_curve() -> None:
     model = DejaVu(whitening="none", mapper=SpectralMapper(2.0))
     unscored = compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)[:50]), model=model, storage_curve=True)
     assert "storage" not in unscored.report.as_json()
-    assert "spectrum" in unscored.pictures
+    assert "storage" not in unscored.pictures
