@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 import torch
 from drawn import texts
-from torch import Tensor
 
 from dejavu_torch import DejaVu
 from dejavu_torch.data.arrays import ArrayTraverse
@@ -20,13 +19,13 @@ from dejavu_torch.maps.spectrum import period_of
 PLACES = 240
 
 
-def route(seed: int) -> Tensor:
+def route(seed):
     noise = torch.randn(PLACES, 6, generator=torch.Generator().manual_seed(seed))
     angle = 2 * torch.pi * torch.arange(PLACES)[:, None] / torch.tensor([60.0, 24, 16, 12, 8, 5])
     return (angle + 0.7).sin() * torch.tensor([3.5, 2, 3, 4, 5, 0.1]) + 0.1 * noise
 
 
-def localized(chunk: int = 10_000, scored: bool = True) -> tuple[Localization, SpectralMap]:
+def localized(chunk=10_000, scored=True):
     model = DejaVu(whitening="none", mapper=SpectralMapper(None, 1.0, chunk)).learn(route(0))  # type: ignore[arg-type]
     truth = as_ground_truth(offset_truth(PLACES, PLACES)) if scored else None
     match = model.localize(route(1))
@@ -36,7 +35,7 @@ def localized(chunk: int = 10_000, scored: bool = True) -> tuple[Localization, S
 
 
 @pytest.mark.parametrize("chunk", [10_000, 150])
-def test_the_lines_that_are_marked_are_those_of_the_map(chunk: int) -> None:
+def test_the_lines_that_are_marked_are_those_of_the_map(chunk):
     run, held = localized(chunk)
     picture = draw_spectrum(run, held)["spectrum"]
     figure, axes = picture.plot
@@ -57,6 +56,6 @@ def test_the_lines_that_are_marked_are_those_of_the_map(chunk: int) -> None:
     assert ("in the chunk of frames 0 to 150" in picture.caption) == (chunk == 150)
 
 
-def test_a_map_without_lines_has_no_such_pictures() -> None:
+def test_a_map_without_lines_has_no_such_pictures():
     run, held = localized()[0], SpectralMapper(None, 1e6)(route(0))
     assert draw_spectrum(run, held) == {}
