@@ -6,10 +6,7 @@ import csv
 import json
 import subprocess
 import threading
-from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,11 +20,11 @@ ONE_AT_A_TIME = threading.Lock()  # as what is printed is that of the process
 TEMPLATES = ("--config", "local_maxima")  # the defaults are a spectral map
 
 
-def run(*arguments: str | Path) -> None:
+def run(*arguments):
     main([str(argument) for argument in arguments])
 
 
-def run_here(command: list[str], **settings: Any) -> subprocess.CompletedProcess[str]:
+def run_here(command, **settings):
     """In the place of `subprocess.run`: a process of `dejavu` is a command of this one, with its output."""
     if "dejavu_torch.cli" not in command:
         return started(command, **settings)
@@ -39,16 +36,16 @@ def run_here(command: list[str], **settings: Any) -> subprocess.CompletedProcess
     return subprocess.CompletedProcess(command, 0)
 
 
-def benchmark(*arguments: str | Path) -> None:
+def benchmark(*arguments):
     main([str(argument) for argument in arguments], run_benchmark)
 
 
-def benchmark_fails(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
+def benchmark_fails(capsys, *arguments):
     """Run a benchmark that must fail; its one line on stderr."""
     return fails(capsys, *arguments, call=benchmark)
 
 
-def fails(capsys: pytest.CaptureFixture[str], *arguments: str | Path, call: Callable[..., None] = run) -> str:
+def fails(capsys, *arguments, call=run):
     """Run a command that must fail; its one line on stderr."""
     with pytest.raises(SystemExit) as stop:
         call(*arguments)
@@ -61,7 +58,7 @@ def fails(capsys: pytest.CaptureFixture[str], *arguments: str | Path, call: Call
     return error
 
 
-def frames(count: int, seed: int = 0, size: int = 32) -> np.ndarray:
+def frames(count, seed=0, size=32):
     """Frames of a texture that slides past with period 16, with noise."""
     noise = np.random.default_rng(seed)
     texture = np.random.default_rng(99).integers(40, 215, (size, size))
@@ -69,19 +66,19 @@ def frames(count: int, seed: int = 0, size: int = 32) -> np.ndarray:
     return np.clip(np.stack(rolled) + noise.normal(0, 8, (count, size, size)), 0, 255).astype(np.uint8)
 
 
-def write_images(folder: Path, images: np.ndarray) -> Path:
+def write_images(folder, images):
     folder.mkdir()
     for i, image in enumerate(images):
         Image.fromarray(image).save(folder / f"{i}.png")
     return folder
 
 
-def rows_of(path: Path) -> list[dict[str, str]]:
+def rows_of(path):
     """The rows of a csv, such as matches.csv."""
     with path.open(encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file))
 
 
-def report_of(folder: Path) -> dict[str, Any]:
-    report: dict[str, Any] = json.loads((folder / "report.json").read_text())
+def report_of(folder):
+    report = json.loads((folder / "report.json").read_text())
     return report

@@ -7,7 +7,6 @@ import io
 import os
 import signal
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -71,7 +70,7 @@ UNDRAWN = ("test_compare", "test_real_routes", "test_several_places", "test_othe
 UNDRAWN += ("test_pretrained", "test_joined", "test_cli_rejection", "test_cli_hub", "test_results")
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(items):
     """What runs whole commands is marked `slow` as well as single tests above 5 s, and goes first, so that
     processes that share the files end together."""
     here = Path(__file__).parent
@@ -83,20 +82,20 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: item.path not in slow)  # stable
 
 
-def pytest_collection_finish() -> None:
+def pytest_collection_finish():
     """Thousands of tests are objects by the million: let no garbage collection go through them again."""
     gc.collect()
     gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _few_threads() -> None:
+def _few_threads():
     """Many small operations: on a busy machine two threads mostly wait for each other."""
     torch.set_num_threads(THREADS)
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _short_work(request: pytest.FixtureRequest) -> Iterator[None]:
+def _short_work(request):
     """Where whole commands run again and again, their pictures are drawn but written as one pixel each, and
     whitening and calibration learn from few copies of frames, which the network sees small: these take most
     of their time, and what a picture looks like, and how many copies there are, is tested elsewhere."""
@@ -118,10 +117,10 @@ def _short_work(request: pytest.FixtureRequest) -> Iterator[None]:
         yield
 
 
-held: dict[tuple[str, int], Tensor] = {}  # frames by route and number
+held = {}  # frames by route and number
 
 
-def read_once(route: SimulatedRoute, frames: range | list[int]) -> Tensor:
+def read_once(route, frames):
     """Frames of a simulated route: drawing them took most of the time of many a test."""
     if sum(map(Tensor.numel, held.values())) > MOST_HELD:
         held.clear()
@@ -132,12 +131,12 @@ def read_once(route: SimulatedRoute, frames: range | list[int]) -> Tensor:
 
 
 @pytest.fixture(autouse=True)
-def _seed() -> None:
+def _seed():
     torch.manual_seed(0)
 
 
 @pytest.fixture(scope="session")
-def data_dir() -> Path:
+def data_dir():
     """The folder of real data sets; a test that asks for it is skipped where there is none."""
     if not os.environ.get("DEJAVU_TEST_DATA"):
         pytest.skip("DEJAVU_TEST_DATA is not set")
@@ -158,6 +157,6 @@ class LargestTensor(TorchDispatchMode):
 
 
 @pytest.fixture
-def largest_tensor() -> type[LargestTensor]:
+def largest_tensor():
     """`with largest_tensor() as seen: ...` and then `seen.numel`."""
     return LargestTensor

@@ -8,9 +8,7 @@ last of equals in `topk`, and rounds products otherwise.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
 
 import pytest
 import torch
@@ -33,7 +31,7 @@ class There(Tensor):
     here: Tensor
 
     @staticmethod
-    def __new__(cls, here: Tensor) -> There:
+    def __new__(cls, here):
         layout = {"strides": here.stride(), "storage_offset": here.storage_offset(), "dtype": here.dtype}
         there = Tensor._make_wrapper_subclass(cls, here.shape, **layout, device=DEVICE)  # type: ignore
         there.here = here
@@ -43,16 +41,16 @@ class There(Tensor):
     def __torch_dispatch__(cls, func, types, args=(), kwargs=None):  # type: ignore[no-untyped-def]
         return computed(func, args, kwargs or {})
 
-    def tolist(self) -> Any:
+    def tolist(self):
         return self.cpu().tolist()
 
-    def numpy(self, *_: Any, **__: Any) -> Any:
+    def numpy(self, *_, **__):
         raise TypeError("can't convert lazy:0 device type tensor to numpy. Use Tensor.cpu() first")
 
-    def __repr__(self, **_: Any) -> str:
+    def __repr__(self, **_):
         return f"{self.cpu()!r} on {self.device}"
 
-    def __format__(self, spec: str) -> str:
+    def __format__(self, spec):
         return format(self.cpu(), spec)
 
 
@@ -64,10 +62,10 @@ class Pretend(TorchDispatchMode):
 
 
 @contextmanager
-def pretend() -> Iterator[torch.device]:
+def pretend():
     """Within it, the device is there."""
 
-    def as_cpu(function: Callable[..., Any]) -> Callable[..., Any]:
+    def as_cpu(function):
         return lambda *kind, **given: function(
             *("cpu" if one == DEVICE.type else one for one in kind), **given
         )
@@ -85,11 +83,11 @@ def pretend() -> Iterator[torch.device]:
             future.set_overwrite_module_params_on_conversion(before)
 
 
-def computed(func: Any, args: Any, kwargs: Any) -> Any:
+def computed(func, args, kwargs):
     """What an operation gives for tensors on the CPU, on the device, or both."""
-    given: list[Tensor] = []
+    given = []
 
-    def here(one: Any) -> Any:
+    def here(one):
         if isinstance(one, Tensor):
             given.append(one)
             return one.here if type(one) is There else one
@@ -115,7 +113,7 @@ def computed(func: Any, args: Any, kwargs: Any) -> Any:
     else:
         out = own_way(kind, func, own, kwargs)
 
-    def there(one: Any) -> Any:
+    def there(one):
         if isinstance(one, Tensor):  # an operation in place gives the tensor that it got
             return held[id(one)] if id(one) in held else There(one)
         return type(one)(map(there, one)) if type(one) in (list, tuple) else one
@@ -123,7 +121,7 @@ def computed(func: Any, args: Any, kwargs: Any) -> Any:
     return there(out)
 
 
-def check(kind: Any, args: Any, given: list[Tensor]) -> None:
+def check(kind, args, given):
     """Raise as CUDA does where tensors of two devices meet."""
     others = [one for one in given if not isinstance(one, There)]
     if kind in COPIES or not others:
@@ -135,7 +133,7 @@ def check(kind: Any, args: Any, given: list[Tensor]) -> None:
         raise RuntimeError(f"{seen}, {DEVICE} and cpu! (in {kind})")
 
 
-def own_way(kind: Any, func: Callable[..., Any], args: Any, kwargs: Any) -> Any:
+def own_way(kind, func, args, kwargs):
     """What an operation gives, changed as another implementation may."""
     if kind is aten.topk:
         values, index = func(args[0].flip(-1 if len(args) < 3 else args[2]), *args[1:], **kwargs)

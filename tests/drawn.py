@@ -5,30 +5,27 @@ from __future__ import annotations
 import io
 from fractions import Fraction
 from types import SimpleNamespace
-from typing import Any
 
 import torch
-from matplotlib.figure import Figure
 from PIL import Image
-from torch import Tensor
 
 from dejavu_torch.evaluation.plots import WIDTH
 from dejavu_torch.types import FrequencyLayer, Match
 
 
-def layer(period: Fraction | int, start: int, stop: int, features: int = 2) -> FrequencyLayer:
+def layer(period, start, stop, features=2):
     return FrequencyLayer(Fraction(period), int(period), start, stop, tuple(range(features)))
 
 
-def matched(*index: int) -> Match:
+def matched(*index):
     place = torch.tensor(index)
     return Match(place, torch.zeros(len(place)), place >= 0)
 
 
-def run_of(scores: Tensor, **parts: Any) -> Any:
+def run_of(scores, **parts):
     """What pictures take of a `Localization`: scores (Q,N) of single queries, and these parts of it."""
     queries, places = scores.shape
-    known: dict[str, Any] = {
+    known = {
         "scores": lambda numbers: scores[numbers],
         "borders": torch.arange(places + 1),
         "query_frames": torch.arange(queries),
@@ -40,7 +37,7 @@ def run_of(scores: Tensor, **parts: Any) -> Any:
     return SimpleNamespace(**known, scored=known["match"])
 
 
-def render(figure: Figure) -> Image.Image:
+def render(figure):
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
     assert buffer.tell() > 3000
@@ -48,7 +45,7 @@ def render(figure: Figure) -> Image.Image:
     return Image.open(buffer).convert("RGB")
 
 
-def texts(figure: Figure) -> list[str]:
+def texts(figure):
     """Every text of a figure."""
     render(figure)
     return [text.get_text() for text in figure.findobj(match=lambda one: hasattr(one, "get_text"))]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import torch
 from helpers import Fixed
-from torch import Tensor
 from torch.nn.functional import interpolate
 
 from dejavu_torch import FrequencyLayer, GroundOdometry
@@ -14,7 +13,7 @@ SIDE, STEP, CYCLE = 48, 6, 60  # pixels
 WHOLE = ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0))  # the camera looks straight down
 
 
-def positions(*speeds: tuple[int, int]) -> Tensor:
+def positions(*speeds):
     """Pixels of ground at each frame, from (pixels per frame, frames)."""
     steps = [speed for speed, frames in speeds for _ in range(frames)]
     return torch.tensor([0, *steps]).cumsum(0)
@@ -25,7 +24,7 @@ REFERENCE = positions((4, 60), (0, 25), (9, 40), (3, 1))
 QUERY = positions((8, 45), (0, 10), (5, 48), (3, 1))
 
 
-def footage(where: Tensor, noise: float = 0.0) -> Tensor:
+def footage(where, noise=0.0):
     """(N,1,48,48) frames over a ground that repeats every 60 pixels and differs a little everywhere."""
     random = torch.Generator().manual_seed(0)
     cycle = torch.rand(1, 1, CYCLE // 4, SIDE // 4, generator=random).repeat(1, 1, 12, 1)
@@ -36,16 +35,16 @@ def footage(where: Tensor, noise: float = 0.0) -> Tensor:
     return (frames + noise * torch.randn(frames.shape, generator=random)).clamp(0, 1)
 
 
-def camera(**settings: object) -> GroundOdometry:
+def camera(**settings):
     return GroundOdometry(WHOLE, (SIDE, SIDE), **{"step": float(STEP), **settings})
 
 
-def everything(places: int) -> Fixed:
+def everything(places):
     """A layer that stores every place."""
     return Fixed(FrequencyLayer(places, places, 0, places, tuple(range(900))))
 
 
-def shift_between(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
+def shift_between(first, second):
     """The likeliest shift of each pair of patches, (B,1,h,w) twice -> shift (B,), confidence (B,)."""
     shifts, confidences = phase_shifts(first, second)
     best = confidences.argmax(1, keepdim=True)

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 import pytest
 import torch
-from torch import Tensor, nn
 
 from dejavu_torch import learning
 from dejavu_torch.features import descriptor, views
 from dejavu_torch.maps.template_map import TemplateMap, TemplateMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.finder import PeriodFinder
-from dejavu_torch.types import FrequencyLayer, InputError, Plan, SequenceModel, Traverse
+from dejavu_torch.types import FrequencyLayer, InputError
 
 
 @contextmanager
-def refused(*words: str) -> Iterator[None]:
+def refused(*words):
     """The block is refused in one line that holds these words."""
     with pytest.raises(InputError) as caught:
         yield
@@ -27,7 +25,7 @@ def refused(*words: str) -> Iterator[None]:
     assert [word for word in words if word not in message] == [], message
 
 
-def streamed(model: SequenceModel, batches: Iterable[Tensor]) -> Iterator[Tensor]:
+def streamed(model, batches):
     """`step` over consecutive batches of scores (B,N)."""
     state = None
     for scores in batches:
@@ -36,13 +34,13 @@ def streamed(model: SequenceModel, batches: Iterable[Tensor]) -> Iterator[Tensor
         yield found
 
 
-def long_from(monkeypatch: pytest.MonkeyPatch, frames: int) -> None:
+def long_from(monkeypatch, frames):
     """Routes of more frames are learned from a sample, chunk by chunk."""
     for module in (views, descriptor, learning):
         monkeypatch.setattr(module, "SAMPLE", frames)
 
 
-def all_of(traverse: Traverse, batch: int = 64) -> Tensor:
+def all_of(traverse, batch=64):
     return torch.cat(list(traverse.batches(batch)))
 
 
@@ -53,17 +51,11 @@ class Fixed(PeriodFinder):
         super().__init__()
         self.layers = layers
 
-    def plan(self, features: Tensor) -> Plan:
+    def plan(self, features):
         return self.layers
 
 
-def scored(
-    queries: Tensor,
-    route: TemplateMap,
-    metric: object = "l1",
-    reduction: str = "mean",
-    temperature: float | None = None,
-) -> Tensor:
+def scored(queries, route, metric="l1", reduction="mean", temperature=None):
     """Scores of the layers and templates of a map with other settings."""
     settings = metric, reduction, temperature
     weights = route.weights if len(route.weights) else None
@@ -71,14 +63,7 @@ def scored(
     return other.scores(queries)
 
 
-def template_model(
-    features: nn.Module | None = None,
-    periods: PeriodFinder | None = None,
-    metric: object = "l1",
-    reduction: str = "mean",
-    temperature: float | None = None,
-    **settings: object,
-) -> DejaVu:
+def template_model(features=None, periods=None, metric="l1", reduction="mean", temperature=None, **settings):
     """A model whose map is of templates, with what its mapper is told beside the model's own settings."""
     mapper = TemplateMapper(periods, metric, reduction, temperature)  # type: ignore[arg-type]
     return DejaVu(features, mapper=mapper, **settings)  # type: ignore[arg-type]

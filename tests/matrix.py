@@ -7,7 +7,6 @@ from collections.abc import Callable
 from fractions import Fraction
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -63,47 +62,47 @@ class Calls(nn.Module):
         super().__init__()
         self.function, self.parts = function, nn.ModuleDict(parts)
 
-    def forward(self, *values: Tensor) -> Tensor:
+    def forward(self, *values):
         return self.function(*self.parts.values(), *values)
 
 
 @cache
-def frames() -> Tensor:
+def frames():
     return torch.rand(ROUTE, 3, 16, 16, generator=torch.Generator().manual_seed(1))
 
 
 @cache
-def rows(columns: int) -> Tensor:
+def rows(columns):
     return torch.rand(ROUTE, columns, generator=torch.Generator().manual_seed(2))
 
 
-def model(spectral: bool) -> DejaVu:
-    settings: dict[str, Any] = {"mapper": TemplateMapper(ImposedPeriods([3, 4], bin=2))}
+def model(spectral):
+    settings = {"mapper": TemplateMapper(ImposedPeriods([3, 4], bin=2))}
     if spectral:
         settings = {"whitening": Whitening(views=1, bits=16), "mapper": SpectralMapper(None, step=1e-3)}
     return DejaVu(HOG(cell=4), **settings).learn(frames())
 
 
-def distances(values: Tensor, templates: Tensor) -> Tensor:
+def distances(values, templates):
     return phase_distances(values, templates.to(values))
 
 
-def augmented(module: nn.Module, values: Tensor) -> Tensor:
+def augmented(module, values):
     module.training = True
-    made: Tensor = module(values)
+    made = module(values)
     return made
 
 
-def seeded(module: nn.Module, values: Tensor) -> Tensor:
+def seeded(module, values):
     """The output with the same random numbers each time."""
     torch.manual_seed(0)
-    made: Tensor = module(values)
+    made = module(values)
     return made
 
 
 PLAN = (FrequencyLayer(Fraction(4), 4, 0, 5, (0, 1)), FrequencyLayer(Fraction(5, 2), 3, 1, 4, (2,)))
 # each with the input of a batch of 5
-MODULES: dict[str, tuple[Callable[[], nn.Module], Callable[[], Tensor]]] = {
+MODULES = {
     "HOG": (lambda: HOG(cell=4), lambda: frames()[:5]),
     "PatchPixels": (lambda: PatchPixels((8, 8)), lambda: frames()[:5]),
     "Distilled": (lambda: Distilled(2), lambda: frames()[:5]),
@@ -144,7 +143,7 @@ MODULES: dict[str, tuple[Callable[[], nn.Module], Callable[[], Tensor]]] = {
 }
 
 
-def close(found: Tensor, expected: Tensor, share: float) -> None:
+def close(found, expected, share):
     """Within a share of the largest value."""
     assert found.shape == expected.shape
     assert found.isfinite().equal(expected.isfinite())
@@ -152,18 +151,18 @@ def close(found: Tensor, expected: Tensor, share: float) -> None:
     torch.testing.assert_close(found.to(expected), expected, rtol=0, atol=share * largest)
 
 
-def gradient(module: nn.Module, values: Tensor) -> None:
+def gradient(module, values):
     exact = values.double().requires_grad_()
     module = module.double()
 
-    def finite(one: Tensor) -> Tensor:
-        made: Tensor = module(one)
+    def finite(one):
+        made = module(one)
         return made.where(made.isfinite(), 0)
 
     assert torch.autograd.gradcheck(finite, (exact,), fast_mode=True)
 
 
-def functions(module: nn.Module, values: Tensor) -> None:
+def functions(module, values):
     other = values.flip(0)
     expected = torch.stack([module(values), module(other)])
     close(torch.func.vmap(module, randomness="same")(torch.stack([values, other])), expected, 1e-5)
@@ -172,20 +171,20 @@ def functions(module: nn.Module, values: Tensor) -> None:
     close(torch.func.grad(lambda one: module(one).square().sum())(values), slope, 1e-4)
 
 
-def float64(module: nn.Module, values: Tensor) -> None:
+def float64(module, values):
     expected = module(values)
     found = module.double()(values.double())
     assert found.dtype == torch.float64
     close(found, expected, 1e-3)
 
 
-def bfloat16(module: nn.Module, values: Tensor) -> None:
+def bfloat16(module, values):
     rounded = values.bfloat16()
     expected = module(rounded.float())
     close(module.bfloat16()(rounded).float(), expected, 0.05)
 
 
-def autocast(module: nn.Module, values: Tensor) -> None:
+def autocast(module, values):
     """Networks are rounded, everything else is exact."""
     learned = any(isinstance(one, nn.Conv2d | Distilled) for one in module.modules())
     expected = seeded(module, values)
@@ -193,19 +192,19 @@ def autocast(module: nn.Module, values: Tensor) -> None:
         close(seeded(module, values), expected, 0.02 if learned else 1e-5)
 
 
-def empty(module: nn.Module, values: Tensor) -> None:
+def empty(module, values):
     assert module(values[:0]).shape == (0, *module(values).shape[1:])
 
 
-def compiled(module: nn.Module, values: Tensor) -> None:
+def compiled(module, values):
     torch.compiler.reset()
     run = torch.compile(module, fullgraph=True, backend="eager")
     for some in (values, values[1:]):
         close(seeded(run, some), seeded(module, some), 1e-5)
 
 
-def exported(module: nn.Module, values: Tensor) -> None:
-    shapes: Any = ({0: torch.export.Dim("rows")},)
+def exported(module, values):
+    shapes = ({0: torch.export.Dim("rows")},)
     if isinstance(module, Calls):
         shapes = (shapes,)
     program = torch.export.export(module, (values,), dynamic_shapes=shapes).module()
@@ -213,7 +212,7 @@ def exported(module: nn.Module, values: Tensor) -> None:
         close(program(some), module(some), 1e-5)
 
 
-ASPECTS: dict[str, Callable[[nn.Module, Tensor], None]] = {
+ASPECTS = {
     "gradient": gradient,
     "torch.func": functions,
     "float64": float64,
@@ -224,7 +223,7 @@ ASPECTS: dict[str, Callable[[nn.Module, Tensor], None]] = {
     "export": exported,
 }
 # what does not hold, and the error that says so
-WITHOUT: dict[str, dict[str, str]] = {
+WITHOUT = {
     "Augmentation": {
         **dict.fromkeys(("gradient", "float64", "bfloat16"), "expected float32"),
         "torch.func": "broadcast shape",
@@ -237,7 +236,7 @@ WITHOUT: dict[str, dict[str, str]] = {
 }
 
 
-def fails(name: str, aspect: str) -> str:
+def fails(name, aspect):
     """Why an aspect does not hold of a module; "" if it does."""
     make, given = MODULES[name]
     torch.manual_seed(0)
@@ -248,7 +247,7 @@ def fails(name: str, aspect: str) -> str:
     return ""
 
 
-def table() -> str:
+def table():
     """The page: a row for each module."""
     lines = [f"| module | {' | '.join(ASPECTS)} |", f"|---|{'---|' * len(ASPECTS)}"]
     for name in MODULES:

@@ -56,12 +56,12 @@ class Asked:
         there.close()
         atexit.register(self.end)
 
-    def ask(self, question: dict[str, Any], streams: tuple[int, ...] = ()) -> Any:
+    def ask(self, question, streams=()):
         with self.lock:
             socket.send_fds(self.socket, [json.dumps(question).encode()], streams)
             return json.loads(self.socket.recv(100))
 
-    def end(self) -> None:
+    def end(self):
         self.socket.close()
         self.process.wait()
 
@@ -76,7 +76,7 @@ class Forked(subprocess.Popen[Any]):
         self.asked = asked(imports)
         super().__init__([code, *map(str, words)], **settings)
 
-    def _execute_child(self, args: list[str], *given: Any) -> None:
+    def _execute_child(self, args, *given):
         folder, environment = given[4:6]
         question = {"code": args[0], "words": args[1:], "folder": str(folder or os.getcwd())}
         question |= {"environment": dict(os.environ if environment is None else environment)}
@@ -86,10 +86,10 @@ class Forked(subprocess.Popen[Any]):
             if -1 not in (it, ours):
                 os.close(it)
 
-    def _try_wait(self, flags: int) -> Any:
+    def _try_wait(self, flags):
         return self.asked.ask({"wait": [self.pid, flags]})
 
-    def _internal_poll(self, *_: Any) -> int | None:
+    def _internal_poll(self, *_):
         if self.returncode is None:
             pid, status = self._try_wait(os.WNOHANG)
             if pid:
@@ -97,7 +97,7 @@ class Forked(subprocess.Popen[Any]):
         return self.returncode
 
 
-def python(code: str, *words: object, input: str | None = None, **settings: Any) -> Done:
+def python(code, *words, input=None, **settings):
     """What such a process ends with and has printed."""
     settings = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, **settings}
     with Forked(code, *words, stdin=None if input is None else subprocess.PIPE, **settings) as process:
@@ -105,7 +105,7 @@ def python(code: str, *words: object, input: str | None = None, **settings: Any)
     return subprocess.CompletedProcess(words, process.returncode, *printed)
 
 
-def forked(command: list[str], **settings: Any) -> Done:
+def forked(command, **settings):
     """In the place of `subprocess.run`, for `python -m MODULE WORDS` with the package imported."""
     if "-m" not in command:
         return run(command, **settings)

@@ -14,11 +14,9 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
 
-import pytest
 import torch
 
 from benchmarks.spread import THREADS, environment_of, imitable
@@ -31,7 +29,7 @@ ALIKE = ("test_notebooks.py", "test_several_processes.py")
 CLOSE = re.compile(r"approx|allclose|assert_close|[ar]tol\b|close\(")
 
 
-def compares_figures(test: ast.FunctionDef) -> bool:
+def compares_figures(test):
     """Whether a test allows for rounding, or compares with a share or another literal that is not whole.
 
     Those marked `figures` would take hours.
@@ -48,7 +46,7 @@ def compares_figures(test: ast.FunctionDef) -> bool:
     return "@pytest.mark.figures" not in text and (shares or bool(CLOSE.search(text)))
 
 
-def chosen() -> Iterator[tuple[Path, str]]:
+def chosen():
     """The files and names of the tests."""
     for path in sorted(TESTS.rglob("test_*.py")):
         if path.name in ALIKE or path.parent.name == "benchmarks":
@@ -59,7 +57,7 @@ def chosen() -> Iterator[tuple[Path, str]]:
                 yield path, node.name
 
 
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Function]) -> None:
+def pytest_collection_modifyitems(config, items):
     """As a plugin of pytest: leaves the chosen tests."""
     tests = set(chosen())
     others = [item for item in items if (item.path, item.originalname) not in tests]
@@ -67,7 +65,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Func
     items[:] = [item for item in items if (item.path, item.originalname) in tests]
 
 
-def run(processor: str, threads: int, more: list[str]) -> subprocess.CompletedProcess[str]:
+def run(processor, threads, more):
     """Runs the chosen tests as one processor."""
     words = ["-n", str(os.cpu_count()), "--dist", "loadfile", "--tb", "line", "-m", "", "-rfE", *more]
     once = (processor, threads) == ("this", 1)
@@ -81,7 +79,7 @@ def run(processor: str, threads: int, more: list[str]) -> subprocess.CompletedPr
     )
 
 
-def main() -> int:
+def main():
     given, _, more = " ".join(sys.argv[1:]).partition(" -- ")
     parser = argparse.ArgumentParser(prog="python -m tests.processors", description=__doc__.splitlines()[0])
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"some of {', '.join(imitable())}")

@@ -7,7 +7,7 @@ its methods. Letters: i frame, k phase, j feature, H a query, mu a layer's templ
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from fractions import Fraction
 from itertools import pairwise, product
 from typing import NamedTuple
@@ -16,24 +16,23 @@ import torch
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dejavu_torch.recognition.motion import Layout, Rates
 from dejavu_torch.types import FrequencyLayer, Plan
 
 Row = Sequence[float]
 Table = Sequence[Row]
 
 
-def phase(i: int, layer: FrequencyLayer) -> int:
+def phase(i, layer):
     """floor((i mod tau) * P / tau), exact, counted from absolute frame 0."""
     return math.floor(Fraction(i) % layer.period * layer.phases / layer.period)
 
 
-def mask(i: int, k: int, layer: FrequencyLayer) -> int:
+def mask(i, k, layer):
     """M(i, tau, k), eq. 2: 1 where frame i of the layer's chunk has phase k."""
     return int(layer.start <= i < layer.stop and phase(i, layer) == k)
 
 
-def template(values: Table, j: int, k: int, layer: FrequencyLayer) -> float:
+def template(values, j, k, layer):
     """mu(H, tau, k) of one feature, eq. 1; 0 for a phase that no frame of the chunk has."""
     total, count = 0.0, 0
     for i in range(len(values)):
@@ -42,17 +41,17 @@ def template(values: Table, j: int, k: int, layer: FrequencyLayer) -> float:
     return total / count if count else 0.0
 
 
-def templates(values: Table, layer: FrequencyLayer) -> list[list[float]]:
+def templates(values, layer):
     """All templates of a layer, P rows of F numbers."""
     return [[template(values, j, k, layer) for j in layer.features] for k in range(layer.phases)]
 
 
-def phase_distance(query: Row, mu: Table, k: int, layer: FrequencyLayer) -> float:
+def phase_distance(query, mu, k, layer):
     """s(tau, k), eq. 3: the sum over the layer's features of |H - mu|."""
     return sum(abs(query[j] - mu[k][column]) for column, j in enumerate(layer.features))
 
 
-def score(query: Row, i: int, plan: Plan, mus: Sequence[Table], reduction: str = "sum") -> float:
+def score(query, i, plan, mus, reduction="sum"):
     """S(i), eq. 4: over the layers that cover i; +inf where none does.
 
     "sum" is the letter, "mean" divides it by the number of features that were summed over.
@@ -67,12 +66,12 @@ def score(query: Row, i: int, plan: Plan, mus: Sequence[Table], reduction: str =
     return total / summed if reduction == "mean" else total
 
 
-def scores(query: Row, places: int, plan: Plan, mus: Sequence[Table], reduction: str = "sum") -> list[float]:
+def scores(query, places, plan, mus, reduction="sum"):
     """S(i) of all places."""
     return [score(query, i, plan, mus, reduction) for i in range(places)]
 
 
-def best(row: Row) -> int:
+def best(row):
     """b = argmin S(i), eq. 5: of equal scores the lowest place; -1 where all are +inf."""
     found, least = -1, math.inf
     for i, value in enumerate(row):
@@ -81,14 +80,14 @@ def best(row: Row) -> int:
     return found
 
 
-def accepted(row: Row, threshold: float) -> bool:
+def accepted(row, threshold):
     """Eq. 6 as the text of section III-C has it: accept when the best score is below the threshold."""
     return best(row) >= 0 and row[best(row)] < threshold
 
 
-def candidates(row: Row, k: int, apart: int) -> list[int]:
+def candidates(row, k, apart):
     """The best place, then the best further than `apart` from all before; -1 where none is left."""
-    found: list[int] = []
+    found = []
     for _ in range(k):
         far = [
             value if all(abs(i - other) > apart for other in found if other >= 0) else math.inf
@@ -106,9 +105,7 @@ class Point(NamedTuple):
     recall: float
 
 
-def precision_recall(
-    score: Sequence[float], right: Sequence[bool], answerable: Sequence[bool], recall: str = "all"
-) -> list[Point]:
+def precision_recall(score, right, answerable, recall="all"):
     """A point for every distinct finite score, by counting.
 
     recall: "all" is TP / all queries with a right answer; "reported" is TP / (TP + FN), where only a
@@ -135,7 +132,7 @@ def precision_recall(
     return points
 
 
-def trapezoid(points: Sequence[Point]) -> float:
+def trapezoid(points):
     """Area under precision over recall between the points themselves."""
     area = 0.0
     for a, b in pairwise(points):
@@ -151,7 +148,7 @@ class Route(NamedTuple):
 
 
 @st.composite
-def routes(draw: Callable, most_layers: int = 4) -> Route:
+def routes(draw, most_layers=4):
     """Small routes whose layers overlap, leave gaps, and have whole and rational periods.
 
     Feature values are multiples of 1/8: sums of them are exact.
@@ -171,15 +168,15 @@ def routes(draw: Callable, most_layers: int = 4) -> Route:
     return Route(values, tuple(plan))
 
 
-def joined_rows(places: Sequence[Table], queries: Sequence[Table], kept: int, level: float) -> Tensor:
+def joined_rows(places, queries, kept, level):
     """Cosines (Q,N) of queries and places from their whitened members: side by side, each of length 1, turned
     to the `kept` directions with the largest mean square over the places, and each number divided by that
     power of its root mean square."""
 
-    def side_by_side(members: Sequence[Table]) -> list[list[float]]:
+    def side_by_side(members):
         rows = []
         for parts in zip(*members, strict=True):
-            row: list[float] = []
+            row = []
             for part in parts:
                 length = math.sqrt(sum(number**2 for number in part))
                 row += [number / length for number in part]
@@ -194,17 +191,17 @@ def joined_rows(places: Sequence[Table], queries: Sequence[Table], kept: int, le
     return (theirs @ ours.T / lengths).float()
 
 
-def transitions(layout: Layout, rates: Rates) -> list[list[float]]:
+def transitions(layout, rates):
     """Probability of each step from one state to another, by walking; see `Layout` for the states."""
     n, moves = layout.places, rates.moves.tolist()
     jump, leave, enter = (float(rate) for rate in rates[1:])
     states = layout.directions * n
     matrix = [[0.0] * (states + 1) for _ in range(states + 1)]
 
-    def number(direction: int, place: int) -> int:
+    def number(direction, place):
         return place if direction == 0 else 2 * n - 1 - place
 
-    def walks(direction: int, place: int) -> list[tuple[int, float]]:
+    def walks(direction, place):
         """Where one step leads; what is missing leaves the route."""
         ways = [(a, b, s) if direction == 0 else (b, a, s) for a, b, s in layout.links]
         linked = [(b, s) for a, b, s in ways if a == place]
@@ -225,7 +222,7 @@ def transitions(layout: Layout, rates: Rates) -> list[list[float]]:
                 mass = {place: share}
                 for v, move in enumerate(moves):
                     if v:
-                        after: dict[int, float] = {}
+                        after = {}
                         for at, amount in mass.items():
                             for to, part in walks(way, at):
                                 after[to] = after.get(to, 0.0) + amount * part
@@ -243,7 +240,7 @@ def transitions(layout: Layout, rates: Rates) -> list[list[float]]:
     return matrix
 
 
-def smoothed(matrix: Tensor, first: Tensor, likelihood: Tensor) -> tuple[Tensor, float]:
+def smoothed(matrix, first, likelihood):
     """Forward and backward (Rabiner, 1989): posteriors (Q,S) and the log likelihood, for S states."""
     forward, backward = [first * likelihood[0]], [torch.ones_like(first)]
     for row in likelihood[1:]:
@@ -268,7 +265,7 @@ class Steps(NamedTuple):
     starts: Sequence[int] = (0,)  # the first place of each route
     links: Sequence[tuple[int, int, float]] = ()
 
-    def onward(self, place: int, way: int) -> dict[int | None, float]:
+    def onward(self, place, way):
         """Where a move by one place leads to, with probabilities; None is off the map."""
         pairs = [(a, b, share) if way == 0 else (b, a, share) for a, b, share in self.links]
         linked = [(to, share) for at, to, share in pairs if at == place]
@@ -276,17 +273,17 @@ class Steps(NamedTuple):
         following = place + 1 if way == 0 else place - 1
         route = sum(start <= place for start in self.starts)
         on_route = 0 <= following < self.places and sum(start <= following for start in self.starts) == route
-        led: dict[int | None, float] = {following if on_route else None: max(0.0, 1 - taken)}
+        led = {following if on_route else None: max(0.0, 1 - taken)}
         for to, share in linked:
             led[to] = led.get(to, 0.0) + share / max(1.0, taken)
         return led
 
-    def state(self, place: int | None, way: int) -> int:
+    def state(self, place, way):
         if place is None:
             return self.places * self.directions
         return place if way == 0 else 2 * self.places - 1 - place
 
-    def transitions(self) -> Table:
+    def transitions(self):
         """Probabilities of each state, row by row the one before it."""
         off = self.places * self.directions
         matrix = [[0.0] * (off + 1) for _ in range(off + 1)]
@@ -296,11 +293,11 @@ class Steps(NamedTuple):
                 row = matrix[self.state(place, way)]
                 for now in range(self.directions):
                     turned = self.turn if now != way else 1 - self.turn * (self.directions - 1)
-                    at: dict[int | None, float] = {place: 1.0}
+                    at = {place: 1.0}
                     for move in self.moves:
                         for reached, share in at.items():
                             row[self.state(reached, now)] += stay * turned * move * share
-                        moved: dict[int | None, float] = {}
+                        moved = {}
                         for reached, share in at.items():
                             onward = {None: 1.0} if reached is None else self.onward(reached, now)
                             for to, part in onward.items():
@@ -312,13 +309,13 @@ class Steps(NamedTuple):
         matrix[off] = [self.enter / off] * off + [1 - self.enter]
         return matrix
 
-    def start(self) -> Row:
+    def start(self):
         off = self.places * self.directions
         share = min(0.5, self.leave / (self.leave + self.enter))
         return [(1 - share) / off] * off + [share]
 
 
-def forward_backward(steps: Steps, evidence: Table, still: Sequence[bool]) -> tuple[list[list[float]], float]:
+def forward_backward(steps, evidence, still):
     """Probability of each state for each query, and the log likelihood of all queries, from the log evidence
     of each place, (Q,N), relative to being off the map; a query that stands still has the state before it."""
     matrix, states = steps.transitions(), range(steps.places * steps.directions + 1)
@@ -344,7 +341,7 @@ def forward_backward(steps: Steps, evidence: Table, still: Sequence[bool]) -> tu
     return found, math.log(total)
 
 
-def all_paths(steps: Steps, evidence: Table, still: Sequence[bool]) -> dict[tuple[int, ...], float]:
+def all_paths(steps, evidence, still):
     """Every sequence of states with its probability times likelihood, as in `forward_backward`."""
     matrix, states, found = steps.transitions(), range(2 * steps.places + 1), {}
     for path in product(states, repeat=len(evidence)):

@@ -15,11 +15,11 @@ PACKAGE = Path(dejavu_torch.__file__).parent
 HEAVY = ["pytorch_lightning", "lightning", "torchmetrics", "matplotlib", "av", "numba", "cv2", "ray"]
 
 
-def test_the_front_door_is_narrow() -> None:
+def test_the_front_door_is_narrow():
     assert 1 <= len(dejavu_torch.__all__) <= 31
 
 
-def test_every_name_is_documented_and_on_the_map_of_the_paper() -> None:
+def test_every_name_is_documented_and_on_the_map_of_the_paper():
     not_of_the_paper = {"ArrayTraverse", "ImageFolder", "InputError", "Match"}
     not_of_the_paper |= {"PRCurve", "Traverse", "open_source"}
     for name in dejavu_torch.__all__:
@@ -31,7 +31,7 @@ def test_every_name_is_documented_and_on_the_map_of_the_paper() -> None:
         assert name in not_of_the_paper or name in (dejavu_torch.__doc__ or "")
 
 
-def test_what_the_docstring_names_is_there() -> None:
+def test_what_the_docstring_names_is_there():
     """The last column of the map names modules of the package."""
     lines = [line for line in (dejavu_torch.__doc__ or "").splitlines() if line.startswith("    ")]
     assert len(lines) > 8
@@ -41,7 +41,7 @@ def test_what_the_docstring_names_is_there() -> None:
 
 
 @pytest.mark.slow
-def test_importing_loads_nothing_heavy_until_it_is_asked_for_and_changes_no_global_setting() -> None:
+def test_importing_loads_nothing_heavy_until_it_is_asked_for_and_changes_no_global_setting():
     code = (
         "import sys, torch, random; before = (torch.get_num_threads(), torch.get_default_dtype(), "
         "torch.is_grad_enabled(), torch.initial_seed(), random.getstate()); import dejavu_torch; "

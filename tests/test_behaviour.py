@@ -6,7 +6,6 @@ import math
 
 import pytest
 import torch
-from torch import Tensor
 
 from dejavu_torch import (
     DejaVu,
@@ -23,21 +22,21 @@ from dejavu_torch.features.views import LabelledFrames
 from dejavu_torch.growth import average, merge
 
 
-def noise(places: int, numbers: int, seed: int = 0) -> Tensor:
+def noise(places, numbers, seed=0):
     return torch.randn(places, numbers, generator=torch.Generator().manual_seed(seed))
 
 
-def smooth(places: int, numbers: int = 8) -> Tensor:
+def smooth(places, numbers=8):
     """Descriptors that change slowly and do not come back."""
     steps = noise(places, numbers).cumsum(0)
     return steps - steps.mean(0)
 
 
-def of_features(mapper: SpectralMapper, route: Tensor) -> DejaVu:
+def of_features(mapper, route):
     return DejaVu(whitening="none", mapper=mapper).learn(route)
 
 
-def test_templates_of_a_long_chunk_are_means() -> None:
+def test_templates_of_a_long_chunk_are_means():
     frames, period = 100_000, 93
     values = torch.arange(frames, dtype=torch.float64)[:, None].remainder(1009)
     (templates,) = PhaseTemplates()(values, (FrequencyLayer(period, period, 0, frames, (0,)),))
@@ -45,7 +44,7 @@ def test_templates_of_a_long_chunk_are_means() -> None:
     torch.testing.assert_close(templates, expected)
 
 
-def test_cosine_and_sine_have_the_same_dead_zone() -> None:
+def test_cosine_and_sine_have_the_same_dead_zone():
     # of period 8, at whose length the dead zone is twice 0.65 steps
     turns = torch.arange(16) * (2 * math.pi / 8)
     slow = 20 * torch.cos(turns / 2)
@@ -56,7 +55,7 @@ def test_cosine_and_sine_have_the_same_dead_zone() -> None:
         assert made.summary().lines == lines
 
 
-def test_a_squared_distance_is_never_below_0() -> None:
+def test_a_squared_distance_is_never_below_0():
     route = 1000 * noise(64, 8)
     model = of_features(SpectralMapper(step=0.2, metric="l2"), route)
     scores = model(route)
@@ -64,19 +63,19 @@ def test_a_squared_distance_is_never_below_0() -> None:
     assert (scores.argmin(1) == torch.arange(64)).all()
 
 
-def test_no_step_is_finer_than_changes_a_score() -> None:
+def test_no_step_is_finer_than_changes_a_score():
     # 64 steps in the RMS of noise are 8.05 bits a number; the coder takes some more
     model = of_features(SpectralMapper(route_bytes_per_place=12.0), noise(1000, 4))
     assert 4 < model.summary().route_bytes / 1000 < 5
 
 
-def test_a_frequency_is_one_period_of_a_summary() -> None:
+def test_a_frequency_is_one_period_of_a_summary():
     turns = torch.arange(120) * (2 * math.pi / 30)
     made = of_features(SpectralMapper(step=0.1), torch.stack([turns.cos(), turns.sin()], 1))
     assert made.summary().chunks[0].periods == (30,)
 
 
-def test_a_precision_is_inclusive() -> None:
+def test_a_precision_is_inclusive():
     route = open_source("sim:aerial?frames=100&size=32")
     model = DejaVu(whitening="none").learn(route).calibrate(route)
     query = open_source("sim:aerial?frames=100&size=32&traverse=1")
@@ -89,7 +88,7 @@ def test_a_precision_is_inclusive() -> None:
     assert match.accepted[probability.argsort()[(len(probability) - 1) // 2]]
 
 
-def test_of_equal_scores_in_several_chunks_the_lowest_place_wins() -> None:
+def test_of_equal_scores_in_several_chunks_the_lowest_place_wins():
     once = noise(50, 8)
     model = of_features(SpectralMapper(step=0.1), once)
     model = merge([model, model, model], ["once", "twice", "thrice"])
@@ -100,7 +99,7 @@ def test_of_equal_scores_in_several_chunks_the_lowest_place_wins() -> None:
     assert torch.equal(candidates.index, torch.arange(50)[:, None] + 50 * torch.arange(3))
 
 
-def test_a_filter_counts_neighbours_up_to_within() -> None:
+def test_a_filter_counts_neighbours_up_to_within():
     scores = torch.full((1, 60), 1.0)
     scores[0, 30] = 0.0
     found = PlaceFilter(within=5, sharpness=20.0)(scores)[0].detach()
@@ -110,7 +109,7 @@ def test_a_filter_counts_neighbours_up_to_within() -> None:
     assert (found[[24, 36]] > 10).all()
 
 
-def test_frames_left_out_move_a_filter_on() -> None:
+def test_frames_left_out_move_a_filter_on():
     route = noise(100, 16)
     model = of_features(SpectralMapper(step=0.2), route)
     filter = PlaceFilter(moves=(0.0, 1.0), within=0, sharpness=5.0)
@@ -120,7 +119,7 @@ def test_frames_left_out_move_a_filter_on() -> None:
         assert live(torch.zeros(16), left_out).place == 41 + left_out  # a frame that tells nothing
 
 
-def test_a_third_visit_weighs_a_third() -> None:
+def test_a_third_visit_weighs_a_third():
     first, others = smooth(60), (smooth(60) + 0.9, smooth(60) - 0.3)
     model = of_features(SpectralMapper(step=0.01, metric="l2", chunk=60), first)
     for visit in others:
@@ -130,8 +129,8 @@ def test_a_third_visit_weighs_a_third() -> None:
     assert (model.map.visit_counts == 3).all()
 
 
-def test_a_threshold_is_kept_where_all_maps_have_it() -> None:
-    def learned(threshold: float | None, seed: int) -> DejaVu:
+def test_a_threshold_is_kept_where_all_maps_have_it():
+    def learned(threshold, seed):
         model = of_features(SpectralMapper(step=0.1), noise(40, 4, seed))
         model.threshold = threshold
         return model
@@ -141,7 +140,7 @@ def test_a_threshold_is_kept_where_all_maps_have_it() -> None:
         assert merge([learned(0.3, 0), learned(other, 1)], ["a", "b"]).threshold is None
 
 
-def test_the_null_takes_as_many_bytes_as_the_map() -> None:
+def test_the_null_takes_as_many_bytes_as_the_map():
     route = smooth(300)
     model = of_features(SpectralMapper(step=2.0), route)
     own = model.localize(route).index

@@ -30,7 +30,7 @@ LONG = "sim:aerial?frames=256"  # longer than the window of periods that some te
 
 
 @pytest.fixture(scope="module")
-def small_map(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def small_map(tmp_path_factory):
     path = tmp_path_factory.mktemp("map") / "small.safetensors"
     run("learn", SMALL, "--map", path)
     return path
@@ -39,7 +39,7 @@ def small_map(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # what works
 
 
-def test_localize_writes_one_row_a_query_as_python_finds_them(small_map: Path, tmp_path: Path) -> None:
+def test_localize_writes_one_row_a_query_as_python_finds_them(small_map, tmp_path):
     run("localize", small_map, QUERY, "--out", tmp_path / "m.csv")
     rows = list(csv.DictReader((tmp_path / "m.csv").open()))
     model = DejaVu.load(small_map)
@@ -53,9 +53,7 @@ def test_localize_writes_one_row_a_query_as_python_finds_them(small_map: Path, t
     assert torch.allclose(torch.tensor([float(row["score"]) for row in rows]), match.score, rtol=1e-5)
 
 
-def test_one_damaged_image_does_not_stop_the_others(
-    small_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_one_damaged_image_does_not_stop_the_others(small_map, tmp_path, capsys):
     images = (255 * open_source(QUERY)[:].permute(0, 2, 3, 1)).round().byte().numpy()
     folder = write_images(tmp_path / "q", images)
     damaged = folder / "40.png"
@@ -70,9 +68,7 @@ def test_one_damaged_image_does_not_stop_the_others(
     assert sum(row["accepted"] == "1" for row in rows) > 80
 
 
-def test_wide_descriptors_are_told_to_be_reduced_not_whitened(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_wide_descriptors_are_told_to_be_reduced_not_whitened(tmp_path, capsys):
     np.save(tmp_path / "wide.npy", np.random.default_rng(0).normal(size=(120, 300)).astype(np.float32))
     run("learn", tmp_path / "wide.npy", "--whitening", "none", "--map", tmp_path / "m.safetensors")
     run("info", tmp_path / "m.safetensors")
@@ -81,9 +77,7 @@ def test_wide_descriptors_are_told_to_be_reduced_not_whitened(
     assert "Whitening, " not in told
 
 
-def test_pixels_that_are_not_square_are_named_where_a_video_does_not_fit(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_pixels_that_are_not_square_are_named_where_a_video_does_not_fit(tmp_path, capsys):
     square = clip(tmp_path / "square.mp4", pictures(12, 48, 64), **H264)
     wide = clip(tmp_path / "wide.mp4", pictures(12, 48, 40), aspect=Fraction(8, 5), **H264)
     error = fails(capsys, "compare", square, wide, "--truth", 0, "--features", "HOG", "--out", tmp_path / "o")
@@ -99,16 +93,14 @@ def test_pixels_that_are_not_square_are_named_where_a_video_does_not_fit(
         ("--preprocess.size none", "--preprocess.size is none; expected null, or int"),
     ],
 )
-def test_what_a_wrong_word_may_mean(words: str, hint: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_a_wrong_word_may_mean(words, hint, capsys):
     assert hint in fails(capsys, "learn", SMALL, "--map", "a.safetensors", *words.split())
 
 
-def test_convention_4_threshold_option_then_map_then_probability_then_all(
-    small_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_convention_4_threshold_option_then_map_then_probability_then_all(small_map, tmp_path, capsys):
     route, out = tmp_path / "a.safetensors", tmp_path / "m.csv"
 
-    def accepted() -> int:
+    def accepted():
         return sum(row["accepted"] == "1" for row in csv.DictReader(out.open()))
 
     run("localize", small_map, QUERY, "--out", out)
@@ -135,7 +127,7 @@ def test_convention_4_threshold_option_then_map_then_probability_then_all(
     assert accepted() == 0
 
 
-def test_a_drive_that_is_asked_for_is_in_order(small_map: Path, tmp_path: Path) -> None:
+def test_a_drive_that_is_asked_for_is_in_order(small_map, tmp_path):
     frames, out, found = 255 * open_source(QUERY)[:].float(), tmp_path / "m.csv", []
     np.save(tmp_path / "q.npy", frames.movedim(1, -1).byte().numpy())
     for words in ((), ("--ordered",)):
@@ -144,7 +136,7 @@ def test_a_drive_that_is_asked_for_is_in_order(small_map: Path, tmp_path: Path) 
     assert found[0] == found[1]
 
 
-def test_config_and_options(tmp_path: Path) -> None:
+def test_config_and_options(tmp_path):
     config = tmp_path / "mine.yaml"
     config.write_text(
         "mapper: {class_path: dejavu_torch.TemplateMapper, init_args: {reduction: sum, "
@@ -168,9 +160,7 @@ def test_config_and_options(tmp_path: Path) -> None:
         ("--config", "own.yaml"),
     ],
 )
-def test_classes_of_the_current_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, str]
-) -> None:
+def test_classes_of_the_current_folder(tmp_path, monkeypatch, words):
     """Only if they are named: the folder may have modules of any name."""
     (tmp_path / "my_network.py").write_text(
         "import torch\nclass Net(torch.nn.Flatten):\n    pass\ndef made(): return Net()\n"
@@ -189,13 +179,11 @@ def test_classes_of_the_current_folder(
     assert DejaVu.load("a.safetensors", Joined([own]) if "[" in words[1] else own).map.places == 64
 
 
-def test_what_learn_says_to_do_next_can_be_done(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_learn_says_to_do_next_can_be_done(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run("learn", SMALL, "--map", tmp_path / "my map.safetensors")
 
-    def next_words() -> list[str]:
+    def next_words():
         words = shlex.split(capsys.readouterr().out.splitlines()[-1])
         assert words[:2] == ["next:", "dejavu"]
         return words[2:]
@@ -206,7 +194,7 @@ def test_what_learn_says_to_do_next_can_be_done(
     assert (tmp_path / "scores" / "index.html").is_file()
 
 
-def test_a_route_that_does_not_repeat(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_route_that_does_not_repeat(tmp_path, capsys):
     noise = np.random.default_rng(0)
     for name in ("a", "b"):
         np.save(tmp_path / f"{name}.npy", noise.normal(size=(200, 40)).astype(np.float32))
@@ -220,9 +208,7 @@ def test_a_route_that_does_not_repeat(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "the map has no layers" in capsys.readouterr().out
 
 
-def test_without_truth_there_are_no_scores_but_answers_that_ask_for_one(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_truth_there_are_no_scores_but_answers_that_ask_for_one(tmp_path, capsys):
     for name, start in (("a", 0), ("b", 16)):
         part = f"sim:aerial?frames=112&traverse={int(start > 0)}&start={start}&stop={start + 96}"
         pixels = 255 * torch.cat(list(open_source(part).batches(64))).permute(0, 2, 3, 1)
@@ -247,9 +233,7 @@ def test_without_truth_there_are_no_scores_but_answers_that_ask_for_one(
     assert "of 96 answers are probably right" in capsys.readouterr().out
 
 
-def test_a_negative_offset_and_a_map_that_is_given(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_negative_offset_and_a_map_that_is_given(tmp_path, capsys):
     pair, out = (tmp_path / "a.npy", tmp_path / "a.npy", "--tolerance", 0), tmp_path / "report"
     np.save(pair[0], frames(64))
     run("compare", *pair, "--truth", "-3", "--out", out)
@@ -267,7 +251,7 @@ def test_a_negative_offset_and_a_map_that_is_given(
 
 
 @pytest.mark.parametrize("command", [name for name in COMMANDS if name != "train"])
-def test_help_reads_well(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_reads_well(command, capsys):
     first, lines = FIRST_OPTIONS.get(command), {}
     for word in ("--help", "--help_all")[: 1 + (first is not None)]:
         with pytest.raises(SystemExit) as stop:
@@ -289,7 +273,7 @@ def test_help_reads_well(command: str, capsys: pytest.CaptureFixture[str]) -> No
 
 
 @pytest.fixture(scope="module")
-def helped() -> tuple[str, str]:
+def helped():
     """What a process in which every help is asked for prints, and what it and OpenMP say on stderr."""
     code = (
         "import sys, dejavu_torch.cli as cli\n"
@@ -308,7 +292,7 @@ def helped() -> tuple[str, str]:
     return ran.stdout, ran.stderr
 
 
-def test_help_loads_nothing_that_only_a_run_needs(helped: tuple[str, str]) -> None:
+def test_help_loads_nothing_that_only_a_run_needs(helped):
     own = re.sub(
         r"\s*OPENMP DISPLAY ENVIRONMENT BEGIN.*?OPENMP DISPLAY ENVIRONMENT END\s*", "", helped[1], flags=re.S
     )
@@ -316,7 +300,7 @@ def test_help_loads_nothing_that_only_a_run_needs(helped: tuple[str, str]) -> No
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="libgomp is the OpenMP of Linux builds")
-def test_threads_do_not_spin_while_they_wait(helped: tuple[str, str]) -> None:
+def test_threads_do_not_spin_while_they_wait(helped):
     assert "OMP_WAIT_POLICY = 'PASSIVE'" in helped[1]
 
 
@@ -324,7 +308,7 @@ def test_threads_do_not_spin_while_they_wait(helped: tuple[str, str]) -> None:
 
 
 @pytest.fixture
-def trained_map(tmp_path: Path) -> Path:
+def trained_map(tmp_path):
     """Arrays a.npy and b.npy, and a map of the first as training leaves it."""
     np.save(tmp_path / "a.npy", frames(96, size=8))
     np.save(tmp_path / "b.npy", frames(96, seed=5, size=8))
@@ -338,7 +322,7 @@ def trained_map(tmp_path: Path) -> Path:
     return tmp_path / "trained.safetensors"
 
 
-def test_compare_judges_the_map_of_a_file(trained_map: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_compare_judges_the_map_of_a_file(trained_map, capsys):
     folder, before = trained_map.parent, trained_map.read_bytes()
     pair = folder / "a.npy", folder / "b.npy", "--truth", "0", "--features", "torch.nn.Flatten"
     run("compare", *pair, "--map", trained_map, "--out", folder / "r")
@@ -414,9 +398,7 @@ WRONG = {  # a line of words behind `dejavu`, and what its one line holds
 @pytest.mark.parametrize(
     "line", [pytest.param(one, marks=[pytest.mark.slow] * one.startswith("train")) for one in WRONG]
 )
-def test_what_is_wrong_is_told_by_options_and_without_python(
-    line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_wrong_is_told_by_options_and_without_python(line, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name, count in (("a", 18), ("b", 18), ("c", 6)):
         np.save(f"{name}.npy", frames(count))
@@ -430,9 +412,7 @@ def test_what_is_wrong_is_told_by_options_and_without_python(
     assert {*tmp_path.iterdir()} == there
 
 
-def test_unreadable_image_in_the_middle(
-    small_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_unreadable_image_in_the_middle(small_map, tmp_path, capsys):
     folder = write_images(tmp_path / "broken", frames(100, size=64))
     (folder / "77.png").write_bytes(b"no image")
     assert "77.png" in fails(capsys, "localize", small_map, folder, "--out", tmp_path / "m.csv")
@@ -440,10 +420,8 @@ def test_unreadable_image_in_the_middle(
     assert sorted(file.name for file in tmp_path.iterdir()) == ["broken"]
 
 
-def test_what_lacks_memory_is_one_line_and_a_bug_is_a_traceback(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def raises(problem: Exception) -> None:
+def test_what_lacks_memory_is_one_line_and_a_bug_is_a_traceback(capsys, monkeypatch):
+    def raises(problem):
         raise problem
 
     monkeypatch.setattr("dejavu_torch.cli.parser.parse", lambda *_: {})
@@ -462,7 +440,7 @@ def test_what_lacks_memory_is_one_line_and_a_bug_is_a_traceback(
 
 
 @pytest.fixture(scope="module")
-def own_process(small_map: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
+def own_process(small_map, tmp_path_factory):
     """What commands behind one another in a process of their own print, and what they say on stderr."""
     code = (
         "import resource, sys, warnings; from dejavu_torch.cli import commands, main\n"
@@ -480,13 +458,11 @@ def own_process(small_map: Path, tmp_path_factory: pytest.TempPathFactory) -> tu
 
 
 @pytest.mark.slow
-def test_localize_memory_does_not_grow_with_the_queries(own_process: tuple[str, str]) -> None:
+def test_localize_memory_does_not_grow_with_the_queries(own_process):
     few, many = (int(line) for line in own_process[0].splitlines() if line.isdigit())
     # features of the further frames would take 8 MB, their frames 57 MB, the painted route takes 2 MB
     assert many - few < 8_000
 
 
-def test_quiet_where_not_a_terminal_and_a_warning_of_a_library_is_one_line(
-    own_process: tuple[str, str],
-) -> None:
+def test_quiet_where_not_a_terminal_and_a_warning_of_a_library_is_one_line(own_process):
     assert own_process[1] == "learned\ndejavu: two lines\n"

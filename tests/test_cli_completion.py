@@ -8,7 +8,6 @@ import shutil
 import subprocess
 import sys
 from contextlib import redirect_stderr, redirect_stdout
-from pathlib import Path
 
 import pytest
 from command_line import fails, run
@@ -18,7 +17,7 @@ from dejavu_torch.cli.presets import preset_names
 
 
 @pytest.fixture(scope="module")
-def script(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def script(tmp_path_factory):
     """That of bash, as a file."""
     pytest.importorskip("shtab")
     folder = tmp_path_factory.mktemp("completion")
@@ -31,18 +30,18 @@ def script(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
-def test_bash_accepts_it(script: Path) -> None:
+def test_bash_accepts_it(script):
     subprocess.run(["bash", "-n", str(script)], check=True)
 
 
 @pytest.mark.skipif(shutil.which("zsh") is None, reason="zsh is not installed")
-def test_zsh_accepts_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_zsh_accepts_it(tmp_path, capsys):
     run("completion", "zsh")
     (tmp_path / "zsh").write_text(capsys.readouterr().out)
     subprocess.run(["zsh", "-n", str(tmp_path / "zsh")], check=True)
 
 
-def completed(script: Path, line: str) -> list[str]:
+def completed(script, line):
     """What bash offers for the last word of a line, in the folder of the script."""
     words = line.split(" ")
     code = (
@@ -75,23 +74,21 @@ def completed(script: Path, line: str) -> list[str]:
         ("dejavu train fit --config ", {*preset_names(), "bash", "zoo"}),
     ],
 )
-def test_a_tab_completes(line: str, offered: set[str], script: Path) -> None:
+def test_a_tab_completes(line, offered, script):
     assert {*completed(script, line)} == offered
 
 
-def test_another_shell_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_another_shell_is_one_line(capsys):
     expected = "dejavu: shell is fish; expected one of ['bash', 'zsh']"  # an argument, so without --
     assert expected in fails(capsys, "completion", "fish")
 
 
-def test_without_shtab_it_says_what_to_install(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_shtab_it_says_what_to_install(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "shtab", None)
     assert "[completion]" in fails(capsys, "completion")
 
 
-def test_help_begins_with_the_commands_of_a_first_day(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_begins_with_the_commands_of_a_first_day(capsys):
     with pytest.raises(SystemExit) as stop:
         run("--help")
     assert stop.value.code == 0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from PIL import Image
 
 
 @pytest.fixture(scope="module")
-def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def pair(tmp_path_factory):
     """Two traverses of one route: the second starts four frames later and ends eight frames earlier."""
     folder = tmp_path_factory.mktemp("pair")
     np.save(folder / "first.npy", frames(96, seed=1))
@@ -22,7 +21,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 
 @pytest.fixture(scope="module")
-def matches(pair: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def matches(pair, tmp_path_factory):
     folder = tmp_path_factory.mktemp("matches")
     run("learn", pair[0], "--map", folder / "map.safetensors")
     run("localize", folder / "map.safetensors", pair[1], "--out", folder / "matches.csv")
@@ -30,7 +29,7 @@ def matches(pair: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -
 
 
 @pytest.fixture(scope="module")
-def compared(pair: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def compared(pair, tmp_path_factory):
     """The report of both, with the truth."""
     folder = tmp_path_factory.mktemp("compared") / "report"
     run("compare", *pair, "--truth", "4", "--out", folder)
@@ -38,9 +37,7 @@ def compared(pair: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) 
 
 
 @pytest.mark.slow
-def test_evaluate_agrees_with_compare_whatever_the_form_of_the_truth(
-    pair: tuple[Path, Path], matches: Path, compared: Path, tmp_path: Path
-) -> None:
+def test_evaluate_agrees_with_compare_whatever_the_form_of_the_truth(pair, matches, compared, tmp_path):
     rows = [f"{query},{query + 4}" for query in range(84)]
     (tmp_path / "all.csv").write_text("query,place\n" + "\n".join(rows))
     (tmp_path / "some.csv").write_text("\n".join([rows[0], rows[37], rows[83]]))
@@ -60,9 +57,7 @@ def test_evaluate_agrees_with_compare_whatever_the_form_of_the_truth(
         assert [report[key] for key in keys] == pytest.approx([expected[key] for key in keys], abs=1e-6)
 
 
-def test_evaluate_writes_a_report_and_says_what_was_judged(
-    matches: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_evaluate_writes_a_report_and_says_what_was_judged(matches, tmp_path, capsys):
     (tmp_path / "some.csv").write_text("query,place\n0,4\n50,54\n60,-1\n")
     run("evaluate", matches, "--truth", tmp_path / "some.csv", "--tolerance", "2", "--out", tmp_path / "out")
     out = capsys.readouterr().out
@@ -84,7 +79,7 @@ def test_evaluate_writes_a_report_and_says_what_was_judged(
     }
 
 
-def test_coordinates_in_image_names_are_a_truth(tmp_path: Path) -> None:
+def test_coordinates_in_image_names_are_a_truth(tmp_path):
     for name, seed, shift in (("first", 1, 0.0), ("second", 2, 3.0)):
         (tmp_path / name).mkdir()
         for i, image in enumerate(frames(64, seed)):
@@ -102,9 +97,7 @@ def test_coordinates_in_image_names_are_a_truth(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_threshold_that_is_named_accepts_right_places_only(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_threshold_that_is_named_accepts_right_places_only(tmp_path, capsys):
     flights = ("sim:aerial?frames=96", "sim:aerial?frames=96&traverse=1")
     run("compare", *flights, "--out", tmp_path / "first")
     first = report_of(tmp_path / "first")
@@ -117,9 +110,7 @@ def test_the_threshold_that_is_named_accepts_right_places_only(
     assert second["accepted"] == round(first["recall_at_100_precision"] * first["with_answer"])
 
 
-def test_a_report_leaves_the_images_alone_and_no_picture_of_an_earlier_one(
-    pair: tuple[Path, Path], compared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_report_leaves_the_images_alone_and_no_picture_of_an_earlier_one(pair, compared, tmp_path, capsys):
     folder = tmp_path / "images"
     folder.mkdir()
     for i, image in enumerate(frames(16)):
@@ -133,9 +124,7 @@ def test_a_report_leaves_the_images_alone_and_no_picture_of_an_earlier_one(
     assert (tmp_path / "out" / "coverage.png").exists()
 
 
-def test_options_that_do_nothing_for_ready_features_are_told(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_options_that_do_nothing_for_ready_features_are_told(tmp_path, caplog):
     np.save(tmp_path / "features.npy", np.random.default_rng(0).normal(size=(64, 8)).astype(np.float32))
     arguments = (tmp_path / "features.npy", "--map", tmp_path / "map.safetensors")
     run("learn", *arguments)
@@ -145,9 +134,7 @@ def test_options_that_do_nothing_for_ready_features_are_told(
 
 
 @pytest.mark.parametrize("name", [b"a\nb", b"a\x1b[2Jb", b"\xff\xfe"])
-def test_a_name_of_any_bytes_makes_one_line(
-    tmp_path: Path, name: bytes, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_name_of_any_bytes_makes_one_line(tmp_path, name, capsys):
     folder = tmp_path / os.fsdecode(name)
     folder.mkdir()
     (folder / "1.png").write_bytes(b"no image")
@@ -156,9 +143,7 @@ def test_a_name_of_any_bytes_makes_one_line(
         assert error.strip("\n").isprintable()
 
 
-def test_what_pillow_logs_is_no_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_what_pillow_logs_is_no_line(tmp_path, capsys, caplog):
     (tmp_path / "images").mkdir()
     path = tmp_path / "images" / "a.tif"
     Image.new("RGB", (5, 4)).save(path)
@@ -170,7 +155,7 @@ def test_what_pillow_logs_is_no_line(
     assert caplog.text == ""
 
 
-def test_numbers_of_any_size_are_evaluated(tmp_path: Path) -> None:
+def test_numbers_of_any_size_are_evaluated(tmp_path):
     far = 2**53 - 1
     (tmp_path / "m.csv").write_text(f"query,place,score\n0,{far},0.5\n{far},3,0.7\n")
     (tmp_path / "t.csv").write_text(f"0,{far}\n{far},5\n")

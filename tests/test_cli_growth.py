@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +16,7 @@ CHUNKS = ("--mapper.chunk", "32", "--whitening.views", "2")
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """A map in chunks of the first half of a route, and maps that cannot grow."""
     folder = tmp_path_factory.mktemp("growth")
     run("learn", FIRST, "--map", folder / "first.safetensors", *CHUNKS)
@@ -35,9 +34,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_map_grows_in_its_own_file_or_in_another(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_map_grows_in_its_own_file_or_in_another(folder, tmp_path, capsys):
     first = folder / "first.safetensors"
     other, own = tmp_path / "other.safetensors", tmp_path / "own.safetensors"
     own.write_bytes(first.read_bytes())
@@ -56,7 +53,7 @@ def test_a_map_grows_in_its_own_file_or_in_another(
     assert model.calibration != DejaVu.load(first).calibration
 
 
-def test_calibration_of_the_new_places(folder: Path, tmp_path: Path) -> None:
+def test_calibration_of_the_new_places(folder, tmp_path):
     first, out = folder / "first.safetensors", tmp_path / "m.safetensors"
     run("learn", NEXT, "--append", first, "--map", out, "--calibration", "none")
     assert DejaVu.load(out).calibration is None
@@ -72,7 +69,7 @@ def test_calibration_of_the_new_places(folder: Path, tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def merged(folder: Path) -> Path:
+def merged(folder):
     """Two routes, described alike, in one map."""
     options = ("--whitening", folder / "first.safetensors", "--calibration", "none")
     run("learn", "sim:aerial?frames=96&seed=1", "--map", folder / "other.safetensors", *options)
@@ -81,9 +78,7 @@ def merged(folder: Path) -> Path:
     return both
 
 
-def test_merged_routes_are_listed_and_matches_name_them(
-    merged: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_merged_routes_are_listed_and_matches_name_them(merged, tmp_path, capsys):
     capsys.readouterr()
     run("info", merged)
     told = capsys.readouterr().out
@@ -114,7 +109,7 @@ def test_merged_routes_are_listed_and_matches_name_them(
     assert report_of(tmp_path / "e")["recall_at_5"] >= report["recall_at_1"]
 
 
-def test_live_names_the_route(merged: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_live_names_the_route(merged, capsys):
     capsys.readouterr()
     run("live", merged, "sim:aerial?frames=96&seed=1&traverse=1&start=90", "--sequence", "1")
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
@@ -127,9 +122,7 @@ def test_live_names_the_route(merged: Path, capsys: pytest.CaptureFixture[str]) 
 # further visits averaged in
 
 
-def test_a_second_traverse_is_averaged_in_before_coding(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_second_traverse_is_averaged_in_before_coding(folder, tmp_path, capsys):
     out = tmp_path / "m.safetensors"
     run("learn", ROUTE, "--average", f"{ROUTE}&traverse=1", "--map", out, *CHUNKS)
     assert "each place is the mean of" in capsys.readouterr().out
@@ -143,9 +136,7 @@ def test_a_second_traverse_is_averaged_in_before_coding(
     assert DejaVu.load(out).map.visits.tolist() == [[128, 2]]
 
 
-def test_a_visit_is_averaged_into_a_map_that_is_there(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_visit_is_averaged_into_a_map_that_is_there(folder, tmp_path, capsys):
     first, out = folder / "first.safetensors", tmp_path / "m.safetensors"
     before = first.read_bytes()
     run("learn", "--append", first, "--average", f"{FIRST}&traverse=1", "--map", out)
@@ -192,14 +183,7 @@ def test_a_visit_is_averaged_into_a_map_that_is_there(
         ("evaluate r.csv --truth 0 --out e --route first --map both.safetensors", ["r.csv, line 2"]),
     ],
 )
-def test_what_is_refused_leaves_all_files(
-    folder: Path,
-    merged: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    words: str,
-    said: list[str],
-) -> None:
+def test_what_is_refused_leaves_all_files(folder, merged, capsys, monkeypatch, words, said):
     monkeypatch.chdir(folder)
     np.save(folder / "e.npy", np.load(folder / "d.npy"))
     (folder / "r.csv").write_text("query,place,score\n0,0,.1\n")

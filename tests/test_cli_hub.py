@@ -6,14 +6,12 @@ import json
 import re
 import shlex
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from command_line import fails, run
-from torch import Tensor, nn
+from torch import nn
 
 from dejavu_torch import HOG, DejaVu
 from dejavu_torch.cli.commands import run_learn
@@ -30,7 +28,7 @@ RESNET = {"backbone": "ResNet50", "fc_output_dim": 2048}
 SELA = {"backbone": "dinov2-large", "aggregation": "gem", "hashing": True, "rerank": True}
 ANYLOC = {"backbone": "DINOv2", "domain": "urban"}
 # the call, the size of the frames, and how many numbers come of it
-CALLS: dict[str, tuple[tuple[str, str], dict[str, Any], tuple[int, int], int]] = {
+CALLS = {
     "megaloc": (("gmberton/MegaLoc", "get_trained_model"), {}, (322, 322), 8448),
     "eigenplaces": (("gmberton/eigenplaces", "get_trained_model"), RESNET, (480, 640), 2048),
     "cosplace": (("gmberton/cosplace", "get_trained_model"), RESNET, (480, 640), 2048),
@@ -60,7 +58,7 @@ class Net(nn.Module):
         super().__init__()
         self.repository, self.linear = repository, nn.Linear(12, numbers)
 
-    def forward(self, frames: Tensor) -> object:
+    def forward(self, frames):
         made = self.linear(nn.functional.adaptive_avg_pool2d(frames, 2).flatten(1))
         if "queries" in self.repository:  # the attention of each block
             return made, [made.view(len(made), -1, 2)]
@@ -68,11 +66,11 @@ class Net(nn.Module):
 
 
 @pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+def asked(monkeypatch):
     """Calls of `torch.hub.load`."""
-    calls: list[dict[str, Any]] = []
+    calls = []
 
-    def load(repo_or_dir: str, model: str, **arguments: Any) -> nn.Module:
+    def load(repo_or_dir, model, **arguments):
         calls.append({"repository": repo_or_dir, "entry": model, **arguments})
         sys.stdout.write("Using a cache\n")  # as some do
         torch.manual_seed(0)
@@ -84,12 +82,12 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     return calls
 
 
-def features_of(*words: str) -> Any:
+def features_of(*words):
     return parse("learn", run_learn, [ROUTE, "--map", "map.safetensors", *words])["model"].features
 
 
 @pytest.mark.parametrize("name", CALLS)
-def test_a_short_name_is_this_call(name: str, asked: list[dict[str, Any]]) -> None:
+def test_a_short_name_is_this_call(name, asked):
     (repository, entry), arguments, size, numbers = CALLS[name]
     net = features_of("--features", f"hub:{name}")
     assert asked == [{"repository": repository, "entry": entry, "trust_repo": True} | arguments]
@@ -104,7 +102,7 @@ def test_a_short_name_is_this_call(name: str, asked: list[dict[str, Any]]) -> No
         assert set(features.unique().tolist()) == {-1.0, 1.0}
 
 
-def test_all_of_them_are_tried() -> None:
+def test_all_of_them_are_tried():
     assert NETWORKS.keys() == CALLS.keys()
 
 
@@ -115,14 +113,14 @@ def test_all_of_them_are_tried() -> None:
         "--features.network.domain=aerial --features.resize=[28,42] --features=hub:anyloc",
     ],
 )
-def test_options_overrule_it_wherever_they_are(words: str, asked: list[dict[str, Any]]) -> None:
+def test_options_overrule_it_wherever_they_are(words, asked):
     net = features_of(*words.split())
     assert net.resize == (28, 42)
     assert net.mean == MEAN
     assert [one["domain"] for one in asked] == ["aerial"]
 
 
-def test_the_words_in_full_are_the_same(asked: list[dict[str, Any]]) -> None:
+def test_the_words_in_full_are_the_same(asked):
     page = (Path(__file__).parents[1] / "docs" / "howto" / "pretrained.md").read_text().replace("\\\n", " ")
     shown = re.findall(r"^dejavu learn \S+ --map \S+ (.*eigenplaces.*)$", page, re.MULTILINE)
     nets = [features_of(*shlex.split(words)) for words in shown]
@@ -139,7 +137,7 @@ def test_the_words_in_full_are_the_same(asked: list[dict[str, Any]]) -> None:
         "[{class_path: HOG}, {class_path: hub:cricavpr, init_args: {resize: [224, 224]}}]",
     ],
 )
-def test_as_a_member_of_a_list(value: str, asked: list[dict[str, Any]]) -> None:
+def test_as_a_member_of_a_list(value, asked):
     joined = features_of("--features", value)
     assert isinstance(joined, Joined)
     assert [type(one) for one in joined.members] == [HOG, Embedding]
@@ -147,14 +145,14 @@ def test_as_a_member_of_a_list(value: str, asked: list[dict[str, Any]]) -> None:
     assert asked[0] == asked[1]
 
 
-def test_a_member_has_settings_of_its_own(asked: list[dict[str, Any]]) -> None:
+def test_a_member_has_settings_of_its_own(asked):
     member = "{class_path: hub:megaloc, init_args: {resize: [28, 42], mean: .5}}"
     net = features_of("--features", f"[HOG, {member}]").members[1]
     assert (net.resize, net.mean, net.std) == ((28, 42), 0.5, STD)
     assert len(asked) == 1
 
 
-def test_a_member_has_arguments_of_its_own(asked: list[dict[str, Any]]) -> None:
+def test_a_member_has_arguments_of_its_own(asked):
     page = (Path(__file__).parents[1] / "docs" / "howto" / "pretrained.md").read_text().replace("\n", " ")
     shown = re.findall(r"`(\[HOG, \{class_path: hub.*?\}\])`", page)
     assert len(shown) == 1
@@ -173,9 +171,7 @@ def test_a_member_has_arguments_of_its_own(asked: list[dict[str, Any]]) -> None:
         ("init_args: {network.domain: aerial}", "hub:anyloc with network.domain;"),
     ],
 )
-def test_what_stands_beside_a_member_is_not_dropped(
-    beside: str, seen: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_stands_beside_a_member_is_not_dropped(beside, seen, capsys):
     value = f"[HOG, {{class_path: hub:anyloc, {beside}}}]"
     error = fails(capsys, "learn", ROUTE, "--map", "map.safetensors", "--features", value)
     assert f"{seen} expected settings under init_args" in error
@@ -190,9 +186,7 @@ CONFIGS = [
 
 
 @pytest.mark.parametrize("features", CONFIGS)
-def test_settings_of_a_config_are_not_its_own(
-    features: str, asked: list[dict[str, Any]], tmp_path: Path
-) -> None:
+def test_settings_of_a_config_are_not_its_own(features, asked, tmp_path):
     config = tmp_path / "own.yaml"
     config.write_text(f"features: {features}\nmapper: {{init_args: {{route_bytes_per_place: 3}}}}\n")
     words = "--features", "hub:megaloc", "--features.resize=[28,42]"
@@ -203,14 +197,14 @@ def test_settings_of_a_config_are_not_its_own(
 
 
 @pytest.mark.parametrize("value", ["hub:megaloc", "[hub:megaloc]", "{class_path: hub:megaloc}"])
-def test_a_config_takes_it(value: str, asked: list[dict[str, Any]], tmp_path: Path) -> None:
+def test_a_config_takes_it(value, asked, tmp_path):
     (tmp_path / "own.yaml").write_text(f"features: {value}")
     net = features_of("--config", str(tmp_path / "own.yaml"))
     assert repr(net) == repr(features_of("--features", value))
 
 
 @pytest.mark.parametrize("value", ["hub:megalock", "[HOG, hub:megalock]", "hub:"])
-def test_an_unknown_name_lists_the_known(value: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unknown_name_lists_the_known(value, capsys):
     error = fails(capsys, "learn", ROUTE, "--map", "map.safetensors", "--features", value)
     assert ": hub:" in error
     assert all(f"hub:{name}" in error for name in CALLS)
@@ -224,9 +218,7 @@ def test_an_unknown_name_lists_the_known(value: str, capsys: pytest.CaptureFixtu
         (run_live, ("map.safetensors", ROUTE)),
     ],
 )
-def test_other_commands_take_it(
-    call: Callable[..., None], words: tuple[str, ...], asked: list[dict[str, Any]]
-) -> None:
+def test_other_commands_take_it(call, words, asked):
     parsed = parse(call.__name__.removeprefix("run_"), call, [*words, "--features", "hub:megaloc"])
     net = parsed["model"].features if "model" in parsed else parsed["loading"].features
     assert isinstance(net, Embedding)
@@ -234,13 +226,7 @@ def test_other_commands_take_it(
 
 
 @pytest.mark.parametrize("value", ["hub:selavpr++", "[HOG, hub:eigenplaces]"])
-def test_the_next_line_runs(
-    value: str,
-    asked: list[dict[str, Any]],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_the_next_line_runs(value, asked, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     run("learn", ROUTE, "--map", "map.safetensors", "--features", value)
     told = shlex.split(capsys.readouterr().out.rpartition("next: dejavu ")[2])
@@ -256,13 +242,7 @@ def test_the_next_line_runs(
 
 
 @pytest.mark.parametrize("config", [(), ("--config", "train_road")])
-def test_a_training_takes_it_and_says_the_words(
-    config: tuple[str, ...],
-    asked: list[dict[str, Any]],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_training_takes_it_and_says_the_words(config, asked, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     made = (
         "--model.backbone",
@@ -282,7 +262,7 @@ def test_a_training_takes_it_and_says_the_words(
     assert asked[0] == asked[-1]
 
 
-def test_a_repository_that_is_really_loaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_repository_that_is_really_loaded(tmp_path, monkeypatch):
     code = (
         "dependencies = ['torch']\n"
         "from torch import nn\n"

@@ -8,10 +8,7 @@ import re
 import signal
 import subprocess
 import time
-from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from typing import Any
 from urllib.request import urlopen
 
 import numpy as np
@@ -25,7 +22,6 @@ from videos import H264, clip, piped
 from dejavu_torch import DejaVu, LiveLocalizer, PlaceFilter, SpectralMapper, Whitening, open_source
 from dejavu_torch.cli.localize import run_live
 from dejavu_torch.cli.parser import parse
-from dejavu_torch.live.localizer import LiveMatch
 from dejavu_torch.live.page import Page
 
 KEYS = ["frame", "time", "place", "reference_frame", "name", "score", "posterior", "probability", "accepted"]
@@ -33,7 +29,7 @@ KEYS += ["milliseconds"]
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """A map of a drive, another drive as a video and as a stream, and one of other pixels."""
     folder = tmp_path_factory.mktemp("live")
     first, second = (
@@ -50,17 +46,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def _pixels(frames: torch.Tensor) -> Any:
+def _pixels(frames):
     return (frames * 255).round().byte().permute(0, 2, 3, 1).contiguous().numpy()
 
 
-def lines_of(text: str) -> list[dict[str, Any]]:
+def lines_of(text):
     return [json.loads(line) for line in text.splitlines()]
 
 
-def test_a_line_a_frame_as_localize_finds_them(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_line_a_frame_as_localize_finds_them(folder, tmp_path, capsys):
     run("live", folder / "map.safetensors", folder / "second.mkv")
     out, err = capsys.readouterr()
     found = lines_of(out)
@@ -81,12 +75,10 @@ def test_a_line_a_frame_as_localize_finds_them(
 
 
 @pytest.mark.parametrize("lag", [10, 100])
-def test_with_a_lag_each_frame_has_its_line_later(
-    lag: int, folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_with_a_lag_each_frame_has_its_line_later(lag, folder, capsys, monkeypatch):
     titles = []
 
-    def interrupted(seconds: float) -> None:
+    def interrupted(seconds):
         if seconds > 60:
             raise KeyboardInterrupt
 
@@ -112,9 +104,7 @@ def test_with_a_lag_each_frame_has_its_line_later(
     assert "64 frames, 0 dropped" in err
 
 
-def test_a_filter_learns_and_queries_are_centred_on_the_way(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_filter_learns_and_queries_are_centred_on_the_way(folder, capsys):
     run("live", folder / "map.safetensors", folder / "second.mkv", "--learns", "--centre", "mean")
     found, model = lines_of(capsys.readouterr().out), DejaVu.load(folder / "map.safetensors")
     frames = open_source(folder / "second.mkv", model.frame_shape[1:])  # type: ignore[index,arg-type]
@@ -127,9 +117,7 @@ def test_a_filter_learns_and_queries_are_centred_on_the_way(
     assert all(one != pytest.approx(scores[0], abs=1e-3) for one in scores[1:])
 
 
-def test_a_pipe_is_brought_to_the_size_of_the_map(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_pipe_is_brought_to_the_size_of_the_map(folder, tmp_path, capsys):
     with piped(tmp_path, (folder / "second.ts").read_bytes()) as pipe:
         run("live", folder / "map.safetensors", pipe)
     out, err = capsys.readouterr()
@@ -144,13 +132,7 @@ def test_a_pipe_is_brought_to_the_size_of_the_map(
 @pytest.mark.parametrize(
     ("after", "words"), [("other.ts", ("64 x 64", "128 x 128")), (None, ("stalled", "0.4"))]
 )
-def test_what_was_found_is_kept_where_a_stream_fails(
-    after: str | None,
-    words: tuple[str, ...],
-    folder: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_what_was_found_is_kept_where_a_stream_fails(after, words, folder, tmp_path, capsys):
     data = b"".join((folder / name).read_bytes() for name in ("second.ts", after) if name)
     with piped(tmp_path, data, open_for=0 if after else 20) as pipe, pytest.raises(SystemExit) as stop:
         run("live", folder / "map.safetensors", pipe, "--timeout", "0.4")
@@ -161,13 +143,11 @@ def test_what_was_found_is_kept_where_a_stream_fails(
     assert len(lines_of(out)) == int(summary.split()[1]) > 0
 
 
-def test_frames_are_dropped_in_real_time_only(
-    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_frames_are_dropped_in_real_time_only(folder, capsys, monkeypatch):
     due = LiveLocalizer.due
     left_out = []
 
-    def slow(self: LiveLocalizer, frame: Any, dropped: int = 0) -> list[LiveMatch]:
+    def slow(self, frame, dropped=0):
         left_out.append(dropped)
         time.sleep(0.1)
         return due(self, frame, dropped)
@@ -184,22 +164,17 @@ def test_frames_are_dropped_in_real_time_only(
 
 
 @pytest.mark.parametrize("options", [(), ("--sequence", "1")], ids=" ".join)
-def test_the_page_shows_frame_reference_and_answer(
-    options: tuple[str, ...],
-    folder: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    states: list[dict[str, Any]] = []
+def test_the_page_shows_frame_reference_and_answer(options, folder, capsys, monkeypatch):
+    states = []
     show = Page.show
 
-    def shown(self: Page, snapshot: Any) -> None:
+    def shown(self, snapshot):
         show(self, snapshot)
         if snapshot.frame.number in (2, 30, 39):
             with urlopen(f"{self.url}state") as answer:
                 states.append(json.load(answer))
 
-    def interrupted(seconds: float) -> None:
+    def interrupted(seconds):
         if seconds > 60:
             raise KeyboardInterrupt
 
@@ -222,9 +197,7 @@ def test_the_page_shows_frame_reference_and_answer(
             assert sum(state["curve"]) + state["off"] == pytest.approx(1, abs=1e-3)
 
 
-def test_a_map_of_even_steps_is_refused_but_as_it_is(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_map_of_even_steps_is_refused_but_as_it_is(tmp_path, capsys):
     model = DejaVu(velocity=camera(), mapper=SpectralMapper(20.0), whitening="none").learn(footage(REFERENCE))
     model.save(tmp_path / "map.safetensors")
     np.save(tmp_path / "frames.npy", _pixels(footage(REFERENCE[:9]))[..., 0])
@@ -237,7 +210,7 @@ def test_a_map_of_even_steps_is_refused_but_as_it_is(
 
 
 @contextmanager
-def process(*words: str | Path) -> Iterator[Forked]:
+def process(*words):
     """`dejavu live` of its own; its lines can be read as they come."""
     code = "from dejavu_torch.cli import main; main()"
     pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
@@ -246,7 +219,7 @@ def process(*words: str | Path) -> Iterator[Forked]:
 
 
 @pytest.mark.parametrize("how", ["interrupt", "head"])
-def test_a_process_that_nobody_needs_any_more_ends(how: str, folder: Path, tmp_path: Path) -> None:
+def test_a_process_that_nobody_needs_any_more_ends(how, folder, tmp_path):
     """Ctrl-C is how a camera is ended; and who reads the lines may leave."""
     stream = piped(tmp_path, (folder / "second.ts").read_bytes() * 2, open_for=60)
     with stream as pipe, process(folder / "map.safetensors", pipe) as live:
@@ -259,7 +232,7 @@ def test_a_process_that_nobody_needs_any_more_ends(how: str, folder: Path, tmp_p
         assert re.fullmatch(r"dejavu: \d+ frames, \d+ dropped; .*\n", live.stderr.read())
 
 
-def test_a_page_of_a_file_plays_in_real_time_and_stays_until_ctrl_c(folder: Path, tmp_path: Path) -> None:
+def test_a_page_of_a_file_plays_in_real_time_and_stays_until_ctrl_c(folder, tmp_path):
     """A folder has no times: 10 frames a second. Nobody looks at the page, and none of its frames is lost."""
     np.save(tmp_path / "frames.npy", _pixels(next(open_source(folder / "second.mkv").batches(8))))
     with process(folder / "map.safetensors", tmp_path / "frames.npy", "--page", "0") as live:
@@ -292,11 +265,9 @@ def test_a_page_of_a_file_plays_in_real_time_and_stays_until_ctrl_c(folder: Path
         ("sim:aerial?frames=20 --learns --match single", "--learns with --match single"),
     ],
 )
-def test_mistakes_are_one_line(
-    words: str, told: str, folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_mistakes_are_one_line(words, told, folder, capsys):
     assert told in fails(capsys, "live", folder / "map.safetensors", *words.split())
 
 
-def test_a_bare_page_has_a_port() -> None:
+def test_a_bare_page_has_a_port():
     assert parse("live", run_live, ["map", "source", "--page"])["page"] == 8765

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import shlex
 import sys
-from pathlib import Path
 
 import pytest
 import torch
 from command_line import fails, run
-from torch import nn
 
 from dejavu_torch import DejaVu
 from dejavu_torch.cli.commands import run_learn
@@ -50,20 +48,20 @@ HUB = ("--features.network", "zoo.load", "--features.network.repo=a/b", "--featu
 
 
 @pytest.fixture(autouse=True)
-def zoo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def zoo(tmp_path, monkeypatch):
     (tmp_path / "zoo.py").write_text(ZOO)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "zoo", raising=False)
 
 
-def features_of(*words: str) -> nn.Module:
+def features_of(*words):
     model = parse("learn", run_learn, [ROUTE, "--map", "map.safetensors", *words])["model"]
     assert isinstance(model, DejaVu)
     return model.features
 
 
-def test_a_function_is_called_with_what_is_typed() -> None:
+def test_a_function_is_called_with_what_is_typed():
     own = ("backbone", "R50"), ("dim", "3"), ("out", "[2, 3]"), ("head", "null"), ("trust", "true")
     words = (word for name, value in own for word in (f"--features.network.{name}", value))
     net = features_of(*OWN, *HUB, *words)
@@ -85,14 +83,14 @@ def test_a_function_is_called_with_what_is_typed() -> None:
     ],
     ids=["typed", "ahead", "method", "class"],
 )  # fmt: skip
-def test_functions_methods_and_classes(words: str, channels: int) -> None:
+def test_functions_methods_and_classes(words, channels):
     net = features_of(*OWN, *words.split())
     assert isinstance(net, Embedding)
     assert net.cell == 0  # the argument of another class than the default
     assert net(torch.rand(2, 3, 20, 20)).shape == (2, channels)
 
 
-def test_a_config_names_functions_likewise(tmp_path: Path) -> None:
+def test_a_config_names_functions_likewise(tmp_path):
     network = "{class_path: zoo.load, init_args: {repo: a, model: m, note: [1]}}"
     settings = f"{{dimension: null, network: {network}}}"
     (tmp_path / "own.yaml").write_text(f"features: {{class_path: Embedding, init_args: {settings}}}")
@@ -102,7 +100,7 @@ def test_a_config_names_functions_likewise(tmp_path: Path) -> None:
     assert zoo.asked == {"repo": "a", "model": "m", "source": "github", "note": [1]}
 
 
-def test_the_next_line_brings_the_network_back(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_next_line_brings_the_network_back(tmp_path, capsys):
     run(
         "learn",
         ROUTE,
@@ -143,15 +141,13 @@ def test_the_next_line_brings_the_network_back(tmp_path: Path, capsys: pytest.Ca
         (("zoo.typed", "--features.layer", "3"), ("Conv2d has no layer '3'",)),
     ],
 )
-def test_mistakes_are_one_line(
-    words: tuple[str, ...], seen: tuple[str, ...], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_mistakes_are_one_line(words, seen, capsys):
     error = fails(capsys, "learn", ROUTE, "--map", "map.safetensors", *OWN, "--features.network", *words)
     for word in seen:
         assert word in error
 
 
-def test_a_training_says_the_words_of_its_network(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_training_says_the_words_of_its_network(capsys):
     made = [word.replace("--features", "--model.backbone") for word in (*OWN, *HUB)]
     made[2] = "--model.backbone.dimension=4"
     steps = "--trainer.max_steps=1", "--trainer.accelerator=cpu", "--trainer.default_root_dir=run"

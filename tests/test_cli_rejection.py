@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from command_line import fails, report_of, rows_of, run
@@ -24,7 +22,7 @@ ROUTE, AGAIN, THIRD, SEA = (
 
 
 @pytest.fixture(scope="module")
-def learned(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def learned(tmp_path_factory):
     path = tmp_path_factory.mktemp("learned") / "map.safetensors"
     with pytest.MonkeyPatch.context() as patch:
         # as many copies of frames as outside of tests, for the probabilities of a filter
@@ -37,7 +35,7 @@ def learned(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_a_learned_map_tells_probabilities_and_accepts_by_them(learned: Path, tmp_path: Path) -> None:
+def test_a_learned_map_tells_probabilities_and_accepts_by_them(learned, tmp_path):
     for sequence in ((), ("--filter",)):
         run("localize", learned, AGAIN, "--precision", ".9", "--out", tmp_path / "m.csv", *sequence)
         found = rows_of(tmp_path / "m.csv")
@@ -47,7 +45,7 @@ def test_a_learned_map_tells_probabilities_and_accepts_by_them(learned: Path, tm
         assert any(row["accepted"] == "1" for row in found)
 
 
-def test_compare_reports_what_is_accepted_on_and_off_the_map(tmp_path: Path) -> None:
+def test_compare_reports_what_is_accepted_on_and_off_the_map(tmp_path):
     out = tmp_path / "out"
     others = f"[{SEA},{SEA}&seed=3]"
     words = ("--precision", ".9", "--calibration", THIRD, "--distractors", others)
@@ -70,9 +68,7 @@ def test_compare_reports_what_is_accepted_on_and_off_the_map(tmp_path: Path) -> 
     assert (again["accepted"], again["accepted_right"]) == (report["accepted"], report["accepted_right"])
 
 
-def test_no_calibration_where_none_is_wanted_or_can_be(
-    learned: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_no_calibration_where_none_is_wanted_or_can_be(learned, tmp_path, capsys):
     path = tmp_path / "map.safetensors"
     run("learn", ROUTE, "--map", path, "--calibration", "none")
     assert DejaVu.load(path).calibration is None
@@ -111,9 +107,7 @@ def test_no_calibration_where_none_is_wanted_or_can_be(
         ),
     ],
 )
-def test_options_that_exclude_each_other_are_told_before_anything_is_read(
-    capsys: pytest.CaptureFixture[str], line: str, told: tuple[str, ...]
-) -> None:
+def test_options_that_exclude_each_other_are_told_before_anything_is_read(capsys, line, told):
     error = fails(capsys, *line.split())
     assert [one for one in told if one not in error] == [], error
     assert "not there" not in error
@@ -137,8 +131,6 @@ def test_options_that_exclude_each_other_are_told_before_anything_is_read(
         ),
     ],
 )
-def test_traverses_that_do_not_serve(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], told: str
-) -> None:
+def test_traverses_that_do_not_serve(tmp_path, capsys, words, told):
     assert told in fails(capsys, "compare", ROUTE, AGAIN, "--out", tmp_path / "out", *words)
     assert not (tmp_path / "out").exists()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,7 +19,7 @@ OPTIONS = [*STEPS, *TEMPLATES, "--mapper.periods.false_alarm", "null"]
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """Footage of both traverses, their ground truth, a map and its matches."""
     folder = tmp_path_factory.mktemp("resampled")
     for name, where, noise in (("reference", REFERENCE, 0.0), ("query", QUERY, 0.02)):
@@ -33,20 +32,18 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def localize(folder: Path, name: str, *options: str) -> list[dict[str, str]]:
+def localize(folder, name, *options):
     command = ["localize", f"{folder}/m.safetensors", f"{folder}/query.npy", "--out", f"{folder}/{name}"]
     main([*command, *options])
     return list(csv.DictReader((folder / name).open()))
 
 
-def evaluate_file(folder: Path, truth: str, out: Path, *options: str) -> dict:
+def evaluate_file(folder, truth, out, *options):
     main(["evaluate", f"{folder}/matches.csv", "--truth", f"{folder}/{truth}", "--out", str(out), *options])
     return report_of(out)
 
 
-def test_convention_11_matches_count_frames_of_the_sources(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_convention_11_matches_count_frames_of_the_sources(folder, capsys):
     rows = localize(folder, "again.csv")
     assert f"{len(QUERY)} frames resampled to 101 even steps of 6 pixels of ground" in capsys.readouterr().out
     main(["info", f"{folder}/m.safetensors"])
@@ -60,7 +57,7 @@ def test_convention_11_matches_count_frames_of_the_sources(
     assert ((REFERENCE[places] - QUERY[queries]).abs() <= 2 * STEP).sum() > 95
 
 
-def test_compare_is_learn_localize_and_evaluate(folder: Path, tmp_path: Path) -> None:
+def test_compare_is_learn_localize_and_evaluate(folder, tmp_path):
     pair, truth = [f"{folder}/reference.npy", f"{folder}/query.npy"], ["--truth", f"{folder}/truth.csv"]
     main(["compare", *pair, *truth, "--out", f"{tmp_path}/c", *OPTIONS])
     report = report_of(tmp_path / "c")
@@ -75,7 +72,7 @@ def test_compare_is_learn_localize_and_evaluate(folder: Path, tmp_path: Path) ->
     assert "right within 5 places at even steps" in (tmp_path / "c" / "index.html").read_text()
 
 
-def test_another_camera_and_frames_as_they_come(folder: Path) -> None:
+def test_another_camera_and_frames_as_they_come(folder):
     # half of the ground fills the patch: it seems to move twice as fast
     rows = localize(folder, "half.csv", "--corners", "[[0,0.5],[1,0.5],[1,1],[0,1]]")
     assert len(rows) == pytest.approx(2 * 101, rel=0.05)
@@ -83,9 +80,7 @@ def test_another_camera_and_frames_as_they_come(folder: Path) -> None:
     assert [int(row["query"]) for row in rows] == list(range(len(QUERY)))
 
 
-def test_ground_that_cannot_be_is_refused(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_ground_that_cannot_be_is_refused(folder, tmp_path, capsys):
     outside = "[[0,0],[1,0],[1,1.5],[0,1]]"
     learn = "learn", folder / "reference.npy", "--map", tmp_path / "m.safetensors"
     assert "lie outside the frame" in fails(capsys, *learn, "--velocity.corners", outside)
@@ -96,7 +91,7 @@ def test_ground_that_cannot_be_is_refused(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_bare_velocity_is_understood(folder: Path, tmp_path: Path) -> None:
+def test_a_bare_velocity_is_understood(folder, tmp_path):
     command = ["learn", f"{folder}/reference.npy", "--map", f"{tmp_path}/m.safetensors", "--velocity"]
     main([*command, *OPTIONS])
     assert DejaVu.load(tmp_path / "m.safetensors").step == STEP

@@ -28,7 +28,7 @@ THIRD = "sim:aerial?frames=96&traverse=2"
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """A spectral map of the route, and frames and features in files."""
     folder = tmp_path_factory.mktemp("spectral")
     run("learn", ROUTE, "--map", folder / "m.safetensors")
@@ -40,13 +40,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def model_of(*words: str | Path) -> DejaVu:
+def model_of(*words):
     model = parse("learn", run_learn, ["x", "--map", "y", *map(str, words)])["model"]
     assert isinstance(model, DejaVu)
     return model
 
 
-def same_maps(first: Path, second: Path) -> bool:
+def same_maps(first, second):
     (one, header), (other, other_header) = read_map(first), read_map(second)
     return header == other_header and all(torch.equal(one[name], other[name]) for name in one)
 
@@ -54,9 +54,7 @@ def same_maps(first: Path, second: Path) -> bool:
 # what works
 
 
-def test_searches_of_localize(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_searches_of_localize(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(coarse, "MIN_PLACES", 0)  # as a long map is searched
     path, out = tmp_path / "m.safetensors", tmp_path / "m.csv"
     run("learn", ROUTE, "--map", path, "--mapper.chunk", "32", "--features", "HOG")
@@ -74,12 +72,12 @@ def test_searches_of_localize(
     assert "single queries: samples every" in capsys.readouterr().out
 
 
-def places(path: Path) -> list[str]:
+def places(path):
     with path.open() as file:
         return [row["place"] for row in csv.DictReader(file)]
 
 
-def test_two_processes_write_the_same_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_processes_write_the_same_bytes(tmp_path, monkeypatch):
     monkeypatch.setattr(distilled, "resize_frames", resize_frames)  # as it is there
     kinds = {"spectral": ("--whitening.views", "2"), "templates": TEMPLATES}
     words = {name: ["learn", ROUTE, *kind, "--map"] for name, kind in kinds.items()}
@@ -97,7 +95,7 @@ def test_two_processes_write_the_same_bytes(tmp_path: Path, monkeypatch: pytest.
         assert here.read_bytes() == other.read_bytes()
 
 
-def test_learn_and_info_tell_what_the_map_holds(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_learn_and_info_tell_what_the_map_holds(folder, capsys):
     path = folder / "told.safetensors"
     run("learn", ROUTE, "--map", path, "--whitening.views", "2")
     learned = capsys.readouterr().out
@@ -117,7 +115,7 @@ def test_learn_and_info_tell_what_the_map_holds(folder: Path, capsys: pytest.Cap
     assert "route_bytes_per_place=None" in info
 
 
-def test_a_seed_makes_the_copies_and_nothing_else_is_drawn(folder: Path) -> None:
+def test_a_seed_makes_the_copies_and_nothing_else_is_drawn(folder):
     paths = [folder / f"seed{i}.safetensors" for i in range(3)]
     run("learn", ROUTE, "--map", paths[0], "--seed", "3")
     run("learn", ROUTE, "--map", paths[1], "--seed", "3")
@@ -127,7 +125,7 @@ def test_a_seed_makes_the_copies_and_nothing_else_is_drawn(folder: Path) -> None
     assert not same_maps(paths[0], folder / "m.safetensors")
 
 
-def test_options_of_parts_and_null_the_whitening_that_suits_the_mapper() -> None:
+def test_options_of_parts_and_null_the_whitening_that_suits_the_mapper():
     model = model_of("--whitening.views", "2", "--mapper.route_bytes_per_place=null", "--mapper.step", "0.1")
     assert isinstance(model.mapper, SpectralMapper)
     assert model.whitening is not None
@@ -137,7 +135,7 @@ def test_options_of_parts_and_null_the_whitening_that_suits_the_mapper() -> None
     assert model_of(*TEMPLATES, "--whitening", "null").whitening is None
 
 
-def test_the_whitening_of_another_map_with_what_is_ahead_of_it(folder: Path) -> None:
+def test_the_whitening_of_another_map_with_what_is_ahead_of_it(folder):
     path, own = folder / "coarse.safetensors", folder / "own.safetensors"
     options = "--features.cell", "16", "--preprocess.contrast", "patch", "--whitening.numbers", "9"
     plain = "--calibration", "none"
@@ -153,7 +151,7 @@ def test_the_whitening_of_another_map_with_what_is_ahead_of_it(folder: Path) -> 
     assert report_of(folder / "fixed")["recall_at_1"] > 0.8
 
 
-def test_compare_learns_its_whitening_from_a_third_traverse(folder: Path) -> None:
+def test_compare_learns_its_whitening_from_a_third_traverse(folder):
     out = folder / "third"
     run("compare", ROUTE, SECOND, "--second", THIRD, "--seed", "1", "--out", out)
     run("learn", ROUTE, "--map", folder / "third.safetensors", "--second", THIRD, "--seed", "1")
@@ -163,7 +161,7 @@ def test_compare_learns_its_whitening_from_a_third_traverse(folder: Path) -> Non
     assert report_of(out)["kind"] == "spectral"
 
 
-def test_whitening_learns_from_several_visits(folder: Path) -> None:
+def test_whitening_learns_from_several_visits(folder):
     fourth = ROUTE + "&traverse=3"
     both = f"['{THIRD}','{fourth}']"
     given = {
@@ -180,7 +178,7 @@ def test_whitening_learns_from_several_visits(folder: Path) -> None:
     assert report_of(folder / "of_both")["recall_at_1"] > 0.9
 
 
-def test_a_map_that_holds_a_share(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_map_that_holds_a_share(folder, capsys):
     """By a word or a file; the map knows it."""
     path, config = folder / "held.safetensors", folder / "hold.yaml"
     config.write_text("mapper: {class_path: SpectralMapper, init_args: {hold: 0.9, chunk: 300}}\n")
@@ -224,13 +222,7 @@ def test_a_map_that_holds_a_share(folder: Path, capsys: pytest.CaptureFixture[st
         ("--filter", ("unrecognized arguments: --filter",)),
     ],
 )
-def test_settings_that_do_not_fit(
-    folder: Path,
-    words: str,
-    told: tuple[str, ...],
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_settings_that_do_not_fit(folder, words, told, capsys, monkeypatch):
     monkeypatch.chdir(folder)
     error = fails(capsys, "learn", "a.npy", "--map", "new.safetensors", *words.split())
     assert [word for word in told if word not in error] == [], error
@@ -238,7 +230,7 @@ def test_settings_that_do_not_fit(
 
 
 @pytest.fixture
-def noisy(tmp_path: Path) -> tuple[Path, Path]:
+def noisy(tmp_path):
     """Two traverses of which single frames are hard to find."""
     noise = np.random.default_rng(0)
     walk = noise.normal(size=(200, 8)).cumsum(0)
@@ -247,7 +239,7 @@ def noisy(tmp_path: Path) -> tuple[Path, Path]:
     return tmp_path / "one.npy", tmp_path / "two.npy"
 
 
-def assert_same_matches(one: Path, other: Path) -> None:
+def assert_same_matches(one, other):
     """Equal but for rounding: a command that localizes alone multiplies other batches."""
     tables = [list(csv.DictReader(path.open(newline=""))) for path in (one, other)]
     scores = [[float(row.pop("score")) for row in table] for table in tables]
@@ -255,9 +247,7 @@ def assert_same_matches(one: Path, other: Path) -> None:
     assert scores[0] == pytest.approx(scores[1], rel=1e-5)
 
 
-def test_a_sequence_is_of_the_map_and_of_all_beside_it(
-    noisy: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_sequence_is_of_the_map_and_of_all_beside_it(noisy, tmp_path, capsys):
     one, two = noisy
     run("compare", one, two, "--truth", 0, "--tolerance", 1, "--sequence", 9, "--out", tmp_path / "9")
     report = report_of(tmp_path / "9")
@@ -280,7 +270,7 @@ def test_a_sequence_is_of_the_map_and_of_all_beside_it(
     assert places(matches) == [str(place) for place in expected.index.tolist()]
 
 
-def test_a_filter_is_of_the_map_and_of_all_beside_it(noisy: tuple[Path, Path], tmp_path: Path) -> None:
+def test_a_filter_is_of_the_map_and_of_all_beside_it(noisy, tmp_path):
     one, two = noisy
     out = tmp_path / "out"
     run("compare", one, two, "--truth", 0, "--filter", "--out", out)

@@ -6,7 +6,6 @@ import errno
 import signal
 import subprocess
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from processes import PACKAGE, Forked
 
 from dejavu_torch.cli import main
 from dejavu_torch.learning import ChunkEncoder
-from dejavu_torch.maps.spectral_map import Chunk
 from dejavu_torch.model import DejaVu
 
 # more than the sample, of which features are ready
@@ -25,7 +23,7 @@ LONG, NUMBERS = 16_100, 8
 
 
 @pytest.fixture(scope="module")
-def route(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def route(tmp_path_factory):
     noise = torch.randn(LONG + 19, NUMBERS, generator=torch.Generator().manual_seed(0))
     smooth = 9 * torch.nn.functional.avg_pool1d(noise.T[:, None], 20, 1)[:, 0].T
     path = tmp_path_factory.mktemp("route") / "route.npy"
@@ -34,16 +32,14 @@ def route(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def whole(route: Path) -> Path:
+def whole(route):
     """The map of a run that nothing disturbs."""
     path = route.with_name("whole.safetensors")
     main(["learn", str(route), "--map", str(path), *CHUNKED])
     return path
 
 
-def test_a_killed_run_goes_on_where_it_was(
-    route: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_killed_run_goes_on_where_it_was(route, whole, tmp_path, monkeypatch):
     out, part = tmp_path / "route.safetensors", tmp_path / "route.safetensors.part"
     words = ["learn", str(route), "--map", str(out), *CHUNKED]
     program = "import sys; from dejavu_torch import learning; learning.SAVE_INTERVAL = 0; "
@@ -55,11 +51,11 @@ def test_a_killed_run_goes_on_where_it_was(
     process.kill()
     assert process.wait() == -signal.SIGKILL
     assert not out.exists()
-    began: list[int] = []
+    began = []
 
     encode = ChunkEncoder.__call__
 
-    def noted(encoder: ChunkEncoder, frames: range) -> Chunk:
+    def noted(encoder, frames):
         began.append(frames.start)
         return encode(encoder, frames)
 
@@ -70,10 +66,8 @@ def test_a_killed_run_goes_on_where_it_was(
     assert sorted(file.name for file in tmp_path.iterdir()) == [out.name]
 
 
-def test_another_command_does_not_take_over_what_is_finished(
-    route: Path, whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def full(*_: object) -> None:
+def test_another_command_does_not_take_over_what_is_finished(route, whole, tmp_path, capsys):
+    def full(*_):
         raise OSError(errno.ENOSPC, "full")
 
     out, part = tmp_path / "route.safetensors", tmp_path / "route.safetensors.part"
@@ -94,7 +88,7 @@ def test_another_command_does_not_take_over_what_is_finished(
     assert not part.exists()
 
 
-def test_several_sources_are_one_route(tmp_path: Path) -> None:
+def test_several_sources_are_one_route(tmp_path):
     images = frames(60, size=16)
     every = write_images(tmp_path / "every", images)
     parts = write_images(tmp_path / "a", images[:25]), write_images(tmp_path / "b", images[25:])

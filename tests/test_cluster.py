@@ -8,16 +8,12 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
 import torch
 from command_line import fails, frames, run, write_images
 from helpers import Fixed, long_from, refused, template_model
-from torch import Tensor, nn
 
 from dejavu_torch import cluster as clustering
 from dejavu_torch.cluster import Cluster, ClusterSearch
@@ -27,9 +23,9 @@ from dejavu_torch.features.views import LabelledFrames
 from dejavu_torch.growth import learn_mean, merge
 from dejavu_torch.learning import Checkpoint, Sample
 from dejavu_torch.maps.spectral import SpectralMapper
-from dejavu_torch.maps.spectral_map import Chunk, SpectralMap
+from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.model import DejaVu
-from dejavu_torch.types import FrequencyLayer, Traverse
+from dejavu_torch.types import FrequencyLayer
 
 CHUNK, PLACES = 50, 620
 FEATURES = """
@@ -57,7 +53,7 @@ class Watched(torch.nn.Module):
 
 
 @pytest.fixture(scope="module")
-def cluster() -> Iterator[Cluster]:
+def cluster():
     """Two workers for all tests here: to start Ray takes seconds."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(clustering, "_processors", lambda: 2)
@@ -66,40 +62,40 @@ def cluster() -> Iterator[Cluster]:
 
 
 @pytest.fixture(autouse=True)
-def _small(monkeypatch: pytest.MonkeyPatch) -> None:
+def _small(monkeypatch):
     long_from(monkeypatch, 400)
     monkeypatch.setattr(clustering, "TASK", 100)
 
 
 @pytest.fixture
-def watched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> nn.Module:
+def watched(tmp_path, monkeypatch):
     """Features of a user's own file, which is gone before any worker could read it."""
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "features_of_mine.py").write_text(FEATURES)
-    module: ModuleType = importlib.import_module("features_of_mine")
+    module = importlib.import_module("features_of_mine")
     (tmp_path / "features_of_mine.py").unlink()
     monkeypatch.delitem(sys.modules, "features_of_mine", raising=False)
     sys.modules["features_of_mine"] = module
-    features: nn.Module = module.Watched(tmp_path)
+    features = module.Watched(tmp_path)
     return features
 
 
-def route() -> Tensor:
+def route():
     noise = torch.randn(PLACES + 9, 1, 8, generator=torch.Generator().manual_seed(1))
     return 4 * torch.nn.functional.avg_pool1d(noise.permute(2, 1, 0), 10, 1)[:, 0].T.contiguous()
 
 
-def learned(traverse: Traverse | Tensor, features: nn.Module | None = None, **settings: object) -> DejaVu:
+def learned(traverse, features=None, **settings):
     model = DejaVu(features, "none", SpectralMapper(6.0, chunk=CHUNK))
     return model.learn(traverse, **settings)  # type: ignore[arg-type]
 
 
-def file_of(model: DejaVu, folder: Path) -> bytes:
+def file_of(model, folder):
     model.save(folder / "map.safetensors")
     return (folder / "map.safetensors").read_bytes()
 
 
-def test_workers_write_the_file_of_one_process(cluster: Cluster, tmp_path: Path) -> None:
+def test_workers_write_the_file_of_one_process(cluster, tmp_path):
     """Whitened, and with a second traverse averaged in."""
     visits, files = LabelledFrames(ArrayTraverse(route() + 0.1), torch.arange(PLACES)), []
     for map_tasks in (map, cluster.map):
@@ -108,12 +104,12 @@ def test_workers_write_the_file_of_one_process(cluster: Cluster, tmp_path: Path)
     assert files[0] == files[1]
 
 
-def test_a_worker_that_is_killed_is_made_up_for(cluster: Cluster, watched: nn.Module, tmp_path: Path) -> None:
+def test_a_worker_that_is_killed_is_made_up_for(cluster, watched, tmp_path):
     images = write_images(tmp_path / "route", frames(PLACES, size=16))
     whole = file_of(learned(open_source(images), watched), tmp_path)
-    killed: list[int] = []
+    killed = []
 
-    def kill() -> None:
+    def kill():
         stop = time.monotonic() + 60
         while not killed and time.monotonic() < stop:
             for file in tmp_path.glob("*.worker"):
@@ -135,9 +131,7 @@ def test_a_worker_that_is_killed_is_made_up_for(cluster: Cluster, watched: nn.Mo
     assert file_of(model, tmp_path) == whole
 
 
-def test_what_cannot_be_made_is_named_and_what_precedes_it_is_kept(
-    cluster: Cluster, watched: nn.Module, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_cannot_be_made_is_named_and_what_precedes_it_is_kept(cluster, watched, tmp_path, monkeypatch):
     monkeypatch.setattr(clustering, "RETRIES", 0)
     bright = frames(PLACES, size=16)
     bright[444] = 255
@@ -148,13 +142,13 @@ def test_what_cannot_be_made_is_named_and_what_precedes_it_is_kept(
     (images / "110.png").write_bytes(b"no image")
     (tmp_path / "go").touch()
     (tmp_path / "deadly").touch()
-    began: list[int] = []
+    began = []
 
-    def noted(encode: Callable[[range], Chunk], tasks: list[range]) -> Iterator[Chunk]:
+    def noted(encode, tasks):
         began.append(tasks[0].start)
         return cluster.map(encode, tasks)
 
-    def learn() -> DejaVu:
+    def learn():
         return learned(open_source(images), watched, checkpoint=Checkpoint(tmp_path / "m"), map_tasks=noted)
 
     with refused("110.png", "read on", "frames 100 to 199", "100 of 620 places"):
@@ -167,7 +161,7 @@ def test_what_cannot_be_made_is_named_and_what_precedes_it_is_kept(
     assert began == [0, 100, 400]
 
 
-def test_chunks_made_together_before_a_bad_frame_are_kept(cluster: Cluster, tmp_path: Path) -> None:
+def test_chunks_made_together_before_a_bad_frame_are_kept(cluster, tmp_path):
     bad = route()
     bad[544] = torch.nan
     assert 544 not in Sample.of(PLACES, CHUNK).frame
@@ -175,14 +169,14 @@ def test_chunks_made_together_before_a_bad_frame_are_kept(cluster: Cluster, tmp_
         learned(bad, checkpoint=Checkpoint(tmp_path / "m"), map_tasks=cluster.map)
 
 
-def found_by(model: DejaVu, queries: Tensor, search: ClusterSearch | None = None) -> list[Tensor]:
+def found_by(model, queries, search=None):
     if search is not None:
         model.searcher = search
     match, best = model.localize(queries), model.candidates(queries, 4, apart=3)
     return [match.index, match.score, *best, match.accepted]
 
 
-def test_parts_of_a_map_on_workers_find_what_the_whole_does(cluster: Cluster) -> None:
+def test_parts_of_a_map_on_workers_find_what_the_whole_does(cluster):
     # with ties between the chunks of one part, and of both
     again = torch.cat([route() * (1 + i / 9) for i in range(64 // 8)], 1)[:500].repeat(20, 1)
     steps = {0.3: (CHUNK, again), 0.2: (40, again[:600])}
@@ -201,7 +195,7 @@ def test_parts_of_a_map_on_workers_find_what_the_whole_does(cluster: Cluster) ->
     assert (found[0] == whole[0]).float().mean() > 0.9  # of places whose scores differ by rounding, any
 
 
-def test_a_part_scores_as_in_the_whole_map(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_part_scores_as_in_the_whole_map(monkeypatch):
     settings = None, "none", SpectralMapper(6.0, chunk=CHUNK)
     models = [DejaVu(*settings).learn(route()[i:] + i) for i in (0, 300)]  # of other means
     whole, queries = merge(models, ["one", "two"]).map, route()[:3]
@@ -212,7 +206,7 @@ def test_a_part_scores_as_in_the_whole_map(monkeypatch: pytest.MonkeyPatch) -> N
         assert torch.allclose(part.scores(queries), expected, atol=1e-6)
 
 
-def test_probabilities_are_those_of_the_whole_map_whatever_happens_to_a_worker(cluster: Cluster) -> None:
+def test_probabilities_are_those_of_the_whole_map_whatever_happens_to_a_worker(cluster):
     torch.manual_seed(0)
     views = LabelledFrames(ArrayTraverse(route() + 0.3 * torch.randn(PLACES, 8)), torch.arange(PLACES))
     model = DejaVu(None, "none", SpectralMapper(6.0, chunk=CHUNK), precision=0.9).learn(route())
@@ -238,7 +232,7 @@ def test_probabilities_are_those_of_the_whole_map_whatever_happens_to_a_worker(c
         )
 
 
-def test_a_short_route_starts_no_cluster(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_short_route_starts_no_cluster(tmp_path, capsys):
     np.save(tmp_path / "route.npy", route()[:64])
     command = ("learn", tmp_path / "route.npy", "--map", tmp_path / "map.safetensors", "--mapper.chunk", "50")
     with pytest.MonkeyPatch.context() as patch:
@@ -247,7 +241,7 @@ def test_a_short_route_starts_no_cluster(tmp_path: Path, capsys: pytest.CaptureF
     assert "is not used for 64 frames" in capsys.readouterr().out
 
 
-def test_a_cluster_that_is_not_there_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_cluster_that_is_not_there_is_refused(tmp_path, capsys):
     command = ("learn", "sim:aerial?frames=64", "--map", tmp_path / "map.safetensors")
     chunked = (*command, "--mapper.chunk", "50")
     assert "--device" in fails(capsys, *chunked, "--cluster", "auto", "--device", "cuda")

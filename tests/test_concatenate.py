@@ -3,7 +3,6 @@ from __future__ import annotations
 import errno
 import tempfile
 import weakref
-from collections.abc import Iterator
 from pathlib import Path
 from unittest import mock
 
@@ -13,7 +12,6 @@ from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
 from processes import python
-from torch import Tensor
 
 from dejavu_torch import memory
 from dejavu_torch.memory import concatenate
@@ -22,7 +20,7 @@ from dejavu_torch.memory import concatenate
 @given(
     rows=st.integers(1, 40), batch=st.integers(1, 9), block=st.integers(0, 300), in_memory=st.integers(0, 500)
 )
-def test_whatever_the_memory_the_rows_are_the_same(rows: int, batch: int, block: int, in_memory: int) -> None:
+def test_whatever_the_memory_the_rows_are_the_same(rows, batch, block, in_memory):
     features = torch.randn(rows, 3)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(memory, "BLOCK_BYTES", block)
@@ -31,7 +29,7 @@ def test_whatever_the_memory_the_rows_are_the_same(rows: int, batch: int, block:
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_spilled_rows_keep_their_type_and_can_be_changed_without_harm(dtype: torch.dtype) -> None:
+def test_spilled_rows_keep_their_type_and_can_be_changed_without_harm(dtype):
     features = torch.randn(9, 3, dtype=dtype)
     spilled = concatenate(features.split(2), in_memory=0)
     assert spilled.dtype == dtype
@@ -41,7 +39,7 @@ def test_spilled_rows_keep_their_type_and_can_be_changed_without_harm(dtype: tor
     assert spilled[0].eq(7).all()
 
 
-def test_what_fits_is_not_held_twice() -> None:
+def test_what_fits_is_not_held_twice():
     if not Path("/proc/self/statm").exists():
         pytest.skip("no /proc")
     code = (
@@ -53,11 +51,11 @@ def test_what_fits_is_not_held_twice() -> None:
     assert held < int(python(code).stdout) < 1.5 * held
 
 
-def test_memory_holds_no_more_than_its_share(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_holds_no_more_than_its_share(tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    made: list[weakref.ref[Tensor]] = []
+    made = []
 
-    def batches() -> Iterator[Tensor]:
+    def batches():
         for i in range(100):
             batch = torch.full((4, 256), float(i))
             made.append(weakref.ref(batch))
@@ -69,12 +67,12 @@ def test_memory_holds_no_more_than_its_share(tmp_path: Path, monkeypatch: pytest
     assert torch.equal(spilled[::4, 0], torch.arange(100.0))
 
 
-def test_batches_that_do_not_lie_in_a_row_spill_as_they_read() -> None:
+def test_batches_that_do_not_lie_in_a_row_spill_as_they_read():
     features = torch.randn(5, 12).T
     assert torch.equal(concatenate(features.split(5), in_memory=0), features)
 
 
-def test_no_room_for_the_file_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_room_for_the_file_is_told(monkeypatch):
     full, nowhere = (
         OSError(errno.ENOSPC, "No space left"),
         FileNotFoundError(errno.ENOENT, "No usable folder"),
@@ -87,8 +85,8 @@ def test_no_room_for_the_file_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
             concatenate(torch.rand(4, 4).split(1), in_memory=0)
 
 
-def test_what_the_traverse_complains_about_passes() -> None:
-    def batches() -> Iterator[Tensor]:
+def test_what_the_traverse_complains_about_passes():
+    def batches():
         yield torch.rand(2, 2)
         raise OSError("the camera is gone")
 
@@ -96,7 +94,7 @@ def test_what_the_traverse_complains_about_passes() -> None:
         concatenate(batches())
 
 
-def test_mixed_and_missing_batches_are_refused() -> None:
+def test_mixed_and_missing_batches_are_refused():
     with refused("features 2.. are 4 of torch.float32", "expected 3 of torch.float32"):
         concatenate([torch.rand(2, 3), torch.rand(2, 4)])
     with refused("features 2.. are 3 of torch.float64", "expected 3 of torch.float32"):

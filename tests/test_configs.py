@@ -9,7 +9,6 @@ import subprocess
 import sys
 import zipfile
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -26,23 +25,23 @@ ROOT = Path(__file__).parents[1]
 PRESETS = ["default", "local_maxima", "paper"]
 
 
-def model_of(name: str) -> DejaVu:
+def model_of(name):
     model = parse("learn", run_learn, ["x", "--map", "y", "--config", name])["model"]
     assert isinstance(model, DejaVu)
     return model
 
 
-def settings(model: DejaVu) -> dict[str, Any]:
+def settings(model):
     parts = {name: getattr(model, name) for name in PARTS}
     recipes = {name: part and recipe_of(part)._asdict() for name, part in parts.items()}
     rest = {name: value for name, value in model.settings().items() if name not in PARTS}
     return recipes | rest | {"whitening": recipes["whitening"] or "none"}
 
 
-def written(name: str) -> dict[str, Any]:
+def written(name):
     """A preset as it is written, with classes by their names."""
 
-    def plain(value: Any) -> Any:
+    def plain(value):
         if isinstance(value, list):
             return [plain(one) for one in value]
         if not isinstance(value, dict):
@@ -50,22 +49,22 @@ def written(name: str) -> dict[str, Any]:
         names = {"class_path": value["class_path"].rpartition(".")[2]} if "class_path" in value else {}
         return {key: plain(one) for key, one in value.items()} | names
 
-    found: dict[str, Any] = plain(yaml.safe_load((ROOT / "configs" / f"{name}.yaml").read_text()))
+    found = plain(yaml.safe_load((ROOT / "configs" / f"{name}.yaml").read_text()))
     return found
 
 
-def test_default_yaml_is_the_constructors_defaults() -> None:
+def test_default_yaml_is_the_constructors_defaults():
     assert settings(model_of("default")) == settings(DejaVu())
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_presets_spell_out_every_argument(name: str) -> None:
+def test_presets_spell_out_every_argument(name):
     assert set(written(name)) == set(inspect.signature(DejaVu).parameters)
     given = {"features": None} if name == "default" else {}  # they depend on the whitening
     assert written(name) == settings(model_of(name)) | given
 
 
-def test_convention_3_paper_yaml_is_the_letter() -> None:
+def test_convention_3_paper_yaml_is_the_letter():
     mapper = written("paper")["mapper"]["init_args"]
     letter = {"window": 1024, "hop": None, "min_period": 8, "strongest": 2, "peaks": "bins"}
     letter |= {"false_alarm": None, "short": "refuse"}
@@ -74,11 +73,11 @@ def test_convention_3_paper_yaml_is_the_letter() -> None:
     assert (mapper["metric"], mapper["reduction"], mapper["temperature"]) == ("l1", "sum", None)
 
 
-def test_reproduce_uses_the_papers_letter() -> None:
+def test_reproduce_uses_the_papers_letter():
     assert settings(paper_model()) == settings(model_of("paper"))
 
 
-def test_a_preset_is_found_by_name_from_anywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_preset_is_found_by_name_from_anywhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = {path.stem for path in (ROOT / "configs").glob("*.yaml")}
     assert set(preset_names()) > names
@@ -92,7 +91,7 @@ def test_a_preset_is_found_by_name_from_anywhere(tmp_path: Path, monkeypatch: py
         find_config("mine")
 
 
-def test_a_config_stands_in_its_place() -> None:
+def test_a_config_stands_in_its_place():
     """Ahead of the options, which overrule it; the last of several counts."""
     words = ["--batch_size", "9", "x", "--config", "paper", "--config=local_maxima", "--map", "y"]
     model = parse("learn", run_learn, words)["model"]
@@ -100,7 +99,7 @@ def test_a_config_stands_in_its_place() -> None:
 
 
 @pytest.mark.slow
-def test_the_wheel_holds_package_and_presets(tmp_path: Path) -> None:
+def test_the_wheel_holds_package_and_presets(tmp_path):
     """Built and unpacked without a network; then used from elsewhere."""
     tree = tmp_path / "tree"
     tree.mkdir()
@@ -143,16 +142,14 @@ def test_the_wheel_holds_package_and_presets(tmp_path: Path) -> None:
     ],
     ids=range(12),
 )
-def test_a_config_that_is_none_is_refused_ahead_of_the_loader(
-    tmp_path: Path, text: str | bytes, words: str
-) -> None:
+def test_a_config_that_is_none_is_refused_ahead_of_the_loader(tmp_path, text, words):
     path = tmp_path / "mine.yaml"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with refused("mine.yaml", words, "expected a YAML file of options"):
         parse("learn", run_learn, ["x", "--map", "y", f"--config={path}"])
 
 
-def test_a_config_is_a_regular_file(tmp_path: Path) -> None:
+def test_a_config_is_a_regular_file(tmp_path):
     os.mkfifo(tmp_path / "fifo")
     with refused("fifo is not a regular file"):
         parse("learn", run_learn, ["x", "--map", "y", "--config", str(tmp_path / "fifo")])
@@ -161,12 +158,12 @@ def test_a_config_is_a_regular_file(tmp_path: Path) -> None:
             find_config(name)
 
 
-def test_aliases_that_a_config_may_have(tmp_path: Path) -> None:
+def test_aliases_that_a_config_may_have(tmp_path):
     (tmp_path / "mine.yaml").write_text("a: &a {x: 1}\nb: {<<: *a, y: 2}\nc: *a\n")
     assert read_config(tmp_path / "mine.yaml") == {"a": {"x": 1}, "b": {"x": 1, "y": 2}, "c": {"x": 1}}
 
 
 @pytest.mark.parametrize("word", ["", "--batch_size="])
-def test_an_empty_word_is_refused(word: str) -> None:
+def test_an_empty_word_is_refused(word):
     with refused("is empty; expected"):
         parse("learn", run_learn, ["x", "--map", "y", word])

@@ -15,7 +15,7 @@ BEHIND = ("page", "panel", "ours")
 TEXTS = ("text", "soft", "link")
 
 
-def luminance(colour: str) -> float:
+def luminance(colour):
     """Relative luminance of #rgb or #rrggbb, as WCAG defines it."""
     digits = colour if len(colour) == 6 else "".join(2 * digit for digit in colour)
     parts = [int(digits[i : i + 2], 16) / 255 for i in (0, 2, 4)]
@@ -23,18 +23,18 @@ def luminance(colour: str) -> float:
     return 0.2126 * red + 0.7152 * green + 0.0722 * blue
 
 
-def contrast(one: str, other: str) -> float:
+def contrast(one, other):
     high, low = sorted((luminance(one), luminance(other)), reverse=True)
     return (high + 0.05) / (low + 0.05)
 
 
-def test_black_on_white_is_21_to_1() -> None:
+def test_black_on_white_is_21_to_1():
     assert contrast("000", "ffffff") == pytest.approx(21)
     assert contrast("767676", "fff") == pytest.approx(4.54, abs=0.01)  # the lightest grey that is readable
 
 
 @pytest.mark.parametrize("name", ["evaluation/report.html.j2", "live/page.html"])
-def test_text_can_be_read_in_light_and_in_dark(name: str) -> None:
+def test_text_can_be_read_in_light_and_in_dark(name):
     style = (PACKAGE / name).read_text().partition("</style>")[0]
     schemes = [dict(re.findall(r"--(\w+):#(\w+)", rule)) for rule in re.findall(r":root\{([^}]*)\}", style)]
     assert len(schemes) == 2

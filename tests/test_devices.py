@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
 from contextlib import nullcontext
 from fractions import Fraction
-from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -46,7 +43,6 @@ from dejavu_torch.features.distilled import Distilled
 from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.views import LabelledFrames
-from dejavu_torch.maps.place_map import Mapper
 from dejavu_torch.recognition import coarse
 from dejavu_torch.recognition.select import best_candidates, best_match
 
@@ -54,7 +50,7 @@ SEQUENCES = [PlaceFilter(), SequenceMatcher(3), None]
 ELSEWHERE = f"cuda:{torch.cuda.device_count()}"  # the first that is not there
 
 
-def models() -> dict[str, DejaVu]:
+def models():
     return {
         "spectral": DejaVu(whitening=Whitening(views=1)),
         "chunks": DejaVu(
@@ -67,14 +63,14 @@ def models() -> dict[str, DejaVu]:
 
 
 @pytest.fixture(scope="module")
-def frames() -> Tensor:
+def frames():
     """(40,3,32,32)"""
     whole = torch.cat(list(open_source("sim:aerial?frames=40").batches(64)))
     return nn.functional.interpolate(whole, (32, 32), mode="area")
 
 
 @pytest.mark.parametrize("kind", models())
-def test_a_frame_stays_on_its_device(kind: str, frames: Tensor, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_frame_stays_on_its_device(kind, frames, monkeypatch):
     """Tensors on `meta` have no numbers, and refuse to meet those of the CPU, as those of a GPU do."""
     monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())  # which does not know meta
     model = models()[kind].learn(frames).to("meta")
@@ -89,7 +85,7 @@ def test_a_frame_stays_on_its_device(kind: str, frames: Tensor, monkeypatch: pyt
 
 
 PLAN = tuple(FrequencyLayer(Fraction(p), p, 0, 12, (0, 1)) for p in (3, 4))
-MODULES: dict[str, nn.Module] = {
+MODULES = {
     "HOG": HOG(),
     "Distilled": Distilled(),
     "Joined": Joined([HOG(), PatchPixels()]),
@@ -102,7 +98,7 @@ MODULES: dict[str, nn.Module] = {
 
 
 @pytest.mark.parametrize("name", MODULES)
-def test_a_module_gives_what_it_gives_on_the_cpu(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_module_gives_what_it_gives_on_the_cpu(name, monkeypatch):
     """Its numbers on a device, its shape on `meta`; but an augmentation draws numbers of its own, and looks
     at them."""
     frames, module = torch.rand(3, 3, 32, 32), MODULES[name].train(name == "Augmentation")
@@ -118,7 +114,7 @@ def test_a_module_gives_what_it_gives_on_the_cpu(name: str, monkeypatch: pytest.
     assert (there.device.type, there.shape, there.dtype) == ("meta", expected.shape, expected.dtype)
 
 
-def test_what_has_no_frames_stays_on_its_device() -> None:
+def test_what_has_no_frames_stays_on_its_device():
     features, scores = torch.rand(12, 2), torch.rand(9, 30)
     blocks, matches = PhaseTemplates()(features, PLAN), best_candidates(scores, 2, 5)
     with pretend() as device:
@@ -132,7 +128,7 @@ def test_what_has_no_frames_stays_on_its_device() -> None:
             torch.testing.assert_close(one.to(device)(scores.to(device)).cpu(), expected)
 
 
-def refused_mixtures(device: torch.device) -> dict[str, object]:
+def refused_mixtures(device):
     there = torch.arange(3.0, device=device)
     return {
         "an index": lambda: torch.zeros(3)[there.long()],
@@ -146,12 +142,12 @@ def refused_mixtures(device: torch.device) -> dict[str, object]:
 
 
 @pytest.mark.parametrize("name", refused_mixtures(torch.device("cpu")))
-def test_the_pretended_device_refuses(name: str) -> None:
+def test_the_pretended_device_refuses(name):
     with pretend() as device, pytest.raises((RuntimeError, TypeError), match="device"):
         refused_mixtures(device)[name]()  # type: ignore[operator]
 
 
-def test_the_pretended_device_takes_what_a_gpu_takes() -> None:
+def test_the_pretended_device_takes_what_a_gpu_takes():
     with pretend() as device:
         there = torch.arange(3.0, device=device)
         made = there.new_zeros(2), torch.zeros(2).to(there), torch.tensor([1.0], device=there.device)
@@ -169,19 +165,19 @@ GPU = pytest.param("cuda", marks=[pytest.mark.gpu, CUDA])
 
 
 @pytest.fixture(params=[DEVICE.type, GPU])
-def device(request: pytest.FixtureRequest) -> Iterator[str]:
+def device(request):
     """The pretended device, and a GPU where there is one."""
     with pretend() if request.param == DEVICE.type else nullcontext():
         yield request.param
 
 
 @pytest.fixture(autouse=True)
-def whole_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+def whole_numbers(monkeypatch):
     """Convolutions of a GPU have 10 bits of each number unless they are told otherwise."""
     monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
 
 
-LEARNED: dict[str, Mapper] = {
+LEARNED = {
     "templates": TemplateMapper(ImposedPeriods([3, 4, 5], bin=4)),
     "found": TemplateMapper(SpectrogramAnalysis(40, false_alarm=None), reduction="sum", temperature=3.0),
     "spectral": SpectralMapper(None, step=1e-4),  # so fine that what rounding moves by a step is not seen
@@ -189,12 +185,12 @@ LEARNED: dict[str, Mapper] = {
 }
 
 
-def small(**settings: Any) -> DejaVu:
+def small(**settings):
     return DejaVu(**{"features": HOG(), "mapper": SpectralMapper(chunk=30)} | settings)
 
 
 @pytest.fixture(scope="module")
-def visits(frames: Tensor) -> tuple[ArrayTraverse, ArrayTraverse]:
+def visits(frames):
     """A route, and a second visit."""
     return ArrayTraverse(frames), ArrayTraverse(0.9 * frames + 0.02 * torch.rand_like(frames))
 
@@ -203,7 +199,7 @@ Visits = tuple[ArrayTraverse, ArrayTraverse]
 
 
 @pytest.mark.parametrize("kind", LEARNED)
-def test_a_map_learned_on_a_gpu_scores_as_that_of_the_cpu(kind: str, device: str, frames: Tensor) -> None:
+def test_a_map_learned_on_a_gpu_scores_as_that_of_the_cpu(kind, device, frames):
     maps = [DejaVu(whitening="none", mapper=LEARNED[kind]).to(one).learn(frames) for one in ("cpu", device)]
     query = frames[3::4] * 0.9 + 0.02
     scores, found = (model(query.to(model.map.device)) for model in maps)
@@ -215,7 +211,7 @@ def test_a_map_learned_on_a_gpu_scores_as_that_of_the_cpu(kind: str, device: str
     assert matches[0].index.tolist() == matches[1].index.tolist()
 
 
-def test_a_whitening_learned_on_a_gpu_is_that_of_the_cpu(device: str, frames: Tensor) -> None:
+def test_a_whitening_learned_on_a_gpu_is_that_of_the_cpu(device, frames):
     whitening = Whitening(numbers=8, views=2, bits=16)
     models = [DejaVu(whitening=copy.deepcopy(whitening)).to(one).learn(frames) for one in ("cpu", device)]
     known = [model.descriptor(frames.to(model.map.device)).cpu() for model in models]
@@ -223,7 +219,7 @@ def test_a_whitening_learned_on_a_gpu_is_that_of_the_cpu(device: str, frames: Te
     torch.testing.assert_close(known[1] @ known[1].T, known[0] @ known[0].T, rtol=1e-3, atol=1e-3)
 
 
-def test_a_map_calibrated_on_a_gpu_is_as_sure_as_that_of_the_cpu(device: str, visits: Visits) -> None:
+def test_a_map_calibrated_on_a_gpu_is_as_sure_as_that_of_the_cpu(device, visits):
     models = [small(whitening="none", mapper=LEARNED["spectral"]).to(one) for one in ("cpu", device)]
     for model in models:
         model.learn(visits[0]).calibrate(visits[0], LabelledFrames(visits[1], torch.arange(40)))
@@ -236,7 +232,7 @@ def test_a_map_calibrated_on_a_gpu_is_as_sure_as_that_of_the_cpu(device: str, vi
 
 
 @pytest.mark.parametrize("kind", models())
-def test_a_gpu_finds_what_the_cpu_finds(kind: str, device: str, frames: Tensor) -> None:
+def test_a_gpu_finds_what_the_cpu_finds(kind, device, frames):
     here = models()[kind].learn(frames)
     there = models()[kind].to(device).learn(frames)
     assert {tensor.device.type for tensor in there.state_dict().values() if isinstance(tensor, Tensor)} == {
@@ -260,9 +256,7 @@ def test_a_gpu_finds_what_the_cpu_finds(kind: str, device: str, frames: Tensor) 
 
 
 @pytest.mark.parametrize("mapper", ["templates", "spectral"])
-def test_a_comparison_runs_on_a_gpu(
-    mapper: str, device: str, visits: Visits, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_comparison_runs_on_a_gpu(mapper, device, visits, tmp_path, monkeypatch):
     """With calibration, baselines and nulls; the map is then saved, and loaded to the device."""
     for drawn in ("draw_pictures", "draw_reliability"):  # from a model on the CPU
         monkeypatch.setattr(f"dejavu_torch.evaluation.compare.{drawn}", lambda *_: {})
@@ -275,7 +269,7 @@ def test_a_comparison_runs_on_a_gpu(
     assert torch.equal(other.localize(visits[1]).index, model.cpu().localize(visits[1]).index)
 
 
-def test_a_map_grows_on_a_gpu(device: str, visits: Visits) -> None:
+def test_a_map_grows_on_a_gpu(device, visits):
     route, again = visits
     second = LabelledFrames(again, torch.arange(40))
     model = small().to(device).learn(route, second=second, visits=second)
@@ -289,7 +283,7 @@ def test_a_map_grows_on_a_gpu(device: str, visits: Visits) -> None:
     assert {one.device.type for one in merged.state_dict().values() if isinstance(one, Tensor)} == {device}
 
 
-def test_a_long_route_is_learned_and_searched_on_a_gpu(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_route_is_learned_and_searched_on_a_gpu(device, monkeypatch):
     """From a sample, chunk by chunk, with principal components of wide features; then by its own samples."""
     long_from(monkeypatch, 200)
     monkeypatch.setattr(coarse, "MIN_PLACES", 100)
@@ -301,7 +295,7 @@ def test_a_long_route_is_learned_and_searched_on_a_gpu(device: str, monkeypatch:
     assert isinstance(model.searcher, coarse.CoarseSearch)
 
 
-def test_even_steps_are_learned_on_a_gpu(device: str) -> None:
+def test_even_steps_are_learned_on_a_gpu(device):
     strip = nn.functional.interpolate(torch.rand(1, 1, 60, 16), scale_factor=4)[0]
     frames = torch.stack([strip[:, 2 * i : 2 * i + 64] for i in range(40)]).flip(0)
     model = small(velocity=GroundOdometry(step=3.0, size=(32, 32))).to(device).learn(frames)
@@ -311,7 +305,7 @@ def test_even_steps_are_learned_on_a_gpu(device: str) -> None:
     assert GroundOdometry().to(device)(frames[:3].to(device))[0].device.type == device
 
 
-def test_controls_and_scores_are_computed_on_a_gpu(device: str, visits: Visits) -> None:
+def test_controls_and_scores_are_computed_on_a_gpu(device, visits):
     model = small(mapper=LEARNED["templates"]).to(device).learn(visits[0])
     features = model.descriptor.describe(next(visits[0].batches(40)).to(device))
     for same in (True, False):
@@ -326,7 +320,7 @@ def test_controls_and_scores_are_computed_on_a_gpu(device: str, visits: Visits) 
 @pytest.mark.gpu
 @pytest.mark.slow
 @CUDA
-def test_commands_run_on_a_gpu(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_commands_run_on_a_gpu(tmp_path, capsys):
     source, query = "sim:aerial?frames=200", "sim:aerial?frames=200&traverse=1"
     run("learn", source, "--map", tmp_path / "map.safetensors", "--device", "cuda")
     run("localize", tmp_path / "map.safetensors", query, "--out", tmp_path / "m.csv", "--device", "cuda:0")
@@ -347,22 +341,16 @@ COMMANDS = {
 @pytest.mark.parametrize(
     ("command", "device"), [*zip(COMMANDS, [ELSEWHERE, "tpu", "cpu:1", "cuda:x"], strict=True)]
 )
-def test_a_device_that_is_not_there_is_one_line(
-    command: str,
-    device: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_device_that_is_not_there_is_one_line(command, device, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     error = fails(capsys, *COMMANDS[command], f"--device={device}")
     assert f"--device {device}" in error
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_option_moves_the_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_option_moves_the_model(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    moved: list[torch.device] = []
+    moved = []
     to = DejaVu.to
     monkeypatch.setattr(DejaVu, "to", lambda self, device: (moved.append(device), to(self, device))[1])
     for command in ("learn", "localize", "live"):
@@ -371,7 +359,7 @@ def test_the_option_moves_the_model(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         assert moved == []
 
 
-def test_learning_takes_double_precision(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_learning_takes_double_precision(monkeypatch):
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: True)
     assert device_of("mps").type == "mps"
     with pytest.raises(ValueError, match="double precision"):

@@ -6,16 +6,13 @@ import copy
 import dataclasses
 import math
 import pickle
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from command_line import fails
 from helpers import refused
-from torch import Tensor, nn
+from torch import nn
 from torch.autograd import forward_ad
 
 from dejavu_torch import (
@@ -47,27 +44,27 @@ FRAMES = torch.rand(60, 3, 32, 24, generator=torch.Generator().manual_seed(0))
 SOME = torch.arange(0, 60, 9)
 
 
-def spectral(features: nn.Module | None = None, **settings: Any) -> DejaVu:
+def spectral(features=None, **settings):
     return DejaVu(features, Whitening(views=1), SpectralMapper(16.0), **settings)
 
 
-def templates(**settings: Any) -> DejaVu:
+def templates(**settings):
     return DejaVu(mapper=TemplateMapper(ImposedPeriods([3, 4, 5], bin=4), **settings))
 
 
-def finds_itself(model: DejaVu, frames: Tensor = FRAMES) -> None:
+def finds_itself(model, frames=FRAMES):
     assert model.localize(frames[SOME]).index.tolist() == SOME.tolist()
 
 
 @pytest.fixture(scope="module")
-def learned() -> DejaVu:
+def learned():
     return spectral().learn(FRAMES)
 
 
 # one model beside another
 
 
-def test_learning_a_second_model_leaves_the_first_alone(learned: DejaVu) -> None:
+def test_learning_a_second_model_leaves_the_first_alone(learned):
     before = learned(FRAMES[SOME])
     other = DejaVu(**learned.settings())
     assert other.features is learned.features
@@ -78,16 +75,14 @@ def test_learning_a_second_model_leaves_the_first_alone(learned: DejaVu) -> None
     assert torch.equal(learned(FRAMES[SOME]), before)
 
 
-def test_a_fixed_whitening_is_shared() -> None:
+def test_a_fixed_whitening_is_shared():
     model = spectral().learn(FRAMES)
     other = DejaVu(mapper=SpectralMapper(16.0))
     other.descriptor.take(model.descriptor, whitening=True)
     assert other.settings()["whitening"] is other.whitening
 
 
-def test_an_optimiser_goes_on_with_the_templates_of_a_map_made_anew(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_an_optimiser_goes_on_with_the_templates_of_a_map_made_anew(caplog):
     model = templates(trainable=True).learn(FRAMES)
     kept, before = model.map.templates, model.map.templates.detach().clone()
     kept.grad, former = torch.ones_like(kept), model.map
@@ -106,14 +101,14 @@ def test_an_optimiser_goes_on_with_the_templates_of_a_map_made_anew(
 
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
-def test_the_default_model_learns_and_localizes_under_autocast(dtype: torch.dtype) -> None:
+def test_the_default_model_learns_and_localizes_under_autocast(dtype):
     with torch.autocast("cpu", dtype):
         model = DejaVu(whitening=Whitening(views=1), mapper=SpectralMapper(16.0)).learn(FRAMES)
         finds_itself(model)
     assert model(FRAMES[:2]).dtype == torch.float32
 
 
-def test_phase_means_are_exact_under_autocast() -> None:
+def test_phase_means_are_exact_under_autocast():
     plan = (FrequencyLayer(4, 4, 0, 60, (0, 1)),)
     features = 100 + torch.rand(60, 2)
     with torch.autocast("cpu", torch.bfloat16):
@@ -121,7 +116,7 @@ def test_phase_means_are_exact_under_autocast() -> None:
     assert torch.equal(found, PhaseTemplates()(features, plan)[0])
 
 
-def network() -> nn.Module:
+def network():
     return nn.Sequential(nn.Conv2d(3, 4, 5, stride=3), nn.Flatten())
 
 
@@ -130,23 +125,23 @@ def network() -> nn.Module:
     [lambda: network().bfloat16(), lambda: network().double(), lambda: SmallCNN(8, 3, (16, 16)).double()],
     ids=["bfloat16", "double", "SmallCNN"],
 )
-def test_frames_have_the_type_of_the_network(make: Callable[[], nn.Module]) -> None:
+def test_frames_have_the_type_of_the_network(make):
     torch.manual_seed(0)
     finds_itself(spectral(make()).learn(FRAMES))
 
 
-def test_joined_networks_have_types_of_their_own() -> None:
+def test_joined_networks_have_types_of_their_own():
     model = spectral(Joined([network().bfloat16(), network()])).learn(FRAMES)
     finds_itself(model)
     assert model(FRAMES[:2]).dtype == torch.float32
 
 
-def test_frames_in_double_precision_are_learned() -> None:
+def test_frames_in_double_precision_are_learned():
     finds_itself(spectral().learn(FRAMES.numpy() / 1.0), FRAMES.double())
     finds_itself(spectral().learn(FRAMES.double()), FRAMES.double())
 
 
-def test_a_default_type_of_double_precision() -> None:
+def test_a_default_type_of_double_precision():
     torch.set_default_dtype(torch.float64)
     try:
         finds_itself(spectral(SmallCNN(8, 3, (16, 16))).learn(FRAMES))
@@ -163,22 +158,22 @@ class Ensemble(nn.Module):
         self.members = nn.ModuleList([nn.Flatten()])
         self.register_buffer("mixing", torch.rand(3 * 32 * 24, 8, dtype=torch.float64))
 
-    def forward(self, frames: Tensor) -> Tensor:
+    def forward(self, frames):
         return self.members[0](frames) @ self.mixing
 
 
-def test_a_network_of_buffers_gets_frames_of_their_type() -> None:
+def test_a_network_of_buffers_gets_frames_of_their_type():
     finds_itself(spectral(Ensemble()).learn(FRAMES))
 
 
-def test_bytes_are_resized_as_torch_does() -> None:
+def test_bytes_are_resized_as_torch_does():
     frames = (255 * FRAMES).byte()
     expected = nn.functional.interpolate(frames, (20, 20), mode="bilinear", antialias=True)
     assert torch.equal(resize_frames(frames, (20, 20)), expected)
 
 
 @pytest.mark.parametrize("to", ["double", "half", "bfloat16"])
-def test_frame_positions_keep_their_type(to: str) -> None:
+def test_frame_positions_keep_their_type(to):
     route = SpectralMapper(16.0)(torch.rand(60, 8))
     route.positions = torch.linspace(0, 3000, 60)
     getattr(route, to)()
@@ -186,13 +181,13 @@ def test_frame_positions_keep_their_type(to: str) -> None:
 
 
 @pytest.mark.parametrize("to", ["double", "half", "bfloat16"])
-def test_a_converted_model_is_saved_as_maps_are(to: str, tmp_path: Path) -> None:
+def test_a_converted_model_is_saved_as_maps_are(to, tmp_path):
     model = spectral().learn(FRAMES)
     getattr(model, to)().save(tmp_path / "map.safetensors")
     finds_itself(DejaVu.load(tmp_path / "map.safetensors"))
 
 
-def test_templates_in_double_precision_are_saved_and_searched(tmp_path: Path) -> None:
+def test_templates_in_double_precision_are_saved_and_searched(tmp_path):
     model = templates().learn(FRAMES)
     expected = model.localize(FRAMES).index
     model.double().save(tmp_path / "map.safetensors")
@@ -203,7 +198,7 @@ def test_templates_in_double_precision_are_saved_and_searched(tmp_path: Path) ->
 # forms of input
 
 
-def test_what_holds_a_route() -> None:
+def test_what_holds_a_route():
     shades = (255 * FRAMES).round().byte()
     for held in (shades, shades.numpy(), shades.permute(0, 2, 3, 1)):
         assert torch.equal(next(as_traverse(held).batches(60)), shades / 255)
@@ -214,7 +209,7 @@ def test_what_holds_a_route() -> None:
         spectral().learn(torch.zeros(60, 4, 32, 24, dtype=torch.uint8))
 
 
-def test_a_path_is_opened() -> None:
+def test_a_path_is_opened():
     source = "sim:aerial?frames=60&size=32"
     model = spectral().learn(source).calibrate(source)
     expected = spectral().learn(open_source(source)).localize(open_source(source + "&traverse=1"))
@@ -223,7 +218,7 @@ def test_a_path_is_opened() -> None:
         spectral().learn("nowhere")
 
 
-def test_no_queries_have_no_scores(learned: DejaVu) -> None:
+def test_no_queries_have_no_scores(learned):
     assert learned(FRAMES[:0]).shape == (0, 60)
     assert templates().learn(FRAMES)(FRAMES[:0]).shape == (0, 60)
     with refused("empty"):
@@ -234,7 +229,7 @@ def test_no_queries_have_no_scores(learned: DejaVu) -> None:
 
 
 @pytest.mark.parametrize("model", [SequenceMatcher(3, (1, 0.5)), PlaceFilter()], ids=["matcher", "filter"])
-def test_several_sequences_are_each_as_alone(model: Any) -> None:
+def test_several_sequences_are_each_as_alone(model):
     scores = torch.rand(2, 3, 7, 20)
     scores[0, 1, 4, 3] = math.inf
     state = scores[..., :2, :] if isinstance(model, SequenceMatcher) else torch.rand(2, 3, 21).softmax(-1)
@@ -247,7 +242,7 @@ def test_several_sequences_are_each_as_alone(model: Any) -> None:
     torch.testing.assert_close(run(scores[0, 0], state[0, 0]), model(scores[0, 0], state[0, 0]))
 
 
-def test_states_have_to_fit_several_sequences() -> None:
+def test_states_have_to_fit_several_sequences():
     scores = torch.rand(3, 7, 20)
     for model, state in ((SequenceMatcher(3), torch.rand(2, 20)), (PlaceFilter(), torch.rand(21).softmax(0))):
         assert model(scores[:0]).shape == (0, 7, 20)
@@ -257,7 +252,7 @@ def test_states_have_to_fit_several_sequences() -> None:
         PlaceFilter()(scores, torch.ones(3, 21))
 
 
-def test_leading_dimensions_of_scores() -> None:
+def test_leading_dimensions_of_scores():
     scores = torch.rand(2, 3, 7, 20)
     match = best_match(scores)
     assert torch.equal(match.index, scores.argmin(-1))
@@ -267,10 +262,10 @@ def test_leading_dimensions_of_scores() -> None:
 # truth in any form
 
 
-def test_every_form_of_truth_gives_the_same_scores(learned: DejaVu, tmp_path: Path) -> None:
+def test_every_form_of_truth_gives_the_same_scores(learned, tmp_path):
     match, places = learned.localize(FRAMES[SOME]), SOME.tolist()
     expected = evaluate(match, SOME[:, None], 2)
-    forms: dict[str, Any] = {
+    forms = {
         "places": SOME,
         "list": places,
         "array": SOME.numpy(),
@@ -309,12 +304,12 @@ def test_every_form_of_truth_gives_the_same_scores(learned: DejaVu, tmp_path: Pa
         (torch.zeros(7, 2, 2, dtype=torch.int64), ("(2, 2)", "integer places")),
     ],
 )
-def test_another_truth_is_refused(learned: DejaVu, truth: Any, facts: tuple[str, ...]) -> None:
+def test_another_truth_is_refused(learned, truth, facts):
     with refused(*facts):
         evaluate(learned.localize(FRAMES[SOME]), truth, 2)
 
 
-def test_what_cannot_be_judged_is_refused() -> None:
+def test_what_cannot_be_judged_is_refused():
     for shape in ((2, 3, 4), (2, 0)):
         index = torch.zeros(shape).long()
         with refused(str(shape), "candidates (Q,k)"):
@@ -324,7 +319,7 @@ def test_what_cannot_be_judged_is_refused() -> None:
         judge(Match(index, index.float(), index > 0), [0, 1], 0, recalls=(0, 1))
 
 
-def test_judged_queries_and_recalls() -> None:
+def test_judged_queries_and_recalls():
     """By hand: right at rank 1, at rank 2, never."""
     index = torch.tensor([[5, 40], [40, 9], [40, 50]])
     match = Match(index, torch.tensor([[0.1, 0.5], [0.3, 0.4], [0.2, 0.6]]), index >= 0)
@@ -335,7 +330,7 @@ def test_judged_queries_and_recalls() -> None:
     assert found.scores.average_precision == 1.0
 
 
-def test_average_precision_is_that_of_scikit_learn() -> None:
+def test_average_precision_is_that_of_scikit_learn():
     metrics = pytest.importorskip("sklearn.metrics")
     score, right = torch.rand(40).mul(10).round(), torch.rand(40) < 0.6
     match = Match(torch.where(right, 0, 9), score, right | ~right)
@@ -345,16 +340,16 @@ def test_average_precision_is_that_of_scikit_learn() -> None:
     assert evaluate(perfect, range(5), 0).average_precision == 1.0
 
 
-def test_a_comparison_takes_places_as_truth() -> None:
+def test_a_comparison_takes_places_as_truth():
     route = "sim:aerial?frames=60&size=32"
-    settings: dict[str, Any] = {"model": spectral(), "calibration": "none", "ordered": False}
+    settings = {"model": spectral(), "calibration": "none", "ordered": False}
     found = compare(route, route + "&traverse=1", torch.arange(60), **settings)
     expected = compare(route, route + "&traverse=1", "0", **settings)
     assert found.report.ours.scores == expected.report.ours.scores
     assert found.report.facts["truth"] == "the places that the caller gave"
 
 
-def test_the_length_and_parts_of_a_match_are_queries() -> None:
+def test_the_length_and_parts_of_a_match_are_queries():
     each = Match(torch.tensor([3, 1, -1]), torch.tensor([0.5, 0.25, 9.0]), torch.tensor([True, True, False]))
     sure = dataclasses.replace(each, probability=each.score / 2, sequences={5: each})
     match = pickle.loads(pickle.dumps(sure))
@@ -370,7 +365,7 @@ def test_the_length_and_parts_of_a_match_are_queries() -> None:
 # torch.func through a whole model
 
 
-def test_a_slope_through_frames_descriptors_and_map(learned: DejaVu) -> None:
+def test_a_slope_through_frames_descriptors_and_map(learned):
     frames = FRAMES[:2].clone().requires_grad_()
     (expected,) = torch.autograd.grad(learned(frames).sum(), frames)
     found = torch.func.grad(lambda some: learned(some).sum())(FRAMES[:2])
@@ -387,9 +382,7 @@ def test_a_slope_through_frames_descriptors_and_map(learned: DejaVu) -> None:
 # what a saved config names
 
 
-def test_why_a_module_of_a_config_cannot_be_imported_is_said(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_why_a_module_of_a_config_cannot_be_imported_is_said(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "own_networks.py").write_text("import missing_library\n")

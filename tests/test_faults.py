@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import random
 import resource
@@ -13,7 +12,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +33,7 @@ REPORT_OF_ARRAYS = ("compare", "a.npy", "b.npy", *PLAIN, "--truth", "0", "--out"
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("made")
     np.save(folder / "a.npy", frames(64))
     np.save(folder / "b.npy", frames(64, seed=1))
@@ -44,18 +42,18 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def folder(made: Path, tmp_path: Path) -> Path:
+def folder(made, tmp_path):
     """A folder of its own with arrays and their map."""
     for file in made.iterdir():
         shutil.copy(file, tmp_path)
     return tmp_path
 
 
-def start(folder: Path, *words: str) -> Forked:
+def start(folder, *words):
     return Forked("from dejavu_torch.cli import main; main()", *words, imports=PACKAGE, cwd=folder, **PIPES)
 
 
-def wait_for(process: subprocess.Popen[bytes], there: Callable[[], object]) -> None:
+def wait_for(process, there):
     late = time.monotonic() + 60
     while not there():
         assert process.poll() is None, process.communicate()
@@ -65,14 +63,14 @@ def wait_for(process: subprocess.Popen[bytes], there: Callable[[], object]) -> N
         time.sleep(0.01)
 
 
-def in_hand(process: subprocess.Popen[bytes]) -> bool:
+def in_hand(process):
     """Whether the command handles its signals; the start of Python itself is beyond it."""
     lines = Path(f"/proc/{process.pid}/status").read_text().splitlines()
     (caught,) = (int(line.split()[1], 16) for line in lines if line.startswith("SigCgt"))
     return bool(caught >> (signal.SIGTERM - 1) & 1)
 
 
-def forked(work: Callable[[], None]) -> int:
+def forked(work):
     """The number of a process that does this: torch takes seconds to import in one that is started."""
     child = os.fork()
     if child:
@@ -88,19 +86,19 @@ def forked(work: Callable[[], None]) -> int:
     os._exit(0)
 
 
-def ended(work: Callable[[], None]) -> int:
+def ended(work):
     """The status of a process that has done this."""
     return os.waitstatus_to_exitcode(os.waitpid(forked(work), 0)[1])
 
 
-def names_in(folder: Path) -> set[str]:
+def names_in(folder):
     return {file.name for file in folder.iterdir()} if folder.exists() else set()
 
 
 # interrupts
 
 
-def test_ctrl_c_at_any_moment_is_one_line_and_130(folder: Path) -> None:
+def test_ctrl_c_at_any_moment_is_one_line_and_130(folder):
     moments = [0, 0.7, 1.6]
     before = names_in(folder)
     for twice, moment in enumerate(moments):
@@ -122,9 +120,7 @@ def test_ctrl_c_at_any_moment_is_one_line_and_130(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("number", "status", "said"), [(signal.SIGINT, 130, INTERRUPTED), (signal.SIGTERM, 143, b"")]
 )
-def test_a_file_that_is_half_written_goes_and_the_old_one_stays(
-    folder: Path, number: int, status: int, said: bytes
-) -> None:
+def test_a_file_that_is_half_written_goes_and_the_old_one_stays(folder, number, status, said):
     (folder / "m.csv").write_text("old")
     np.lib.format.open_memmap(folder / "long.npy", "w+", np.uint8, (100_000, 32, 32)).flush()  # takes no room
     before = names_in(folder)
@@ -136,7 +132,7 @@ def test_a_file_that_is_half_written_goes_and_the_old_one_stays(
     assert (folder / "m.csv").read_text() == "old"
 
 
-def test_a_training_that_is_interrupted_leaves_a_map(folder: Path) -> None:
+def test_a_training_that_is_interrupted_leaves_a_map(folder):
     (folder / "train.yaml").write_text(
         "model:\n"
         "  class_path: dejavu_torch.TemplateTask\n"
@@ -159,9 +155,7 @@ def test_a_training_that_is_interrupted_leaves_a_map(folder: Path) -> None:
     assert DejaVu.load(folder / "run" / "map.safetensors").trained is not None
 
 
-def test_a_benchmark_of_memory_that_is_interrupted_leaves_neither_files_nor_a_process(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_benchmark_of_memory_that_is_interrupted_leaves_neither_files_nor_a_process(tmp_path, monkeypatch):
     from benchmarks import memory
     from dejavu_torch.cli import process
     from dejavu_torch.data.output import remove_temporaries
@@ -173,7 +167,7 @@ def test_a_benchmark_of_memory_that_is_interrupted_leaves_neither_files_nor_a_pr
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
     monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
 
-    def bench() -> None:
+    def bench():
         process.take_over()
         process.cleanup[:] = [remove_temporaries]
         list(memory.bench_memory([64]))
@@ -193,25 +187,25 @@ def test_a_benchmark_of_memory_that_is_interrupted_leaves_neither_files_nor_a_pr
     assert time.monotonic() < late
 
 
-def python(code: str, *words: str, **settings: object) -> tuple[int, str, str]:
+def python(code, *words, **settings):
     """Status and output of code run by another interpreter; torch is not needed for most."""
     done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, **settings)  # type: ignore[call-overload]
     return done.returncode, done.stdout, done.stderr
 
 
-def test_ctrl_c_when_all_is_done_changes_nothing() -> None:
+def test_ctrl_c_when_all_is_done_changes_nothing():
     late = "import atexit, signal; atexit.register(signal.raise_signal, signal.SIGINT)"
     code = f"{late}\nfrom dejavu_torch.cli import main; main()"
     assert python(code, "--version")[::2] == (0, "")
 
 
-def test_a_signal_that_is_ignored_stays_so() -> None:
+def test_a_signal_that_is_ignored_stays_so():
     ignore = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"  # as nohup, or a shell's &, does
     code = f"{ignore}\nfrom dejavu_torch.cli import process; process.take_over(); signal.raise_signal(2)"
     assert python(code) == (0, "", "")
 
 
-def test_where_interrupts_are_raised_the_second_one_ends() -> None:
+def test_where_interrupts_are_raised_the_second_one_ends():
     code = (
         "import signal; from dejavu_torch.cli import process; process.take_over()\n"
         "with process.interrupts_raise():\n"
@@ -223,7 +217,7 @@ def test_where_interrupts_are_raised_the_second_one_ends() -> None:
     assert python(code) == (130, "kept\n", "dejavu: interrupted\n")
 
 
-def test_an_interrupt_that_was_turned_into_another_exception_is_one() -> None:
+def test_an_interrupt_that_was_turned_into_another_exception_is_one():
     code = (
         "import signal; from dejavu_torch import cli\n"
         "def run(given):\n"
@@ -238,7 +232,7 @@ def test_an_interrupt_that_was_turned_into_another_exception_is_one() -> None:
 # standard streams
 
 
-def opened(number: int) -> io.TextIOWrapper | None:
+def opened(number):
     """A standard stream as Python opens it."""
     try:
         os.fstat(number)
@@ -248,12 +242,10 @@ def opened(number: int) -> io.TextIOWrapper | None:
 
 
 @pytest.mark.parametrize(("redirected", "status"), [("left", 0), ("closed", 0), ("full", 2)])
-def test_files_are_written_whatever_becomes_of_what_is_printed(
-    redirected: str, status: int, folder: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_files_are_written_whatever_becomes_of_what_is_printed(redirected, status, folder, capfd):
     """Where who reads has left, as `head` does, where streams are closed, and where a disk is full."""
 
-    def command() -> None:
+    def command():
         os.chdir(folder)
         read, write = os.pipe()
         os.close(read)
@@ -285,14 +277,14 @@ def test_files_are_written_whatever_becomes_of_what_is_printed(
         ("''", 2, "dejavu: '' is no command; expected one of"),
     ],
 )
-def test_the_overview_whatever_becomes_of_what_is_printed(words: str, status: int, said: str) -> None:
+def test_the_overview_whatever_becomes_of_what_is_printed(words, status, said):
     command = f"set -o pipefail; {' '.join(DEJAVU)} {words}"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (status, "", bool(said))
     assert done.stderr.startswith(said)
 
 
-def test_a_folder_that_is_gone_is_no_traceback(tmp_path: Path) -> None:
+def test_a_folder_that_is_gone_is_no_traceback(tmp_path):
     code = "import os; os.rmdir(os.getcwd()); from dejavu_torch.cli import main; main()"
     (tmp_path / "gone").mkdir()
     path = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
@@ -305,7 +297,7 @@ def test_a_folder_that_is_gone_is_no_traceback(tmp_path: Path) -> None:
 # names
 
 
-def test_names_that_are_no_text_do_not_fail_a_report(tmp_path: Path) -> None:
+def test_names_that_are_no_text_do_not_fail_a_report(tmp_path):
     for name, seed in ((b"caf\xe9\n\x1b[31m", 1), ("\xe9$_{$".encode(), 2)):
         plain = write_images(tmp_path / f"{seed}", frames(32, seed=seed))
         for image in plain.iterdir():
@@ -326,9 +318,7 @@ def test_names_that_are_no_text_do_not_fail_a_report(tmp_path: Path) -> None:
     assert (len(rows), rows[1].count(r"\udcff\n$_{$")) == (33, 2)
 
 
-def test_what_a_writer_could_not_take_is_refused_ahead_of_the_work(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_a_writer_could_not_take_is_refused_ahead_of_the_work(folder, capsys):
     os.mkfifo(folder / "fifo.safetensors")
     (folder / "link").symlink_to("nowhere")
     before = names_in(folder)
@@ -359,9 +349,7 @@ def test_what_a_writer_could_not_take_is_refused_ahead_of_the_work(
         "demo --second images --out images",
     ],
 )
-def test_an_output_that_is_what_is_read_is_refused_and_stays(
-    folder: Path, words: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_output_that_is_what_is_read_is_refused_and_stays(folder, words, capsys, monkeypatch):
     monkeypatch.chdir(folder)
     for name in ("npy", "safetensors"):
         (folder / f"link.{name}").symlink_to("b.npy")
@@ -375,7 +363,7 @@ def test_an_output_that_is_what_is_read_is_refused_and_stays(
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
 
-def test_a_report_may_lie_beside_what_it_is_of(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_report_may_lie_beside_what_it_is_of(folder, monkeypatch):
     monkeypatch.chdir(folder)
     run("localize", "map.safetensors", "b.npy", "--out", "m.csv")
     (folder / "0").mkdir()
@@ -388,7 +376,7 @@ def test_a_report_may_lie_beside_what_it_is_of(folder: Path, monkeypatch: pytest
 # no room
 
 
-def mounted(folder: Path, options: str, *commands: str) -> list[str]:
+def mounted(folder, options, *commands):
     """The lines that commands say behind one another with a small disk at `disk`, by themselves, and one that
     can only be read at `sealed`."""
     probe = ["unshare", "-rm", "mount", "-t", "tmpfs", "none", "/mnt"]
@@ -404,7 +392,7 @@ def mounted(folder: Path, options: str, *commands: str) -> list[str]:
     return [*done.stdout.splitlines(), *done.stderr.splitlines()]
 
 
-def commands_of_one_process(*lines: str) -> str:
+def commands_of_one_process(*lines):
     """For a shell: commands, and behind a `!` lines of a shell, in one process, which loads torch once and
     whose pictures are bytes without their drawing."""
     code = (
@@ -417,7 +405,7 @@ def commands_of_one_process(*lines: str) -> str:
     return shlex.join([sys.executable, "-c", code, *lines])
 
 
-def test_a_disk_that_is_full_or_sealed_is_one_line_and_leaves_what_was_there(folder: Path) -> None:
+def test_a_disk_that_is_full_or_sealed_is_one_line_and_leaves_what_was_there(folder):
     """A sealed one is told ahead of the work."""
     plain = " ".join(PLAIN)
     words = commands_of_one_process(
@@ -446,11 +434,11 @@ def test_a_disk_that_is_full_or_sealed_is_one_line_and_leaves_what_was_there(fol
     ]
 
 
-def test_a_limit_on_files_is_one_line(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_limit_on_files_is_one_line(folder, capfd):
     (folder / "m.csv").write_text("old")
     before = names_in(folder)
 
-    def limited() -> None:
+    def limited():
         os.chdir(folder)
         resource.setrlimit(resource.RLIMIT_FSIZE, (500, 500))
         run("localize", "map.safetensors", "b.npy", "--out", "m.csv")
@@ -462,11 +450,11 @@ def test_a_limit_on_files_is_one_line(folder: Path, capfd: pytest.CaptureFixture
 # kills
 
 
-def test_a_kill_leaves_a_whole_map_and_a_whole_report(folder: Path) -> None:
+def test_a_kill_leaves_a_whole_map_and_a_whole_report(folder):
     model, target, moment = DejaVu.load(folder / "map.safetensors"), folder / "out", random.Random(0)
     whole = (folder / "map.safetensors").read_bytes()
 
-    def save_for_ever() -> None:
+    def save_for_ever():
         from dejavu_torch.data.output import whole_folder
 
         while True:
@@ -486,10 +474,10 @@ def test_a_kill_leaves_a_whole_map_and_a_whole_report(folder: Path) -> None:
         assert {file.read_bytes() for file in target.glob("*")} <= {whole}
 
 
-def test_two_writers_of_a_map_and_a_folder_both_end_well(folder: Path) -> None:
+def test_two_writers_of_a_map_and_a_folder_both_end_well(folder):
     from dejavu_torch.data.output import whole_file, whole_folder
 
-    def write(text: str) -> None:
+    def write(text):
         for _ in range(100):
             with whole_file(folder / "one") as temporary:
                 temporary.write_text(text)

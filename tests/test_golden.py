@@ -20,16 +20,16 @@ REAL = {"corridor"}  # runs on real data
 
 
 @pytest.fixture(scope="module", params=list(runs.RUNS))
-def ran(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
+def ran(request, tmp_path_factory):
     """The name of a run, and the folder of its report."""
-    name: str = request.param
+    name = request.param
     data = request.getfixturevalue("data_dir") if name in REAL else None
     out = tmp_path_factory.mktemp("golden") / name
     runs.run(name, out, data)
     return name, out
 
 
-def test_report_is_the_golden_one(ran: tuple[str, Path]) -> None:
+def test_report_is_the_golden_one(ran):
     name, out = ran
     report, golden = runs.report_of(out), runs.golden_report(name)
     assert set(runs.keys(report)) == set(runs.keys(golden))
@@ -39,7 +39,7 @@ def test_report_is_the_golden_one(ran: tuple[str, Path]) -> None:
     assert size == report["map_bytes"] <= runs.MORE * golden["map_bytes"]
 
 
-def test_matches_are_those_of_the_golden_run(ran: tuple[str, Path]) -> None:
+def test_matches_are_those_of_the_golden_run(ran):
     name, out = ran
     seen, golden = runs.read_matches(out / "matches.csv"), runs.golden_matches(name)
     assert [row.keys() for row in seen] == [row.keys() for row in golden]
@@ -61,11 +61,11 @@ def test_matches_are_those_of_the_golden_run(ran: tuple[str, Path]) -> None:
 
 
 @pytest.mark.parametrize("route", frames.ROUTES)
-def test_simulated_frames_are_the_same(route: str) -> None:
+def test_simulated_frames_are_the_same(route):
     assert frames.differs(route, frames.golden()[route]) == ""
 
 
-def test_checksums_see_small_changes_and_no_rounding() -> None:
+def test_checksums_see_small_changes_and_no_rounding():
     drawn = frames.drawn(frames.ROUTES[0])
     left_out = frames.unsure(drawn)
     assert len(left_out) < 0.01 * drawn.size
@@ -76,7 +76,7 @@ def test_checksums_see_small_changes_and_no_rounding() -> None:
     assert frames.checksum(np.roll(drawn, 1, axis=-1), left_out) != known
 
 
-def test_another_process_draws_the_same_frames() -> None:
+def test_another_process_draws_the_same_frames():
     code = (
         "from golden import frames; print([frames.differs(r, frames.golden()[r]) for r in frames.ROUTES[:2]])"
     )
@@ -91,7 +91,7 @@ def test_another_process_draws_the_same_frames() -> None:
     assert done.stdout.strip() == "['', '']"
 
 
-def test_commands_have_the_options() -> None:
+def test_commands_have_the_options():
     seen, golden = options.read(), json.loads(options.FILE.read_text())
     found = [
         f"{words} {name}: {seen.get(words, {}).get(name)}; golden {golden.get(words, {}).get(name)}"

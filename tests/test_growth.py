@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -13,7 +10,6 @@ from footage import REFERENCE, SIDE, camera, footage
 from helpers import long_from, refused, streamed, template_model
 from hypothesis import given
 from hypothesis import strategies as st
-from torch import Tensor
 
 from dejavu_torch import (
     HOG,
@@ -36,18 +32,17 @@ from dejavu_torch.maps.frame_table import FrameTable, Route
 from dejavu_torch.maps.spectral import encode_chunk
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.recognition.calibration import Calibration, Platt
-from dejavu_torch.types import Traverse
 
 NUMBERS = 6
 
 
-def walk(places: int, seed: int = 0) -> Tensor:
+def walk(places, seed=0):
     """Descriptors (N,6) that change slowly."""
     steps = torch.randn(places, NUMBERS, generator=torch.Generator().manual_seed(seed))
     return 0.1 * steps.cumsum(0) + torch.arange(6.0)
 
 
-def learned(route: Tensor | Traverse, chunk: int = 64, **settings: object) -> DejaVu:
+def learned(route, chunk=64, **settings):
     mapper = SpectralMapper(4.0, chunk=chunk, **settings)  # type: ignore[arg-type]
     return DejaVu(whitening="none", mapper=mapper).learn(route)
 
@@ -56,21 +51,21 @@ class Named(ArrayTraverse):
     """Frames or features with names."""
 
     @property
-    def names(self) -> list[str]:  # type: ignore[override]
+    def names(self):  # type: ignore[override]
         return [f"{self.name}_{i:04}.png" for i in range(len(self))]
 
 
-def spectral(model: DejaVu) -> SpectralMap:
+def spectral(model):
     assert isinstance(model.map, SpectralMap)
     return model.map
 
 
-def coding_of(route: SpectralMap) -> Any:
+def coding_of(route):
     """What `encode_chunk` takes beside descriptors."""
     return route.means[0], route.step, route.transform, route.resolution
 
 
-def on_ground(route: Tensor) -> DejaVu:
+def on_ground(route):
     """A model whose places are even steps along the ground."""
     model = DejaVu(HOG(), "none", SpectralMapper(200.0, chunk=20), velocity=camera())
     return model.learn(ArrayTraverse(route, "route"))
@@ -87,9 +82,7 @@ def on_ground(route: Tensor) -> DejaVu:
         (32, (192, 1), {}),
     ],
 )
-def test_the_file_is_that_of_all_places_learned_at_once(
-    chunk: int, parts: tuple[int, ...], settings: dict[str, object], tmp_path: Path
-) -> None:
+def test_the_file_is_that_of_all_places_learned_at_once(chunk, parts, settings, tmp_path):
     route = walk(sum(parts))
     first, *others = route.split(parts)
     model, whole = (learned(first, chunk, **settings) for _ in range(2))
@@ -103,7 +96,7 @@ def test_the_file_is_that_of_all_places_learned_at_once(
     assert DejaVu.load(tmp_path / "appended").map.places == len(route)
 
 
-def test_the_old_places_stay_and_the_new_ones_are_found() -> None:
+def test_the_old_places_stay_and_the_new_ones_are_found():
     route = walk(500)
     model = learned(route[:200])  # 200 is no multiple of 64: the last chunk stays short
     model.threshold = 0.25
@@ -116,7 +109,7 @@ def test_the_old_places_stay_and_the_new_ones_are_found() -> None:
     assert (model.threshold, model.summary().places) == (0.25, 500)
 
 
-def test_names_follow_and_parts_without_names_stay_without() -> None:
+def test_names_follow_and_parts_without_names_stay_without():
     route = walk(192)
     model = learned(route[:64])
     append(append(model, Named(route[64:128], "b")), route[128:])
@@ -125,7 +118,7 @@ def test_names_follow_and_parts_without_names_stay_without() -> None:
     assert append(learned(route[:64]), route[64:128]).frame_names == []
 
 
-def test_a_calibration_goes_and_comes_again_from_the_new_places() -> None:
+def test_a_calibration_goes_and_comes_again_from_the_new_places():
     coarse = torch.rand(120, 1, 8, 8, generator=torch.Generator().manual_seed(0))
     frames = torch.nn.functional.interpolate(coarse, (32, 32), mode="bilinear")
     mapper = SpectralMapper(40.0, chunk=20)
@@ -146,7 +139,7 @@ def test_a_calibration_goes_and_comes_again_from_the_new_places() -> None:
     assert lower.mean() < matched.probability.mean() - 0.3
 
 
-def test_places_at_even_steps_go_on_behind_the_last() -> None:
+def test_places_at_even_steps_go_on_behind_the_last():
     model, rest = on_ground(footage(REFERENCE)), ArrayTraverse(footage(REFERENCE + 31), "next")
     alone = model.map.frame_of(torch.arange(101))
     assert append(model, rest).map.places == 202
@@ -165,7 +158,7 @@ def test_places_at_even_steps_go_on_behind_the_last() -> None:
     st.lists(st.floats(-3.0, 3.0, width=32), min_size=2, max_size=40),
     st.sampled_from([1, 7, 1000, 99_999, 2**23]),
 )
-def test_positions_behind_others_reach_as_many_places(moves: list[float], places: int) -> None:
+def test_positions_behind_others_reach_as_many_places(moves, places):
     own = torch.tensor([0.0, *moves]).cumsum(0)
     behind = positions_behind(own, places)
     assert count_places(behind) == places + count_places(own)
@@ -177,7 +170,7 @@ def test_positions_behind_others_reach_as_many_places(moves: list[float], places
         assert (shown - 2 - shown_frames(own.clamp(min=0))).abs().max() <= 1
 
 
-def test_no_place_is_lost_behind_more_than_float32_can_count() -> None:
+def test_no_place_is_lost_behind_more_than_float32_can_count():
     own = torch.arange(50.0)
     assert count_places(positions_behind(own, 2**24 - 50)) == 2**24
     with refused("16777217 places", "merge"):
@@ -187,9 +180,7 @@ def test_no_place_is_lost_behind_more_than_float32_can_count() -> None:
     assert torch.equal(table.steps[50:] - 2**24, own.double() + 1)
 
 
-def test_frames_that_are_appended_are_coded_as_those_of_a_long_route(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_frames_that_are_appended_are_coded_as_those_of_a_long_route(monkeypatch, tmp_path):
     long_from(monkeypatch, 60)
     route = open_source("sim:aerial?frames=130")
     mapper = SpectralMapper(5.0, chunk=40)
@@ -212,13 +203,13 @@ def test_frames_that_are_appended_are_coded_as_those_of_a_long_route(
 # what is refused leaves the map as it was
 
 
-def image_model(chunk: int = 20, **settings: object) -> DejaVu:
+def image_model(chunk=20, **settings):
     frames = torch.rand(40, 3, 32, 32, generator=torch.Generator().manual_seed(0))
     mapper = SpectralMapper(40.0, chunk=chunk)
     return DejaVu(whitening="none", mapper=mapper, **settings).learn(frames)  # type: ignore[arg-type]
 
 
-def test_what_cannot_be_appended() -> None:
+def test_what_cannot_be_appended():
     features, images = learned(walk(64)), image_model()
     for model, added, words in (
         (template_model().learn(walk(64)), walk(40), ("'templates'", "'spectral'")),
@@ -238,14 +229,14 @@ def test_what_cannot_be_appended() -> None:
         assert model.get_extra_state() == state
 
 
-def test_frames_of_another_size_go_where_features_resize_them() -> None:
+def test_frames_of_another_size_go_where_features_resize_them():
     model = image_model(features=HOG(resize=(32, 32)))
     assert append(model, torch.rand(20, 3, 64, 48)).map.places == 60
     grey = image_model(preprocess=Preprocess(channel="grey"))
     assert append(grey, torch.rand(20, 1, 32, 32)).map.places == 60
 
 
-def test_more_places_than_lines_can_be_numbered(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_places_than_lines_can_be_numbered(monkeypatch):
     model = learned(walk(64))
     monkeypatch.setattr(growth, "LARGEST", 100)
     with refused("128 places", "at most 100"):
@@ -262,7 +253,7 @@ def test_more_places_than_lines_can_be_numbered(monkeypatch: pytest.MonkeyPatch)
 # maps of several routes
 
 
-def routes(*names: str, chunks: Sequence[int] = (64, 50, 10_000), **settings: object) -> list[DejaVu]:
+def routes(*names, chunks=(64, 50, 10_000), **settings):
     """Models of other routes that describe them alike, each at its own mean and step."""
     whitening = Whitening(numbers=4)
     models = []
@@ -275,7 +266,7 @@ def routes(*names: str, chunks: Sequence[int] = (64, 50, 10_000), **settings: ob
 
 
 @pytest.mark.parametrize("metric", ["cosine", "l2"])
-def test_a_merged_map_scores_as_its_parts_do(metric: str, tmp_path: Path) -> None:
+def test_a_merged_map_scores_as_its_parts_do(metric, tmp_path):
     models = routes("a", "b", "c", metric=metric)
     merged = merge(models, ["a", "b", "c"])
     merged.save(tmp_path / "m.safetensors")
@@ -294,7 +285,7 @@ def test_a_merged_map_scores_as_its_parts_do(metric: str, tmp_path: Path) -> Non
     assert (tmp_path / "again.safetensors").read_bytes() == (tmp_path / "m.safetensors").read_bytes()
 
 
-def test_a_place_of_a_merged_map_has_a_route_and_a_frame() -> None:
+def test_a_place_of_a_merged_map_has_a_route_and_a_frame():
     models = routes("a", "b", "c")
     merged = merge(models, ["a", "b", "c"])
     assert merged.map.routes == (("a", 100, 100), ("b", 130, 130), ("c", 160, 160))
@@ -314,7 +305,7 @@ def test_a_place_of_a_merged_map_has_a_route_and_a_frame() -> None:
         merged.map.part("d")  # type: ignore[operator]
 
 
-def test_even_steps_of_merged_routes() -> None:
+def test_even_steps_of_merged_routes():
     grounds = footage(REFERENCE), footage(REFERENCE[:70]).flip(3)
     models = [on_ground(ground) for ground in grounds]
     merged = merge(models, ["out", "back"])
@@ -331,7 +322,7 @@ def test_even_steps_of_merged_routes() -> None:
         merge(models, ["out", "back"])
 
 
-def test_a_sequence_does_not_run_from_one_route_into_the_next() -> None:
+def test_a_sequence_does_not_run_from_one_route_into_the_next():
     models = routes("a", "b", "c")
     merged = merge(models, ["a", "b", "c"])
     queries = walk(30, seed=4)
@@ -342,7 +333,7 @@ def test_a_sequence_does_not_run_from_one_route_into_the_next() -> None:
         whole = torch.cat(list(streamed(matcher, map(merged.map.scores, queries_of(merged, queries)))))
         assert not torch.equal(whole, expected)  # as one route's places they would count
         assert torch.equal(merged.localize(queries, sequence=matcher).index, expected.argmin(1))
-        seen: list[Tensor] = []
+        seen = []
         merged.localizer(merged.matching(matcher)._replace(callback=seen.append))(
             merged.descriptor.whitened(queries)
         )
@@ -350,11 +341,11 @@ def test_a_sequence_does_not_run_from_one_route_into_the_next() -> None:
     assert merged.localize(queries, sequence=PlaceFilter()).index.shape == (30,)
 
 
-def queries_of(model: DejaVu, queries: Tensor) -> Iterator[Tensor]:
+def queries_of(model, queries):
     return (model.descriptor.whitened(part) for part in queries.split(8))
 
 
-def test_merging_merged_maps_and_names_that_are_there(caplog: pytest.LogCaptureFixture) -> None:
+def test_merging_merged_maps_and_names_that_are_there(caplog):
     models = routes("a", "b", "c")
     for model in models:
         model.threshold = 0.25
@@ -368,7 +359,7 @@ def test_merging_merged_maps_and_names_that_are_there(caplog: pytest.LogCaptureF
     assert caplog.text == ""
 
 
-def test_what_is_of_single_routes_is_not_kept_and_told(caplog: pytest.LogCaptureFixture) -> None:
+def test_what_is_of_single_routes_is_not_kept_and_told(caplog):
     models = routes("a", "b")
     models[0].calibration = Calibration(Platt(1.0, 0.0), None)
     models[1].precision, models[1].threshold = 0.9, 0.5
@@ -378,7 +369,7 @@ def test_what_is_of_single_routes_is_not_kept_and_told(caplog: pytest.LogCapture
     assert models[1].precision == 0.9
 
 
-def test_maps_that_cannot_be_merged() -> None:
+def test_maps_that_cannot_be_merged():
     (one,) = routes("a")
     other = DejaVu(whitening=Whitening(numbers=4), mapper=SpectralMapper()).learn(walk(90, seed=8))
     plain = learned(walk(90))
@@ -408,7 +399,7 @@ def test_maps_that_cannot_be_merged() -> None:
     assert merge([plain, learned(walk(90, seed=1))], ["a", "b"]).map.places == 180
 
 
-def test_a_state_that_does_not_fit_leaves_a_merged_map_as_it_was() -> None:
+def test_a_state_that_does_not_fit_leaves_a_merged_map_as_it_was():
     merged = merge(routes("a", "b"), ["a", "b"])
     query = walk(1)
     before = merged(query)
@@ -427,11 +418,11 @@ def test_a_state_that_does_not_fit_leaves_a_merged_map_as_it_was() -> None:
 # further visits averaged in
 
 
-def noisy(route: Tensor, seed: int, noise: float = 0.3) -> Tensor:
+def noisy(route, seed, noise=0.3):
     return route + noise * torch.randn(route.shape, generator=torch.Generator().manual_seed(seed))
 
 
-def by_hand(route: Tensor, counts: list[int], rows: Tensor, places: list[int]) -> Tensor:
+def by_hand(route, counts, rows, places):
     """The mean of each place's descriptor, so many times, and of each further one, in a loop."""
     sums, numbers = [row * n for row, n in zip(route, counts, strict=True)], list(counts)
     for row, place in zip(rows, places, strict=True):
@@ -440,7 +431,7 @@ def by_hand(route: Tensor, counts: list[int], rows: Tensor, places: list[int]) -
     return torch.stack([total / n for total, n in zip(sums, numbers, strict=True)])
 
 
-def test_a_map_of_means_is_that_of_the_means_by_hand(tmp_path: Path) -> None:
+def test_a_map_of_means_is_that_of_the_means_by_hand(tmp_path):
     route, more = walk(120), noisy(walk(150), 1)
     places = [*range(-10, 0), *range(20, 120), *[60] * 40]
     model = DejaVu(whitening="none", mapper=SpectralMapper(6.0, chunk=50))
@@ -467,12 +458,12 @@ def test_a_map_of_means_is_that_of_the_means_by_hand(tmp_path: Path) -> None:
     assert fresh.map.visit_counts.tolist() == [1] * 120
 
 
-def test_places_of_one_visit_take_no_bytes(tmp_path: Path) -> None:
+def test_places_of_one_visit_take_no_bytes(tmp_path):
     learned(walk(100)).save(tmp_path / "m")
     assert "map.visits" not in read_map(tmp_path / "m")[0]
 
 
-def test_a_visit_is_averaged_into_a_map() -> None:
+def test_a_visit_is_averaged_into_a_map():
     route, more = walk(150), noisy(walk(60), 1)
     model = learned(route, 50, resolution=4.0)
     one = spectral(model)
@@ -492,7 +483,7 @@ def test_a_visit_is_averaged_into_a_map() -> None:
     assert (spectral(model).decode(0)[:45] - means[:45]).abs().mean() < 2 * coded[0].step
 
 
-def test_counts_follow_where_a_map_grows(tmp_path: Path) -> None:
+def test_counts_follow_where_a_map_grows(tmp_path):
     route = walk(200)
     model = learned(route[:100], 50)
     rest = ArrayTraverse(noisy(route[100:], 2), "rest")
@@ -510,7 +501,7 @@ def test_counts_follow_where_a_map_grows(tmp_path: Path) -> None:
     assert DejaVu.load(tmp_path / "m").map.visits.tolist() == both.map.visits.tolist()
 
 
-def test_which_places_a_visit_shows(tmp_path: Path) -> None:
+def test_which_places_a_visit_shows(tmp_path):
     model, again = learned(walk(100)), ArrayTraverse(walk(100, seed=1), "again")
     few = ArrayTraverse(walk(30), "few")
     assert associate(model, None, again).places.tolist() == list(range(100))
@@ -529,7 +520,7 @@ def test_which_places_a_visit_shows(tmp_path: Path) -> None:
     assert (int(moved.map.visit_counts.sum()), len(moved.map.positions)) == (202, len(REFERENCE))
 
 
-def test_visits_that_cannot_be_averaged() -> None:
+def test_visits_that_cannot_be_averaged():
     model = learned(walk(90), 10_000)
     before, templates = model.map, template_model(whitening="none")
     at = torch.arange(90)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator
 from pathlib import Path
 
 import dejavu_torch
@@ -43,11 +42,11 @@ ARROWS = {
 }
 
 
-def room_of(file: Path) -> str:
+def room_of(file):
     return file.parts[0].removesuffix(".py")
 
 
-def imported(source: str, file: Path) -> Iterator[str]:
+def imported(source, file):
     """Every import in a file, in functions and under TYPE_CHECKING too, as a dotted name."""
     package = ["dejavu_torch", *file.parent.parts]
     for node in ast.walk(ast.parse(source)):
@@ -62,19 +61,19 @@ def imported(source: str, file: Path) -> Iterator[str]:
         yield from targets
 
 
-def rooms_imported(source: str, file: Path) -> set[str]:
+def rooms_imported(source, file):
     """Rooms that a file imports; the front door itself, as of `HOG`, counts as the room ""."""
     targets = [target.split(".") for target in imported(source, file)]
     found = {rest[0] if rest else "" for name, *rest in targets if name == "dejavu_torch"}
     return {room if room in ARROWS else "" for room in found} - {room_of(file)}
 
 
-def circles(sources: dict[Path, str]) -> list[str]:
+def circles(sources):
     """Files that import one another, if through others: of each circle the names of its files."""
     named = {".".join(("dejavu_torch", *file.with_suffix("").parts)): file for file in sources}
     named |= {name.removesuffix(".__init__"): file for name, file in named.items()}
     del named["dejavu_torch"]  # the front door opens lazily
-    reached: dict[Path, set[Path]] = {}
+    reached = {}
     for file, source in sources.items():
         targets = list(imported(source, file))
         names = {name if name in named else name.rpartition(".")[0] for name in targets}
@@ -87,21 +86,21 @@ def circles(sources: dict[Path, str]) -> list[str]:
     return [", ".join(sorted(map(str, circle))) for circle in found if circle]
 
 
-def test_arrows_between_rooms_are_these_and_point_one_way() -> None:
-    used: dict[str, set[str]] = {room: set() for room in ARROWS}
+def test_arrows_between_rooms_are_these_and_point_one_way():
+    used = {room: set() for room in ARROWS}
     for file, source in SOURCES.items():
         if file.stem not in ("__init__", "__main__") or len(file.parts) > 1:
             used[room_of(file)] |= rooms_imported(source, file)
     assert used.pop("cli") - {""} == set(ARROWS["cli"].split())  # which the front door may be opened by
     assert used == {room: set(rooms.split()) for room, rooms in ARROWS.items() if room != "cli"}
-    above: set[str] = set()
+    above = set()
     for room, rooms in ARROWS.items():
         assert set(rooms.split()) <= above, room
         above.add(room)
     assert circles(SOURCES) == []
 
 
-def test_circles_are_caught() -> None:
+def test_circles_are_caught():
     sources = {
         "__init__.py": "from dejavu_torch.maps.one import f",
         "maps/__init__.py": "from dejavu_torch.maps import two",
@@ -109,7 +108,7 @@ def test_circles_are_caught() -> None:
         "maps/three.py": "from dejavu_torch import maps\nfrom dejavu_torch.maps.one import f",
     }
 
-    def found(two: str) -> list[str]:
+    def found(two):
         return circles({Path(name): text for name, text in {**sources, "maps/two.py": two}.items()})
 
     assert found("import torch") == []
@@ -124,7 +123,7 @@ def test_circles_are_caught() -> None:
         assert "maps/two.py" in circle, source
 
 
-def test_rooms_are_seen_however_they_are_imported() -> None:
+def test_rooms_are_seen_however_they_are_imported():
     for file, source, rooms in (
         ("types.py", "import dejavu_torch.data.files", {"data"}),
         ("features/hog.py", "from dejavu_torch import periods", {"periods"}),

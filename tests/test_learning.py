@@ -6,17 +6,13 @@ import errno
 import importlib
 import math
 import multiprocessing
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from typing import Any
 
 import pytest
 import safetensors.torch
 import torch
 from command_line import frames, write_images
 from helpers import long_from, refused
-from torch import Tensor
 
 from dejavu_torch import growth, learning
 from dejavu_torch.data.arrays import ArrayTraverse
@@ -28,45 +24,44 @@ from dejavu_torch.features.views import LabelledFrames
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.learning import Checkpoint, ChunkEncoder, Sample
 from dejavu_torch.maps.spectral import SpectralMapper, encode_chunk
-from dejavu_torch.maps.spectral_map import Chunk, SpectralMap
+from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import run_key
-from dejavu_torch.types import Traverse
 
 CHUNK, PLACES = 50, 1030
 
 
 @pytest.fixture(autouse=True)
-def _small(monkeypatch: pytest.MonkeyPatch) -> None:
+def _small(monkeypatch):
     long_from(monkeypatch, 400)
     monkeypatch.setattr(learning, "SAVE_INTERVAL", -1)  # after each chunk
 
 
-def route(places: int = PLACES, numbers: int = 12) -> Tensor:
+def route(places=PLACES, numbers=12):
     noise = torch.randn(places + 9, 1, numbers, generator=torch.Generator().manual_seed(1))
     return 4 * torch.nn.functional.avg_pool1d(noise.permute(2, 1, 0), 10, 1)[:, 0].T.contiguous()
 
 
-def learned(traverse: Traverse | Tensor, bytes_: float = 3.0, **settings: object) -> DejaVu:
+def learned(traverse, bytes_=3.0, **settings):
     return DejaVu(mapper=SpectralMapper(bytes_, chunk=CHUNK)).learn(traverse, **settings)  # type: ignore[arg-type]
 
 
-def file_of(model: DejaVu, folder: Path) -> bytes:
+def file_of(model, folder):
     model.save(folder / "map.safetensors")
     return (folder / "map.safetensors").read_bytes()
 
 
-def found_share(model: DejaVu, queries: Tensor) -> float:
+def found_share(model, queries):
     """Of every seventh query, that shows the place of its number."""
     return float((model.localize(queries[::7]).index == torch.arange(0, PLACES, 7)).float().mean())
 
 
 @pytest.fixture
-def made(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+def made(monkeypatch):
     """The places of each chunk that is coded."""
-    seen: list[int] = []
+    seen = []
 
-    def counted(descriptors: Tensor, *rest: object) -> object:
+    def counted(descriptors, *rest):
         seen.append(len(descriptors))
         return encode_chunk(descriptors, *rest)  # type: ignore[arg-type]
 
@@ -74,7 +69,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return seen
 
 
-def test_chunks_are_those_of_their_own_descriptors() -> None:
+def test_chunks_are_those_of_their_own_descriptors():
     model = learned(route())
     whitening, mapper = model.whitening, model.mapper
     assert whitening is not None
@@ -89,7 +84,7 @@ def test_chunks_are_those_of_their_own_descriptors() -> None:
     assert found_share(model, route()) > 0.95
 
 
-def test_a_short_route_is_learned_from_all_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_short_route_is_learned_from_all_of_it(tmp_path, monkeypatch):
     long_from(monkeypatch, PLACES)
     model = DejaVu(mapper=SpectralMapper(3.0, chunk=CHUNK))
     whole = model.learn_features(model.descriptor.learn(ArrayTraverse(route())), ArrayTraverse(route()))
@@ -98,7 +93,7 @@ def test_a_short_route_is_learned_from_all_of_it(tmp_path: Path, monkeypatch: py
 
 
 @contextmanager
-def two_threads() -> Iterator[None]:
+def two_threads():
     """In the block torch computes in two threads; they must still be two at its end."""
     threads = torch.get_num_threads()
     torch.set_num_threads(2)
@@ -109,11 +104,11 @@ def two_threads() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def settings_of(known: SpectralMap) -> tuple[Any, ...]:
+def settings_of(known):
     return known.means[-1], known.step, known.transform, known.resolution
 
 
-def test_no_call_changes_the_number_of_threads() -> None:
+def test_no_call_changes_the_number_of_threads():
     """Nor one that fails."""
     model = learned(route())
     encode = ChunkEncoder(ArrayTraverse(route()), model.descriptor, *settings_of(model.map))
@@ -126,7 +121,7 @@ def test_no_call_changes_the_number_of_threads() -> None:
             call(bad)
 
 
-def test_bytes_do_not_hang_on_how_a_route_is_read(tmp_path: Path) -> None:
+def test_bytes_do_not_hang_on_how_a_route_is_read(tmp_path):
     whole = file_of(learned(route()), tmp_path)
     parts = route().split([333, 1, 696])
     assert file_of(learned(Chain([ArrayTraverse(part) for part in parts])), tmp_path) == whole
@@ -137,7 +132,7 @@ def test_bytes_do_not_hang_on_how_a_route_is_read(tmp_path: Path) -> None:
         assert file_of(learned(route()), tmp_path) == whole
 
 
-def test_convention_the_sample_is_evenly_spaced_and_of_whole_chunks() -> None:
+def test_convention_the_sample_is_evenly_spaced_and_of_whole_chunks():
     found = Sample.of(PLACES, CHUNK)
     starts = found.frame[:: found.segment]
     assert (found.segment, len(found.frame)) == (CHUNK, 400)
@@ -150,11 +145,11 @@ def test_convention_the_sample_is_evenly_spaced_and_of_whole_chunks() -> None:
     assert int(found.frame.max()) < PLACES
 
 
-def test_the_sample_of_a_long_route_meets_its_budget() -> None:
+def test_the_sample_of_a_long_route_meets_its_budget():
     assert abs(learned(route(), 4.0).summary().route_bytes / PLACES / 4 - 1) < 0.05
 
 
-def test_a_second_traverse_tells_of_what_is_in_the_sample() -> None:
+def test_a_second_traverse_tells_of_what_is_in_the_sample():
     torch.manual_seed(0)
     noisy = route() + 0.2 * torch.randn(PLACES, 12)
     views = LabelledFrames(ArrayTraverse(noisy), torch.arange(PLACES))
@@ -169,22 +164,22 @@ def test_a_second_traverse_tells_of_what_is_in_the_sample() -> None:
     assert found_share(model, noisy) > 0.9
 
 
-def resumed(folder: Path) -> bytes:
+def resumed(folder):
     """The file of a run with a checkpoint."""
     return file_of(learned(route(), checkpoint=Checkpoint(folder / "m")), folder)
 
 
-def stopped(after: int) -> learning.MapTasks:
+def stopped(after):
     """As `map`, interrupted after so many chunks."""
 
-    def some(encode: Callable[[range], Chunk], tasks: list[range]) -> Iterator[Chunk]:
+    def some(encode, tasks):
         yield from map(encode, tasks[:after])
         raise KeyboardInterrupt
 
     return some
 
 
-def test_finished_chunks_are_not_made_again(tmp_path: Path, made: list[int]) -> None:
+def test_finished_chunks_are_not_made_again(tmp_path, made):
     whole = file_of(learned(route()), tmp_path)
     assert sum(made) == PLACES
     with pytest.raises(KeyboardInterrupt):
@@ -195,13 +190,11 @@ def test_finished_chunks_are_not_made_again(tmp_path: Path, made: list[int]) -> 
         assert sum(made) == rest
 
 
-def test_an_interruption_while_the_map_grows_adds_no_chunk_twice(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interruption_while_the_map_grows_adds_no_chunk_twice(tmp_path, monkeypatch):
     whole = file_of(learned(route()), tmp_path)
     extend, calls = SpectralMap.extend, iter([False, True])
 
-    def interrupted(self: SpectralMap, chunks: Any, *rest: Any) -> None:
+    def interrupted(self, chunks, *rest):
         extend(self, chunks, *rest)
         if next(calls, False):
             raise KeyboardInterrupt
@@ -213,14 +206,14 @@ def test_an_interruption_while_the_map_grows_adds_no_chunk_twice(
     assert resumed(tmp_path) == whole
 
 
-def test_the_partial_map_is_written_each_minute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_partial_map_is_written_each_minute(tmp_path, monkeypatch):
     monkeypatch.setattr(learning, "SAVE_INTERVAL", 60)
     now = iter(range(0, 10**6, 25))
     monkeypatch.setattr(learning, "monotonic", lambda: next(now))
-    written: list[int] = []
+    written = []
     save = Checkpoint.save
 
-    def noted(self: Checkpoint, route: SpectralMap, *rest: Any) -> None:
+    def noted(self, route, *rest):
         written.append(len(route.chunks))
         save(self, route, *rest)
 
@@ -229,7 +222,7 @@ def test_the_partial_map_is_written_each_minute(tmp_path: Path, monkeypatch: pyt
     assert written == [3, 6, 9, 12, 15, 18, 21]
 
 
-def test_a_long_route_holds_the_share_that_its_sample_holds() -> None:
+def test_a_long_route_holds_the_share_that_its_sample_holds():
     model = DejaVu(whitening="none", mapper=SpectralMapper(hold=0.8, chunk=CHUNK))
     noise = torch.randn(PLACES, 40, generator=torch.Generator().manual_seed(0))
     route = model.learn(noise).map
@@ -238,10 +231,10 @@ def test_a_long_route_holds_the_share_that_its_sample_holds() -> None:
     assert 1 - float(missing.square().mean() / noise.var()) == pytest.approx(0.8, abs=0.02)
 
 
-def test_the_partial_map_of_another_run_is_refused(tmp_path: Path) -> None:
+def test_the_partial_map_of_another_run_is_refused(tmp_path):
     part = tmp_path / "map.safetensors.part"
 
-    def learn(*args: object, **settings: object) -> DejaVu:
+    def learn(*args, **settings):
         return learned(*args, **settings, checkpoint=Checkpoint(tmp_path / "map.safetensors"))  # type: ignore[arg-type]
 
     learn(route())
@@ -262,11 +255,11 @@ def test_the_partial_map_of_another_run_is_refused(tmp_path: Path) -> None:
     assert part.read_bytes() == kept[:-9]
 
 
-def test_other_code_is_another_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_code_is_another_run(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     file = tmp_path / "own_features.py"
 
-    def key(factor: int) -> dict[str, str]:
+    def key(factor):
         file.write_text(
             "import torch\nclass Own(torch.nn.Module):\n    def forward(self, x):\n"
             f"        return {factor} * x.flatten(1)\n"
@@ -281,13 +274,11 @@ def test_other_code_is_another_run(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert key(2) != first
 
 
-def test_a_full_disk_keeps_what_is_finished(
-    tmp_path: Path, made: list[int], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_keeps_what_is_finished(tmp_path, made, monkeypatch):
     whole = file_of(learned(route()), tmp_path)
     save, room = safetensors.torch.save_file, iter(range(6))  # chunks
 
-    def full(*file: object) -> None:
+    def full(*file):
         if next(room, None) is None:
             raise OSError(errno.ENOSPC, "No space left on device")
         save(*file)  # type: ignore[arg-type]
@@ -301,11 +292,11 @@ def test_a_full_disk_keeps_what_is_finished(
     assert sum(made) == PLACES - 300
 
 
-def test_an_image_that_cannot_be_read_is_named_and_the_rest_kept(tmp_path: Path, made: list[int]) -> None:
+def test_an_image_that_cannot_be_read_is_named_and_the_rest_kept(tmp_path, made):
     folder = write_images(tmp_path / "route", frames(520, size=16))
     good = (folder / "434.png").read_bytes()
 
-    def learn(name: str) -> bytes:
+    def learn(name):
         model = DejaVu(HOG(cell=8), "none", SpectralMapper(8.0, chunk=CHUNK))
         return file_of(model.learn(open_source(folder), checkpoint=Checkpoint(tmp_path / name)), tmp_path)
 
@@ -320,7 +311,7 @@ def test_an_image_that_cannot_be_read_is_named_and_the_rest_kept(tmp_path: Path,
     assert sum(made) == 120
 
 
-def test_descriptors_of_a_long_route_in_one_chunk_lie_in_a_file(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_descriptors_of_a_long_route_in_one_chunk_lie_in_a_file(monkeypatch):
     values = route(PLACES, 40)
     monkeypatch.setattr(descriptor, "IN_MEMORY", PLACES * 160 - 1)
     monkeypatch.setattr(descriptor, "DESCRIPTOR_MEMORY", PLACES * 100)
@@ -337,11 +328,11 @@ def test_descriptors_of_a_long_route_in_one_chunk_lie_in_a_file(monkeypatch: pyt
     assert found_share(DejaVu(whitening=Whitening(numbers=32)).learn(values), values) > 0.95
 
 
-def test_places_appended_to_a_map_are_kept_as_well(tmp_path: Path, made: list[int]) -> None:
+def test_places_appended_to_a_map_are_kept_as_well(tmp_path, made):
     first, rest = route()[:500], route()[500:]
     visits = LabelledFrames(ArrayTraverse(rest + 0.1), torch.arange(len(rest)))
 
-    def grown(**work: object) -> DejaVu:
+    def grown(**work):
         model = learned(first)
         made.clear()
         return growth.append(model, rest, visits=visits, **work)  # type: ignore[arg-type]
@@ -358,23 +349,23 @@ def test_places_appended_to_a_map_are_kept_as_well(tmp_path: Path, made: list[in
         growth.append(again, rest, visits=visits, checkpoint=Checkpoint(tmp_path / "m"))
 
 
-def visits_of(places: Tensor) -> LabelledFrames:
+def visits_of(places):
     """Frames that show these places; -1 is none."""
     noise = 0.5 * torch.randn(len(places), 12, generator=torch.Generator().manual_seed(2))
     return LabelledFrames(ArrayTraverse(route()[places] + noise), places)
 
 
-def test_processes_write_the_file_of_one(tmp_path: Path) -> None:
+def test_processes_write_the_file_of_one(tmp_path):
     whole = file_of(learned(route()), tmp_path)
     with multiprocessing.get_context("spawn").Pool(2) as pool:
         assert file_of(learned(route(), map_tasks=pool.imap), tmp_path) == whole
 
 
-def test_visits_are_averaged_in_chunk_by_chunk(tmp_path: Path, made: list[int]) -> None:
+def test_visits_are_averaged_in_chunk_by_chunk(tmp_path, made):
     # all places but some, one of them twice, some frames that show none, and against the direction
     places = torch.cat([torch.arange(0, 400), torch.tensor([7, -1, -1]), torch.arange(480, PLACES).flip(0)])
 
-    def model() -> DejaVu:
+    def model():
         return DejaVu(whitening="none", mapper=SpectralMapper(3.0, chunk=CHUNK))
 
     whole = growth.learn_mean(model(), route(), visits_of(places))
@@ -400,16 +391,14 @@ def test_visits_are_averaged_in_chunk_by_chunk(tmp_path: Path, made: list[int]) 
         growth.learn_mean(model(), route(), visits_of(places)._replace(places=torch.arange(PLACES)))
 
 
-def test_a_long_route_of_ready_features_holds_their_variance(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_long_route_of_ready_features_holds_their_variance(tmp_path, caplog):
     """Wide ones that change from place to place: reduced, though nothing whitens, and resumed alike."""
     random = torch.Generator().manual_seed(0)
     basis = torch.randn(60, 300, generator=random)
     places = torch.randn(PLACES, 60, generator=random) @ basis
     wide = ArrayTraverse(places)
 
-    def learn() -> DejaVu:
+    def learn():
         model = DejaVu(whitening="none", mapper=SpectralMapper(chunk=CHUNK))
         return model.learn(wide, checkpoint=Checkpoint(tmp_path / "m"))
 

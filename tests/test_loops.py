@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,14 +16,14 @@ from dejavu_torch.data.ground_truth import as_ground_truth, of_loops
 from dejavu_torch.evaluation.compare import compare
 
 
-def twice(length: int = 120) -> torch.Tensor:
+def twice(length=120):
     """A drive over `length` places, and over the same again, with other noise."""
     places = F.normalize(torch.randn(length, 16), dim=1)
     return F.normalize(torch.cat([places, places]) + 0.05 * torch.randn(2 * length, 16), dim=1)
 
 
 @pytest.mark.parametrize("drive", [False, True])
-def test_a_second_lap_finds_the_first(drive: bool) -> None:
+def test_a_second_lap_finds_the_first(drive):
     rows = twice()
     match = DejaVu(whitening="none").learn(rows).loops(rows, 30, drive)
     assert len(match) == 240
@@ -37,7 +36,7 @@ def test_a_second_lap_finds_the_first(drive: bool) -> None:
         assert not match.accepted[:120].any()
 
 
-def test_a_blank_frame_comes_back_to_nothing() -> None:
+def test_a_blank_frame_comes_back_to_nothing():
     rows = twice()
     rows[[50, 170]] = 0
     match = DejaVu(whitening="none").learn(rows).loops(rows, 30, drive=False)
@@ -45,7 +44,7 @@ def test_a_blank_frame_comes_back_to_nothing() -> None:
     assert not (match.index == 50).any()
 
 
-def test_what_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_refused(tmp_path, capsys):
     rows = twice()
     model = DejaVu(whitening="none").learn(rows)
     with refused("100 places, the map 240", "learned from"):
@@ -68,7 +67,7 @@ def test_what_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
         assert f"--loops 30 and {option}" in fails(capsys, *words, *option.split())
 
 
-def test_only_earlier_places_are_right() -> None:
+def test_only_earlier_places_are_right():
     truth = as_ground_truth([[0, 1, 90], [5], [], [88]])
     queries = torch.tensor([60, 6, 2, 100])
     assert of_loops(truth, queries, 20).positives.tolist() == [[0, 1, -1], [-1] * 3, [-1] * 3, [-1] * 3]
@@ -76,7 +75,7 @@ def test_only_earlier_places_are_right() -> None:
         of_loops(truth, queries, 70)
 
 
-def test_the_commands_find_and_score_loops(tmp_path: Path) -> None:
+def test_the_commands_find_and_score_loops(tmp_path):
     drive, where = tmp_path / "d.npy", tmp_path / "d.csv"
     np.save(drive, twice().numpy())
     where.write_text("x,y\n" + "\n".join(f"{i % 120},0" for i in range(240)))
@@ -95,9 +94,7 @@ def test_the_commands_find_and_score_loops(tmp_path: Path) -> None:
     assert report["accepted_right"] == report["accepted"] == len(pairs)
 
 
-def test_a_comparison_of_loops_asks_all_contenders_for_them(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_comparison_of_loops_asks_all_contenders_for_them(tmp_path, capsys):
     drive, where = tmp_path / "d.npy", tmp_path / "d.csv"
     np.save(drive, twice().numpy())
     where.write_text("x,y\n" + "\n".join(f"{i % 120},0" for i in range(240)))
@@ -127,7 +124,7 @@ def test_a_comparison_of_loops_asks_all_contenders_for_them(
         compare(twice(), None, loops=5, sequence=PlaceFilter())
 
 
-def test_real_drives_with_and_without_loops(data_dir: Path) -> None:
+def test_real_drives_with_and_without_loops(data_dir):
     """Four laps of a small car on a track of 390 frames; a road in a city, driven once."""
     laps = open_source(data_dir / "rc_car_laps" / "frames")
     match = DejaVu().learn(laps).calibrate(laps).loops(laps, 50)
@@ -135,7 +132,7 @@ def test_real_drives_with_and_without_loops(data_dir: Path) -> None:
     starts = torch.tensor([194, 590, 982, 1356, 1750.0])
     judged = found[(found >= 590) & (match.index[found] >= 194)]
 
-    def around(frames: torch.Tensor) -> torch.Tensor:
+    def around(frames):
         lap = torch.searchsorted(starts, frames.float(), right=True) - 1
         return (frames - starts[lap]) / (starts[lap + 1] - starts[lap])
 

@@ -11,7 +11,7 @@ import pytest
 
 @pytest.mark.parametrize("aspect", matrix.ASPECTS)
 @pytest.mark.parametrize("name", matrix.MODULES)
-def test_a_cell_says_what_holds(name: str, aspect: str) -> None:
+def test_a_cell_says_what_holds(name, aspect):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of operations that vmap runs one after another
         why = matrix.fails(name, aspect)
@@ -19,5 +19,5 @@ def test_a_cell_says_what_holds(name: str, aspect: str) -> None:
     assert re.search(refused, why) if refused else why == "", why
 
 
-def test_the_page_is_written_anew() -> None:
+def test_the_page_is_written_anew():
     assert matrix.PAGE.read_text() == matrix.table()

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from fractions import Fraction
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from helpers import Fixed, refused, template_model
 from PIL import Image
-from torch import Tensor, nn
+from torch import nn
 
 from dejavu_torch import model as model_module
 from dejavu_torch.data.arrays import ArrayTraverse
@@ -37,7 +36,7 @@ class Tiny(nn.Module):
         self.norm = nn.BatchNorm2d(4)
         self.drop = nn.Dropout(0.5)
 
-    def forward(self, frames: Tensor) -> Tensor:
+    def forward(self, frames):
         return self.drop(torch.tanh(self.norm(self.conv(frames)))).mean((2, 3))
 
 
@@ -47,25 +46,25 @@ class Made(Traverse):
     def __init__(self, make: Any, count: int) -> None:
         self.make, self.count, self.given = make, count, 0
 
-    def __len__(self) -> int:
+    def __len__(self):
         return self.count
 
-    def read(self, frames: range | list[int]) -> Tensor:
+    def read(self, frames):
         self.given += 1
         return self.make(torch.as_tensor(frames))
 
 
-def layers(*periods: int, stop: int = 72, features: int = 4) -> Fixed:
+def layers(*periods, stop=72, features=4):
     chosen = tuple(range(features))
     return Fixed(*(FrequencyLayer(Fraction(tau), tau, 0, stop, chosen) for tau in periods))
 
 
-def waves(frames: int = 72, dtype: torch.dtype = torch.float32) -> Tensor:
+def waves(frames=72, dtype=torch.float32):
     """Two features that repeat, after 8 and after 9 frames."""
     return torch.arange(frames)[:, None] % torch.tensor([8, 9], dtype=dtype)
 
 
-def pictures(frames: int = 72, dtype: torch.dtype = torch.float32) -> Tensor:
+def pictures(frames=72, dtype=torch.float32):
     """The left half of the frame repeats after 8 frames, the right half after 9."""
     random = torch.Generator().manual_seed(0)
     left, right = (torch.rand(p, 1, SIZE, SIZE, generator=random, dtype=dtype) for p in (8, 9))
@@ -74,14 +73,14 @@ def pictures(frames: int = 72, dtype: torch.dtype = torch.float32) -> Tensor:
     return torch.cat([left[at % 8], right[at % 9]], 3)
 
 
-def wave_model(**arguments: Any) -> DejaVu:
+def wave_model(**arguments):
     return template_model(periods=SpectrogramAnalysis(window=72, strongest=1), **arguments)
 
 
 # what goes in and what comes out
 
 
-def test_features_that_repeat_are_found_exactly() -> None:
+def test_features_that_repeat_are_found_exactly():
     model = wave_model().learn(waves())
     assert [layer.period for layer in model.map.plan] == [8, 9]
     match = model.localize(waves())
@@ -92,7 +91,7 @@ def test_features_that_repeat_are_found_exactly() -> None:
 
 
 @pytest.mark.parametrize("make", [waves, pictures])
-def test_tensors_traverses_and_batch_sizes_agree(make: Any) -> None:
+def test_tensors_traverses_and_batch_sizes_agree(make):
     values = make()
     whole = wave_model(batch_size=1000).learn(values)
     other = wave_model(batch_size=7).learn(ArrayTraverse(values))
@@ -106,7 +105,7 @@ def test_tensors_traverses_and_batch_sizes_agree(make: Any) -> None:
         torch.testing.assert_close(found.score, expected.score)
 
 
-def test_preprocessing_comes_ahead_of_the_features_everywhere(tmp_path: Path) -> None:
+def test_preprocessing_comes_ahead_of_the_features_everywhere(tmp_path):
     frames = torch.rand(40, 3, SIZE, SIZE)
     by_hand = Preprocess("R-B", "patch", patch=5)(frames)
     model = template_model(preprocess=Preprocess("R-B", "patch", patch=5), periods=layers(8, stop=40))
@@ -120,14 +119,12 @@ def test_preprocessing_comes_ahead_of_the_features_everywhere(tmp_path: Path) ->
     assert torch.equal(loaded(frames[:3]), model(frames[:3]))
 
 
-def test_queries_of_another_size_with_as_many_features_are_told_of(caplog: pytest.LogCaptureFixture) -> None:
+def test_queries_of_another_size_with_as_many_features_are_told_of(caplog):
     wave_model(features=HOG()).learn(torch.rand(72, 1, 32, 16)).localize(torch.rand(3, 1, 16, 32))
     assert "1 x 16 x 32" in caplog.text
 
 
-def test_so_many_features_are_told_of(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_so_many_features_are_told_of(monkeypatch, caplog):
     monkeypatch.setattr(model_module, "MANY_FEATURES", 50)
     template_model().learn(torch.rand(40, 200))  # ready features: nothing to be done about them
     assert "smaller frames" not in caplog.text
@@ -138,7 +135,7 @@ def test_so_many_features_are_told_of(
 # training and deployment give equal scores
 
 
-def test_training_and_deployed_path_give_equal_scores() -> None:
+def test_training_and_deployed_path_give_equal_scores():
     model = template_model(Tiny(), layers(8, 9)).learn(pictures())
     model.train()
     query = pictures(6)
@@ -149,7 +146,7 @@ def test_training_and_deployed_path_give_equal_scores() -> None:
     assert torch.equal(match.score, expected.score)
 
 
-def test_a_batch_of_frames_finds_what_each_frame_finds() -> None:
+def test_a_batch_of_frames_finds_what_each_frame_finds():
     """As in the README: `model(frames)` after `learn`, of a network with BatchNorm."""
     model = template_model(Tiny(), layers(8, 9)).learn(pictures())
     frames = pictures(6)
@@ -158,9 +155,7 @@ def test_a_batch_of_frames_finds_what_each_frame_finds() -> None:
 
 
 @pytest.mark.parametrize("most", [1.4, 255.0])
-def test_frames_that_are_not_in_0_to_1_are_warned_of_once(
-    most: float, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_frames_that_are_not_in_0_to_1_are_warned_of_once(most, caplog):
     frames = pictures(40)
     frames = frames / frames.max() * most
     model = DejaVu(Tiny(), Whitening(views=2)).learn(frames)
@@ -184,15 +179,15 @@ class Attending(nn.Module):
     def __init__(self, share: float) -> None:
         super().__init__()
         self.share = share
-        self.sizes: list[int] = []
+        self.sizes = []
 
-    def forward(self, frames: Tensor) -> Tensor:
+    def forward(self, frames):
         self.sizes.append(len(frames))
         features = nn.functional.avg_pool2d(frames, 4).flatten(1)
         return features + self.share * (features.mean(0) - features)
 
 
-def test_a_network_that_attends_to_its_batch_is_refused_but_frame_by_frame() -> None:
+def test_a_network_that_attends_to_its_batch_is_refused_but_frame_by_frame():
     frames = pictures(40)
     with refused("frame 0", "39 others", "--batch_size 1"):
         DejaVu(Attending(0.1), "none").learn(frames)
@@ -205,7 +200,7 @@ def test_a_network_that_attends_to_its_batch_is_refused_but_frame_by_frame() -> 
     assert set(network.sizes) == {1}
 
 
-def test_what_rounding_changes_is_not_refused() -> None:
+def test_what_rounding_changes_is_not_refused():
     frames = pictures(40)
     network = Attending(1e-4)
     DejaVu(network, "none").learn(frames)
@@ -218,7 +213,7 @@ def test_what_rounding_changes_is_not_refused() -> None:
 # gradients
 
 
-def test_gradcheck_from_frames_to_scores() -> None:
+def test_gradcheck_from_frames_to_scores():
     torch.manual_seed(0)
     model = template_model(Tiny(), layers(8, 9)).double().eval()
     model.learn(pictures(dtype=torch.float64))
@@ -226,7 +221,7 @@ def test_gradcheck_from_frames_to_scores() -> None:
     assert torch.autograd.gradcheck(model, frames)
 
 
-def test_gradients_reach_the_weights_of_the_backbone() -> None:
+def test_gradients_reach_the_weights_of_the_backbone():
     model = template_model(Tiny(), layers(8, 9)).learn(pictures()).eval()
     model(pictures(4) + 0.1).logsumexp(1).sum().backward()
     for gradient in (model.features.conv.weight.grad, model.features.conv.bias.grad):
@@ -237,7 +232,7 @@ def test_gradients_reach_the_weights_of_the_backbone() -> None:
 # a module like any other
 
 
-def test_state_dict_goes_into_a_fresh_model() -> None:
+def test_state_dict_goes_into_a_fresh_model():
     torch.manual_seed(0)
     model = template_model(Tiny(), layers(8, 9)).learn(pictures()).eval()
     fresh = template_model(Tiny()).eval()
@@ -255,7 +250,7 @@ def test_state_dict_goes_into_a_fresh_model() -> None:
 # a route in which nothing repeats, and bad input
 
 
-def test_a_constant_route_gives_a_map_without_layers() -> None:
+def test_a_constant_route_gives_a_map_without_layers():
     for values in (torch.full((72, 3), 0.3), torch.full((72, 1, SIZE, SIZE), 0.3)):
         model = wave_model().learn(values)
         assert model.map.plan == ()
@@ -267,7 +262,7 @@ def test_a_constant_route_gives_a_map_without_layers() -> None:
         assert model(values[:5]).isposinf().all()
 
 
-def test_a_frame_that_is_not_finite_is_named() -> None:
+def test_a_frame_that_is_not_finite_is_named():
     for make, bad in ((waves, torch.nan), (pictures, torch.inf)):
         values = make()
         values[41].view(-1)[1] = bad
@@ -278,9 +273,7 @@ def test_a_frame_that_is_not_finite_is_named() -> None:
             model.localize(values)
 
 
-def test_large_frames_are_reduced_and_queries_follow(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_large_frames_are_reduced_and_queries_follow(tmp_path, caplog):
     small = torch.rand(24, 1, 20, 40, generator=torch.Generator().manual_seed(0))
     large = nn.functional.interpolate(small, scale_factor=8, mode="nearest")  # 160 x 320
     model = DejaVu(HOG(cell=4), Whitening(views=1)).learn(large)
@@ -303,7 +296,7 @@ def test_large_frames_are_reduced_and_queries_follow(
     assert large.grad.isfinite().all()
 
 
-def test_frames_keep_their_size_where_it_was_asked_for(tmp_path: Path) -> None:
+def test_frames_keep_their_size_where_it_was_asked_for(tmp_path):
     images = tmp_path / "images"
     images.mkdir()
     for i in range(3):
@@ -325,7 +318,7 @@ def test_frames_keep_their_size_where_it_was_asked_for(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("training", [True, False])
-def test_learning_ends_in_eval_mode_and_matching_restores_the_mode(training: bool) -> None:
+def test_learning_ends_in_eval_mode_and_matching_restores_the_mode(training):
     model = template_model(Tiny(), layers(8)).train()
     before = {name: value.clone() for name, value in model.features.state_dict().items()}
     model.learn(pictures())
@@ -340,7 +333,7 @@ def test_learning_ends_in_eval_mode_and_matching_restores_the_mode(training: boo
     assert all(torch.equal(before[name], value) for name, value in model.features.state_dict().items())
 
 
-def test_what_is_known_of_a_map_is_part_of_its_state() -> None:
+def test_what_is_known_of_a_map_is_part_of_its_state():
     model, again = wave_model().learn(waves()), wave_model()
     model.trained, model.frame_names = Training(7, None), [f"{i:04}.png" for i in range(72)]
     again.load_state_dict(model.state_dict())
@@ -354,18 +347,18 @@ def test_what_is_known_of_a_map_is_part_of_its_state() -> None:
 class Paired(nn.Module):
     """Makes features and something else, as many networks do."""
 
-    def forward(self, frames: Tensor) -> tuple[Tensor, int]:
+    def forward(self, frames):
         return frames.flatten(1), 1
 
 
 class Wrong(nn.Module):
     """Makes no features."""
 
-    def forward(self, frames: Tensor) -> Tensor:
+    def forward(self, frames):
         return frames.flatten(1)[:1]
 
 
-def on_waves(query: Tensor) -> Any:
+def on_waves(query):
     return wave_model().learn(waves()).localize(query)
 
 
@@ -412,12 +405,12 @@ def on_waves(query: Tensor) -> Any:
         (lambda: template_model(temperature=0.0), ("temperature", "expected")),
     ],
 )
-def test_what_is_refused(use: Any, words: tuple[str, ...]) -> None:
+def test_what_is_refused(use, words):
     with refused(*words):
         use()
 
 
-def test_queries_are_read_as_they_are_matched_in_constant_memory(largest_tensor: Any) -> None:
+def test_queries_are_read_as_they_are_matched_in_constant_memory(largest_tensor):
     model = wave_model(batch_size=4).learn(waves())
     made, numbers = Made(lambda at: waves()[at % 72], 5 * READY), set()
     for i, match in enumerate(model.matches(made)):  # ready features come in larger batches than frames
@@ -432,7 +425,7 @@ def test_queries_are_read_as_they_are_matched_in_constant_memory(largest_tensor:
     assert numbers.pop() <= READY * 72
 
 
-def test_a_flat_image_has_finite_gradients_and_no_graph_is_left() -> None:
+def test_a_flat_image_has_finite_gradients_and_no_graph_is_left():
     model = wave_model().learn(pictures().requires_grad_())
     frames = torch.full((2, 1, SIZE, 2 * SIZE), 0.5, requires_grad=True)
     features = model.descriptor.describe(frames).detach()

@@ -5,10 +5,8 @@ from __future__ import annotations
 
 import io
 import shutil
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
-from typing import Any
 
 import pytest
 import torch
@@ -32,9 +30,9 @@ from dejavu_torch.features.distilled import Distilled
 from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.preprocess import VALUES_AT_ONCE
-from dejavu_torch.types import FrequencyLayer, Plan
+from dejavu_torch.types import FrequencyLayer
 
-CHUNKS: Plan = (  # overlapping, with gaps, and a rational period
+CHUNKS = (  # overlapping, with gaps, and a rational period
     FrequencyLayer(4, 4, 0, 20, (0, 2)),
     FrequencyLayer("5/2", 3, 5, 25, (0, 1)),
     FrequencyLayer(7, 7, 10, 25, (3,)),
@@ -43,33 +41,33 @@ CHUNKS: Plan = (  # overlapping, with gaps, and a rational period
 UNCOVERED = [*range(25, 30), *range(50, 60)]
 
 
-def embedding() -> Embedding:
+def embedding():
     return Embedding(nn.Conv2d(3, 4, 3), dimension=8, resize=(16, 16), grid=2, cell=4)
 
 
-def spectral(features: Callable[[], nn.Module], size: tuple[int, int] = (32, 24)) -> DejaVu:
+def spectral(features, size=(32, 24)):
     """The default, a spectral map of whitened descriptors, of a route of 60 colour frames."""
     model = DejaVu(features(), Whitening(views=1), SpectralMapper(16.0))
     return model.learn(torch.rand(60, 3, *size)).eval()
 
 
-def templates(features: Callable[[], nn.Module], **settings: Any) -> DejaVu:
+def templates(features, **settings):
     """Templates of a route of 60 colour frames."""
     mapper = TemplateMapper(ImposedPeriods([3, 4, 5], bin=4))
     return DejaVu(features(), mapper=mapper, **settings).learn(torch.rand(60, 3, 32, 24)).eval()
 
 
-def of_chunks(plan: Plan = CHUNKS, **settings: Any) -> DejaVu:
+def of_chunks(plan=CHUNKS, **settings):
     """A model of 4 features and several chunks, with places that no layer covers."""
     mapper = TemplateMapper(Fixed(*plan), **settings)
     return DejaVu(mapper=mapper).learn(torch.rand(60, 4)).eval()
 
 
-def whitened(**settings: Any) -> DejaVu:
+def whitened(**settings):
     return DejaVu(mapper=SpectralMapper(16.0, **settings)).learn(torch.rand(60, 8)).eval()
 
 
-MODELS: dict[str, Callable[[], DejaVu]] = {
+MODELS = {
     "HOG": partial(templates, HOG),
     "HOG resized": partial(templates, lambda: HOG(resize=(24, 16), bins="linear")),
     "SmallCNN": partial(
@@ -89,11 +87,11 @@ MODELS: dict[str, Callable[[], DejaVu]] = {
 }
 
 
-def exported(model: DejaVu, queries: Tensor) -> torch.export.ExportedProgram:
+def exported(model, queries):
     return torch.export.export(model, (queries,), dynamic_shapes={"queries": {0: torch.export.Dim("batch")}})
 
 
-def saved(program: torch.export.ExportedProgram) -> Any:
+def saved(program):
     """The program as it is read again."""
     buffer = io.BytesIO()
     torch.export.save(program, buffer)
@@ -101,12 +99,12 @@ def saved(program: torch.export.ExportedProgram) -> Any:
     return torch.export.load(buffer).module()
 
 
-def queries_of(model: DejaVu, batch: int) -> Tensor:
+def queries_of(model, batch):
     assert model.frame_shape is not None
     return torch.rand(batch, *model.frame_shape)
 
 
-def assert_scores_alike(run: Callable[[Tensor], Tensor], model: DejaVu, *batches: int) -> None:
+def assert_scores_alike(run, model, *batches):
     for batch in batches:
         queries = queries_of(model, batch)
         scores = run(queries)
@@ -115,7 +113,7 @@ def assert_scores_alike(run: Callable[[Tensor], Tensor], model: DejaVu, *batches
 
 
 @pytest.mark.parametrize("kind", ["joined", "in parts", "spectral dct, l2", "no layers", "l1, temperature"])
-def test_the_exported_model_scores_as_the_model_does(kind: str) -> None:
+def test_the_exported_model_scores_as_the_model_does(kind):
     """The modules by themselves are exported by the matrix."""
     model = MODELS[kind]()
     program = exported(model, queries_of(model, 2))
@@ -124,20 +122,20 @@ def test_the_exported_model_scores_as_the_model_does(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["no layers", "l1, temperature"])
-def test_the_compiled_model_scores_as_the_model_does(kind: str) -> None:
+def test_the_compiled_model_scores_as_the_model_does(kind):
     model = MODELS[kind]()
     torch.compiler.reset()
     assert_scores_alike(torch.compile(model, fullgraph=True, backend="eager"), model, 8, 100)
 
 
-def test_places_that_nothing_covers_and_frames_that_run_in_parts_are_among_them() -> None:
+def test_places_that_nothing_covers_and_frames_that_run_in_parts_are_among_them():
     assert of_chunks()(torch.rand(3, 4))[:, UNCOVERED].isposinf().all()
     assert VALUES_AT_ONCE < 100 * 3 * 64 * 64
 
 
 @pytest.mark.figures
 @pytest.mark.skipif(not (shutil.which("g++") or shutil.which("c++")), reason="no C++ compiler")
-def test_the_model_compiled_by_inductor_scores_frames_as_the_model_does() -> None:
+def test_the_model_compiled_by_inductor_scores_frames_as_the_model_does():
     model = MODELS["HOG"]()
     torch.compiler.reset()
     run = torch.compile(model, fullgraph=True, dynamic=True)
@@ -147,7 +145,7 @@ def test_the_model_compiled_by_inductor_scores_frames_as_the_model_does() -> Non
 
 
 @pytest.mark.parametrize("training", [True, False])
-def test_the_weights_of_the_features_count(training: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_weights_of_the_features_count(training, monkeypatch):
     model, queries = of_chunks(), torch.rand(5, 4)
     before = model(queries)
     model.map.trainable(weights=True, start=torch.tensor([0.5, 1.0, 2.0, 0.0]))
@@ -183,7 +181,7 @@ class ReadingOperations(TorchDispatchMode):
         super().__init__()
         self.found = found
 
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         name = func.overloadpacket.__name__
         masked = name.startswith("index") and any(
             isinstance(index, Tensor) and index.dtype == torch.bool
@@ -197,12 +195,12 @@ class ReadingOperations(TorchDispatchMode):
 
 
 @contextmanager
-def host_synchronisations(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+def host_synchronisations(monkeypatch):
     """The names of all operations and methods that read a number from a tensor."""
-    found: list[str] = []
+    found = []
 
-    def counted(name: str, method: Callable[..., Any]) -> Callable[..., Any]:
-        def wrapper(self: Tensor, *args: Any, **kwargs: Any) -> Any:
+    def counted(name, method):
+        def wrapper(self, *args, **kwargs):
             found.append(f"Tensor.{name}")
             return method(self, *args, **kwargs)
 
@@ -215,7 +213,7 @@ def host_synchronisations(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]
 
 
 @pytest.mark.parametrize("kind", MODELS)
-def test_forward_reads_no_number(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_forward_reads_no_number(kind, monkeypatch):
     model = MODELS[kind]()
     for count in (5, 96):
         queries = queries_of(model, count)
@@ -226,7 +224,7 @@ def test_forward_reads_no_number(kind: str, monkeypatch: pytest.MonkeyPatch) -> 
             assert model(mode.from_tensor(queries)).shape == scores.shape
 
 
-def test_backward_reads_no_number(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_backward_reads_no_number(monkeypatch):
     mapper = TemplateMapper(ImposedPeriods([3, 4, 5], bin=4), temperature=0.5, trainable=True)
     model = DejaVu(mapper=mapper).learn(torch.rand(60, 3, 32, 24))
     with host_synchronisations(monkeypatch) as found:
@@ -235,7 +233,7 @@ def test_backward_reads_no_number(monkeypatch: pytest.MonkeyPatch) -> None:
     assert model.map.templates.grad is not None
 
 
-READERS: dict[str, Callable[[Tensor], Any]] = {
+READERS = {
     "item": lambda x: x.sum().item(),
     "numpy": lambda x: x.numpy(),
     "bool": lambda x: bool(x.any()),
@@ -248,7 +246,7 @@ READERS: dict[str, Callable[[Tensor], Any]] = {
 
 
 @pytest.mark.parametrize("reads", READERS.values(), ids=READERS)
-def test_the_counter_sees_them(reads: Callable[[Tensor], Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_counter_sees_them(reads, monkeypatch):
     with host_synchronisations(monkeypatch) as found:
         reads(torch.tensor([1.0, 0.0, 1.0]))
     assert found

@@ -7,7 +7,6 @@ import logging
 import tempfile
 import warnings
 from pathlib import Path
-from typing import Any
 
 import matplotlib.pyplot as plt
 import pytest
@@ -24,9 +23,7 @@ SHORTER = {
 
 
 @pytest.mark.parametrize("name", SHORTER)
-def test_its_cells_run(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_its_cells_run(name, tmp_path, monkeypatch, caplog):
     monkeypatch.chdir(NOTEBOOKS)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.delenv("DEJAVU_FULL", raising=False)
@@ -37,11 +34,11 @@ def test_its_cells_run(
     for long, short in SHORTER[name].items():
         assert long in code
         code = code.replace(long, short)
-    space: dict[str, Any] = {"__name__": "__main__"}
+    space = {"__name__": "__main__"}
     with plt.rc_context(), warnings.catch_warnings():
         exec(compile(code, f"{name}.ipynb", "exec"), space)
     plt.close("all")
 
 
-def test_no_notebook_is_left_out() -> None:
+def test_no_notebook_is_left_out():
     assert set(SHORTER) == {path.stem for path in NOTEBOOKS.glob("*.ipynb")}

@@ -7,14 +7,13 @@ import re
 import shlex
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from command_line import fails, run
 from helpers import Fixed, refused, streamed
 from PIL import Image
-from torch import Tensor, nn
+from torch import nn
 
 from dejavu_torch import (
     HOG,
@@ -35,7 +34,7 @@ from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.distilled import Distilled
 from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.pixels import PatchPixels
-from dejavu_torch.types import FrequencyLayer, SequenceModel
+from dejavu_torch.types import FrequencyLayer
 
 pytest.importorskip("onnxscript")
 pytest.importorskip("onnxruntime")
@@ -43,30 +42,30 @@ pytest.importorskip("onnxruntime")
 LAYERS = (FrequencyLayer(4, 4, 0, 20, (0, 2)), FrequencyLayer("5/2", 3, 5, 25, (0, 1)))
 
 
-def of_features(**settings: Any) -> DejaVu:
+def of_features(**settings):
     """A template map of ready features; nothing covers places 25 to 29."""
     mapper = TemplateMapper(Fixed(*LAYERS), **settings)
     return DejaVu(mapper=mapper).learn(torch.rand(30, 4)).eval()
 
 
-def of_frames(frames: Tensor, features: nn.Module | None = None, **settings: Any) -> DejaVu:
+def of_frames(frames, features=None, **settings):
     return DejaVu(features, Whitening(views=1), SpectralMapper(16.0, **settings)).learn(frames).eval()
 
 
-def facts_of(session: Any) -> dict[str, Any]:
-    facts: dict[str, Any] = json.loads(session.get_modelmeta().custom_metadata_map[METADATA])
+def facts_of(session):
+    facts = json.loads(session.get_modelmeta().custom_metadata_map[METADATA])
     return facts
 
 
 @pytest.fixture(scope="module")
-def flights() -> tuple[Tensor, Tensor]:
+def flights():
     """80 small frames of a road and of another flight over it."""
     sources = (open_source(f"sim:aerial?frames=80&traverse={i}") for i in range(2))
     road, query = (torch.cat(list(source.batches(80)))[..., ::2, ::2].contiguous() for source in sources)
     return road, query
 
 
-def test_a_file_says_what_it_is(flights: tuple[Tensor, Tensor], tmp_path: Path) -> None:
+def test_a_file_says_what_it_is(flights, tmp_path):
     import onnx
 
     network = SmallCNN(8, channels=3, resize=(16, 16), widths=(4, 8), squeeze=4)
@@ -95,7 +94,7 @@ def test_a_file_says_what_it_is(flights: tuple[Tensor, Tensor], tmp_path: Path) 
             torch.testing.assert_close(run_session(session, frames), model(frames), rtol=0, atol=1e-4)
 
 
-def test_other_parts_score_as_in_torch(flights: tuple[Tensor, Tensor], tmp_path: Path) -> None:
+def test_other_parts_score_as_in_torch(flights, tmp_path):
     mapper = TemplateMapper(ImposedPeriods([3, 4, 5], bin=4), "l1", "sum")
     network = SmallCNN(8, channels=1, resize=(16, 16), widths=(4, 8), squeeze=4)
     model = DejaVu(network, mapper=mapper, preprocess=Preprocess("R-B", "patch")).learn(flights[0]).eval()
@@ -108,7 +107,7 @@ def test_other_parts_score_as_in_torch(flights: tuple[Tensor, Tensor], tmp_path:
 @pytest.mark.parametrize(
     "settings", [{"metric": "l2", "temperature": 0.1}, {"metric": "cosine"}], ids=["l2", "cosine"]
 )
-def test_a_map_of_features_takes_features(settings: dict[str, Any], tmp_path: Path) -> None:
+def test_a_map_of_features_takes_features(settings, tmp_path):
     model, queries = of_features(**settings), torch.rand(9, 4)
     facts = export_onnx(model, tmp_path / "map.onnx").facts
     assert facts["inputs"] == {"features": ["batch", 4]}
@@ -118,9 +117,7 @@ def test_a_map_of_features_takes_features(settings: dict[str, Any], tmp_path: Pa
     torch.testing.assert_close(found, model(queries), rtol=0, atol=1e-5)
 
 
-def assert_streams(
-    file: Path, route: DejaVu, model: SequenceModel, state: list[int], queries: Tensor
-) -> dict[str, Any]:
+def assert_streams(file, route, model, state, queries):
     """A file goes from state to state as a sequence model does; its facts."""
     session, (_, *shape) = session_of(str(file)), queries.shape
     facts = facts_of(session)
@@ -134,7 +131,7 @@ def assert_streams(
 
 
 @pytest.mark.parametrize("sequence", [None, PlaceFilter(within=2)], ids=["single", "filter"])
-def test_a_file_centres_as_a_live_run_does(sequence: PlaceFilter | None, tmp_path: Path) -> None:
+def test_a_file_centres_as_a_live_run_does(sequence, tmp_path):
     model, queries = DejaVu(mapper=SpectralMapper(8.0)).learn(torch.rand(60, 4)), torch.rand(9, 4) + 1
     facts = export_onnx(model, tmp_path / "map.onnx", sequence, centre=True).facts
     assert [*facts["inputs"].items()][-1] == ("mean", [model.map.dimension + 1])
@@ -154,7 +151,7 @@ def test_a_file_centres_as_a_live_run_does(sequence: PlaceFilter | None, tmp_pat
     )
 
 
-def test_only_maps_with_a_mean_centre(tmp_path: Path) -> None:
+def test_only_maps_with_a_mean_centre(tmp_path):
     mapper = TemplateMapper(Fixed(FrequencyLayer(4, 4, 0, 20, (0, 1))))
     model = DejaVu(mapper=mapper).learn(torch.rand(20, 3, 24, 24))
     for centred in (
@@ -168,14 +165,14 @@ def test_only_maps_with_a_mean_centre(tmp_path: Path) -> None:
 class Solves(nn.Module):
     """What ONNX has no operation for."""
 
-    def forward(self, frames: Tensor) -> Tensor:
+    def forward(self, frames):
         return torch.linalg.svdvals(frames).flatten(1)
 
 
 class Counts(nn.Module):
     """What is made for one number of frames."""
 
-    def forward(self, frames: Tensor) -> Tensor:
+    def forward(self, frames):
         return frames.flatten(1) + torch.zeros(len(frames), 1)
 
 
@@ -191,9 +188,7 @@ class Counts(nn.Module):
     ],
     ids=["no operation", "batch", "clahe"],
 )
-def test_a_part_that_cannot_be_exported_is_named(
-    part: dict[str, Any], words: tuple[str, ...], tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_part_that_cannot_be_exported_is_named(part, words, tmp_path, capfd):
     mapper = TemplateMapper(Fixed(FrequencyLayer(4, 4, 0, 20, (0, 1))))
     model = DejaVu(mapper=mapper, **part).learn(torch.rand(20, 3, 24, 24))
     with refused(*words):
@@ -202,7 +197,7 @@ def test_a_part_that_cannot_be_exported_is_named(
     assert capfd.readouterr() == ("", "")
 
 
-def test_scores_that_differ_are_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scores_that_differ_are_no_file(tmp_path, monkeypatch):
     for name, given in {"_program": None, "_serialised": b"", "session_of": None}.items():
         monkeypatch.setattr(onnx_file, name, lambda *_, given=given: given)
     monkeypatch.setattr(onnx_file, "run_session", lambda session, frames: torch.zeros(len(frames), 30))
@@ -211,7 +206,7 @@ def test_scores_that_differ_are_no_file(tmp_path: Path, monkeypatch: pytest.Monk
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_cannot_be_written_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_written_is_refused(tmp_path, monkeypatch):
     with refused("there is no map yet"):
         export_onnx(DejaVu(), tmp_path / "map.onnx")
     with refused("folder", "does not exist"):
@@ -230,7 +225,7 @@ def test_what_cannot_be_written_is_refused(tmp_path: Path, monkeypatch: pytest.M
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command(tmp_path, capsys):
     model = of_features()
     model.save(tmp_path / "map.safetensors")
     words = ("export", tmp_path / "map.safetensors", "--onnx")
@@ -257,14 +252,12 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert (tmp_path / "map.onnx").read_bytes() == before
 
 
-def test_the_documentation_runs_and_a_filter_goes_from_state_to_state(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_documentation_runs_and_a_filter_goes_from_state_to_state(tmp_path, monkeypatch, capsys):
     page = (Path(__file__).parents[1] / "docs" / "howto" / "export.md").read_text()
     monkeypatch.chdir(tmp_path)
     frame = open_source("sim:aerial?frames=64&traverse=1")[40]
     Image.fromarray((frame * 255).byte().permute(1, 2, 0).numpy()).save("frame.png")
-    space: dict[str, Any] = {}
+    space = {}
     for language, block in re.findall(r"```(sh|python)\n(.*?)```", page, re.DOTALL):
         if language == "python":
             exec(block, space)

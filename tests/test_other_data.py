@@ -17,7 +17,7 @@ PAGE = (Path(__file__).parents[1] / "docs" / "howto" / "other_data.md").read_tex
 VALUES = (1, 5, 10, 20)
 
 
-def descriptors(count: int, seed: int = 0) -> np.ndarray:
+def descriptors(count, seed=0):
     """Descriptors that change slowly along a route, with noise of their own."""
     waves = np.random.default_rng(9).normal(size=(2, 12))
     along = np.sin(np.arange(count)[:, None] * 0.15 * np.abs(waves[0]) + waves[1])
@@ -25,7 +25,7 @@ def descriptors(count: int, seed: int = 0) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def toy(tmp_path_factory):
     """A data set in the layout of VPR-datasets-downloader, whose names two tools sort differently; some
     queries are far from all of the database. Beside it descriptors of its images, sorted as text."""
     folder = tmp_path_factory.mktemp("toy")
@@ -43,7 +43,7 @@ def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def recalls(folder: Path, predictions: np.ndarray, values: tuple[int, ...] = VALUES) -> str:
+def recalls(folder, predictions, values=VALUES):
     """The line of VPR-methods-evaluation for predictions (Q,K), numbers of database images sorted as text."""
     places = {}
     for name in ("database", "queries"):
@@ -58,9 +58,7 @@ def recalls(folder: Path, predictions: np.ndarray, values: tuple[int, ...] = VAL
     )
 
 
-def test_ranks_of_another_tool_have_its_recall(
-    toy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_ranks_of_another_tool_have_its_recall(toy, tmp_path, capsys):
     database, queries = (np.load(toy / f"{name}_descriptors.npy") for name in ("database", "queries"))
     distances = np.linalg.norm(queries[:, None] - database, axis=2)
     predictions = distances.argsort(1)[:, :20]
@@ -93,9 +91,7 @@ def test_ranks_of_another_tool_have_its_recall(
 
 
 @pytest.mark.slow
-def test_the_page_from_descriptors_to_recall(
-    toy: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_page_from_descriptors_to_recall(toy, monkeypatch, capsys):
     monkeypatch.chdir(toy)
     named = next(code for code in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL) if "glob" in code)
     exec(named, {})
@@ -115,9 +111,7 @@ def test_the_page_from_descriptors_to_recall(
         assert row["place_name"] == images["database"][int(row["place"])]
 
 
-def test_a_list_of_another_tool_becomes_a_truth(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_list_of_another_tool_becomes_a_truth(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     right = np.empty(2, dtype=object)
     right[0], right[1] = np.array([18, 17]), [3]
@@ -144,7 +138,7 @@ def test_a_list_of_another_tool_becomes_a_truth(
 
 
 @pytest.fixture(scope="module")
-def extracted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def extracted(tmp_path_factory):
     """Descriptors of two traverses as hloc writes them, of images in folders, with coordinates in names."""
     h5py = pytest.importorskip("h5py")
     folder = tmp_path_factory.mktemp("extracted")
@@ -158,7 +152,7 @@ def extracted(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_hloc_descriptors_are_compared(extracted: Path, tmp_path: Path) -> None:
+def test_hloc_descriptors_are_compared(extracted, tmp_path):
     sources = extracted / "db.h5", extracted / "query.h5"
     run("compare", *sources, "--truth", "utm:5", "--tolerance", "0", "--out", tmp_path / "report")
     report, rows = report_of(tmp_path / "report"), rows_of(tmp_path / "report" / "matches.csv")
@@ -170,7 +164,7 @@ def test_hloc_descriptors_are_compared(extracted: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("top", [None, 3])
-def test_localize_writes_pairs(extracted: Path, tmp_path: Path, top: int | None) -> None:
+def test_localize_writes_pairs(extracted, tmp_path, top):
     matches, pairs = tmp_path / "m.csv", tmp_path / "pairs.txt"
     options = () if top is None else ("--top", str(top))
     source = f"{extracted / 'query.h5'}?start=5&stop=25"
@@ -183,9 +177,7 @@ def test_localize_writes_pairs(extracted: Path, tmp_path: Path, top: int | None)
     assert {name.split("/")[0] for _, name in found} == {"db"}
 
 
-def test_pairs_need_names_and_a_file_of_their_own(
-    extracted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_pairs_need_names_and_a_file_of_their_own(extracted, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     np.save("unnamed.npy", descriptors(60))
     run("learn", "unnamed.npy", "--map", "unnamed.safetensors")
@@ -203,7 +195,7 @@ def test_pairs_need_names_and_a_file_of_their_own(
     assert {file.name for file in tmp_path.iterdir()} == {"unnamed.npy", "unnamed.safetensors"}
 
 
-def test_equal_names_say_that_frames_show_the_same_places(tmp_path: Path) -> None:
+def test_equal_names_say_that_frames_show_the_same_places(tmp_path):
     for name in ("a", "b"):
         np.save(tmp_path / f"{name}.npy", descriptors(60, len(name)))
         (tmp_path / f"{name}.txt").write_text("".join(f"{i}.jpg\n" for i in range(60)))
@@ -215,7 +207,7 @@ def test_equal_names_say_that_frames_show_the_same_places(tmp_path: Path) -> Non
     assert torch.equal(truth.positives[:, 0], torch.arange(60))
 
 
-def test_the_page_is_short_and_its_commands_are_understood() -> None:
+def test_the_page_is_short_and_its_commands_are_understood():
     assert len(PAGE.split()) < 700
     blocks = re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL)
     lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines()]

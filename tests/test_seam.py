@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
@@ -35,16 +32,16 @@ class StoredMap(PlaceMap):
         self.power = power
         self.register_buffer("values", torch.zeros(0, 0) if values is None else values)
 
-    def scores(self, queries: Tensor) -> Tensor:
+    def scores(self, queries):
         return torch.cdist(queries, self.values, p=self.power)
 
-    def settings(self) -> dict[str, Any]:
+    def settings(self):
         return {"power": self.power}
 
-    def summary(self) -> MapSummary:
+    def summary(self):
         return MapSummary(self.kind, self.places, self.places, 0, 0, (), {"values": self.values.nbytes}, {})
 
-    def check(self) -> None:
+    def check(self):
         seen, expected = tuple(self.values.shape), (self.places, self.dimension)
         require(seen == expected, f"values {seen}; expected {expected}")
         super().check()
@@ -59,20 +56,20 @@ class StoredMapper(Mapper):
         super().__init__()
         self.power, self.every = power, every
 
-    def forward(self, features: Tensor) -> StoredMap:
+    def forward(self, features):
         return StoredMap(features[:: self.every].clone(), self.power)
 
-    def empty(self) -> StoredMap:
+    def empty(self):
         return StoredMap(power=self.power)
 
 
 @pytest.fixture
-def registered(monkeypatch: pytest.MonkeyPatch) -> None:
+def registered(monkeypatch):
     """The one line: the class in `CLASSES`."""
     monkeypatch.setattr(model_file, "REGISTRY", {**model_file.REGISTRY, "StoredMapper": StoredMapper})
 
 
-def test_learn_localize_save_load(registered: None, tmp_path: Path) -> None:
+def test_learn_localize_save_load(registered, tmp_path):
     values = torch.rand(40, 6)
     model = DejaVu(mapper=StoredMapper()).learn(values)
     assert model.localize(values + 0.01).index.tolist() == list(range(40))
@@ -84,7 +81,7 @@ def test_learn_localize_save_load(registered: None, tmp_path: Path) -> None:
     assert read_place_map(tmp_path / "m.safetensors").places == 40
 
 
-def test_a_kind_that_is_not_registered_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_kind_that_is_not_registered_is_refused(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(model_file, "REGISTRY", {**model_file.REGISTRY, "StoredMapper": StoredMapper})
         DejaVu(mapper=StoredMapper()).learn(torch.rand(9, 2)).save(tmp_path / "m.safetensors")
@@ -92,7 +89,7 @@ def test_a_kind_that_is_not_registered_is_refused(tmp_path: Path, monkeypatch: p
         DejaVu.load(tmp_path / "m.safetensors")
 
 
-def test_compare_reports_any_kind() -> None:
+def test_compare_reports_any_kind():
     reference, query = (torch.rand(30, 4, generator=torch.Generator().manual_seed(0)) for _ in range(2))
     result = compare(
         ArrayTraverse(reference, "a"), ArrayTraverse(query + 0.01, "b"), "0", DejaVu(mapper=StoredMapper())
@@ -105,7 +102,7 @@ def test_compare_reports_any_kind() -> None:
     assert {"pr", "coverage"} <= result.pictures.keys()
 
 
-def test_what_is_of_templates_alone_is_refused_in_one_line() -> None:
+def test_what_is_of_templates_alone_is_refused_in_one_line():
     values = torch.rand(30, 4)
     model = DejaVu(mapper=StoredMapper()).learn(values)
     for use in (
@@ -116,7 +113,7 @@ def test_what_is_of_templates_alone_is_refused_in_one_line() -> None:
             use()
 
 
-def test_a_state_of_another_kind_or_of_other_settings_is_refused() -> None:
+def test_a_state_of_another_kind_or_of_other_settings_is_refused():
     state = DejaVu(mapper=StoredMapper()).learn(torch.rand(9, 2)).state_dict()
     with refused("kind is 'stored'", "'templates'"):
         template_model().load_state_dict(state)
@@ -126,7 +123,7 @@ def test_a_state_of_another_kind_or_of_other_settings_is_refused() -> None:
     assert other.map.places == 0
 
 
-def test_the_one_table_between_frames_and_places() -> None:
+def test_the_one_table_between_frames_and_places():
     """A camera that stands over frames 2 to 4: all of them are place 2."""
     route = TemplateMap((), (), 4, 2)
     route.positions = torch.tensor([0.0, 1.0, 2.0, 2.0, 2.0, 3.0])
@@ -144,7 +141,7 @@ def test_the_one_table_between_frames_and_places() -> None:
         route.place_of(torch.tensor([5]))
 
 
-def test_a_mapper_that_does_not_fit_is_refused() -> None:
+def test_a_mapper_that_does_not_fit_is_refused():
     with refused("StoredMapper made a map of 5 places", "(9, 2)"):
         DejaVu(mapper=StoredMapper(every=2)).learn(torch.rand(9, 2))
     with refused("Linear", "Mapper"):
@@ -153,7 +150,7 @@ def test_a_mapper_that_does_not_fit_is_refused() -> None:
         TemplateMapper(nn.Linear(2, 2))  # type: ignore[arg-type]
 
 
-def test_a_state_that_is_refused_leaves_the_map_as_it_was() -> None:
+def test_a_state_that_is_refused_leaves_the_map_as_it_was():
     wave = torch.arange(128)[:, None] % torch.tensor([8.0, 9.0])
     model, other = template_model().learn(wave), template_model().learn(wave[:64] + 1)
     expected, state = model(wave), other.map.state_dict()
@@ -170,13 +167,11 @@ def test_a_state_that_is_refused_leaves_the_map_as_it_was() -> None:
 class Foreign(PeriodFinder):
     """A finder that no map file can bring."""
 
-    def plan(self, features: Tensor) -> tuple[FrequencyLayer, ...]:
+    def plan(self, features):
         return (FrequencyLayer(10, 10, 0, len(features), tuple(range(features.shape[1]))),)
 
 
-def test_a_loaded_map_says_that_its_period_finder_is_missing(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_loaded_map_says_that_its_period_finder_is_missing(tmp_path, caplog):
     values = torch.rand(60, 4)
     DejaVu(mapper=TemplateMapper(Foreign())).learn(values).save(tmp_path / "m.safetensors")
     model = DejaVu.load(tmp_path / "m.safetensors")
@@ -202,6 +197,6 @@ def test_a_loaded_map_says_that_its_period_finder_is_missing(
     ],
     ids=["learn", "compare", "evaluate", "best_match", "HOG", "forward"],
 )
-def test_what_is_no_tensor_or_traverse_is_refused_in_one_line(use: Any) -> None:
+def test_what_is_no_tensor_or_traverse_is_refused_in_one_line(use):
     with refused("expected"):
         use()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -20,7 +18,7 @@ from dejavu_torch.motion.resampling import ResampledTraverse
 
 
 @pytest.fixture(scope="module")
-def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def pair(tmp_path_factory):
     folder = tmp_path_factory.mktemp("pair")
     for name, seed in (("first", 1), ("second", 2)):
         np.save(folder / f"{name}.npy", frames(96, seed))
@@ -28,7 +26,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 
 @pytest.fixture(scope="module")
-def route(pair: tuple[Path, Path]) -> Path:
+def route(pair):
     path = pair[0].parent / "map.safetensors"
     run("learn", pair[0], "--map", path)
     return path
@@ -37,18 +35,18 @@ def route(pair: tuple[Path, Path]) -> Path:
 # in Python
 
 
-def waves() -> torch.Tensor:
+def waves():
     return torch.rand(90, 6, generator=torch.Generator().manual_seed(0))
 
 
 @pytest.fixture
-def model() -> DejaVu:
+def model():
     """A map whose last 10 places nothing covers, and of places that are alike."""
     model = template_model(periods=Fixed(FrequencyLayer(20, 20, 0, 80, (0, 1, 2, 3))))
     return model.learn(waves())
 
 
-def test_the_first_candidate_is_what_localize_finds(monkeypatch: pytest.MonkeyPatch, model: DejaVu) -> None:
+def test_the_first_candidate_is_what_localize_finds(monkeypatch, model):
     queries = torch.rand(40, 6, generator=torch.Generator().manual_seed(1))
     index, score, _ = model.candidates(queries, 5, apart=3)
     monkeypatch.setattr("dejavu_torch.recognition.localizer.SCORES_AT_ONCE", 200)
@@ -66,9 +64,7 @@ def test_the_first_candidate_is_what_localize_finds(monkeypatch: pytest.MonkeyPa
 # in matches.csv
 
 
-def test_localize_writes_a_row_for_each_candidate(
-    route: Path, pair: tuple[Path, Path], tmp_path: Path
-) -> None:
+def test_localize_writes_a_row_for_each_candidate(route, pair, tmp_path):
     run("localize", route, pair[1], "--out", tmp_path / "best.csv")
     run("localize", route, pair[1], "--out", tmp_path / "top.csv", "--top", "10")
     best, rows = rows_of(tmp_path / "best.csv"), rows_of(tmp_path / "top.csv")
@@ -84,7 +80,7 @@ def test_localize_writes_a_row_for_each_candidate(
 
 
 @pytest.fixture(scope="module")
-def flights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def flights(tmp_path_factory):
     """A calibrated map, whose queries are another flight."""
     path = tmp_path_factory.mktemp("flights") / "map.safetensors"
     run("learn", "sim:aerial?frames=96", "--map", path)
@@ -95,9 +91,7 @@ AGAIN = "sim:aerial?frames=96&traverse=1"
 
 
 @pytest.mark.parametrize("words", [("--precision", ".3"), (), ("--filter", "--precision", ".01")])
-def test_the_first_of_several_places_has_the_probability(
-    flights: Path, tmp_path: Path, words: tuple[str, ...]
-) -> None:
+def test_the_first_of_several_places_has_the_probability(flights, tmp_path, words):
     best, top = tmp_path / "best.csv", tmp_path / "top.csv"
     run("localize", flights, AGAIN, *words, "--out", best)
     run("localize", flights, AGAIN, *words, "--top", "4", "--out", top)
@@ -114,7 +108,7 @@ def test_the_first_of_several_places_has_the_probability(
     assert reports[0]["accepted"] == reports[1]["accepted"] == sum(row["accepted"] == "1" for row in alone)
 
 
-def test_compare_and_evaluate_agree(route: Path, pair: tuple[Path, Path], tmp_path: Path) -> None:
+def test_compare_and_evaluate_agree(route, pair, tmp_path):
     options = "--truth", "0", "--tolerance", "1", "--map", route
     run("compare", *pair, *options, "--top", "12", "--out", tmp_path / "c")
     rows = rows_of(tmp_path / "c" / "matches.csv")
@@ -131,9 +125,7 @@ def test_compare_and_evaluate_agree(route: Path, pair: tuple[Path, Path], tmp_pa
     assert report_of(tmp_path / "c")["recall_at_1"] < report_of(tmp_path / "c")["recall_at_10"]
 
 
-def test_without_top_compare_counts_and_writes_matches_only(
-    route: Path, pair: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_top_compare_counts_and_writes_matches_only(route, pair, tmp_path, capsys):
     run("compare", *pair, "--map", route, "--truth", "0", "--tolerance", "1", "--out", tmp_path / "c")
     assert "among the first 5 candidates" in capsys.readouterr().out
     assert report_of(tmp_path / "c")["recall_at_10"] > 0
@@ -144,14 +136,14 @@ def test_without_top_compare_counts_and_writes_matches_only(
     assert (report["recall_at_5"], report["recall_at_10"]) == (None, None)
 
 
-def test_as_many_ranks_as_the_file_has(tmp_path: Path) -> None:
+def test_as_many_ranks_as_the_file_has(tmp_path):
     rows = "".join(f"3,{10 * rank},0.{rank},1,{rank}\n" for rank in range(1, 8))
     (tmp_path / "m.csv").write_text("query,place,score,accepted,rank\n" + rows)
     facts = evaluate_file(tmp_path / "m.csv", "47").report.facts  # place 50: rank 5
     assert (facts["queries"], facts["recall_at_5"], facts["recall_at_10"]) == (1, 1.0, None)
 
 
-def test_a_route_of_fewer_places_than_candidates() -> None:
+def test_a_route_of_fewer_places_than_candidates():
     waves = torch.rand(8, 3, generator=torch.Generator().manual_seed(3))
     model = template_model(periods=Fixed(FrequencyLayer(8, 8, 0, 8, (0, 1, 2))))
     result = compare(ArrayTraverse(waves), ArrayTraverse(waves + 0.01), "0", model=model, tolerance=0)
@@ -159,7 +151,7 @@ def test_a_route_of_fewer_places_than_candidates() -> None:
     assert (report["recall_at_5"], report["recall_at_10"]) == (1.0, None)
 
 
-def test_convention_11_candidates_are_even_steps_apart_and_written_as_frames(tmp_path: Path) -> None:
+def test_convention_11_candidates_are_even_steps_apart_and_written_as_frames(tmp_path):
     model = template_model(periods=everything(101), velocity=camera()).learn(footage(REFERENCE))
     query = ArrayTraverse(footage(QUERY, noise=0.02))
     steps = model.resample(query, model.step)

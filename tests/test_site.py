@@ -23,7 +23,7 @@ SECTIONS = re.compile("^(Args|Attributes|Convention|Raises|Returns|Shape|Example
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def site(tmp_path_factory):
     for needed in ("sphinx", "furo", "myst_nb"):
         pytest.importorskip(needed)
     out = tmp_path_factory.mktemp("site")
@@ -37,7 +37,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out / "html"
 
 
-def documented() -> dict[str, str]:
+def documented():
     """Public names and their docstrings: those of the front door, and those with sections."""
     found = {}
     for path in PACKAGE.rglob("*.py"):
@@ -51,17 +51,17 @@ def documented() -> dict[str, str]:
     return found
 
 
-def words(text: str) -> str:
+def words(text):
     """What is left of marked-up text."""
     return " ".join(re.findall(r"\w+", text))
 
 
 @cache
-def shown(page: Path) -> str:
+def shown(page):
     return words(unescape(re.sub(r"<[^>]*>", "", page.read_text())))
 
 
-def test_every_public_name_has_its_docstring_on_the_page_of_its_folder(site: Path) -> None:
+def test_every_public_name_has_its_docstring_on_the_page_of_its_folder(site):
     from sphinx.util.inventory import InventoryFile
 
     with (site / "objects.inv").open("rb") as file:
@@ -78,7 +78,7 @@ def test_every_public_name_has_its_docstring_on_the_page_of_its_folder(site: Pat
         assert words(text.partition("\n\n")[0]) in shown(page), name
 
 
-def test_every_command_has_its_help(site: Path) -> None:
+def test_every_command_has_its_help(site):
     text = shown(site / "reference" / "commands.html")
     for name in (*COMMANDS, "train options fit"):
         assert f"usage dejavu {name} " in text
@@ -88,7 +88,7 @@ def test_every_command_has_its_help(site: Path) -> None:
         assert option in text
 
 
-def test_every_link_within_the_site_leads_somewhere(site: Path) -> None:
+def test_every_link_within_the_site_leads_somewhere(site):
     anchors = {
         page: {unescape(name) for name in re.findall(r'\bid="([^"]+)"', page.read_text())}
         for page in site.rglob("*.html")
@@ -106,6 +106,6 @@ def test_every_link_within_the_site_leads_somewhere(site: Path) -> None:
     assert lost == []
 
 
-def test_notebooks_are_pages(site: Path) -> None:
+def test_notebooks_are_pages(site):
     for notebook in (ROOT / "notebooks").glob("*.ipynb"):
         assert (site / "notebooks" / notebook.stem).with_suffix(".html").is_file()

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 import torch
 from helpers import all_of, refused
-from torch import Tensor
 
 from dejavu_torch import HOG, DejaVu, ImposedPeriods, SequenceMatcher, TemplateMapper, open_source
 from dejavu_torch.data.arrays import ArrayTraverse
@@ -18,53 +15,50 @@ from dejavu_torch.growth import second_traverse
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.recognition.filter import PlaceFilter
-from dejavu_torch.types import Match, Traverse
 
 FRAMES = 200
 
 
-def near_share(model: DejaVu, traverse: Traverse) -> float:
+def near_share(model, traverse):
     """Of the frames, that are found within 5 places."""
     return float(((model.localize(traverse).index - torch.arange(FRAMES)).abs() <= 5).float().mean())
 
 
 @pytest.fixture(scope="module")
-def reference() -> Traverse:
+def reference():
     return open_source(f"sim:aerial?frames={FRAMES}")
 
 
 @pytest.fixture(scope="module")
-def second() -> Traverse:
+def second():
     return open_source(f"sim:aerial?frames={FRAMES}&traverse=1")
 
 
-def spectral(**settings: object) -> DejaVu:
-    few: dict[str, object] = {"views": 4}  # sooner than those of a short route
+def spectral(**settings):
+    few = {"views": 4}  # sooner than those of a short route
     return DejaVu(whitening=Whitening(**(few | settings)), mapper=SpectralMapper())  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
-def model(reference: Traverse) -> DejaVu:
+def model(reference):
     return spectral().learn(reference)
 
 
-def test_a_second_traverse_is_found(model: DejaVu, second: Traverse) -> None:
+def test_a_second_traverse_is_found(model, second):
     assert near_share(model, second) > 0.95
     assert isinstance(model.map, SpectralMap)
     halves = (1764 + 1440 + 2 * 100) * 100 / 2  # half a byte for each number of a projection
     assert halves < model.summary().fixed["whitening"] < 1.02 * halves
 
 
-def test_a_second_traverse_is_found_at_five_bytes_a_place(
-    model: DejaVu, reference: Traverse, second: Traverse
-) -> None:
+def test_a_second_traverse_is_found_at_five_bytes_a_place(model, reference, second):
     few = DejaVu(mapper=SpectralMapper(5.0))
     few.descriptor.take(model.descriptor, whitening=True)
     assert near_share(few.learn(reference), second) > 0.95
     assert 4.8 * FRAMES <= few.summary().route_bytes <= 5 * FRAMES
 
 
-def test_two_runs_give_the_same_map(model: DejaVu, reference: Traverse) -> None:
+def test_two_runs_give_the_same_map(model, reference):
     torch.manual_seed(5)  # of the caller: not of the copies
     again, other = spectral().learn(reference), spectral(seed=1).learn(reference)
     projection = "descriptor.whitening.projection"
@@ -75,7 +69,7 @@ def test_two_runs_give_the_same_map(model: DejaVu, reference: Traverse) -> None:
     assert not torch.equal(states[0][projection], states[2][projection])
 
 
-def test_scores_of_frames_and_of_their_features_agree(model: DejaVu, second: Traverse) -> None:
+def test_scores_of_frames_and_of_their_features_agree(model, second):
     frames = next(iter(second.batches(8)))
     scores = model(frames)
     descriptors = model.descriptor.whitened(model.descriptor.describe(frames))
@@ -90,7 +84,7 @@ def test_scores_of_frames_and_of_their_features_agree(model: DejaVu, second: Tra
     assert (1 - (four * descriptors[:4]).sum(1)).abs().max() < 1e-4
 
 
-def test_save_and_load(model: DejaVu, second: Traverse, tmp_path: Path) -> None:
+def test_save_and_load(model, second, tmp_path):
     model.save(tmp_path / "m.safetensors")
     again = DejaVu.load(tmp_path / "m.safetensors")
     frames = next(iter(second.batches(8)))
@@ -104,14 +98,14 @@ def test_save_and_load(model: DejaVu, second: Traverse, tmp_path: Path) -> None:
     assert torch.equal(fresh(frames), model(frames))
 
 
-def test_whitening_by_a_second_traverse(model: DejaVu, reference: Traverse, second: Traverse) -> None:
+def test_whitening_by_a_second_traverse(model, reference, second):
     learned = spectral().learn(reference, second=LabelledFrames(second, torch.arange(FRAMES)))
     projections = [one.state_dict()["descriptor.whitening.projection"] for one in (learned, model)]
     assert not torch.equal(*projections)
     assert near_share(learned, open_source(f"sim:aerial?frames={FRAMES}&traverse=2")) > 0.95
 
 
-def test_frames_that_show_no_place_are_left_out(reference: Traverse, second: Traverse) -> None:
+def test_frames_that_show_no_place_are_left_out(reference, second):
     part = open_source(f"sim:aerial?frames={FRAMES}&traverse=1&start=100")
     shown = torch.arange(FRAMES).where(torch.arange(FRAMES) >= 100, -1)
     learned = [
@@ -122,14 +116,14 @@ def test_frames_that_show_no_place_are_left_out(reference: Traverse, second: Tra
     assert (first - other).abs().max() <= 1  # a step of rounding
 
 
-def test_wide_descriptors_reduce_the_route_they_are_of_alone() -> None:
+def test_wide_descriptors_reduce_the_route_they_are_of_alone():
     model = DejaVu(whitening="none").learn(torch.rand(60, 300))
     assert model.map.dimension < 61
     assert model.learn(torch.rand(60, 40)).map.dimension == 40
     assert model.whitening is None
 
 
-def test_views_of_a_second_traverse(reference: Traverse, second: Traverse) -> None:
+def test_views_of_a_second_traverse(reference, second):
     model = spectral()
     views = second_traverse(model, reference, second)
     assert views.traverse is second
@@ -145,7 +139,7 @@ def test_views_of_a_second_traverse(reference: Traverse, second: Traverse) -> No
         DejaVu(whitening="none").learn(plain[0], second=LabelledFrames(plain[1], torch.arange(9)))
 
 
-def test_the_whitening_of_another_model(model: DejaVu, reference: Traverse, tmp_path: Path) -> None:
+def test_the_whitening_of_another_model(model, reference, tmp_path):
     model.save(tmp_path / "m.safetensors")
     known, other = DejaVu.load(tmp_path / "m.safetensors"), DejaVu(mapper=SpectralMapper(3.0))
     for without in (DejaVu(), spectral()):
@@ -158,7 +152,7 @@ def test_the_whitening_of_another_model(model: DejaVu, reference: Traverse, tmp_
     assert near_share(other, reference) > 0.9
 
 
-def test_a_failed_relearning_keeps_map_and_whitening(reference: Traverse, second: Traverse) -> None:
+def test_a_failed_relearning_keeps_map_and_whitening(reference, second):
     model = DejaVu(whitening=Whitening(views=4), mapper=SpectralMapper(200.0)).learn(reference)
     frames = next(iter(second.batches(8)))
     before = model(frames)
@@ -167,7 +161,7 @@ def test_a_failed_relearning_keeps_map_and_whitening(reference: Traverse, second
     assert torch.equal(model(frames), before)
 
 
-def test_two_features_beside_a_larger_drift_are_localized() -> None:
+def test_two_features_beside_a_larger_drift_are_localized():
     """Neighbouring frames are no views: they would rank what repeats fast last."""
     time = torch.arange(720.0)
     wave = torch.stack([time % 8, time % 9, 30 * torch.sin(time / 300)], 1)
@@ -175,7 +169,7 @@ def test_two_features_beside_a_larger_drift_are_localized() -> None:
     assert (found == torch.arange(720)).float().mean() > 0.9
 
 
-def test_copies_are_those_of_the_seed_and_in_order(reference: Traverse) -> None:
+def test_copies_are_those_of_the_seed_and_in_order(reference):
     (copies, places, _), _ = augmented_route(reference, FRAMES, copies=3, most=60, strengths={}, seed=4)
     assert len(copies) == 60
     assert places.tolist() == 3 * list(range(0, FRAMES, 10))  # one block
@@ -197,19 +191,19 @@ def test_copies_are_those_of_the_seed_and_in_order(reference: Traverse) -> None:
 # ready features ---------------------------------------------------------------------------------------
 
 
-def isolated(places: int = 300, features: int = 600, rank: int = 100) -> tuple[Tensor, Tensor]:
+def isolated(places=300, features=600, rank=100):
     """Features of places that have nothing in common with those beside them, and of another visit."""
     random = torch.Generator().manual_seed(0)
     own = torch.randn(places, rank, generator=random) @ torch.randn(rank, features, generator=random)
     return own + 8, own + 8 + 40 * torch.randn(places, features, generator=random)
 
 
-def share_found(model: DejaVu, queries: Tensor) -> float:
+def share_found(model, queries):
     return float((model.localize(queries).index == torch.arange(len(queries))).float().mean())
 
 
 @pytest.mark.parametrize("whitening", [None, "none"])
-def test_ready_features_are_found_as_by_their_cosine(whitening: str | None) -> None:
+def test_ready_features_are_found_as_by_their_cosine(whitening):
     places, queries = isolated()
     plain = torch.nn.functional.cosine_similarity(queries[:, None], places[None], dim=2).argmax(1)
     cosine = float((plain == torch.arange(300)).float().mean())
@@ -222,7 +216,7 @@ def test_ready_features_are_found_as_by_their_cosine(whitening: str | None) -> N
     assert sizes[1] <= 5 < 2 * sizes[1] < sizes[0]
 
 
-def test_the_variance_that_a_map_of_ready_features_holds() -> None:
+def test_the_variance_that_a_map_of_ready_features_holds():
     places, _ = isolated()
     model = DejaVu().learn(places)
     assert model.whitening is not None
@@ -232,7 +226,7 @@ def test_the_variance_that_a_map_of_ready_features_holds() -> None:
     assert DejaVu(whitening="none").learn(places[:, :200]).map.dimension == 200  # as they are
 
 
-def test_frames_that_five_bytes_are_too_few_for(reference: Traverse) -> None:
+def test_frames_that_five_bytes_are_too_few_for(reference):
     """The mean of 1764 numbers alone takes 58.8 bytes of each of 60 places."""
     few = frame_range(reference, 0, 60, 1)
     with refused("route_bytes_per_place is 5;", "expected more than 59.3"):
@@ -245,10 +239,10 @@ def test_frames_that_five_bytes_are_too_few_for(reference: Traverse) -> None:
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float64])
 @pytest.mark.parametrize("kind", ["spectral", "templates"])
-def test_a_map_does_not_hang_on_the_default_type(dtype: torch.dtype, kind: str, tmp_path: Path) -> None:
+def test_a_map_does_not_hang_on_the_default_type(dtype, kind, tmp_path):
     """Neither its file nor its answers, with simulated routes, calibration and every way of matching."""
 
-    def made() -> tuple[bytes, list[Match]]:
+    def made():
         route, query = (open_source(f"sim:aerial?frames=100&traverse={one}") for one in (0, 1))
         mapper = SpectralMapper(chunk=50) if kind == "spectral" else TemplateMapper(ImposedPeriods((8, 13)))
         DejaVu(mapper=mapper).learn(route).calibrate(route).save(tmp_path / "m.safetensors")

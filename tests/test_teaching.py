@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import copy
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from command_line import fails, report_of, run
 from helpers import refused
-from torch import Tensor
 
 from dejavu_torch import (
     DejaVu,
@@ -33,42 +31,42 @@ from dejavu_torch.teaching import FEWEST, ROUNDS, SURE, place_drive, refine
 FRAMES, FIRST, LAST = 160, 20, 140
 
 
-def frames_of(traverse: int, seed: int = 0) -> Tensor:
+def frames_of(traverse, seed=0):
     source = open_source(f"sim:aerial?frames={FRAMES}&traverse={traverse}&seed={seed}")
     return torch.cat(list(source.batches(FRAMES)))[..., ::2, ::2].contiguous()
 
 
 @pytest.fixture(scope="module")
-def road() -> ArrayTraverse:
+def road():
     return ArrayTraverse(frames_of(0), "road")
 
 
 @pytest.fixture(scope="module")
-def drive() -> ArrayTraverse:
+def drive():
     """Frames of another flight, without their positions."""
     return ArrayTraverse(frames_of(1)[FIRST:LAST], "drive")
 
 
 @pytest.fixture(scope="module")
-def placed(road: ArrayTraverse, drive: ArrayTraverse) -> LabelledFrames:
+def placed(road, drive):
     return second_traverse(fresh(), road, drive)
 
 
-def fresh() -> DejaVu:
+def fresh():
     return DejaVu(whitening=Whitening(views=2), mapper=SpectralMapper(12.0, chunk=200))
 
 
-def waves(places: int, seed: int = 0) -> Tensor:
+def waves(places, seed=0):
     noise = torch.randn(places + 7, 16, generator=torch.Generator().manual_seed(seed))
     smooth = torch.nn.functional.avg_pool1d(noise.T[None], 8, 1)[0].T
     return smooth / smooth.norm(dim=1, keepdim=True)
 
 
-def noisy(rows: Tensor, seed: int = 1, size: float = 0.05) -> Tensor:
+def noisy(rows, seed=1, size=0.05):
     return rows + size * torch.randn(rows.shape, generator=torch.Generator().manual_seed(seed))
 
 
-def test_a_drive_is_placed_where_it_is_sure_and_another_route_nowhere() -> None:
+def test_a_drive_is_placed_where_it_is_sure_and_another_route_nowhere():
     model = DejaVu(whitening="none").learn(waves(200))
     found = place_drive(model, noisy(waves(200)[30:170]))
     assert (found >= 0).float().mean() > 0.9
@@ -79,9 +77,7 @@ def test_a_drive_is_placed_where_it_is_sure_and_another_route_nowhere() -> None:
     assert (place_drive(model, part) == -1).all()  # below a tenth of the drive
 
 
-def test_frames_are_placed_without_truth_and_teach(
-    road: ArrayTraverse, drive: ArrayTraverse, placed: LabelledFrames
-) -> None:
+def test_frames_are_placed_without_truth_and_teach(road, drive, placed):
     assert placed.traverse is drive
     assert placed.placed is not None
     sure = placed.places >= 0
@@ -104,7 +100,7 @@ def test_frames_are_placed_without_truth_and_teach(
     assert not torch.equal(*projections)
 
 
-def test_another_route_teaches_nothing(road: ArrayTraverse, tmp_path: Path) -> None:
+def test_another_route_teaches_nothing(road, tmp_path):
     other = ArrayTraverse(frames_of(0, seed=7)[:120].flip(-1), "other")
     views = second_traverse(fresh(), road, other)
     assert (views.places == -1).all()
@@ -114,9 +110,7 @@ def test_another_route_teaches_nothing(road: ArrayTraverse, tmp_path: Path) -> N
     assert (tmp_path / "taught.safetensors").read_bytes() == (tmp_path / "plain.safetensors").read_bytes()
 
 
-def test_drives_with_and_without_truth_teach_together(
-    road: ArrayTraverse, drive: ArrayTraverse, placed: LabelledFrames
-) -> None:
+def test_drives_with_and_without_truth_teach_together(road, drive, placed):
     again = ArrayTraverse(frames_of(2)[:100], "again")
     views = second_traverse(fresh(), road, [again, drive], ["0", None])
     assert views.placed is not None
@@ -128,9 +122,7 @@ def test_drives_with_and_without_truth_teach_together(
     assert len(list(views.placed_lines())) == 1
 
 
-def test_features_are_computed_once(
-    road: ArrayTraverse, drive: ArrayTraverse, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_features_are_computed_once(road, drive, monkeypatch):
     model, seen = fresh(), []
     describe = type(model.descriptor).describe
     monkeypatch.setattr(
@@ -143,7 +135,7 @@ def test_features_are_computed_once(
     assert once <= sum(seen) < once + FRAMES  # and a few to compare sizes
 
 
-def test_a_weight_counts_as_so_many_pairs() -> None:
+def test_a_weight_counts_as_so_many_pairs():
     views, places = torch.randn(40, 6), torch.randn(40, 6)
     weight = torch.ones(40)
     weight[25:] = 3.0
@@ -153,7 +145,7 @@ def test_a_weight_counts_as_so_many_pairs() -> None:
         torch.testing.assert_close(found.abs(), known.abs(), rtol=1e-4, atol=1e-5)
 
 
-def test_a_frame_of_a_drive_counts_as_so_many_copies() -> None:
+def test_a_frame_of_a_drive_counts_as_so_many_copies():
     places = waves(100)
     copies = (noisy(places), torch.arange(100))
     drive = (changed(places)[:80], torch.arange(80))
@@ -169,12 +161,10 @@ def test_a_frame_of_a_drive_counts_as_so_many_copies() -> None:
     torch.testing.assert_close(*products, rtol=0, atol=2e-3)
 
 
-def test_drives_are_placed_on_what_they_have_taught(
-    road: ArrayTraverse, drive: ArrayTraverse, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_drives_are_placed_on_what_they_have_taught(road, drive, monkeypatch):
     learn, taught = DejaVu.learn, []
 
-    def noted(model: DejaVu, source: object, progress: bool = False, second: object = None) -> DejaVu:
+    def noted(model, source, progress=False, second=None):
         taught.append(second)
         return learn(model, source, progress, second)  # type: ignore[arg-type]
 
@@ -185,12 +175,12 @@ def test_drives_are_placed_on_what_they_have_taught(
     assert len(taught) == ROUNDS
 
 
-def test_the_light_of_a_drive_is_no_change(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_light_of_a_drive_is_no_change(monkeypatch):
     places, shown = waves(100), torch.arange(80)
     views = noisy(places)[:80]
     light = torch.rand(16)
 
-    def products(drive: Tensor) -> Tensor:
+    def products(drive):
         whitening = Whitening(numbers=8, bits=16, shrinkage=0.1)
         copies = [(noisy(places, seed=2), torch.arange(100))]
         whitening.learn(places, copies, visits=Visits([(drive, shown)], torch.zeros_like(shown)))
@@ -201,7 +191,7 @@ def test_the_light_of_a_drive_is_no_change(monkeypatch: pytest.MonkeyPatch) -> N
     torch.testing.assert_close(products(views + light), products(views), rtol=0, atol=1e-3)
 
 
-def test_a_sample_keeps_the_drive_of_each_frame() -> None:
+def test_a_sample_keeps_the_drive_of_each_frame():
     which, places = torch.tensor([0, 0, 1, 1, 1]), torch.tensor([3, -1, 0, 4, 9])
     views = LabelledFrames(ArrayTraverse(torch.rand(5, 4)), places, Placed(which, {1: "b"}, 0.9, 1))
     some = views_of(views, torch.tensor([0, 3, 9]))
@@ -212,7 +202,7 @@ def test_a_sample_keeps_the_drive_of_each_frame() -> None:
     assert not len(Sample(torch.arange(3), 3).views(nothing).places)  # not refused: copies are left
 
 
-def test_what_cannot_be_placed_is_refused(road: ArrayTraverse) -> None:
+def test_what_cannot_be_placed_is_refused(road):
     few = ArrayTraverse(frames_of(1)[:29], "few")
     with refused("few has 29 frames and road 160", "a truth for its places", "at least 30 frames in order"):
         second_traverse(fresh(), road, few)
@@ -222,9 +212,7 @@ def test_what_cannot_be_placed_is_refused(road: ArrayTraverse) -> None:
         second_traverse(fresh(), road, ArrayTraverse(torch.rand(40, 3, 30, 48), "wide"))
 
 
-def test_a_report_and_the_command_tell_how_many_frames_teach(
-    road: ArrayTraverse, drive: ArrayTraverse, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_report_and_the_command_tell_how_many_frames_teach(road, drive, tmp_path, capsys):
     names = {"road": road[:], "drive": drive[:], "query": frames_of(2)}
     for name, frames in names.items():
         pixels = frames.mul(255).round().byte().permute(0, 2, 3, 1).numpy()
@@ -254,18 +242,18 @@ def test_a_report_and_the_command_tell_how_many_frames_teach(
     assert "second" not in plain.facts
 
 
-def model_of(rows: Tensor, **settings: object) -> DejaVu:
+def model_of(rows, **settings):
     return DejaVu(whitening="none", mapper=SpectralMapper(16.0, chunk=100, **settings)).learn(rows)  # type: ignore[arg-type]
 
 
-def changed(rows: Tensor, seed: int = 3) -> Tensor:
+def changed(rows, seed=3):
     """Another visit: the first half of the dimensions changes with the day and is noise there."""
     noise = torch.randn(rows.shape, generator=torch.Generator().manual_seed(seed)) * rows.std()
     return torch.cat([rows[:, :8] + 2 * noise[:, :8], rows[:, 8:] + 0.1 * noise[:, 8:]], 1)
 
 
 @pytest.mark.parametrize("metric", ["cosine", "l2"])
-def test_a_stage_compares_queries_and_places_after_it(metric: str) -> None:
+def test_a_stage_compares_queries_and_places_after_it(metric):
     rows, queries = waves(200), torch.randn(9, 16)
     plain, first, second = model_of(rows, metric=metric).map, torch.randn(16, 16), torch.randn(16, 16)
     assert isinstance(plain, SpectralMap)
@@ -293,7 +281,7 @@ def test_a_stage_compares_queries_and_places_after_it(metric: str) -> None:
     torch.testing.assert_close(refined.of_chunks(refined.coded()).scores(queries), refined.scores(queries))
 
 
-def test_gradients_pass_the_stage() -> None:
+def test_gradients_pass_the_stage():
     place_map = model_of(waves(60)).map
     assert isinstance(place_map, SpectralMap)
     refined = place_map.refined(torch.eye(16) + 0.1 * torch.randn(16, 16))
@@ -301,7 +289,7 @@ def test_gradients_pass_the_stage() -> None:
     assert torch.autograd.gradcheck(refined.scores, queries)
 
 
-def test_a_drive_refines_a_map_and_the_next_one_is_found_better(tmp_path: Path) -> None:
+def test_a_drive_refines_a_map_and_the_next_one_is_found_better(tmp_path):
     rows = waves(300)
     model = model_of(rows)
     model.save(tmp_path / "before.safetensors")
@@ -333,7 +321,7 @@ def test_a_drive_refines_a_map_and_the_next_one_is_found_better(tmp_path: Path) 
     assert abs((tmp_path / "after.safetensors").stat().st_size - size) < 50
 
 
-def test_another_route_refines_nothing(tmp_path: Path) -> None:
+def test_another_route_refines_nothing(tmp_path):
     model = model_of(waves(300))
     model.save(tmp_path / "before.safetensors")
     found = refine(model, waves(200, seed=9))
@@ -347,7 +335,7 @@ def test_another_route_refines_nothing(tmp_path: Path) -> None:
     assert str(same).endswith("the map stays as it was")
 
 
-def test_few_frames_cannot_tell_whether_a_stage_helps() -> None:
+def test_few_frames_cannot_tell_whether_a_stage_helps():
     model = model_of(waves(300))
     few = refine(model, noisy(waves(300)[:64]))
     assert (few.placed >= 60, few.accepted) == (True, False)
@@ -356,7 +344,7 @@ def test_few_frames_cannot_tell_whether_a_stage_helps() -> None:
     assert not len(model.map.stage)
 
 
-def test_what_refines_no_map_is_refused() -> None:
+def test_what_refines_no_map_is_refused():
     model = model_of(waves(100))
     with refused("has 29 frames", "at least 30"):
         refine(model, waves(29))
@@ -371,7 +359,7 @@ def test_what_refines_no_map_is_refused() -> None:
     assert not len(model.map.stage)
 
 
-def test_what_knows_of_a_stage(tmp_path: Path) -> None:
+def test_what_knows_of_a_stage(tmp_path):
     rows = waves(400)
     model = model_of(rows)
     refine(model, changed(rows))
@@ -396,7 +384,7 @@ def test_what_knows_of_a_stage(tmp_path: Path) -> None:
     assert (best[:, 0] - scores.amin(1) < 1e-5).float().mean() > 0.9
 
 
-def test_a_calibration_is_learned_anew_from_all_of_a_drive() -> None:
+def test_a_calibration_is_learned_anew_from_all_of_a_drive():
     rows = waves(300)
     model, plain = model_of(rows), model_of(rows)
     model.calibrate(None, LabelledFrames(ArrayTraverse(noisy(rows, size=0.1)), torch.arange(300)))
@@ -412,7 +400,7 @@ def test_a_calibration_is_learned_anew_from_all_of_a_drive() -> None:
     assert abs(float(match.probability.mean() - right.mean())) < 0.1
 
 
-def test_the_command_refines_a_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_refines_a_map(tmp_path, capsys):
     rows = waves(200)
     for name, values in {"route": rows, "drive": changed(rows), "other": waves(90, seed=9)}.items():
         np.save(tmp_path / f"{name}.npy", values.numpy())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,37 +23,37 @@ from dejavu_torch.updating import PIECE, Update, update
 END = 240  # places that the map has; the route goes on
 
 
-def waves(places: int, seed: int = 0) -> Tensor:
+def waves(places, seed=0):
     noise = torch.randn(places + 3, 16, generator=torch.Generator().manual_seed(seed))
     smooth = torch.nn.functional.avg_pool1d(noise.T[None], 4, 1)[0].T
     return smooth / smooth.norm(dim=1, keepdim=True)
 
 
-def seen(rows: Tensor, seed: int = 1) -> Tensor:
+def seen(rows, seed=1):
     return rows + 0.05 * torch.randn(rows.shape, generator=torch.Generator().manual_seed(seed))
 
 
 ROUTE, ASIDE = waves(400), waves(150, seed=9)
 
 
-def model_of(rows: Tensor) -> DejaVu:
+def model_of(rows):
     return DejaVu(None, "none", mapper=SpectralMapper(24.0)).learn(rows)
 
 
-def spectral(model: DejaVu) -> SpectralMap:
+def spectral(model):
     assert isinstance(model.map, SpectralMap)
     return model.map
 
 
-def located(model: DejaVu, queries: Tensor) -> Tensor:
+def located(model, queries):
     return model.localize(ArrayTraverse(queries, "asked"), sequence=PlaceSmoother()).index
 
 
-def close(stretch: tuple[int, int], first: int, last: int) -> bool:
+def close(stretch, first, last):
     return abs(stretch[0] - first) <= 3 and abs(stretch[1] - last) <= 3
 
 
-def test_ground_beyond_the_end_becomes_a_route_with_names() -> None:
+def test_ground_beyond_the_end_becomes_a_route_with_names():
     model = model_of(ROUTE[:END])
     drive = ArrayTraverse(seen(ROUTE[100:330]), "data/monday.npy")
     drive.names = [f"{i}.png" for i in range(230)]
@@ -74,7 +73,7 @@ def test_ground_beyond_the_end_becomes_a_route_with_names() -> None:
     assert ((shown - torch.arange(50, 320)).abs() <= 5).float().mean() > 0.97
 
 
-def test_the_same_drive_brings_nothing_new_and_other_laps_are_stored_once() -> None:
+def test_the_same_drive_brings_nothing_new_and_other_laps_are_stored_once():
     model, drive = model_of(ROUTE[:END]), seen(ROUTE[100:380])
     assert len(drive) - (END - 100) > PIECE
     assert update(model, drive).stretches
@@ -89,9 +88,9 @@ def test_the_same_drive_brings_nothing_new_and_other_laps_are_stored_once() -> N
     assert close(stretch, END - 100, 380 - 100)
 
 
-def test_a_detour_is_connected_at_both_ends_in_either_direction() -> None:
+def test_a_detour_is_connected_at_both_ends_in_either_direction():
     way = torch.cat([ROUTE[40:120], ASIDE, ROUTE[120:200]])
-    places: list[Tensor] = []
+    places = []
     for drive in (seen(way), seen(way).flip(0)):
         model = model_of(ROUTE[:END])
         (stretch,) = update(model, drive).stretches
@@ -105,7 +104,7 @@ def test_a_detour_is_connected_at_both_ends_in_either_direction() -> None:
     assert ((places[0] - places[1]).abs() <= 6).float().mean() > 0.95  # stored in the map's direction
 
 
-def test_new_ground_is_stored_without_the_light_of_the_day() -> None:
+def test_new_ground_is_stored_without_the_light_of_the_day():
     light = 0.4 * torch.randn(16, generator=torch.Generator().manual_seed(3))
     model, drive = model_of(ROUTE[:END]), seen(ROUTE[60:360]) + light
     (stretch,) = update(model, drive).stretches
@@ -116,7 +115,7 @@ def test_new_ground_is_stored_without_the_light_of_the_day() -> None:
     assert torch.nn.functional.cosine_similarity(stored, expected, dim=1).mean() > max(0.9, float(plain))
 
 
-def test_a_drive_of_another_route_changes_nothing() -> None:
+def test_a_drive_of_another_route_changes_nothing():
     model = model_of(ROUTE)
     before = {name: value.clone() for name, value in model.state_dict().items() if isinstance(value, Tensor)}
     found = update(model, waves(200, seed=5))
@@ -126,7 +125,7 @@ def test_a_drive_of_another_route_changes_nothing() -> None:
     assert update(model, seen(ROUTE[20:300])).stretches == ()
 
 
-def test_short_gaps_stay_out_and_short_drives_do_not_refine() -> None:
+def test_short_gaps_stay_out_and_short_drives_do_not_refine():
     model = model_of(ROUTE[:END])
     gap = torch.cat([ROUTE[20:100], ASIDE[:12], ROUTE[100:200]])
     assert update(model, seen(gap)).stretches == ()
@@ -138,7 +137,7 @@ def test_short_gaps_stay_out_and_short_drives_do_not_refine() -> None:
 
 
 @pytest.mark.parametrize(("noise", "stored"), [(0.05, True), (0.3, False)])
-def test_what_may_be_hard_to_recognise_is_told_and_not_stored(noise: float, stored: bool) -> None:
+def test_what_may_be_hard_to_recognise_is_told_and_not_stored(noise, stored):
     """Where single images rarely find places of the map, a stretch without any may be of the map too."""
     way = torch.cat([ROUTE[20:150], ASIDE[:60], ROUTE[150:]])
     drive = way + noise * torch.randn(way.shape, generator=torch.Generator().manual_seed(1))
@@ -150,7 +149,7 @@ def test_what_may_be_hard_to_recognise_is_told_and_not_stored(noise: float, stor
     assert ("may be new, or hard to recognise" in str(found)) != stored
 
 
-def test_what_fits_no_map_is_refused() -> None:
+def test_what_fits_no_map_is_refused():
     model = model_of(ROUTE[:END])
     with refused("the array has 29 frames; expected at least 30"):
         update(model, seen(ROUTE[:29]))
@@ -161,7 +160,7 @@ def test_what_fits_no_map_is_refused() -> None:
     assert model.map.routes == ()
 
 
-def test_connections_are_followed_by_a_whole_drive() -> None:
+def test_connections_are_followed_by_a_whole_drive():
     model = model_of(ROUTE[:END])
     update(model, seen(torch.cat([ROUTE[40:120], ASIDE, ROUTE[120:200]])))
     assert len(model.map.connections) == 2
@@ -177,7 +176,7 @@ def test_connections_are_followed_by_a_whole_drive() -> None:
     assert ((match.index[:60] - torch.tensor(expected[:60])).abs() <= 5).all()
 
 
-def test_maps_that_are_saved_merged_and_cut_keep_their_connections(tmp_path: Path) -> None:
+def test_maps_that_are_saved_merged_and_cut_keep_their_connections(tmp_path):
     model = model_of(ROUTE[:END])
     update(model, seen(ROUTE[100:330]))
     model.save(tmp_path / "m.safetensors")
@@ -198,7 +197,7 @@ def test_maps_that_are_saved_merged_and_cut_keep_their_connections(tmp_path: Pat
 
 @settings(deadline=None, max_examples=4)
 @given(st.integers(60, 200), st.integers(80, 140), st.booleans())
-def test_places_of_the_map_score_as_before(start: int, length: int, back: bool) -> None:
+def test_places_of_the_map_score_as_before(start, length, back):
     model = model_of(ROUTE[:END])
     drive, queries = seen(ROUTE[start : END + length]), waves(7, seed=2)
     before = copy.deepcopy(model).map
@@ -209,7 +208,7 @@ def test_places_of_the_map_score_as_before(start: int, length: int, back: bool) 
     assert spectral(model).coded()[0].stream.checksum == before.coded()[0].stream.checksum
 
 
-def test_the_command_updates_a_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_updates_a_map(tmp_path, capsys):
     days = {"route": ROUTE[:END], "monday": seen(ROUTE[90:330]), "other": waves(90, seed=9)}
     for name, values in days.items():
         np.save(tmp_path / f"{name}.npy", values.numpy())
@@ -230,7 +229,7 @@ def test_the_command_updates_a_map(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "none.npy" in fails(capsys, "update", path, tmp_path / "none.npy")
 
 
-def test_an_update_in_words() -> None:
+def test_an_update_in_words():
     assert str(Update(None, True)) == "too few frames to learn from; nothing new"
     told = str(Update(None, True, ((3, 40),), ("monday",), ((60, 90),)))
     assert told.endswith(

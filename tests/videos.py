@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from fractions import Fraction
-from pathlib import Path
 
 import av
 import numpy as np
-from torch import Tensor
 
 H264 = {"codec": "libx264", "pixels": "yuv420p"}
 
 
-def pictures(n: int, height: int = 32, width: int = 48) -> np.ndarray:
+def pictures(n, height=32, width=48):
     """(n,H,W,3): frame i has grey level 8 * i on its left half, noise of its own on the right one."""
     frames = np.random.default_rng(0).integers(0, 256, (n, height, width, 3), np.uint8)
     frames[:, :, : width // 2] = 8 * np.arange(n, dtype=np.uint8)[:, None, None, None]
@@ -24,18 +21,18 @@ def pictures(n: int, height: int = 32, width: int = 48) -> np.ndarray:
 
 
 def clip(
-    path: Path,
-    frames: np.ndarray,
-    codec: str = "ffv1",
-    pixels: str = "bgr0",
-    ticks: list[int] | None = None,
-    bframes: int | None = None,
-    group: int | None = None,
-    turn: int | None = None,
-    options: dict[str, str] | None = None,
-    base: Fraction = Fraction(1, 25),
-    aspect: Fraction | None = None,
-) -> Path:
+    path,
+    frames,
+    codec="ffv1",
+    pixels="bgr0",
+    ticks=None,
+    bframes=None,
+    group=None,
+    turn=None,
+    options=None,
+    base=Fraction(1, 25),
+    aspect=None,
+):
     """Write frames at 25 per second, or at the given multiples of the time base, `group` from one key frame
     to the next."""
     with av.open(str(path), "w", options=options or {}) as container:
@@ -59,18 +56,18 @@ def clip(
     return path
 
 
-def numbers(frames: Tensor) -> list[int]:
+def numbers(frames):
     """Which of `pictures` each frame is."""
     return (frames[:, :, 4:-4, 4:16].mean((1, 2, 3)) * 255 / 8).round().int().tolist()
 
 
 @contextmanager
-def piped(folder: Path, data: bytes, open_for: float = 0) -> Iterator[str]:
+def piped(folder, data, open_for=0):
     """A named pipe that gives these bytes, once, and stays open for so many seconds."""
     path, done = folder / "pipe", threading.Event()
     os.mkfifo(path)
 
-    def write() -> None:
+    def write():
         with suppress(BrokenPipeError), path.open("wb") as pipe:
             pipe.write(data)
             pipe.flush()

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 from command_line import benchmark
 from torch.nn.functional import normalize
@@ -19,7 +17,7 @@ from dejavu_torch import open_source
 from dejavu_torch.types import Match
 
 
-def test_answers_are_counted_at_each_precision() -> None:
+def test_answers_are_counted_at_each_precision():
     probability = torch.tensor([0.4, 0.6, 0.95, 0.995])
     match = Match(torch.arange(4), torch.zeros(4), torch.tensor([True, False, True, True]), probability)
     scored, right = torch.tensor([True, True, False, True]), torch.tensor([True, False, False, True])
@@ -33,7 +31,7 @@ def test_answers_are_counted_at_each_precision() -> None:
     assert (row["precision"], row["accepted"], row["judged"], row["right"]) == (None, 3, 2, 2)
 
 
-def test_routes_laps_and_drives_become_two_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_routes_laps_and_drives_become_two_tables(tmp_path, monkeypatch):
     for name, traverse in (("road", 0), ("drive", 1)):
         frames = torch.cat(list(open_source(f"sim:aerial?frames=120&traverse={traverse}").batches(120)))
         np.save(tmp_path / f"{name}.npy", frames[..., ::2, ::2].mul(255).byte().permute(0, 2, 3, 1).numpy())

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import json
 import math
-from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 from command_line import benchmark
-from torch import Tensor
 from torch.nn.functional import normalize
 
 from benchmarks import drives, large_drives, storage_drives, tables
@@ -24,14 +21,14 @@ from dejavu_torch.recognition.evidence import place_means, standardised
 PLACES, NUMBERS = 120, 24
 
 
-def walk(seed: int, noise: float = 0.0, route: int = 7) -> Tensor:
+def walk(seed, noise=0.0, route=7):
     """Features along a route, with noise of this seed."""
     profile, own = (torch.Generator().manual_seed(one) for one in (route, seed))
     smooth = torch.randn(PLACES, NUMBERS, generator=profile).cumsum(0)
     return smooth + noise * torch.randn(PLACES, NUMBERS, generator=own)
 
 
-def test_drives_are_cut_from_the_one_that_was() -> None:
+def test_drives_are_cut_from_the_one_that_was():
     made = drives_of(10, torch.zeros(4, 1))
     listed = {name: numbers.tolist() for name, numbers in made.items() if numbers is not None}
     assert listed["there and back"] == [0, 1, 2, 3, 4, 4, 3, 2, 1, 0]
@@ -53,9 +50,7 @@ def test_drives_are_cut_from_the_one_that_was() -> None:
     assert torch.equal(again, cut)
 
 
-def test_large_maps_are_measured_beside_all_places(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_large_maps_are_measured_beside_all_places(tmp_path, monkeypatch, capsys):
     task = large_drives.Task(120, 600, 5.0)
     monkeypatch.setattr(large_drives, "TASKS", (task,))
     monkeypatch.setattr(drives, "TASKS", (task,))
@@ -73,7 +68,7 @@ def test_large_maps_are_measured_beside_all_places(
     assert "| 120, 600, 5 |" in tables.large_drives()
 
 
-def test_queries_of_another_route_have_no_place_but_are_judged() -> None:
+def test_queries_of_another_route_have_no_place_but_are_judged():
     truth = GroundTruth(torch.tensor([[4], [5]]), torch.tensor([True, False]), torch.tensor([[7], [8]]))
     known = Known(DejaVu(), torch.tensor([[1.0], [2]]), truth, 1, torch.tensor([[30.0], [40]]))
     queries, found = asked(known, torch.tensor([1, -2, 0]))
@@ -83,9 +78,7 @@ def test_queries_of_another_route_have_no_place_but_are_judged() -> None:
     assert found.ignored.tolist() == [[8], [-1], [7]]
 
 
-def test_a_row_for_each_drive_of_a_route(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_row_for_each_drive_of_a_route(tmp_path, monkeypatch, capsys):
     for name, features in {"a": walk(0), "b": walk(1, 1.0), "c": walk(2, 1.0, route=5)}.items():
         np.save(tmp_path / f"{name}.npy", features.numpy())
     route = Route("{data}/a.npy", "{data}/b.npy", 2, "0")
@@ -110,7 +103,7 @@ def test_a_row_for_each_drive_of_a_route(
     assert skipped == [HALF, ELSEWHERE]
 
 
-def test_sums_on_both_sides_are_those_of_a_literal_loop() -> None:
+def test_sums_on_both_sides_are_those_of_a_literal_loop():
     scores = torch.rand(9, 12, generator=torch.Generator().manual_seed(0))
     z = standardised(scores, place_means(scores, torch.ones(9))).z
     expected = torch.full((9, 12), math.inf)
@@ -124,7 +117,7 @@ def test_sums_on_both_sides_are_those_of_a_literal_loop() -> None:
     torch.testing.assert_close(both_sides(scores, 3, (1.0, 1.6)), expected)
 
 
-def test_stores_are_asked_three_ways_from_the_same_scores(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stores_are_asked_three_ways_from_the_same_scores(monkeypatch):
     monkeypatch.setattr(storage_drives, "BUDGETS", (1.0,))
     monkeypatch.setattr(storage_drives, "BETWEEN", (8,))
     monkeypatch.setattr(storage_drives, "HOG_SPACED", (1,))
@@ -149,8 +142,8 @@ def test_stores_are_asked_three_ways_from_the_same_scores(monkeypatch: pytest.Mo
     assert storage_drives.pictured(rows)[0].axes[1].get_title("left") == "whole drive\nwalk"
 
 
-def test_the_table_of_made_drives(monkeypatch: pytest.MonkeyPatch) -> None:
-    def row(case: str, one: float, auc: float, taken: bool) -> dict[str, object]:
+def test_the_table_of_made_drives(monkeypatch):
+    def row(case, one, auc, taken):
         facts = {"is_drive": taken, "above_half": 0.5, "above_nine_tenths": 0.25, "calibration_error": 0.125}
         facts |= {"auc_one": one, "auc_uncentred": one - 0.25}
         return {"case": case, "contender": "reversed", "auc": auc, **facts}

@@ -7,18 +7,16 @@ from fractions import Fraction
 from unittest.mock import patch
 
 import torch
-from torch import Tensor
 
 from benchmarks import layer_search
 from benchmarks.template_search import in_layers
 from dejavu_torch import FrequencyLayer, TemplateMap
 from dejavu_torch.recognition.select import best_match
-from dejavu_torch.types import Plan
 
-LONG: Plan = tuple(FrequencyLayer(Fraction(p), p, 0, 60_000, (j,)) for j, p in enumerate((210, 286)))
+LONG = tuple(FrequencyLayer(Fraction(p), p, 0, 60_000, (j,)) for j, p in enumerate((210, 286)))
 
 
-def random_values(draw: random.Random, generator: torch.Generator, *shape: int) -> Tensor:
+def random_values(draw, generator, *shape):
     """Many equal ones, sums that are equal once rounded, or neither."""
     kind = draw.choice(["few", "rounded", "any", "flat"])
     if kind == "few":
@@ -29,7 +27,7 @@ def random_values(draw: random.Random, generator: torch.Generator, *shape: int) 
     return torch.ones(shape) if kind == "flat" else torch.rand(shape, generator=generator)
 
 
-def random_map(draw: random.Random, generator: torch.Generator) -> TemplateMap:
+def random_map(draw, generator):
     """Two layers, whose periods share any factor or are equal, over a part of the route or all of it."""
     start, factor = draw.choice([0, 0, 1, 7, 30]), draw.choice([1, 1, 2, 3, 6])
     stop = start + factor * 14 + draw.choice([draw.randint(1, 60), draw.randint(60, 1200)])
@@ -44,13 +42,13 @@ def random_map(draw: random.Random, generator: torch.Generator) -> TemplateMap:
     return TemplateMap(tuple(plan), blocks, stop + draw.choice([0, 0, 5]), 3, metric, reduction)
 
 
-def check(route: TemplateMap, queries: Tensor) -> None:
+def check(route, queries):
     found, expected = in_layers(route, queries), best_match(route.scores(queries))
     assert torch.equal(found[0], expected.score)
     assert torch.equal(found[1], expected.index)
 
 
-def test_equals_the_scan_in_random_cases() -> None:
+def test_equals_the_scan_in_random_cases():
     for seed in range(3):
         draw, generator = random.Random(seed), torch.Generator().manual_seed(seed)
         for _ in range(300):
@@ -59,7 +57,7 @@ def test_equals_the_scan_in_random_cases() -> None:
                 check(route, random_values(draw, generator, draw.randint(1, 5), 3))
 
 
-def test_a_distance_that_is_not_finite_means_what_it_means_in_a_scan() -> None:
+def test_a_distance_that_is_not_finite_means_what_it_means_in_a_scan():
     for value in (torch.nan, torch.inf):
         generator = torch.Generator().manual_seed(0)
         route = TemplateMap(

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 from itertools import pairwise
-from pathlib import Path
 
-import pytest
 from command_line import benchmark
 
 from benchmarks import live, train
@@ -17,9 +15,7 @@ from dejavu_torch.features.cnn import SmallCNN
 ROUTE, AGAIN = "sim:aerial?frames=64", "sim:aerial?frames=64&traverse=1"
 
 
-def test_every_frame_is_found_and_timed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_every_frame_is_found_and_timed(tmp_path, monkeypatch, capsys):
     short = live.bench_live(400, 40, ((32, 48),), (96, 128), numbers=12)
     monkeypatch.setattr(live, "bench_live", lambda: short)
     benchmark("live", "--out", tmp_path)
@@ -36,10 +32,8 @@ def test_every_frame_is_found_and_timed(
     assert (tmp_path / "bench.png").is_file()
 
 
-def test_every_way_is_trained_with_every_seed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def small() -> SmallCNN:
+def test_every_way_is_trained_with_every_seed(tmp_path, monkeypatch, capsys):
+    def small():
         return SmallCNN(dimension=12, resize=(16, 16), widths=(4, 8), squeeze=4, cell=0)
 
     rungs = [Rung("plain", small, Augmentation), Rung("other", small, lambda: Augmentation(noise=0.0))]
@@ -61,7 +55,7 @@ def test_every_way_is_trained_with_every_seed(
     assert (tmp_path / "bench.png").is_file()
 
 
-def test_each_rung_of_the_ladder_changes_one_thing() -> None:
+def test_each_rung_of_the_ladder_changes_one_thing():
     told = [
         (str(rung.backbone()), str(rung.augmentation()), rung.precision, rung.lr, rung.rate)
         for rung in ladder()

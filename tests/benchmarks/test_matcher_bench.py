@@ -6,7 +6,6 @@ import json
 import math
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -15,11 +14,10 @@ from command_line import benchmark as command
 from drawn import render, texts
 from matplotlib.colors import to_rgb
 from processes import python
-from torch import Tensor
 
 from benchmarks import matcher
 from benchmarks.matcher import COLUMNS, bench_matcher
-from benchmarks.measure import Contender, Row, Run, benchmark, new_row, table
+from benchmarks.measure import Contender, benchmark, new_row, table
 from benchmarks.plots import plot_growth, plot_ratios
 from benchmarks.scale_contenders import CONTENDERS
 from benchmarks.template_search import OURS, SCAN, bench_templates, random_map
@@ -31,7 +29,7 @@ L1, HOG, SEQUENCE, FILTER = "l1 9 x 40 x 410", "hog 24 x 16", "sequence 9 x 5 x 
 EXPORT = "single frames 3 x 24 x 16 on 200"
 
 
-def small(*only: str) -> list[Row]:
+def small(*only):
     """The rows of small cases, of these kinds alone if any are named."""
     sizes = {"images": [(24, 16)], "distances": [(9, 40, 410)], "sequences": [(9, 5, 5000)]}
     sizes |= {"filters": [(40, 3000)], "exports": [(3, 24, 16, 200)]}
@@ -40,7 +38,7 @@ def small(*only: str) -> list[Row]:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Iterator[None]:
+def one_thread():
     """With more there are rows of ours with one as well."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -49,11 +47,11 @@ def one_thread() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def rows() -> dict[tuple[str, str], Row]:
+def rows():
     return {(row["case"], row["contender"]): row for row in small()}
 
 
-def test_all_contenders_of_all_cases_give_what_we_give(rows: dict[tuple[str, str], Row]) -> None:
+def test_all_contenders_of_all_cases_give_what_we_give(rows):
     ways = ("dejavu", "dejavu (eager torch)", "torch.cdist", "torch.compile", "scipy cdist", "faiss")
     others = {HOG: ("dejavu", "scikit-image"), L1: ways, SEQUENCE: ("dejavu", "dejavu (a query at a time)")}
     others |= {FILTER: ("dejavu",), EXPORT: ("dejavu", "onnxruntime")}
@@ -76,9 +74,7 @@ def test_all_contenders_of_all_cases_give_what_we_give(rows: dict[tuple[str, str
     ("module", "part", "contender"),
     [("faiss", "distances", "faiss"), ("onnxruntime", "exports", "onnxruntime")],
 )
-def test_a_program_that_is_not_installed_is_a_row_that_says_so(
-    module: str, part: str, contender: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_program_that_is_not_installed_is_a_row_that_says_so(module, part, contender, monkeypatch):
     monkeypatch.setitem(sys.modules, module, None)
     found = {row["contender"]: row for row in small(part)}
     assert module in found[contender]["skipped"]
@@ -86,7 +82,7 @@ def test_a_program_that_is_not_installed_is_a_row_that_says_so(
     assert found["dejavu"]["seconds"] is not None
 
 
-def test_a_slow_contender_does_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_contender_does_a_part(monkeypatch):
     monkeypatch.setattr(matcher, "AT_MOST", 0)
     ours, theirs = small("images")
     assert (ours["measured_rows"], theirs["measured_rows"]) == (None, 1)
@@ -94,14 +90,14 @@ def test_a_slow_contender_does_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
     assert theirs["difference"] < 1e-6
 
 
-def counted(name: str, value: Tensor, log: list[str], threads: int = 1, pause: float = 0.0) -> Contender:
+def counted(name, value, log, threads=1, pause=0.0):
     """Gives `value`, and remembers who ran in which order."""
 
-    def run() -> Tensor:
+    def run():
         log.append(name)
         return value
 
-    def ready() -> Run:
+    def ready():
         log.append(f"{name} ready")
         time.sleep(pause)
         return run
@@ -109,8 +105,8 @@ def counted(name: str, value: Tensor, log: list[str], threads: int = 1, pause: f
     return Contender(name, ready, threads)
 
 
-def test_contenders_take_turns_after_the_warm_up() -> None:
-    log: list[str] = []
+def test_contenders_take_turns_after_the_warm_up():
+    log = []
     ours = counted("dejavu", torch.zeros(4), log, pause=0.2)
     first, second = benchmark("case", [ours, counted("b", torch.tensor([0.0, 0.5]), log, 2)], 3)
     runs = 1 if first["peak_bytes"] is None else 2
@@ -120,8 +116,8 @@ def test_contenders_take_turns_after_the_warm_up() -> None:
     assert (second["measured_rows"], second["bytes"], second["threads"]) == (2, 16, 2)
 
 
-def test_an_error_of_ours_is_raised_and_one_of_theirs_is_a_row() -> None:
-    def broken() -> Run:
+def test_an_error_of_ours_is_raised_and_one_of_theirs_is_a_row():
+    def broken():
         raise ZeroDivisionError("of\nno use")
 
     fine = counted("dejavu", torch.zeros(2), [])
@@ -131,7 +127,7 @@ def test_an_error_of_ours_is_raised_and_one_of_theirs_is_a_row() -> None:
         benchmark("case", [Contender("dejavu", broken), fine], 1)
 
 
-def test_peak_memory_sees_what_is_freed_again() -> None:
+def test_peak_memory_sees_what_is_freed_again():
     if not Path("/proc/self/statm").exists():
         pytest.skip("no /proc")
 
@@ -147,12 +143,7 @@ def test_peak_memory_sees_what_is_freed_again() -> None:
     assert 60 * 2**20 < int(python(code).stdout) < 200 * 2**20
 
 
-def test_what_is_written_and_printed(
-    tmp_path: Path,
-    rows: dict[tuple[str, str], Row],
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_what_is_written_and_printed(tmp_path, rows, monkeypatch, capsys):
     monkeypatch.setattr(matcher, "bench_matcher", rows.values)
     command("matcher", "--out", tmp_path / "new")
     assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["bench.json", "bench.png"]
@@ -165,14 +156,14 @@ def test_what_is_written_and_printed(
     assert shown[-1].endswith(f"next: open {tmp_path / 'new' / 'bench.png'}")
 
 
-def test_the_table() -> None:
+def test_the_table():
     ours = new_row("l1", "dejavu", seconds=0.5, ratio_to_ours=1.0, threads=2, bytes=2_000_000, difference=0.0)
     slow = new_row("l1", "slow", seconds=0.25, measured_rows=7)
     shown = [" ".join(line.split()) for line in table([ours, slow], COLUMNS).splitlines()]
     assert shown[-2:] == ["l1: dejavu 0.500 1.0 2 2.0 0.0e+00", "l1: slow 0.250 7 measured"]
 
 
-def test_a_bar_for_each_contender_in_its_colour() -> None:
+def test_a_bar_for_each_contender_in_its_colour():
     figure, axes = plot_ratios({"one": {"dejavu (numba)": 1.0, "other": 2.5}, "two": {"uncompressed": 1.0}})
     render(figure)
     assert [axis.get_title("left") for axis in axes] == ["one", "two"]
@@ -183,7 +174,7 @@ def test_a_bar_for_each_contender_in_its_colour() -> None:
     assert colours == [pytest.approx(to_rgb(colour)) for colour in expected]
 
 
-def test_every_contender_that_grows_has_a_style_of_its_own() -> None:
+def test_every_contender_that_grows_has_a_style_of_its_own():
     shares = {name: [(1e4, 1.0), (1e5, 0.0)] for name in CONTENDERS}
     figure, axes = plot_growth({"recall@1": shares, "ms": {"dejavu 1 B": [(1e4, 1.0)]}}, ["recall@1"])
     render(figure)
@@ -193,7 +184,7 @@ def test_every_contender_that_grows_has_a_style_of_its_own() -> None:
     assert [axis.get_yscale() for axis in axes] == ["linear", "log"]
 
 
-def test_template_search_times_both_ways_to_the_same_places() -> None:
+def test_template_search_times_both_ways_to_the_same_places():
     rows = list(bench_templates((5000, 40_000), queries=2, repeats=1))
     assert [(row["case"], row["contender"]) for row in rows] == [
         (f"templates={places}", name) for places in (5000, 40_000) for name in (OURS, SCAN)
@@ -205,7 +196,7 @@ def test_template_search_times_both_ways_to_the_same_places() -> None:
 
 
 @pytest.mark.parametrize("places", [4, 6, 1000, 10**7])
-def test_the_periods_are_the_least_that_tell_the_places_apart(places: int) -> None:
+def test_the_periods_are_the_least_that_tell_the_places_apart(places):
     short, long = (
         layer.period.numerator for layer in random_map(places, torch.Generator().manual_seed(0)).plan
     )

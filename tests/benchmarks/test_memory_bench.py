@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,18 +18,16 @@ HOG = "HOG, float32"
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _short_pieces() -> Iterator[None]:
+def _short_pieces():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(memory, "PIECE", 300)  # frames, which take seconds to paint
         yield
 
 
-def test_what_is_measured_and_written_also_where_a_process_dies(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    files: list[int] = []
+def test_what_is_measured_and_written_also_where_a_process_dies(tmp_path, monkeypatch):
+    files = []
 
-    def stub(module: str, arguments: Any) -> dict[str, Any]:
+    def stub(module, arguments):
         name, places, queries, _, folder = arguments
         files.append(len(list(Path(folder).glob("*-*"))))
         if name == "dejavu templates":
@@ -59,13 +55,13 @@ def test_what_is_measured_and_written_also_where_a_process_dies(
 
 
 @pytest.fixture(scope="module")
-def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def drives(tmp_path_factory):
     folder = tmp_path_factory.mktemp("drives")
     paint_drives(folder, 200)
     return folder
 
 
-def test_a_frame_is_a_window_of_the_drive(drives: Path) -> None:
+def test_a_frame_is_a_window_of_the_drive(drives):
     image = np.load(drives / "places.npy")
     (batch,) = Drive(image, torch.tensor([3, 150, 0])).batches(8)
     assert batch.shape == (3, 3, 64, 64)
@@ -75,7 +71,7 @@ def test_a_frame_is_a_window_of_the_drive(drives: Path) -> None:
     assert shown_by(5, 2).tolist() == [0, 1, 0, 1, 0]
 
 
-def test_places_are_learned_and_found(drives: Path) -> None:
+def test_places_are_learned_and_found(drives):
     learned, found = (memory.measure(HOG, 200, queries, 1, drives) for queries in (0, 50))
     assert learned["bytes"] == found["bytes"] == kept(drives, HOG, 200).stat().st_size
     assert found["recall_at_1"] > 0.9
@@ -85,7 +81,7 @@ def test_places_are_learned_and_found(drives: Path) -> None:
 
 
 @pytest.mark.parametrize("name", CONTENDERS)
-def test_every_contender_finds_the_places(name: str, drives: Path, tmp_path: Path) -> None:
+def test_every_contender_finds_the_places(name, drives, tmp_path):
     if name.startswith("faiss"):
         pytest.importorskip("faiss")
     route, queries = (np.load(drives / f"{which}.npy") for which in ("places", "queries"))
@@ -103,9 +99,7 @@ print("a line of a library", json.dumps({"found": importlib.util.find_spec("korn
 """
 
 
-def test_a_process_does_not_import_from_the_current_folder_and_says_why_it_failed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_process_does_not_import_from_the_current_folder_and_says_why_it_failed(tmp_path, monkeypatch):
     (tmp_path / "kornia.py").touch()
     (tmp_path / "there").mkdir()
     (tmp_path / "there" / "probe.py").write_text(PROBE)

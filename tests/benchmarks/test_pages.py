@@ -15,7 +15,7 @@ from dejavu_torch.evaluation.report import report_folder, write_report
 KEPT = Path(__file__).parents[2] / "docs" / "results" / "axe.json"
 
 
-def test_the_kept_result_has_no_finding_at_any_width() -> None:
+def test_the_kept_result_has_no_finding_at_any_width():
     kept = json.loads(KEPT.read_text())
     rows = kept["rows"]
     assert {(row["page"], row["width"], row["scheme"]) for row in rows} == {
@@ -27,7 +27,7 @@ def test_the_kept_result_has_no_finding_at_any_width() -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="chromium is not installed")
-def test_a_browser_finds_nothing_serious_and_nothing_too_wide(tmp_path: Path) -> None:
+def test_a_browser_finds_nothing_serious_and_nothing_too_wide(tmp_path):
     pytest.importorskip("axe_playwright_python")
     one, two = (open_source(f"sim:aerial?frames=200&traverse={i}") for i in (0, 1))
     result = compare(one, two)

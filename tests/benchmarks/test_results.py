@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import shlex
 import subprocess
-from pathlib import Path
-from typing import Any
 
 import pytest
 from command_line import benchmark, benchmark_fails, run_here
@@ -17,7 +15,7 @@ from dejavu_torch.cli.parser import command_parser
 from dejavu_torch.cli.reports import run_compare
 
 
-def test_every_command_is_understood_and_every_way_is_used() -> None:
+def test_every_command_is_understood_and_every_way_is_used():
     parser = command_parser("compare", run_compare)
     planned = list(runs(list(WAYS)))
     for run in planned:
@@ -26,20 +24,18 @@ def test_every_command_is_understood_and_every_way_is_used() -> None:
     assert {run.footage for run in planned if run.way == "default"} == set(FOOTAGE)
 
 
-def test_kept_figures_name_no_folder_of_a_machine() -> None:
+def test_kept_figures_name_no_folder_of_a_machine():
     for file in tables.FOLDER.glob("*.json"):
         assert '"/' not in file.read_text(encoding="utf-8"), file.name
 
 
-def test_reports_are_kept_and_made_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_reports_are_kept_and_made_once(tmp_path, monkeypatch, capsys):
     flight = Footage("sim:aerial?frames=48", "sim:aerial?frames=48&traverse=1")
     broken = flight._replace(query="{data}/nowhere.mp4")
     monkeypatch.setattr(results, "FOOTAGE", {"flight": flight, "broken": broken})
     given = ("results", tmp_path, "--out", tmp_path / "out", "--ways", "HOG", "--jobs", "2")
 
-    def refusing(command: list[str], **settings: Any) -> subprocess.CompletedProcess[str]:
+    def refusing(command, **settings):
         refused = ["sh", "-c", "echo 'dejavu: nowhere.mp4 is not there'; exit 2"]  # sooner than a command
         return run_here(refused if any("nowhere" in word for word in command) else command, **settings)
 
@@ -65,7 +61,7 @@ def test_reports_are_kept_and_made_once(
     assert [row.get("commit") for row in again] == [None, bench["commit"]]  # of the row that is kept
 
 
-def test_bad_options_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_options_are_refused(tmp_path, capsys):
     given = ("results", tmp_path, "--out", tmp_path / "out")
     assert "expected one of 'default'" in benchmark_fails(capsys, *given, "--ways", "all")
     assert "0 jobs" in benchmark_fails(capsys, *given, "--jobs", "0")
@@ -73,8 +69,8 @@ def test_bad_options_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert not (tmp_path / "out").exists()
 
 
-def rows() -> list[dict[str, Any]]:
-    def one(auc: float, **more: Any) -> dict[str, Any]:
+def rows():
+    def one(auc, **more):
         return {"auc": auc, "recall_at_1": auc, **more}
 
     curve = {name: [one(0.5, route_bytes_per_place=1.0)] for name in ("map", "null")}
@@ -88,9 +84,7 @@ def rows() -> list[dict[str, Any]]:
     ]
 
 
-def test_tables_stand_where_they_are_marked_and_seeds_are_means(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_tables_stand_where_they_are_marked_and_seeds_are_means(tmp_path, monkeypatch):
     (tmp_path / "results").mkdir()
     monkeypatch.setattr(tables, "FOLDER", tmp_path / "results")
     page = tmp_path / "page.md"
@@ -111,6 +105,6 @@ def test_tables_stand_where_they_are_marked_and_seeds_are_means(
 
 
 @pytest.mark.parametrize("page", sorted(tables.FOLDER.parent.rglob("*.md")), ids=lambda page: page.stem)
-def test_the_tables_of_the_documentation_are_those_of_its_json(page: Path) -> None:
+def test_the_tables_of_the_documentation_are_those_of_its_json(page):
     text = page.read_text()
     assert tables.filled(text) == text

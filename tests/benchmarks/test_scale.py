@@ -6,9 +6,7 @@ import json
 import math
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,10 +16,9 @@ from command_line import benchmark
 from helpers import all_of, refused
 from processes import forked
 from safetensors.torch import save_file
-from torch import Tensor
 
 from benchmarks import scale, scale_contenders
-from benchmarks.made import BLOCK, Likeness, MadeRoute, likeness
+from benchmarks.made import BLOCK, MadeRoute, likeness
 from benchmarks.repeating import TiledRoute, step_that_holds, tiles_of
 from benchmarks.scale import Task, spread
 from benchmarks.scale_contenders import FLOWN, ONE_CHUNK, PLACED, REPEATED, Faiss, Interpolated, Mapped
@@ -35,14 +32,14 @@ from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.model import DejaVu
 
 
-def smooth(count: int, numbers: int, seed: int = 0) -> Tensor:
+def smooth(count, numbers, seed=0):
     """Descriptors of length 1 that change little from place to place."""
     noise = torch.randn(count + 15, numbers, generator=torch.Generator().manual_seed(seed))
     return F.normalize(F.avg_pool1d(noise.T[None], 16, 1)[0].T, dim=1)
 
 
 @pytest.fixture(scope="module")
-def like() -> Likeness:
+def like():
     """Of a route whose numbers 0 to 3 are seen again as 0.8 of them, 4 to 7 as 0.4, with noise."""
     route, shown = smooth(6000, 8), torch.arange(0, 6000, 2)
     kept = torch.tensor([0.8] * 4 + [0.4] * 4)
@@ -50,13 +47,13 @@ def like() -> Likeness:
     return likeness(route, kept * route[shown] + 0.1 * noise, shown)
 
 
-def test_what_is_left_of_each_number_is_measured(like: Likeness) -> None:
+def test_what_is_left_of_each_number_is_measured(like):
     assert torch.allclose(like.rho, torch.tensor([0.8] * 4 + [0.4] * 4), atol=0.03)
     assert torch.allclose(like.spread.T @ like.spread, 0.01 * torch.eye(8), atol=0.002)
     assert float(like.sizes.square().mean()) == pytest.approx(1, abs=0.01)
 
 
-def test_any_part_of_a_made_route_is_made_by_itself(like: Likeness) -> None:
+def test_any_part_of_a_made_route_is_made_by_itself(like):
     length = 2 * BLOCK + 100
     whole = all_of(MadeRoute(like, length), 1000)
     assert whole.shape == (length, 8)
@@ -65,7 +62,7 @@ def test_any_part_of_a_made_route_is_made_by_itself(like: Likeness) -> None:
     assert not torch.allclose(all_of(MadeRoute(like, 64, seed=1)), whole[:64])
 
 
-def test_a_made_route_and_its_queries_are_like_those_that_were_measured(like: Likeness) -> None:
+def test_a_made_route_and_its_queries_are_like_those_that_were_measured(like):
     route, made = smooth(6000, 8), all_of(MadeRoute(like, 6000), 1000)
     assert torch.linalg.vector_norm(made, dim=1).allclose(torch.ones(6000))
     for apart in (1, 4, 8, 40):  # the triangle of a moving mean, and nothing beyond it
@@ -80,7 +77,7 @@ def test_a_made_route_and_its_queries_are_like_those_that_were_measured(like: Li
     assert torch.equal(again, MadeRoute(like, 6000).seen_again(shown))
 
 
-def test_descriptors_of_tiles_are_those_of_the_frames() -> None:
+def test_descriptors_of_tiles_are_those_of_the_frames():
     model = DejaVu(HOG(), Whitening(numbers=16))
     assert model.whitening is not None
     still = {"ground": "repeat", "noise": 0, "drift": 0, "yaw": 0}
@@ -97,7 +94,7 @@ def test_descriptors_of_tiles_are_those_of_the_frames() -> None:
 
 
 @pytest.mark.parametrize("chunk", [10_000, 500])
-def test_a_step_holds_the_share_that_is_asked_for(chunk: int) -> None:
+def test_a_step_holds_the_share_that_is_asked_for(chunk):
     route = smooth(2000, 32)
     step = step_that_holds(0.8, ArrayTraverse(route), chunk)  # type: ignore[arg-type]
     kept = SpectralMapper(None, step=step, chunk=chunk)(route)
@@ -106,9 +103,7 @@ def test_a_step_holds_the_share_that_is_asked_for(chunk: int) -> None:
     assert float(lost) == pytest.approx(0.2, abs=0.02)
 
 
-def test_interpolated_frames_are_those_of_the_baseline(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_interpolated_frames_are_those_of_the_baseline(tmp_path, monkeypatch):
     monkeypatch.setattr(scale_contenders, "ROWS", 64)  # several pieces
     route, queries = smooth(501, 12), smooth(501, 12, seed=1)[:50]
     size = Interpolated(12 * 30 / 501).learn(ArrayTraverse(route), tmp_path / "kept")  # type: ignore[arg-type]
@@ -122,7 +117,7 @@ def test_interpolated_frames_are_those_of_the_baseline(
 
 
 @pytest.mark.parametrize("factory", ["Flat", "IVF{cells},PQ4np", "HNSW16,Flat"])
-def test_an_index_finds_the_nearest_and_tells_its_bytes(factory: str, tmp_path: Path) -> None:
+def test_an_index_finds_the_nearest_and_tells_its_bytes(factory, tmp_path):
     pytest.importorskip("faiss")
     route = smooth(1200, 16)
     size = Faiss(factory).learn(ArrayTraverse(route), tmp_path / "kept")  # type: ignore[arg-type]
@@ -132,7 +127,7 @@ def test_an_index_finds_the_nearest_and_tells_its_bytes(factory: str, tmp_path: 
     assert code * 1200 <= size <= code * 1200 + (1200 * 200 if "HNSW" in factory else 1000)
 
 
-def test_a_null_tells_the_frames_that_it_shuffled(tmp_path: Path) -> None:
+def test_a_null_tells_the_frames_that_it_shuffled(tmp_path):
     route = smooth(600, 16)
     null = Mapped(SpectralMapper(8.0, chunk=10_000), shuffled=True)
     null.learn(ArrayTraverse(route), tmp_path / "kept")  # type: ignore[arg-type]
@@ -140,12 +135,12 @@ def test_a_null_tells_the_frames_that_it_shuffled(tmp_path: Path) -> None:
     assert ((place - torch.arange(0, 600, 20)).abs() <= 5).double().mean() > 0.9
 
 
-def in_this_process(module: str, arguments: Any) -> dict[str, Any]:
+def in_this_process(module, arguments):
     """In the place of `in_process`; what is given goes through JSON, as there."""
     what, task, folder = json.loads(json.dumps(arguments))
     threads = torch.get_num_threads()
     try:
-        facts: dict[str, Any] = getattr(scale, what)(Task(*task), Path(folder))
+        facts = getattr(scale, what)(Task(*task), Path(folder))
     except Exception as error:
         return {"skipped": str(error)}
     finally:
@@ -154,7 +149,7 @@ def in_this_process(module: str, arguments: Any) -> dict[str, Any]:
 
 
 @pytest.fixture
-def _small(monkeypatch: pytest.MonkeyPatch) -> None:
+def _small(monkeypatch):
     monkeypatch.setattr(scale, "in_process", in_this_process)
     monkeypatch.setattr(scale, "give_back", lambda: None)  # of a process of its own
     sizes = {"RENDERED": 600, "SHUFFLED": 600, "CHECKED": 520, "QUERIES": 40, "BATCH": 20, "COPIED": 2**20}
@@ -166,7 +161,7 @@ def _small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("_small")
-def test_contenders_are_chosen_by_name(tmp_path: Path) -> None:
+def test_contenders_are_chosen_by_name(tmp_path):
     benchmark("scale", "--places", "900", "--contenders", "faiss flat", "--out", tmp_path)
     rows = json.loads((tmp_path / "bench.json").read_text())["rows"]
     assert [(row["case"], row["contender"]) for row in rows] == [("places=900", "faiss flat")]
@@ -175,7 +170,7 @@ def test_contenders_are_chosen_by_name(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("_small")
-def test_rows_of_all_cases_are_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_rows_of_all_cases_are_written(tmp_path, capsys):
     benchmark("scale", "--places", "600", "900", "--out", tmp_path)
     written = json.loads((tmp_path / "bench.json").read_text())
     rows = {(row["case"], row["contender"]): row for row in written["rows"]}
@@ -204,8 +199,8 @@ def test_rows_of_all_cases_are_written(tmp_path: Path, capsys: pytest.CaptureFix
     assert "places=600" in capsys.readouterr().out
 
 
-def test_rows_are_written_as_they_finish(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def two(*_: Any) -> Iterator[dict[str, Any]]:
+def test_rows_are_written_as_they_finish(tmp_path, monkeypatch):
+    def two(*_):
         for name in ("one", "two"):
             yield scale_row("places=600", name, 600, seconds=1.0)
             assert json.loads((tmp_path / "bench.json").read_text())["rows"][-1]["contender"] == name
@@ -219,7 +214,7 @@ def test_rows_are_written_as_they_finish(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 @pytest.mark.usefixtures("_small")
-def test_without_faiss_its_rows_say_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_without_faiss_its_rows_say_so(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "faiss", None)
     np.save(tmp_path / "drawn.npy", smooth(600, 16).numpy())
     row = scale.measured(Task("places=600", "faiss flat", "drawn", 600, 1, "cpu"), tmp_path)
@@ -227,7 +222,7 @@ def test_without_faiss_its_rows_say_so(monkeypatch: pytest.MonkeyPatch, tmp_path
     assert row["seconds"] is None
 
 
-def test_a_process_learns_and_another_localizes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_process_learns_and_another_localizes(tmp_path, monkeypatch):
     monkeypatch.setattr(subprocess, "run", forked)
     route = smooth(600, 16)
     np.save(tmp_path / "drawn.npy", route.numpy())
@@ -237,13 +232,13 @@ def test_a_process_learns_and_another_localizes(tmp_path: Path, monkeypatch: pyt
     assert (row["skipped"], row["recall_at_1"]) == (None, 1)
 
 
-def test_queries_lie_evenly_along_the_route() -> None:
+def test_queries_lie_evenly_along_the_route():
     assert spread(10).tolist() == list(range(10))
     assert len(spread(10**6)) == scale.QUERIES
     assert int(spread(10**6)[-1]) == 10**6 - 10**6 // scale.QUERIES
 
 
-def test_exponents_and_tables() -> None:
+def test_exponents_and_tables():
     sizes, cycle = (100, 1000, 10_000), math.lcm(*TILES)
     rows = [scale_row(f"places={n}", "dejavu", n, seconds=1e-6 * n**0.5, route_bytes=7) for n in sizes]
     rows += [scale_row(f"repeat={n}", "dejavu", n, seconds=1e-6 * n, route_bytes=7) for n in sizes]
@@ -262,10 +257,10 @@ def test_exponents_and_tables() -> None:
     assert last.startswith("repeat=N: exponents of N\n")
 
 
-def test_a_map_is_kept_for_all_its_searches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    ran: list[tuple[str, str]] = []
+def test_a_map_is_kept_for_all_its_searches(tmp_path, monkeypatch):
+    ran = []
 
-    def in_no_process(_: str, words: list[Any]) -> dict[str, Any]:
+    def in_no_process(_, words):
         ran.append((words[0], words[1].contender))
         words[1].file(tmp_path).touch()
         return {"bytes": 7}

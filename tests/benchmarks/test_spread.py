@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import ast
 import json
-from pathlib import Path
-from typing import Any
 
 import pytest
 from command_line import benchmark, benchmark_fails
@@ -15,12 +13,10 @@ from benchmarks.measure import done_once
 from tests.processors import chosen, compares_figures
 
 
-def test_every_processor_and_seed_is_run_and_compared(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    seen: list[tuple[str, str]] = []
+def test_every_processor_and_seed_is_run_and_compared(tmp_path, monkeypatch, capsys):
+    seen = []
 
-    def made(words: list[str], folder: Path, report: Path, environment: dict[str, str]) -> None:
+    def made(words, folder, report, environment):
         seed = words[words.index("--seed") + 1]
         seen.append((seed, environment["OMP_NUM_THREADS"]))
         folder.mkdir(parents=True, exist_ok=True)
@@ -32,7 +28,7 @@ def test_every_processor_and_seed_is_run_and_compared(
     given = ("spread", "a", "b", "--tolerance", "0", "--out", tmp_path / "out")
     benchmark(*given, "--seeds", "3")
     assert seen == [("0", "1"), ("0", "2")] * 2 + [("1", "1"), ("2", "1"), ("3", "1")]
-    rows: list[dict[str, Any]] = json.loads((tmp_path / "out" / "bench.json").read_text())["rows"]
+    rows = json.loads((tmp_path / "out" / "bench.json").read_text())["rows"]
     assert [row["differ"] for row in rows] == [0, 0, 0, 0, 0.5, 0.5, 0.5]
     said = capsys.readouterr().out
     assert "by processor: auc 0.000, standard deviation 0.000" in said
@@ -42,7 +38,7 @@ def test_every_processor_and_seed_is_run_and_compared(
     assert "a is not there" in benchmark_fails(capsys, *given)
 
 
-def test_commands_run_in_the_environment_of_a_processor(tmp_path: Path) -> None:
+def test_commands_run_in_the_environment_of_a_processor(tmp_path):
     environment = spread.environment_of("oldest", 2)
     assert environment["ATEN_CPU_CAPABILITY"] == "default"
     assert environment["OMP_NUM_THREADS"] == "2"
@@ -62,12 +58,12 @@ def test_commands_run_in_the_environment_of_a_processor(tmp_path: Path) -> None:
         ("assert scale == 2.0", False),
     ],
 )
-def test_tests_that_compare_figures_are_known(body: str, expected: bool) -> None:
+def test_tests_that_compare_figures_are_known(body, expected):
     (test,) = ast.parse(f"def test_it():\n    {body}").body
     assert isinstance(test, ast.FunctionDef)
     assert compares_figures(test) is expected
 
 
-def test_goldens_and_figures_of_readme_are_among_them() -> None:
+def test_goldens_and_figures_of_readme_are_among_them():
     names = {path.name for path, _ in chosen()}
     assert {"test_golden.py", "test_readme_figures.py", "test_real_routes.py", "test_hog.py"} <= names

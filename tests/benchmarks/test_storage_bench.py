@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import json
 import sys
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from command_line import benchmark, benchmark_fails, run
-from torch import Tensor
 
 from benchmarks import storage
-from benchmarks.measure import PROCESS, Contender, Row, new_row
+from benchmarks.measure import PROCESS, Contender, new_row
 from benchmarks.plots import plot_frontiers
 from benchmarks.storage import (
     KEYS,
-    Route,
     bench_storage,
     bytes_for,
     contenders_of,
@@ -38,7 +34,7 @@ from dejavu_torch.maps.spectral import SpectralMapper
 PLACES, NUMBERS = 300, 24
 
 
-def series(seed: int) -> Tensor:
+def series(seed):
     """Smooth numbers, the same for all seeds, and noise of this one."""
     profile, noise = (torch.Generator().manual_seed(one) for one in (7, seed))
     walk = torch.randn(PLACES, NUMBERS, generator=profile).cumsum(0)
@@ -46,7 +42,7 @@ def series(seed: int) -> Tensor:
 
 
 @pytest.fixture(scope="module")
-def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
+def pair(tmp_path_factory):
     folder = tmp_path_factory.mktemp("pair")
     for name, seed in (("a", 0), ("b", 1)):
         np.save(folder / f"{name}.npy", series(seed).numpy())
@@ -54,22 +50,22 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
 
 
 @pytest.fixture(scope="module")
-def rows(pair: tuple[str, str]) -> list[Row]:
+def rows(pair):
     return list(bench_storage(pair))
 
 
 @pytest.fixture(scope="module")
-def route() -> Route:
+def route():
     """The pair in memory, and another route for codebooks and a whitening."""
     reference, query, other = (ArrayTraverse(series(seed)) for seed in (0, 1, 5))
     return described("pair", reference, query, other=other)
 
 
-def row_of(route: Route, name: str) -> Row:
+def row_of(route, name):
     return judged(route, next(one for one in contenders_of(route) if one.name == name))
 
 
-def test_all_families_are_there_and_what_is_skipped_says_why(rows: list[Row]) -> None:
+def test_all_families_are_there_and_what_is_skipped_says_why(rows):
     pytest.importorskip("faiss")
     ran = {row["family"] for row in rows if row["skipped"] is None}
     stores = {"dejavu", "null", "frames", "interpolated", "PCA", "binary", "PQ, own codebooks"}
@@ -84,7 +80,7 @@ def test_all_families_are_there_and_what_is_skipped_says_why(rows: list[Row]) ->
     assert any("--codebooks" in line for line in skipped_lines(rows))
 
 
-def test_all_bytes_are_counted_fixed_and_growing_apart(rows: list[Row]) -> None:
+def test_all_bytes_are_counted_fixed_and_growing_apart(rows):
     found = {row["contender"]: row for row in rows}
     whole, ours = found["whole database, float"], found["dejavu 5"]
     columns = NUMBERS + 1  # ready features: a constant number behind them
@@ -101,7 +97,7 @@ def test_all_bytes_are_counted_fixed_and_growing_apart(rows: list[Row]) -> None:
     assert found["signs of every frame"]["route_bytes"] == PLACES * 4  # of 25 bits
 
 
-def test_codebooks_count_where_they_are_of_the_route(route: Route) -> None:
+def test_codebooks_count_where_they_are_of_the_route(route):
     pytest.importorskip("faiss")
     names = [f"{key} of every 3rd frame, interpolated" for key in ("PQ4x8np", "OPQ4,PQ4x8np")]
     names = [names[0], *(f"{name}, own codebooks" for name in names)]
@@ -113,7 +109,7 @@ def test_codebooks_count_where_they_are_of_the_route(route: Route) -> None:
     assert turned["route_bytes"] == 39 * (4 + 4)  # a bit a number, and the factor that decoding reads
 
 
-def test_more_bytes_recognise_more_and_the_whole_database_most(rows: list[Row]) -> None:
+def test_more_bytes_recognise_more_and_the_whole_database_most(rows):
     found = {row["contender"]: row for row in rows}
     areas = [found[name]["auc"] for name in ("dejavu 0.5", "dejavu 2.5", "whole database, float")]
     assert areas == pytest.approx(sorted(areas))  # but for rounding
@@ -127,7 +123,7 @@ def test_more_bytes_recognise_more_and_the_whole_database_most(rows: list[Row]) 
     assert row["recall_at_1"] == pytest.approx(float(right.float().mean()), abs=0.01)
 
 
-def test_other_whitenings_take_other_fixed_bytes(route: Route, rows: list[Row]) -> None:
+def test_other_whitenings_take_other_fixed_bytes(route, rows):
     names = (*storage.WHITENINGS, "of another route")
     others = {name: row_of(route, f"dejavu 5, whitening {name}") for name in names}
     sizes = {name: row["fixed_bytes"] for name, row in others.items()}
@@ -145,13 +141,11 @@ def test_other_whitenings_take_other_fixed_bytes(route: Route, rows: list[Row]) 
     assert axes[1].texts[-1].get_text() == f"16 bits, {sizes['16 bits'] / 1000:.0f} kB"
 
 
-def test_a_whitening_that_is_given_describes_all(
-    pair: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_whitening_that_is_given_describes_all(pair, tmp_path, monkeypatch, capsys):
     run("learn", pair[1], "--map", tmp_path / "map.safetensors")
     whitened = []
 
-    def first(route: Route) -> list[Contender]:
+    def first(route):
         whitened.append(route.places)
         return list(stores_of(route))[1:2]  # a quarter of a byte is too few for 300 places
 
@@ -166,7 +160,7 @@ def test_a_whitening_that_is_given_describes_all(
     assert "without whitening" in benchmark_fails(capsys, "storage", *pair, *words)
 
 
-def test_the_paper_beside_them(route: Route) -> None:
+def test_the_paper_beside_them(route):
     period = torch.arange(1024)[:, None] % torch.tensor([16, 32])
     wave = (period < torch.tensor([8, 16])).float() + 0.01 * torch.rand(1024, 2)
     row = row_of(described("wave", ArrayTraverse(wave), ArrayTraverse(wave + 0.01)), "the paper")
@@ -175,8 +169,8 @@ def test_the_paper_beside_them(route: Route) -> None:
     assert "1024" in row_of(route, "the paper")["skipped"]
 
 
-def test_what_cannot_be_stored_is_a_row(route: Route, monkeypatch: pytest.MonkeyPatch) -> None:
-    def missing() -> Any:
+def test_what_cannot_be_stored_is_a_row(route, monkeypatch):
+    def missing():
         import av
 
         av.CodecContext.create("libx999", "w")
@@ -193,13 +187,13 @@ def test_what_cannot_be_stored_is_a_row(route: Route, monkeypatch: pytest.Monkey
     assert (row_of(route, "whole database, float")["peak_bytes"] is not None) == PROCESS.exists()
 
 
-def of(size: float, auc: float, family: str = "other") -> Row:
+def of(size, auc, family="other"):
     sequences = {"1": {"auc": auc, "recall_at_1": auc}}
     facts = {"seconds": 1.0, "auc": auc, "route_bytes_per_place": size, "sequences": sequences}
     return new_row("case", f"{family} {size}", KEYS, family=family, **facts)
 
 
-def test_a_front_is_what_nothing_smaller_reaches() -> None:
+def test_a_front_is_what_nothing_smaller_reaches():
     points = front([of(4, 0.6), of(1, 0.2), of(2, 0.6), of(3, 0.5), of(8, 0.9), of(2, 0.4)])
     assert points == [(1, 0.2), (2, 0.6), (8, 0.9)]
     areas = (0.6, 0.75, 0.1, 0.95)
@@ -207,14 +201,14 @@ def test_a_front_is_what_nothing_smaller_reaches() -> None:
     assert bytes_for(0.5, []) is None
 
 
-def test_equal_areas() -> None:
+def test_equal_areas():
     (entry,) = equal_areas([of(1, 0.75, "dejavu"), of(2, 0.6, "null"), of(8, 0.9, "null"), of(3, 0.7)])
     assert (entry["T"], entry["auc"], entry["route_bytes_per_place"]) == (1, 0.75, 1)
     assert entry["bytes_per_place"] == {"null": pytest.approx(4), "other": None}
     assert entry["null_over_ours"] == pytest.approx(4)
 
 
-def test_what_is_missed_is_set_beside_the_best_rival() -> None:
+def test_what_is_missed_is_set_beside_the_best_rival():
     rows = [of(size, auc, "dejavu") for size, auc in ((1, 0.5), (3.2, 0.9), (5, 0.9999))]
     rivals = [of(1, 0.75), of(1.62, 0.8, "more"), of(5, 0.6)]
     rivals += [of(1, 0.99, other) for other in ("null", storage.GIVEN, storage.PAPER)]
@@ -223,7 +217,7 @@ def test_what_is_missed_is_set_beside_the_best_rival() -> None:
     assert storage.missed(rivals) == {"case": pytest.approx((1 / (0.25 * 0.2**3)) ** 0.25)}
 
 
-def test_the_tables() -> None:
+def test_the_tables():
     rows = [of(1, 0.5, "dejavu"), of(3.2, 0.75, "dejavu"), of(1.01, 0.4), of(10, 0.8), of(2, 0.99, "more")]
     skipped = [new_row("case", name, KEYS, family="none", skipped="absent") for name in "abc"]
     best, equal = storage_tables([*rows, *skipped], at=3.2)
@@ -245,17 +239,15 @@ def test_the_tables() -> None:
     assert skipped_lines(skipped[:1]) == ["case: skipped a: absent"]
 
 
-def test_rows_are_written_as_they_finish_the_map_that_is_given_among_them(
-    pair: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rows_are_written_as_they_finish_the_map_that_is_given_among_them(pair, tmp_path, monkeypatch):
     seen, out, path = [], tmp_path / "out", tmp_path / "map.safetensors"
     given = "dejavu, map"
 
-    def some(*arguments: Any) -> list[Contender]:
+    def some(*arguments):
         names = ("dejavu 5", "dejavu 10", "null 5", given)
         return [one for one in contenders_of(*arguments) if one.name in names]
 
-    def watched(*arguments: Any) -> Row:
+    def watched(*arguments):
         seen.append(len(json.loads((out / "bench.json").read_text())["rows"]) if out.exists() else 0)
         return judged(*arguments)
 
@@ -273,7 +265,7 @@ def test_rows_are_written_as_they_finish_the_map_that_is_given_among_them(
     assert rows[given]["route_bytes"] == pytest.approx(rows["dejavu 5"]["route_bytes"], rel=0.03)
 
 
-def test_a_line_for_each_family_and_ours_the_thickest() -> None:
+def test_a_line_for_each_family_and_ours_the_thickest():
     fronts = {"dejavu": [(0.5, 0.6), (2.0, 0.9999)], "null": [(1.0, 0.0)], "of a user": [(1.0, 0.5)]}
     figure, axes = plot_frontiers({"one": fronts, "two": {"dejavu": [(1.0, 0.5)]}})
     assert [axis.get_title("left") for axis in axes] == ["one", "two"]
@@ -283,7 +275,7 @@ def test_a_line_for_each_family_and_ours_the_thickest() -> None:
     assert [text.get_text() for text in figure.legends[0].get_texts()] == list(fronts)
 
 
-def test_built_in_routes() -> None:
+def test_built_in_routes():
     routes = storage.routes_of((), (64, 300), None, False)
     names = ["sim:aerial, 64 places", "sim:aerial, 300 places", "sim:outdoor", "sim:underground"]
     assert [name.startswith(known) for (name, *_), known in zip(routes, names, strict=True)] == [True] * 4
@@ -292,9 +284,7 @@ def test_built_in_routes() -> None:
         assert said in route.name
 
 
-def test_a_truth_and_a_tolerance_that_are_given(
-    pair: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_truth_and_a_tolerance_that_are_given(pair, tmp_path, monkeypatch):
     monkeypatch.setattr(storage, "contenders_of", lambda route, *_: list(stores_of(route))[:8])
     places = np.load(pair[0])
     np.save(tmp_path / "later.npy", places[100:])
@@ -340,12 +330,10 @@ REFUSALS = {
 
 
 @pytest.mark.parametrize("line", REFUSALS)
-def test_what_is_refused(
-    line: str, pair: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_refused(line, pair, tmp_path, capsys):
     np.save(tmp_path / "short.npy", series(1)[:200].numpy())
     np.save(tmp_path / "narrow.npy", series(1)[:, :9].numpy())
-    known: dict[str, str | Path] = {"A": pair[0], "B": pair[1]}
+    known = {"A": pair[0], "B": pair[1]}
     for name in ("SHORT", "NARROW"):
         known[name], known[f"OF_{name}"] = (
             tmp_path / f"{name.lower()}.{ending}" for ending in ("npy", "safetensors")
@@ -358,7 +346,7 @@ def test_what_is_refused(
     assert not (tmp_path / "out").exists()
 
 
-def test_pairs_of_other_lengths_that_know_their_places(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pairs_of_other_lengths_that_know_their_places(monkeypatch):
     monkeypatch.setattr(storage, "contenders_of", lambda *_: [])
     pair = [f"sim:aerial?frames=60&stop={stop}&traverse={stop % 2}" for stop in (60, 51)]
     assert list(bench_storage(pair)) == []

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 
 from benchmarks import tables, teaching
@@ -18,16 +16,14 @@ from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.features.views import LabelledFrames
 
 
-def test_frames_without_a_place_are_not_counted_as_wrong() -> None:
+def test_frames_without_a_place_are_not_counted_as_wrong():
     truth = as_ground_truth(torch.tensor([[0], [1], [-1], [3], [40]]))
     views = LabelledFrames(ArrayTraverse(torch.rand(4, 3)), torch.tensor([1, 9, -1, 30]))
     task = Task(TASKS["laps, first, then last"].learned, (1, None))
     assert right_of(views, truth, task, tolerance=5) == 0.5  # of those at 1 and 40
 
 
-def test_a_row_for_each_way_to_learn(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_row_for_each_way_to_learn(tmp_path, monkeypatch, capsys):
     for name, traverse, part in (("road", 0, slice(0, 120)), ("drive", 1, slice(0, 110))):
         frames = torch.cat(list(open_source(f"sim:aerial?frames=120&traverse={traverse}").batches(120)))
         pixels = frames[part, ..., ::2, ::2].mul(255).byte().permute(0, 2, 3, 1).numpy()

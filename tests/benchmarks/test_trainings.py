@@ -5,18 +5,14 @@ from __future__ import annotations
 import json
 import subprocess
 from pathlib import Path
-from typing import Any
 
-import pytest
 from command_line import benchmark, benchmark_fails, run_here
 
 from benchmarks import trainings
 from benchmarks.trainings import PRESETS, ROUTES, Route
 
 
-def test_a_training_is_set_beside_the_untrained_map_and_made_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_training_is_set_beside_the_untrained_map_and_made_once(tmp_path, monkeypatch, capsys):
     flight = Route(
         "sim:aerial?frames=120", "sim:aerial?frames=120&traverse=1", options="--trainer.max_steps 1"
     )
@@ -24,7 +20,7 @@ def test_a_training_is_set_beside_the_untrained_map_and_made_once(
     monkeypatch.setattr(trainings, "ROUTES", {"flight, short": flight, "broken": broken})
     given = ("trainings", tmp_path, "--out", tmp_path / "out", "--seeds", "3", "--jobs", "2")
 
-    def refusing(command: list[str], **settings: Any) -> subprocess.CompletedProcess[str]:
+    def refusing(command, **settings):
         refused = ["sh", "-c", "echo 'dejavu: lr is 0'; exit 2"]  # sooner than a training
         return run_here(refused if "--model.lr" in command else command, **settings)
 
@@ -50,9 +46,9 @@ def test_a_training_is_set_beside_the_untrained_map_and_made_once(
     row = found["flight, short", "trained 5 B"]
     monkeypatch.setattr(trainings.Judge, "of", lambda *_: [row])
     monkeypatch.setattr(trainings.Judge, "hog", lambda *_: row)
-    calls: list[list[str]] = []
+    calls = []
 
-    def counted(command: list[str], **settings: Any) -> subprocess.CompletedProcess[str]:
+    def counted(command, **settings):
         if command[0] == "git":  # asks for the commit
             return run_here(command, **settings)
         calls.append(command)
@@ -68,9 +64,7 @@ def test_a_training_is_set_beside_the_untrained_map_and_made_once(
     assert "status 3" in capsys.readouterr().out
 
 
-def test_bad_options_are_refused_ahead_of_the_first_training(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_options_are_refused_ahead_of_the_first_training(tmp_path, capsys):
     given = ("trainings", tmp_path, "--out", tmp_path / "out")
     assert "No closing quotation" in benchmark_fails(capsys, *given, "--options=--foo '")
     assert "expected one of 'road, first half'" in benchmark_fails(capsys, *given, "--routes", "roads")
@@ -78,7 +72,7 @@ def test_bad_options_are_refused_ahead_of_the_first_training(
     assert not (tmp_path / "out").exists()
 
 
-def test_the_routes_are_below_the_folder_of_the_footage() -> None:
+def test_the_routes_are_below_the_folder_of_the_footage():
     for route in (one.below(Path("/films")) for one in (*ROUTES.values(), *PRESETS.values())):
         for name in (route.reference, route.query, *filter(None, [route.truth])):
             assert "/films/" in name or name.startswith("sim:")

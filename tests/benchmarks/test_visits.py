@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 
 from benchmarks import tables, visits
@@ -15,7 +13,7 @@ from benchmarks.visits import ANEW, UPDATED, Visits, curves, run_visits
 from dejavu_torch import open_source
 
 
-def test_a_row_for_each_number_of_drives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_row_for_each_number_of_drives(tmp_path, monkeypatch):
     for name, traverse in (("road", 0), ("drive", 1)):
         frames = torch.cat(list(open_source(f"sim:aerial?frames=120&traverse={traverse}").batches(120)))
         pixels = frames[..., ::2, ::2].mul(255).byte().permute(0, 2, 3, 1).numpy()

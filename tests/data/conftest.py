@@ -9,7 +9,7 @@ from videos import H264, clip, pictures
 
 
 @pytest.fixture(scope="session")
-def sources(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+def sources(tmp_path_factory):
     """One of every kind, of 12 frames."""
     folder = tmp_path_factory.mktemp("sources")
     pixels = np.random.default_rng(0).integers(0, 256, (12, 16, 16, 3), np.uint8)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from helpers import all_of, refused
-from torch import Tensor
 
 from dejavu_torch.data.arrays import ArrayTraverse, read_array
 
@@ -34,7 +33,7 @@ FEATURES = RANDOM.random((7, 6))
     ],
     ids=["grey", "colour", "one-channel", "float", "half", "reversed", "fortran"],
 )
-def test_values(values: np.ndarray, expected: Tensor, kind: str, tmp_path: Path) -> None:
+def test_values(values, expected, kind, tmp_path):
     if kind == "file":
         np.save(tmp_path / "a.npy", values)
         traverse = read_array(tmp_path / "a.npy")
@@ -55,7 +54,7 @@ def test_values(values: np.ndarray, expected: Tensor, kind: str, tmp_path: Path)
         ("".join(f"{'9' * 5000}{i}\n" for i in range(7)), True),
     ],
 )
-def test_a_file_beside_features_names_their_images(tmp_path: Path, text: str, ordered: bool) -> None:
+def test_a_file_beside_features_names_their_images(tmp_path, text, ordered):
     np.save(tmp_path / "a.npy", FEATURES)
     (tmp_path / "a.txt").write_bytes(text.encode())
     traverse = read_array(tmp_path / "a.npy")
@@ -67,14 +66,14 @@ def test_a_file_beside_features_names_their_images(tmp_path: Path, text: str, or
 
 
 @pytest.mark.parametrize("count", [0, 6, 8])
-def test_another_number_of_names_is_refused(tmp_path: Path, count: int) -> None:
+def test_another_number_of_names_is_refused(tmp_path, count):
     np.save(tmp_path / "a.npy", FEATURES)
     (tmp_path / "a.txt").write_text("a.jpg\n" * count)
     with refused("a.txt", f"has {count} names", "expected 7 names", "a.npy"):
         read_array(tmp_path / "a.npy")
 
 
-def test_names_that_are_no_text_are_refused_and_frames_have_none(tmp_path: Path) -> None:
+def test_names_that_are_no_text_are_refused_and_frames_have_none(tmp_path):
     np.save(tmp_path / "a.npy", FEATURES)
     np.save(tmp_path / "b.npy", GREY)
     for name in ("a.txt", "b.txt"):
@@ -84,7 +83,7 @@ def test_names_that_are_no_text_are_refused_and_frames_have_none(tmp_path: Path)
     assert read_array(tmp_path / "b.npy").names == ()
 
 
-def test_another_byte_order_is_read(tmp_path: Path) -> None:
+def test_another_byte_order_is_read(tmp_path):
     np.save(tmp_path / "a.npy", FEATURES.astype(">f8"))
     assert torch.equal(all_of(read_array(tmp_path / "a.npy")), torch.tensor(FEATURES))
 
@@ -105,7 +104,7 @@ def test_another_byte_order_is_read(tmp_path: Path) -> None:
     ],
     ids=lambda values: f"{values.shape}{values.dtype}",
 )
-def test_another_shape_or_type_is_refused(values: np.ndarray, tmp_path: Path) -> None:
+def test_another_shape_or_type_is_refused(values, tmp_path):
     with refused("the array", str(values.shape), "expected frames (N,H,W)"):
         ArrayTraverse(values)
     path = tmp_path / "a.npy"
@@ -114,7 +113,7 @@ def test_another_shape_or_type_is_refused(values: np.ndarray, tmp_path: Path) ->
         read_array(path)
 
 
-def test_a_file_that_is_no_whole_array_is_refused(tmp_path: Path) -> None:
+def test_a_file_that_is_no_whole_array_is_refused(tmp_path):
     path = tmp_path / "a.npy"
     np.save(path, FEATURES)
     whole = path.read_bytes()
@@ -125,9 +124,9 @@ def test_a_file_that_is_no_whole_array_is_refused(tmp_path: Path) -> None:
             read_array(path)
 
 
-def test_pickled_objects_are_refused_and_not_run(tmp_path: Path) -> None:
+def test_pickled_objects_are_refused_and_not_run(tmp_path):
     class Trap:
-        def __reduce__(self) -> tuple[object, tuple[Path]]:
+        def __reduce__(self):
             return Path.touch, (tmp_path / "ran",)
 
     path = tmp_path / "a.npy"
@@ -137,7 +136,7 @@ def test_pickled_objects_are_refused_and_not_run(tmp_path: Path) -> None:
     assert not (tmp_path / "ran").exists()
 
 
-def written(path: Path, kind: str, shape: str) -> Path:
+def written(path, kind, shape):
     """A file that says that it is of any type and shape."""
     text = f"{{'descr': {kind}, 'fortran_order': False, 'shape': {shape}}}".encode().ljust(118) + b"\n"
     path.write_bytes(b"\x93NUMPY\1\0" + len(text).to_bytes(2, "little") + text + bytes(256))
@@ -153,18 +152,18 @@ def written(path: Path, kind: str, shape: str) -> Path:
         ("('<f4', (1000000000000,))", "(4, 4)"),
     ],
 )
-def test_a_size_that_a_file_does_not_have_is_refused(tmp_path: Path, kind: str, shape: str) -> None:
+def test_a_size_that_a_file_does_not_have_is_refused(tmp_path, kind, shape):
     with refused("a.npy", "expected frames (N,H,W)"):
         read_array(written(tmp_path / "a.npy", kind, shape))
 
 
-def test_a_file_of_no_frames_is_said_to_hold_nothing(tmp_path: Path) -> None:
+def test_a_file_of_no_frames_is_said_to_hold_nothing(tmp_path):
     with refused("a.npy", "(0, 9999999999), which is empty"):
         read_array(written(tmp_path / "a.npy", "'<f4'", "(0, 9999999999)"))
 
 
 @pytest.mark.parametrize("bad", [-0.01, 1.01, np.nan, np.inf])
-def test_float_frames_of_a_file_lie_from_0_to_1(tmp_path: Path, bad: float) -> None:
+def test_float_frames_of_a_file_lie_from_0_to_1(tmp_path, bad):
     frames = FRAMES.copy()
     frames[5, 0, 1, 1] = bad
     np.save(tmp_path / "a.npy", frames)

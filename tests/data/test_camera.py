@@ -5,11 +5,9 @@ from __future__ import annotations
 import os
 import re
 import threading
-from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,17 +24,17 @@ FRAMES = pictures(12)
 
 
 @pytest.fixture(scope="module")
-def stream(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+def stream(tmp_path_factory):
     """A stream of MPEG, which can begin and end anywhere."""
     return clip(tmp_path_factory.mktemp("stream") / "clip.ts", FRAMES, **H264).read_bytes()  # type: ignore[arg-type]
 
 
 @contextmanager
-def served(folder: Path) -> Iterator[str]:
+def served(folder):
     """The address of a folder."""
 
     class Quiet(SimpleHTTPRequestHandler):
-        def log_message(self, *_: object) -> None:
+        def log_message(self, *_):
             pass
 
     with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=folder)) as server:
@@ -45,7 +43,7 @@ def served(folder: Path) -> Iterator[str]:
         server.shutdown()
 
 
-def test_a_pipe_gives_the_frames_of_the_file(tmp_path: Path, stream: bytes) -> None:
+def test_a_pipe_gives_the_frames_of_the_file(tmp_path, stream):
     with piped(tmp_path, stream) as pipe:
         assert is_stream(pipe)
         shots = list(Camera(pipe))
@@ -55,7 +53,7 @@ def test_a_pipe_gives_the_frames_of_the_file(tmp_path: Path, stream: bytes) -> N
     assert numbers(pixels) == [*range(12)]
 
 
-def test_frames_are_brought_to_a_size_as_those_of_a_file(tmp_path: Path, stream: bytes) -> None:
+def test_frames_are_brought_to_a_size_as_those_of_a_file(tmp_path, stream):
     (tmp_path / "clip.ts").write_bytes(stream)
     expected = Video(tmp_path / "clip.ts", width=24, height=16)[0]
     with piped(tmp_path, stream) as pipe:
@@ -68,7 +66,7 @@ def test_frames_are_brought_to_a_size_as_those_of_a_file(tmp_path: Path, stream:
     assert torch.equal(torch.from_numpy(first.pixels.copy()).permute(2, 0, 1) / 255, expected)
 
 
-def test_a_stream_that_changes_size_keeps_what_came_before(tmp_path: Path, stream: bytes) -> None:
+def test_a_stream_that_changes_size_keeps_what_came_before(tmp_path, stream):
     other = clip(tmp_path / "other.ts", pictures(4, 48, 64), **H264).read_bytes()  # type: ignore[arg-type]
     count = 0
     with piped(tmp_path, stream + other) as pipe, refused("48 x 64", "32 x 48", "frame 12"):
@@ -77,13 +75,13 @@ def test_a_stream_that_changes_size_keeps_what_came_before(tmp_path: Path, strea
     assert count == 12
 
 
-def test_the_end_of_an_address_is_told(tmp_path: Path, stream: bytes) -> None:
+def test_the_end_of_an_address_is_told(tmp_path, stream):
     (tmp_path / "clip.ts").write_bytes(stream)
     with served(tmp_path) as address, refused("clip.ts ended after 12 frames", "expected more frames"):
         list(Camera(f"{address}/clip.ts"))
 
 
-def test_an_answer_names_no_file_of_this_machine(tmp_path: Path, stream: bytes) -> None:
+def test_an_answer_names_no_file_of_this_machine(tmp_path, stream):
     (tmp_path / "clip.ts").write_bytes(stream)
     for where in (f"file:{tmp_path}/clip.ts", "file:clip.ts"):
         (tmp_path / "list.m3u8").write_text(
@@ -97,7 +95,7 @@ def test_an_answer_names_no_file_of_this_machine(tmp_path: Path, stream: bytes) 
         (tmp_path / "pipe").unlink()
 
 
-def test_an_open_pipe_is_one_by_whatever_name(stream: bytes) -> None:
+def test_an_open_pipe_is_one_by_whatever_name(stream):
     reading, writing = os.pipe()
     thread = threading.Thread(target=lambda: (os.write(writing, stream), os.close(writing)))
     thread.start()
@@ -114,7 +112,7 @@ def test_an_open_pipe_is_one_by_whatever_name(stream: bytes) -> None:
         "srt://127.0.0.1:1?passphrase=hidden",
     ],
 )
-def test_messages_keep_what_only_the_user_of_an_address_is_to_know(address: str) -> None:
+def test_messages_keep_what_only_the_user_of_an_address_is_to_know(address):
     with pytest.raises(InputError) as error:
         list(Camera(address))
     assert "://127.0.0.1:1" in str(error.value)
@@ -129,19 +127,19 @@ def test_messages_keep_what_only_the_user_of_an_address_is_to_know(address: str)
         ("nothing://here", ("nothing://here", "a video stream")),
     ],
 )
-def test_what_is_no_stream_is_one_line(source: str, words: tuple[str, ...]) -> None:
+def test_what_is_no_stream_is_one_line(source, words):
     assert is_stream(source)
     with refused(*words):
         list(Camera(source))
 
 
 @pytest.mark.parametrize("data", [b"", b"no video at all" * 100])
-def test_a_pipe_without_video_is_one_line(data: bytes, tmp_path: Path) -> None:
+def test_a_pipe_without_video_is_one_line(data, tmp_path):
     with piped(tmp_path, data) as pipe, refused("pipe", "a video stream"):
         list(Camera(pipe))
 
 
-def test_files_are_no_streams(tmp_path: Path) -> None:
+def test_files_are_no_streams(tmp_path):
     path = clip(tmp_path / "clip.mkv", FRAMES[:3])
     assert not any(map(is_stream, (str(path), str(tmp_path), "sim:aerial", "missing.mp4", "nul\0")))
     shots = list(shots_of(open_source(path)))

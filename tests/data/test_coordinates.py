@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,19 +17,18 @@ from dejavu_torch.data.ground_truth import find_ground_truth
 from dejavu_torch.data.source import check_not_read
 from dejavu_torch.data.traverse import Chain, Part
 from dejavu_torch.evaluation.compare import count_standing
-from dejavu_torch.types import Traverse
 
 NAN = math.nan
 
 
-def images(folder: Path, *names: str) -> Path:
+def images(folder, *names):
     folder.mkdir()
     for name in names:
         Image.new("L", (12, 12)).save(folder / name)
     return folder
 
 
-def values(text: str, traverse: Traverse, tmp_path: Path) -> list[list[float]]:
+def values(text, traverse, tmp_path):
     (tmp_path / "where.csv").write_text(text)
     return read_coordinates(tmp_path / "where.csv", traverse).values.tolist()
 
@@ -45,12 +43,12 @@ def values(text: str, traverse: Traverse, tmp_path: Path) -> list[list[float]]:
         ("lat,lon,alt\n48,11,500\n49,-12,501\n", [[48, 11], [49, -12]]),
     ],
 )
-def test_a_row_for_each_frame(text: str, expected: list[list[float]], tmp_path: Path) -> None:
+def test_a_row_for_each_frame(text, expected, tmp_path):
     two = ArrayTraverse(torch.rand(2, 4), "two")
     np.testing.assert_array_equal(values(text, two, tmp_path), expected)
 
 
-def test_rows_by_the_names_of_images(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_rows_by_the_names_of_images(tmp_path, caplog):
     folder = images(tmp_path / "a", "1.png", "2.png", "3.png")
     found = values("name,x,y\n3.png,30,0\n1.png,10,0\nother.png,0,0\n", open_source(folder), tmp_path)
     np.testing.assert_array_equal(found, [[10, 0], [NAN, NAN], [30, 0]])
@@ -60,7 +58,7 @@ def test_rows_by_the_names_of_images(tmp_path: Path, caplog: pytest.LogCaptureFi
 
 
 @pytest.mark.parametrize(("unit", "sign"), [(1, " "), (10**9, ",")])  # TUM, EuRoC
-def test_poses_with_times(unit: int, sign: str, tmp_path: Path) -> None:
+def test_poses_with_times(unit, sign, tmp_path):
     """Poses every half second at 1 m/s, images a quarter of a second later, and one after the end."""
     first = 1403636579
     names = [
@@ -77,7 +75,7 @@ def test_poses_with_times(unit: int, sign: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(found, [[0.25, 2, 3], [1.25, 2, 3], [NAN] * 3], atol=1e-6)
 
 
-def test_rows_by_time(tmp_path: Path) -> None:
+def test_rows_by_time(tmp_path):
     folder = images(tmp_path / "a", "100.25.png", "101.0.png", "103.0.png", "105.png")
     found = values(
         "time,x,y\n100,7,2\n100.5,8,4\n101,9,6\n103,1,1\n104.5,2,2\n", open_source(folder), tmp_path
@@ -104,12 +102,12 @@ def test_rows_by_time(tmp_path: Path) -> None:
         ("x,y\n,\n,\n", ("columns x, y",)),
     ],
 )
-def test_what_is_refused(text: str, words: tuple[str, ...], tmp_path: Path) -> None:
+def test_what_is_refused(text, words, tmp_path):
     with refused(*words):
         values(text, ArrayTraverse(torch.rand(2, 4), "two"), tmp_path)
 
 
-def test_parts_and_chains_keep_coordinates(tmp_path: Path) -> None:
+def test_parts_and_chains_keep_coordinates(tmp_path):
     (tmp_path / "w.csv").write_text("x,y\n" + "\n".join(f"{i},0" for i in range(9)))
     np.save(tmp_path / "f.npy", np.random.default_rng(0).random((9, 5), np.float32))
     whole = open_source(f"{tmp_path}/f.npy?coordinates={tmp_path}/w.csv")
@@ -128,13 +126,13 @@ def test_parts_and_chains_keep_coordinates(tmp_path: Path) -> None:
     assert truth.positives.tolist() == [[2, 3, 4], [4, 5, 6], [6, 7, 8]]
 
 
-def test_a_file_of_coordinates_is_never_an_output(tmp_path: Path) -> None:
+def test_a_file_of_coordinates_is_never_an_output(tmp_path):
     for name in ("coordinates", "mask"):
         with refused("w.csv is an input"):
             check_not_read(tmp_path / "w.csv", f"{tmp_path}/a?start=3&{name}={tmp_path}/w.csv")
 
 
-def test_a_report_tells_errors_in_metres(tmp_path: Path) -> None:
+def test_a_report_tells_errors_in_metres(tmp_path):
     """Each query shows the place 1 m beside it: all errors are 1 m."""
     rows = torch.nn.functional.normalize(torch.randn(60, 8), dim=1)
     reference, query = ArrayTraverse(rows, "one"), ArrayTraverse(rows.clone(), "two")
@@ -145,7 +143,7 @@ def test_a_report_tells_errors_in_metres(tmp_path: Path) -> None:
     assert facts["error_metres"]["all"] == {"0.5": 1.0, "0.9": 1.0, "0.99": 1.0}
 
 
-def test_places_where_the_camera_stands_are_counted() -> None:
+def test_places_where_the_camera_stands_are_counted():
     moving = torch.nn.functional.normalize(torch.randn(40, 16), dim=1)
     assert count_standing(moving) == 0
     assert count_standing(torch.cat([moving, moving[-1:].repeat(29, 1)])) == 29

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import warnings
-from pathlib import Path
 
 import pytest
 from helpers import refused
@@ -25,13 +24,13 @@ from dejavu_torch.types import InputError
     ],
     ids=["missing", "directory", "fifo", "null", "long"],
 )
-def test_what_is_no_regular_file_is_refused_and_not_waited_for(tmp_path: Path, name: str, words: str) -> None:
+def test_what_is_no_regular_file_is_refused_and_not_waited_for(tmp_path, name, words):
     os.mkfifo(tmp_path / "fifo")
     with refused(words, "expected a text"):
         check_regular(tmp_path / name, "a text")
 
 
-def test_whatever_a_decoder_raises_is_one_line_and_what_it_warns_of_is_none(tmp_path: Path) -> None:
+def test_whatever_a_decoder_raises_is_one_line_and_what_it_warns_of_is_none(tmp_path):
     path = tmp_path / "a.bin"
     path.write_bytes(b"12345")
     (tmp_path / "link").symlink_to(path)
@@ -47,9 +46,7 @@ def test_whatever_a_decoder_raises_is_one_line_and_what_it_warns_of_is_none(tmp_
             warnings.warn("odd", stacklevel=1)
 
 
-def test_a_text_without_its_mark_and_one_that_is_none(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_text_without_its_mark_and_one_that_is_none(tmp_path, monkeypatch):
     path = tmp_path / "a.csv"
     path.write_bytes(b"\xef\xbb\xbfa\r\nb")
     assert read_text(path, "lines") == "a\nb"

@@ -6,7 +6,6 @@ import os
 import shutil
 import sys
 import types
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,13 +26,13 @@ GREY = np.arange(20, dtype=np.uint8).reshape(4, 5) * 10
 COLOUR = np.stack([GREY, 255 - GREY, GREY // 2], 2)
 
 
-def write(path: Path, *names: str) -> None:
+def write(path, *names):
     """Grey images, the j-th all of value j."""
     for j, name in enumerate(names):
         Image.new("L", (5, 4), j).save(path / name)
 
 
-def with_alpha(pixels: np.ndarray) -> np.ndarray:
+def with_alpha(pixels):
     return np.concatenate([pixels.reshape(4, 5, -1), np.full((4, 5, 1), 90, np.uint8)], 2)
 
 
@@ -48,9 +47,7 @@ def with_alpha(pixels: np.ndarray) -> np.ndarray:
         (("1.png", "2_left.png"), False),
     ],
 )
-def test_names_that_end_in_rising_numbers_are_in_order(
-    tmp_path: Path, names: tuple[str, ...], ordered: bool
-) -> None:
+def test_names_that_end_in_rising_numbers_are_in_order(tmp_path, names, ordered):
     write(tmp_path, *names)
     assert ImageFolder(tmp_path).ordered is ordered
 
@@ -70,7 +67,7 @@ def test_names_that_end_in_rising_numbers_are_in_order(
         (Image.fromarray(GREY), "a.pgm", GREY[..., None] / 255),
     ],
 )
-def test_pixel_formats(image: Image.Image, name: str, expected: np.ndarray, tmp_path: Path) -> None:
+def test_pixel_formats(image, name, expected, tmp_path):
     image.save(tmp_path / name)
     found = read_image(tmp_path / name)
     assert found.dtype == torch.float32
@@ -78,14 +75,14 @@ def test_pixel_formats(image: Image.Image, name: str, expected: np.ndarray, tmp_
 
 
 @pytest.mark.parametrize("name", ["a.jpg", "a.JPEG", "a.webp"])
-def test_lossy_formats(name: str, tmp_path: Path) -> None:
+def test_lossy_formats(name, tmp_path):
     Image.new("RGB", (16, 8), (200, 100, 50)).save(tmp_path / name)
     found = all_of(ImageFolder(tmp_path))
     assert found.shape == (1, 3, 8, 16)
     torch.testing.assert_close(found[0, :, 4, 8], torch.tensor([200, 100, 50]) / 255, atol=0.02, rtol=0)
 
 
-def test_numbers_in_names_count_as_numbers(tmp_path: Path) -> None:
+def test_numbers_in_names_count_as_numbers(tmp_path):
     names = ["f1.png", "f9.png", "f10.png", "f010b.png", "f100.png", "g1_2.png", "g1_10.png", "x.png"]
     write(tmp_path, *names)
     (tmp_path / "truth.csv").write_text("query,place")
@@ -96,9 +93,7 @@ def test_numbers_in_names_count_as_numbers(tmp_path: Path) -> None:
     assert torch.equal(all_of(folder)[:, 0, 0, 0] * 255, torch.arange(8.0))
 
 
-def test_the_order_of_names_that_two_tools_sort_differently(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_the_order_of_names_that_two_tools_sort_differently(tmp_path, caplog):
     write(tmp_path, "f9.png", "f10.png", "g.png")
     natural, texts = ([0, 1, 2], [1, 0, 2])
     for order, expected in (("natural", natural), ("lexicographic", texts)):
@@ -114,9 +109,7 @@ def test_the_order_of_names_that_two_tools_sort_differently(
         assert words in line
 
 
-def test_names_of_one_width_need_no_word_on_their_order(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_names_of_one_width_need_no_word_on_their_order(tmp_path, caplog):
     write(tmp_path, "f08.png", "f09.png", "f10.png", "g.png")
     assert ImageFolder(tmp_path).names == ImageFolder(tmp_path, order="natural").names
     assert caplog.text == ""
@@ -132,9 +125,7 @@ def test_names_of_one_width_need_no_word_on_their_order(
         ("full", (10**5, 10**5), ("expected", "at most")),
     ],
 )
-def test_what_is_no_folder_of_images_and_sizes_that_no_frame_has(
-    tmp_path: Path, name: str, given: tuple[int, ...], words: tuple[str, ...]
-) -> None:
+def test_what_is_no_folder_of_images_and_sizes_that_no_frame_has(tmp_path, name, given, words):
     for folder in ("empty", "full"):
         (tmp_path / folder).mkdir()
     (tmp_path / "empty" / "notes.txt").touch()
@@ -143,14 +134,14 @@ def test_what_is_no_folder_of_images_and_sizes_that_no_frame_has(
         all_of(ImageFolder(tmp_path / name, *given))
 
 
-def test_mixed_images_are_refused_by_name(tmp_path: Path) -> None:
+def test_mixed_images_are_refused_by_name(tmp_path):
     write(tmp_path, "0.png", "1.png", "2.png")
     Image.new("L", (5, 6)).save(tmp_path / "1.png")
     with refused("1.png", "6 x 5 pixels of 1 channel", "expected 4 x 5 pixels of 1 channel", "0.png"):
         all_of(ImageFolder(tmp_path))
 
 
-def test_all_images_have_the_channels_of_the_first(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_all_images_have_the_channels_of_the_first(tmp_path, caplog):
     colours = np.random.default_rng(0).integers(0, 256, (4, 5, 3), np.uint8)
     for name, kinds in {"day": ("RGB", "L", "L"), "night": ("L", "RGB", "L")}.items():
         (tmp_path / name).mkdir()
@@ -167,9 +158,7 @@ def test_all_images_have_the_channels_of_the_first(tmp_path: Path, caplog: pytes
     assert caplog.text.count("images in colour are read as grey, as the first image is") == 1
 
 
-def test_images_that_are_left_out_are_told(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_images_that_are_left_out_are_told(tmp_path, caplog, monkeypatch):
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
     _has_heif.cache_clear()
     write(tmp_path, "1.png", "2.png")
@@ -195,8 +184,8 @@ def test_images_that_are_left_out_are_told(
         ImageFolder(tmp_path)
 
 
-def test_heif_is_read_by_pillow_heif(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    called: list[bool] = []
+def test_heif_is_read_by_pillow_heif(tmp_path, monkeypatch):
+    called = []
     opener = types.SimpleNamespace(register_heif_opener=lambda: called.append(True))
     monkeypatch.setitem(sys.modules, "pillow_heif", opener)
     _has_heif.cache_clear()
@@ -207,7 +196,7 @@ def test_heif_is_read_by_pillow_heif(tmp_path: Path, monkeypatch: pytest.MonkeyP
     _has_heif.cache_clear()
 
 
-def test_only_the_images_asked_for_are_read(tmp_path: Path) -> None:
+def test_only_the_images_asked_for_are_read(tmp_path):
     write(tmp_path, *(f"{j}.png" for j in range(10)))
     for broken, content in ((4, b""), (9, b"no image at all\nbut text\n")):
         (tmp_path / f"{broken}.png").write_bytes(content)
@@ -220,7 +209,7 @@ def test_only_the_images_asked_for_are_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.bmp", "a.tif", "a.webp", "a.ppm"])
-def test_a_truncated_image_is_refused_by_name(tmp_path: Path, name: str) -> None:
+def test_a_truncated_image_is_refused_by_name(tmp_path, name):
     noise = np.random.default_rng(0).integers(0, 256, (40, 40, 3), np.uint8)
     path = tmp_path / name
     Image.fromarray(noise).save(path)
@@ -231,7 +220,7 @@ def test_a_truncated_image_is_refused_by_name(tmp_path: Path, name: str) -> None
             read_image(path)
 
 
-def test_images_are_resized_as_they_are_read(tmp_path: Path) -> None:
+def test_images_are_resized_as_they_are_read(tmp_path):
     for i in range(3):
         Image.fromarray(np.full((40, 60, 3), 40 * i + 20, np.uint8)).save(tmp_path / f"{i}.png")
     for size, shape in (((30, 0), (20, 30)), ((0, 10), (10, 15)), ((12, 8), (8, 12)), ((0, 0), (40, 60))):
@@ -240,7 +229,7 @@ def test_images_are_resized_as_they_are_read(tmp_path: Path) -> None:
         assert frames.mean((1, 2, 3)).mul(255).tolist() == pytest.approx([20, 60, 100], abs=1e-3)
 
 
-def test_a_camera_held_upright_is_turned(tmp_path: Path) -> None:
+def test_a_camera_held_upright_is_turned(tmp_path):
     picture = Image.fromarray(np.arange(12, dtype=np.uint8).reshape(3, 4) * 20)
     exif = Image.Exif()
     exif[0x0112] = 6  # turn a quarter clockwise to see it upright
@@ -253,9 +242,7 @@ def test_a_camera_held_upright_is_turned(tmp_path: Path) -> None:
     ("size", "words"),
     [((60_000, 60_000), "pixels"), ((10_000, 10_000), "10 MB free")],
 )
-def test_an_image_that_claims_too_many_pixels_is_refused_by_its_header(
-    tmp_path: Path, size: tuple[int, int], words: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_image_that_claims_too_many_pixels_is_refused_by_its_header(tmp_path, size, words, monkeypatch):
     monkeypatch.setattr(memory, "free_memory", lambda: 10e6)
     monkeypatch.setattr(Image.Image, "load", lambda _: pytest.fail("it was decoded"))
     (tmp_path / "a.ppm").write_bytes(f"P6 {size[1]} {size[0]} 255\n".encode() + bytes(99))
@@ -263,7 +250,7 @@ def test_an_image_that_claims_too_many_pixels_is_refused_by_its_header(
         read_image(tmp_path / "a.ppm")
 
 
-def test_only_the_formats_of_the_suffixes_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_the_formats_of_the_suffixes_are_read(tmp_path, monkeypatch):
     monkeypatch.setattr(EpsImagePlugin, "Ghostscript", lambda *_, **__: pytest.fail("a program was started"))
     path = tmp_path / "a.png"
     path.write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 10 10\n%%EndComments\n")
@@ -272,7 +259,7 @@ def test_only_the_formats_of_the_suffixes_are_read(tmp_path: Path, monkeypatch: 
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -0.1, 1.5])
-def test_float_images_lie_from_0_to_1(tmp_path: Path, bad: float) -> None:
+def test_float_images_lie_from_0_to_1(tmp_path, bad):
     pixels = np.linspace(0, 1, 20, dtype=np.float32).reshape(4, 5)
     Image.fromarray(pixels).save(tmp_path / "a.tif")
     assert torch.equal(read_image(tmp_path / "a.tif")[0], torch.tensor(pixels))
@@ -286,7 +273,7 @@ def test_float_images_lie_from_0_to_1(tmp_path: Path, bad: float) -> None:
 
 
 @pytest.mark.parametrize("name", [b"a\nb.png", b"a\x1b[2Jb.png", b"\xff.png"])
-def test_a_name_of_any_bytes_is_one_line(tmp_path: Path, name: bytes) -> None:
+def test_a_name_of_any_bytes_is_one_line(tmp_path, name):
     (tmp_path / os.fsdecode(name)).write_bytes(b"no image")
     with pytest.raises(InputError) as caught:
         all_of(ImageFolder(tmp_path))
@@ -297,7 +284,7 @@ def test_a_name_of_any_bytes_is_one_line(tmp_path: Path, name: bytes) -> None:
     assert ImageFolder(folder).name.isprintable()
 
 
-def test_times_with_decimals_are_in_order(tmp_path: Path) -> None:
+def test_times_with_decimals_are_in_order(tmp_path):
     write(tmp_path, "1305031102.175304.png", "1305031102.211214.png", "1305031103.011214.png")
     assert ImageFolder(tmp_path).ordered
     write(tmp_path, "1305031102.99.png")
@@ -306,9 +293,7 @@ def test_times_with_decimals_are_in_order(tmp_path: Path) -> None:
     assert not ImageFolder(tmp_path).ordered
 
 
-def test_images_of_16_bits_that_use_few_of_them_are_told(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_images_of_16_bits_that_use_few_of_them_are_told(tmp_path, caplog):
     noise = np.random.default_rng(0).integers(0, 900, (12, 15))
     traverses = {}
     for name, values in {"thermal": 51_000 + noise, "depth": noise * 70, "grey": noise // 60}.items():
@@ -326,14 +311,14 @@ def test_images_of_16_bits_that_use_few_of_them_are_told(
     assert Part(Chain([traverses["thermal"]]), range(1)).deep
 
 
-def photo(file: Path, time: str = "", fraction: str = "") -> None:
+def photo(file, time="", fraction=""):
     exif = Image.Exif()
     if time:
         exif.get_ifd(0x8769).update({36867: f"2026:05:03 {time}", 37521: fraction})
     Image.new("L", (5, 4)).save(file, exif=exif)
 
 
-def test_photos_by_when_they_were_taken(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_photos_by_when_they_were_taken(tmp_path, caplog):
     """A camera that counts to 9999 and goes on from 0."""
     times = {"DSC_9998": "12:00:01", "DSC_9999": "12:00:02", "DSC_0000": "12:00:03", "DSC_0001": "12:00:03"}
     (tmp_path / "a").mkdir()
@@ -356,7 +341,7 @@ def test_photos_by_when_they_were_taken(tmp_path: Path, caplog: pytest.LogCaptur
     assert caplog.messages == [line]
 
 
-def test_some_images_and_those_in_folders_inside(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_some_images_and_those_in_folders_inside(tmp_path, caplog):
     for name in ("cam0", "cam1", ".thumbs"):
         (tmp_path / name).mkdir()
         write(tmp_path / name, "1.color.png", "1.depth.png")

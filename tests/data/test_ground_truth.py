@@ -8,7 +8,6 @@ import zipfile
 from contextlib import chdir
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ import torch
 from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
-from torch import Tensor
 
 from dejavu_torch import memory
 from dejavu_torch.data.arrays import ArrayTraverse
@@ -36,12 +34,11 @@ from dejavu_torch.data.ground_truth import (
 from dejavu_torch.data.positions import look_up
 from dejavu_torch.data.strip import SlidingWindow
 from dejavu_torch.data.traverse import frame_range
-from dejavu_torch.types import Traverse
 
 POSITIONS = st.lists(st.integers(-20, 20), min_size=1, max_size=12)
 
 
-def column(truth: Tensor) -> list[int]:
+def column(truth):
     assert (truth.ndim, truth.shape[1], truth.dtype) == (2, 1, torch.int64)
     return truth[:, 0].tolist()
 
@@ -49,14 +46,14 @@ def column(truth: Tensor) -> list[int]:
 @given(
     st.lists(st.integers(0, 30), min_size=1, max_size=9), st.none() | st.integers(1, 30), st.integers(-40, 40)
 )
-def test_offset(numbers: list[int], frames: int | None, offset: int) -> None:
+def test_offset(numbers, frames, offset):
     end = 100 if frames is None else frames  # of a map of unknown length
     expected = [i + offset if 0 <= i + offset < end else -1 for i in numbers]
     assert column(offset_truth(torch.tensor(numbers), frames, offset)) == expected
 
 
 @given(POSITIONS, POSITIONS)
-def test_position_is_the_nearest_reference_frame(reference: list[int], query: list[int]) -> None:
+def test_position_is_the_nearest_reference_frame(reference, query):
     found = column(position_truth(torch.tensor(reference).double(), torch.tensor(query).double()))
     ordered = sorted(reference)
     widest = max((b - a for a, b in pairwise(ordered)), default=0)
@@ -68,7 +65,7 @@ def test_position_is_the_nearest_reference_frame(reference: list[int], query: li
             assert abs(reference[place] - position) == nearest
 
 
-def test_convention_5_tolerance_is_inclusive() -> None:
+def test_convention_5_tolerance_is_inclusive():
     index = torch.tensor([4, 5, 10, 15, 16])
     assert is_right(index, torch.full((5, 1), 10), 5).tolist() == [False, True, True, True, False]
     assert is_right(index, torch.full((5, 1), 10), 0).tolist() == [False, False, True, False, False]
@@ -82,16 +79,14 @@ ANSWERS = st.lists(
 
 
 @given(ANSWERS, st.integers(0, 4))
-def test_any_right_place_will_do_and_minus_one_is_none(
-    rows: list[tuple[int, list[int]]], tolerance: int
-) -> None:
+def test_any_right_place_will_do_and_minus_one_is_none(rows, tolerance):
     expected = [i >= 0 and any(t >= 0 and abs(i - t) <= tolerance for t in truth) for i, truth in rows]
     index, truth = torch.tensor([i for i, _ in rows]), torch.tensor([t for _, t in rows])
     assert is_right(index, truth, tolerance).tolist() == expected
 
 
 @given(st.lists(st.lists(st.integers(0, 9), max_size=4), min_size=1, max_size=8))
-def test_padded_holds_each_row_in_order(rows: list[list[int]]) -> None:
+def test_padded_holds_each_row_in_order(rows):
     table = padded(torch.tensor(places, dtype=torch.int64) for places in rows)
     assert table.dtype == torch.int64
     assert table.shape == (len(rows), max(map(len, rows)))
@@ -104,9 +99,7 @@ POINTS = st.lists(st.tuples(st.integers(-6, 6), st.integers(-6, 6)), min_size=1,
 
 
 @given(POINTS, POINTS, st.integers(0, 6))
-def test_near_is_every_frame_within_the_radius_inclusive(
-    reference: list[tuple[int, int]], query: list[tuple[int, int]], radius: int
-) -> None:
+def test_near_is_every_frame_within_the_radius_inclusive(reference, query, radius):
     # UTM coordinates are large: float32 would not hold their metres
     far = torch.tensor([500_000, 5_000_000], dtype=torch.float64)
     found = near_truth(torch.tensor(reference) + far, torch.tensor(query) + far, radius)
@@ -117,7 +110,7 @@ def test_near_is_every_frame_within_the_radius_inclusive(
     assert [[place for place in row if place >= 0] for row in found.tolist()] == expected
 
 
-def test_near_needs_no_table_of_all_pairs(largest_tensor: type) -> None:
+def test_near_needs_no_table_of_all_pairs(largest_tensor):
     line = torch.stack([torch.arange(2500.0), torch.zeros(2500)], 1)
     with largest_tensor() as seen:
         found = near_truth(line, line, 0.0)
@@ -125,7 +118,7 @@ def test_near_needs_no_table_of_all_pairs(largest_tensor: type) -> None:
     assert seen.numel < 2500 * 2500 / 3
 
 
-def test_a_soft_place_counts_neither_way_and_an_unknown_query_never() -> None:
+def test_a_soft_place_counts_neither_way_and_an_unknown_query_never():
     """Right, wrong, soft, silent, soft but right by the tolerance, not known, not known though right."""
     index = torch.tensor([10, 30, 20, -1, 11, 30, 10])
     known = torch.tensor([True] * 5 + [False] * 2)
@@ -134,28 +127,28 @@ def test_a_soft_place_counts_neither_way_and_an_unknown_query_never() -> None:
     assert counted(index, truth, 0).tolist() == [True, True, False, True, False, False, False]
 
 
-def route(length: int, place: list[float] | None = None) -> Traverse:
+def route(length, place=None):
     traverse = ArrayTraverse(torch.rand(length, 2))
     traverse.places = None if place is None else torch.tensor(place, dtype=torch.float64)
     return traverse
 
 
-def known(*arguments: Any, **options: bool) -> GroundTruth:
+def known(*arguments, **options):
     found = find_ground_truth(*arguments, **options)
     assert found is not None
     return found
 
 
-def read(truth: str, frames: int | None, queries: int | Tensor, **options: bool) -> GroundTruth:
+def read(truth, frames, queries, **options):
     return known(truth, None, None, frames, queries, **options)
 
 
-def sets(table: Tensor) -> list[set[int]]:
+def sets(table):
     assert table.dtype == torch.int64
     return [{place for place in row if place >= 0} for row in table.tolist()]
 
 
-def written(folder: Path, text: str | bytes) -> str:
+def written(folder, text):
     path = folder / "truth.csv"
     path.write_bytes(text.encode() if isinstance(text, str) else text)
     return str(path)
@@ -176,9 +169,7 @@ def written(folder: Path, text: str | bytes) -> str:
         (None, route(3), None, None),
     ],
 )
-def test_what_a_command_was_given_or_can_know(
-    truth: str | None, reference: Traverse | None, query: Traverse | None, expected: list[int] | None
-) -> None:
+def test_what_a_command_was_given_or_can_know(truth, reference, query, expected):
     queries = len(query) if query is not None else None
     found = find_ground_truth(truth, reference, query, reference and len(reference), queries or 3)
     assert (found is None) == (expected is None)
@@ -187,7 +178,7 @@ def test_what_a_command_was_given_or_can_know(
         assert found.judged.all()
 
 
-def test_an_offset_beyond_every_frame_is_refused() -> None:
+def test_an_offset_beyond_every_frame_is_refused():
     with refused("truth 9", "from -3 to 4"):
         find_ground_truth("9", route(5), route(4), 5, 4)
     with refused("truth -9", "from -8"):
@@ -202,8 +193,8 @@ class Named(ArrayTraverse):
         self.names, self.times = names, torch.arange(len(names)).double() if timed else None
 
 
-def strip(pixels: int, width: int = 8, **part: int) -> Traverse:
-    window: Traverse = SlidingWindow(torch.rand(1, 8, pixels), width)
+def strip(pixels, width=8, **part):
+    window = SlidingWindow(torch.rand(1, 8, pixels), width)
     return frame_range(window, **part) if part else window
 
 
@@ -229,9 +220,7 @@ ABC, TIMES = list("abc"), ["0:00.0", "0:00.5", "0:01.0"]
         (route(3), strip(10), False),
     ],
 )
-def test_as_many_frames_are_the_same_places_where_they_say_so(
-    reference: Traverse, query: Traverse, says: bool
-) -> None:
+def test_as_many_frames_are_the_same_places_where_they_say_so(reference, query, says):
     frames, queries = len(reference), len(query)
     assert queries == frames
     found = find_ground_truth(None, reference, query, frames, queries)
@@ -240,7 +229,7 @@ def test_as_many_frames_are_the_same_places_where_they_say_so(
     assert found is None if not says else torch.equal(found.positives, named.positives)
 
 
-def test_numbered_queries_get_their_own_rows() -> None:
+def test_numbered_queries_get_their_own_rows():
     numbers = torch.tensor([3, 0])
     by_offset = known("2", None, None, None, numbers)
     by_position = known(None, route(3, [0, 1, 2]), route(4, [2, 9, 9, 1]), 3, numbers)
@@ -268,9 +257,7 @@ NO_TRUTH = ["x", "", "1.5", "utm:", "utm:far", "utm:-1", "utm:nan", "utm2", "9" 
         ("folder.csv", {}, ("folder.csv", "is a folder")),
     ],
 )
-def test_what_is_no_truth_is_refused_early(
-    truth: str, options: dict[str, bool], words: tuple[str, ...], scratch: Path
-) -> None:
+def test_what_is_no_truth_is_refused_early(truth, options, words, scratch):
     (scratch / "folder.csv").mkdir(exist_ok=True)
     with chdir(scratch), refused(*words):
         check_ground_truth(truth, **options)
@@ -283,14 +270,12 @@ TABLE = "query,place...\n0,4\n2,1,7\n3\n5,-1\n"
 
 
 @pytest.fixture(scope="module")
-def scratch(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def scratch(tmp_path_factory):
     return tmp_path_factory.mktemp("truth")
 
 
 @given(LISTED, st.booleans(), st.lists(st.integers(0, 20), min_size=1, max_size=9, unique=True))
-def test_csv_holds_what_was_written(
-    scratch: Path, listed: dict[int, list[int]], header: bool, numbers: list[int]
-) -> None:
+def test_csv_holds_what_was_written(scratch, listed, header, numbers):
     lines = [",".join(map(str, [query, *places])) for query, places in listed.items()]
     path = written(scratch, "\n".join(["query,place", *lines] if header else lines))
     wanted = [set(listed.get(query, [])) for query in numbers]
@@ -321,7 +306,7 @@ def test_csv_holds_what_was_written(
         "3\n5\n2,1,7\n0,4",
     ],
 )
-def test_csv_is_read_leniently(tmp_path: Path, text: str) -> None:
+def test_csv_is_read_leniently(tmp_path, text):
     truth = read(written(tmp_path, text), 8, 7)
     assert sets(truth.positives) == [{4}, set(), {1, 7}, set(), set(), set(), set()]
     assert truth.judged.tolist() == [True, False, True, True, False, True, False]
@@ -353,25 +338,23 @@ def test_csv_is_read_leniently(tmp_path: Path, text: str) -> None:
         ("0,1\n1,7.5\n", ("line 2", "place 7.5", "0 to 7")),
     ],
 )
-def test_a_csv_that_is_none_is_refused(tmp_path: Path, text: str | bytes, words: tuple[str, ...]) -> None:
+def test_a_csv_that_is_none_is_refused(tmp_path, text, words):
     interpolate = any(word in words for word in ("2 places", "0 places", "place 7.5"))
     with refused("truth.csv", *words):
         read(written(tmp_path, text), 8, 7, interpolate=interpolate)
 
 
-def test_places_are_not_bounded_where_the_map_is_not_known(tmp_path: Path) -> None:
+def test_places_are_not_bounded_where_the_map_is_not_known(tmp_path):
     assert read(written(tmp_path, "0,100000"), None, 1).positives.tolist() == [[100000]]
     with refused("place -3", "from 0,"):
         read(written(tmp_path, "0,-3"), None, 1)
 
 
 @given(st.dictionaries(st.integers(0, 30), st.integers(0, 60), min_size=1, max_size=6))
-def test_interpolation_is_a_straight_line_between_neighbours_and_nothing_beyond(
-    scratch: Path, listed: dict[int, int]
-) -> None:
+def test_interpolation_is_a_straight_line_between_neighbours_and_nothing_beyond(scratch, listed):
     path = written(scratch, "".join(f"{query},{place}\n" for query, place in listed.items()))
     truth = read(path, 61, 34, interpolate=True)
-    expected: dict[int, float] = dict(listed)
+    expected = dict(listed)
     for a, b in pairwise(sorted(listed)):
         expected |= {q: listed[a] + (listed[b] - listed[a]) * (q - a) / (b - a) for q in range(a, b)}
     assert truth.judged.tolist() == [query in expected for query in range(34)]
@@ -381,7 +364,7 @@ def test_interpolation_is_a_straight_line_between_neighbours_and_nothing_beyond(
     assert all(sets(truth.positives)[query] == {place} for query, place in listed.items())
 
 
-def test_interpolation_by_hand(tmp_path: Path) -> None:
+def test_interpolation_by_hand(tmp_path):
     path = written(tmp_path, "1,10\n5,12.4\n6,0\n")
     some = read(path, 20, torch.tensor([5, 2, 0]), interpolate=True)
     assert some.positives[:, 0].tolist() == [12, 11, -1]
@@ -400,14 +383,14 @@ MATRIX = st.integers(1, 6).flatmap(
 )
 
 
-def saved(folder: Path, **arrays: np.ndarray) -> str:
+def saved(folder, **arrays):
     path = folder / "truth.npz"
     np.savez(path, **arrays)
     return str(path)
 
 
 @given(MATRIX, st.sampled_from([bool, np.uint8, np.float64]))
-def test_npz_rows_are_places_and_columns_queries(scratch: Path, cells: list[list[str]], dtype: type) -> None:
+def test_npz_rows_are_places_and_columns_queries(scratch, cells, dtype):
     hard = np.array([[cell in ("hard", "both") for cell in row] for row in cells])
     soft = np.array([[cell in ("soft", "both") for cell in row] for row in cells])
     places, queries = hard.shape
@@ -428,7 +411,7 @@ def test_npz_rows_are_places_and_columns_queries(scratch: Path, cells: list[list
     assert sets(turned.ignored) == sets(truth.ignored)[::-1]
 
 
-def test_npz_with_one_matrix_only(tmp_path: Path) -> None:
+def test_npz_with_one_matrix_only(tmp_path):
     matrix = np.array([[True, False], [True, False], [False, True]])
     for name in ("GThard", "GTsoft"):
         truth = read(saved(tmp_path, **{name: matrix}), 3, 2)
@@ -453,14 +436,12 @@ SQUARE, SOME = np.eye(3, dtype=bool), torch.tensor([0, 2])
         (np.full((3, 3), np.nan), 3, 3, ("not finite",)),
     ],
 )
-def test_a_matrix_that_does_not_fit_is_refused(
-    tmp_path: Path, hard: np.ndarray, places: int | None, queries: int | Tensor, words: tuple[str, ...]
-) -> None:
+def test_a_matrix_that_does_not_fit_is_refused(tmp_path, hard, places, queries, words):
     with refused("truth.npz", "GThard", *words):
         read(saved(tmp_path, GThard=hard), places, queries)
 
 
-def test_other_npz_files_are_refused(tmp_path: Path) -> None:
+def test_other_npz_files_are_refused(tmp_path):
     with refused("truth.npz", "contains gt, S", "GThard"):
         read(saved(tmp_path, gt=SQUARE, S=SQUARE), 3, 3)
     with refused("differ in shape"):
@@ -477,21 +458,21 @@ def test_other_npz_files_are_refused(tmp_path: Path) -> None:
 # coordinates in image names
 
 
-def images(*points: tuple[float, float]) -> Traverse:
+def images(*points):
     return Named([f"{i:03}@{east:.2f}@{north:.2f}@33@T@@@.png" for i, (east, north) in enumerate(points)])
 
 
 # a list for each query
 
 
-def listed(folder: Path, rows: object) -> str:
+def listed(folder, rows):
     path = folder / "truth.json"
     path.write_text(rows if isinstance(rows, str) else json.dumps(rows))
     return str(path)
 
 
 @given(st.lists(st.lists(st.integers(0, 9), max_size=4), min_size=1, max_size=9).filter(any))
-def test_json_lists_all_right_places_of_each_query(scratch: Path, rows: list[list[int]]) -> None:
+def test_json_lists_all_right_places_of_each_query(scratch, rows):
     path = listed(scratch, rows)
     for frames in (10, None):
         truth = read(path, frames, len(rows))
@@ -522,14 +503,12 @@ def test_json_lists_all_right_places_of_each_query(scratch: Path, rows: list[lis
         ([[], []], 2, ("no query has a right answer", "truth.json")),
     ],
 )
-def test_a_json_of_another_shape_is_refused(
-    tmp_path: Path, rows: object, queries: int | Tensor, words: tuple[str, ...]
-) -> None:
+def test_a_json_of_another_shape_is_refused(tmp_path, rows, queries, words):
     with refused("truth.json", *words):
         read(listed(tmp_path, rows), 10, queries)
 
 
-def test_a_list_counts_frames_of_queries_that_are_resampled(tmp_path: Path) -> None:
+def test_a_list_counts_frames_of_queries_that_are_resampled(tmp_path):
     path, query = listed(tmp_path, [[4], [5], [6], [7]]), ArrayTraverse(torch.rand(4, 2))
     shown = torch.tensor([0, 2, 2])
     truth = known(path, None, query, 10, shown, resampled=True)
@@ -538,7 +517,7 @@ def test_a_list_counts_frames_of_queries_that_are_resampled(tmp_path: Path) -> N
         known(path, None, ArrayTraverse(torch.rand(5, 2)), 10, shown, resampled=True)
 
 
-def test_utm_makes_every_reference_frame_near_by_right() -> None:
+def test_utm_makes_every_reference_frame_near_by_right():
     reference = images(*((500_000 + 10 * i, 4_000_000) for i in range(8)))
     query = images((500_030, 4_000_000), (500_000, 4_000_025), (500_000, 4_000_026))
     expected = [{1, 2, 3, 4, 5}, {0}, set()]
@@ -552,7 +531,7 @@ def test_utm_makes_every_reference_frame_near_by_right() -> None:
         find_ground_truth("utm:1", reference, query, 8, torch.tensor([2, 1]))
 
 
-def test_utm_needs_two_folders_of_images_with_coordinates() -> None:
+def test_utm_needs_two_folders_of_images_with_coordinates():
     good = images((500_001, 2))
     for name in ("1.png", "@1@.png", "@x@3@.png"):
         with refused(name, "no coordinates", "@easting@northing@"):
@@ -566,7 +545,7 @@ def test_utm_needs_two_folders_of_images_with_coordinates() -> None:
         find_ground_truth("utm", good, good, 1, torch.tensor([1]))
 
 
-def test_degrees_are_no_metres_of_utm() -> None:
+def test_degrees_are_no_metres_of_utm():
     degrees = named((48.137, 11.575), (48.1371, 11.575), (48.2, 11.6))
     for text in ("utm", "utm:25"):
         with refused("48.137, 11.575 look like degrees", "degrees:25 (lat, lon) or metres:25"):
@@ -580,11 +559,11 @@ def test_degrees_are_no_metres_of_utm() -> None:
         find_ground_truth("degrees", images((500_000, 4_000_000)), degrees, 1, 3)
 
 
-def named(*fixes: tuple[float | str, ...]) -> Named:
+def named(*fixes):
     return Named(["@" + "@".join(map(str, fix)) + "@.jpg" for fix in fixes])
 
 
-def test_equal_numbers_in_other_zones_are_other_places() -> None:
+def test_equal_numbers_in_other_zones_are_other_places():
     one = (500_000, 5_300_000, 32, "U", 47.85, 9.0)
     other = (500_000, 5_300_000, 33, "U", 47.85, 15.0)  # 450 km east
     assert sets(known("utm", named(one), named(one, other), 1, 2).positives) == [{0}, set()]
@@ -596,7 +575,7 @@ def test_equal_numbers_in_other_zones_are_other_places() -> None:
     assert sets(known("utm:20000", named(*south), named(*south), 2, 2).positives) == [{0, 1}] * 2
 
 
-def test_frames_without_a_fix_are_not_scored(caplog: pytest.LogCaptureFixture) -> None:
+def test_frames_without_a_fix_are_not_scored(caplog):
     reference = Named(["@500000@4000000@.jpg", "@@@.jpg", "@500010@4000000@.jpg"])
     query = Named(["none.jpg", "@500000@4000000@.jpg"])
     truth = known("utm", reference, query, 3, 2)
@@ -606,7 +585,7 @@ def test_frames_without_a_fix_are_not_scored(caplog: pytest.LogCaptureFixture) -
     assert "1 of 2 frames have no coordinates, such as none.jpg" in caplog.text
 
 
-def test_a_truth_that_calls_nearly_all_right_is_told(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_truth_that_calls_nearly_all_right_is_told(caplog):
     road = images(*((500_000 + 10 * i, 4_000_000) for i in range(40)))
     known("utm:25", road, road, 40, 40)
     assert "count as right" not in caplog.text
@@ -617,7 +596,7 @@ def test_a_truth_that_calls_nearly_all_right_is_told(caplog: pytest.LogCaptureFi
 # real data
 
 
-def test_the_corridor_truth(data_dir: Path) -> None:
+def test_the_corridor_truth(data_dir):
     truth = read(str(data_dir / "corridor" / "truth.csv"), 111, 111)
     assert truth.judged.all()
     found = sets(truth.positives)
@@ -632,11 +611,11 @@ SHOWN = torch.tensor([3, 9])
 PLACE_OF = torch.tensor([0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, -1])
 
 
-def resampled(truth: str, **options: bool) -> GroundTruth:
+def resampled(truth, **options):
     return known(truth, route(12), route(11), 12, SHOWN, resampled=True, **options)
 
 
-def test_convention_11_a_ground_truth_counts_frames(tmp_path: Path) -> None:
+def test_convention_11_a_ground_truth_counts_frames(tmp_path):
     found = resampled(written(tmp_path, "query,place\n3,4\n4,0\n9,11,2\n"))
     assert sets(found.positives) == [{4}, {2, 11}]
     places = ground_truth_in_places(found, lambda frames: look_up(PLACE_OF, frames))
@@ -645,7 +624,7 @@ def test_convention_11_a_ground_truth_counts_frames(tmp_path: Path) -> None:
     assert sets(resampled("-1").positives) == [{2}, {8}]
 
 
-def test_a_frame_that_no_query_shows_speaks_for_the_nearest_one_that_is_shown(tmp_path: Path) -> None:
+def test_a_frame_that_no_query_shows_speaks_for_the_nearest_one_that_is_shown(tmp_path):
     found = resampled(written(tmp_path, "1,0\n2,1\n10,4\n"))
     assert sets(found.positives) == [{0, 1}, {4}]
     assert found.judged.all()
@@ -661,13 +640,13 @@ def test_a_frame_that_no_query_shows_speaks_for_the_nearest_one_that_is_shown(tm
         read(written(tmp_path, "1,0\n10,4\n"), 12, SHOWN)
 
 
-def test_a_frame_may_be_shown_by_several_queries(tmp_path: Path) -> None:
+def test_a_frame_may_be_shown_by_several_queries(tmp_path):
     path = written(tmp_path, "0,2\n1,5\n")
     found = known(path, None, None, 12, torch.tensor([0, 0, 1, 1, 1]), resampled=True)
     assert sets(found.positives) == [{2}, {2}, {5}, {5}, {5}]
 
 
-def test_matrices_are_of_frames(tmp_path: Path) -> None:
+def test_matrices_are_of_frames(tmp_path):
     hard, soft = np.zeros((12, 11), bool), np.zeros((12, 11), bool)
     hard[11, 3] = hard[0, 9] = hard[5, 0] = soft[4, 3] = True
     places = ground_truth_in_places(
@@ -676,7 +655,7 @@ def test_matrices_are_of_frames(tmp_path: Path) -> None:
     assert (sets(places.positives), sets(places.ignored)) == ([set(), {0}], [{1}, set()])
 
 
-def test_positions_and_coordinates_are_of_frames() -> None:
+def test_positions_and_coordinates_are_of_frames():
     reference = images(*((10 * i, 0) for i in range(12)))
     query = images(*((10 * i, 0) for i in range(1, 12)))
     found = known("utm:1", reference, query, 12, SHOWN, resampled=True)
@@ -688,7 +667,7 @@ def test_positions_and_coordinates_are_of_frames() -> None:
     assert sets(found.positives) == [{4}, {10}]
 
 
-def test_as_many_resampled_frames_are_no_ground_truth() -> None:
+def test_as_many_resampled_frames_are_no_ground_truth():
     pair = route(12), route(12)
     assert find_ground_truth(None, *pair, 12, SHOWN, resampled=True, aligned=True) is None
     assert find_ground_truth(None, *pair, 12, SHOWN, aligned=True) is not None
@@ -704,9 +683,7 @@ def test_as_many_resampled_frames_are_no_ground_truth() -> None:
         (None, {"positions": True}, "positions that both traverses carry"),
     ],
 )
-def test_a_ground_truth_in_words(
-    truth: str | None, options: dict[str, bool], words: str, tmp_path: Path
-) -> None:
+def test_a_ground_truth_in_words(truth, options, words, tmp_path):
     assert words in describe_ground_truth(truth, **options)
     path = written(tmp_path, "0,1")
     assert describe_ground_truth(path) == path
@@ -716,7 +693,7 @@ def test_a_ground_truth_in_words(
 # sizes, which are checked before anything is read
 
 
-def packed(folder: Path, kind: str, shape: str, body: bytes) -> str:
+def packed(folder, kind, shape, body):
     """An .npz whose GThard says that it is of this type and shape."""
     header = f"{{'descr': {kind}, 'fortran_order': False, 'shape': {shape}}}\n".encode()
     array = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + body
@@ -734,16 +711,12 @@ def packed(folder: Path, kind: str, shape: str, body: bytes) -> str:
         ("('|b1', (1000000000000,))", "(3, 3)", "GThard"),
     ],
 )
-def test_a_size_that_a_matrix_claims_is_not_believed(
-    tmp_path: Path, kind: str, shape: str, words: str
-) -> None:
+def test_a_size_that_a_matrix_claims_is_not_believed(tmp_path, kind, shape, words):
     with refused("truth.npz", words):
         read(packed(tmp_path, kind, shape, bytes(9)), None, torch.tensor([0]))
 
 
-def test_a_matrix_larger_than_the_memory_is_not_unpacked(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_matrix_larger_than_the_memory_is_not_unpacked(tmp_path, monkeypatch):
     path = packed(tmp_path, "'|b1'", "(3000, 3000)", b"\1" * 3000**2)
     assert Path(path).stat().st_size < 10**5
     monkeypatch.setattr(memory, "free_memory", lambda: 10e6)
@@ -751,7 +724,7 @@ def test_a_matrix_larger_than_the_memory_is_not_unpacked(
         read(path, 3000, 3000)
 
 
-def test_a_table_wider_than_the_memory_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_table_wider_than_the_memory_is_refused(tmp_path, monkeypatch):
     wide = "0," + ",".join(map(str, range(20_000)))
     path = written(tmp_path, "\n".join([wide, *(f"{i},1" for i in range(1, 2000))]))
     monkeypatch.setattr(memory, "free_memory", lambda: 1e9)

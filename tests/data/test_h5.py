@@ -5,9 +5,7 @@ from __future__ import annotations
 import os
 import pickle
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +21,7 @@ NAMES = ["db/left/9.jpg", "db/left/10.jpg", "db/left/11.jpg", "query.jpg"]
 ROWS = np.random.default_rng(0).normal(size=(4, 6)).astype(np.float16)
 
 
-def written(path: Path, rows: dict[str, Any], key: str = "global_descriptor") -> Path:
+def written(path, rows, key="global_descriptor"):
     """As hloc does it: a group for each image, its size beside what was extracted."""
     with h5py.File(path, "w", libver="latest") as file:
         for name, row in rows.items():
@@ -35,9 +33,7 @@ def written(path: Path, rows: dict[str, Any], key: str = "global_descriptor") ->
 
 @pytest.mark.parametrize("kind", ["float16", "float32", ">f4"])
 @pytest.mark.parametrize("suffix", ["h5", "HDF5"])
-def test_rows_are_in_natural_order_with_the_names_of_their_images(
-    tmp_path: Path, kind: str, suffix: str
-) -> None:
+def test_rows_are_in_natural_order_with_the_names_of_their_images(tmp_path, kind, suffix):
     shuffled = {NAMES[i]: ROWS[i].astype(kind) for i in (2, 3, 0, 1)}
     source = open_source(f"{written(tmp_path / f'a.{suffix}', shuffled)}?order=natural")
     assert isinstance(source, DescriptorFile)
@@ -49,7 +45,7 @@ def test_rows_are_in_natural_order_with_the_names_of_their_images(
     assert torch.equal(all_of(pickle.loads(pickle.dumps(source))), all_of(source))  # as a cluster sends it
 
 
-def test_the_lexicographic_order_is_another_traverse(tmp_path: Path) -> None:
+def test_the_lexicographic_order_is_another_traverse(tmp_path):
     path = written(tmp_path / "a.h5", dict(zip(NAMES, ROWS, strict=True)))
     natural, lexicographic = (open_source(f"{path}?order={order}") for order in ("natural", "lexicographic"))
     assert lexicographic.names == sorted(NAMES)
@@ -60,7 +56,7 @@ def test_the_lexicographic_order_is_another_traverse(tmp_path: Path) -> None:
         open_source(f"{path}?order=size")
 
 
-def test_names_that_end_in_rising_numbers_are_in_order(tmp_path: Path) -> None:
+def test_names_that_end_in_rising_numbers_are_in_order(tmp_path):
     path = written(tmp_path / "a.h5", {f"db/{i}.jpg": ROWS[0] for i in (9, 10, 11)})
     assert open_source(f"{path}?order=natural").ordered
     assert not open_source(f"{path}?order=lexicographic").ordered
@@ -84,35 +80,35 @@ BAD[2] = np.nan
         ({"a.jpg": "text"}, ("global_descriptor of a.jpg is ()",)),
     ],
 )
-def test_other_contents_are_refused(tmp_path: Path, rows: dict[str, Any], words: tuple[str, ...]) -> None:
+def test_other_contents_are_refused(tmp_path, rows, words):
     path = written(tmp_path / "a.h5", rows)
     with refused(str(path), *words):
         all_of(open_source(path))
 
 
-def test_local_features_alone_are_refused(tmp_path: Path) -> None:
+def test_local_features_alone_are_refused(tmp_path):
     path = written(tmp_path / "feats.h5", {"a.jpg": np.zeros((4, 2), np.float32)}, "keypoints")
     with refused("feats.h5 contains no global_descriptor"):
         open_source(path)
 
 
-def in_another_file(group: Any) -> None:
+def in_another_file(group):
     (Path(group.file.filename).parent / "secret").write_bytes(bytes(64))
     external = [("secret", 0, h5py.h5f.UNLIMITED)]
     group.create_dataset("global_descriptor", (8,), np.float32, external=external)
 
 
-def seen_in_another_file(group: Any) -> None:
+def seen_in_another_file(group):
     layout = h5py.VirtualLayout((8,), np.float32)
     layout[:] = h5py.VirtualSource("other.h5", "x", (8,))
     group.create_virtual_dataset("global_descriptor", layout)
 
 
-def a_group(group: Any) -> None:
+def a_group(group):
     group.create_group("global_descriptor")
 
 
-def test_one_table_for_all_images_is_refused(tmp_path: Path) -> None:
+def test_one_table_for_all_images_is_refused(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["global_descriptor"] = ROWS
     with refused("a.h5 has one global_descriptor for all images", "expected a group for each image"):
@@ -123,14 +119,14 @@ def test_one_table_for_all_images_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("make", [in_another_file, seen_in_another_file, a_group])
-def test_numbers_that_the_file_does_not_hold_are_refused(tmp_path: Path, make: Callable[[Any], None]) -> None:
+def test_numbers_that_the_file_does_not_hold_are_refused(tmp_path, make):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         make(file.create_group("a.jpg"))
     with refused("a.h5", "global_descriptor of a.jpg is", "expected a group for each image"):
         all_of(open_source(tmp_path / "a.h5"))
 
 
-def test_a_file_that_is_no_whole_hdf5_is_refused(tmp_path: Path) -> None:
+def test_a_file_that_is_no_whole_hdf5_is_refused(tmp_path):
     path = written(tmp_path / "a.h5", {"a.jpg": ROWS[0]})
     whole = path.read_bytes()
     for content in (b"", b"no hdf5\n" * 99, whole[: len(whole) // 2], whole[:-20]):
@@ -143,7 +139,7 @@ def test_a_file_that_is_no_whole_hdf5_is_refused(tmp_path: Path) -> None:
         open_source(path)
 
 
-def test_without_h5py_a_line_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_h5py_a_line_says_what_to_install(tmp_path, monkeypatch):
     path = written(tmp_path / "a.h5", {"a.jpg": ROWS[0]})
     monkeypatch.setitem(sys.modules, "h5py", None)
     with refused("a.h5", "h5py", "cannot be imported", "pip install 'dejavu_torch[h5]'"):

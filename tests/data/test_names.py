@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import json
 import zlib
-from pathlib import Path
 
 import pytest
 import torch
@@ -20,7 +19,7 @@ from dejavu_torch.data.names import MAX_NAME_LENGTH, clock_time, decode_names, e
 from dejavu_torch.data.traverse import frame_range
 
 
-def packed(names: list[str]) -> str:
+def packed(names):
     """The code, once it was read back."""
     code = encode_names(names)
     assert decode_names(json.loads(json.dumps(code))) == names
@@ -42,27 +41,27 @@ TIMES = st.builds(
 
 
 @given(st.lists(COUNTER | TIMES | st.lists(PLAIN, max_size=12) | st.lists(NEARLY, max_size=15), max_size=4))
-def test_any_names_are_given_back(series: list[list[str]]) -> None:
+def test_any_names_are_given_back(series):
     packed([name for names in series for name in names])
 
 
 @pytest.mark.parametrize("frames", [2, 30_000])
 @pytest.mark.parametrize("form", ["{:06}.png", "image-1-{:03}_cam0.png", "frame{:04}.2.tif", "{}"])
-def test_a_counter_takes_hardly_a_byte_for_a_hundred_frames(form: str, frames: int) -> None:
+def test_a_counter_takes_hardly_a_byte_for_a_hundred_frames(form, frames):
     assert len(packed([form.format(5 + 3 * i) for i in range(frames)])) < 150 + frames / 100
 
 
-def test_times_of_a_video_take_less_than_a_tenth_of_a_byte_a_frame() -> None:
+def test_times_of_a_video_take_less_than_a_tenth_of_a_byte_a_frame():
     for rate in (25.0, 24000 / 1001):
         assert len(packed([clock_time(i / rate) for i in range(30_000)])) < 3000
 
 
-def test_other_names_are_compressed() -> None:
+def test_other_names_are_compressed():
     names = [f"@{500_000 + (i * i) % 97}@{4_000_000 + 7 * i}@.jpg" for i in range(1000)]
     assert len(packed(names)) < len(json.dumps(names)) / 3
 
 
-def test_the_names_of_a_traverse(tmp_path: Path) -> None:
+def test_the_names_of_a_traverse(tmp_path):
     for i in range(8, 12):
         Image.new("L", (2, 2)).save(tmp_path / f"{i}.png")
     folder = ImageFolder(tmp_path)
@@ -71,17 +70,17 @@ def test_the_names_of_a_traverse(tmp_path: Path) -> None:
     assert ArrayTraverse(torch.rand(5, 2)).names == ()
 
 
-def test_a_name_beyond_reason_is_refused() -> None:
+def test_a_name_beyond_reason_is_refused():
     packed(["\U0001f600" * MAX_NAME_LENGTH])
     with refused("4097 characters", "at most 4096"):
         packed(["x" * (MAX_NAME_LENGTH + 1)])
 
 
-def coded(value: object) -> str:
+def coded(value):
     return base64.b64encode(zlib.compress(json.dumps(value).encode())).decode()
 
 
-def test_numbers_wider_than_any_are_refused() -> None:
+def test_numbers_wider_than_any_are_refused():
     with refused("too wide", "at most 18 digits"):
         decode_names(coded({"texts": ["a", "b"], "columns": [[10**9, 0, 1]]}))
 
@@ -90,5 +89,5 @@ def test_numbers_wider_than_any_are_refused() -> None:
     ("seconds", "text"),
     [(0, "0:00:00.000"), (59.999, "0:00:59.999"), (3600.001, "1:00:00.001"), (-0.04, "-0:00:00.040")],
 )
-def test_clock_times(seconds: float, text: str) -> None:
+def test_clock_times(seconds, text):
     assert clock_time(seconds) == text

@@ -6,10 +6,7 @@ import errno
 import os
 import stat
 import tempfile
-from collections.abc import Callable
-from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
 
 import pytest
 from helpers import refused
@@ -26,26 +23,26 @@ from dejavu_torch.data.output import (
 from dejavu_torch.types import InputError
 
 
-def full_disk(*_: object, **__: object) -> None:
+def full_disk(*_, **__):
     raise OSError(errno.ENOSPC, "No space left on device")
 
 
-def write(target: Path, text: str = "new") -> None:
+def write(target, text="new"):
     with whole_file(target) as temporary:
         temporary.write_text(text)
 
 
-def held(folder: Path) -> dict[str, str]:
+def held(folder):
     """The files in a folder, and what they hold."""
     return {file.name: file.read_text() for file in folder.iterdir() if file.is_file()}
 
 
-def mode_of(path: Path) -> int:
+def mode_of(path):
     return stat.S_IMODE(path.stat().st_mode)
 
 
 @pytest.mark.parametrize("name", [".mode", ".dejavu-notes", "a" * 255])
-def test_a_file_or_folder_of_any_name_appears_whole(tmp_path: Path, name: str) -> None:
+def test_a_file_or_folder_of_any_name_appears_whole(tmp_path, name):
     with whole_file(tmp_path / name) as temporary:
         assert (temporary.parent.parent, temporary.name) == (tmp_path, name)
         temporary.write_text("first half, ")
@@ -58,11 +55,11 @@ def test_a_file_or_folder_of_any_name_appears_whole(tmp_path: Path, name: str) -
     assert sorted(file.name for file in tmp_path.iterdir()) == sorted([name, "a"])
 
 
-def file_in(folder: Path) -> AbstractContextManager[Path]:
+def file_in(folder):
     return whole_file(folder / "a")
 
 
-def whole(folder: Path) -> AbstractContextManager[Path]:
+def whole(folder):
     return whole_folder(folder, ["earlier"])
 
 
@@ -71,16 +68,14 @@ def whole(folder: Path) -> AbstractContextManager[Path]:
     ("kind", "before"),
     [(file_in, {}), (file_in, {"a": "old"}), (whole, None), (whole, {"a": "old", "earlier": "old"})],
 )
-def test_an_exception_leaves_what_was_there(
-    tmp_path: Path, kind: Callable[[Path], Any], before: dict[str, str] | None, problem: BaseException
-) -> None:
+def test_an_exception_leaves_what_was_there(tmp_path, kind, before, problem):
     folder = tmp_path / "new" / "folder"
     if before is not None:
         folder.mkdir(parents=True)
         for name, text in before.items():
             (folder / name).write_text(text)
 
-    def write_half() -> None:
+    def write_half():
         with kind(folder) as temporary:
             (temporary / "a" if temporary.is_dir() else temporary).write_text("half")
             raise problem
@@ -104,16 +99,14 @@ def test_an_exception_leaves_what_was_there(
         (check_output_file, "a" * 256, "too long"),
     ],
 )
-def test_what_cannot_be_written_is_refused_at_once(
-    tmp_path: Path, check: Callable[[Path], None], name: str, words: str
-) -> None:
+def test_what_cannot_be_written_is_refused_at_once(tmp_path, check, name, words):
     (tmp_path / "file").touch()
     with refused(str(tmp_path), words):
         check(tmp_path / name)
     assert list(tmp_path.iterdir()) == [tmp_path / "file"]
 
 
-def test_a_folder_is_made_with_its_parents() -> None:
+def test_a_folder_is_made_with_its_parents():
     with temporary_folder(Path(tempfile.gettempdir())) as folder:
         for _ in range(2):
             make_output_folder(folder / "a" / "b")
@@ -126,7 +119,7 @@ def test_a_folder_is_made_with_its_parents() -> None:
 # what is there already
 
 
-def test_through_a_link_its_target_is_written(tmp_path: Path) -> None:
+def test_through_a_link_its_target_is_written(tmp_path):
     (tmp_path / "there").mkdir()
     for name, first in (("a.txt", "link.txt"), ("new.txt", "dangling.txt")):
         (tmp_path / first).symlink_to(tmp_path / "there" / name)
@@ -138,7 +131,7 @@ def test_through_a_link_its_target_is_written(tmp_path: Path) -> None:
     assert len([file for file in tmp_path.iterdir() if file.is_symlink()]) == 4
 
 
-def test_a_file_keeps_its_mode_and_a_new_one_follows_the_umask(tmp_path: Path) -> None:
+def test_a_file_keeps_its_mode_and_a_new_one_follows_the_umask(tmp_path):
     private, new = tmp_path / "private", tmp_path / "new"
     private.touch()
     private.chmod(0o600)
@@ -154,7 +147,7 @@ def test_a_file_keeps_its_mode_and_a_new_one_follows_the_umask(tmp_path: Path) -
     assert (mode_of(tmp_path / "folder"), mode_of(tmp_path / "folder" / "a")) == (0o750, 0o640)
 
 
-def test_what_is_no_regular_file_is_refused_and_stays(tmp_path: Path) -> None:
+def test_what_is_no_regular_file_is_refused_and_stays(tmp_path):
     os.mkfifo(tmp_path / "fifo")
     (tmp_path / "link").symlink_to("/dev/null")
     before = {file.name: file.lstat().st_mode for file in tmp_path.iterdir()}
@@ -166,7 +159,7 @@ def test_what_is_no_regular_file_is_refused_and_stays(tmp_path: Path) -> None:
     assert {file.name: file.lstat().st_mode for file in tmp_path.iterdir()} == before
 
 
-def test_no_permission_is_told_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_permission_is_told_at_once(tmp_path, monkeypatch):
     (tmp_path / "a").touch()
     monkeypatch.setattr(os, "access", lambda place, mode: Path(place) != tmp_path / "a")
     with refused("no permission", str(tmp_path / "a")):
@@ -174,7 +167,7 @@ def test_no_permission_is_told_at_once(tmp_path: Path, monkeypatch: pytest.Monke
     check_output_file(tmp_path / "b")
 
 
-def test_the_folder_vanishes_meanwhile(tmp_path: Path) -> None:
+def test_the_folder_vanishes_meanwhile(tmp_path):
     (tmp_path / "folder").mkdir()
     with refused("a.txt", "No such file"), whole_file(tmp_path / "folder" / "a.txt") as temporary:
         temporary.write_text("new")
@@ -185,7 +178,7 @@ def test_the_folder_vanishes_meanwhile(tmp_path: Path) -> None:
 # folders
 
 
-def test_a_folder_keeps_its_other_files(tmp_path: Path) -> None:
+def test_a_folder_keeps_its_other_files(tmp_path):
     for name in ("own", "kept", "earlier"):
         (tmp_path / name).write_text("old")
     (tmp_path / "kept").chmod(0o600)
@@ -196,9 +189,7 @@ def test_a_folder_keeps_its_other_files(tmp_path: Path) -> None:
     assert mode_of(tmp_path / "kept") == 0o600
 
 
-def test_a_full_disk_or_a_folder_in_the_way_leaves_what_was_there(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_or_a_folder_in_the_way_leaves_what_was_there(tmp_path, monkeypatch):
     (tmp_path / "a").write_text("old")
     (tmp_path / "b").mkdir()
     with monkeypatch.context() as patch:
@@ -213,7 +204,7 @@ def test_a_full_disk_or_a_folder_in_the_way_leaves_what_was_there(
     assert (tmp_path / "a").read_text() == "old"
 
 
-def test_of_two_writers_of_a_new_folder_the_last_wins(tmp_path: Path) -> None:
+def test_of_two_writers_of_a_new_folder_the_last_wins(tmp_path):
     target = tmp_path / "target"
     with whole_folder(target) as one, whole_folder(target) as other:
         (one / "a").write_text("one")

@@ -14,7 +14,7 @@ WAYS = st.lists(st.floats(-1.5, 2.5, width=32), min_size=1, max_size=25).map(
 
 
 @given(WAYS)
-def test_each_place_is_taken_where_it_is_first_reached(positions: torch.Tensor) -> None:
+def test_each_place_is_taken_where_it_is_first_reached(positions):
     shown, exact = shown_frames(positions), positions.double()
     assert len(shown) == int(exact.max() + NEAR) + 1
     for place, frame in enumerate(shown.tolist()):
@@ -27,7 +27,7 @@ def test_each_place_is_taken_where_it_is_first_reached(positions: torch.Tensor) 
 
 
 @given(WAYS)
-def test_a_frame_belongs_to_the_place_nearest_to_it(positions: torch.Tensor) -> None:
+def test_a_frame_belongs_to_the_place_nearest_to_it(positions):
     places = len(shown_frames(positions))
     nearest = place_of(positions, torch.arange(len(positions)))
     for place, position in zip(nearest.tolist(), positions.tolist(), strict=True):
@@ -37,7 +37,7 @@ def test_a_frame_belongs_to_the_place_nearest_to_it(positions: torch.Tensor) -> 
             assert abs(position - place) <= min(abs(position - other) for other in range(places)) + 1e-6
 
 
-def test_convention_11_standing_and_going_back_add_no_places() -> None:
+def test_convention_11_standing_and_going_back_add_no_places():
     positions = torch.tensor([0.0, 1, 2, 2, 2, 1, 0, 1, 2, 3])
     assert shown_frames(positions).tolist() == [0, 1, 2, 9]
     assert place_of(positions, torch.arange(10)).tolist() == [0, 1, 2, 2, 2, 1, 0, 1, 2, 3]
@@ -45,7 +45,7 @@ def test_convention_11_standing_and_going_back_add_no_places() -> None:
     assert place_of(positions, torch.tensor([[8, -1]])).tolist() == [[2, -1]]
 
 
-def test_minus_one_stays() -> None:
+def test_minus_one_stays():
     table = torch.tensor([5, 7, -1])
     assert look_up(table, torch.tensor([[0, -1], [2, 1]])).tolist() == [[5, -1], [-1, 7]]
     assert look_up(table, torch.zeros(2, 0, dtype=torch.int64)).shape == (2, 0)

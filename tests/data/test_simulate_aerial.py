@@ -9,7 +9,6 @@ import pytest
 import torch
 import torch.nn.functional as F
 from helpers import all_of, refused
-from torch import Tensor
 
 from dejavu_torch.data.simulate.aerial import (
     CHEVRON_PERIOD,
@@ -24,26 +23,26 @@ from dejavu_torch.data.simulate.aerial import (
 FRAMES = 600
 
 
-def looks(frames: Tensor) -> Tensor:
+def looks(frames):
     """Grey frames at a quarter of the size, each with mean 0 and norm 1, (N,D)."""
     grey = F.avg_pool2d(frames.mean(1, keepdim=True), 4).flatten(1)
     return F.normalize(grey - grey.mean(1, keepdim=True), dim=1)
 
 
 @pytest.fixture(scope="module")
-def flights() -> tuple[Tensor, Tensor]:
+def flights():
     first, second = (AerialRoad(seed=3, traverse=t, frames=FRAMES) for t in (0, 1))
     return all_of(first), all_of(second)
 
 
-def test_a_road_describes_itself() -> None:
+def test_a_road_describes_itself():
     road = AerialRoad(frames=50, size=32)
     assert road.name == "sim:aerial?seed=0&traverse=0&frames=50&size=32"
     assert len(road) == 50
     assert torch.equal(road.places, torch.arange(50, dtype=torch.float64))
 
 
-def test_frames_depend_on_the_arguments_alone() -> None:
+def test_frames_depend_on_the_arguments_alone():
     before = torch.get_rng_state(), random.getstate()
     road = AerialRoad(seed=5, traverse=1, frames=70)
     whole = all_of(road, 70)
@@ -58,7 +57,7 @@ def test_frames_depend_on_the_arguments_alone() -> None:
 
 
 @pytest.mark.parametrize("scale", [1, 2])
-def test_markings_repeat_exactly_and_no_sooner(scale: int) -> None:
+def test_markings_repeat_exactly_and_no_sooner(scale):
     for mask, period in zip(road_markings(800, scale), (DASH_PERIOD, CHEVRON_PERIOD), strict=True):
         assert mask.shape == (HEIGHT * scale, 800 * scale)
         assert mask.max() == 1
@@ -68,13 +67,13 @@ def test_markings_repeat_exactly_and_no_sooner(scale: int) -> None:
     assert (DASH_PERIOD, CHEVRON_PERIOD) == (93, 171)
 
 
-def test_the_camera_moves_one_column_per_frame() -> None:
+def test_the_camera_moves_one_column_per_frame():
     frames = all_of(AerialRoad(frames=40, noise=0, drift=0, yaw=0))
     assert torch.allclose(frames[1:, :, :, :-1], frames[:-1, :, :, 1:], atol=0.02)
 
 
 @pytest.mark.parametrize(("period", "rows"), [(DASH_PERIOD, slice(22, 27)), (CHEVRON_PERIOD, slice(27, 35))])
-def test_the_frames_show_both_periods(period: int, rows: slice, flights: tuple[Tensor, Tensor]) -> None:
+def test_the_frames_show_both_periods(period, rows, flights):
     for frames in flights:
         lane = frames.mean(1)[:, rows].mean(1)
         lane = F.normalize(lane - lane.mean(1, keepdim=True), dim=1)
@@ -83,7 +82,7 @@ def test_the_frames_show_both_periods(period: int, rows: slice, flights: tuple[T
         assert abs(lags[int(likeness.argmax())] - period) <= 1
 
 
-def test_two_flights_see_the_same_route(flights: tuple[Tensor, Tensor]) -> None:
+def test_two_flights_see_the_same_route(flights):
     first, second = (looks(frames) for frames in flights)
     same = (first * second).sum(1)
     shuffled = (first * second.roll(FRAMES // 3, 0)).sum(1)
@@ -92,7 +91,7 @@ def test_two_flights_see_the_same_route(flights: tuple[Tensor, Tensor]) -> None:
     assert ((found - torch.arange(FRAMES)).abs() <= 3).float().mean() > 0.6
 
 
-def test_noise_has_the_promised_strength_and_differs_in_every_frame() -> None:
+def test_noise_has_the_promised_strength_and_differs_in_every_frame():
     loud, quiet = (all_of(AerialRoad(frames=40, noise=noise)) for noise in (0.02, 0))
     noise = loud - quiet
     assert noise.std() == pytest.approx(0.02, rel=0.05)
@@ -100,7 +99,7 @@ def test_noise_has_the_promised_strength_and_differs_in_every_frame() -> None:
     assert (flat @ flat.T - torch.eye(40)).abs().max() < 0.1
 
 
-def test_a_smaller_frame_shows_the_same_view() -> None:
+def test_a_smaller_frame_shows_the_same_view():
     quiet = [all_of(AerialRoad(frames=10, size=size, noise=0)) for size in (64, 32, 128)]
     assert quiet[1].shape == (10, 3, 32, 32)
     assert quiet[2].shape == (10, 3, 128, 128)
@@ -108,7 +107,7 @@ def test_a_smaller_frame_shows_the_same_view() -> None:
     assert (F.avg_pool2d(quiet[2], 2) - quiet[0]).abs().mean() < 0.02
 
 
-def test_bad_arguments_are_refused_in_one_line() -> None:
+def test_bad_arguments_are_refused_in_one_line():
     with refused("frames=0; expected", f"1 <= frames <= {math.lcm(*TILES)}, a whole number"):
         AerialRoad(frames=0)
     with refused("ground=sand; expected", "once or repeat"):
@@ -116,13 +115,13 @@ def test_bad_arguments_are_refused_in_one_line() -> None:
 
 
 @pytest.fixture(scope="module")
-def repeating() -> AerialRoad:
+def repeating():
     """As it is drawn without what differs from flight to flight; the light that is left is a factor."""
     return AerialRoad(ground="repeat", frames=math.lcm(*TILES), noise=0, drift=0, yaw=0)
 
 
 @pytest.mark.parametrize("start", [0, 700, 990])  # the last one sees where a tile begins anew
-def test_each_half_of_repeating_ground_comes_again_after_its_tile(repeating: AerialRoad, start: int) -> None:
+def test_each_half_of_repeating_ground_comes_again_after_its_tile(repeating, start):
     upper, lower = slice(0, VIEW // 2), slice(VIEW // 2, VIEW)
     cycles = torch.tensor([0, 1, 7, 900])
     for period, same, other in zip(TILES, (upper, lower), (lower, upper), strict=True):
@@ -135,13 +134,13 @@ def test_each_half_of_repeating_ground_comes_again_after_its_tile(repeating: Aer
             assert (frame[:, other] - first[:, other]).abs().max() > 0.2
 
 
-def test_the_road_between_the_tiles_is_the_same_everywhere(repeating: AerialRoad) -> None:
+def test_the_road_between_the_tiles_is_the_same_everywhere(repeating):
     band = repeating._frames(torch.arange(0, 10**6, 99_999))[..., 24:40, :]
     assert (band - band[..., :1]).abs().max() < 1e-4
     assert (band - band[:1]).abs().max() < 0.1  # the light
 
 
-def test_repeating_ground_has_more_frames_than_ground_that_does_not() -> None:
+def test_repeating_ground_has_more_frames_than_ground_that_does_not():
     road = AerialRoad(ground="repeat", frames=math.lcm(*TILES), traverse=1)
     assert road.name == f"sim:aerial?seed=0&traverse=1&frames={math.lcm(*TILES)}&ground=repeat"
     assert road.read(range(len(road) - 1, len(road))).shape == (1, 3, VIEW, VIEW)

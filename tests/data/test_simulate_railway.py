@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 
@@ -14,14 +13,13 @@ import torch.nn.functional as F
 from helpers import all_of, refused
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch import Tensor
 
 from dejavu_torch.data.ground_truth import position_truth
 from dejavu_torch.data.simulate import SIMULATORS
 from dejavu_torch.data.simulate.outdoor import Outdoor
 from dejavu_torch.data.simulate.route import SimulatedRoute, option
 from dejavu_torch.data.simulate.sheets import Painter, Thing, View
-from dejavu_torch.data.simulate.train import FPS, Railway, reference_place, ride
+from dejavu_torch.data.simulate.train import FPS, reference_place, ride
 from dejavu_torch.data.simulate.underground import Underground
 from dejavu_torch.data.source import open_source
 from dejavu_torch.motion.odometry import GroundOdometry
@@ -31,12 +29,12 @@ both = pytest.mark.parametrize("kind", KINDS)
 
 
 @cache
-def ride_of(kind: type[Railway], traverse: int = 0) -> Railway:
+def ride_of(kind, traverse=0):
     """A whole ride on the railway of seed 0, built once."""
     return kind(traverse=traverse)
 
 
-def filmed(kind: type[Railway], traverse: int = 0, **camera: float) -> Railway:
+def filmed(kind, traverse=0, **camera):
     """The same ride with another camera, past scenery that is built already."""
     train = kind(traverse=traverse, **camera)  # type: ignore[arg-type]
     train.__dict__["_world"] = ride_of(kind, traverse)._world
@@ -44,20 +42,20 @@ def filmed(kind: type[Railway], traverse: int = 0, **camera: float) -> Railway:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def forget() -> Iterator[None]:
+def forget():
     yield
     ride_of.cache_clear()
 
 
-def frames_at(train: Railway, index: Tensor) -> Tensor:
+def frames_at(train, index):
     """These frames, read one at a time as a batch of one would."""
     return torch.cat([train._frames(part) for part in index.split(32)])
 
 
 @both
-def test_frames_depend_on_the_arguments_alone(kind: type[Railway]) -> None:
+def test_frames_depend_on_the_arguments_alone(kind):
     route = 200.0 if kind is Outdoor else 2000.0  # less to paint, and room for the stations
-    brief: type[Railway] = type("Brief", (kind,), {"route": route})
+    brief = type("Brief", (kind,), {"route": route})
     first = all_of(brief(traverse=1, frames=4))
     assert first.shape == (4, 3, 64, 128)
     torch.manual_seed(5)
@@ -73,7 +71,7 @@ def test_frames_depend_on_the_arguments_alone(kind: type[Railway]) -> None:
 
 
 @both
-def test_the_train_obeys_its_limits_and_stands_at_its_stops(kind: type[Railway]) -> None:
+def test_the_train_obeys_its_limits_and_stands_at_its_stops(kind):
     for traverse in (0, 1):
         train = kind(seed=4, traverse=traverse)
         step = train.distance.diff()
@@ -91,7 +89,7 @@ def test_the_train_obeys_its_limits_and_stands_at_its_stops(kind: type[Railway])
         assert ((speed > 0.4 * top) & (speed < 0.75 * top)).float().mean() > 0.03  # slow sections
 
 
-def test_a_ride_keeps_to_its_plan() -> None:
+def test_a_ride_keeps_to_its_plan():
     distance = ride(1000.0, 10.0, [(400, 500, 5.0)], [(700, 4.0)])
     assert distance[0] == 0
     assert (distance == 700).sum() in (100, 101)  # 4 s
@@ -108,7 +106,7 @@ def test_a_ride_keeps_to_its_plan() -> None:
     queries=st.lists(st.integers(0, 80), min_size=1, max_size=20),
 )
 @settings(max_examples=60, deadline=None)
-def test_a_reference_place_by_hand(steps: list[float], queries: list[int]) -> None:
+def test_a_reference_place_by_hand(steps, queries):
     reference = [0.0]
     for step in steps:
         reference.append(reference[-1] + step)
@@ -127,7 +125,7 @@ def test_a_reference_place_by_hand(steps: list[float], queries: list[int]) -> No
 
 
 @both
-def test_a_place_is_the_reference_frame_at_the_same_distance(kind: type[Railway]) -> None:
+def test_a_place_is_the_reference_frame_at_the_same_distance(kind):
     reference, other = ride_of(kind), ride_of(kind, 1)
     assert torch.equal(reference.places, torch.arange(len(reference)).double())
     low = reference.distance[other.places.floor().long()]
@@ -143,7 +141,7 @@ def test_a_place_is_the_reference_frame_at_the_same_distance(kind: type[Railway]
 
 
 @both
-def test_a_standing_train_sees_one_picture(kind: type[Railway]) -> None:
+def test_a_standing_train_sees_one_picture(kind):
     train = filmed(kind, noise=0.0, shake=0.0)
     step = train.distance.diff()
     first = int((step == 0).nonzero()[5])
@@ -152,7 +150,7 @@ def test_a_standing_train_sees_one_picture(kind: type[Railway]) -> None:
     assert drive.diff(dim=0).abs().max() > 0.1
 
 
-def brightness(train: Railway, metres: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+def brightness(train, metres, rows, columns):
     """These pixels of a 64 x 128 frame with the camera still at each of these distances, (n,R*C)."""
     view = View(64, 128)
     keep = (rows[:, None] * 128 + columns).flatten()
@@ -165,14 +163,14 @@ def brightness(train: Railway, metres: Tensor, rows: Tensor, columns: Tensor) ->
     return torch.cat(parts).mean(1).flatten(1)
 
 
-def likeness(signal: Tensor, lags: range) -> Tensor:
+def likeness(signal, lags):
     """Autocorrelation at these lags."""
     signal = signal - F.avg_pool1d(signal[None, None], 301, 1, 150, count_include_pad=False)[0, 0]
     return torch.stack([torch.corrcoef(torch.stack([signal[lag:], signal[:-lag]]))[0, 1] for lag in lags])
 
 
 @pytest.mark.parametrize(("kind", "period"), [(Outdoor, 0.6), (Underground, 0.75)])
-def test_sleepers_repeat_with_their_period(kind: type[Railway], period: float) -> None:
+def test_sleepers_repeat_with_their_period(kind, period):
     train, step = ride_of(kind), 0.025
     assert ("sleeper", period) in [(s.name, s.period) for s in train.structures]
     between = torch.tensor([62]), torch.tensor([64])  # the rails
@@ -183,7 +181,7 @@ def test_sleepers_repeat_with_their_period(kind: type[Railway], period: float) -
 
 
 @both
-def test_structures_start_and_stop_where_they_say(kind: type[Railway]) -> None:
+def test_structures_start_and_stop_where_they_say(kind):
     name, sheet = {Outdoor: ("fence post", "fence"), Underground: ("rib", "ceiling")}[kind]
     train = ride_of(kind)
     stretches = [s for s in train.structures if s.name == name]
@@ -205,7 +203,7 @@ def test_structures_start_and_stop_where_they_say(kind: type[Railway]) -> None:
 
 @both
 @pytest.mark.parametrize(("height", "width"), [(64, 128), (32, 16), (16, 64), (512, 1024)])
-def test_the_ground_is_a_strip_beside_the_sleepers(kind: type[Railway], height: int, width: int) -> None:
+def test_the_ground_is_a_strip_beside_the_sleepers(kind, height, width):
     train, focal = kind(height=height, width=width), 0.55 * width
     met = []
     for x, y in train.corners:
@@ -223,7 +221,7 @@ def test_the_ground_is_a_strip_beside_the_sleepers(kind: type[Railway], height: 
 
 @pytest.mark.parametrize("traverse", [0, 1])
 @both
-def test_the_ground_moves_as_the_train_does(kind: type[Railway], traverse: int) -> None:
+def test_the_ground_moves_as_the_train_does(kind, traverse):
     train, start, stop = ride_of(kind, traverse), 700, 750
     frames = frames_at(train, torch.arange(start, stop))
     shift, confidence = GroundOdometry(train.corners, (32, 32))(frames)
@@ -252,7 +250,7 @@ FROZEN = {
 
 
 @both
-def test_the_routes_stay_as_they_are(kind: type[Railway]) -> None:
+def test_the_routes_stay_as_they_are(kind):
     """Results are measured on these very routes: a change here makes earlier and later figures incomparable.
 
     If it fails, undo what changed the frames. The numbers above change only where all results are redone.
@@ -278,9 +276,7 @@ def test_the_routes_stay_as_they_are(kind: type[Railway]) -> None:
     count=st.integers(1, 6),
 )
 @settings(max_examples=60, deadline=None)
-def test_cover_is_the_hidden_part_of_an_interval(
-    gap: float, length: float, depth: float, slope: float, half: float, count: int
-) -> None:
+def test_cover_is_the_hidden_part_of_an_interval(gap, length, depth, slope, half, count):
     at = 10 + gap * torch.arange(count).double()
     thing = Thing("any", 0, 1, "ffffff", at, length, depth)
     s = torch.linspace(0, 60, 25)
@@ -292,7 +288,7 @@ def test_cover_is_the_hidden_part_of_an_interval(
     assert np.abs(seen.numpy() - hidden).max() < 0.01
 
 
-def test_railways_open_by_name() -> None:
+def test_railways_open_by_name():
     train = open_source("sim:underground?seed=2&frames=7&height=32&width=40&speed=20")
     assert isinstance(train, Underground)
     assert train.name == "sim:underground?seed=2&traverse=0&frames=7&height=32&width=40&speed=20.0"
@@ -302,7 +298,7 @@ def test_railways_open_by_name() -> None:
     assert len(open_source(f"sim:outdoor?seed={10**25}")) in range(3000, 8000)
 
 
-def has(given: str, *expected: str) -> tuple[str, list[str]]:
+def has(given, *expected):
     """What the simulator itself refuses, with what it says."""
     return given, [f"has {given}; expected", *expected]
 
@@ -321,20 +317,20 @@ def has(given: str, *expected: str) -> tuple[str, list[str]]:
         ("colour=red", ["unknown 'colour'", "seed, traverse, frames, height, width, speed, noise, shake"]),
     ],
 )
-def test_an_impossible_address_is_refused(kind: type[Railway], query: str, words: list[str]) -> None:
+def test_an_impossible_address_is_refused(kind, query, words):
     with refused(f"sim:{kind.kind}", *words):
         open_source(f"sim:{kind.kind}?{query}")
 
 
 @both
-def test_more_frames_than_the_route_are_refused_with_their_number(kind: type[Railway]) -> None:
+def test_more_frames_than_the_route_are_refused_with_their_number(kind):
     address, length = f"sim:{kind.kind}?traverse=1", ride_of(kind, 1).length
     assert len(open_source(f"{address}&frames={length}")) == length
     with refused(f"has frames={length + 1}; expected at most the {length} of its route"):
         open_source(f"{address}&frames={length + 1}")
 
 
-def test_what_is_no_whole_number_is_refused() -> None:
+def test_what_is_no_whole_number_is_refused():
     for value in (40.5, float("nan"), "40", None):
         with refused(f"sim:outdoor has frames={value}; expected", "a whole number"):
             Outdoor(frames=value)  # type: ignore[arg-type]
@@ -342,7 +338,7 @@ def test_what_is_no_whole_number_is_refused() -> None:
         next(Outdoor(frames=3).batches(0))
 
 
-def test_a_new_route_is_one_subclass() -> None:
+def test_a_new_route_is_one_subclass():
     @dataclass(eq=False)
     class Corridor(SimulatedRoute):
         seed: int = option(0, 0)
@@ -351,11 +347,11 @@ def test_a_new_route_is_one_subclass() -> None:
         grey: float = option(0.5, 0, 1)
         kind = "corridor"
 
-        def __post_init__(self) -> None:
+        def __post_init__(self):
             super().__post_init__()
             self.length, self.places = self.frames, torch.arange(self.frames).double()
 
-        def _frames(self, at: Tensor) -> Tensor:
+        def _frames(self, at):
             return torch.full((len(at), 3, 2, 2), self.grey)
 
     route = Corridor(frames=5, grey=1)

@@ -20,11 +20,10 @@ from dejavu_torch.data.simulate.aerial import AerialRoad
 from dejavu_torch.data.source import open_source
 from dejavu_torch.data.traverse import Chain
 from dejavu_torch.data.video import Video
-from dejavu_torch.types import Traverse
 
 
 @pytest.mark.parametrize("name", ["a.npy", "a.NPY", "with space?.npy"])
-def test_an_array(tmp_path: Path, name: str) -> None:
+def test_an_array(tmp_path, name):
     with (tmp_path / name).open("wb") as file:
         np.save(file, np.ones((3, 2)))
     source = open_source(tmp_path / name)
@@ -37,7 +36,7 @@ def test_an_array(tmp_path: Path, name: str) -> None:
     ("options", "shape"),
     [("", (5, 3, 32, 48)), ("?width=16&height=8", (5, 3, 8, 16)), ("?width=24", (5, 3, 16, 24))],
 )
-def test_a_video(tmp_path: Path, name: str, options: str, shape: tuple[int, ...]) -> None:
+def test_a_video(tmp_path, name, options, shape):
     path = clip(tmp_path / name, pictures(5))
     for kind in (str, Path):
         source = open_source(kind(f"{path}{options}"))
@@ -46,7 +45,7 @@ def test_a_video(tmp_path: Path, name: str, options: str, shape: tuple[int, ...]
         assert next(source.batches(8)).shape == shape
 
 
-def test_a_simulator() -> None:
+def test_a_simulator():
     source = open_source("sim:aerial?seed=3&traverse=1&frames=40&noise=0.1")
     assert isinstance(source, AerialRoad)
     assert (source.seed, source.traverse, len(source), source.noise) == (3, 1, 40, 0.1)
@@ -76,7 +75,7 @@ def test_a_simulator() -> None:
         *((path, ["is not there"]) for path in ("", "?width=3", "a" * 5000, "a\0b", "\udcff", "b/" * 3000)),
     ],
 )
-def test_what_cannot_be_opened_is_refused(sources: dict[str, str], source: str, words: list[str]) -> None:
+def test_what_cannot_be_opened_is_refused(sources, source, words):
     with refused(*words):
         open_source(source.replace("{}", str(Path(sources["images"]).parent)))
 
@@ -85,13 +84,13 @@ def test_what_cannot_be_opened_is_refused(sources: dict[str, str], source: str, 
     ("name", "words"),
     [("a.gif", ("an animation", "ffmpeg")), ("a.ZIP", ("an archive", "unzip")), ("a.bag", ("a ROS bag",))],
 )
-def test_how_to_convert_what_is_no_source(tmp_path: Path, name: str, words: tuple[str, ...]) -> None:
+def test_how_to_convert_what_is_no_source(tmp_path, name, words):
     (tmp_path / name).touch()
     with refused(name, "into a folder of images", *words):
         open_source(tmp_path / name)
 
 
-def test_a_folder_takes_the_options_of_a_video(tmp_path: Path) -> None:
+def test_a_folder_takes_the_options_of_a_video(tmp_path):
     for i in range(4):
         Image.new("RGB", (60, 40), (i, i, i)).save(tmp_path / f"{i}.png")
     source = open_source(f"{tmp_path}?width=30&step=2")
@@ -105,7 +104,7 @@ def test_a_folder_takes_the_options_of_a_video(tmp_path: Path) -> None:
 # part of a source
 
 
-def part_of(address: str, part: str) -> Traverse:
+def part_of(address, part):
     return open_source(f"{address}{'&' if '?' in address else '?'}{part}")
 
 
@@ -113,7 +112,7 @@ KINDS = ["images", "frames.npy", "features.npy", "clip.mkv", "clip.mp4", "strip"
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_part_of_every_source_means_the_same(sources: dict[str, str], kind: str) -> None:
+def test_a_part_of_every_source_means_the_same(sources, kind):
     whole, some = open_source(sources[kind]), part_of(sources[kind], "start=3&stop=9&step=2")
     frames, chosen = all_of(whole), slice(3, 9, 2)
     assert len(frames) == 12
@@ -142,22 +141,20 @@ HUGE = "1" + "0" * 30
         *((part, "12") for part in ("start=12", "stop=13")),
     ],
 )
-def test_a_part_that_is_not_there_is_refused(
-    sources: dict[str, str], kind: str, part: str, words: str
-) -> None:
+def test_a_part_that_is_not_there_is_refused(sources, kind, part, words):
     with refused(words):
         part_of(sources[kind], part)
 
 
 @pytest.mark.parametrize("step", [HUGE, 2**63 - 1, 12])
 @pytest.mark.parametrize("kind", ["frames.npy", "clip.mkv", "aerial"])
-def test_a_step_beyond_the_end_takes_one_frame(sources: dict[str, str], kind: str, step: int) -> None:
+def test_a_step_beyond_the_end_takes_one_frame(sources, kind, step):
     source = part_of(sources[kind], f"step={step}")
     torch.testing.assert_close(all_of(source), all_of(open_source(sources[kind]))[:1])
     assert source.places is None or len(source.places) == 1
 
 
-def test_a_part_of_a_reference_keeps_its_positions() -> None:
+def test_a_part_of_a_reference_keeps_its_positions():
     reference = open_source("sim:outdoor?frames=60&start=20&stop=50")
     query = open_source("sim:outdoor?frames=60&traverse=1&start=30&step=3")
     assert reference.places is not None
@@ -169,7 +166,7 @@ def test_a_part_of_a_reference_keeps_its_positions() -> None:
 
 
 @pytest.mark.parametrize("name", ["a.npy", "a.mp4", "a.png"])
-def test_a_fifo_is_not_waited_for(tmp_path: Path, name: str) -> None:
+def test_a_fifo_is_not_waited_for(tmp_path, name):
     os.mkfifo(tmp_path / name)
     for source in (f"{tmp_path / name}", f"strip:{tmp_path / name}?width=3"):
         with refused(name):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -11,7 +9,6 @@ from helpers import all_of, refused
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
-from torch import Tensor
 
 from dejavu_torch.data.source import open_source
 from dejavu_torch.data.strip import SlidingWindow, read_strip
@@ -20,18 +17,18 @@ ROWS = [":5", "a:b", "3:3", "-3:5", "19:21", "1:2:3", "0.5:3", "nan:3"]
 
 
 @pytest.fixture
-def image(tmp_path: Path) -> Path:
+def image(tmp_path):
     pixels = np.random.default_rng(0).integers(0, 256, (20, 40, 3), np.uint8)
     Image.fromarray(pixels).save(tmp_path / "road.png")
     return tmp_path / "road.png"
 
 
-def pixels_of(path: Path) -> Tensor:
+def pixels_of(path):
     return torch.tensor(np.asarray(Image.open(path))).permute(2, 0, 1).double() / 255
 
 
 @given(st.integers(1, 9), st.integers(1, 12), st.integers(1, 20))
-def test_frame_i_begins_at_column_i_times_step(width: int, step: int, batch: int) -> None:
+def test_frame_i_begins_at_column_i_times_step(width, step, batch):
     strip = torch.rand(2, 5, 9)
     traverse = SlidingWindow(strip, width, step)
     starts = range(0, 9 - width + 1, step)
@@ -39,7 +36,7 @@ def test_frame_i_begins_at_column_i_times_step(width: int, step: int, batch: int
     assert torch.equal(all_of(traverse, batch), torch.stack([strip[:, :, i : i + width] for i in starts]))
 
 
-def test_a_file_is_cut_as_asked(image: Path) -> None:
+def test_a_file_is_cut_as_asked(image):
     grey = (pixels_of(image) * torch.tensor([0.299, 0.587, 0.114])[:, None, None]).sum(0, keepdim=True)
     halved = (grey[:, ::2, ::2] + grey[:, 1::2, ::2] + grey[:, ::2, 1::2] + grey[:, 1::2, 1::2]) / 4
     expected = torch.stack([halved[:, 2:8, i : i + 7] for i in range(14)])
@@ -51,7 +48,7 @@ def test_a_file_is_cut_as_asked(image: Path) -> None:
         assert len(traverse) == 14
 
 
-def test_a_file_as_it_is(image: Path) -> None:
+def test_a_file_as_it_is(image):
     frames = all_of(open_source(f"strip:{image}?width=40"))
     torch.testing.assert_close(frames, pixels_of(image).float()[None], atol=1e-6, rtol=0)
     assert all_of(open_source(f"strip:{image}?width=2&halve=2&step=3")).shape == (3, 3, 5, 2)
@@ -60,7 +57,7 @@ def test_a_file_as_it_is(image: Path) -> None:
 @pytest.mark.parametrize(
     "strip", [torch.rand(5, 9), torch.rand(1, 1, 5, 9), torch.zeros(1, 5, 9, dtype=torch.uint8)]
 )
-def test_what_is_no_strip_is_refused(strip: Tensor) -> None:
+def test_what_is_no_strip_is_refused(strip):
     with refused(str(tuple(strip.shape)), "expected float (C,H,W)"):
         SlidingWindow(strip, 3)
     with refused("40 pixels", "step 0"):
@@ -78,7 +75,7 @@ def test_what_is_no_strip_is_refused(strip: Tensor) -> None:
         ("text.png?width=3", ("cannot be read",)),
     ],
 )
-def test_a_file_that_cannot_be_cut_so_is_refused(image: Path, name: str, words: tuple[str, ...]) -> None:
+def test_a_file_that_cannot_be_cut_so_is_refused(image, name, words):
     (image.parent / "text.png").write_text("text")
     with refused(name.partition("?")[0], *words):
         open_source(f"strip:{image.parent}/{name}")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pickle
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,6 @@ from helpers import all_of, refused
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
-from torch import Tensor
 from torch.utils.data import DataLoader, TensorDataset
 from videos import clip, numbers, pictures
 
@@ -48,7 +46,7 @@ PARTS = st.tuples(st.integers(0, 39), st.integers(0, 40), st.integers(1, 45)).fi
 # cropped, masked and damaged frames
 
 
-def test_crop_and_mask(tmp_path: Path) -> None:
+def test_crop_and_mask(tmp_path):
     write_images(tmp_path / "a", frames(3, size=12))
     Image.fromarray(np.repeat([[0, 255]], 12, 1).astype(np.uint8).repeat(6, 0).reshape(6, 24)).save(
         tmp_path / "half.png"
@@ -71,7 +69,7 @@ def test_crop_and_mask(tmp_path: Path) -> None:
             open_source(f"{tmp_path}/a?{option}")
 
 
-def test_damaged_frames_are_black_and_counted(tmp_path: Path) -> None:
+def test_damaged_frames_are_black_and_counted(tmp_path):
     write_images(tmp_path / "a", frames(6, size=12))
     plain = open_source(tmp_path / "a")
     names = [*plain.names]
@@ -95,7 +93,7 @@ def test_damaged_frames_are_black_and_counted(tmp_path: Path) -> None:
 # the sequence protocol
 
 
-def descriptor_file(folder: Path) -> Traverse:
+def descriptor_file(folder):
     h5py = pytest.importorskip("h5py")
     with h5py.File(folder / "a.h5", "w") as file:
         for i, row in enumerate(np.random.default_rng(0).random((12, 4), np.float32)):
@@ -116,13 +114,13 @@ SOURCES = ("images", "frames.npy", "features.npy", "clip.mkv", "clip.mp4", "stri
 
 
 @pytest.mark.parametrize("kind", [*SOURCES, *MADE])
-def test_any_traverse_is_a_sequence(kind: str, sources: dict[str, str], tmp_path: Path) -> None:
+def test_any_traverse_is_a_sequence(kind, sources, tmp_path):
     made, images = MADE.get(kind), open_source(sources["images"])
-    traverse: Traverse = made(images, tmp_path) if made else open_source(sources[kind])
+    traverse = made(images, tmp_path) if made else open_source(sources[kind])
     count, whole = len(traverse), all_of(traverse, 5)
     numbers = np.arange(count)
 
-    def same(found: Tensor, expected: Tensor) -> None:  # simulated frames are drawn together
+    def same(found, expected):  # simulated frames are drawn together
         torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
 
     assert (len(whole), whole.shape[1:]) == (count, traverse.frame_shape)
@@ -131,7 +129,7 @@ def test_any_traverse_is_a_sequence(kind: str, sources: dict[str, str], tmp_path
     for i in (count - 1, 0, 3, -1, -count, torch.tensor(2), np.int64(1)):
         same(traverse[i], whole[int(i)])
     mask = torch.arange(count) % 3 == 1
-    several: list[Any] = [slice(1, 5, 3), slice(-3, None), slice(None, None, -1), range(1, 4), [3, 2, 2, -1]]
+    several = [slice(1, 5, 3), slice(-3, None), slice(None, None, -1), range(1, 4), [3, 2, 2, -1]]
     for index in (*several, torch.tensor([3, 0, 3]), mask, mask.numpy()):
         same(traverse[index], whole[numbers[np.asarray(index) if index is mask else index].copy()])
     for none in (slice(3, 3), slice(count, count + 5), [], torch.zeros(count, dtype=torch.bool)):
@@ -151,7 +149,7 @@ def test_any_traverse_is_a_sequence(kind: str, sources: dict[str, str], tmp_path
 
 
 @pytest.mark.parametrize("how", ["fork", "spawn"])
-def test_a_loader_with_workers_gives_the_same_frames(how: str, sources: dict[str, str]) -> None:
+def test_a_loader_with_workers_gives_the_same_frames(how, sources):
     for kind in ("clip.mp4", "images"):
         traverse = open_source(sources[kind])
         whole = traverse[:]
@@ -159,15 +157,15 @@ def test_a_loader_with_workers_gives_the_same_frames(how: str, sources: dict[str
         assert torch.equal(torch.cat([*loader]), whole)
 
 
-def test_a_traverse_of_ones_own_is_a_length_and_a_reader() -> None:
+def test_a_traverse_of_ones_own_is_a_length_and_a_reader():
     class Ramp(Traverse):
         def __init__(self, count: int) -> None:
             self.count = count
 
-        def __len__(self) -> int:
+        def __len__(self):
             return self.count
 
-        def read(self, frames: range | list[int]) -> Tensor:
+        def read(self, frames):
             return torch.tensor([*frames]).float()[:, None]
 
     assert torch.equal(Ramp(40)[3:9], VALUES[3:9])
@@ -183,7 +181,7 @@ def test_a_traverse_of_ones_own_is_a_length_and_a_reader() -> None:
 
 
 @given(PARTS, st.integers(1, 50))
-def test_a_part_is_a_slice_however_the_frames_are_read(part: tuple[int, int, int], size: int) -> None:
+def test_a_part_is_a_slice_however_the_frames_are_read(part, size):
     start, stop, step = part
     expected = VALUES[start : stop or None : step]
     for traverse in (ArrayTraverse(VALUES), frame_range(ArrayTraverse(VALUES))):
@@ -195,19 +193,19 @@ def test_a_part_is_a_slice_however_the_frames_are_read(part: tuple[int, int, int
         assert torch.equal(some[1:4], expected[1:4])
 
 
-def test_parts_of_parts_name_both() -> None:
+def test_parts_of_parts_name_both():
     part = frame_range(frame_range(ArrayTraverse(VALUES, "walk"), start=10), stop=8, step=2)
     assert part.name == "walk[10:][0:8:2]"
     assert part[:].flatten().tolist() == [10, 12, 14, 16]
 
 
-def parts(cuts: list[int]) -> list[Traverse]:
+def parts(cuts):
     bounds = [0, *sorted(cuts), len(VALUES)]
     return [ArrayTraverse(VALUES[a:b]) for a, b in pairwise(bounds) if b > a]
 
 
 @given(st.lists(st.integers(0, 40), max_size=4), st.integers(1, 50), st.integers(0, 40), st.integers(0, 45))
-def test_a_chain_reads_as_one_traverse(cuts: list[int], size: int, start: int, stop: int) -> None:
+def test_a_chain_reads_as_one_traverse(cuts, size, start, stop):
     chain = Chain(parts(cuts))
     assert torch.equal(all_of(chain, size), VALUES)
     assert len(chain) == 40
@@ -217,7 +215,7 @@ def test_a_chain_reads_as_one_traverse(cuts: list[int], size: int, start: int, s
 
 
 @given(st.sets(st.integers(0, 39)), st.integers(1, 50))
-def test_a_part_has_the_frames_with_these_numbers(numbers: set[int], size: int) -> None:
+def test_a_part_has_the_frames_with_these_numbers(numbers, size):
     frame = torch.tensor(sorted(numbers), dtype=torch.int64)
     some = Part(ArrayTraverse(VALUES), frame)
     assert len(some) == len(frame)
@@ -225,7 +223,7 @@ def test_a_part_has_the_frames_with_these_numbers(numbers: set[int], size: int) 
     assert [i for run in runs(frame) for i in run] == sorted(numbers)
 
 
-def test_repeated_frames_are_read_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_repeated_frames_are_read_once(monkeypatch):
     traverse, read = ArrayTraverse(VALUES), list[int]()
     some = Part(traverse, torch.tensor([3, 3, 3, 9, 2, 9]))
     monkeypatch.setattr(traverse, "read", lambda wanted: read.extend(wanted) or VALUES[[*wanted]])
@@ -233,7 +231,7 @@ def test_repeated_frames_are_read_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert read == [2, 3, 9]
 
 
-def test_large_frames_are_read_few_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_frames_are_read_few_at_a_time(monkeypatch):
     chain, large = Chain(parts([20])), ArrayTraverse(torch.rand(9, 1, 4, 5))
     some = Part(chain, torch.arange(5, 30))
     assert large.at_once(64) == 64
@@ -247,7 +245,7 @@ def test_large_frames_are_read_few_at_a_time(monkeypatch: pytest.MonkeyPatch) ->
         large.at_once(64)
 
 
-def test_frames_keep_their_names_and_times_behind_the_name_of_their_traverse(tmp_path: Path) -> None:
+def test_frames_keep_their_names_and_times_behind_the_name_of_their_traverse(tmp_path):
     folders = [write_images(tmp_path / name, frames(count, size=16)) for name, count in (("a", 3), ("b", 2))]
     alone, other = map(open_source, folders)
     chain = chained([alone, other])
@@ -261,7 +259,7 @@ def test_frames_keep_their_names_and_times_behind_the_name_of_their_traverse(tmp
     assert Chain([ArrayTraverse(VALUES)] * 2).names == ()
 
 
-def test_frames_of_other_sizes_are_refused() -> None:
+def test_frames_of_other_sizes_are_refused():
     pair = [ArrayTraverse(torch.zeros(3, 4), "left"), ArrayTraverse(torch.zeros(3, 5), "right")]
     with refused("right", "5", "4", "left"):
         Chain(pair)
@@ -270,7 +268,7 @@ def test_frames_of_other_sizes_are_refused() -> None:
 
 
 @pytest.mark.parametrize("source", ["aerial", "outdoor", "underground"])
-def test_a_simulated_route_goes_elsewhere_without_its_drawings(source: str) -> None:
+def test_a_simulated_route_goes_elsewhere_without_its_drawings(source):
     route = open_source(f"sim:{source}?frames=8&seed=3")
     first = route[:2]
     packed = pickle.dumps(route)
@@ -278,7 +276,7 @@ def test_a_simulated_route_goes_elsewhere_without_its_drawings(source: str) -> N
     assert torch.equal(pickle.loads(packed)[:2], first)
 
 
-def test_an_array_goes_elsewhere_as_its_file(tmp_path: Path) -> None:
+def test_an_array_goes_elsewhere_as_its_file(tmp_path):
     np.save(tmp_path / "route.npy", np.random.default_rng(0).random((5000, 8), np.float32))
     route = open_source(tmp_path / "route.npy")
     packed = pickle.dumps(route)
@@ -293,7 +291,7 @@ def test_an_array_goes_elsewhere_as_its_file(tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """The same 6 smooth frames of 64 x 96 pixels as images, as a video and as an array."""
     folder, frames = tmp_path_factory.mktemp("frames"), pictures(6, 64, 96)
     frames[:, :, 48:] = 100 + np.arange(48, dtype=np.uint8)[:, None]
@@ -308,7 +306,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     "source", ["images", "clip.mkv", "frames.npy", "images?start=1&stop=6&step=2", "clip.mkv?stop=4"]
 )
-def test_frames_are_resized_and_all_else_stays(source: str, folder: Path) -> None:
+def test_frames_are_resized_and_all_else_stays(source, folder):
     own = open_source(f"{folder}/{source}")
     own.places = torch.arange(len(own)).double()
     first = own[0]  # what is open or known by now is of the other size
@@ -326,9 +324,7 @@ def test_frames_are_resized_and_all_else_stays(source: str, folder: Path) -> Non
     assert torch.equal(own[0], first)
 
 
-def test_large_frames_are_resized_few_at_a_time(
-    monkeypatch: pytest.MonkeyPatch, largest_tensor: type
-) -> None:
+def test_large_frames_are_resized_few_at_a_time(monkeypatch, largest_tensor):
     large = ArrayTraverse(torch.rand(9, 1, 40, 50))
     monkeypatch.setattr(types, "BATCH_NUMBERS", 2 * 40 * 50)
     with largest_tensor() as seen:
@@ -338,7 +334,7 @@ def test_large_frames_are_resized_few_at_a_time(
     torch.testing.assert_close(found, Fitted(large, (3, 4, 5))[:])
 
 
-def test_a_large_jpeg_is_decoded_small(tmp_path: Path) -> None:
+def test_a_large_jpeg_is_decoded_small(tmp_path):
     across = torch.linspace(0, 255, 800).byte().expand(3, 600, 800)
     Image.fromarray(across.permute(1, 2, 0).numpy()).save(tmp_path / "photo.jpg", quality=95)
     small, whole = (open_source(f"{tmp_path}{size}")[:] for size in ("?width=80", ""))
@@ -346,7 +342,7 @@ def test_a_large_jpeg_is_decoded_small(tmp_path: Path) -> None:
     torch.testing.assert_close(small, resize_frames(whole, (60, 80)), atol=0.02, rtol=0)
 
 
-def test_a_portrait_among_landscapes_is_refused(tmp_path: Path) -> None:
+def test_a_portrait_among_landscapes_is_refused(tmp_path):
     for i, size in enumerate(((400, 300), (404, 300), (300, 400))):
         Image.new("L", size, 90).save(tmp_path / f"{i}.png")
     with refused("2.png", "300 x 400", "aspect ratio", "0.png"):
@@ -354,7 +350,7 @@ def test_a_portrait_among_landscapes_is_refused(tmp_path: Path) -> None:
     assert open_source(f"{tmp_path}?width=160&height=120")[:].shape == (3, 1, 120, 160)  # as asked for
 
 
-def test_sizes() -> None:
+def test_sizes():
     assert reduced_size((4000, 1), 160) == (160, 1)
     assert reduced_size((96, 96), 160) == (96, 96)
     assert reduced_size((3000, 4000), None) == (3000, 4000)
@@ -372,14 +368,14 @@ class Labelled:
     def __init__(self, items: list[Any]) -> None:
         self.items = items
 
-    def __len__(self) -> int:
+    def __len__(self):
         return len(self.items)
 
-    def __getitem__(self, i: int) -> Any:
+    def __getitem__(self, i):
         return self.items[i], i % 3
 
 
-def pil(frames: Tensor) -> list[Image.Image]:
+def pil(frames):
     return [Image.fromarray(frame) for frame in (frames.permute(0, 2, 3, 1) * 255).round().byte().numpy()]
 
 
@@ -399,7 +395,7 @@ TOLD = {"pair": "of each pair the first part is taken", "pil": "PIL images are c
     ],
     ids=["tensors", "arrays", "pairs", "tensor dataset", "images", "pairs of images", "bytes"],
 )
-def test_any_frames_learn_and_localize(make: Any, told: list[str], caplog: pytest.LogCaptureFixture) -> None:
+def test_any_frames_learn_and_localize(make, told, caplog):
     values = (open_source("sim:aerial?frames=40")[:] * 255).round() / 255
     source = make(values)
     assert torch.equal(as_traverse(source)[:], values)
@@ -408,7 +404,7 @@ def test_any_frames_learn_and_localize(make: Any, told: list[str], caplog: pytes
     assert DejaVu().learn(source).localize(source).index.tolist() == list(range(40))
 
 
-def test_images_of_other_modes_are_frames() -> None:
+def test_images_of_other_modes_are_frames():
     grey, palette = Image.new("L", (5, 4), 51), Image.new("P", (5, 4))
     assert torch.equal(as_traverse([grey])[:], torch.full((1, 1, 4, 5), 0.2))
     assert as_traverse([palette, Image.new("RGBA", (5, 4))])[:].shape == (2, 3, 4, 5)
@@ -429,11 +425,11 @@ def test_images_of_other_modes_are_frames() -> None:
         ([torch.rand(3, 4, 5), torch.rand(3)], ["item 1", "(3,)", "expected (3, 4, 5) as item 0"]),
     ],
 )
-def test_what_holds_no_frames_of_one_shape_is_refused(source: Any, words: list[str]) -> None:
+def test_what_holds_no_frames_of_one_shape_is_refused(source, words):
     with refused(*words):
         as_traverse(source)[:]
 
 
-def test_a_named_dataset_is_told_by_its_name() -> None:
+def test_a_named_dataset_is_told_by_its_name():
     with refused("item 1 of my photos"):
         Frames([torch.rand(1, 4, 5), "two"], "my photos")[:]

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
 
 import av
 import numpy as np
@@ -42,7 +40,7 @@ FRAGMENTS = {"movflags": "empty_moov", "frag_duration": "400000"}  # of 10 frame
 
 
 @pytest.mark.parametrize("name", ["a.mkv", "a.avi", "with space: 100%d?.MKV", "12:30.mkv"])
-def test_lossless_pixels(tmp_path: Path, name: str) -> None:
+def test_lossless_pixels(tmp_path, name):
     frames = pictures(5)
     found = all_of(Video(clip(tmp_path / name, frames)))
     assert found.dtype == torch.float32
@@ -50,9 +48,7 @@ def test_lossless_pixels(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_frames_their_times_and_names_are_in_order(
-    tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_frames_their_times_and_names_are_in_order(tmp_path, name, caplog):
     video = Video(clip(tmp_path / name, pictures(30), **KINDS[name]))
     assert len(video) == 30
     for i, batch in enumerate(video.batches(7)):
@@ -67,7 +63,7 @@ def test_frames_their_times_and_names_are_in_order(
 
 
 @pytest.mark.parametrize("name", ["h264.mp4", "h264.mkv", "mjpeg.avi"])
-def test_the_batch_size_changes_nothing(tmp_path: Path, name: str) -> None:
+def test_the_batch_size_changes_nothing(tmp_path, name):
     video = Video(clip(tmp_path / name, pictures(11), **KINDS[name]), width=20)
     whole = all_of(video)
     for batch in (1, 2, 5, 100):
@@ -77,7 +73,7 @@ def test_the_batch_size_changes_nothing(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.parametrize("group", [8, None], ids=["short groups", "one group"])
 @pytest.mark.parametrize("name", KINDS)
-def test_any_frame_is_exact_in_any_order(tmp_path: Path, name: str, group: int | None) -> None:
+def test_any_frame_is_exact_in_any_order(tmp_path, name, group):
     path = clip(tmp_path / name, pictures(30), group=group, **KINDS[name])
     whole, video = all_of(Video(path)), Video(path)
     assert numbers(whole) == list(range(30))
@@ -90,13 +86,11 @@ def test_any_frame_is_exact_in_any_order(tmp_path: Path, name: str, group: int |
 
 
 @pytest.mark.parametrize(("name", "key"), [("h264.mp4", 14), ("ffv1.mkv", 16)])
-def test_only_the_groups_asked_for_are_decoded(
-    tmp_path: Path, name: str, key: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_the_groups_asked_for_are_decoded(tmp_path, name, key, monkeypatch):
     path = clip(tmp_path / name, pictures(30), group=8, **KINDS[name])
     video, decode, decoded = Video(path), video_module._decode, list[int]()
 
-    def noted(*opened: Any) -> Iterator[Any]:
+    def noted(*opened):
         for frame in decode(*opened):
             decoded.append(round(25 * frame.time))
             yield frame
@@ -107,7 +101,7 @@ def test_only_the_groups_asked_for_are_decoded(
     assert decoded == list(range(key, 22))  # from a key frame on, each once
 
 
-def test_a_forked_process_reads_its_own_frames(tmp_path: Path) -> None:
+def test_a_forked_process_reads_its_own_frames(tmp_path):
     video = Video(clip(tmp_path / "a.mp4", pictures(30), group=8, **H264))
     assert numbers(video[9:12]) == [9, 10, 11]  # its file stays open
     loader = DataLoader(video, batch_size=7, num_workers=2, multiprocessing_context="fork")
@@ -116,16 +110,14 @@ def test_a_forked_process_reads_its_own_frames(tmp_path: Path) -> None:
     assert numbers(video[12:15]) == [12, 13, 14]
 
 
-def test_opening_reads_all_names_and_times(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_opening_reads_all_names_and_times(tmp_path, monkeypatch):
     video = Video(clip(tmp_path / "a.mkv", pictures(30)))
     monkeypatch.setattr(video, "_open", lambda: pytest.fail("it is read again"))
     assert (len(video), video.names[3], video.names[29]) == (30, "0:00:00.120", "0:00:01.160")
 
 
 @pytest.mark.parametrize("kind", ["h264.mp4", "h264.mkv", "mjpeg.avi"])
-def test_a_frame_rate_that_varies_is_told_once(
-    tmp_path: Path, kind: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_frame_rate_that_varies_is_told_once(tmp_path, kind, caplog):
     ticks = [0, 1, 2, 3, 4, 5, 6, 9, 10, 11, 13, 14]
     path = clip(tmp_path / kind, pictures(12), ticks=ticks, **KINDS[kind])
     for _ in (1, 2):
@@ -142,9 +134,7 @@ def test_a_frame_rate_that_varies_is_told_once(
     ("rate", "ticks"),
     [(Fraction(30000, 1001), 1000), (Fraction(30000, 1001), 90000), (Fraction(480), 1000)],
 )
-def test_rounded_timestamps_are_no_varying_rate(
-    tmp_path: Path, rate: Fraction, ticks: int, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_rounded_timestamps_are_no_varying_rate(tmp_path, rate, ticks, caplog):
     base = Fraction(1, ticks)
     stamps = [round(i / rate / base) for i in range(40)]
     video = Video(clip(tmp_path / "a.mkv", pictures(40), ticks=stamps, base=base))
@@ -154,7 +144,7 @@ def test_rounded_timestamps_are_no_varying_rate(
 
 
 @pytest.mark.parametrize("hidden", [4, 17])
-def test_frames_that_an_edit_list_hides_are_left_out(tmp_path: Path, hidden: int) -> None:
+def test_frames_that_an_edit_list_hides_are_left_out(tmp_path, hidden):
     whole = clip(tmp_path / "whole.mp4", pictures(30), **H264)
     with av.open(str(whole)) as source, av.open(str(tmp_path / "cut.mp4"), "w") as target:
         stream = target.add_stream_from_template(source.streams.video[0])
@@ -175,7 +165,7 @@ def test_frames_that_an_edit_list_hides_are_left_out(tmp_path: Path, hidden: int
     ("given", "shape"),
     [({"height": 8}, (8, 12)), ({"width": 6, "height": 16}, (16, 6)), ({"width": 1}, (1, 1))],
 )
-def test_frames_are_averaged_over_areas(tmp_path: Path, given: dict, shape: tuple[int, int]) -> None:
+def test_frames_are_averaged_over_areas(tmp_path, given, shape):
     path = clip(tmp_path / "a.mkv", pictures(3))
     found = all_of(Video(path, **given))
     assert found.shape == (3, 3, *shape)
@@ -185,7 +175,7 @@ def test_frames_are_averaged_over_areas(tmp_path: Path, given: dict, shape: tupl
 
 @pytest.mark.parametrize(("turn", "quarters"), [(90, 1), (-90, 3), (180, 2)])
 @pytest.mark.parametrize("given", [{}, {"width": 16}])
-def test_frames_are_upright(tmp_path: Path, turn: int, quarters: int, given: dict) -> None:
+def test_frames_are_upright(tmp_path, turn, quarters, given):
     frames = pictures(2)
     upright = np.ascontiguousarray(np.rot90(frames, quarters, (1, 2)))  # counterclockwise
     found = all_of(Video(clip(tmp_path / "a.mkv", frames, turn=turn), **given))
@@ -193,7 +183,7 @@ def test_frames_are_upright(tmp_path: Path, turn: int, quarters: int, given: dic
     torch.testing.assert_close(found, expected, atol=2 / 255, rtol=0)
 
 
-def test_frames_are_streamed(tmp_path: Path, largest_tensor: type) -> None:
+def test_frames_are_streamed(tmp_path, largest_tensor):
     video = Video(clip(tmp_path / "a.mkv", pictures(30)), width=24)
     with largest_tensor() as seen:
         assert sum(len(batch) for batch in video.batches(4)) == 30
@@ -201,11 +191,11 @@ def test_frames_are_streamed(tmp_path: Path, largest_tensor: type) -> None:
 
 
 @pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="needs /proc")
-def test_the_file_is_closed(tmp_path: Path) -> None:
+def test_the_file_is_closed(tmp_path):
     path = clip(tmp_path / "a.mkv", pictures(5))
     video = Video(path)
 
-    def is_open() -> bool:
+    def is_open():
         return str(path) in [str(link.resolve()) for link in Path("/proc/self/fd").iterdir()]
 
     assert not is_open()
@@ -220,14 +210,14 @@ def test_the_file_is_closed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.mkv", "a.avi", "a.mjpeg", "a.ts"])
-def test_a_file_that_is_no_video_is_refused(tmp_path: Path, name: str) -> None:
+def test_a_file_that_is_no_video_is_refused(tmp_path, name):
     for content in (b"", b"no video\n" * 99, bytes(5000), b"\x1a\x45\xdf\xa3", b"RIFF"):
         (tmp_path / name).write_bytes(content)
         with refused(name):
             all_of(Video(tmp_path / name))
 
 
-def test_sizes_that_no_frame_has_are_refused(tmp_path: Path) -> None:
+def test_sizes_that_no_frame_has_are_refused(tmp_path):
     path = clip(tmp_path / "a.mkv", pictures(2))
     with refused(str(path), "width=-1", "expected width and height of at least 0"):
         Video(path, width=-1)
@@ -235,7 +225,7 @@ def test_sizes_that_no_frame_has_are_refused(tmp_path: Path) -> None:
         all_of(Video(path, height=1_000_000))
 
 
-def test_sound_alone_is_refused(tmp_path: Path) -> None:
+def test_sound_alone_is_refused(tmp_path):
     with av.open(str(tmp_path / "a.mp4"), "w") as container:
         stream = container.add_stream("aac", rate=8000)
         sound = av.AudioFrame.from_ndarray(np.zeros((1, 8000), np.float32), "fltp", "mono")
@@ -246,7 +236,7 @@ def test_sound_alone_is_refused(tmp_path: Path) -> None:
         Video(tmp_path / "a.mp4")
 
 
-def test_a_video_without_frames_is_refused(tmp_path: Path) -> None:
+def test_a_video_without_frames_is_refused(tmp_path):
     with av.open(str(tmp_path / "a.avi"), "w") as container:
         stream = container.add_stream("mjpeg", rate=25)
         stream.height, stream.width, stream.pix_fmt = 32, 48, "yuvj420p"
@@ -256,7 +246,7 @@ def test_a_video_without_frames_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["mjpeg.mjpeg", "h264.ts"])
-def test_frames_of_another_size_are_refused(tmp_path: Path, kind: str) -> None:
+def test_frames_of_another_size_are_refused(tmp_path, kind):
     small = clip(tmp_path / f"small.{kind}", pictures(4, 32, 48), **KINDS[kind])
     large = clip(tmp_path / f"large.{kind}", pictures(4, 64, 80), **KINDS[kind])
     both = tmp_path / f"both.{kind}"
@@ -282,9 +272,7 @@ def test_frames_of_another_size_are_refused(tmp_path: Path, kind: str) -> None:
         ("mjpeg.avi", {}),
     ],
 )
-def test_a_cut_behind_a_frame_is_refused(
-    tmp_path: Path, name: str, options: dict[str, str], more: int, kept: int
-) -> None:
+def test_a_cut_behind_a_frame_is_refused(tmp_path, name, options, more, kept):
     path = clip(tmp_path / name, pictures(30), options=options, **KINDS[name])
     assert numbers(all_of(Video(path))) == list(range(30))
     with av.open(str(path)) as container:
@@ -295,9 +283,7 @@ def test_a_cut_behind_a_frame_is_refused(
 
 
 @pytest.mark.parametrize("name", ["h264.mp4", "h264.mkv", "mjpeg.avi", "mpeg4.mp4", "h264.ts"])
-def test_a_hole_in_the_middle_is_refused_in_one_line(
-    tmp_path: Path, name: str, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_hole_in_the_middle_is_refused_in_one_line(tmp_path, name, capfd):
     path = clip(tmp_path / name, pictures(30), **KINDS[name])
     whole = path.read_bytes()
     at, width = len(whole) // 2, 2000
@@ -309,7 +295,7 @@ def test_a_hole_in_the_middle_is_refused_in_one_line(
     assert capfd.readouterr() == ("", "")
 
 
-def test_any_cut_of_a_small_video_is_refused(tmp_path: Path) -> None:
+def test_any_cut_of_a_small_video_is_refused(tmp_path):
     path = clip(tmp_path / "a.mkv", pictures(3, 4, 6))
     whole = path.read_bytes()
     for stop in range(8, len(whole), 5):
@@ -318,7 +304,7 @@ def test_any_cut_of_a_small_video_is_refused(tmp_path: Path) -> None:
             Video(path)
 
 
-def test_a_video_recorded_live_is_read(tmp_path: Path) -> None:
+def test_a_video_recorded_live_is_read(tmp_path):
     path = clip(tmp_path / "a.mkv", pictures(5), options={"live": "1"})
     assert numbers(all_of(Video(path))) == [0, 1, 2, 3, 4]
     path = clip(tmp_path / "a.avi", pictures(5))
@@ -328,14 +314,14 @@ def test_a_video_recorded_live_is_read(tmp_path: Path) -> None:
         assert numbers(all_of(Video(path))) == [0, 1, 2, 3, 4]
 
 
-def test_what_follows_a_video_does_not_matter(tmp_path: Path) -> None:
+def test_what_follows_a_video_does_not_matter(tmp_path):
     for name in ("h264.mp4", "h264.mkv", "mjpeg.avi"):
         path = clip(tmp_path / name, pictures(5), **KINDS[name])
         path.write_bytes(path.read_bytes() + b"something else")
         assert numbers(all_of(Video(path))) == [0, 1, 2, 3, 4]
 
 
-def test_a_drive(data_dir: Path) -> None:
+def test_a_drive(data_dir):
     video = Video(data_dir / "highway" / "solidWhiteRight.mp4", width=160)
     assert len(video) == 221
     assert torch.equal(video.times, torch.arange(221).double() / 25)
@@ -345,16 +331,14 @@ def test_a_drive(data_dir: Path) -> None:
     assert next(Video(video.path).batches(1)).shape == (1, 3, 540, 960)
 
 
-def test_a_list_of_other_files_is_no_video(tmp_path: Path) -> None:
+def test_a_list_of_other_files_is_no_video(tmp_path):
     clip(tmp_path / "a.mkv", pictures(3))
     (tmp_path / "list.mp4").write_text("ffconcat version 1.0\nfile a.mkv\n")
     with refused("list.mp4", "cannot be read as a video"):
         Video(tmp_path / "list.mp4")
 
 
-def test_a_stream_that_claims_too_many_pixels_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stream_that_claims_too_many_pixels_is_refused(tmp_path, monkeypatch):
     path = clip(tmp_path / "a.mkv", pictures(3))
     monkeypatch.setattr(video_module, "MOST_PIXELS", 1000)
     with refused("a.mkv has 32 x 48 pixels", "at most 1000"):

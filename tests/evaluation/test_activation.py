@@ -2,7 +2,6 @@ from __future__ import annotations
 
 from fractions import Fraction
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
@@ -14,18 +13,18 @@ from dejavu_torch.evaluation.activation import Rate, activation_rates, in_phase
 from dejavu_torch.types import FrequencyLayer
 
 
-def layer(period: Fraction | int, phases: int, start: int = 0, stop: int = 40) -> FrequencyLayer:
+def layer(period, phases, start=0, stop=40):
     return FrequencyLayer(Fraction(period), phases, start, stop, (0,))
 
 
-def rates(best: list[int], index: list[int], truth: GroundTruth, tolerance: int, places: int) -> list[Rate]:
+def rates(best, index, truth, tolerance, places):
     """Of a layer of period 10 in the chunk [0, 40), to which these phases are nearest, and of the fusion."""
-    route: Any = SimpleNamespace(plan=(layer(10, 10),), places=places, device="cpu")
+    route = SimpleNamespace(plan=(layer(10, 10),), places=places, device="cpu")
     route.distances = lambda queries, _: [(queries - torch.arange(10)).abs()]
     return activation_rates(route, [0], torch.tensor(best)[:, None], torch.tensor(index), truth, tolerance)
 
 
-def test_rates_in_closed_form() -> None:
+def test_rates_in_closed_form():
     # of the places 3, 13, 27 inside and 41, 52 outside
     truth = as_ground_truth(torch.tensor([[3], [13], [27], [41], [52]]))
     best = [3, 4, 0, 0, 7]  # 0, 1 and 3 phases off inside; 1 and 5 off outside
@@ -35,7 +34,7 @@ def test_rates_in_closed_form() -> None:
     assert fused == pytest.approx((2 / 3, 1 / 2, 3 / 60))
 
 
-def test_unknown_queries_and_those_without_an_answer_do_not_count() -> None:
+def test_unknown_queries_and_those_without_an_answer_do_not_count():
     right = torch.tensor([[3], [13], [-1]])
     truth = GroundTruth(right, torch.tensor([True, False, True]), right.new_zeros(3, 0))
     alone, fused = rates([8, 3, 3], [8, 3, 3], truth, 0, 40)
@@ -43,9 +42,7 @@ def test_unknown_queries_and_those_without_an_answer_do_not_count() -> None:
 
 
 @given(st.fractions(2, 60, max_denominator=7), st.integers(0, 500), st.integers(0, 9), st.data())
-def test_the_phase_of_a_place_is_in_phase_with_it_and_shifts_go_around(
-    period: Fraction, place: int, tolerance: int, data: st.DataObject
-) -> None:
+def test_the_phase_of_a_place_is_in_phase_with_it_and_shifts_go_around(period, place, tolerance, data):
     phases = data.draw(st.integers(1, int(period)))
     one = layer(period, phases)
     best = torch.arange(phases)
@@ -64,5 +61,5 @@ def test_the_phase_of_a_place_is_in_phase_with_it_and_shifts_go_around(
         (Rate(None, 0.25, 0.1), "right 25 % elsewhere, by chance 10 %"),
     ],
 )
-def test_rates_in_words(rate: Rate, text: str) -> None:
+def test_rates_in_words(rate, text):
     assert rate.describe() == text

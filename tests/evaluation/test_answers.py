@@ -6,7 +6,6 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from torch import Tensor
 
 from dejavu_torch.evaluation.answers import (
     answer_facts,
@@ -20,12 +19,12 @@ from dejavu_torch.evaluation.answers import (
 from dejavu_torch.types import Match
 
 
-def answers(index: Tensor, probability: Tensor | None = None, score: Tensor | None = None) -> Match:
+def answers(index, probability=None, score=None):
     score = torch.zeros(len(index)) if score is None else score
     return Match(index, score, torch.ones(len(index), dtype=torch.bool), probability)
 
 
-def test_probable_answers_are_counted_and_told() -> None:
+def test_probable_answers_are_counted_and_told():
     match = answers(torch.arange(5), torch.tensor([0.95, 0.9, 0.5, 0.49, 0.0]))
     counts = probable_counts(match)
     assert counts == {"0.9": 2, "0.5": 3}
@@ -33,7 +32,7 @@ def test_probable_answers_are_counted_and_told() -> None:
     assert probable_counts(answers(torch.arange(5))) == {}
 
 
-def test_the_next_step_is_one_that_was_not_taken() -> None:
+def test_the_next_step_is_one_that_was_not_taken():
     first, second = next_steps(together=False, strict=False)
     assert "--ordered" in first
     assert "--precision .9" in second
@@ -41,7 +40,7 @@ def test_the_next_step_is_one_that_was_not_taken() -> None:
     assert next_steps(together=True, strict=True) == []
 
 
-def test_confident_are_the_probable_else_the_third_of_the_best_scores() -> None:
+def test_confident_are_the_probable_else_the_third_of_the_best_scores():
     index, score = torch.arange(7), torch.tensor([3.0, 1.0, 2.0, torch.inf, 9.0, 8.0, 7.0])
     sure = torch.tensor([0.5, 0.9, 0.49, 0.0, 1.0, 0.2, 0.3])
     assert confident(answers(index, sure)).nonzero().flatten().tolist() == [0, 1, 4]
@@ -50,7 +49,7 @@ def test_confident_are_the_probable_else_the_third_of_the_best_scores() -> None:
 
 
 @given(st.integers(-60, 60), st.integers(0, 40), st.integers(0, 2**16))
-def test_most_answers_near_a_line_tell_its_offset(offset: int, wrong: int, seed: int) -> None:
+def test_most_answers_near_a_line_tell_its_offset(offset, wrong, seed):
     """Up to two frames off it, and 40 of 100 anywhere."""
     noise = torch.Generator().manual_seed(seed)
     queries = torch.arange(100)
@@ -76,11 +75,11 @@ def test_most_answers_near_a_line_tell_its_offset(offset: int, wrong: int, seed:
     ],
     ids=["shuffled", "backwards", "slow", "fast", "one place", "three lines"],
 )
-def test_no_line_no_offset(places: Tensor) -> None:
+def test_no_line_no_offset(places):
     assert line_of(places, torch.arange(100), within=5) is None
 
 
-def test_few_answers_or_few_frames_show_no_line() -> None:
+def test_few_answers_or_few_frames_show_no_line():
     assert line_of(torch.arange(9), torch.arange(9), within=5) is None
     assert line_of(torch.arange(12), torch.arange(12), within=5) is None  # any order would be near it
     assert line_of(torch.arange(40), torch.arange(40), within=5, min_answers=41) is None
@@ -97,7 +96,7 @@ def test_few_answers_or_few_frames_show_no_line() -> None:
         (True, None, False),  # a ground truth that is no offset
     ],
 )
-def test_what_is_asked_of_a_line(scored: bool, offset: int | None, asks: bool) -> None:
+def test_what_is_asked_of_a_line(scored, offset, asks):
     queries = torch.arange(60)
     sure = torch.where(queries < 40, 0.8, 0.1)
     match = answers(torch.where(queries < 40, queries + 20, -1), sure)
@@ -109,7 +108,7 @@ def test_what_is_asked_of_a_line(scored: bool, offset: int | None, asks: bool) -
     assert ("contradict the truth (place = query + 0)" in told) == (asks and scored)
 
 
-def test_queries_that_run_backwards_are_told() -> None:
+def test_queries_that_run_backwards_are_told():
     queries = torch.arange(60)
     facts = answer_facts(answers(80 - queries), queries, 5, False)
     assert facts["line"] == {"offset": 80, "answers": 60, "confident": 60, "backwards": True}
@@ -120,7 +119,7 @@ def test_queries_that_run_backwards_are_told() -> None:
 @pytest.mark.parametrize(
     ("offset", "line"), [(-7, "query - 7: is it --truth -7?"), (0, "query: is it --truth 0?")]
 )
-def test_an_offset_may_be_negative_or_none(offset: int, line: str) -> None:
+def test_an_offset_may_be_negative_or_none(offset, line):
     queries = torch.arange(60)
     facts = answer_facts(answers(queries + offset), queries, 5, False)
     assert f"place = {line}" in describe_line(facts, False)

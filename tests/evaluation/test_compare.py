@@ -4,7 +4,6 @@ import base64
 import io
 import re
 import sys
-from typing import Any
 from xml.etree import ElementTree
 
 import pytest
@@ -13,7 +12,7 @@ from footage import QUERY, REFERENCE, STEP, camera, everything
 from footage import footage as ground
 from helpers import Fixed, all_of, refused, template_model
 from PIL import Image
-from torch import Tensor, nn
+from torch import nn
 
 from dejavu_torch import HOG, DejaVu, SequenceMatcher, SpectrogramAnalysis, open_source
 from dejavu_torch.data.arrays import ArrayTraverse
@@ -31,7 +30,7 @@ from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.types import FrequencyLayer, Training
 
 
-def route(seed: int, frames: int = 240) -> torch.Tensor:
+def route(seed, frames=240):
     """Features that repeat with periods 12 and 20, and noise."""
     noise = torch.Generator().manual_seed(seed)
     profile = torch.Generator().manual_seed(7)
@@ -40,25 +39,25 @@ def route(seed: int, frames: int = 240) -> torch.Tensor:
     return torch.cat(parts, 1) + 0.3 * torch.randn(frames, 60, generator=noise)
 
 
-def smooth(seed: int, frames: int = 200) -> Tensor:
+def smooth(seed, frames=200):
     """Features that change slowly, and never return."""
     steps = torch.randn(frames + 9, 12, generator=torch.Generator().manual_seed(seed))
     return steps.unfold(0, 10, 1).mean(2)
 
 
 @pytest.fixture
-def model() -> DejaVu:
+def model():
     return template_model(periods=SpectrogramAnalysis(window=240, min_period=4, strongest=1))
 
 
 @pytest.fixture
-def _drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+def _drawn(monkeypatch):
     """Pictures, and the facts that they tell, for the tests that look at them."""
     monkeypatch.setattr("dejavu_torch.evaluation.compare.draw_pictures", draw_pictures)
 
 
 @pytest.mark.usefixtures("_drawn")
-def test_a_comparison_is_shown_in_a_few_lines_and_in_a_notebook_as_table_and_pictures(model: DejaVu) -> None:
+def test_a_comparison_is_shown_in_a_few_lines_and_in_a_notebook_as_table_and_pictures(model):
     reference, query = ArrayTraverse(route(0), "<b>&one"), ArrayTraverse(route(1), "two")
     result = compare(reference, query, "0", model)
     scores = result.report.ours.scores
@@ -81,7 +80,7 @@ def test_a_comparison_is_shown_in_a_few_lines_and_in_a_notebook_as_table_and_pic
 
 
 @pytest.fixture
-def trained(model: DejaVu) -> DejaVu:
+def trained(model):
     """The map of route(0), with templates that are no phase means, as training leaves it."""
     model.learn(route(0))
     model.map.trainable(weights=True, start=torch.linspace(0.5, 1.5, 60))
@@ -93,7 +92,7 @@ def trained(model: DejaVu) -> DejaVu:
     return model
 
 
-def test_a_map_that_is_there_is_evaluated_as_it_is(trained: DejaVu) -> None:
+def test_a_map_that_is_there_is_evaluated_as_it_is(trained):
     before, expected = trained.map, trained.localize(route(1))
     templates = before.templates.clone()
     result = compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), "0", model=trained)
@@ -113,7 +112,7 @@ def test_a_map_that_is_there_is_evaluated_as_it_is(trained: DejaVu) -> None:
     assert anew["auc"] != report["auc"]
 
 
-def test_the_null_of_a_trained_map_has_the_templates_of_shuffled_frames(trained: DejaVu) -> None:
+def test_the_null_of_a_trained_map_has_the_templates_of_shuffled_frames(trained):
     reference, query = route(0), route(1)
     result = compare(ArrayTraverse(reference), ArrayTraverse(query), "0", model=trained, seed=5)
     null = result.report.contenders["null"]
@@ -124,17 +123,17 @@ def test_the_null_of_a_trained_map_has_the_templates_of_shuffled_frames(trained:
 
 
 @pytest.mark.parametrize("frames", [239, 241])
-def test_another_reference_than_the_map_s_is_refused(trained: DejaVu, frames: int) -> None:
+def test_another_reference_than_the_map_s_is_refused(trained, frames):
     with refused(f"has {frames} places", "the map has 240", "expected the reference"):
         compare(route(0, frames), route(1), "0", model=trained)
 
 
-def test_a_reference_of_other_features_than_the_map_s_is_refused(trained: DejaVu) -> None:
+def test_a_reference_of_other_features_than_the_map_s_is_refused(trained):
     with refused("the array gives 6 features", "expects 60"):
         compare(torch.rand(240, 6), torch.rand(240, 6), "0", model=trained)
 
 
-def test_a_traverse_matched_with_itself_is_warned_of(model: DejaVu, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_traverse_matched_with_itself_is_warned_of(model, caplog):
     same = route(0)
     compare(same, same, "0", model=model)
     assert "matched with itself" in caplog.text
@@ -143,8 +142,8 @@ def test_a_traverse_matched_with_itself_is_warned_of(model: DejaVu, caplog: pyte
     assert "matched with itself" not in caplog.text
 
 
-def test_a_map_of_another_route_is_warned_of(caplog: pytest.LogCaptureFixture) -> None:
-    def warnings(reference: Tensor, tolerance: int = 2) -> list[str]:
+def test_a_map_of_another_route_is_warned_of(caplog):
+    def warnings(reference, tolerance=2):
         caplog.clear()
         pair = ArrayTraverse(reference, "one"), ArrayTraverse(route(1), "two")
         compare(*pair, "0", model=model, tolerance=tolerance)
@@ -157,7 +156,7 @@ def test_a_map_of_another_route_is_warned_of(caplog: pytest.LogCaptureFixture) -
     assert re.fullmatch(r"the map finds \d+ of 240 frames of one; expected the reference .*", message)
 
 
-def test_a_map_of_even_steps_is_compared_at_its_own_step() -> None:
+def test_a_map_of_even_steps_is_compared_at_its_own_step():
     """Not at the one that its reference would get of itself."""
     reference, query = ArrayTraverse(ground(REFERENCE)), ArrayTraverse(ground(QUERY))
     model = template_model(periods=everything(101), velocity=camera()).learn(reference)
@@ -171,19 +170,19 @@ def test_a_map_of_even_steps_is_compared_at_its_own_step() -> None:
 # HOG beside other features
 
 
-def pictures(seed: int) -> ArrayTraverse:
+def pictures(seed):
     """64 frames that repeat after 8, with noise."""
     noise, texture = torch.Generator().manual_seed(seed), torch.Generator().manual_seed(7)
     frames = torch.rand(8, 1, 24, 24, generator=texture)[torch.arange(64) % 8]
     return ArrayTraverse((frames + 0.1 * torch.randn(frames.shape, generator=noise)).clamp(0, 1))
 
 
-def contenders(features: nn.Module | None) -> dict[str, Any]:
+def contenders(features):
     model = template_model(features, SpectrogramAnalysis(window=64, min_period=4, strongest=1))
     return dict(compare(pictures(1), pictures(2), "0", model, tolerance=3).report.contenders)
 
 
-def test_hog_stands_beside_other_features() -> None:
+def test_hog_stands_beside_other_features():
     found = contenders(nn.Sequential(nn.AvgPool2d(4), nn.Flatten()))
     dimension = HOG()(torch.rand(1, 1, 24, 24)).shape[1]
     for key, k, name in (("hog", 1, "HOG, every frame"), ("hog_stride_coarsest", 6, "HOG, every 6th frame")):
@@ -195,7 +194,7 @@ def test_hog_stands_beside_other_features() -> None:
     assert not {"hog", "hog_stride_coarsest"} & contenders(None).keys()  # not beside itself
 
 
-def test_whatever_stores_features_needs_the_backbone_as_well() -> None:
+def test_whatever_stores_features_needs_the_backbone_as_well():
     net = nn.Sequential(nn.AvgPool2d(4), nn.Flatten(), nn.Linear(36, 40), nn.BatchNorm1d(40)).eval()
     weights = sum(tensor.nbytes for tensor in net.state_dict().values())
     model = template_model(net, SpectrogramAnalysis(window=64, min_period=4, strongest=1))
@@ -214,20 +213,20 @@ def test_whatever_stores_features_needs_the_backbone_as_well() -> None:
 # sequences
 
 
-def passing(seed: int, places: int = 64) -> Tensor:
+def passing(seed, places=64):
     """Features of single places that a visit changes too much to be told apart."""
     noise, profile = (torch.Generator().manual_seed(one) for one in (seed, 7))
     return torch.randn(places, 12, generator=profile) + 1.5 * torch.randn(places, 12, generator=noise)
 
 
 @pytest.mark.parametrize("kind", ["templates", "spectral"])
-def test_sequences_of_every_contender(kind: str) -> None:
+def test_sequences_of_every_contender(kind):
     model = DejaVu(whitening="none")
     if kind == "templates":
         model = template_model(periods=Fixed(FrequencyLayer(64, 64, 0, 64, tuple(range(12)))))
     pair = ArrayTraverse(passing(1)), ArrayTraverse(passing(2))
 
-    def report(sequence: Any) -> dict[str, Any]:
+    def report(sequence):
         return compare(*pair, "0", model=model, tolerance=1, sequence=sequence).report.as_json()
 
     single, seven, filtered = report(None), report(SequenceMatcher(7)), report(PlaceFilter(within=1))
@@ -252,11 +251,11 @@ def test_sequences_of_every_contender(kind: str) -> None:
 
 
 @pytest.mark.usefixtures("_drawn")
-def test_a_filter_stands_beside_single_queries_in_order_and_changes_nothing_else() -> None:
+def test_a_filter_stands_beside_single_queries_in_order_and_changes_nothing_else():
     pair, model = (ArrayTraverse(passing(1)), ArrayTraverse(passing(2))), DejaVu(whitening="none")
 
-    def report(ordered: bool | None, storage: bool = False) -> dict[str, Any]:
-        settings: dict[str, Any] = {"tolerance": 1, "ordered": ordered, "storage_curve": storage}
+    def report(ordered, storage=False):
+        settings = {"tolerance": 1, "ordered": ordered, "storage_curve": storage}
         result = compare(*pair, "0", model, sequence=None, centre=False, **settings).report
         ways = ["AUC, one image", "as it drives", "whole drive"]
         assert (score_table(result)[0][1:4] == ways) == bool(ordered)
@@ -280,7 +279,7 @@ def test_a_filter_stands_beside_single_queries_in_order_and_changes_nothing_else
     assert all("sequences" not in size for size in ordered["storage"]["map"])
 
 
-def test_many_queries_in_order_are_filtered_if_that_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_queries_in_order_are_filtered_if_that_is_asked_for(monkeypatch):
     pair = [open_source(f"sim:aerial?frames=30&traverse={i}") for i in range(2)]
     found = []
     for most in (900, 899):
@@ -289,14 +288,14 @@ def test_many_queries_in_order_are_filtered_if_that_is_asked_for(monkeypatch: py
     assert found == [[True, True], [False, True]]
 
 
-def test_the_scores_of_single_queries_are_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_scores_of_single_queries_are_computed_once(monkeypatch):
     """Maps and stores are asked as many queries with a sequence as without."""
-    asked: list[int] = []
+    asked = []
 
-    def counting(function: Any, queries: int) -> Any:
-        def counted(*args: Any, **settings: Any) -> Tensor:
+    def counting(function, queries):
+        def counted(*args, **settings):
             asked.append(len(args[queries]))
-            scores: Tensor = function(*args, **settings)
+            scores = function(*args, **settings)
             return scores
 
         return counted
@@ -315,7 +314,7 @@ def test_the_scores_of_single_queries_are_computed_once(monkeypatch: pytest.Monk
     assert totals[0] > 64 * 10
 
 
-def test_seqslam_s_pixels_stand_beside_a_sequence_of_frames() -> None:
+def test_seqslam_s_pixels_stand_beside_a_sequence_of_frames():
     """In frames of noise that repeat after 8, its sequences find what single frames do not."""
     model = template_model(nn.Flatten(), SpectrogramAnalysis(window=64, min_period=4, strongest=1))
     found = compare(pictures(1), pictures(2), "0", model, tolerance=3, sequence=SequenceMatcher(5)).report
@@ -331,12 +330,12 @@ def test_seqslam_s_pixels_stand_beside_a_sequence_of_frames() -> None:
 
 
 class Terminal(io.StringIO):
-    def isatty(self) -> bool:
+    def isatty(self):
         return True
 
 
 @pytest.mark.parametrize("terminal", [True, False])
-def test_each_long_step_has_a_bar_on_a_terminal(terminal: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_long_step_has_a_bar_on_a_terminal(terminal, monkeypatch):
     stream = Terminal() if terminal else io.StringIO()
     monkeypatch.setattr(sys, "stderr", stream)
     pair = [open_source(f"sim:aerial?frames=80&traverse={one}") for one in (0, 1)]
@@ -346,7 +345,7 @@ def test_each_long_step_has_a_bar_on_a_terminal(terminal: bool, monkeypatch: pyt
     assert [step for step in steps if step in stream.getvalue()] == ([*steps] if terminal else [])
 
 
-def test_routes_off_the_map_are_prepared_as_queries_are(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_routes_off_the_map_are_prepared_as_queries_are(monkeypatch):
     """Ready features are accepted for ready features, and frames are resampled at the map's step."""
     monkeypatch.setattr("dejavu_torch.evaluation.compare.draw_pictures", lambda *_: {})
     features = [ArrayTraverse(smooth(seed), str(seed)) for seed in (0, 0, 3)]
@@ -367,12 +366,7 @@ def test_routes_off_the_map_are_prepared_as_queries_are(monkeypatch: pytest.Monk
         ((20, 8), (5, 1, 32, 32), ("frames", "expected ready features", "route")),
     ],
 )
-def test_routes_of_another_kind_are_refused_before_learning(
-    reference: tuple[int, ...],
-    other: tuple[int, ...],
-    facts: tuple[str, ...],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_routes_of_another_kind_are_refused_before_learning(reference, other, facts, monkeypatch):
     monkeypatch.setattr(Descriptor, "learn", None)
     pair = ArrayTraverse(torch.rand(reference), "route"), ArrayTraverse(torch.rand(reference), "again")
     with refused("route", "elsewhere", *facts):

@@ -4,27 +4,23 @@ from __future__ import annotations
 
 import math
 from fractions import Fraction
-from typing import Any
 
 import pytest
 import torch
 from helpers import Fixed, refused, template_model
-from torch import Tensor
 
 from dejavu_torch import DejaVu, SequenceMatcher, SpectralMapper
 from dejavu_torch.evaluation.controls import leave_out_match, null_control
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
-from dejavu_torch.types import FrequencyLayer, Match, Plan, Training
+from dejavu_torch.types import FrequencyLayer, Training
 
 
-def layer(
-    period: Fraction | int, start: int, stop: int, *features: int, phases: int | None = None
-) -> FrequencyLayer:
+def layer(period, start, stop, *features, phases=None):
     return FrequencyLayer(Fraction(period), phases or int(period), start, stop, features)
 
 
-def route(frames: int, dimension: int = 80, noise: float = 0.2, seed: int = 0) -> Tensor:
+def route(frames, dimension=80, noise=0.2, seed=0):
     """Waves of 16 and of 27 frames, each feature with its own phase; each traverse has its own noise."""
     fixed, fresh = torch.Generator().manual_seed(99), torch.Generator().manual_seed(seed)
     period = torch.tensor([16.0, 27.0]).repeat(dimension // 2)
@@ -32,14 +28,14 @@ def route(frames: int, dimension: int = 80, noise: float = 0.2, seed: int = 0) -
     return torch.cos(2 * torch.pi * turn) + noise * torch.randn(frames, dimension, generator=fresh)
 
 
-def recall(match: Match, tolerance: int = 0) -> float:
+def recall(match, tolerance=0):
     return evaluate(match, torch.arange(len(match.index))[:, None], tolerance).recall_at_1
 
 
 # the null control
 
 
-def test_convention_8_the_null_of_a_repeating_route_finds_no_layers() -> None:
+def test_convention_8_the_null_of_a_repeating_route_finds_no_layers():
     """White noise plus a strong periodic part: in shuffled order it is white noise."""
     reference, query = route(432), route(432, seed=1)
     model = template_model(periods=SpectrogramAnalysis(window=432, strongest=1, false_alarm=1e-6)).learn(
@@ -52,7 +48,7 @@ def test_convention_8_the_null_of_a_repeating_route_finds_no_layers() -> None:
     assert evaluate(null, torch.arange(432)[:, None], 5) == (0.0,) * 7
 
 
-def test_convention_8_the_null_of_the_paper_is_at_chance() -> None:
+def test_convention_8_the_null_of_the_paper_is_at_chance():
     reference, query = route(432), route(432, seed=1)
     paper = SpectrogramAnalysis(window=432, peaks="bins", false_alarm=None)
     model = template_model(periods=paper, reduction="sum").learn(reference)
@@ -63,7 +59,7 @@ def test_convention_8_the_null_of_the_paper_is_at_chance() -> None:
     assert recall(null) < 0.05
 
 
-def test_convention_8_a_match_of_the_null_names_the_frame_that_is_stored() -> None:
+def test_convention_8_a_match_of_the_null_names_the_frame_that_is_stored():
     """One template for each frame: every frame is found, wherever the shuffling has put it."""
     reference = torch.rand(50, 6)
     model = template_model(periods=Fixed(layer(50, 0, 50, 0, 1, 2, 3, 4, 5))).learn(reference)
@@ -73,7 +69,7 @@ def test_convention_8_a_match_of_the_null_names_the_frame_that_is_stored() -> No
 
 
 @pytest.mark.parametrize("kind", ["templates", "spectral"])
-def test_a_sequence_of_the_null_runs_along_the_route(kind: str) -> None:
+def test_a_sequence_of_the_null_runs_along_the_route(kind):
     """Its map is of shuffled frames, and its scores are added up along the frames as they were."""
     reference = torch.rand(60, 5)
     query = reference + 0.3 * torch.rand(60, 5)
@@ -87,7 +83,7 @@ def test_a_sequence_of_the_null_runs_along_the_route(kind: str) -> None:
     assert recall(many) > 0.95
 
 
-def test_the_null_shuffles_by_its_seed_and_leaves_the_model_alone() -> None:
+def test_the_null_shuffles_by_its_seed_and_leaves_the_model_alone():
     reference, query = torch.rand(64, 3), torch.rand(64, 3)
     model = template_model(periods=Fixed(layer(8, 0, 64, 0, 1, 2)), threshold=0.2).learn(reference)
     before = model(query)
@@ -99,7 +95,7 @@ def test_the_null_shuffles_by_its_seed_and_leaves_the_model_alone() -> None:
     assert torch.equal(first.accepted, first.score < 0.2)
 
 
-def test_the_null_of_the_same_plan_fails_where_the_score_comes_from_periods() -> None:
+def test_the_null_of_the_same_plan_fails_where_the_score_comes_from_periods():
     reference, query = route(432, seed=1), route(432, seed=2)
     model = template_model(periods=Fixed(layer(16, 0, 432, *range(40)), layer(27, 0, 432, *range(40, 80))))
     model.learn_features(reference)
@@ -110,7 +106,7 @@ def test_the_null_of_the_same_plan_fails_where_the_score_comes_from_periods() ->
     assert null <= 0.3 * ours
 
 
-def test_the_null_of_the_same_plan_keeps_the_weights_of_the_features() -> None:
+def test_the_null_of_the_same_plan_keeps_the_weights_of_the_features():
     """A template a frame: every frame is found at 0 only where both sides are weighted."""
     reference = torch.rand(30, 4)
     model = template_model(periods=Fixed(layer(30, 0, 30, 0, 1, 2, 3))).learn_features(reference)
@@ -134,9 +130,7 @@ DISTANCES = {
 WEIGHTS = {"l1": lambda f: f, "l2": math.sqrt, "cosine": lambda f: 1}
 
 
-def literal_leave_out(
-    features: Tensor, plan: Plan, width: int, metric: str, reduction: str
-) -> tuple[list[int], list[float]]:
+def literal_leave_out(features, plan, width, metric, reduction):
     """Learn anew for each query without the frames near it, then look the query up; loops only."""
     index, best = [], []
     for q in range(len(features)):
@@ -186,9 +180,7 @@ PLANS = {
         (PLANS["once"], 0, "l2", "mean"),
     ],
 )
-def test_convention_8_leave_out_equals_learning_without_those_frames(
-    plan: Plan, width: int, metric: str, reduction: Any
-) -> None:
+def test_convention_8_leave_out_equals_learning_without_those_frames(plan, width, metric, reduction):
     features = torch.rand(24, 3, generator=torch.Generator().manual_seed(width), dtype=torch.float64)
     model = template_model(periods=Fixed(*plan), metric=metric, reduction=reduction).learn(features)
     found = leave_out_match(model, features, width)
@@ -197,7 +189,7 @@ def test_convention_8_leave_out_equals_learning_without_those_frames(
     assert found.index.tolist() == index
 
 
-def test_a_phase_left_without_frames_is_no_place() -> None:
+def test_a_phase_left_without_frames_is_no_place():
     """One frame to a phase: without itself the query finds the places of other frames only."""
     features = torch.arange(6.0)[:, None]
     model = template_model(periods=Fixed(layer(6, 0, 6, 0))).learn(features)
@@ -209,7 +201,7 @@ def test_a_phase_left_without_frames_is_no_place() -> None:
     assert not everything.accepted.any()
 
 
-def test_convention_8_the_self_match_trap() -> None:
+def test_convention_8_the_self_match_trap():
     """Pure noise, folded, recognises itself; not so when each query is taken out of the means."""
     noise, fresh = torch.randn(2, 256, 400, generator=torch.Generator().manual_seed(0))
     chosen = range(400)
@@ -220,7 +212,7 @@ def test_convention_8_the_self_match_trap() -> None:
     assert recall(null_control(model, noise, fresh)) < 0.03
 
 
-def test_convention_8_on_sliding_footage_the_neighbours_carry_the_answer() -> None:
+def test_convention_8_on_sliding_footage_the_neighbours_carry_the_answer():
     """Each frame equals its neighbours but for little: width 0 cures nothing, a wider one does."""
     steps = torch.randn(256, 300, generator=torch.Generator().manual_seed(0))
     kernel = torch.hann_window(9, periodic=False)
@@ -230,7 +222,7 @@ def test_convention_8_on_sliding_footage_the_neighbours_carry_the_answer() -> No
     assert recall(leave_out_match(model, sliding, 10), tolerance=5) < 0.2
 
 
-def test_the_threshold_and_an_empty_map() -> None:
+def test_the_threshold_and_an_empty_map():
     features = torch.rand(40, 3)
     model = template_model(periods=Fixed(layer(4, 0, 40, 0, 1, 2)), threshold=0.25).learn(features)
     match = leave_out_match(model, features)
@@ -240,7 +232,7 @@ def test_the_threshold_and_an_empty_map() -> None:
     assert null_control(empty, features, features).index.tolist() == [-1] * 40
 
 
-def test_leave_out_scores_as_the_model_does() -> None:
+def test_leave_out_scores_as_the_model_does():
     """With its temperature, and with the weights of the features."""
     features = torch.rand(40, 3, dtype=torch.float64)
     model = template_model(periods=Fixed(layer(4, 0, 40, 0, 1, 2), layer(5, 0, 30, 0, 1))).learn(features)
@@ -259,7 +251,7 @@ def test_leave_out_scores_as_the_model_does() -> None:
     torch.testing.assert_close(found.score, expected.score, rtol=0, atol=1e-9)
 
 
-def test_what_leaving_out_does_not_fit_is_refused() -> None:
+def test_what_leaving_out_does_not_fit_is_refused():
     features = torch.rand(40, 3)
     model = template_model(periods=Fixed(layer(4, 0, 40, 0, 1, 2))).learn(features)
     for given, width in ((features[:39], 0), (features, -1)):

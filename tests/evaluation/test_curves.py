@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from itertools import pairwise
 from typing import Literal
 
@@ -16,7 +15,6 @@ from torch import Tensor
 
 from dejavu_torch.data.ground_truth import GroundTruth
 from dejavu_torch.evaluation.curves import (
-    PRCurve,
     Scores,
     area,
     count_queries,
@@ -42,7 +40,7 @@ PLACED = st.lists(
 )
 
 
-def columns(queries: list[tuple[float, bool, bool]]) -> tuple[Tensor, Tensor, Tensor]:
+def columns(queries):
     score, right, answerable = zip(*queries, strict=True) if queries else ((), (), ())
     return (
         torch.tensor(score, dtype=torch.float64),
@@ -51,9 +49,7 @@ def columns(queries: list[tuple[float, bool, bool]]) -> tuple[Tensor, Tensor, Te
     )
 
 
-def literal_curve(
-    queries: list[tuple[float, bool, bool]], recall: Recall
-) -> list[tuple[float, float, float]]:
+def literal_curve(queries, recall):
     """(precision, recall, threshold), one query and one threshold at a time."""
     points = []
     for threshold in sorted({score for score, _, _ in queries if score < INF}):
@@ -66,21 +62,21 @@ def literal_curve(
     return points
 
 
-def literal_area(points: list[tuple[float, float, float]]) -> float:
+def literal_area(points):
     return sum((b[1] - a[1]) * (a[0] + b[0]) / 2 for a, b in pairwise(points))
 
 
-def flat(points: list[tuple[float, float, float]]) -> list[float]:
+def flat(points):
     return [number for point in points for number in point]
 
 
-def points_of(curve: PRCurve) -> list[tuple[float, float, float]]:
+def points_of(curve):
     return list(zip(*(column.tolist() for column in curve), strict=True))
 
 
 @BOTH
 @given(queries=QUERIES)
-def test_every_distinct_score_is_a_threshold(queries: list[tuple[float, bool, bool]], recall: Recall) -> None:
+def test_every_distinct_score_is_a_threshold(queries, recall):
     curve, expected = pr_curve(*columns(queries), recall), literal_curve(queries, recall)
     assert flat(points_of(curve)) == pytest.approx(flat(expected))
     assert area(curve) == pytest.approx(literal_area(expected))
@@ -89,9 +85,7 @@ def test_every_distinct_score_is_a_threshold(queries: list[tuple[float, bool, bo
 
 @BOTH
 @given(queries=QUERIES, order=st.randoms())
-def test_the_order_of_queries_changes_nothing(
-    queries: list[tuple[float, bool, bool]], order: object, recall: Recall
-) -> None:
+def test_the_order_of_queries_changes_nothing(queries, order, recall):
     mixed = list(queries)
     order.shuffle(mixed)  # type: ignore[attr-defined]
     assert points_of(pr_curve(*columns(mixed), recall)) == points_of(pr_curve(*columns(queries), recall))
@@ -99,7 +93,7 @@ def test_the_order_of_queries_changes_nothing(
 
 @BOTH
 @given(queries=QUERIES)
-def test_only_the_order_of_scores_counts(queries: list[tuple[float, bool, bool]], recall: Recall) -> None:
+def test_only_the_order_of_scores_counts(queries, recall):
     score, right, answerable = columns(queries)
     before, after = (pr_curve(s, right, answerable, recall) for s in (score, score.exp()))
     assert torch.equal(before.precision, after.precision)
@@ -107,14 +101,14 @@ def test_only_the_order_of_scores_counts(queries: list[tuple[float, bool, bool]]
 
 
 @given(queries=QUERIES)
-def test_the_reported_recall_is_never_the_smaller(queries: list[tuple[float, bool, bool]]) -> None:
+def test_the_reported_recall_is_never_the_smaller(queries):
     every, reported = (pr_curve(*columns(queries), recall) for recall in ("all", "reported"))
     assert (reported.recall >= every.recall).all()
     assert (every.recall.diff() >= 0).all()
     assert (reported.recall.diff() >= 0).all()
 
 
-def test_queries_with_equal_scores_report_together() -> None:
+def test_queries_with_equal_scores_report_together():
     curve = pr_curve(torch.ones(4), torch.tensor([True, False, True, True]), torch.ones(4, dtype=torch.bool))
     assert points_of(curve) == [(0.75, 0.75, 1.0)]
 
@@ -122,7 +116,7 @@ def test_queries_with_equal_scores_report_together() -> None:
 # matches and truth
 
 
-def literal_average_precision(points: list[tuple[float, float, float]]) -> float:
+def literal_average_precision(points):
     """Precision times the gain of recall at each point, relative to all the recall that is reached."""
     total, before = 0.0, 0.0
     for precision, recall, _ in points:
@@ -130,14 +124,14 @@ def literal_average_precision(points: list[tuple[float, float, float]]) -> float
     return total / before if before else 0.0
 
 
-def match_of(index: list[int], score: list[float] | None = None) -> Match:
+def match_of(index, score=None):
     scores = torch.arange(len(index)).float() if score is None else torch.tensor(score)
     places = torch.where(scores.isfinite(), torch.tensor(index), -1)
     return Match(places, scores, scores.isfinite())
 
 
 @given(PLACED, st.integers(0, 3))
-def test_judge_equals_literal_loops(rows: list[tuple[float, int, list[int]]], tolerance: int) -> None:
+def test_judge_equals_literal_loops(rows, tolerance):
     match = match_of([index for _, index, _ in rows], [score for score, _, _ in rows])
     queries = []
     for score, index, truth in rows:
@@ -159,7 +153,7 @@ def test_judge_equals_literal_loops(rows: list[tuple[float, int, list[int]]], to
     )
 
 
-def test_convention_5_tolerance_is_inclusive_in_every_score() -> None:
+def test_convention_5_tolerance_is_inclusive_in_every_score():
     match, truth = match_of([5, 6]), torch.zeros(2, 1, dtype=torch.int64)
     assert evaluate(match, truth, 4).recall_at_1 == 0.0
     assert evaluate(match, truth, 5).recall_at_1 == 0.5
@@ -167,7 +161,7 @@ def test_convention_5_tolerance_is_inclusive_in_every_score() -> None:
     assert curve_of(match, truth, 5).precision.tolist() == [1.0, 0.5]
 
 
-def test_convention_6_recall_is_of_all_answerable_queries_and_reported_forgives_wrong_reports() -> None:
+def test_convention_6_recall_is_of_all_answerable_queries_and_reported_forgives_wrong_reports():
     """Two right reports, one wrong one, one silent query, one query without an answer."""
     match = match_of([0, 1, 9, 0, 4], [1.0, 2.0, 3.0, INF, 4.0])
     truth = torch.tensor([[0], [1], [2], [3], [-1]])
@@ -179,7 +173,7 @@ def test_convention_6_recall_is_of_all_answerable_queries_and_reported_forgives_
     assert scores.precision_at_100_recall == 2 / 4
 
 
-def test_convention_6_the_paper_s_figures_fit_the_reported_recall() -> None:
+def test_convention_6_the_paper_s_figures_fit_the_reported_recall():
     """Every query reports, 95 of 100 rightly: 95 % precision at 100 % recall."""
     match, truth = match_of([0] * 95 + [9] * 5), torch.zeros(100, 1, dtype=torch.int64)
     assert curve_of(match, truth, 5, "reported").recall[-1] == 1.0
@@ -187,7 +181,7 @@ def test_convention_6_the_paper_s_figures_fit_the_reported_recall() -> None:
     assert evaluate(match, truth, 5).precision_at_100_recall == pytest.approx(0.95)
 
 
-def test_convention_7_curves_are_plain_tensors_without_torchmetrics() -> None:
+def test_convention_7_curves_are_plain_tensors_without_torchmetrics():
     for column in curve_of(match_of([0, 1, 2]), torch.arange(3)[:, None], 0):
         assert type(column) is Tensor
         assert (column.dtype, column.ndim) == (torch.float64, 1)
@@ -195,7 +189,7 @@ def test_convention_7_curves_are_plain_tensors_without_torchmetrics() -> None:
     assert python(code).returncode == 0
 
 
-def test_convention_7_thresholds_are_the_scores_themselves() -> None:
+def test_convention_7_thresholds_are_the_scores_themselves():
     """No sigmoid: distances that differ by little at a large value stay apart."""
     score = torch.tensor([1000.0, 1000.001, 1000.002], dtype=torch.float64)
     curve = pr_curve(score, torch.tensor([True, False, True]), torch.ones(3, dtype=torch.bool))
@@ -215,9 +209,7 @@ ASKED = st.lists(
 
 
 @given(ASKED, st.integers(0, 2))
-def test_queries_that_are_not_counted_are_as_if_never_asked(
-    rows: list[tuple[float, int, list[int], bool, list[int]]], tolerance: int
-) -> None:
+def test_queries_that_are_not_counted_are_as_if_never_asked(rows, tolerance):
     soft = [(row[4] * 12)[:3] for row in rows]
     match = match_of([row[1] for row in rows], [row[0] for row in rows])
     truth = GroundTruth(
@@ -246,14 +238,14 @@ def test_queries_that_are_not_counted_are_as_if_never_asked(
         assert counts[name] == rest_counts[name]
 
 
-def test_a_soft_place_within_the_tolerance_of_a_right_one_is_right() -> None:
+def test_a_soft_place_within_the_tolerance_of_a_right_one_is_right():
     truth = GroundTruth(torch.tensor([[10]]), torch.tensor([True]), torch.tensor([[12]]))
     assert evaluate(match_of([12]), truth, 2).recall_at_1 == 1.0
     with refused("none can be judged"):
         evaluate(match_of([12]), truth, 1)
 
 
-def test_the_threshold_of_full_precision_accepts_what_is_right_and_no_more() -> None:
+def test_the_threshold_of_full_precision_accepts_what_is_right_and_no_more():
     score, every = torch.tensor([3.0, 1.0, 2.0, 4.0]), torch.ones(4, dtype=torch.bool)
     for right, count in (([1, 1, 1, 1], 4), ([0, 1, 1, 1], 2), ([0, 1, 0, 0], 1)):
         curve = pr_curve(score, torch.tensor(right, dtype=torch.bool), every)
@@ -280,7 +272,7 @@ THREE, TWO = torch.zeros(3), torch.zeros(2, 1, dtype=torch.int64)
         ),
     ],
 )
-def test_what_does_not_fit_is_refused(call: Callable[[], object], facts: list[str]) -> None:
+def test_what_does_not_fit_is_refused(call, facts):
     with refused(*facts):
         call()
 
@@ -288,7 +280,7 @@ def test_what_does_not_fit_is_refused(call: Callable[[], object], facts: list[st
 # candidates
 
 
-def test_a_right_place_among_the_first_candidates() -> None:
+def test_a_right_place_among_the_first_candidates():
     """By hand: right at rank 1, 2, 3, never; no answer; not known."""
     candidates = torch.tensor(
         [[10, 50, 90], [50, 12, 90], [50, 90, 8], [50, 90, -1], [10, 20, 30], [1, 2, 3]]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from contextlib import redirect_stdout
-from pathlib import Path
 
 import pytest
 from PIL import Image
@@ -20,7 +19,7 @@ OF_TEMPLATES = {"chunks", "spectrogram", "templates", "features", "activations"}
 
 
 @pytest.fixture(scope="module")
-def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def demo(tmp_path_factory):
     out = tmp_path_factory.mktemp("demo")
     paper = paper_model()
     paper.mapper.periods.window = FRAMES  # type: ignore[union-attr]
@@ -32,14 +31,14 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_pictures_show_something(demo: Path) -> None:
+def test_pictures_show_something(demo):
     for name in PICTURES:
         with Image.open(demo / f"{name}.png") as image:
             assert min(image.size) > 300
             assert len(image.convert("RGB").resize((100, 100)).getcolors(10_000)) > 20
 
 
-def test_page_is_self_contained(demo: Path) -> None:
+def test_page_is_self_contained(demo):
     page = (demo / "index.html").read_text()
     assert not OF_TEMPLATES & {path.stem for path in demo.glob("*.png")}
     assert page.count("data:image/png;base64,") == len(PICTURES)

@@ -14,7 +14,7 @@ from helpers import Fixed, refused, template_model
 from dejavu_torch import FrequencyLayer
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.evaluation.curves import RECALL_DEFINITION, evaluate
-from dejavu_torch.evaluation.evaluate import Evaluation, evaluate_file
+from dejavu_torch.evaluation.evaluate import evaluate_file
 from dejavu_torch.evaluation.matches import write_matches
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.types import Match
@@ -24,17 +24,17 @@ HEADER = "query,place,score,accepted\n"
 MATCHES = HEADER + "0,0,0.1,1\n1,4,0.2,1\n2,50,0.3,0\n3,-1,inf,0\n4,30,0.4,1\n"
 
 
-def written(folder: Path, text: str, name: str = "matches.csv") -> Path:
+def written(folder, text, name="matches.csv"):
     (folder / name).write_text(text)
     return folder / name
 
 
-def scores_of(result: Evaluation) -> dict[str, float]:
+def scores_of(result):
     assert result.report.ours.scores is not None
     return result.report.ours.scores._asdict()
 
 
-def found(path: Path) -> Match:
+def found(path):
     """What a small map makes of noisy queries, some of which nothing covers."""
     features = torch.rand(96, 8)
     model = template_model(periods=Fixed(FrequencyLayer(24, 24, 0, 60, (0, 1, 2, 3))))
@@ -49,7 +49,7 @@ def found(path: Path) -> Match:
     return match
 
 
-def test_the_file_gives_the_scores_of_the_matches_in_memory(tmp_path: Path) -> None:
+def test_the_file_gives_the_scores_of_the_matches_in_memory(tmp_path):
     match = found(tmp_path / "m.csv")
     right = torch.arange(96)[:, None]
     result = evaluate_file(tmp_path / "m.csv", "0", tolerance=3)
@@ -65,7 +65,7 @@ def test_the_file_gives_the_scores_of_the_matches_in_memory(tmp_path: Path) -> N
         )
 
 
-def test_facts_by_hand(tmp_path: Path) -> None:
+def test_facts_by_hand(tmp_path):
     path = written(tmp_path, MATCHES)
     facts = evaluate_file(path, "0", tolerance=3).report.facts
     expected = {"queries": 5, "judged": 5, "unknown": 0, "ignored": 0, "with_answer": 5, "accepted": 3}
@@ -79,7 +79,7 @@ def test_facts_by_hand(tmp_path: Path) -> None:
     assert evaluate_file(path, "0", tolerance=0).report.facts["accepted_right"] == 1
 
 
-def test_queries_the_truth_does_not_know_are_left_out(tmp_path: Path) -> None:
+def test_queries_the_truth_does_not_know_are_left_out(tmp_path):
     path, truth = written(tmp_path, MATCHES), written(tmp_path, "1,4\n2,2\n9,9\n", "truth.csv")
     result = evaluate_file(path, str(truth), tolerance=0)
     facts = result.report.facts
@@ -90,7 +90,7 @@ def test_queries_the_truth_does_not_know_are_left_out(tmp_path: Path) -> None:
     assert [between[k] for k in ("judged", "unknown")] == [4, 1]
 
 
-def test_soft_places_count_neither_way(tmp_path: Path) -> None:
+def test_soft_places_count_neither_way(tmp_path):
     path = written(tmp_path, MATCHES)
     hard = np.eye(60, 5, dtype=bool)
     soft = hard.copy()
@@ -102,7 +102,7 @@ def test_soft_places_count_neither_way(tmp_path: Path) -> None:
     assert evaluate_file(path, str(tmp_path / "gt.npz"), tolerance=3).report.facts["ignored"] == 1
 
 
-def test_numbered_queries_in_any_order(tmp_path: Path) -> None:
+def test_numbered_queries_in_any_order(tmp_path):
     path = written(tmp_path, HEADER + "40,41,0.5,1\n10,11,0.1,1\n20,7,0.9,1\n")
     result = evaluate_file(path, "1", tolerance=0)
     assert result.queries.tolist() == [40, 10, 20]
@@ -111,7 +111,7 @@ def test_numbered_queries_in_any_order(tmp_path: Path) -> None:
     assert scores_of(result)["recall_at_100_precision"] == pytest.approx(2 / 3)
 
 
-def test_truth_that_lies_in_the_traverses(tmp_path: Path) -> None:
+def test_truth_that_lies_in_the_traverses(tmp_path):
     path = written(tmp_path, MATCHES)
     stored, seen = ArrayTraverse(torch.rand(60, 2)), ArrayTraverse(torch.rand(5, 2))
     with refused("no ground truth"):
@@ -120,7 +120,7 @@ def test_truth_that_lies_in_the_traverses(tmp_path: Path) -> None:
     assert evaluate_file(path, None, 0, reference=stored, query=seen).report.facts["accepted_right"] == 3
 
 
-def test_recall_values_by_hand(tmp_path: Path) -> None:
+def test_recall_values_by_hand(tmp_path):
     rows = [
         (0, (5, 0, 9)),
         (1, (1, 8, 7)),
@@ -145,7 +145,7 @@ def test_recall_values_by_hand(tmp_path: Path) -> None:
             evaluate_file(path, "0", recall_values=[1, first])
 
 
-def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
+def test_what_does_not_fit_is_refused(tmp_path):
     path = written(tmp_path, MATCHES)
     with refused("tolerance is -1"):
         evaluate_file(path, "0", tolerance=-1)
@@ -178,7 +178,7 @@ class Resampled(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def resampled(tmp_path_factory: pytest.TempPathFactory) -> Resampled:
+def resampled(tmp_path_factory):
     folder = tmp_path_factory.mktemp("resampled")
     model = template_model(periods=everything(101), velocity=camera()).learn(footage(REFERENCE))
     model.save(folder / "m.safetensors")
@@ -191,7 +191,7 @@ def resampled(tmp_path_factory: pytest.TempPathFactory) -> Resampled:
     return Resampled(folder / "m.safetensors", folder / "matches.csv", query, match)
 
 
-def test_convention_11_the_map_turns_frames_into_places(resampled: Resampled) -> None:
+def test_convention_11_the_map_turns_frames_into_places(resampled):
     truth = str(resampled.map.parent / "truth.csv")
     by_places = evaluate_file(resampled.matches, truth, tolerance=1, map=resampled.map)
     facts = by_places.report.facts
@@ -205,7 +205,7 @@ def test_convention_11_the_map_turns_frames_into_places(resampled: Resampled) ->
         evaluate_file(resampled.matches, truth, tolerance=1)
 
 
-def test_convention_11_all_frames_of_one_place_are_right(resampled: Resampled, tmp_path: Path) -> None:
+def test_convention_11_all_frames_of_one_place_are_right(resampled, tmp_path):
     """It stands from frame 60 to 85: in places any of these is right, in frames only those near by."""
     path = written(tmp_path, HEADER + "0,85,0.1,1\n")
     truth = str(written(tmp_path, "0,60\n", "truth.csv"))
@@ -213,13 +213,13 @@ def test_convention_11_all_frames_of_one_place_are_right(resampled: Resampled, t
     assert scores_of(evaluate_file(path, truth, 24))["recall_at_1"] == 0
 
 
-def test_frames_that_the_reference_does_not_have_are_refused(resampled: Resampled, tmp_path: Path) -> None:
+def test_frames_that_the_reference_does_not_have_are_refused(resampled, tmp_path):
     truth = written(tmp_path, "query,place\n0,99999\n", "truth.csv")
     with refused("place 99999", f"0 to {len(REFERENCE) - 1}"):
         evaluate_file(resampled.matches, str(truth), map=resampled.map)
 
 
-def test_similarities_are_noticed_and_read(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_similarities_are_noticed_and_read(tmp_path, caplog):
     rows = [(q, q if q % 3 else q + 40, 0.9 - 0.001 * q if q % 3 else 0.3) for q in range(60)]
     path = written(tmp_path, "query,place,score\n" + "".join(f"{q},{p},{s}\n" for q, p, s in rows))
     wrong = evaluate_file(path, "0", 2)

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 import torch
 from drawn import matched, run_of, texts
-from torch import Tensor
 
 from dejavu_torch import PlaceFilter
 from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth
@@ -20,7 +18,7 @@ from dejavu_torch.evaluation.match_plots import (
 from dejavu_torch.types import Match
 
 
-def dots(axis: object) -> dict[str, list[tuple[float, float]]]:
+def dots(axis):
     """The points of each group of a coverage plot by its label."""
     return {
         line.get_label(): list(zip(*(map(float, part) for part in line.get_data()), strict=True))
@@ -28,18 +26,18 @@ def dots(axis: object) -> dict[str, list[tuple[float, float]]]:
     }
 
 
-def scaled(scores: Tensor) -> Tensor:
+def scaled(scores):
     """0 at a query's best score, 1 at its median and above."""
     least, median = scores.amin(1, keepdim=True), scores.median(1, keepdim=True).values
     return ((scores - least) / (median - least)).clamp(max=1)
 
 
-def image(axis: object) -> Tensor:
+def image(axis):
     """What an axis shows, a row a query."""
     return torch.as_tensor(axis.images[0].get_array().filled(torch.nan)).T  # type: ignore[attr-defined]
 
 
-def test_without_a_truth_coverage_shows_the_probabilities() -> None:
+def test_without_a_truth_coverage_shows_the_probabilities():
     sure = torch.tensor([0.9, 0.2, 0.0, 0.6], dtype=torch.float64)
     match = Match(*matched(4, 9, -1, 2), sure)
     figure, axis = draw_coverage(match, None, 1, torch.arange(11), torch.arange(4), "frames")["coverage"].plot
@@ -51,7 +49,7 @@ def test_without_a_truth_coverage_shows_the_probabilities() -> None:
     assert "probability of being right" in texts(figure)
 
 
-def test_coverage_leaves_grey_what_is_not_scored() -> None:
+def test_coverage_leaves_grey_what_is_not_scored():
     right, known = torch.arange(5)[:, None], torch.tensor([True, False, True, False, True])
     truth = GroundTruth(right, known, torch.tensor([[-1], [-1], [7], [-1], [-1]]))
     queries = torch.tensor([10, 20, 30, 40, 50])
@@ -62,7 +60,7 @@ def test_coverage_leaves_grey_what_is_not_scored() -> None:
     assert {"3 not scored", "right within 0 frames"} <= set(texts(figure))
 
 
-def test_examples_are_the_surest_right_the_surest_wrong_and_one_at_the_border() -> None:
+def test_examples_are_the_surest_right_the_surest_wrong_and_one_at_the_border():
     score = torch.tensor([0.3, 0.2, 0.1, 0.25, 0.9, torch.inf])
     match = Match(torch.tensor([0, 9, 7, 3, 4, -1]), score, score < 10)
     truth = torch.arange(6)[:, None]
@@ -78,7 +76,7 @@ def test_examples_are_the_surest_right_the_surest_wrong_and_one_at_the_border() 
     assert example_queries(match, None, 0) == {2: "surest answer", 4: answers[4]}
 
 
-def test_rows_show_frames_side_by_side_under_their_titles() -> None:
+def test_rows_show_frames_side_by_side_under_their_titles():
     long, frames = "reported:\nframe 9 of_a_long_name_0009.png", torch.rand(3, 1, 16, 16)
     first = dict(zip(["query:\nframe 0", long, "right:\nframe 1"], frames, strict=True))
     second = {"query:\nframe 3": torch.rand(3, 8, 12), "reported": frames[0], "right:\nnone is known": None}
@@ -91,11 +89,11 @@ def test_rows_show_frames_side_by_side_under_their_titles() -> None:
     assert "".join(axes[0, 1].get_title(loc="left").split()) == "".join(long.split())  # wrapped
 
 
-def test_scores_are_scaled_and_the_best_of_each_block_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scores_are_scaled_and_the_best_of_each_block_is_shown(monkeypatch):
     monkeypatch.setattr("dejavu_torch.evaluation.match_plots.BLOCK_SCORES", 200)
     scores, asked = torch.rand(30, 50), []
 
-    def of(numbers: Tensor) -> Tensor:
+    def of(numbers):
         asked.append(len(numbers))
         return scores[numbers]
 
@@ -109,7 +107,7 @@ def test_scores_are_scaled_and_the_best_of_each_block_is_shown(monkeypatch: pyte
     assert picture.caption.endswith(told)
 
 
-def test_convention_11_places_and_queries_are_drawn_at_their_frames() -> None:
+def test_convention_11_places_and_queries_are_drawn_at_their_frames():
     """Of ten places, the camera stands at the fourth from frame 6 to 29; the query moves twice as fast."""
     borders = torch.tensor([0, 2, 4, 6, 30, 31, 32, 33, 34, 35, 40])
     queries, match = torch.tensor([0, 4, 8, 12]), matched(0, 3, -1, 9)
@@ -134,9 +132,7 @@ def test_convention_11_places_and_queries_are_drawn_at_their_frames() -> None:
     assert "right place" not in texts(draw_scores(run)["scores"].plot[0])
 
 
-def test_a_posterior_is_pooled_as_it_comes_and_shows_some_right_places(
-    monkeypatch: pytest.MonkeyPatch, largest_tensor: type
-) -> None:
+def test_a_posterior_is_pooled_as_it_comes_and_shows_some_right_places(monkeypatch, largest_tensor):
     monkeypatch.setattr("dejavu_torch.evaluation.match_plots.BLOCK_SCORES", 450)
     scores, model = torch.rand(130, 75), PlaceFilter()
     with torch.no_grad():

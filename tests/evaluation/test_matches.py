@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator
-from pathlib import Path
 from unicodedata import category
 
 import pytest
@@ -30,17 +28,17 @@ RANKED = "query,place,score,accepted,rank\n4,7,0.5,1,1\n4,20,0.6,0,2\n9,3,0.1,1,
 
 
 @pytest.fixture(scope="module")
-def scratch(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def scratch(tmp_path_factory):
     return tmp_path_factory.mktemp("matches")
 
 
-def written(folder: Path, text: str | bytes) -> Path:
+def written(folder, text):
     path = folder / "matches.csv"
     path.write_bytes(text.encode() if isinstance(text, str) else text)
     return path
 
 
-def told(path: Path) -> list[tuple[int, int, float, bool]]:
+def told(path):
     """The rows that were read, by query."""
     queries, match, _ = read_matches(path)
     assert [queries.dtype, match.index.dtype, match.score.dtype] == [torch.int64, torch.int64, torch.float64]
@@ -50,9 +48,7 @@ def told(path: Path) -> list[tuple[int, int, float, bool]]:
 
 
 @given(ROWS, st.none() | st.integers(1, 4), st.integers(1, 5))
-def test_what_is_written_in_parts_is_read(
-    scratch: Path, rows: list[tuple[int, float, bool]], ranks: int | None, size: int
-) -> None:
+def test_what_is_written_in_parts_is_read(scratch, rows, ranks, size):
     count, rows = len(rows), rows * (ranks or 1)
     index, score, accepted = (torch.tensor(column) for column in zip(*rows, strict=True))
     silent = index % 5 == 0
@@ -73,7 +69,7 @@ def test_what_is_written_in_parts_is_read(
     assert lines(path)[0] == f"query,place,score,accepted,{rank}query_name,place_name"
 
 
-def test_by_hand(tmp_path: Path) -> None:
+def test_by_hand(tmp_path):
     assert told(written(tmp_path, PLAIN)) == [(0, 7, 0.5, True), (1, -1, INF, False), (2, 3, -2.0, False)]
 
 
@@ -90,16 +86,16 @@ def test_by_hand(tmp_path: Path) -> None:
         'query,place,score,accepted,note\n0,7,0.5,1,"a, b"\n1,-1,Infinity,0,\n2,3,-2,0,x,,\n',
     ],
 )
-def test_other_ways_to_write_the_same(tmp_path: Path, text: str) -> None:
+def test_other_ways_to_write_the_same(tmp_path, text):
     assert told(written(tmp_path, text)) == told(written(tmp_path, PLAIN))
 
 
-def test_without_the_column_every_finite_score_is_accepted(tmp_path: Path) -> None:
+def test_without_the_column_every_finite_score_is_accepted(tmp_path):
     path = written(tmp_path, "query,place,score\n5,1,0.25\n3,2,inf\n4,-1,0.5\n")
     assert told(path) == [(3, -1, INF, False), (4, -1, INF, False), (5, 1, 0.25, True)]
 
 
-def test_convention_2_no_place_or_no_score_reports_nothing(tmp_path: Path) -> None:
+def test_convention_2_no_place_or_no_score_reports_nothing(tmp_path):
     path = written(tmp_path, "query,place,score,accepted\n0,-1,0.5,1\n1,4,inf,1\n")
     assert told(path) == [(0, -1, INF, False), (1, -1, INF, False)]
 
@@ -132,12 +128,12 @@ def test_convention_2_no_place_or_no_score_reports_nothing(tmp_path: Path) -> No
         (RANKED + "5,8,1,1,1\n", ("query 5 has 1 ranks", "expected 2, as query 4 has")),
     ],
 )
-def test_what_cannot_be_read_is_refused(tmp_path: Path, text: str | bytes, words: tuple[str, ...]) -> None:
+def test_what_cannot_be_read_is_refused(tmp_path, text, words):
     with refused("matches.csv", *words):
         read_matches(written(tmp_path, text))
 
 
-def test_what_reports_nothing_needs_no_probability(tmp_path: Path) -> None:
+def test_what_reports_nothing_needs_no_probability(tmp_path):
     text = "query,place,score,probability\n0,-1,inf,\n1,4,0.5,0.75\n"
     assert read_matches(written(tmp_path, text)).match.probability.tolist() == [0, 0.75]
 
@@ -145,7 +141,7 @@ def test_what_reports_nothing_needs_no_probability(tmp_path: Path) -> None:
 # ranks
 
 
-def test_of_ranked_rows_the_first_is_the_match(tmp_path: Path) -> None:
+def test_of_ranked_rows_the_first_is_the_match(tmp_path):
     path = written(tmp_path, RANKED)
     assert told(path) == [(4, 7, 0.5, True), (9, 3, 0.1, True)]
     assert read_matches(path).candidates.tolist() == [[7, 20], [3, -1]]
@@ -163,20 +159,20 @@ class Named:
     def __init__(self, form: str) -> None:
         self.form = form
 
-    def __getitem__(self, frame: int) -> str:
+    def __getitem__(self, frame):
         return self.form.format(frame)
 
 
-def lines(path: Path) -> list[str]:
+def lines(path):
     text = path.read_bytes().decode()
     assert text.count("\n") == text.count("\r\n")
     return text.splitlines()
 
 
-def test_convention_11_the_file_counts_frames_of_the_sources(tmp_path: Path) -> None:
+def test_convention_11_the_file_counts_frames_of_the_sources(tmp_path):
     path, frames = tmp_path / "m.csv", torch.tensor([10, 14, 19])
 
-    def frame_of(places: torch.Tensor) -> torch.Tensor:
+    def frame_of(places):
         return torch.where(places >= 0, frames[places.clamp(min=0)], -1)
 
     parts = [MATCH[:2], MATCH[2:]]
@@ -193,7 +189,7 @@ def test_convention_11_the_file_counts_frames_of_the_sources(tmp_path: Path) -> 
 
 
 @given(st.lists(st.text(st.characters(blacklist_characters="\0"), max_size=9), min_size=3, max_size=3))
-def test_any_name_leaves_the_file_readable(scratch: Path, names: list[str]) -> None:
+def test_any_name_leaves_the_file_readable(scratch, names):
     path = scratch / "names.csv"
     write_matches(path, [MATCH], query_names=names, place_names=names)
     queries, match, _ = read_matches(path)
@@ -212,9 +208,7 @@ def test_any_name_leaves_the_file_readable(scratch: Path, names: list[str]) -> N
 
 
 @given(ROWS, st.none() | st.integers(1, 4))
-def test_pairs_are_the_names_of_the_rows_that_report_a_place(
-    scratch: Path, rows: list[tuple[int, float, bool]], ranks: int | None
-) -> None:
+def test_pairs_are_the_names_of_the_rows_that_report_a_place(scratch, rows, ranks):
     index, score, accepted = (torch.tensor(column) for column in zip(*rows * (ranks or 1), strict=True))
     index = torch.where(index % 5 == 0, -1, index)
     path, pairs, names = scratch / "m.csv", scratch / "pairs.txt", (Named("q/{}.jpg"), Named("r\n{}.jpg"))
@@ -230,8 +224,8 @@ def test_pairs_are_the_names_of_the_rows_that_report_a_place(
     ]
 
 
-def test_neither_matches_nor_pairs_are_half_written(tmp_path: Path) -> None:
-    def breaks_off() -> Iterator[Match]:
+def test_neither_matches_nor_pairs_are_half_written(tmp_path):
+    def breaks_off():
         yield MATCH
         raise InputError("a frame is damaged")
 
@@ -250,13 +244,13 @@ def test_neither_matches_nor_pairs_are_half_written(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "names", [[], [""], ["a.jpg", ""], ["a.jpg", "b c.jpg"], [" a"], ["a\tb"], ["a\u2003b"]]
 )
-def test_names_that_no_pair_can_hold_are_refused(names: list[str]) -> None:
+def test_names_that_no_pair_can_hold_are_refused(names):
     check_pair_names(["a.jpg", "b/é.jpg"], "the query")
     with refused("the query", repr(names[-1]) if names and names[-1] else "without a name", "--pairs"):
         check_pair_names(names, "the query")
 
 
-def test_places_of_several_routes_are_told_by_route_and_frame(tmp_path: Path) -> None:
+def test_places_of_several_routes_are_told_by_route_and_frame(tmp_path):
     routes = (Route("out", 4, 8), Route("b,ack", 3, 5))
     score, route = torch.tensor([0.1, 0.2, 0.3, INF, 0.5]), torch.tensor([0, 0, 1, -1, 1])
     match = Match(torch.tensor([0, 3, 4, -1, 6]), score, torch.ones(5) > 0, route=route)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 import torch
 from drawn import texts
 from footage import QUERY, REFERENCE, STEP, camera, footage
 from helpers import Fixed, template_model
-from torch import Tensor, nn
+from torch import nn
 
 from dejavu_torch import HOG, DejaVu, Match, PlaceFilter, Preprocess, SpectrogramAnalysis
 from dejavu_torch.data.arrays import ArrayTraverse
@@ -19,11 +17,9 @@ from dejavu_torch.data.strip import SlidingWindow
 from dejavu_torch.evaluation.contenders import contend
 from dejavu_torch.evaluation.localization import Localization
 from dejavu_torch.evaluation.pictures import draw_pictures, paper_pictures
-from dejavu_torch.evaluation.plots import Picture
 from dejavu_torch.evaluation.report import PICTURES
 from dejavu_torch.evaluation.template_plots import as_hog_sees, best_explained, shown_chunk, slit_scan
 from dejavu_torch.recognition.localizer import Matching
-from dejavu_torch.recognition.sequence import SequenceModel
 from dejavu_torch.types import FrequencyLayer
 
 ALL = (
@@ -32,11 +28,11 @@ ALL = (
 )
 
 
-def layer(period: int, start: int, stop: int, *features: int) -> FrequencyLayer:
+def layer(period, start, stop, *features):
     return FrequencyLayer(period, period, start, stop, features)  # type: ignore[arg-type]
 
 
-def frames(seed: int, length: int = 120) -> Tensor:
+def frames(seed, length=120):
     """Stripes that pass with periods 12 and 20 in the upper and the lower half, and noise."""
     i = torch.arange(length, dtype=torch.float32)[:, None, None]
     rows, columns = torch.meshgrid(torch.arange(24), torch.arange(24), indexing="ij")
@@ -45,14 +41,14 @@ def frames(seed: int, length: int = 120) -> Tensor:
     return 0.9 * stripes[:, None] + 0.1 * noise
 
 
-def localized(model: DejaVu, reference: Tensor, query: Tensor, truth: GroundTruth | None) -> Localization:
+def localized(model, reference, query, truth):
     traverses = ArrayTraverse(reference), ArrayTraverse(query)
     stored, seen = (model.descriptor.all_of(traverse) for traverse in traverses)
     model.learn_features(stored)
     return Localization(model, *traverses, stored, seen, model.localize(seen), truth, 2)
 
 
-def drawn(run: Localization, laid_out: bool = True, **found: Match) -> dict[str, Picture]:
+def drawn(run, laid_out=True, **found):
     contenders = {"map": contend("this map", run.match, run.truth, 2)}
     contenders |= {key: contend(f"the {key}", match, run.truth, 2) for key, match in found.items()}
     pictures = draw_pictures(run, contenders)
@@ -65,20 +61,20 @@ def drawn(run: Localization, laid_out: bool = True, **found: Match) -> dict[str,
     return pictures
 
 
-def model_of(window: int = 60, features: nn.Module | None = None) -> DejaVu:
+def model_of(window=60, features=None):
     return template_model(features or HOG(), SpectrogramAnalysis(window=window, min_period=4))
 
 
-def same_places(length: int = 120) -> GroundTruth:
+def same_places(length=120):
     return as_ground_truth(offset_truth(length, length))
 
 
 @pytest.fixture(scope="module")
-def run() -> Localization:
+def run():
     return localized(model_of(), frames(0), frames(1), same_places())
 
 
-def test_every_picture_of_frames_that_repeat(run: Localization) -> None:
+def test_every_picture_of_frames_that_repeat(run):
     other = Match(torch.arange(120), torch.zeros(120), torch.ones(120, dtype=torch.bool))
     pictures = drawn(run, stride=other, leave_out=other)
     assert tuple(pictures) == ALL
@@ -111,7 +107,7 @@ OTHER = nn.Sequential(nn.AvgPool2d(2), nn.Flatten())
         ),
     ],
 )
-def test_pictures_that_there_is_nothing_for_are_left_out(left_out: str, given: dict[str, Any]) -> None:
+def test_pictures_that_there_is_nothing_for_are_left_out(left_out, given):
     model, of, truth = ({"model": model_of(), "of": nn.Identity(), "truth": same_places()} | given).values()
     run = localized(model, of(frames(0)), of(frames(1)), truth)
     pictures = drawn(run, laid_out=False)
@@ -122,7 +118,7 @@ def test_pictures_that_there_is_nothing_for_are_left_out(left_out: str, given: d
         assert "lsewhere" not in pictures["activations"].caption
 
 
-def test_the_pairs_are_the_frames_that_were_matched(run: Localization) -> None:
+def test_the_pairs_are_the_frames_that_were_matched(run):
     pairs = draw_pictures(run, {})["pairs"]
     numbers = [int(axis.get_title(loc="left").split()[-1]) for axis in pairs.plot[1].flat]
     sources = [frames(1), frames(0), frames(0)] * len(pairs.plot[1])
@@ -135,20 +131,20 @@ def test_the_pairs_are_the_frames_that_were_matched(run: Localization) -> None:
     assert "best match of those that are rejected" in draw_pictures(strict, {})["pairs"].caption
 
 
-def sequenced(run: Localization, model: SequenceModel) -> Localization:
+def sequenced(run, model):
     """The same, with the queries matched together."""
     match = run.model.localize(run.query_features, sequence=model)
     return run._replace(matching=Matching(model), match=match)
 
 
-def test_a_filter_shows_its_posterior(run: Localization) -> None:
+def test_a_filter_shows_its_posterior(run):
     pictures = draw_pictures(sequenced(run, PlaceFilter()), {})
     assert list(pictures)[2:4] == ["scores", "posterior"]
     assert "The scores are those of single queries" in pictures["scores"].caption
     assert "Circles" in pictures["posterior"].caption
 
 
-def test_the_paper_s_own_pictures(run: Localization) -> None:
+def test_the_paper_s_own_pictures(run):
     assert list(paper_pictures(run)) == ["frames", "autocorrelogram", "layers"]
     assert list(paper_pictures(run._replace(truth=None))) == ["autocorrelogram", "layers"]
     nothing = localized(template_model(periods=Fixed()), frames(0), frames(1), same_places())
@@ -157,7 +153,7 @@ def test_the_paper_s_own_pictures(run: Localization) -> None:
     assert list(paper_pictures(features)) == ["autocorrelogram", "layers"]
 
 
-def test_the_frame_under_the_features_is_what_hog_sees() -> None:
+def test_the_frame_under_the_features_is_what_hog_sees():
     hog = HOG(cell=4, resize=(17, 41))
     model, frame = DejaVu(hog, preprocess=Preprocess(channel="R-B", contrast="patch")), torch.rand(3, 50, 60)
     seen = as_hog_sees(model, frame)
@@ -165,7 +161,7 @@ def test_the_frame_under_the_features_is_what_hog_sees() -> None:
     assert torch.equal(HOG(cell=4)(seen[None]), model.descriptor.describe(frame[None]))
 
 
-def test_the_feature_that_is_shown_is_the_one_that_its_templates_explain() -> None:
+def test_the_feature_that_is_shown_is_the_one_that_its_templates_explain():
     wave = torch.sin(torch.arange(80) * 2 * torch.pi / 8)
     noise = torch.randn(80, 3)
     stored = torch.stack([torch.ones(80), wave + noise[:, 0], wave + 0.1 * noise[:, 1], 5 * noise[:, 2]], 1)
@@ -174,7 +170,7 @@ def test_the_feature_that_is_shown_is_the_one_that_its_templates_explain() -> No
     assert best_explained(stored, one, templates) == 2
 
 
-def test_slit_scan_holds_no_more_than_it_shows() -> None:
+def test_slit_scan_holds_no_more_than_it_shows():
     scan = slit_scan(ArrayTraverse(torch.rand(300, 1, 16, 16)), 10, 290)
     assert scan is not None
     assert scan.untyped_storage().nbytes() <= 2 * 280 * 16 * 4
@@ -188,7 +184,7 @@ def test_slit_scan_holds_no_more_than_it_shows() -> None:
 
 
 @pytest.fixture(scope="module")
-def resampled() -> Localization:
+def resampled():
     periods = SpectrogramAnalysis(window=50, min_period=4, false_alarm=None)
     model = template_model(HOG(), periods, velocity=camera())
     reference, query = (model.resample(ArrayTraverse(footage(w)), STEP) for w in (REFERENCE, QUERY))
@@ -200,14 +196,12 @@ def resampled() -> Localization:
 
 
 @pytest.fixture(scope="module")
-def pictures(resampled: Localization) -> dict[str, Picture]:
+def pictures(resampled):
     run = resampled
     return draw_pictures(run, {"map": contend("this map", run.match, run.truth, 3)}) | paper_pictures(run)
 
 
-def test_convention_11_every_axis_along_a_resampled_route_counts_frames(
-    resampled: Localization, pictures: dict[str, Picture]
-) -> None:
+def test_convention_11_every_axis_along_a_resampled_route_counts_frames(resampled, pictures):
     run, frames = resampled, len(REFERENCE)
     assert run.model.map.places == 101 < frames
     axes = {name: picture.plot[1] for name, picture in pictures.items()}
@@ -234,7 +228,7 @@ def test_convention_11_every_axis_along_a_resampled_route_counts_frames(
         assert "place (frame)" in texts(pictures[name].plot[0]), name
 
 
-def test_convention_11_what_counts_places_says_so(pictures: dict[str, Picture]) -> None:
+def test_convention_11_what_counts_places_says_so(pictures):
     for name in ("spectrogram", "chunks", "layers"):
         assert "period (places at even steps)" in texts(pictures[name].plot[0]), name
     assert "lag (places at even steps)" in texts(pictures["autocorrelogram"].plot[0])
@@ -246,9 +240,7 @@ def test_convention_11_what_counts_places_says_so(pictures: dict[str, Picture]) 
     assert "period (frames)" in texts(plain["chunks"].plot[0])
 
 
-def test_convention_11_frames_of_a_resampled_route_are_called_as_in_the_matches(
-    resampled: Localization, pictures: dict[str, Picture]
-) -> None:
+def test_convention_11_frames_of_a_resampled_route_are_called_as_in_the_matches(resampled, pictures):
     run = resampled
     titles = [axis.get_title(loc="left") for axis in pictures["pairs"].plot[1].flat]
     asked, reported = ([int(title.split()[-1]) for title in titles[k::3]] for k in (0, 1))

@@ -8,7 +8,6 @@ import re
 import shlex
 from contextlib import redirect_stdout
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -21,7 +20,7 @@ OF_TEMPLATES = {"chunks", "spectrogram", "templates", "features", "activations"}
 
 
 @pytest.fixture(scope="module")
-def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def demo(tmp_path_factory):
     out = tmp_path_factory.mktemp("demo")
     with (out / "printed.txt").open("w") as printed, redirect_stdout(printed):
         main(["demo", "--out", str(out)])
@@ -29,24 +28,24 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def report(demo: Path) -> dict[str, Any]:
+def report(demo):
     return json.loads((demo / "report.json").read_text())
 
 
-def test_the_imposed_periods_are_among_the_strongest(report: dict[str, Any]) -> None:
+def test_the_imposed_periods_are_among_the_strongest(report):
     assert report["periods"] == sorted(set(report["periods"]))
     for period in (93, 171):
         assert min(abs(found - period) for found in report["periods"]) < 1
 
 
-def test_convention_8_figures_stand_beside_their_null_and_fair_baselines(report: dict[str, Any]) -> None:
+def test_convention_8_figures_stand_beside_their_null_and_fair_baselines(report):
     assert report["auc"] > max(report[name]["auc"] for name in ("hog", "null", "stride"))
     # keyframes get the bytes of the route, and every 10th descriptor more of them
     assert report["interpolated"]["route_bytes"] <= report["route_bytes"] < report["stride"]["route_bytes"]
     assert report["interpolated"]["route_bytes"] > 0.9 * report["route_bytes"]
 
 
-def test_order_saves_bytes_and_most_of_all_where_they_are_few(report: dict[str, Any]) -> None:
+def test_order_saves_bytes_and_most_of_all_where_they_are_few(report):
     map, null, interpolated = (report["storage"][name] for name in ("map", "null", "interpolated"))
     assert len(map) == len(null) == 5
     assert map[0]["auc"] > 0.95
@@ -57,18 +56,18 @@ def test_order_saves_bytes_and_most_of_all_where_they_are_few(report: dict[str, 
         assert told_of[2] == pytest.approx(entry["route_bytes_per_place"], rel=0.01)
 
 
-def test_repetition_saves_as_little_as_readme_tells(report: dict[str, Any]) -> None:
+def test_repetition_saves_as_little_as_readme_tells(report):
     found = re.search(r"takes only (\d+) % more bytes", " ".join(README.read_text().split()))
     assert found is not None
     assert report["noise_over_map"] == pytest.approx(1 + int(found[1]) / 100, abs=0.015)
 
 
-def test_fixed_bytes_are_what_readme_tells(report: dict[str, Any]) -> None:
+def test_fixed_bytes_are_what_readme_tells(report):
     for found in re.findall(r"(\d+) kB, nearly all|fixed (\d+) kB", README.read_text()):
         assert report["fixed_bytes"] / 1000 == pytest.approx(int(found[0] or found[1]), rel=0.02)
 
 
-def test_it_ends_with_commands_to_try(demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_ends_with_commands_to_try(demo, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     lines = (demo / "printed.txt").read_text().splitlines()[-3:]
     commands = [shlex.split(line.partition("or try: dejavu ")[2]) for line in lines]
@@ -82,14 +81,14 @@ def test_it_ends_with_commands_to_try(demo: Path, tmp_path: Path, monkeypatch: p
         assert row == other
 
 
-def told() -> dict[str, list[float]]:
+def told():
     """The rows of README's table: AUC, recall@1, and bytes of the route per place."""
     table = README.read_text().split("## Results")[1].split("The null codes")[0]
     rows = (line.replace("*", "").split("|") for line in table.splitlines() if re.search(r"\| \d+\.\d", line))
     return {cells[1].strip(): [float(cell) for cell in cells[2:5]] for cells in rows}
 
 
-def test_readme_tells_what_the_demo_measures(report: dict[str, Any]) -> None:
+def test_readme_tells_what_the_demo_measures(report):
     named = {
         "this map": report,
         "its descriptors of all frames, float": report["uncompressed"],
@@ -104,7 +103,7 @@ def test_readme_tells_what_the_demo_measures(report: dict[str, Any]) -> None:
         assert told()[name][2] == pytest.approx(route, rel=0.02)
 
 
-def test_a_map_of_templates_has_its_pictures_and_its_periods(tmp_path: Path) -> None:
+def test_a_map_of_templates_has_its_pictures_and_its_periods(tmp_path):
     main(["demo", "--config", "local_maxima", "--out", str(tmp_path)])
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["auc"] < told()["HOG, every 10th frame"][0]  # as README says of such maps

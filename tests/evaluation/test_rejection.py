@@ -25,7 +25,7 @@ MATCH = Match(
 )
 
 
-def test_the_figures_of_a_rejection() -> None:
+def test_the_figures_of_a_rejection():
     facts = rejection_facts(MATCH, TRUTH, 0, {"sea": torch.tensor([0.1, 0.6, 0.995, 0.2])})["rejection"]
     assert facts["recall_at_100_precision"] == 0.75  # in the order of probability: all but the wrong one
     assert facts["auc"] == 0.5  # from the recall of the first answer on
@@ -46,7 +46,7 @@ def test_the_figures_of_a_rejection() -> None:
     )
 
 
-def test_without_probabilities_or_truth_there_is_less_to_tell() -> None:
+def test_without_probabilities_or_truth_there_is_less_to_tell():
     plain = Match(*MATCH)
     assert rejection_facts(plain, TRUTH, 0, {}) == draw_reliability(plain, TRUTH, 0) == {}
     assert rejection_facts(MATCH, None, 0, {}) == {"rejection": {"off_map": {}}}
@@ -54,7 +54,7 @@ def test_without_probabilities_or_truth_there_is_less_to_tell() -> None:
     assert rejection_table({"off_map": {}}) == rejection_table({}) == []
 
 
-def test_the_picture_shows_the_share_that_is_right() -> None:
+def test_the_picture_shows_the_share_that_is_right():
     figure, (above, below) = draw_reliability(MATCH, TRUTH, 0)["reliability"].plot
     (points,) = above.collections
     drawn = [tuple(point) for point in points.get_offsets().tolist()]
@@ -68,7 +68,7 @@ def test_the_picture_shows_the_share_that_is_right() -> None:
 
 
 @pytest.mark.parametrize("shape", [(1, 8, 6), (3, 20, 30)])
-def test_frames_of_another_route_are_brought_to_the_map_s(shape: tuple[int, ...]) -> None:
+def test_frames_of_another_route_are_brought_to_the_map_s(shape):
     for channels in (1, 3):
         fitted = Fitted(as_traverse(torch.rand(5, channels, 10, 12)), shape)
         assert [batch.shape for batch in fitted.batches(3)] == [(3, *shape), (2, *shape)]

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -32,26 +30,26 @@ SCORES = Scores(0.5, 0.6, 0.1, 0.2, 0.7, 0.75, 0.8)
 FACTS = {"queries": 20, "tolerance": 3, "recall_definition": "TP / all", "version": "1", "torch": "2"}
 
 
-def report(facts: dict[str, Any] | None = None, **contenders: Contender) -> Report:
+def report(facts=None, **contenders):
     return Report(Contender("this map", SCORES, 4000), contenders, FACTS | (facts or {}))
 
 
-def picture(heading: str = "a heading") -> Picture:
+def picture(heading="a heading"):
     return Picture(canvas(1), heading, "A caption.")
 
 
-def written(folder: Path, one: Report, **pictures: Picture) -> str:
+def written(folder, one, **pictures):
     with report_folder(folder) as temporary:
         write_report(temporary, one, pictures, "a title", "dejavu demo", "the plan")
     return (folder / "index.html").read_text(encoding="utf-8")
 
 
-def match(scores: list[float]) -> Match:
+def match(scores):
     return Match(torch.arange(len(scores)), torch.tensor(scores), torch.ones(len(scores), dtype=torch.bool))
 
 
 @pytest.mark.parametrize(("equal", "late"), [(1, False), (2, True)])
-def test_a_curve_that_starts_late_has_a_star_and_the_star_is_explained(equal: bool, late: bool) -> None:
+def test_a_curve_that_starts_late_has_a_star_and_the_star_is_explained(equal, late):
     # all are right: the curve starts at the share of those that have the best score
     scores = [0.1] * equal + [0.2] * (10 - equal)
     ours = contend("this map", match(scores), torch.arange(10)[:, None], 0)
@@ -62,7 +60,7 @@ def test_a_curve_that_starts_late_has_a_star_and_the_star_is_explained(equal: bo
     assert one.as_json()["curve_starts_at_recall"] == ours.starts
 
 
-def test_the_table_has_bytes_where_the_places_are_known() -> None:
+def test_the_table_has_bytes_where_the_places_are_known():
     one = report({"frames": 32}, null=Contender("null", SCORES))
     main, more = ["AUC", "recall@1", "R@100P"], ["P@100R", "AUC rep.", "R@100P rep."]
     few, many = ["0.500", "0.750", "0.100"], ["0.700", "0.600", "0.200"]
@@ -76,7 +74,7 @@ def test_the_table_has_bytes_where_the_places_are_known() -> None:
     assert score_table(report(), every=True) == [["", *main, *more], ["this map", *few, *many]]
 
 
-STORED: dict[str, Any] = {  # of a storage curve, as in report.json
+STORED = {  # of a storage curve, as in report.json
     "frames": 40,
     "storage": {
         "map": [
@@ -87,7 +85,7 @@ STORED: dict[str, Any] = {  # of a storage curve, as in report.json
 }
 
 
-def test_the_table_has_the_map_in_five_bytes_and_in_one() -> None:
+def test_the_table_has_the_map_in_five_bytes_and_in_one():
     one = report(STORED, null=Contender("null", SCORES))
     one = one._replace(ours=Contender("this map", SCORES, 440, fixed=40))
     assert [row[0] for row in score_table(one)] == [
@@ -100,7 +98,7 @@ def test_the_table_has_the_map_in_five_bytes_and_in_one() -> None:
     assert len(score_table(report({"storage": STORED["storage"]}))) == 2  # of no known number of places
 
 
-def test_areas_of_sequences_in_a_table_below_the_scores(tmp_path: Path) -> None:
+def test_areas_of_sequences_in_a_table_below_the_scores(tmp_path):
     areas = {1: SCORES, 5: SCORES._replace(auc=0.875)}
     null = Contender("null", SCORES, sequences=areas)
     aside = Contender("without", SCORES)
@@ -118,7 +116,7 @@ def test_areas_of_sequences_in_a_table_below_the_scores(tmp_path: Path) -> None:
     assert "T = " not in written(tmp_path, report(null=aside))
 
 
-def test_long_headings_of_a_text_table_take_several_lines() -> None:
+def test_long_headings_of_a_text_table_take_several_lines():
     table = text_table([["", "AUC", "route bytes per place"], ["a map", "0.5", "5.0"]])
     assert table.splitlines() == [
         "            route bytes",
@@ -127,7 +125,7 @@ def test_long_headings_of_a_text_table_take_several_lines() -> None:
     ]
 
 
-def test_the_summary_tells_what_was_scored() -> None:
+def test_the_summary_tells_what_was_scored():
     facts = {
         "truth": "place = query",
         "unit": "places",
@@ -151,7 +149,7 @@ def test_the_summary_tells_what_was_scored() -> None:
     assert summary(report()) == "20 queries; right within 3 frames."
 
 
-def test_the_page_begins_with_plain_words() -> None:
+def test_the_page_begins_with_plain_words():
     baseline = Contender("all frames", SCORES._replace(recall_at_1=0.9), 64000, 1)
     assert headline(report({"frames": 32}, uncompressed=baseline)).replace("\xa0", " ") == (
         "20 queries were localized on a map of 32 places: 75.0 % were matched to their right place "
@@ -170,7 +168,7 @@ def test_the_page_begins_with_plain_words() -> None:
     assert "None" not in headline(unscored) + summary(unscored)
 
 
-STEPS: list[tuple[dict[str, Any], float | None, str, list[str]]] = [  # facts, recall@1, verdict, steps
+STEPS = [  # facts, recall@1, verdict, steps
     ({"kind": "spectral"}, 0.95, "Yes: 19 of 20 queries", ["localize"]),
     ({"with_answer": 10}, 0.6, "Partly: 6 of 10 queries that have a right place", []),
     ({"kind": "templates"}, 0.2, "No: 4 of 20", ["--ordered", "--second", "localize"]),
@@ -204,9 +202,7 @@ STEPS: list[tuple[dict[str, Any], float | None, str, list[str]]] = [  # facts, r
 
 
 @pytest.mark.parametrize(("facts", "recall", "told", "after"), STEPS)
-def test_whether_it_worked_and_what_to_do_next(
-    facts: dict[str, Any], recall: float | None, told: str, after: list[str]
-) -> None:
+def test_whether_it_worked_and_what_to_do_next(facts, recall, told, after):
     scores = None if recall is None else SCORES._replace(recall_at_1=recall)
     one = report(facts)._replace(ours=Contender("this map", scores, 4000))
     assert told in verdict(one)
@@ -215,7 +211,7 @@ def test_whether_it_worked_and_what_to_do_next(
     assert [word for word, step in zip(after, found, strict=True) if word not in step] == []
 
 
-def test_the_next_step_is_the_whole_drive_or_more_bytes_if_these_find_more() -> None:
+def test_the_next_step_is_the_whole_drive_or_more_bytes_if_these_find_more():
     ours = Contender("this map", SCORES, 4000, sequences={"smoother": SCORES._replace(recall_at_1=0.8)})
     floats = Contender("all frames", SCORES._replace(recall_at_1=0.9), 64000, 1)
     one = report({"kind": "spectral"}, uncompressed=floats)._replace(ours=ours)
@@ -233,12 +229,12 @@ def test_the_next_step_is_the_whole_drive_or_more_bytes_if_these_find_more() -> 
     assert "--mapper.hold" not in trained
 
 
-def key(page: str) -> dict[str, str]:
+def key(page):
     """The words that a part of a page explains."""
     return dict(re.findall(r"<dt>([^<]+)</dt> <dd>([^<]+)</dd>", page.replace("\n", " ")))
 
 
-def test_the_key_explains_what_the_table_holds_and_no_more(tmp_path: Path) -> None:
+def test_the_key_explains_what_the_table_holds_and_no_more(tmp_path):
     null, frames = Contender("null", SCORES), Contender("all", SCORES, 100, 1)
     every = {"uncompressed": frames, "interpolated": frames, "null": null, "null_same_plan": null}
     sizes = ["bytes per place", "route bytes per place"]
@@ -258,7 +254,7 @@ def test_the_key_explains_what_the_table_holds_and_no_more(tmp_path: Path) -> No
         assert list(below) == (["lines", "strongest periods"] if "kind" in facts else ["layer"])
 
 
-def test_names_are_escaped(tmp_path: Path) -> None:
+def test_names_are_escaped(tmp_path):
     evil = "<script>alert('1 & 2')</script>"
     one = report({"truth": evil, "version": evil, "frames": 2}, hog=Contender(evil, SCORES))
     write_report(tmp_path, one, {"pr": Picture(canvas(1), evil, evil)}, evil, evil, evil)
@@ -269,7 +265,7 @@ def test_names_are_escaped(tmp_path: Path) -> None:
     assert "<script" not in (tmp_path / "index.html").read_text()
 
 
-def test_pictures_of_an_earlier_report_are_removed_and_other_files_stay(tmp_path: Path) -> None:
+def test_pictures_of_an_earlier_report_are_removed_and_other_files_stay(tmp_path):
     (tmp_path / "own.png").write_bytes(b"")
     written(tmp_path, report(), **{name: picture() for name in PICTURES})
     assert {file.stem for file in tmp_path.glob("*.png")} == {*PICTURES, "own"}
@@ -279,7 +275,7 @@ def test_pictures_of_an_earlier_report_are_removed_and_other_files_stay(tmp_path
     assert (tmp_path / "pr.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_page_fits_a_phone_and_needs_no_other_file(tmp_path: Path) -> None:
+def test_the_page_fits_a_phone_and_needs_no_other_file(tmp_path):
     page = written(tmp_path, report({"frames": 32}), coverage=picture("places"), pr=picture("curves"))
     assert '<meta name="viewport" content="width=device-width,initial-scale=1">' in page
     assert page.count("data:image/png;base64,") == 2
@@ -295,7 +291,7 @@ def test_the_page_fits_a_phone_and_needs_no_other_file(tmp_path: Path) -> None:
     assert not [text for text in ("the map</h2>", "<img", "<ul>", "None", "bytes", "null") if text in bare]
 
 
-def test_the_first_screen_answers_and_the_pairs_are_beside_it(tmp_path: Path) -> None:
+def test_the_first_screen_answers_and_the_pairs_are_beside_it(tmp_path):
     page = written(
         tmp_path, report({"frames": 32, "kind": "spectral"}), pr=picture("curves"), pairs=picture("pairs")
     )
@@ -319,7 +315,7 @@ def test_the_first_screen_answers_and_the_pairs_are_beside_it(tmp_path: Path) ->
     )
 
 
-def test_the_page_has_landmarks_headings_in_order_and_named_headers(tmp_path: Path) -> None:
+def test_the_page_has_landmarks_headings_in_order_and_named_headers(tmp_path):
     page = written(tmp_path, report({"frames": 32}, null=Contender("null", SCORES)), pr=picture("curves"))
     assert '<html lang="en">' in page
     assert [page.count(f"<{one}>") for one in ("header", "main", "footer")] == [1, 1, 1]
@@ -330,7 +326,7 @@ def test_the_page_has_landmarks_headings_in_order_and_named_headers(tmp_path: Pa
     assert re.findall(r'<img(?! alt="\w)', page) == []
 
 
-def test_each_row_has_the_colour_of_its_curve(tmp_path: Path) -> None:
+def test_each_row_has_the_colour_of_its_curve(tmp_path):
     page = written(tmp_path, report(hog=Contender("HOG", SCORES), null=Contender("null", SCORES)))
     colours = re.findall(r'<i style="background:(#\w+)"></i>([^<]+)', page)
     expected = [("map", "this map"), ("hog", "HOG"), ("null", "null")]
@@ -342,7 +338,7 @@ def test_each_row_has_the_colour_of_its_curve(tmp_path: Path) -> None:
     ] * 2
 
 
-def test_an_index_links_its_pages_and_shares_the_table(tmp_path: Path) -> None:
+def test_an_index_links_its_pages_and_shares_the_table(tmp_path):
     rows = [["", "AUC", "R@100P rep."], ["outdoor", "0.5", ""], ["aerial", "0.6", "0.1"]]
     links = {"outdoor": "outdoor/index.html"}
     write_index(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from pathlib import Path
 from unittest.mock import create_autospec
 
 import pytest
@@ -15,7 +14,7 @@ from dejavu_torch.cli import main
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.data.source import open_source
-from dejavu_torch.evaluation.compare import Comparison, compare
+from dejavu_torch.evaluation.compare import compare
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.paper_tables import (
     COLUMNS,
@@ -43,7 +42,7 @@ PAPER = {"min_period": 8, "peaks": "bins", "false_alarm": None, "short": "refuse
 FRAMES, LENGTHS = 512, (256, 512, 1024)
 
 
-def shorter(dataset: str, window: int) -> DejaVu:
+def shorter(dataset, window):
     """The paper's settings with shorter chunks."""
     paper = paper_model(open_source(f"sim:{dataset}?frames=1"))
     paper.mapper = TemplateMapper(SpectrogramAnalysis(window, **PAPER), reduction="sum")
@@ -51,12 +50,12 @@ def shorter(dataset: str, window: int) -> DejaVu:
 
 
 @pytest.fixture(scope="module")
-def aerial() -> Comparison:
+def aerial():
     """The first 512 frames, one chunk."""
     return reproduce("aerial", shorter("aerial", 512), frames=FRAMES, lengths=LENGTHS)
 
 
-def test_the_paper_s_settings_are_the_default(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_paper_s_settings_are_the_default(monkeypatch):
     class Asked(Exception):
         pass
 
@@ -74,7 +73,7 @@ def test_the_paper_s_settings_are_the_default(monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.slow
-def test_the_database_itself_is_found_and_leaving_out_undoes_it(aerial: Comparison) -> None:
+def test_the_database_itself_is_found_and_leaving_out_undoes_it(aerial):
     report = aerial.report.as_json()
     assert report["ideal"]["recall_at_1"] > 0.99 > report["recall_at_1"]
     assert report["ideal_leave_out"]["recall_at_1"] < 0.1
@@ -82,7 +81,7 @@ def test_the_database_itself_is_found_and_leaving_out_undoes_it(aerial: Comparis
 
 
 @pytest.mark.slow
-def test_chunks_of_other_lengths_are_maps_of_their_own(aerial: Comparison) -> None:
+def test_chunks_of_other_lengths_are_maps_of_their_own(aerial):
     rows = aerial.report.facts["chunk_lengths"]
     assert [row["window"] for row in rows] == [256, 512]  # 1024 is longer than the route
     assert rows[1]["auc"] == aerial.report.as_json()["auc"]
@@ -99,7 +98,7 @@ def test_chunks_of_other_lengths_are_maps_of_their_own(aerial: Comparison) -> No
 
 
 @pytest.mark.slow
-def test_section_five_sets_the_papers_numbers_beside_ours(aerial: Comparison) -> None:
+def test_section_five_sets_the_papers_numbers_beside_ours(aerial):
     head, paper, ideal, leave_out, own, *others = section_five({"aerial": aerial.report})
     assert paper[1:4] == ["0.2064", "0.9590", "0.9813"]
     assert "paper" in paper[0]
@@ -111,15 +110,13 @@ def test_section_five_sets_the_papers_numbers_beside_ours(aerial: Comparison) ->
     assert {len(row) for row in (head, paper, ideal, own, *others)} == {len(head)}
 
 
-def test_other_datasets_are_refused() -> None:
+def test_other_datasets_are_refused():
     with refused("'moon'", "expected aerial, outdoor, underground"):
         reproduce("moon")
 
 
 @pytest.mark.slow
-def test_the_command_writes_an_index_over_the_reports(
-    aerial: Comparison, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_writes_an_index_over_the_reports(aerial, tmp_path, monkeypatch, capsys):
     short = create_autospec(reproduce, return_value=aerial)
     monkeypatch.setattr("dejavu_torch.evaluation.reproduce.reproduce", short)
     main(["reproduce", "aerial", "--out", str(tmp_path / "out")])
@@ -137,24 +134,24 @@ def test_the_command_writes_an_index_over_the_reports(
 
 
 @pytest.fixture(scope="module")
-def outdoor() -> Comparison:
+def outdoor():
     """The first 310 frames, from the start of the train on, in chunks of 64."""
     return reproduce("outdoor", shorter("outdoor", 64), frames=310, lengths=(32, 64))
 
 
-def metres_of(result: Comparison, traverse: int, frames: torch.Tensor) -> torch.Tensor:
-    distance: torch.Tensor = open_source(f"sim:outdoor?frames=310&traverse={traverse}").distance[frames]
+def metres_of(result, traverse, frames):
+    distance = open_source(f"sim:outdoor?frames=310&traverse={traverse}").distance[frames]
     return distance
 
 
 @pytest.mark.slow
-def test_train_footage_is_resampled_to_even_steps(outdoor: Comparison) -> None:
+def test_train_footage_is_resampled_to_even_steps(outdoor):
     facts, route = outdoor.report.facts, outdoor.run.model.map
     assert facts["unit"] != "frames"
     assert facts["resampling"]["reference_frames"] == facts["resampling"]["query_frames"] == 310
     assert facts["frames"] == len(outdoor.run.reference_features) == route.places
 
-    def bend(metres: torch.Tensor) -> float:
+    def bend(metres):
         return float((metres - torch.linspace(0, 1, len(metres)) * metres[-1]).abs().max())
 
     assert bend(metres_of(outdoor, 0, torch.arange(310))) > 15  # the train speeds up all the time
@@ -174,7 +171,7 @@ def test_train_footage_is_resampled_to_even_steps(outdoor: Comparison) -> None:
 
 
 @pytest.mark.slow
-def test_structures_cut_the_even_steps(outdoor: Comparison) -> None:
+def test_structures_cut_the_even_steps(outdoor):
     cuts = structure_cuts(open_source("sim:outdoor?frames=310"))
     assert cuts
     facts, route = outdoor.report.facts, outdoor.run.model.map
@@ -196,13 +193,13 @@ class Rails(ArrayTraverse):
     distance = torch.arange(64, dtype=torch.float64) / 2
 
 
-def test_cuts_are_the_frames_at_which_a_structure_starts_or_stops() -> None:
+def test_cuts_are_the_frames_at_which_a_structure_starts_or_stops():
     assert structure_cuts(Rails(torch.rand(64, 3))) == [25, 40]  # 0 and 900 m are no cuts inside
     assert structure_cuts(ArrayTraverse(torch.rand(64, 3))) == []
 
 
 @pytest.mark.slow
-def test_the_effect_of_boundaries_is_a_line(aerial: Comparison) -> None:
+def test_the_effect_of_boundaries_is_a_line(aerial):
     assert boundary_lines({"aerial": aerial.report}) == []
     effects = {"cuts": 7, "known_boundaries": BoundaryEffect(32, 10, 20, 0.25, None)._asdict()}
     others = {"comparable": aerial.report.contenders["null"], "known_boundaries": aerial.report.ours}
@@ -215,7 +212,7 @@ def test_the_effect_of_boundaries_is_a_line(aerial: Comparison) -> None:
         assert fact in line
 
 
-def test_given_chunks_end_at_the_cuts() -> None:
+def test_given_chunks_end_at_the_cuts():
     assert GivenChunks([40, 100], min_period=8).chunks(160) == [(0, 40), (40, 100), (100, 160)]
     # pieces under two of the shortest periods join the piece before
     assert GivenChunks([5, 40, 50, 150], min_period=8).chunks(160) == [(0, 40), (40, 160)]
@@ -223,7 +220,7 @@ def test_given_chunks_end_at_the_cuts() -> None:
         GivenChunks([5], min_period=8).chunks(10)
 
 
-def test_recall_near_and_far_by_hand() -> None:
+def test_recall_near_and_far_by_hand():
     truth = as_ground_truth(torch.tensor([[0], [90], [100], [110], [111], [-1]]))
     index = torch.tensor([0, 90, 5, 110, 6, 7])  # right, right, wrong, right, wrong, no answer
     match = Match(index, torch.ones(6), torch.ones(6, dtype=torch.bool))
@@ -234,7 +231,7 @@ def test_recall_near_and_far_by_hand() -> None:
         boundary_effect(match, truth, [], 0)
 
 
-def two_periods(name: str, random: torch.Generator) -> ArrayTraverse:
+def two_periods(name, random):
     """Period 10 up to frame 90, period 14 from there on; windows of 128 see both at once."""
     parts = []
     for period, start, stop in ((10, 0, 90), (14, 90, 256)):
@@ -244,7 +241,7 @@ def two_periods(name: str, random: torch.Generator) -> ArrayTraverse:
     return ArrayTraverse(values + 0.3 * torch.randn(values.shape, generator=random), name)
 
 
-def test_a_map_with_known_boundaries_is_learned_and_scored_as_any_other() -> None:
+def test_a_map_with_known_boundaries_is_learned_and_scored_as_any_other():
     random = torch.Generator().manual_seed(0)
     reference, query = two_periods("a route", random), two_periods("again", random)
     settings = {"false_alarm": None, "strongest": 1}

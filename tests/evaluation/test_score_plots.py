@@ -22,16 +22,16 @@ from dejavu_torch.evaluation.score_plots import (
 )
 
 
-def contender(name: str, auc: float, points: int = 4) -> Contender:
+def contender(name, auc, points=4):
     curve = PRCurve(*torch.rand(3, points, dtype=torch.float64))
     return Contender(name, Scores(auc, *torch.rand(6).tolist()), curve=curve)
 
 
-def rgb(colour: str) -> tuple[float, ...]:
+def rgb(colour):
     return tuple(int(colour[j : j + 2], 16) / 255 for j in (1, 3, 5))
 
 
-def test_curves_have_the_colour_of_the_key_whatever_else_is_drawn() -> None:
+def test_curves_have_the_colour_of_the_key_whatever_else_is_drawn():
     everything = {
         key: contender(f"the {key}", 0.1 * i) for i, key in enumerate(COLOURS) if key != "leave_out"
     }
@@ -45,7 +45,7 @@ def test_curves_have_the_colour_of_the_key_whatever_else_is_drawn() -> None:
         assert "right within 2 frames" in texts(pictures["pr"].plot[0])
 
 
-def test_a_curve_that_reports_nothing_says_so_and_one_without_scores_is_left_out() -> None:
+def test_a_curve_that_reports_nothing_says_so_and_one_without_scores_is_left_out():
     silent, unscored = contender("null: x", 0.0, points=0), Contender("unscored", None)
     pictures = draw_curves({"null": silent, "hog": unscored, "leave_out": contender("other", 1)}, "2 frames")
     assert list(pictures) == ["pr"]
@@ -54,11 +54,11 @@ def test_a_curve_that_reports_nothing_says_so_and_one_without_scores_is_left_out
     assert draw_curves({"hog": unscored}, "2 frames") == {}
 
 
-def points(*pairs: tuple[float, float]) -> list[Stored]:
+def points(*pairs):
     return [Stored(size, area, area) for size, area in pairs]
 
 
-def test_the_storage_picture_shows_the_points_and_what_the_null_takes() -> None:
+def test_the_storage_picture_shows_the_points_and_what_the_null_takes():
     storage = {"map": points((1, 0.5), (2, 0.8)), "null": points((4, 0.5), (16, 0.6)), "interpolated": []}
     whole = Contender("all of them", Scores(0.9, 0.9, 0.1, 0.1, 0.9, 0.9, 0.9), 100, 1)
     picture = draw_storage({"uncompressed": whole}, storage, "2 frames")["storage"]
@@ -75,11 +75,11 @@ def test_the_storage_picture_shows_the_points_and_what_the_null_takes() -> None:
     assert draw_storage({}, {}, "2 frames") == draw_storage({}, {"map": []}, "2 frames") == {}
 
 
-def at(*areas: float) -> dict[int, Scores]:
+def at(*areas):
     return {T: Scores(area, area, 0, 0, area, area, area) for T, area in zip((1, 5, 11), areas, strict=True)}
 
 
-def test_the_areas_of_sequences_of_all_contenders_and_of_the_map_at_other_sizes() -> None:
+def test_the_areas_of_sequences_of_all_contenders_and_of_the_map_at_other_sizes():
     """Sizes that the map has, and those that no budget has, are not drawn twice."""
     contenders = {
         "map": Contender("this map", None, 1000, fixed=500, sequences=at(0.5, 0.7, 0.9)),
@@ -117,7 +117,7 @@ SIGHT = {
 }
 
 
-def oklab(colour: str, sight: torch.Tensor) -> torch.Tensor:
+def oklab(colour, sight):
     """Coordinates in which equal steps look equal; black and white are 1 apart."""
     value = torch.tensor(rgb(colour))
     linear = torch.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
@@ -135,17 +135,17 @@ def oklab(colour: str, sight: torch.Tensor) -> torch.Tensor:
     "together",
     [list(COLOURS.values())[:10], [RIGHT, WRONG, DARK], [RIGHT, WRONG, GREY], [*LAYERS, COLOURS["map"]]],
 )
-def test_colours_that_share_a_picture_differ_for_the_colour_blind(together: list[str], sight: str) -> None:
+def test_colours_that_share_a_picture_differ_for_the_colour_blind(together, sight):
     for one, other in combinations(together, 2):
         apart = (oklab(one, SIGHT[sight]) - oklab(other, SIGHT[sight])).norm()
         assert apart > 0.05, (one, other)
 
 
-def test_a_colour_means_one_contender() -> None:
+def test_a_colour_means_one_contender():
     assert len({*COLOURS.values(), RIGHT, WRONG, GREY, DARK, *LAYERS}) == len(COLOURS) + 6
 
 
-def test_recall_and_bytes_over_the_length_of_a_chunk() -> None:
+def test_recall_and_bytes_over_the_length_of_a_chunk():
     rows = [Length(256, 0.8, 0.7, 0.85, 4000, 40.0), Length(512, 0.9, 0.8, 0.95, 3000, 30.0)]
     plot = plot_lengths({"aerial": rows, "nothing": []})
     render(plot[0])

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 import torch
 from helpers import refused, template_model
-from torch import Tensor
 
 from dejavu_torch import DejaVu, SequenceMatcher
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.evaluation.compare import Comparison, compare
+from dejavu_torch.evaluation.compare import compare
 from dejavu_torch.evaluation.storage import coded_at_sizes, noise_over_map
 from dejavu_torch.maps.spectral import SpectralMapper
 
 PLACES, NUMBERS = 400, 16
 
 
-def route(seed: int) -> Tensor:
+def route(seed):
     """Smooth numbers, some of which repeat, and noise."""
     profile, noise = (torch.Generator().manual_seed(one) for one in (7, seed))
     walk = torch.randn(PLACES, NUMBERS // 2, generator=profile).cumsum(0) / 5
@@ -27,7 +24,7 @@ def route(seed: int) -> Tensor:
 
 
 @pytest.fixture(scope="module")
-def result() -> Comparison:
+def result():
     model = DejaVu(whitening="none", mapper=SpectralMapper(2.0))
     return compare(
         ArrayTraverse(route(0)), ArrayTraverse(route(1)), "0", model=model, tolerance=2, storage_curve=True
@@ -35,11 +32,11 @@ def result() -> Comparison:
 
 
 @pytest.fixture(scope="module")
-def report(result: Comparison) -> dict[str, Any]:
+def report(result):
     return result.report.as_json()
 
 
-def test_the_curve_is_in_the_report(report: dict[str, Any]) -> None:
+def test_the_curve_is_in_the_report(report):
     storage = report["storage"]
     assert {"map", "null", "interpolated", "null_over_map"} == set(storage)
     sizes = [one["route_bytes_per_place"] for one in storage["map"]]
@@ -55,7 +52,7 @@ def test_the_curve_is_in_the_report(report: dict[str, Any]) -> None:
     assert storage["null_over_map"][0] > 1
 
 
-def test_at_the_map_s_own_budget_the_curve_is_the_report(result: Comparison, report: dict[str, Any]) -> None:
+def test_at_the_map_s_own_budget_the_curve_is_the_report(result, report):
     curve = coded_at_sizes(result.run, [2.0])
     (ours,), (null,), (between,) = curve["map"], curve["null"], curve["interpolated"]
     assert ours.auc == report["auc"]
@@ -64,7 +61,7 @@ def test_at_the_map_s_own_budget_the_curve_is_the_report(result: Comparison, rep
     assert between.route_bytes_per_place * PLACES == report["interpolated"]["route_bytes"]
 
 
-def test_each_budget_is_evaluated_at_every_length() -> None:
+def test_each_budget_is_evaluated_at_every_length():
     model = DejaVu(whitening="none", mapper=SpectralMapper(2.0))
     pair = ArrayTraverse(route(0)), ArrayTraverse(route(1))
     found = compare(*pair, "0", model=model, tolerance=2, sequence=SequenceMatcher(5), storage_curve=True)
@@ -78,7 +75,7 @@ def test_each_budget_is_evaluated_at_every_length() -> None:
     assert "sequences" in found.pictures
 
 
-def test_noise_as_smooth_as_the_route_costs_what_repetition_saves(report: dict[str, Any]) -> None:
+def test_noise_as_smooth_as_the_route_costs_what_repetition_saves(report):
     assert report["noise_over_map"] > 1  # half of the numbers are waves, and noise has no lines
     order = torch.Generator().manual_seed(3)
     noise = torch.randn(PLACES, NUMBERS, generator=order).cumsum(0)
@@ -88,21 +85,21 @@ def test_noise_as_smooth_as_the_route_costs_what_repetition_saves(report: dict[s
     assert kept[1] > 1.4
 
 
-def test_budgets_that_cannot_be_met_are_left_out(result: Comparison) -> None:
+def test_budgets_that_cannot_be_met_are_left_out(result):
     curve = coded_at_sizes(result.run, [0.01, 1000.0])
     assert curve["map"] == curve["null"] == []
     # two keyframes at least; all frames at most
     assert [one.route_bytes_per_place for one in curve["interpolated"]] == [NUMBERS]
 
 
-def test_what_has_no_curve_is_refused(result: Comparison) -> None:
+def test_what_has_no_curve_is_refused(result):
     with refused("no ground truth", "spectral"):
         coded_at_sizes(result.run._replace(truth=None))
     with refused("'templates'", "spectral"):
         coded_at_sizes(result.run._replace(model=template_model().learn(route(0))))
 
 
-def test_without_truth_there_is_no_curve() -> None:
+def test_without_truth_there_is_no_curve():
     model = DejaVu(whitening="none", mapper=SpectralMapper(2.0))
     unscored = compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)[:50]), model=model, storage_curve=True)
     assert "storage" not in unscored.report.as_json()

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from fractions import Fraction
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from drawn import layer, render, run_of, texts
-from torch import Tensor
 
 from dejavu_torch import HOG, DejaVu
 from dejavu_torch.data.arrays import ArrayTraverse
@@ -30,17 +28,17 @@ from dejavu_torch.types import FrequencyLayer
 STANDS = torch.tensor([0, 2, 4, 30, 31, 32, 33, 34, 35])  # the camera stands from frame 4 to 29
 
 
-def wave(period: float, frames: int = 256) -> Tensor:
+def wave(period, frames=256):
     return torch.sin(torch.arange(frames) * 2 * torch.pi / period)
 
 
-def described(values: Tensor, **parts: Any) -> Any:
+def described(values, **parts):
     """A run of which only the reference's features (N,D) matter."""
     model = SimpleNamespace(trained=None, mapper=SimpleNamespace(**parts))
     return run_of(torch.zeros(1, len(values)), reference_features=values, model=model, unit="places")
 
 
-def test_convention_11_axes_along_the_route_count_frames_and_periods_count_places() -> None:
+def test_convention_11_axes_along_the_route_count_frames_and_periods_count_places():
     layers = (layer(4, 0, 4), layer(2, 4, 8))
     figure, axis = draw_chunks(layers, STANDS, "places")["chunks"].plot
     drawn = {tuple(map(tuple, part.get_segments()[0].tolist())) for part in axis.collections}
@@ -63,7 +61,7 @@ def test_convention_11_axes_along_the_route_count_frames_and_periods_count_place
     assert "difference of query 77 (lower is better)" in texts(figure)
 
 
-def test_layers_show_their_phases() -> None:
+def test_layers_show_their_phases():
     layers = [layer(tau, 20, 80, tau) for tau in range(5, 20)]
     shown = draw_layers(layers, torch.arange(81), "frames")["layers"].plot[1].images[0].get_array()
     assert shown.shape == (12, 60)  # the twelve of most features
@@ -71,7 +69,7 @@ def test_layers_show_their_phases() -> None:
 
 
 @pytest.mark.parametrize("hop", [None, 64])
-def test_spectrogram_is_darkest_at_the_period(hop: int | None) -> None:
+def test_spectrogram_is_darkest_at_the_period(hop):
     values, analysis = torch.cat([wave(32), wave(16)])[:, None], SpectrogramAnalysis(window=256, hop=hop)
     run = described(values, periods=analysis)
     figure, (above, below) = draw_spectrogram(run, (layer(32, 0, 256, 1),), 0)["spectrogram"].plot
@@ -89,7 +87,7 @@ def test_spectrogram_is_darkest_at_the_period(hop: int | None) -> None:
     assert "feature 0 along the route" in texts(figure)
 
 
-def test_spectrogram_of_a_constant_feature_and_of_a_long_one() -> None:
+def test_spectrogram_of_a_constant_feature_and_of_a_long_one():
     run = described(torch.ones(64, 1), periods=SpectrogramAnalysis(window=64))
     render(draw_spectrogram(run, (), 0)["spectrogram"].plot[0])
     run = described(wave(32, 9000)[:, None], periods=SpectrogramAnalysis(window=1024))
@@ -98,7 +96,7 @@ def test_spectrogram_of_a_constant_feature_and_of_a_long_one() -> None:
     assert (extremes.y0, extremes.y1) == pytest.approx((-1, 1), abs=1e-3)
 
 
-def test_templates_lie_over_the_frames_they_are_the_mean_of() -> None:
+def test_templates_lie_over_the_frames_they_are_the_mean_of():
     one = FrequencyLayer(Fraction(5), 5, 3, 15, (0, 4))
     values = torch.arange(15).remainder(5).float()[:, None].expand(-1, 5)  # the phase itself
     templates = torch.stack([torch.ones(5), torch.arange(5.0)], 1)
@@ -117,7 +115,7 @@ def test_templates_lie_over_the_frames_they_are_the_mean_of() -> None:
 
 
 @pytest.mark.parametrize(("period", "phases"), [(Fraction(15, 2), 3), (Fraction(2), 1), (Fraction(8), 8)])
-def test_templates_of_any_period_and_of_many_features(period: Fraction, phases: int) -> None:
+def test_templates_of_any_period_and_of_many_features(period, phases):
     one = FrequencyLayer(period, phases, 0, 40, tuple(range(100)))
     picture = draw_templates(described(torch.rand(40, 100)), one, torch.rand(phases, 100), 3)["templates"]
     above, below = picture.plot[1]
@@ -129,7 +127,7 @@ def test_templates_of_any_period_and_of_many_features(period: Fraction, phases: 
 
 
 @pytest.mark.parametrize("degrees", [10, 70, 130])
-def test_an_edge_in_the_frame_is_drawn_where_it_is(degrees: int) -> None:
+def test_an_edge_in_the_frame_is_drawn_where_it_is(degrees):
     """One edge through the middle of the frame: what lights up there is drawn along it."""
     # the gradient points to `degrees` from x towards y, the middle of a bin
     angle = torch.deg2rad(torch.tensor(float(degrees)))
@@ -147,7 +145,7 @@ def test_an_edge_in_the_frame_is_drawn_where_it_is(degrees: int) -> None:
 
 
 @pytest.mark.parametrize("shape", [(3, 64, 64), (1, 64, 16)])
-def test_features_are_drawn_on_a_frame_of_any_shape(shape: tuple[int, int, int]) -> None:
+def test_features_are_drawn_on_a_frame_of_any_shape(shape):
     frames = torch.rand(9, *shape)
     features = tuple(range(0, HOG()(frames[:1]).shape[1], 3))
     layers = [FrequencyLayer(Fraction(p), p, 0, 9, features) for p in (9, 20)]
@@ -161,7 +159,7 @@ def test_features_are_drawn_on_a_frame_of_any_shape(shape: tuple[int, int, int])
         assert image.width < 5 * image.height
 
 
-def test_a_feature_that_repeats_is_like_itself_a_period_later() -> None:
+def test_a_feature_that_repeats_is_like_itself_a_period_later():
     figure, axis = draw_autocorrelogram(wave(50, 600), [50.0], 0, "frames")["autocorrelogram"].plot
     render(figure)
     line = axis.lines[0].get_ydata()

@@ -5,17 +5,15 @@ from __future__ import annotations
 import copy
 import json
 from inspect import signature
-from typing import Any
 
 import pytest
 import torch
 from helpers import refused
 from kornia.geometry.transform import get_affine_matrix2d, warp_affine
-from torch import Tensor
 
 from dejavu_torch.features.augmentation import LARGEST, Augmentation
 
-OFF: dict[str, Any] = {name: 0.0 if len(most) == 1 else (0.0, 0.0) for name, most in LARGEST.items()}
+OFF = {name: 0.0 if len(most) == 1 else (0.0, 0.0) for name, most in LARGEST.items()}
 DEFAULTS = {name: argument.default for name, argument in signature(Augmentation).parameters.items()}
 DEFAULTS["perspective"] = 10.0  # which is off unless it is asked for
 CHANCES = {
@@ -25,26 +23,26 @@ CHANCES = {
 }
 
 
-def only(**strengths: Any) -> Augmentation:
+def only(**strengths):
     return Augmentation(**{**OFF, **strengths})
 
 
-def flat(value: float, channels: int = 1) -> Tensor:
+def flat(value, channels=1):
     return torch.full((200, channels, 12, 12), value)
 
 
-def changed(before: Tensor, after: Tensor) -> Tensor:
+def changed(before, after):
     """Which entries of the batch changed by more than rounding."""
     return ((before - after).abs() > 1e-4).flatten(1).any(1)
 
 
-def assert_spread(values: Tensor, most: float, middle: float = 0.0) -> None:
+def assert_spread(values, most, middle=0.0):
     """Drawn evenly from middle - most to middle + most."""
     assert -1.005 * most <= values.min() - middle < -0.85 * most
     assert 0.85 * most < values.max() - middle <= 1.005 * most
 
 
-def test_eval_gives_the_input_itself_and_training_leaves_it_alone() -> None:
+def test_eval_gives_the_input_itself_and_training_leaves_it_alone():
     frames = torch.rand(2, 3, 9, 11, requires_grad=True)
     before = frames.detach().clone()
     assert Augmentation().eval()(frames) is frames
@@ -56,7 +54,7 @@ def test_eval_gives_the_input_itself_and_training_leaves_it_alone() -> None:
 
 
 @pytest.mark.parametrize("name", DEFAULTS)
-def test_each_alone_acts_on_some_or_all_clips_and_alike_on_the_frames_of_one(name: str) -> None:
+def test_each_alone_acts_on_some_or_all_clips_and_alike_on_the_frames_of_one(name):
     alone = only(**{name: DEFAULTS[name]})
     frames = torch.rand(300, 1, 16, 16) * 0.5 + 0.25
     share = changed(frames, alone(frames)).float().mean().item()
@@ -65,7 +63,7 @@ def test_each_alone_acts_on_some_or_all_clips_and_alike_on_the_frames_of_one(nam
     assert torch.allclose(after, after[:, :1].expand_as(after), atol=1e-6) == (name != "noise")
 
 
-def test_noise_is_of_the_frame_and_whether_there_is_any_is_of_the_clip() -> None:
+def test_noise_is_of_the_frame_and_whether_there_is_any_is_of_the_clip():
     clips = torch.full((100, 6, 1, 16, 16), 0.5)
     spread = (only(noise=0.03)(clips) - clips).flatten(2).std(2)
     noisy = spread[:, 0] > 0
@@ -74,7 +72,7 @@ def test_noise_is_of_the_frame_and_whether_there_is_any_is_of_the_clip() -> None
     assert spread.std(1)[noisy].min() > 0
 
 
-def test_range_and_type_at_the_largest_strengths() -> None:
+def test_range_and_type_at_the_largest_strengths():
     wild = Augmentation(**{name: most if len(most) > 1 else most[0] for name, most in LARGEST.items()})
     after = wild(torch.rand(40, 3, 24, 28))
     assert after.dtype == torch.float32
@@ -82,7 +80,7 @@ def test_range_and_type_at_the_largest_strengths() -> None:
     assert 0 <= after.min() < after.max() <= 1
 
 
-def test_the_seed_repeats_it() -> None:
+def test_the_seed_repeats_it():
     for shape in ((6, 3, 16, 20), (2, 3, 3, 16, 20)):
         frames, augmentation = torch.rand(shape), Augmentation()
         torch.manual_seed(3)
@@ -95,7 +93,7 @@ def test_the_seed_repeats_it() -> None:
 
 
 @pytest.mark.parametrize("occlusion", [0.0, 0.3])
-def test_entries_see_none_but_what_covers_them(occlusion: float) -> None:
+def test_entries_see_none_but_what_covers_them(occlusion):
     frames, other = torch.rand(8, 3, 16, 16).expand(2, 8, 3, 16, 16).clone()
     other[3] = torch.rand(3, 16, 16)
     seen = set()
@@ -108,7 +106,7 @@ def test_entries_see_none_but_what_covers_them(occlusion: float) -> None:
     assert seen == ({3, 4} if occlusion else {3})
 
 
-def test_colour_is_of_the_channel_and_exposure_of_all() -> None:
+def test_colour_is_of_the_channel_and_exposure_of_all():
     for name, gain, offset in (("colour", 0.2, 0.05), ("exposure", 0.4, 0.3)):
         brighter = only(**{name: (gain, 0.0)})(flat(0.5, channels=3))
         assert (brighter.amax((2, 3)) == brighter.amin((2, 3))).all()
@@ -118,7 +116,7 @@ def test_colour_is_of_the_channel_and_exposure_of_all() -> None:
         assert_spread(only(**{name: (0.0, offset)})(flat(0.5))[:, 0, 0, 0] - 0.5, offset)
 
 
-def test_gamma_is_a_power() -> None:
+def test_gamma_is_a_power():
     after = only(gamma=0.5)(flat(0.25))[:, 0, 0, 0]
     power = after.log() / torch.tensor(0.25).log()
     assert 0.66 <= power.min() < 0.75 < 1.4 < power.max() <= 1.501
@@ -126,7 +124,7 @@ def test_gamma_is_a_power() -> None:
     assert torch.allclose(only(gamma=0.5)(ends), ends)
 
 
-def test_illumination_falls_evenly_from_one_side() -> None:
+def test_illumination_falls_evenly_from_one_side():
     change = only(illumination=0.25)(flat(0.5))[:, 0] - 0.5
     change = change[changed(torch.zeros_like(change), change)]
     assert 0.15 < change.abs().amax((1, 2)).max() <= 0.251
@@ -135,7 +133,7 @@ def test_illumination_falls_evenly_from_one_side() -> None:
         assert change.diff(n=2, dim=axis).abs().max() < 1e-6
 
 
-def test_blur_takes_variance_keeps_the_mean_and_reaches_as_far_as_sigma() -> None:
+def test_blur_takes_variance_keeps_the_mean_and_reaches_as_far_as_sigma():
     frames = torch.rand(60, 1, 32, 32)
     blurred = only(blur=3.0)(frames)
     assert (blurred.var((1, 2, 3)) < 1.001 * frames.var((1, 2, 3))).all()  # a tiny sigma leaves it as it is
@@ -149,7 +147,7 @@ def test_blur_takes_variance_keeps_the_mean_and_reaches_as_far_as_sigma() -> Non
 
 
 @pytest.mark.parametrize("most", [0.01, 0.15, 0.6])
-def test_occlusion_covers_one_rectangle_of_at_most_its_fraction(most: float) -> None:
+def test_occlusion_covers_one_rectangle_of_at_most_its_fraction(most):
     side, levels = 60, torch.arange(1.0, 201.0) / 201
     frames = levels[:, None, None, None].expand(-1, 2, side, side).contiguous()
     after = only(occlusion=most)(frames)
@@ -167,13 +165,13 @@ def test_occlusion_covers_one_rectangle_of_at_most_its_fraction(most: float) -> 
         assert other[covered > 0, 0].float().mean(0)[5:-5, 5:-5].min() > 0  # anywhere
 
 
-def test_a_clip_alone_is_covered_with_black() -> None:
+def test_a_clip_alone_is_covered_with_black():
     after = torch.cat([only(occlusion=0.5)(torch.full((1, 3, 1, 20, 20), 0.5)) for _ in range(20)])
     assert set(after.unique().tolist()) == {0.0, 0.5}
 
 
 @pytest.mark.parametrize("drawn", [1e-6, 1 - 1e-6])
-def test_warps_are_those_of_kornia(drawn: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_warps_are_those_of_kornia(drawn, monkeypatch):
     """Drawn to either end: kornia turns, scales and moves the frame by as much."""
     frames, sign = torch.rand(2, 3, 20, 30), -1 if drawn < 0.5 else 1
     monkeypatch.setattr(torch, "rand", lambda shape, **_: torch.full(shape, drawn))
@@ -181,13 +179,13 @@ def test_warps_are_those_of_kornia(drawn: float, monkeypatch: pytest.MonkeyPatch
     centre, pixels = torch.tensor([[29 / 2, 19 / 2]]), sign * torch.tensor([[0.3 * 30, 0.2 * 20]])
     zoom, turn = torch.full((1, 2), 1 + 0.3 * sign), torch.tensor([-25.0 * sign])
     matrix = get_affine_matrix2d(pixels, centre, zoom, turn)[:, :2]
-    settings: dict[str, Any] = {"padding_mode": "border", "align_corners": True}
+    settings = {"padding_mode": "border", "align_corners": True}
     expected = warp_affine(frames, matrix.expand(2, 2, 3), (20, 30), **settings)
     found = only(rotation=25.0, scale=0.3, shift=(0.3, 0.2))(frames)
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-4)
 
 
-def test_perspective_keeps_the_middle_and_makes_one_side_larger() -> None:
+def test_perspective_keeps_the_middle_and_makes_one_side_larger():
     frames = torch.zeros(200, 1, 61, 61)
     frames[:, :, 30, 30] = 1
     after = only(perspective=20.0)(frames)[:, 0]
@@ -202,7 +200,7 @@ def test_perspective_keeps_the_middle_and_makes_one_side_larger() -> None:
     assert -0.6 < ratio.min() < -0.15
 
 
-def test_it_is_plain_numbers_with_nothing_to_save() -> None:
+def test_it_is_plain_numbers_with_nothing_to_save():
     frames, augmentation = torch.rand(3, 3, 16, 16), Augmentation(**json.loads(json.dumps(DEFAULTS)))
     augmentation(frames)
     assert not augmentation.state_dict()
@@ -211,7 +209,7 @@ def test_it_is_plain_numbers_with_nothing_to_save() -> None:
 
 
 @pytest.mark.parametrize("name", DEFAULTS)
-def test_a_wrong_strength_is_refused(name: str) -> None:
+def test_a_wrong_strength_is_refused(name):
     pair = isinstance(DEFAULTS[name], tuple)
     for wrong in (-0.01, float("nan"), 181.0, "much"):
         with refused(f"{name} is", "expected a number from 0 to"):
@@ -220,7 +218,7 @@ def test_a_wrong_strength_is_refused(name: str) -> None:
         only(**{name: 0.1 if pair else (0.1, 0.1)})
 
 
-def test_frames_by_name_and_none_at_all() -> None:
+def test_frames_by_name_and_none_at_all():
     assert Augmentation()(frames=torch.rand(0, 3, 16, 16)).shape == (0, 3, 16, 16)
     with refused("float64"):
         Augmentation()(frames=torch.rand(0, 3, 16, 16).double())
@@ -235,6 +233,6 @@ def test_frames_by_name_and_none_at_all() -> None:
         (torch.rand(2, 0, 16, 16), ("(2, 0, 16, 16)", "float32 (B,C,H,W)")),
     ],
 )
-def test_wrong_frames_are_refused(frames: Tensor, facts: tuple[str, ...]) -> None:
+def test_wrong_frames_are_refused(frames, facts):
     with refused(*facts):
         only(blur=4.0)(frames)

@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
 from helpers import refused
-from torch import Tensor, nn
+from torch import nn
 
 from dejavu_torch.features.cnn import FLAT, SmallCNN, local_contrast
 from dejavu_torch.features.embedding import Embedding
 
 
-def small(**settings: Any) -> SmallCNN:
+def small(**settings):
     return SmallCNN(**{"dimension": 6, "resize": (16, 24), "widths": (4, 6), "squeeze": 3} | settings)
 
 
 # local contrast
 
 
-def around(image: Tensor, cell: int) -> Tensor:
+def around(image, cell):
     """Means of the cells of one channel, interpolated between their centres; whole cells."""
     values = image.unflatten(0, (-1, cell)).unflatten(2, (-1, cell)).mean((1, 3)).numpy()
     for size in image.shape:  # rows, then columns
@@ -32,14 +29,14 @@ def around(image: Tensor, cell: int) -> Tensor:
 
 
 @pytest.mark.parametrize("channels", [1, 3])
-def test_local_contrast_is_that_of_cells(channels: int) -> None:
+def test_local_contrast_is_that_of_cells(channels):
     frame = torch.rand(channels, 12, 20, dtype=torch.float64)
     centred = torch.stack([channel - around(channel, 4) for channel in frame])
     contrast = (around(centred.square().mean(0), 4) + FLAT**2).sqrt()
     torch.testing.assert_close(local_contrast(frame[None], 4)[0], centred / contrast, rtol=0, atol=1e-12)
 
 
-def test_gain_and_offset_change_almost_nothing() -> None:
+def test_gain_and_offset_change_almost_nothing():
     frames = torch.rand(2, 3, 32, 40, dtype=torch.float64)
     plain = local_contrast(frames)
     torch.testing.assert_close(local_contrast(frames + 0.3), plain, rtol=0, atol=1e-12)
@@ -48,13 +45,13 @@ def test_gain_and_offset_change_almost_nothing() -> None:
     assert 0.5 < plain.std() < 1.5
 
 
-def test_a_flat_frame_stays_flat_and_faint_noise_faint() -> None:
+def test_a_flat_frame_stays_flat_and_faint_noise_faint():
     assert torch.equal(local_contrast(torch.full((1, 1, 16, 16), 0.5)), torch.zeros(1, 1, 16, 16))
     noise = 0.5 + 0.1 * FLAT * torch.randn(1, 1, 32, 32, dtype=torch.float64)
     assert local_contrast(noise).std() < 0.2
 
 
-def test_gradients_of_local_contrast_are_right_and_finite_on_a_flat_frame() -> None:
+def test_gradients_of_local_contrast_are_right_and_finite_on_a_flat_frame():
     frames = torch.rand(1, 2, 5, 7, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda x: local_contrast(x, 3), frames)
     flat = torch.full((1, 1, 8, 8), 0.5, requires_grad=True)
@@ -68,20 +65,18 @@ def test_gradients_of_local_contrast_are_right_and_finite_on_a_flat_frame() -> N
 
 @pytest.mark.parametrize("size", [(16, 24), (40, 31)])
 @pytest.mark.parametrize(("channels", "resize"), [(1, (16, 24)), (3, (17, 23)), (3, (1, 1))])
-def test_frames_of_any_size_give_d_features(
-    channels: int, resize: tuple[int, int], size: tuple[int, int]
-) -> None:
+def test_frames_of_any_size_give_d_features(channels, resize, size):
     features = small(channels=channels, resize=resize).eval()(torch.rand(5, channels, *size))
     assert (features.shape, features.dtype) == ((5, 6), torch.float32)
 
 
-def test_features_of_the_training_frames_are_standardised() -> None:
+def test_features_of_the_training_frames_are_standardised():
     features = small().train()(torch.rand(40, 3, 16, 24))
     torch.testing.assert_close(features.mean(0), torch.zeros(6), rtol=0, atol=1e-5)
     torch.testing.assert_close(features.var(0, correction=0), torch.ones(6), rtol=0, atol=1e-2)
 
 
-def test_in_eval_mode_a_batch_is_its_frames_one_by_one() -> None:
+def test_in_eval_mode_a_batch_is_its_frames_one_by_one():
     net = small()
     frames = torch.rand(6, 3, 20, 20)
     net(frames)
@@ -90,14 +85,14 @@ def test_in_eval_mode_a_batch_is_its_frames_one_by_one() -> None:
     torch.testing.assert_close(net(frames), alone, rtol=0, atol=1e-5)
 
 
-def test_frames_in_double_precision_are_described_in_that_of_the_weights() -> None:
+def test_frames_in_double_precision_are_described_in_that_of_the_weights():
     net, frames = small().eval(), torch.rand(2, 3, 20, 20)
     torch.testing.assert_close(net(frames.double()), net(frames))
     of_any = Embedding(nn.Conv2d(3, 4, 3), dimension=5, resize=(16, 24)).eval()
     torch.testing.assert_close(of_any(frames.double()), of_any(frames))
 
 
-def test_the_contrast_is_that_of_local_contrast_unless_it_is_left() -> None:
+def test_the_contrast_is_that_of_local_contrast_unless_it_is_left():
     frames, net = torch.rand(4, 3, 16, 24), small().eval()
     found, net.cell = net(frames), 0
     assert torch.equal(found, net(local_contrast(frames, 8)))
@@ -105,7 +100,7 @@ def test_the_contrast_is_that_of_local_contrast_unless_it_is_left() -> None:
     assert not torch.allclose(net(frames.flip(3)), net(frames), atol=1e-3)  # it knows where things are
 
 
-def test_gradients_reach_every_parameter_and_the_frames() -> None:
+def test_gradients_reach_every_parameter_and_the_frames():
     net, frames = small(), torch.rand(4, 3, 20, 20, requires_grad=True)
     net(frames)[:, 0].square().mul(torch.arange(4.0)).sum().backward()
     assert frames.grad is not None
@@ -114,7 +109,7 @@ def test_gradients_reach_every_parameter_and_the_frames() -> None:
         assert value.abs().max() > 0
 
 
-def test_state_dict_round_trip() -> None:
+def test_state_dict_round_trip():
     net, other, frames = small(), small(), torch.rand(4, 3, 16, 24)
     net(frames)
     other.load_state_dict(net.state_dict())
@@ -136,6 +131,6 @@ def test_state_dict_round_trip() -> None:
         (lambda: small()(torch.rand(3, 16, 24)), ("(3, 16, 24)", "(B,3,H,W)")),
     ],
 )
-def test_what_is_refused(call: Callable[[], Any], facts: tuple[str, ...]) -> None:
+def test_what_is_refused(call, facts):
     with refused(*facts):
         call()

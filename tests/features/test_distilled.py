@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import pytest
 import torch
 from command_line import benchmark, benchmark_fails
 from helpers import refused
 from safetensors.torch import load_file
-from torch import Tensor, nn
+from torch import nn
 from torch.nn.functional import adaptive_avg_pool2d
 
 from benchmarks import distil
@@ -24,7 +23,7 @@ from dejavu_torch.motion.resampling import ground_truth_of
 from dejavu_torch.resize import resize_frames
 
 
-def layers() -> nn.Sequential:
+def layers():
     """The network as torch's own modules, made from the file."""
     stored, made = load_file(WEIGHTS["lite0"]), []
     for i, stride in enumerate(STRIDES):
@@ -36,20 +35,20 @@ def layers() -> nn.Sequential:
     return nn.Sequential(*made[:-1])
 
 
-def test_it_is_the_layers_of_the_file_pooled() -> None:
+def test_it_is_the_layers_of_the_file_pooled():
     frames = torch.rand(3, 3, 96, 96)
     expected = adaptive_avg_pool2d(layers()(2 * frames - 1), 4)
     torch.testing.assert_close(Distilled(4)(frames).view_as(expected), expected, rtol=1e-4, atol=1e-4)
 
 
-def test_grey_frames_are_colours_alike_and_other_channels_their_mean() -> None:
+def test_grey_frames_are_colours_alike_and_other_channels_their_mean():
     net, frames = Distilled(), torch.rand(2, 2, 40, 70)
     grey = frames.mean(1, keepdim=True)
     torch.testing.assert_close(net(grey), net(grey.expand(-1, 3, -1, -1)), rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(net(frames), net(grey))
 
 
-def test_gradients_reach_the_frames_and_no_weight() -> None:
+def test_gradients_reach_the_frames_and_no_weight():
     net, frames = Distilled(), torch.rand(1, 3, 32, 32, requires_grad=True)
     net(frames).square().sum().backward()
     assert frames.grad is not None
@@ -57,13 +56,13 @@ def test_gradients_reach_the_frames_and_no_weight() -> None:
     assert not [*net.parameters()]
 
 
-def test_settings_out_of_range_are_refused() -> None:
+def test_settings_out_of_range_are_refused():
     for settings, seen in (({"grid": 0}, "grid=0"), ({"grid": 13}, "1 to 12"), ({"weights": "vgg"}, "lite0")):
         with refused(seen):
             Distilled(**settings)
 
 
-def test_no_map_holds_its_weights(tmp_path: Path) -> None:
+def test_no_map_holds_its_weights(tmp_path):
     route, again = (open_source(f"sim:aerial?frames=120&traverse={i}") for i in (0, 1))
     model = DejaVu(Joined([HOG(), Distilled()])).learn(route)
     model.save(tmp_path / "map.safetensors")
@@ -74,7 +73,7 @@ def test_no_map_holds_its_weights(tmp_path: Path) -> None:
     torch.testing.assert_close(loaded_again.localize(again).score, model.localize(again).score)
 
 
-def test_a_map_of_other_weights_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_map_of_other_weights_is_refused(tmp_path, monkeypatch):
     model = DejaVu(Distilled()).learn(open_source("sim:aerial?frames=60"))
     model.save(tmp_path / "map.safetensors")
     stored = load_file(WEIGHTS["lite0"])
@@ -86,7 +85,7 @@ def test_a_map_of_other_weights_is_refused(tmp_path: Path, monkeypatch: pytest.M
             DejaVu.load(tmp_path / "map.safetensors", given)
 
 
-def test_of_unseen_frames_it_tells_what_its_teacher_does() -> None:
+def test_of_unseen_frames_it_tells_what_its_teacher_does():
     pytest.importorskip("efficientnet_lite_pytorch")
     network = distil.teacher()
     frames = torch.cat([leaves(32, 96, 10_000), *(part for part in _held("aerial"))])
@@ -101,14 +100,12 @@ def test_of_unseen_frames_it_tells_what_its_teacher_does() -> None:
     assert error < 0.4 * linear.square().mean()
 
 
-def _held(kind: str) -> list[Tensor]:
+def _held(kind):
     route = open_source(f"sim:{kind}?seed={distil.HELD}&frames=320")
     return [resize_frames(route[::10], (96, 96))]
 
 
-def test_the_bench_makes_weights_that_the_class_reads(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_bench_makes_weights_that_the_class_reads(tmp_path, monkeypatch, capsys):
     pytest.importorskip("efficientnet_lite_pytorch")
     for name, few in {"IMAGES": 16, "JUDGED_ON": 16, "FRAMES": 8, "BATCH": 8, "JUDGED": 2}.items():
         monkeypatch.setattr(distil, name, few)
@@ -127,7 +124,7 @@ def test_the_bench_makes_weights_that_the_class_reads(
     assert "at least 30" in benchmark_fails(capsys, "distil", "--out", tmp_path / "no", "--steps", "20")
 
 
-def test_normalisation_and_scale_are_folded_into_the_weights(tmp_path: Path) -> None:
+def test_normalisation_and_scale_are_folded_into_the_weights(tmp_path):
     student, frames = distil.Student(), torch.rand(16, 3, 96, 96)
     for _ in range(20):  # running statistics
         student(2 * frames - 1)
@@ -139,7 +136,7 @@ def test_normalisation_and_scale_are_folded_into_the_weights(tmp_path: Path) -> 
     assert (found - expected).square().mean() < 1e-3 * expected.var()  # of 8 bits
 
 
-def test_beside_hog_it_is_worth_more_than_pixels_in_the_city(data_dir: Path) -> None:
+def test_beside_hog_it_is_worth_more_than_pixels_in_the_city(data_dir):
     city = data_dir / "robotcar" / "t5"
     reference, query = (open_source(city / f"{name}.npy") for name in ("reference", "query"))
     truth = ground_truth_of(str(city / "truth.csv"), reference, query)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -27,23 +26,23 @@ class Maker(nn.Module):
         super().__init__()
         self.make = make
 
-    def forward(self, frames: Tensor) -> Any:
+    def forward(self, frames):
         return self.make(frames)
 
 
 class Picky(nn.Module):
     """Objects to every frame."""
 
-    def forward(self, frames: Tensor) -> Tensor:
+    def forward(self, frames):
         raise AssertionError(f"frames of {frames.shape[-1]} are not\nwhat I want")
 
 
-def tiny_vit() -> nn.Module:
+def tiny_vit():
     sizes = {"embed_dims": [8] * 4, "depths": [1] * 4, "num_heads": [1] * 4, "window_sizes": [2] * 4}
     return TinyViT(img_size=32, num_classes=10, **sizes)
 
 
-def plain(**settings: Any) -> Embedding:
+def plain(**settings):
     return Embedding(nn.Conv2d(3, 4, 3), **{"dimension": 5, "resize": (12, 16)} | settings)
 
 
@@ -57,7 +56,7 @@ def plain(**settings: Any) -> Embedding:
     ],
     ids=["HardNet", "TinyViT", "Conv2d", "SmallCNN"],
 )
-def test_networks_of_all_kinds(make: Callable[[], nn.Module], settings: dict[str, Any]) -> None:
+def test_networks_of_all_kinds(make, settings):
     net = Embedding(make(), dimension=12, **settings)
     frames = torch.rand(3, 3, 40, 36)
     features = net(frames)
@@ -69,7 +68,7 @@ def test_networks_of_all_kinds(make: Callable[[], nn.Module], settings: dict[str
     torch.testing.assert_close(net(frames), alone, rtol=0, atol=1e-4)
 
 
-def test_the_features_are_the_pooled_maps_projected_and_standardised() -> None:
+def test_the_features_are_the_pooled_maps_projected_and_standardised():
     net = plain(grid=2)
     frames = torch.rand(8, 3, 12, 16)
     maps = net.network(frames)  # 10 x 14, so that a cell of the grid is 5 x 7
@@ -79,7 +78,7 @@ def test_the_features_are_the_pooled_maps_projected_and_standardised() -> None:
     torch.testing.assert_close(net(frames), expected, rtol=0, atol=1e-4)
 
 
-def test_without_a_dimension_the_descriptor_is_what_it_gives() -> None:
+def test_without_a_dimension_the_descriptor_is_what_it_gives():
     full = Embedding(SmallCNN(dimension=7, resize=(16, 16), widths=(4,)), 5, resize=(16, 16), hidden=6).eval()
     own, frames = full.without_code(), torch.rand(20, 3, 24, 24)
     assert torch.equal(own(frames), full.describe(frames))
@@ -87,7 +86,7 @@ def test_without_a_dimension_the_descriptor_is_what_it_gives() -> None:
     assert all(name.startswith("network.") for name in own.state_dict())
 
 
-def test_grey_is_repeated_and_colour_becomes_luminance() -> None:
+def test_grey_is_repeated_and_colour_becomes_luminance():
     grey = torch.rand(2, 1, 12, 16)
     net = plain().eval()
     assert torch.equal(net(grey), net(grey.expand(-1, 3, -1, -1)))
@@ -97,7 +96,7 @@ def test_grey_is_repeated_and_colour_becomes_luminance() -> None:
     torch.testing.assert_close(one(red), one(torch.full((1, 1, 12, 16), 0.299)), rtol=0, atol=1e-5)
 
 
-def test_making_one_changes_nothing_of_the_network() -> None:
+def test_making_one_changes_nothing_of_the_network():
     """Neither running statistics nor the mode of any part."""
     network = nn.Sequential(nn.BatchNorm2d(3), nn.Conv2d(3, 4, 3), nn.Dropout())
     network[0].eval()
@@ -125,16 +124,14 @@ TOKENS = lambda frames: frames.flatten(2).mT  # noqa: E731
         (TOKENS, None, MEAN),
     ],
 )
-def test_of_several_outputs_the_first_vectors_count_or_the_one_named(
-    make: Callable[[Tensor], Any], output: int | None, expected: Callable[[Tensor], Tensor]
-) -> None:
+def test_of_several_outputs_the_first_vectors_count_or_the_one_named(make, output, expected):
     frames = torch.rand(4, 3, 96, 96)
     several = Embedding(Maker(make), dimension=None, output=output)
     torch.testing.assert_close(several(frames), expected(frames))
     torch.testing.assert_close(several.without_code()(frames), expected(frames))
 
 
-def test_mean_and_deviation_are_taken_out_last() -> None:
+def test_mean_and_deviation_are_taken_out_last():
     frames = torch.rand(2, 3, 12, 16)
     net = plain(mean=[0.1, 0.2, 0.3], std=0.5, cell=4).eval()
     assert set(net.state_dict()) == set(plain().state_dict())
@@ -168,9 +165,7 @@ NO_MAPS = "expected maps (B,K,h,w), vectors (B,K)"
         (lambda: Maker(MEAN), 1, ("output is 1", "Maker made 1")),
     ],
 )
-def test_networks_that_do_not_fit_are_refused(
-    make: Callable[[], nn.Module], output: int | None, facts: tuple[str, ...]
-) -> None:
+def test_networks_that_do_not_fit_are_refused(make, output, facts):
     network = make().train()
     with refused(*facts):
         Embedding(network, output=output)
@@ -198,12 +193,12 @@ def test_networks_that_do_not_fit_are_refused(
         (lambda: Coder(6, 3, noise=math.inf), ("Coder got", "noise=inf")),
     ],
 )
-def test_what_is_refused(call: Callable[[], Any], facts: tuple[str, ...]) -> None:
+def test_what_is_refused(call, facts):
     with refused(*facts):
         call()
 
 
-def test_a_map_brings_a_layer_back(tmp_path: Path) -> None:
+def test_a_map_brings_a_layer_back(tmp_path):
     network = SmallCNN(dimension=7, resize=(16, 16), widths=(4, 8))
     net = Embedding(network, None, layer="linear", mean=0.4, std=[0.2, 0.3, 0.4])
     frames = torch.rand(20, 3, 24, 24)
@@ -215,7 +210,7 @@ def test_a_map_brings_a_layer_back(tmp_path: Path) -> None:
 # the code ---------------------------------------------------------------------------------------------
 
 
-def test_components_are_whitened_and_of_one_length() -> None:
+def test_components_are_whitened_and_of_one_length():
     views, places = torch.randn(2, 200, 6)
     coder = Coder(6, 3, hidden=5, kept=4).eval()
     coder.whiten(views, places)
@@ -228,7 +223,7 @@ def test_components_are_whitened_and_of_one_length() -> None:
     torch.testing.assert_close(coder(mean + 7 * (views - mean)), coder(views), rtol=1e-4, atol=1e-4)
 
 
-def test_noise_is_for_training_alone() -> None:
+def test_noise_is_for_training_alone():
     views = torch.randn(200, 6)
     coder = Coder(6, 3, hidden=5, noise=0.5)
     coder.layers[1].momentum = 0.0  # its statistics stay
@@ -240,13 +235,13 @@ def test_noise_is_for_training_alone() -> None:
     assert torch.equal(coder(views), coder(views))
 
 
-def test_gradients_reach_the_descriptor() -> None:
+def test_gradients_reach_the_descriptor():
     coder = Coder(4, 2, hidden=3, noise=0.0).double().eval()
     views = torch.randn(3, 4, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(coder, (views,))
 
 
-def test_a_map_brings_the_whitening_back(tmp_path: Path) -> None:
+def test_a_map_brings_the_whitening_back(tmp_path):
     frames = torch.rand(12, 3, 16, 16)
     settings = {"resize": (16, 16), "grid": 2, "hidden": 6, "noise": 0.3, "kept": 7}
     net, empty = plain(**settings), plain(**settings)

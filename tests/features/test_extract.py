@@ -23,9 +23,9 @@ class Pooled(nn.Module):
     def __init__(self, channels: int = 1) -> None:
         super().__init__()
         self.norm = nn.BatchNorm2d(channels)
-        self.modes: list[bool] = []
+        self.modes = []
 
-    def forward(self, frames: Tensor) -> Tensor:
+    def forward(self, frames):
         self.modes.append(self.training)
         return self.norm(frames).mean((2, 3))
 
@@ -38,14 +38,14 @@ class Given(Traverse):
     def __init__(self, values: Tensor) -> None:
         self.values = values
 
-    def __len__(self) -> int:
+    def __len__(self):
         return len(self.values)
 
-    def read(self, frames: range | list[int]) -> Tensor:
+    def read(self, frames):
         return self.values[torch.as_tensor(frames)]
 
 
-def test_frames_go_through_the_module_in_order() -> None:
+def test_frames_go_through_the_module_in_order():
     frames = torch.rand(10, 1, 24, 24)
     whole = HOG()(frames)
     for size in (1, 3, 10, 64):
@@ -54,7 +54,7 @@ def test_frames_go_through_the_module_in_order() -> None:
         torch.testing.assert_close(torch.cat(batches), whole, rtol=0, atol=1e-6)
 
 
-def test_runs_in_eval_mode_and_restores_the_mode_of_every_part() -> None:
+def test_runs_in_eval_mode_and_restores_the_mode_of_every_part():
     for whole, part in ((True, True), (True, False), (False, False)):
         module = Pooled().train(whole)
         module.norm.train(part)
@@ -64,7 +64,7 @@ def test_runs_in_eval_mode_and_restores_the_mode_of_every_part() -> None:
         assert int(module.norm.num_batches_tracked) == 0
 
 
-def test_restores_the_mode_after_an_error_and_when_abandoned() -> None:
+def test_restores_the_mode_after_an_error_and_when_abandoned():
     module = Pooled().train()
     frames = torch.rand(6, 1, 4, 4)
     batches = feature_batches(ArrayTraverse(frames), module, 2)
@@ -77,7 +77,7 @@ def test_restores_the_mode_after_an_error_and_when_abandoned() -> None:
     assert module.training
 
 
-def test_batches_keep_no_gradients_and_features_of_one_do() -> None:
+def test_batches_keep_no_gradients_and_features_of_one_do():
     frames = torch.rand(4, 1, 16, 16, requires_grad=True)
     for features in feature_batches(ArrayTraverse(frames), HOG(), 2):
         assert not features.requires_grad
@@ -85,7 +85,7 @@ def test_batches_keep_no_gradients_and_features_of_one_do() -> None:
     assert frames.grad is not None
 
 
-def test_ready_features_pass_as_they_are() -> None:
+def test_ready_features_pass_as_they_are():
     module = Pooled()
     features = torch.rand(7, 3)
     assert torch.equal(torch.cat(list(feature_batches(ArrayTraverse(features), module, 2))), features)
@@ -94,7 +94,7 @@ def test_ready_features_pass_as_they_are() -> None:
 
 @pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf])
 @pytest.mark.parametrize("size", [1, 2, 64])
-def test_a_bad_frame_is_named_by_its_number(bad: float, size: int) -> None:
+def test_a_bad_frame_is_named_by_its_number(bad, size):
     frames, features = torch.rand(8, 1, 16, 16), torch.rand(8, 3)
     frames[5, 0, 8, 8] = features[5, 1] = bad
     for values in (frames, features):
@@ -113,17 +113,17 @@ def test_a_bad_frame_is_named_by_its_number(bad: float, size: int) -> None:
         (HOG(), torch.zeros(0, 3), ("the list", "no frames")),
     ],
 )
-def test_what_is_refused(module: nn.Module, values: Tensor, facts: tuple[str, ...]) -> None:
+def test_what_is_refused(module, values, facts):
     with refused(*facts):
         list(feature_batches(Given(values), module))
 
 
-def test_coarse_floats_become_float32() -> None:
+def test_coarse_floats_become_float32():
     features = torch.rand(4, 3).bfloat16()
     assert next(feature_batches(Given(features), HOG())).dtype == torch.float32
 
 
-def test_batches_of_large_frames_are_smaller(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_batches_of_large_frames_are_smaller(monkeypatch):
     monkeypatch.setattr(types, "BATCH_NUMBERS", 3 * 16 * 16 + 1)
     frames = torch.rand(7, 1, 16, 16)
     batches = list(feature_batches(ArrayTraverse(frames), HOG(), 64))
@@ -132,11 +132,11 @@ def test_batches_of_large_frames_are_smaller(monkeypatch: pytest.MonkeyPatch) ->
 
 
 class Terminal(io.StringIO):
-    def isatty(self) -> bool:
+    def isatty(self):
         return True
 
 
-def test_a_bar_counts_frames_however_often_they_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bar_counts_frames_however_often_they_are_looked_at(monkeypatch):
     frames = ArrayTraverse(torch.rand(70, 1, 16, 16))
     (copies, *_), looks = augmented_route(frames, 70, 3, 10_000, {"noise": 0.01})
     terminal = Terminal()
@@ -153,9 +153,7 @@ def test_a_bar_counts_frames_however_often_they_are_looked_at(monkeypatch: pytes
     assert augmented_route(frames, 70, 1, 100, {"noise": 0.01})[1] == "1 look at each frame"
 
 
-def test_without_a_terminal_there_is_a_line_now_and_then(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_a_terminal_there_is_a_line_now_and_then(monkeypatch, capsys):
     frames = ArrayTraverse(torch.rand(100, 1, 4, 4))
     list(feature_batches(frames, nn.Flatten(), 1, progress=True, verb="learning"))
     assert capsys.readouterr().err == ""  # over at once

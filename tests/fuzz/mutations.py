@@ -10,9 +10,6 @@ from __future__ import annotations
 import copy
 import math
 import re
-from collections.abc import Sequence
-from random import Random
-from typing import Any
 
 CANARY = "fuzz_canary"  # a module in the working folder, which no file may have imported
 LONG = 100_000  # characters
@@ -51,12 +48,12 @@ PICKLES = (  # each calls the canary where it is unpickled
 ONE_EACH = 0.7  # of the cases have a single change: several hide each other
 
 
-def times(random: Random) -> int:
+def times(random):
     """How many changes."""
     return 1 if random.random() < ONE_EACH else random.randint(2, 5)
 
 
-def mutate_bytes(random: Random, data: bytes) -> bytes:
+def mutate_bytes(random, data):
     """Bytes flipped, cut, doubled, spliced, overwritten or inserted; mostly near an end."""
     for _ in range(times(random)):
         start, other = _place(random, data), _place(random, data)
@@ -79,14 +76,14 @@ def mutate_bytes(random: Random, data: bytes) -> bytes:
     return data
 
 
-def _place(random: Random, data: bytes) -> int:
+def _place(random, data):
     """Somewhere in the bytes."""
     near = min(len(data), random.choice((16, 256, 4096, len(data))))
     at = random.randrange(near + 1)
     return max(0, len(data) - 1 - at) if random.random() < 0.3 else min(at, max(0, len(data) - 1))
 
 
-def mutate_json(random: Random, value: Any) -> Any:
+def mutate_json(random, value):
     """A tree of JSON values with some replaced by another type or size, removed, renamed or added."""
     value = copy.deepcopy(value)
     for _ in range(times(random)):
@@ -106,16 +103,16 @@ def mutate_json(random: Random, value: Any) -> Any:
     return value
 
 
-def _places(value: Any) -> Any:
+def _places(value):
     for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
         yield value, key
         if isinstance(inner, (dict, list)):
             yield from _places(inner)
 
 
-def odd_value(random: Random, value: Any) -> Any:
+def odd_value(random, value):
     """Something else in place of a JSON value."""
-    near: tuple[Any, ...] = ()
+    near = ()
     if isinstance(value, int | float) and not isinstance(value, bool):
         near = (value + 1, value - 1, -value, value * 2, value * 1000, float(value), str(value))
     elif isinstance(value, str):
@@ -130,7 +127,7 @@ def odd_value(random: Random, value: Any) -> Any:
     return random.choice((*[random.choice(NUMBERS)] * 4, *others))
 
 
-def mutate_text(random: Random, text: str, tokens: Sequence[str] = TOKENS) -> bytes:
+def mutate_text(random, text, tokens=TOKENS):
     """A text with other tokens or lines, sometimes no UTF-8 at all."""
     for _ in range(times(random)):
         by_line = random.random() < 0.2
@@ -156,7 +153,7 @@ def mutate_text(random: Random, text: str, tokens: Sequence[str] = TOKENS) -> by
     return text.encode(random.choice(("utf-16", "latin-1")), "replace") if random.random() < 0.05 else data
 
 
-def mutate_words(random: Random, words: Sequence[str], others: Sequence[Sequence[str]]) -> list[str]:
+def mutate_words(random, words, others):
     """A command line with words removed, doubled, exchanged, emptied, changed, or some of other lines.
 
     Args:

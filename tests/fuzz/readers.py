@@ -16,11 +16,11 @@ import struct
 import threading
 import warnings
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from random import Random
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import h5py
 import numpy as np
@@ -52,7 +52,7 @@ from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.training.checkpoint import read_checkpoint
-from dejavu_torch.types import InputError, Match, Traverse
+from dejavu_torch.types import InputError, Match
 
 from .inputs import (
     TRAIN,
@@ -84,14 +84,14 @@ class Case:
 
     def __init__(self, random: Random, folder: Path, made: Path) -> None:
         self.random, self.folder, self._made = random, folder, made
-        self.words: list[str] = []  # of a command line
-        self.begin: Callable[[], None] = lambda: None  # the input is there: from here on files are watched
+        self.words = []  # of a command line
+        self.begin = lambda: None  # the input is there: from here on files are watched
 
-    def made(self, maker: Maker) -> Path:
+    def made(self, maker):
         """The folder of what a maker made."""
         return self._made / maker.__name__
 
-    def command(self, words: Sequence[str]) -> None:
+    def command(self, words):
         """Run a command line, which may write where its words say."""
         self.words = list(words)
         self.begin()
@@ -110,13 +110,13 @@ class Reader(NamedTuple):
     share: float
 
 
-READERS: dict[str, Reader] = {}
+READERS = {}
 
 
-def reader(name: str, *makers: Maker, share: float = 1.0) -> Callable[[Run], Run]:
+def reader(name, *makers, share=1.0):
     """Register a reader."""
 
-    def register(run: Run) -> Run:
+    def register(run):
         READERS[name] = Reader(name, run, makers, share)
         return run
 
@@ -126,7 +126,7 @@ def reader(name: str, *makers: Maker, share: float = 1.0) -> Callable[[Run], Run
 # what is read ---------------------------------------------------------------------------------------------
 
 
-def take(traverse: Traverse, most: int = 4) -> None:
+def take(traverse, most=4):
     """Read the beginning of a traverse and check what comes."""
     traverse.frame_shape  # noqa: B018
     for i, batch in enumerate(traverse.batches(8)):
@@ -137,7 +137,7 @@ def take(traverse: Traverse, most: int = 4) -> None:
     assert len(traverse.names) in (0, len(traverse))
 
 
-def same_model(first: DejaVu, second: DejaVu) -> bool:
+def same_model(first, second):
     """Whether two maps hold the same tensors and settings."""
     (tensors, header), (others, other) = contents_of(first), contents_of(second)
     settings = json.dumps(header, sort_keys=True) == json.dumps(other, sort_keys=True)
@@ -145,7 +145,7 @@ def same_model(first: DejaVu, second: DejaVu) -> bool:
     return alike and all(same_tensor(tensors[name], others[name]) for name in tensors)
 
 
-def same_tensor(one: Tensor, other: Tensor) -> bool:
+def same_tensor(one, other):
     alike = one.dtype == other.dtype and one.shape == other.shape
     return alike and torch.equal(one.nan_to_num(), other.nan_to_num())
 
@@ -153,11 +153,11 @@ def same_tensor(one: Tensor, other: Tensor) -> bool:
 # maps -----------------------------------------------------------------------------------------------------
 
 
-def pick_map(case: Case) -> Path:
+def pick_map(case):
     return case.random.choice(sorted(case.made(maps).glob("*.safetensors")))
 
 
-def damaged(random: Random, data: bytes) -> bytes:
+def damaged(random, data):
     """A map file with other bytes, or with another table of its tensors."""
     if random.random() < 0.7:
         return mutate_bytes(random, data)
@@ -169,7 +169,7 @@ def damaged(random: Random, data: bytes) -> bytes:
 
 
 @reader("damaged map", maps, share=2)
-def damaged_map(case: Case) -> None:
+def damaged_map(case):
     path, data = pick_map(case), Path("in/map.safetensors")
     data.write_bytes(damaged(case.random, path.read_bytes()))
     case.begin()
@@ -179,7 +179,7 @@ def damaged_map(case: Case) -> None:
 
 
 @reader("map of matches", maps, share=0.5)
-def map_of_matches(case: Case) -> None:
+def map_of_matches(case):
     data = Path("in/map.safetensors")
     data.write_bytes(damaged(case.random, pick_map(case).read_bytes()))
     Path("in/matches.csv").write_text(matches_text())
@@ -189,7 +189,7 @@ def map_of_matches(case: Case) -> None:
 
 
 @reader("map commands", maps, share=1)
-def map_commands(case: Case) -> None:
+def map_commands(case):
     path, data = pick_map(case), Path("in/map.safetensors")
     data.write_bytes(damaged(case.random, path.read_bytes()))
     shutil.copy(path.with_suffix(".npy"), "in/query.npy")
@@ -200,7 +200,7 @@ def map_commands(case: Case) -> None:
 
 
 @reader("codec", share=1)
-def codec(case: Case) -> None:
+def codec(case):
     random = case.random
     rows, columns = random.randint(1, 30), random.randint(1, 8)
     numbers = [int(random.gauss(0, 9)) for _ in range(rows * columns)]
@@ -220,7 +220,7 @@ def codec(case: Case) -> None:
         raise Wrong("a damaged stream decodes to other levels")
 
 
-def rewritten(data: bytes, packing: int, change: Callable[[str, bytes], bytes]) -> bytes:
+def rewritten(data, packing, change):
     """A whole archive whose files, by name, hold something else."""
     written = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(written, "w") as new:
@@ -233,7 +233,7 @@ def rewritten(data: bytes, packing: int, change: Callable[[str, bytes], bytes]) 
 
 
 @reader("checkpoint", checkpoints, share=1)
-def checkpoint(case: Case) -> None:
+def checkpoint(case):
     """Damage is seen; settings that a file names import nothing."""
     path, data = case.made(checkpoints) / "last.ckpt", Path("in/last.ckpt")
     data.write_bytes(mutate_bytes(case.random, path.read_bytes()))
@@ -245,7 +245,7 @@ def checkpoint(case: Case) -> None:
 
 
 @reader("train commands", inputs, share=0.15)
-def train_commands(case: Case) -> None:
+def train_commands(case):
     train.TRAINER |= {"max_steps": 2, "max_time": "00:00:00:08"}  # where a config does not say it
     shutil.copytree(case.made(inputs), "in", dirs_exist_ok=True)
     random, data = case.random, Path("in/last.ckpt")
@@ -268,7 +268,7 @@ def train_commands(case: Case) -> None:
 SETTINGS = ("0", "1", "2", "0.5", "null", "true", "l2", "mean", "[2,2]", "16", "1e-3", "linear", "none")
 
 
-def mutated_yaml(random: Random, text: str) -> bytes:
+def mutated_yaml(random, text):
     if random.random() < 0.6:
         return mutate_text(random, text)
     lines = text.splitlines()
@@ -279,7 +279,7 @@ def mutated_yaml(random: Random, text: str) -> bytes:
 
 
 @reader("config", inputs, share=1.5)
-def config(case: Case) -> None:
+def config(case):
     random = case.random
     text = (FOLDER / f"{random.choice(('default', 'local_maxima', 'paper'))}.yaml").read_text()
     lines = [line.partition("#")[0].rstrip() for line in text.splitlines()]
@@ -335,7 +335,7 @@ compare in/frames.npy in/query.npy --out out/r --truth 0 --distractors in/photos
 """.strip().splitlines()
 
 
-def groups(line: str) -> list[list[str]]:
+def groups(line):
     """The words of a line, each option with its value."""
     return [group.split() for group in re.findall(r"--[^\s=]+\s+(?!--)\S+|\S+", line)]
 
@@ -371,7 +371,7 @@ fit validate test export in/a_file -c null --help
 TRAIN_OTHERS = groups(TRAIN_WORDS)
 
 
-def copy_inputs(case: Case) -> None:
+def copy_inputs(case):
     """All that command lines name, and what is no regular file."""
     shutil.copytree(case.made(inputs), "in", dirs_exist_ok=True)
     for suffix in ("npy", "mp4", "csv", "safetensors", "png", "yaml", "npz"):
@@ -379,7 +379,7 @@ def copy_inputs(case: Case) -> None:
     Path("in/loop.npy").symlink_to("loop.npy")
 
 
-def run_words(case: Case, lines: Sequence[str]) -> None:
+def run_words(case, lines):
     """A mutated command line; what takes minutes is not begun."""
     copy_inputs(case)
     line = case.random.choice(lines).split()
@@ -388,7 +388,7 @@ def run_words(case: Case, lines: Sequence[str]) -> None:
     if case.random.random() < 0.05:
         words = mutate_words(case.random, line, OTHERS)
 
-    def too_long(*_: object, **__: object) -> None:
+    def too_long(*_, **__):
         raise InputError("this would take too long here")
 
     reproduce.reproduce = too_long  # type: ignore[assignment]
@@ -399,12 +399,12 @@ def run_words(case: Case, lines: Sequence[str]) -> None:
 
 
 @reader("commands", inputs, share=1)
-def command_lines(case: Case) -> None:
+def command_lines(case):
     run_words(case, LINES)
 
 
 @reader("slow commands", inputs, share=0.15)
-def slow_command_lines(case: Case) -> None:
+def slow_command_lines(case):
     run_words(case, SLOW_LINES)
 
 
@@ -412,7 +412,7 @@ def slow_command_lines(case: Case) -> None:
 
 
 @reader("npy", maps, share=2)
-def npy(case: Case) -> None:
+def npy(case):
     random, path = case.random, Path("in/array.npy")
     noise = np.random.default_rng(random.randrange(2**32))
     features, frames = noise.normal(size=(9, 5)).astype(np.float32), noise.random((4, 1, 8, 8))
@@ -445,7 +445,7 @@ def npy(case: Case) -> None:
 
 
 @reader("h5", share=1)
-def h5(case: Case) -> None:
+def h5(case):
     random, written = case.random, io.BytesIO()
     noise = np.random.default_rng(random.randrange(2**32))
     odd = (noise.random((2, 3)), 0.5, "text", np.zeros(0), np.array([np.nan] * 5), np.arange(5), np.zeros(4))
@@ -463,7 +463,7 @@ def h5(case: Case) -> None:
 
 
 @reader("names", share=0.5)
-def names_beside_features(case: Case) -> None:
+def names_beside_features(case):
     random = case.random
     np.save("in/a.npy", np.random.default_rng(0).normal(size=(9, 5)))
     text = "".join(f"@{i}@{i + 1}@.jpg\n" for i in range(9))
@@ -474,7 +474,7 @@ def names_beside_features(case: Case) -> None:
     find_ground_truth("utm:2", traverse, traverse, 9, 9)
 
 
-def mutated_image(random: Random, folder: Path) -> tuple[str, bytes]:
+def mutated_image(random, folder):
     """An image's suffix and its bytes."""
     path = random.choice(sorted(folder.iterdir()))
     act = random.random()
@@ -493,7 +493,7 @@ def mutated_image(random: Random, folder: Path) -> tuple[str, bytes]:
 
 
 @reader("image", images, share=1.5)
-def image_folder(case: Case) -> None:
+def image_folder(case):
     random, folder = case.random, Path("in/photos")
     folder.mkdir()
     for i in range(2):
@@ -511,7 +511,7 @@ def image_folder(case: Case) -> None:
 
 
 @reader("strip", images, share=0.5)
-def strip(case: Case) -> None:
+def strip(case):
     suffix, data = mutated_image(case.random, case.made(images))
     path = Path(f"in/strip{suffix}")
     path.write_bytes(data)
@@ -520,7 +520,7 @@ def strip(case: Case) -> None:
 
 
 @reader("video", videos, share=1)
-def video(case: Case) -> None:
+def video(case):
     random = case.random
     path = random.choice(sorted(case.made(videos).iterdir()))
     suffix = random.choice((path.suffix, path.suffix, path.suffix, ".mp4", ".avi", ".webm", ".wmv"))
@@ -531,7 +531,7 @@ def video(case: Case) -> None:
 
 
 @reader("stream", videos, share=1)
-def stream(case: Case) -> None:
+def stream(case):
     """A pipe of bytes that may break off or go on as another video."""
     random = case.random
     first, second = (random.choice(sorted(case.made(videos).iterdir())).read_bytes() for _ in range(2))
@@ -548,20 +548,20 @@ def stream(case: Case) -> None:
                 raise Wrong(f"frames {shot.pixels.shape} {shot.pixels.dtype}")
 
 
-def _send(pipe: int, data: bytes) -> None:
+def _send(pipe, data):
     with suppress(OSError), open(pipe, "wb") as file:
         file.write(data)
 
 
 @reader("live frame", maps, share=1)
-def live_frame(case: Case) -> None:
+def live_frame(case):
     """A frame of any type, shape and values, in between two that fit."""
     random, path = case.random, case.random.choice(sorted(case.made(maps).glob("*.safetensors")))
     good = np.load(path.with_suffix(".npy"))
     noise = np.random.default_rng(random.randrange(2**32))
     fits = good.shape[1:]
     any_shape = tuple(random.choice((0, 1, 3, 16, 40)) for _ in range(3))
-    odd: Any = noise.random(random.choice((fits, fits, (*fits, 3), (3, *fits), (1,), (0, 0), any_shape)))
+    odd = noise.random(random.choice((fits, fits, (*fits, 3), (3, *fits), (1,), (0, 0), any_shape)))
     odd *= random.choice((1, 1, 1, 1, 1, 255, -1, 1e30, np.nan, np.inf))
     kind = random.choice(("u1", "u1", "f4", "f4", "f8", ">f4", "f2", "i8", "?", "c8", "O", "U3"))
     with np.errstate(all="ignore"), warnings.catch_warnings():
@@ -601,7 +601,7 @@ in/fifo.npy in/fifo.mp4 in/loop.npy strip:in/fifo.png?width=8
 
 
 @reader("source", inputs, share=2)
-def source(case: Case) -> None:
+def source(case):
     random = case.random
     copy_inputs(case)
     text = random.choice(SOURCES.split())
@@ -622,7 +622,7 @@ def source(case: Case) -> None:
 
 
 @reader("truth table", share=1.5)
-def truth_table(case: Case) -> None:
+def truth_table(case):
     random = case.random
     header = random.choice(("query,place\n", "query,place,place\n", "", "query;place\n"))
     rows = "".join(f"{i},{(i + random.randint(-1, 1)) % 30}\n" for i in range(12))
@@ -631,15 +631,15 @@ def truth_table(case: Case) -> None:
 
 
 @reader("truth lists", share=0.5)
-def truth_lists(case: Case) -> None:
+def truth_lists(case):
     random = case.random
-    held: Any = [[i, (i + random.randint(0, 2)) % 30] for i in range(12)]
+    held = [[i, (i + random.randint(0, 2)) % 30] for i in range(12)]
     text = json.dumps(mutate_json(random, held)).encode()
     Path("in/truth.json").write_bytes(random.choice((text, mutate_text(random, json.dumps(held)))))
     judge(case, "in/truth.json")
 
 
-def changed_array(random: Random, held: bytes) -> bytes:
+def changed_array(random, held):
     """A .npy of (30,12) with other bytes, with another shape, or as it is."""
     if random.random() < 0.5:
         return mutate_bytes(random, held)
@@ -650,11 +650,11 @@ def changed_array(random: Random, held: bytes) -> bytes:
 
 
 @reader("truth matrices", share=1)
-def truth_matrices(case: Case) -> None:
+def truth_matrices(case):
     random, path = case.random, Path("in/truth.npz")
     kinds = (bool, np.uint8, np.float32, "O", "U3", "<c8", "V4", "<M8[s]")
     matrix = np.eye(30, 12)
-    arrays: dict[str, Any] = {"GThard": matrix.astype(bool), "GTsoft": matrix[::-1].astype(bool)}
+    arrays = {"GThard": matrix.astype(bool), "GTsoft": matrix[::-1].astype(bool)}
     act = random.random()
     if act < 0.3:
         name = random.choice(sorted(arrays))
@@ -674,7 +674,7 @@ def truth_matrices(case: Case) -> None:
 
 
 @reader("truth text", share=1)
-def truth_text(case: Case) -> None:
+def truth_text(case):
     random = case.random
     plain = random.choice(("0", "-1", "12", "utm", "utm:25", "in/truth.csv"))
     text = mutate_text(random, plain).decode(errors="surrogateescape")
@@ -688,7 +688,7 @@ def truth_text(case: Case) -> None:
     judge(case, text, traverse)
 
 
-def judge(case: Case, truth: str, traverse: Traverse | None = None) -> None:
+def judge(case, truth, traverse=None):
     """Twelve matches by a truth."""
     random = case.random
     resampled, interpolate = random.random() < 0.2, random.random() < 0.3
@@ -705,7 +705,7 @@ def judge(case: Case, truth: str, traverse: Traverse | None = None) -> None:
 
 
 @reader("matches", share=1.5)
-def matches(case: Case) -> None:
+def matches(case):
     random = case.random
     text = matches_text()
     if random.random() < 0.3:

@@ -33,13 +33,11 @@ import time
 import traceback
 import warnings
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from itertools import pairwise
-from multiprocessing.connection import Connection
 from pathlib import Path
 from random import Random
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 
@@ -50,7 +48,7 @@ from dejavu_torch.maps import codec
 from dejavu_torch.types import InputError
 
 from .mutations import CANARY
-from .readers import READERS, Case, Reader, Wrong
+from .readers import READERS, Case, Wrong
 
 CPU, WALL = 20, 90  # seconds of a case
 SILENT = 300  # seconds after which a process that says nothing is ended
@@ -86,7 +84,7 @@ class Hang(BaseException):
 # in the forked process ----------------------------------------------------------------------------------
 
 
-def _run_case(reader: Reader, seed: int, number: int, root: Path) -> Result:
+def _run_case(reader, seed, number, root):
     """One case, whatever it does."""
     shutil.rmtree(root / "work", ignore_errors=True)
     folder = root / "work" / "a" / "b" / "case"  # so deep that ../.. is still inside
@@ -104,7 +102,7 @@ def _run_case(reader: Reader, seed: int, number: int, root: Path) -> Result:
     outcome, findings = "accepted", []
     for output in (1, 2):
         os.ftruncate(output, 0)
-    before: dict[str, Any] = {}
+    before = {}
     case.begin = lambda: before.update(_files(root / "work"))
     signal.setitimer(signal.ITIMER_PROF, CPU)
     signal.setitimer(signal.ITIMER_REAL, WALL)
@@ -139,7 +137,7 @@ def _run_case(reader: Reader, seed: int, number: int, root: Path) -> Result:
     return Result(number, "broken" if findings else outcome, findings)
 
 
-def _finding(error: BaseException, kind: str) -> Finding:
+def _finding(error, kind):
     where = ""
     for frame in traceback.extract_tb(error.__traceback__):
         if Path(frame.filename).is_relative_to(PACKAGE):
@@ -147,7 +145,7 @@ def _finding(error: BaseException, kind: str) -> Finding:
     return Finding(kind, where, str(error)[:MOST])
 
 
-def _told(root: Path, case: Case, outcome: str) -> list[Finding]:
+def _told(root, case, outcome):
     """What is wrong with what a case wrote to stderr: each line is one message of ours.
 
     Beside a call of the library lines of C code are let pass, such as libtiff's, which nothing can turn off.
@@ -162,7 +160,7 @@ def _told(root: Path, case: Case, outcome: str) -> list[Finding]:
     return []
 
 
-def _left(root: Path, case: Case, outcome: str, before: dict[str, Any], temporary: Path) -> list[Finding]:
+def _left(root, case, outcome, before, temporary):
     """What is wrong with the files after a case."""
     if any(temporary.iterdir()):
         gc.collect()  # a tensor that is kept in a temporary file
@@ -182,7 +180,7 @@ def _left(root: Path, case: Case, outcome: str, before: dict[str, Any], temporar
     return findings
 
 
-def _named(words: Sequence[str], folder: Path) -> Callable[[str], bool]:
+def _named(words, folder):
     """Whether a command line, run in `folder`, names a file, or its folder, as output and not as input."""
     outputs, inputs = set(), set()
     for before, word in pairwise(["", *words]):
@@ -194,9 +192,9 @@ def _named(words: Sequence[str], folder: Path) -> Callable[[str], bool]:
     return lambda name: name not in inputs and any(Path(name).is_relative_to(place) for place in outputs)
 
 
-def _files(folder: Path) -> dict[str, Any]:
+def _files(folder):
     """Every file and folder by its path, and the size and time of files."""
-    found: dict[str, Any] = {}
+    found = {}
     for path in folder.rglob("*"):
         status = path.lstat()
         told = None if stat.S_ISDIR(status.st_mode) else (status.st_size, status.st_mtime_ns)
@@ -204,14 +202,14 @@ def _files(folder: Path) -> dict[str, Any]:
     return found
 
 
-def _address_space() -> int:
+def _address_space():
     return int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
 
 
-def _prepare(root: Path) -> None:
+def _prepare(root):
     """Outputs, timers, warnings and paths of a forked process."""
 
-    def hang(number: int, _: Any) -> None:
+    def hang(number, _):
         raise Hang(f"over {CPU} s of CPU" if number == signal.SIGPROF else f"over {WALL} s")
 
     signal.signal(signal.SIGPROF, hang)
@@ -231,7 +229,7 @@ def _prepare(root: Path) -> None:
     torch.set_num_threads(1)
 
 
-def _work(reader: Reader, seed: int, numbers: Sequence[int], root: Path, told: Connection) -> None:
+def _work(reader, seed, numbers, root, told):
     """Run cases, telling of each when it begins and when it has ended."""
     _prepare(root)
     for maker in reader.makers:
@@ -259,7 +257,7 @@ def _work(reader: Reader, seed: int, numbers: Sequence[int], root: Path, told: C
 # in this process ----------------------------------------------------------------------------------------
 
 
-def run(reader: Reader, seed: int, numbers: Iterable[int], root: Path) -> Iterator[Result]:
+def run(reader, seed, numbers, root):
     """The results of the cases of a reader, in order."""
     waiting, forked = list(numbers), multiprocessing.get_context("fork")
     while waiting:
@@ -287,7 +285,7 @@ def run(reader: Reader, seed: int, numbers: Iterable[int], root: Path) -> Iterat
             raise RuntimeError(f"{reader.name} made no input: {text[-3000:]}")
 
 
-def main(arguments: list[str] | None = None) -> int:
+def main(arguments=None):
     """The command; 1 where there are findings."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__.partition("\n")[0])
     parser.add_argument("--cases", type=int, default=300, help="of all readers together")
@@ -297,8 +295,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--keep", type=Path, help="a folder to leave the case's files in")
     chosen = parser.parse_args(arguments)
     print("reader               cases  accepted  refused  findings  seconds", flush=True)
-    distinct: dict[tuple[str, str], list[tuple[str, int, Finding]]] = defaultdict(list)
-    total: Counter[str] = Counter()
+    distinct = defaultdict(list)
+    total = Counter()
     with ExitStack() as stack:
         root = chosen.keep or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="fuzz-")))
         root.mkdir(exist_ok=True)
@@ -324,6 +322,6 @@ def main(arguments: list[str] | None = None) -> int:
     return 1 if distinct else 0
 
 
-def _row(name: str, counts: Counter[str]) -> str:
+def _row(name, counts):
     cases, accepted, refused, broken = (counts[one] for one in ("cases", "accepted", "refused", "broken"))
     return f"{name:<20} {cases:5}  {accepted:8}  {refused:7}  {broken:8}"

@@ -52,7 +52,7 @@ EVERY = (*WRONG, "well", "replace")
 
 
 @pytest.fixture(scope="module")
-def told() -> tuple[str, str]:
+def told():
     """What a run prints of the readers, and of the mistakes: in a process of its own, as one that has
     computed in threads cannot be forked."""
     done = python(BOTH, *EVERY, cwd=ROOT, imports=PACKAGE)
@@ -62,11 +62,11 @@ def told() -> tuple[str, str]:
     return cases, mistakes
 
 
-def test_no_case_goes_wrong(told: tuple[str, str]) -> None:
+def test_no_case_goes_wrong(told):
     assert told[0].endswith("status 0\n"), told[0][-5000:]
 
 
-def test_every_mistake_is_found(told: tuple[str, str]) -> None:
+def test_every_mistake_is_found(told):
     rows = [line.split() for line in told[1].splitlines()]
     broken = {row[0]: row[1:5] for row in rows if len(row) == 6 and row[1] == "2"}
     assert broken == {name: ["2", "0", "0", "2"] if name in WRONG else ["2", "2", "0", "0"] for name in EVERY}

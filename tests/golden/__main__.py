@@ -14,7 +14,7 @@ from . import frames, options, runs
 PARTS = ("runs", "frames", "options")
 
 
-def main(words: list[str]) -> None:
+def main(words):
     unknown = set(words) - set(PARTS)
     if unknown:
         raise SystemExit(f"{', '.join(sorted(unknown))}: expected {', '.join(PARTS)}")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -26,30 +25,30 @@ ROUTES = tuple(
 )
 
 
-def drawn(route: str) -> np.ndarray:
+def drawn(route):
     """Some frames of a route, float in [0,1]. Shape: (3,C,H,W)."""
     source = open_source(route)
     return torch.cat([source.read(range(at, at + 1)) for at in AT]).numpy()
 
 
-def unsure(frames: np.ndarray) -> list[int]:
+def unsure(frames):
     """The places in the flat array of values so near to the edge of a level that rounding may decide."""
     level = frames.ravel().astype(np.float64) * LEVELS
     return [int(at) for at in np.flatnonzero(np.abs(level - np.floor(level) - 0.5) < NEAR * LEVELS)]
 
 
-def checksum(frames: np.ndarray, left_out: list[int]) -> str:
+def checksum(frames, left_out):
     """sha256 of the levels of all values but those left out."""
     levels = np.rint(frames.ravel().astype(np.float64) * LEVELS).astype(np.uint8)
     return hashlib.sha256(np.delete(levels, left_out).tobytes()).hexdigest()
 
 
-def golden() -> dict[str, dict[str, Any]]:
-    found: dict[str, dict[str, Any]] = json.loads(FILE.read_text())
+def golden():
+    found = json.loads(FILE.read_text())
     return found
 
 
-def write() -> None:
+def write():
     made = {}
     for route in ROUTES:
         frames = drawn(route)
@@ -60,7 +59,7 @@ def write() -> None:
     FILE.write_text("{\n" + ",\n".join(lines) + "\n}\n")
 
 
-def differs(route: str, known: dict[str, Any]) -> str:
+def differs(route, known):
     """How frames differ from those of the golden checksum; empty where they do not."""
     frames = drawn(route)
     if list(frames.shape) != known["shape"]:

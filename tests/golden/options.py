@@ -10,9 +10,8 @@ import json
 import pydoc
 import re
 import types
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Literal, Union, get_args, get_origin
+from typing import Literal, Union, get_args, get_origin
 
 import jsonargparse
 from pytorch_lightning import Trainer
@@ -31,9 +30,9 @@ STAGES = ("fit", "validate", "test", "export")
 LIGHTNING = ("--verbose", "--weights_only")  # options of Lightning, as are those of its Trainer that we leave
 
 
-def shown(*words: str) -> argparse.ArgumentParser:
+def shown(*words):
     """The parser whose help a command line prints."""
-    seen: list[argparse.ArgumentParser] = []
+    seen = []
     printed = argparse.ArgumentParser.print_help
     try:
         argparse.ArgumentParser.print_help = lambda self, file=None: seen.append(self)  # type: ignore
@@ -45,7 +44,7 @@ def shown(*words: str) -> argparse.ArgumentParser:
     return seen[-1]
 
 
-def commands() -> dict[str, str]:
+def commands():
     """What `dejavu --help` lists."""
     with contextlib.suppress(SystemExit), contextlib.redirect_stdout(io.StringIO()) as printed:
         main(["--help"])
@@ -53,7 +52,7 @@ def commands() -> dict[str, str]:
     return {name: listed[name] for name in COMMANDS}
 
 
-def kinds(annotation: Any) -> list[str]:
+def kinds(annotation):
     """The kinds of value that an annotation allows, sorted: `int | None` and `Optional[int]` are alike."""
     if get_origin(annotation) in (Union, types.UnionType):
         return sorted({kind for one in get_args(annotation) for kind in kinds(one)})
@@ -68,7 +67,7 @@ def kinds(annotation: Any) -> list[str]:
     return [getattr(annotation, "__name__", str(annotation)).removeprefix("typing.")]
 
 
-def plain(value: Any) -> Any:
+def plain(value):
     """A default as JSON: class paths without their modules."""
     if isinstance(value, argparse.Namespace) or hasattr(value, "as_dict"):
         value = value.as_dict() if hasattr(value, "as_dict") else vars(value)
@@ -82,7 +81,7 @@ def plain(value: Any) -> Any:
     return value if value is None or isinstance(value, bool | int | float | str) else str(value)
 
 
-def options(parser: argparse.ArgumentParser) -> Iterator[tuple[str, dict[str, Any]]]:
+def options(parser):
     """The options of a parser and, without dashes, its positional arguments."""
     trainer = inspect.signature(Trainer).parameters
     for action in parser._actions:
@@ -95,7 +94,7 @@ def options(parser: argparse.ArgumentParser) -> Iterator[tuple[str, dict[str, An
             continue
         kind = getattr(action, "_typehint", None) or action.type
         flag = action.nargs == 0
-        about: dict[str, Any] = {"kind": ["flag"] if flag else kinds(kind)}
+        about = {"kind": ["flag"] if flag else kinds(kind)}
         if action.choices:
             about["choices"] = sorted(map(str, action.choices))
         if action.nargs not in (None, 0):
@@ -107,9 +106,9 @@ def options(parser: argparse.ArgumentParser) -> Iterator[tuple[str, dict[str, An
         yield name, about
 
 
-def read() -> dict[str, dict[str, Any]]:
+def read():
     """All of them, by the words that show them."""
-    found: dict[str, dict[str, Any]] = {"dejavu": commands()}
+    found = {"dejavu": commands()}
     for command in found["dejavu"]:
         if command != "train":
             found[command] = dict(options(shown(command, "--help")))
@@ -127,7 +126,7 @@ def read() -> dict[str, dict[str, Any]]:
     return found
 
 
-def text(found: dict[str, dict[str, Any]]) -> str:
+def text(found):
     """JSON with a line for each option."""
     blocks = []
     for words, one in found.items():
@@ -136,5 +135,5 @@ def text(found: dict[str, dict[str, Any]]) -> str:
     return "{\n" + ",\n".join(blocks) + "\n}\n"
 
 
-def write() -> None:
+def write():
     FILE.write_text(text(read()))

@@ -6,9 +6,7 @@ import csv
 import json
 import math
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 import numpy as np
@@ -19,7 +17,7 @@ HERE = Path(__file__).parent
 SMALL = "size=32"
 
 
-def _visits(route: str) -> tuple[str, str]:
+def _visits(route):
     return f"sim:{route}", f"sim:{route}&traverse=1"
 
 
@@ -27,7 +25,7 @@ def _visits(route: str) -> tuple[str, str]:
 # variance: runs of frames have none, that of descriptors few components of 16 bits.
 PLAIN = ("--features", "[HOG,Distilled]", "--whitening", "none")
 # {data} is DEJAVU_TEST_DATA, {made} a folder of `descriptors`
-RUNS: dict[str, tuple[str, ...]] = {
+RUNS = {
     "demo": (*_visits(f"aerial?seed=0&frames=300&{SMALL}"), *PLAIN),
     "descriptors": (
         *("{made}/0.npy", "{made}/1.npy", "--truth", "0", "--second", "{made}/2.npy", "--storage_curve"),
@@ -67,7 +65,7 @@ SCORE = 1e-4  # of scores and probabilities in matches.csv
 SAME = 0.995  # of the places in it
 
 
-def descriptors(visit: int) -> np.ndarray:
+def descriptors(visit):
     """(400,16) float32 of a visit to a smooth route; variances that no rounding puts in another order."""
     random = np.random.default_rng(7)
     i, waves = np.arange(400)[:, None], random.integers(1, 40, 16)
@@ -76,7 +74,7 @@ def descriptors(visit: int) -> np.ndarray:
     return ((route + noise) * 0.8 ** np.arange(16)).astype(np.float32)
 
 
-def run(name: str, out: Path, data: Path | None) -> None:
+def run(name, out, data):
     """Run one of them; its pictures are of few pixels."""
     made = out.parent / f"{name}_made"
     if any("{made}" in word for word in RUNS[name]):
@@ -88,7 +86,7 @@ def run(name: str, out: Path, data: Path | None) -> None:
         main(["compare", *words, "--out", str(out)])
 
 
-def write(name: str, out: Path, data: Path | None) -> None:
+def write(name, out, data):
     """Run it, and keep what it made."""
     run(name, out / "report", data)
     text = (out / "report" / "report.json").read_text().replace(str(data), "{data}").replace(str(out), "")
@@ -96,26 +94,26 @@ def write(name: str, out: Path, data: Path | None) -> None:
     shutil.copyfile(out / "report" / "matches.csv", HERE / f"{name}.matches.csv")
 
 
-def golden_report(name: str) -> dict[str, Any]:
-    report: dict[str, Any] = json.loads((HERE / f"{name}.report.json").read_text())
+def golden_report(name):
+    report = json.loads((HERE / f"{name}.report.json").read_text())
     return report
 
 
-def report_of(out: Path) -> dict[str, Any]:
-    report: dict[str, Any] = json.loads((out / "report.json").read_text())
+def report_of(out):
+    report = json.loads((out / "report.json").read_text())
     return report
 
 
-def golden_matches(name: str) -> list[dict[str, str]]:
+def golden_matches(name):
     return read_matches(HERE / f"{name}.matches.csv")
 
 
-def read_matches(path: Path) -> list[dict[str, str]]:
+def read_matches(path):
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
 
 
-def keys(value: object, path: str = "") -> Iterator[str]:
+def keys(value, path=""):
     """Every key of a report, with those above it; the parts of a list by their numbers."""
     if isinstance(value, dict):
         for name, part in value.items():
@@ -127,7 +125,7 @@ def keys(value: object, path: str = "") -> Iterator[str]:
             yield from keys(part, f"{path}/{number}")
 
 
-def differences(seen: Any, golden: Any, queries: int, path: str = "") -> Iterator[str]:
+def differences(seen, golden, queries, path=""):
     """Where a report differs from the golden one by more than rounding, a line each.
 
     Args:
@@ -145,7 +143,7 @@ def differences(seen: Any, golden: Any, queries: int, path: str = "") -> Iterato
         yield f"{path} is {seen}; golden {golden}"
 
 
-def _close(seen: Any, golden: Any, name: str, path: str, queries: int) -> bool:
+def _close(seen, golden, name, path, queries):
     numbers = all(isinstance(one, int | float) and not isinstance(one, bool) for one in (seen, golden))
     if not numbers or name in EXACT:
         return bool(seen == golden)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -18,14 +17,14 @@ from dejavu_torch.types import InputError
 PIXELS = np.zeros((2, 2, 3), np.uint8)
 
 
-def shots(count: int, rate: float = 25.0) -> Iterator[Frame]:
+def shots(count, rate=25.0):
     return (Frame(i, i / rate, PIXELS) for i in range(count))
 
 
-def test_no_frame_of_a_file_is_dropped_nor_read_far_ahead() -> None:
+def test_no_frame_of_a_file_is_dropped_nor_read_far_ahead():
     read = []
 
-    def counted() -> Iterator[Frame]:
+    def counted():
         for shot in shots(30):
             read.append(shot.number)
             yield shot
@@ -37,10 +36,10 @@ def test_no_frame_of_a_file_is_dropped_nor_read_far_ahead() -> None:
     assert (i, feed.dropped) == (29, 0)
 
 
-def test_of_a_live_source_the_newest_frame_is_taken_and_the_others_are_counted() -> None:
+def test_of_a_live_source_the_newest_frame_is_taken_and_the_others_are_counted():
     steps = [threading.Event() for _ in range(2)]
 
-    def bursts() -> Iterator[Frame]:
+    def bursts():
         yield from shots(5)
         steps[0].set()
         assert steps[1].wait(5)
@@ -57,10 +56,10 @@ def test_of_a_live_source_the_newest_frame_is_taken_and_the_others_are_counted()
     assert feed.dropped == 9 - len(seen)
 
 
-def test_a_source_that_stalls_is_told_behind_what_came() -> None:
+def test_a_source_that_stalls_is_told_behind_what_came():
     never = threading.Event()
 
-    def stalls() -> Iterator[Frame]:
+    def stalls():
         yield from shots(3)
         never.wait(10)
 
@@ -76,8 +75,8 @@ def test_a_source_that_stalls_is_told_behind_what_came() -> None:
 
 
 @pytest.mark.parametrize("newest", [False, True])
-def test_what_reading_raises_comes_behind_the_frames(newest: bool) -> None:
-    def breaks() -> Iterator[Frame]:
+def test_what_reading_raises_comes_behind_the_frames(newest):
+    def breaks():
         yield from shots(1)
         raise InputError("it broke off")
 
@@ -88,13 +87,13 @@ def test_what_reading_raises_comes_behind_the_frames(newest: bool) -> None:
     assert seen == [0]
 
 
-def test_the_thread_ends_with_the_feed() -> None:
+def test_the_thread_ends_with_the_feed():
     with FrameReader(shots(10**9)) as feed:
         next(iter(feed))
     assert not feed._thread.is_alive()
 
 
-def test_real_time() -> None:
+def test_real_time():
     began = time.monotonic()
     assert len(list(in_real_time(shots(6, rate=50), "clip"))) == 6
     assert time.monotonic() - began >= 0.1

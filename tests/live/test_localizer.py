@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import copy
 import math
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from footage import QUERY, REFERENCE, camera, footage
 from helpers import refused
-from torch import Tensor
 
 from dejavu_torch import (
     DejaVu,
@@ -23,18 +21,17 @@ from dejavu_torch import (
     TemplateMapper,
     Whitening,
 )
-from dejavu_torch.live.localizer import LiveMatch, as_batch
-from dejavu_torch.types import SequenceModel
+from dejavu_torch.live.localizer import as_batch
 
 PLACES, SHAPE = 48, (3, 24, 32)
 
 
-def answers(localizer: LiveLocalizer, frames: Tensor) -> list[LiveMatch]:
+def answers(localizer, frames):
     return [localizer(frame) for frame in frames]
 
 
 @pytest.fixture(scope="module")
-def route() -> Tensor:
+def route():
     """A camera that moves along a texture."""
     ground = torch.rand(1, 3, 6, 40, generator=torch.Generator().manual_seed(1))
     ground = torch.nn.functional.interpolate(ground, (24, 32 + 3 * PLACES), mode="bicubic").clamp(0, 1)[0]
@@ -42,19 +39,19 @@ def route() -> Tensor:
 
 
 @pytest.fixture(scope="module")
-def drive(route: Tensor) -> Tensor:
+def drive(route):
     noise = torch.randn(route[10:40].shape, generator=torch.Generator().manual_seed(2))
     return (route[10:40] + 0.03 * noise).clamp(0, 1)
 
 
 @pytest.fixture(scope="module")
-def spectral(route: Tensor) -> DejaVu:
+def spectral(route):
     return (
         DejaVu(whitening=Whitening(views=1), mapper=SpectralMapper(20.0), threshold=0.7).learn(route).eval()
     )
 
 
-SEQUENCES: dict[str, SequenceModel | None] = {
+SEQUENCES = {
     "single": None,
     "sequence": SequenceMatcher(5),
     "speeds": SequenceMatcher(4, (1.0, 0.5)),
@@ -64,9 +61,7 @@ SEQUENCES: dict[str, SequenceModel | None] = {
 
 @pytest.mark.parametrize("sequence", SEQUENCES.values(), ids=SEQUENCES)
 @pytest.mark.parametrize("kind", ["spectral", "templates"])
-def test_one_by_one_is_as_all_together(
-    kind: str, sequence: SequenceModel | None, spectral: DejaVu, route: Tensor, drive: Tensor
-) -> None:
+def test_one_by_one_is_as_all_together(kind, sequence, spectral, route, drive):
     model = spectral
     if kind == "templates":
         model = DejaVu(mapper=TemplateMapper(ImposedPeriods([5, 7, 9], bin=4)), threshold=1.0).learn(route)
@@ -80,7 +75,7 @@ def test_one_by_one_is_as_all_together(
     assert (match.index - torch.arange(10, 40)).abs().float().median() <= 2
 
 
-def test_with_a_lag_answers_come_later_and_know_of_it(spectral: DejaVu, drive: Tensor) -> None:
+def test_with_a_lag_answers_come_later_and_know_of_it(spectral, drive):
     sequence = PlaceFilter(lag=4)
     localizer = LiveLocalizer(spectral, sequence)
     due = []
@@ -101,7 +96,7 @@ def test_with_a_lag_answers_come_later_and_know_of_it(spectral: DejaVu, drive: T
         localizer(drive[0])
 
 
-def test_the_mean_of_the_frames_so_far_is_removed_if_asked_for(spectral: DejaVu, drive: Tensor) -> None:
+def test_the_mean_of_the_frames_so_far_is_removed_if_asked_for(spectral, drive):
     assert spectral.whitening is not None
     queries = spectral.whitening(spectral.descriptor.describe(drive)).detach()
     mean = spectral.map.mean
@@ -115,7 +110,7 @@ def test_the_mean_of_the_frames_so_far_is_removed_if_asked_for(spectral: DejaVu,
         )
 
 
-def test_the_default_is_a_filter_and_tells_its_posterior(spectral: DejaVu, drive: Tensor) -> None:
+def test_the_default_is_a_filter_and_tells_its_posterior(spectral, drive):
     found = answers(LiveLocalizer(spectral), drive)
     assert [one.posterior for one in found] == pytest.approx([math.exp(-one.score) for one in found])
     assert all(0 < one.posterior <= 1 for one in found)
@@ -133,13 +128,13 @@ def test_the_default_is_a_filter_and_tells_its_posterior(spectral: DejaVu, drive
         lambda x: x.numpy().astype(">f4"),
     ],
 )
-def test_every_kind_of_array(given: Any, spectral: DejaVu, drive: Tensor) -> None:
+def test_every_kind_of_array(given, spectral, drive):
     batch = as_batch(given(drive[5]))
     torch.testing.assert_close(batch[0].float(), drive[5], atol=0.5 / 255 + 1e-6, rtol=0)
     assert LiveLocalizer(spectral, None)(given(drive[5])).place == 15
 
 
-def test_ready_features() -> None:
+def test_ready_features():
     wave = torch.randn(40, 6)
     model = DejaVu().learn(wave)
     assert LiveLocalizer(model, None)(wave[7]).place == 7
@@ -160,9 +155,7 @@ def test_ready_features() -> None:
         ("photo.jpg", ("str", "uint8")),
     ],
 )
-def test_what_is_no_frame_of_the_map_is_refused_and_changes_nothing(
-    frame: Any, words: tuple[str, ...], spectral: DejaVu, drive: Tensor
-) -> None:
+def test_what_is_no_frame_of_the_map_is_refused_and_changes_nothing(frame, words, spectral, drive):
     localizer = LiveLocalizer(spectral)
     before = answers(localizer, drive[:6])
     with refused(*words):
@@ -172,9 +165,7 @@ def test_what_is_no_frame_of_the_map_is_refused_and_changes_nothing(
     assert [one[:6] for one in found] == [one[:6] for one in expected]
 
 
-def test_a_frame_of_another_size_is_brought_to_the_maps(
-    spectral: DejaVu, drive: Tensor, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_frame_of_another_size_is_brought_to_the_maps(spectral, drive, caplog):
     large = torch.nn.functional.interpolate(drive[:6], scale_factor=3, mode="nearest")
     found = [one.place for one in answers(LiveLocalizer(spectral, None), large)]
     assert found == spectral.localize(large).index.tolist()
@@ -184,7 +175,7 @@ def test_a_frame_of_another_size_is_brought_to_the_maps(
     assert len(caplog.messages) == 1
 
 
-def test_scores_are_of_the_latest_frame_and_reset_forgets(spectral: DejaVu, drive: Tensor) -> None:
+def test_scores_are_of_the_latest_frame_and_reset_forgets(spectral, drive):
     localizer = LiveLocalizer(spectral, SequenceMatcher(5))
     first = answers(localizer, drive[:8])
     assert localizer.scores is not None
@@ -195,7 +186,7 @@ def test_scores_are_of_the_latest_frame_and_reset_forgets(spectral: DejaVu, driv
     assert [one[:6] for one in answers(localizer, drive[:8])] == [one[:6] for one in first]
 
 
-def test_frames_left_out_move_the_filter_on(route: Tensor) -> None:
+def test_frames_left_out_move_the_filter_on(route):
     """Of every 6th frame only a filter that knows is not lost."""
     torch.manual_seed(3)
     model = DejaVu(whitening="none", mapper=SpectralMapper(None, step=0.05, metric="l2"))
@@ -203,7 +194,7 @@ def test_frames_left_out_move_the_filter_on(route: Tensor) -> None:
     model.learn(wave)
     frames, noise = range(10, 290, 6), 1.2
 
-    def posteriors(told: bool) -> Tensor:
+    def posteriors(told):
         generator = torch.Generator().manual_seed(0)
         localizer = LiveLocalizer(model)
         seen = (wave[i] + noise * torch.randn(24, generator=generator) for i in frames)
@@ -215,7 +206,7 @@ def test_frames_left_out_move_the_filter_on(route: Tensor) -> None:
     assert posteriors(True)[10:].mean() > posteriors(False)[10:].mean() + 0.2
 
 
-def test_a_copy_goes_on_by_itself(spectral: DejaVu, drive: Tensor) -> None:
+def test_a_copy_goes_on_by_itself(spectral, drive):
     localizer = LiveLocalizer(spectral)
     answers(localizer, drive[:5])
     other = copy.deepcopy(localizer)
@@ -223,12 +214,12 @@ def test_a_copy_goes_on_by_itself(spectral: DejaVu, drive: Tensor) -> None:
     assert [one.place for one in answers(other, drive[5:9])] == [one.place for one in expected]
 
 
-def test_names_and_interruption(spectral: DejaVu, drive: Tensor, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_names_and_interruption(spectral, drive, monkeypatch):
     localizer = LiveLocalizer(spectral)
     monkeypatch.setattr(spectral.state, "frame_names", [f"{i}.png" for i in range(PLACES)])
     assert localizer(drive[0]).name == f"{localizer(drive[0]).frame}.png"
 
-    def interrupted(queries: Tensor) -> Tensor:
+    def interrupted(queries):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
@@ -240,7 +231,7 @@ def test_names_and_interruption(spectral: DejaVu, drive: Tensor, monkeypatch: py
     assert broken(drive[0])[:6] == LiveLocalizer(spectral)(drive[0])[:6]
 
 
-def test_what_cannot_be_localised_live_is_refused(spectral: DejaVu) -> None:
+def test_what_cannot_be_localised_live_is_refused(spectral):
     for model, sequence, words in (
         (DejaVu(), None, ["no map"]),
         (spectral, "best", ["best", "PlaceFilter"]),
@@ -250,7 +241,7 @@ def test_what_cannot_be_localised_live_is_refused(spectral: DejaVu) -> None:
             LiveLocalizer(model, sequence)  # type: ignore[arg-type]
 
 
-def test_a_map_of_even_steps_takes_frames_as_they_are_or_none() -> None:
+def test_a_map_of_even_steps_takes_frames_as_they_are_or_none():
     model = DejaVu(velocity=camera(), mapper=SpectralMapper(20.0), whitening="none").learn(footage(REFERENCE))
     with refused("even steps", "as_is"):
         LiveLocalizer(model)

@@ -8,9 +8,7 @@ import math
 import re
 import shutil
 import subprocess
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from urllib.request import urlopen
 
 import numpy as np
@@ -28,7 +26,7 @@ from dejavu_torch.live.page import PAGE, Page, ReferencePictures, Snapshot, as_p
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
 
-def moment(number: int = 7, name: str = "left<b>.png", accepted: bool = True, time: float = 0.28) -> Snapshot:
+def moment(number=7, name="left<b>.png", accepted=True, time=0.28):
     pixels = np.zeros((24, 32, 3), np.uint8)
     pixels[:, :16] = (200, 40, 40)
     scores = torch.full((3001,), 1e-5)
@@ -39,18 +37,18 @@ def moment(number: int = 7, name: str = "left<b>.png", accepted: bool = True, ti
 
 
 @pytest.fixture
-def page() -> Iterator[Page]:
+def page():
     with Page(0, "drive.mp4 on map.safetensors") as page:
         yield page
 
 
-def state_of(page: Page, seen: str = "") -> dict[str, object]:
+def state_of(page, seen=""):
     with urlopen(f"{page.url}state?seen={seen}") as answer:
-        state: dict[str, object] = json.load(answer)
+        state = json.load(answer)
         return state
 
 
-def test_the_state_is_that_of_the_latest_frame(page: Page) -> None:
+def test_the_state_is_that_of_the_latest_frame(page):
     assert state_of(page)["number"] == -1
     page.show(moment())
     state = state_of(page)
@@ -65,7 +63,7 @@ def test_the_state_is_that_of_the_latest_frame(page: Page) -> None:
     assert (state_of(page, seen="7")["number"], state_of(page)["time"]) == (8, None)
 
 
-def test_it_asks_for_nothing_elsewhere(page: Page) -> None:
+def test_it_asks_for_nothing_elsewhere(page):
     with urlopen(page.url) as answer:
         text = answer.read().decode()
     assert text == PAGE.read_text()
@@ -81,7 +79,7 @@ def test_it_asks_for_nothing_elsewhere(page: Page) -> None:
         ("/etc", "127.0.0.1", 404),
     ],
 )
-def test_only_this_machine_is_answered(path: str, host: str, status: int, page: Page) -> None:
+def test_only_this_machine_is_answered(path, host, status, page):
     port = int(page.url.rpartition(":")[2].strip("/"))
     connection = http.client.HTTPConnection("127.0.0.1", port)
     connection.request("GET", path, headers={"Host": f"{host}:{port}"})
@@ -89,7 +87,7 @@ def test_only_this_machine_is_answered(path: str, host: str, status: int, page: 
     connection.close()
 
 
-def test_a_port_that_cannot_be_had_is_one_line(page: Page) -> None:
+def test_a_port_that_cannot_be_had_is_one_line(page):
     port = page.url.rpartition(":")[2].strip("/")
     with refused(port, "in use"):
         Page(int(port))
@@ -97,7 +95,7 @@ def test_a_port_that_cannot_be_had_is_one_line(page: Page) -> None:
         Page(70000)
 
 
-def test_curve_keeps_the_highest_of_many_places() -> None:
+def test_curve_keeps_the_highest_of_many_places():
     scores = torch.full((100_000,), 12.0)
     scores[70_001] = 0.0
     heights = curve(scores, posterior=False)
@@ -107,7 +105,7 @@ def test_curve_keeps_the_highest_of_many_places() -> None:
 
 
 @pytest.mark.parametrize("places", [1, 7, 512, 700, 100_000])
-def test_columns_of_a_posterior_and_being_off_the_map_add_up_to_1(places: int) -> None:
+def test_columns_of_a_posterior_and_being_off_the_map_add_up_to_1(places):
     posterior = torch.rand(places + 1, generator=torch.Generator().manual_seed(0))
     posterior /= posterior.sum()
     heights = curve(posterior, posterior=True)
@@ -117,7 +115,7 @@ def test_columns_of_a_posterior_and_being_off_the_map_add_up_to_1(places: int) -
     assert heights[len(heights) // 2] == pytest.approx(float(posterior[:-1][middle].sum()), abs=1e-5)
 
 
-def test_reference_pictures_of_any_source(tmp_path: Path) -> None:
+def test_reference_pictures_of_any_source(tmp_path):
     frames = pictures(5)
     np.save(tmp_path / "frames.npy", frames)
     by_index = ReferencePictures(open_source(tmp_path / "frames.npy"), 5)
@@ -137,7 +135,7 @@ def test_reference_pictures_of_any_source(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
-def test_a_browser_shows_it(page: Page, tmp_path: Path) -> None:
+def test_a_browser_shows_it(page, tmp_path):
     page.reference = lambda frame: as_picture(np.full((24, 32, 3), frame % 256, np.uint8))
     page.show(moment())
     options = "--headless --no-sandbox --disable-gpu --no-first-run --disable-sync --window-size=1000,800"

@@ -15,14 +15,13 @@ import torch
 from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
-from torch import Tensor
 
 from dejavu_torch.maps import codec, compiling
 from dejavu_torch.maps.codec import Stream, coded_bytes, decode, encode
 from dejavu_torch.types import InputError
 
 
-def levels(rows: int = 200, columns: int = 7, spread: float = 3.0) -> Tensor:
+def levels(rows=200, columns=7, spread=3.0):
     random = torch.randn(rows, columns, generator=torch.Generator().manual_seed(0))
     return (random * spread * torch.linspace(2, 0.1, rows)[:, None]).round().to(torch.int32)
 
@@ -30,7 +29,7 @@ def levels(rows: int = 200, columns: int = 7, spread: float = 3.0) -> Tensor:
 @given(
     st.integers(1, 40), st.integers(1, 20), st.sampled_from([0.1, 3.0, 60.0, 500.0, 2e9]), st.integers(0, 99)
 )
-def test_a_stream_gives_the_levels_back(rows: int, columns: int, spread: float, seed: int) -> None:
+def test_a_stream_gives_the_levels_back(rows, columns, spread, seed):
     random = torch.randn(rows, columns, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     own = (random * spread).round().clamp(1 - 2**31, 2**31 - 1).to(torch.int32)
     stream = encode(own)
@@ -40,7 +39,7 @@ def test_a_stream_gives_the_levels_back(rows: int, columns: int, spread: float, 
     assert 0 <= coded_bytes(own) - len(stream.bytes) <= 1
 
 
-def test_how_many_rows_are_coded_at_a_time_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_how_many_rows_are_coded_at_a_time_changes_nothing(monkeypatch):
     own = levels()
     whole = encode(own), coded_bytes(own)
     for block in (1, 7 * 16, 7 * 200):
@@ -50,7 +49,7 @@ def test_how_many_rows_are_coded_at_a_time_changes_nothing(monkeypatch: pytest.M
         assert torch.equal(decode(whole[0], 200, 7), own.to(torch.int8))
 
 
-def test_the_rows_that_are_0_at_the_end_cost_next_to_nothing() -> None:
+def test_the_rows_that_are_0_at_the_end_cost_next_to_nothing():
     own = levels(500, 32)
     longer = torch.cat([own, own.new_zeros(100000, 32)])
     stream = encode(longer)
@@ -58,7 +57,7 @@ def test_the_rows_that_are_0_at_the_end_cost_next_to_nothing() -> None:
     assert torch.equal(decode(stream, len(longer), 32), longer.to(torch.int8))
 
 
-def test_levels_of_a_known_law_take_little_more_than_their_entropy() -> None:
+def test_levels_of_a_known_law_take_little_more_than_their_entropy():
     """Geometric magnitudes that fall along rows and columns, and signs of which nothing is known."""
     random = torch.Generator().manual_seed(0)
     rows, columns = torch.arange(3000)[:, None], torch.arange(64)
@@ -71,7 +70,7 @@ def test_levels_of_a_known_law_take_little_more_than_their_entropy() -> None:
     assert 0.97 * ideal < len(encode(own).bytes) < 1.05 * ideal
 
 
-def made(rows: int, columns: int, largest: int) -> Tensor:
+def made(rows, columns, largest):
     """Levels that fall along the rows, by whole numbers alone."""
     count = torch.arange(rows * columns)
     noise = (count * count * 7919 + count * 104729) % 100003 % 1009
@@ -91,13 +90,13 @@ STREAMS = {
 }
 
 
-def test_a_stream_stays_what_it_was() -> None:
+def test_a_stream_stays_what_it_was():
     for shape in STREAMS:
         stream = encode(made(*shape))
         assert (len(stream.bytes), zlib.crc32(stream.bytes.numpy().tobytes())) == STREAMS[shape]
 
 
-def test_damage_is_told() -> None:
+def test_damage_is_told():
     own = levels()
     stream = encode(own)
     altered = stream.bytes.clone()
@@ -112,7 +111,7 @@ def test_damage_is_told() -> None:
         decode(encode(torch.zeros(10, 4, dtype=torch.int8)), 11, 4)
 
 
-def test_a_stream_of_too_many_or_too_few_bytes_is_told() -> None:
+def test_a_stream_of_too_many_or_too_few_bytes_is_told():
     """Even where the levels are those of the checksum."""
     own = levels()
     stream = encode(own)
@@ -122,13 +121,13 @@ def test_a_stream_of_too_many_or_too_few_bytes_is_told() -> None:
 
 
 @given(st.binary(max_size=60), st.integers(1, 20), st.integers(1, 9))
-def test_a_stream_of_anything_is_refused(packed: bytes, rows: int, columns: int) -> None:
+def test_a_stream_of_anything_is_refused(packed, rows, columns):
     stream = Stream(torch.tensor(list(packed), dtype=torch.uint8), zlib.crc32(b"other levels"))
     with refused("truncated or altered", f"{rows * columns} levels"):
         decode(stream, rows, columns)
 
 
-def test_a_claim_of_nothing_or_beyond_the_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_claim_of_nothing_or_beyond_the_memory_is_refused(monkeypatch):
     stream = encode(levels())
     for rows, columns in ((0, 5), (5, -1), (10**10, 10**4)):
         with refused(f"claims {rows} x {columns}", "1 or more", "memory"):
@@ -137,7 +136,7 @@ def test_a_claim_of_nothing_or_beyond_the_memory_is_refused(monkeypatch: pytest.
     assert decode(stream, 200, 7).shape == (200, 7)
 
 
-def test_a_claim_of_endless_zeros_is_refused_before_they_are_decoded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_claim_of_endless_zeros_is_refused_before_they_are_decoded(monkeypatch):
     monkeypatch.setattr(codec, "LEVELS_AT_LEAST", 2**12)
     zeros = Stream(torch.zeros(3, dtype=torch.uint8), 0)
     with refused("nearly all 0"):
@@ -150,7 +149,7 @@ def test_a_claim_of_endless_zeros_is_refused_before_they_are_decoded(monkeypatch
 
 
 @given(st.integers(1, 700), st.integers(1, 12), st.integers(0, 400), st.integers(0, 2**32 - 1))
-def test_compiled_and_plain_are_one(rows: int, columns: int, spread: int, seed: int) -> None:
+def test_compiled_and_plain_are_one(rows, columns, spread, seed):
     """Streams, and how an altered stream is refused."""
     random = np.random.default_rng(seed)
     own = (random.integers(-spread, spread + 1, (rows, columns)) * random.random((rows, 1)) ** 4).astype(int)
@@ -170,9 +169,7 @@ def test_compiled_and_plain_are_one(rows: int, columns: int, spread: int, seed: 
     assert told[0] == told[1]
 
 
-def test_it_is_compiled_once_it_pays_if_it_can_be(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_it_is_compiled_once_it_pays_if_it_can_be(monkeypatch, caplog):
     monkeypatch.setattr(codec, "_coded", 0)
     assert codec._kernel(codec.WORTH_COMPILING - 1) is codec._code
     assert codec._kernel(1) is codec._compiled() is not codec._code
@@ -185,9 +182,7 @@ def test_it_is_compiled_once_it_pays_if_it_can_be(
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.2])
-def test_a_long_compilation_is_told(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, seconds: float
-) -> None:
+def test_a_long_compilation_is_told(monkeypatch, caplog, seconds):
     """A load from the cache is short, and silent."""
     monkeypatch.setattr(compiling, "SILENCE", 0.1)
     monkeypatch.setattr("numba.njit", lambda *_, **__: lambda one: sleep(seconds) or partial(one))

@@ -10,18 +10,16 @@ import torch
 from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
-from torch import Tensor
 
 from dejavu_torch import FrequencyLayer, phase_distances
-from dejavu_torch.maps.distance import Metric
 
-METRICS: list[Metric] = ["l1", "l2", "cosine"]
+METRICS = ["l1", "l2", "cosine"]
 
 
-def loops(query: Tensor, templates: Tensor, metric: Metric) -> Tensor:
+def loops(query, templates, metric):
     """Each metric from its definition, pair by pair."""
 
-    def one(a: Tensor, b: Tensor) -> Tensor:
+    def one(a, b):
         if metric == "l1":
             return (a - b).abs().sum()
         if metric == "l2":
@@ -32,7 +30,7 @@ def loops(query: Tensor, templates: Tensor, metric: Metric) -> Tensor:
 
 
 @given(st.integers(1, 5), st.integers(1, 6), st.integers(1, 8), st.integers(0, 2**16))
-def test_eq_3_equals_reference(queries: int, phases: int, features: int, seed: int) -> None:
+def test_eq_3_equals_reference(queries, phases, features, seed):
     generator = torch.Generator().manual_seed(seed)
     query = torch.randn(queries, features, generator=generator, dtype=torch.float64)
     mu = torch.randn(phases, features, generator=generator, dtype=torch.float64)
@@ -44,7 +42,7 @@ def test_eq_3_equals_reference(queries: int, phases: int, features: int, seed: i
     torch.testing.assert_close(phase_distances(query, mu).tolist(), expected, rtol=0, atol=1e-12)
 
 
-def test_metrics_are_their_definitions() -> None:
+def test_metrics_are_their_definitions():
     for metric in METRICS:
         query, mu = torch.randn(6, 10, dtype=torch.float64), torch.randn(7, 10, dtype=torch.float64)
         torch.testing.assert_close(
@@ -52,7 +50,7 @@ def test_metrics_are_their_definitions() -> None:
         )
 
 
-def test_small_distances_between_large_features_are_kept() -> None:
+def test_small_distances_between_large_features_are_kept():
     """|a - b| squared as a*a + b*b - 2ab would lose them in float32."""
     for metric in ("l1", "l2"):
         query = 1000 + torch.rand(40, 64)
@@ -61,18 +59,18 @@ def test_small_distances_between_large_features_are_kept() -> None:
         torch.testing.assert_close(phase_distances(query, mu, metric).double(), expected, rtol=1e-4, atol=0)
 
 
-def test_cosine_of_nothing_is_1() -> None:
+def test_cosine_of_nothing_is_1():
     assert phase_distances(torch.zeros(1, 3), torch.rand(2, 3), "cosine").tolist() == [[1.0, 1.0]]
 
 
-def test_what_has_no_distance_is_refused() -> None:
+def test_what_has_no_distance_is_refused():
     with refused("'manhattan' is unknown; expected l1, l2, cosine"):
         phase_distances(torch.rand(3, 4), torch.rand(5, 4), "manhattan")  # type: ignore[arg-type]
     with refused("(3, 4) and (5, 3); expected (Q,F) and (P,F)"):
         phase_distances(torch.rand(3, 4), torch.rand(5, 3))
 
 
-def test_convention_10_float32_whatever_the_autocast() -> None:
+def test_convention_10_float32_whatever_the_autocast():
     for metric in METRICS:
         query, mu = torch.rand(3, 50), torch.rand(5, 50)
         plain = phase_distances(query, mu, metric)
@@ -93,9 +91,7 @@ def test_convention_10_float32_whatever_the_autocast() -> None:
         (torch.float32, torch.float64, torch.float64),
     ],
 )
-def test_convention_10_float32_at_least(
-    query: torch.dtype, templates: torch.dtype, result: torch.dtype, metric: Metric
-) -> None:
+def test_convention_10_float32_at_least(query, templates, result, metric):
     a, b = torch.rand(3, 4).to(query), torch.rand(5, 4).to(templates)
     distances = phase_distances(a, b, metric)
     assert distances.dtype == result
@@ -103,9 +99,7 @@ def test_convention_10_float32_at_least(
 
 
 @pytest.mark.parametrize("metric", METRICS)
-def test_convention_10_nothing_of_queries_times_phases_times_features(
-    metric: Metric, largest_tensor: type
-) -> None:
+def test_convention_10_nothing_of_queries_times_phases_times_features(metric, largest_tensor):
     query = torch.rand(50, 40, requires_grad=True)
     mu = torch.rand(60, 40, requires_grad=True)
     with largest_tensor() as seen:
@@ -114,13 +108,13 @@ def test_convention_10_nothing_of_queries_times_phases_times_features(
 
 
 @pytest.mark.parametrize("metric", METRICS)
-def test_gradients_are_right(metric: Metric) -> None:
+def test_gradients_are_right(metric):
     query = torch.randn(3, 4, dtype=torch.float64, requires_grad=True)
     mu = torch.randn(5, 4, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda a, b: phase_distances(a, b, metric), (query, mu))
 
 
-def test_gradients_are_finite_where_query_and_template_are_equal_or_0() -> None:
+def test_gradients_are_finite_where_query_and_template_are_equal_or_0():
     for metric in METRICS:
         query = torch.rand(3, 4)
         query[0] = 0

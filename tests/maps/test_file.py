@@ -5,10 +5,7 @@ from __future__ import annotations
 import json
 import pickle
 import sys
-from collections.abc import Iterator
 from fractions import Fraction
-from pathlib import Path
-from typing import Any
 
 import pytest
 import safetensors.torch
@@ -17,7 +14,7 @@ from helpers import Fixed, refused, template_model
 from hypothesis import given
 from hypothesis import strategies as st
 from safetensors import safe_open
-from torch import Tensor, nn
+from torch import nn
 
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.names import encode_names
@@ -55,40 +52,40 @@ class Small(nn.Module):
             nn.Conv2d(1, 3, 3), nn.BatchNorm2d(3), nn.AdaptiveAvgPool2d(1), nn.Flatten()
         )
 
-    def forward(self, frames: Tensor) -> Tensor:
+    def forward(self, frames):
         return self.layers(frames)
 
 
-def waves(frames: int = 64) -> Tensor:
+def waves(frames=64):
     """Two features that repeat, after 8 and after 9 frames."""
     return torch.arange(frames)[:, None] % torch.tensor([8.0, 9.0])
 
 
-def pictures(frames: int = 64, size: int = 24) -> Tensor:
+def pictures(frames=64, size=24):
     """Frames that repeat after 8."""
     random = torch.Generator().manual_seed(0)
     return torch.rand(8, 1, size, size, generator=random)[torch.arange(frames) % 8]
 
 
 @pytest.fixture
-def path(tmp_path: Path) -> Path:
+def path(tmp_path):
     return tmp_path / "route.safetensors"
 
 
 @pytest.fixture
-def saved(path: Path) -> Path:
+def saved(path):
     template_model(periods=WINDOW).learn(waves()).save(path)
     return path
 
 
-def contents(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def contents(path):
     """Tensors of a map file, and what its one entry of metadata says."""
     with safe_open(path, framework="pt") as file:
         assert list(file.metadata()) == [NAME]
         return {name: file.get_tensor(name) for name in file.keys()}, json.loads(file.metadata()[NAME])  # noqa: SIM118
 
 
-def craft(path: Path, tensors: dict[str, Any] | None = None, **header: Any) -> None:
+def craft(path, tensors=None, **header):
     """Write a map file anew, sealed as it should be, with other tensors or entries of its header.
 
     A tensor is None to take it away, or a list of numbers; an entry may be a path such as "map.places".
@@ -107,7 +104,7 @@ def craft(path: Path, tensors: dict[str, Any] | None = None, **header: Any) -> N
     write_map(path, {name: one for name, one in own.items() if one is not None}, sealed["header"])
 
 
-def with_metadata(path: Path, metadata: dict[str, str] | None) -> None:
+def with_metadata(path, metadata):
     """Give a map file other metadata, and leave its tensors as they are."""
     tensors, _ = contents(path)
     path.unlink()
@@ -118,8 +115,8 @@ def with_metadata(path: Path, metadata: dict[str, str] | None) -> None:
 
 
 @pytest.mark.parametrize(("metric", "reduction"), [("l1", "mean"), ("l2", "sum"), ("cosine", "mean")])
-def test_scores_are_equal_bit_for_bit(path: Path, metric: str, reduction: Any) -> None:
-    settings: dict[str, Any] = {"metric": metric, "reduction": reduction, "batch_size": 7, "threshold": 0.0}
+def test_scores_are_equal_bit_for_bit(path, metric, reduction):
+    settings = {"metric": metric, "reduction": reduction, "batch_size": 7, "threshold": 0.0}
     traverse = ArrayTraverse(torch.rand(2, 3, 4000, 6))
     model = template_model(periods=WINDOW, **settings).learn_features(waves().double() / 3, traverse)
     model.save(path)
@@ -134,7 +131,7 @@ def test_scores_are_equal_bit_for_bit(path: Path, metric: str, reduction: Any) -
     assert (DejaVu.load(path).map.places, DejaVu.load(path).frame_shape) == (80, (2,))
 
 
-def test_a_map_of_frames_comes_back_with_its_features_and_periods(path: Path) -> None:
+def test_a_map_of_frames_comes_back_with_its_features_and_periods(path):
     finder = SpectrogramAnalysis(window=64, peaks="bins", false_alarm=None)
     model = template_model(HOG(cell=4, resize=(16, 16)), finder).learn(pictures())
     model.save(path)
@@ -156,25 +153,21 @@ def test_a_map_of_frames_comes_back_with_its_features_and_periods(path: Path) ->
         st.text(max_size=5), st.text(max_size=9) | st.floats(allow_nan=False, allow_infinity=False)
     ),
 )
-def test_the_size_of_a_file_is_known_from_types_and_shapes(
-    tmp_path_factory: pytest.TempPathFactory,
-    kinds: dict[str, tuple[torch.dtype, list[int]]],
-    header: dict[str, Any],
-) -> None:
+def test_the_size_of_a_file_is_known_from_types_and_shapes(tmp_path_factory, kinds, header):
     path = tmp_path_factory.getbasetemp() / "any.safetensors"
     tensors = {name: torch.zeros(shape, dtype=dtype) for name, (dtype, shape) in kinds.items()}
     write_map(path, tensors, header)
     assert map_size(tensors, header) == path.stat().st_size
 
 
-def test_one_file_of_the_size_the_map_claims(saved: Path) -> None:
+def test_one_file_of_the_size_the_map_claims(saved):
     assert list(saved.parent.iterdir()) == [saved]
     model = DejaVu.load(saved)
     assert saved.stat().st_size == model.summary().map_bytes
     assert model.summary().bytes_per_place == model.summary().map_bytes / 64
 
 
-def test_no_pickle_is_written_or_read(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_pickle_is_written_or_read(path, monkeypatch):
     model = template_model(Small(), WINDOW).learn(pictures())
     for name in ("dump", "dumps", "load", "loads", "Pickler", "Unpickler"):
         monkeypatch.delattr(pickle, name)
@@ -184,7 +177,7 @@ def test_no_pickle_is_written_or_read(path: Path, monkeypatch: pytest.MonkeyPatc
     DejaVu.load(path, Small())
 
 
-def test_where_a_map_cannot_be_written(tmp_path: Path) -> None:
+def test_where_a_map_cannot_be_written(tmp_path):
     model = template_model(periods=WINDOW).learn(waves())
     for one, where, words in (
         (model, "missing/a.safetensors", ["missing", "does not exist"]),
@@ -199,7 +192,7 @@ def test_where_a_map_cannot_be_written(tmp_path: Path) -> None:
 # files that are no whole map
 
 
-def test_a_truncated_map_is_refused_at_any_length(saved: Path) -> None:
+def test_a_truncated_map_is_refused_at_any_length(saved):
     whole = saved.read_bytes()
     for length in [0, 1, 7, 8, 9, *range(20, len(whole), 211), len(whole) - 1]:
         saved.write_bytes(whole[:length])
@@ -210,7 +203,7 @@ def test_a_truncated_map_is_refused_at_any_length(saved: Path) -> None:
 TEXTS = ("", "[]", '{"version": true, "header": {}}', f'{{"version": {FORMAT}, "header": []}}')
 
 
-def with_sealed(path: Path, **changes: Any) -> None:
+def with_sealed(path, **changes):
     """Give a map file another version, other checksums or another header."""
     with_metadata(path, {NAME: json.dumps(contents(path)[1] | changes)})
 
@@ -232,14 +225,14 @@ def with_sealed(path: Path, **changes: Any) -> None:
         *((lambda path, text=text: with_metadata(path, {NAME: text}), []) for text in TEXTS),
     ],
 )
-def test_what_is_no_map_is_refused(saved: Path, change: Any, words: list[str]) -> None:
+def test_what_is_no_map_is_refused(saved, change, words):
     change(saved)
     with refused(str(saved), *words):
         DejaVu.load(saved)
 
 
 MAPPER, FEATURES, WHITENING = "mapper.init_args.", "features.init_args.", "whitening.init_args."
-LINES: list[tuple[dict[str, Any], dict[str, Any], str]] = [
+LINES = [
     ({}, {FEATURES + "widths": [10**9]}, "size mismatch for convolutions"),
     ({}, {FEATURES + "resize": [10**9, 10**9]}, "SmallCNN got resize"),
     ({}, {"map.dimension": 10**12}, "means (0, 12)"),
@@ -247,7 +240,7 @@ LINES: list[tuple[dict[str, Any], dict[str, Any], str]] = [
     ({"map.lengths": [10**12]}, {}, "[1000000000000] places"),
     ({"map.stream_table": [[10**12, 0]]}, {}, "the table claims [1000000000000]"),
 ]
-TEMPLATES: list[tuple[dict[str, Any], dict[str, Any], str]] = [
+TEMPLATES = [
     ({"map.positions": torch.tensor([*range(63), 2.0**50])}, {}, "expected 64"),
     ({}, {"map.places": 10**12}, "a map of 1000000000000 places"),
     (
@@ -259,7 +252,7 @@ TEMPLATES: list[tuple[dict[str, Any], dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("kind", "claims"), [(0, LINES), (1, TEMPLATES)])
-def test_no_size_in_a_file_is_believed(path: Path, whole_maps: list[Path], kind: int, claims: Any) -> None:
+def test_no_size_in_a_file_is_believed(path, whole_maps, kind, claims):
     for tensors, header, words in claims:
         path.write_bytes(whole_maps[kind].read_bytes())
         craft(path, tensors, **header)
@@ -275,15 +268,13 @@ def test_no_size_in_a_file_is_believed(path: Path, whole_maps: list[Path], kind:
         ({MAPPER + "metric": "l7"}, ["metric is 'l7'", "'cosine'"]),
     ],
 )
-def test_what_only_another_version_knows_is_refused(
-    saved: Path, header: dict[str, Any], words: list[str]
-) -> None:
+def test_what_only_another_version_knows_is_refused(saved, header, words):
     craft(saved, **header)
     with refused(str(saved), *words):
         DejaVu.load(saved)
 
 
-def test_a_map_of_arguments_that_are_gone_scores_alike(path: Path) -> None:
+def test_a_map_of_arguments_that_are_gone_scores_alike(path):
     features, frames = Joined([PatchPixels((8, 12)), PatchPixels((12, 8))]), pictures()
     model = DejaVu(features, mapper=SpectralMapper(step=0.1)).learn(frames)
     model.save(path)
@@ -296,7 +287,7 @@ def test_a_map_of_arguments_that_are_gone_scores_alike(path: Path) -> None:
         DejaVu.load(path)
 
 
-def test_what_a_file_lacks_or_cannot_be_imported_has_its_default(saved: Path, trap: Path) -> None:
+def test_what_a_file_lacks_or_cannot_be_imported_has_its_default(saved, trap):
     expected, header = DejaVu.load(saved).localize(waves()), contents(saved)[1]["header"]
     del header["features"]["init_args"]["bins"]
     craft(saved, features=header["features"])
@@ -311,7 +302,7 @@ def test_what_a_file_lacks_or_cannot_be_imported_has_its_default(saved: Path, tr
 
 
 @pytest.fixture(scope="module")
-def whole_maps(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+def whole_maps(tmp_path_factory):
     """A map of each kind, the spectral one with whitening, weights and names."""
     folder = tmp_path_factory.mktemp("maps")
     torch.manual_seed(0)
@@ -323,7 +314,7 @@ def whole_maps(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return sorted(folder.iterdir())
 
 
-def test_any_flipped_bit_is_noticed(whole_maps: list[Path], path: Path) -> None:
+def test_any_flipped_bit_is_noticed(whole_maps, path):
     for whole in whole_maps:
         content = whole.read_bytes()
         places = torch.randperm(8 * len(content), generator=torch.Generator().manual_seed(0))[:300].tolist()
@@ -337,7 +328,7 @@ def test_any_flipped_bit_is_noticed(whole_maps: list[Path], path: Path) -> None:
 
 
 @pytest.mark.parametrize("part", ["header", "map", "features", "whitening"])
-def test_damage_is_told_by_its_part(whole_maps: list[Path], path: Path, part: str) -> None:
+def test_damage_is_told_by_its_part(whole_maps, path, part):
     tensors, sealed = contents(whole_maps[0])
     if part == "header":
         sealed["header"]["batch_size"] += 1
@@ -349,7 +340,7 @@ def test_damage_is_told_by_its_part(whole_maps: list[Path], path: Path, part: st
         DejaVu.load(path)
 
 
-def test_the_same_model_gives_the_same_bytes(whole_maps: list[Path], path: Path) -> None:
+def test_the_same_model_gives_the_same_bytes(whole_maps, path):
     for whole in whole_maps:
         for _ in range(4):
             DejaVu.load(whole).save(path)
@@ -359,7 +350,7 @@ def test_the_same_model_gives_the_same_bytes(whole_maps: list[Path], path: Path)
 # features from elsewhere
 
 
-def test_features_from_elsewhere_get_their_weights_from_the_file(path: Path) -> None:
+def test_features_from_elsewhere_get_their_weights_from_the_file(path):
     torch.manual_seed(0)
     model = template_model(Small(), SpectrogramAnalysis(window=64, false_alarm=None)).learn(pictures())
     model.save(path)
@@ -386,15 +377,15 @@ class Patch(nn.Module):
         super().__init__()
         self.convolution = nn.Conv2d(1, channels, 3)
 
-    def forward(self, frames: Tensor) -> Tensor:
+    def forward(self, frames):
         return self.convolution(frames)
 
 
-def embedding(network: nn.Module, **settings: Any) -> Embedding:
+def embedding(network, **settings):
     return Embedding(network, **{"dimension": 5, "channels": 1, "resize": (8, 8)} | settings)
 
 
-def learnt_with(features: nn.Module, path: Path) -> DejaVu:
+def learnt_with(features, path):
     finder = Fixed(FrequencyLayer(Fraction(8), 8, 0, 64, (0, 1, 2)))
     model = template_model(features, finder).learn(pictures())
     model.save(path)
@@ -409,7 +400,7 @@ def learnt_with(features: nn.Module, path: Path) -> DejaVu:
     ],
     ids=["SmallCNN", "Embedding of an Embedding"],
 )
-def test_learnt_features_of_this_package_load_by_themselves(path: Path, make: Any) -> None:
+def test_learnt_features_of_this_package_load_by_themselves(path, make):
     torch.manual_seed(0)
     model = learnt_with(make(), path)
     query = pictures(5)
@@ -419,7 +410,7 @@ def test_learnt_features_of_this_package_load_by_themselves(path: Path, make: An
     assert path.stat().st_size == model.summary().map_bytes
 
 
-def test_an_embedding_of_a_network_from_elsewhere_must_be_given(path: Path) -> None:
+def test_an_embedding_of_a_network_from_elsewhere_must_be_given(path):
     torch.manual_seed(0)
     model, query = learnt_with(embedding(Patch()), path), pictures(5)
     with refused(str(path), "Patch", "only the caller can load", "`features`"):
@@ -448,7 +439,7 @@ def test_an_embedding_of_a_network_from_elsewhere_must_be_given(path: Path) -> N
         (lambda: embedding(Patch()), lambda: embedding(Patch(3)), ("does not fit",)),
     ],
 )
-def test_other_features_are_refused(path: Path, own: Any, given: Any, words: tuple[str, ...]) -> None:
+def test_other_features_are_refused(path, own, given, words):
     learnt_with(own(), path)
     with refused(str(path), *words):
         DejaVu.load(path, given())
@@ -457,7 +448,7 @@ def test_other_features_are_refused(path: Path, own: Any, given: Any, words: tup
 # what training leaves in the file
 
 
-def test_a_trained_map_comes_back(path: Path) -> None:
+def test_a_trained_map_comes_back(path):
     """Templates, weights and temperature that no eq. 1 gives."""
     model = template_model(periods=WINDOW, temperature=0.07).learn(waves())
     model.map.trainable(weights=True, start=torch.tensor([0.5, -2.0]))
@@ -482,7 +473,7 @@ def test_a_trained_map_comes_back(path: Path) -> None:
 
 
 @pytest.fixture
-def trap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def trap(tmp_path, monkeypatch):
     """Importable modules that leave a mark when they are imported."""
     folder, mark = tmp_path / "importable", tmp_path / "mark"
     (folder / "dejavu_torch_extra").mkdir(parents=True)
@@ -495,12 +486,12 @@ def trap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     sys.modules.pop("dejavu_torch_extra", None)
 
 
-def test_no_foreign_class_path_is_imported(saved: Path, trap: Path) -> None:
+def test_no_foreign_class_path_is_imported(saved, trap):
     whole = saved.read_bytes()
     paths = ["trap_module.Net", "dejavu_torch_extra.Net", "os.system", "builtins.exec", "Net", ""]
     paths += [".trap_module.Net", "dejavu_torch.types.torch.nn.Flatten", "dejavu_torch...trap_module.Net"]
     for class_path in paths:
-        foreign: dict[str, Any] = {"class_path": class_path, "init_args": {"command": "touch mark"}}
+        foreign = {"class_path": class_path, "init_args": {"command": "touch mark"}}
         nested = {"class_path": "Embedding", "init_args": {"network": foreign}}
         for features in (foreign, foreign | {"init_args": {}}, nested):
             saved.write_bytes(whole)

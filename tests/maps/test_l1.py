@@ -5,14 +5,12 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import sys
-from collections.abc import Callable, Iterator
 
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from processes import python
-from torch import Tensor
 from torch.autograd import forward_ad
 from torch.fx.experimental.proxy_tensor import make_fx
 
@@ -23,7 +21,7 @@ ENOUGH = (64, l1.WORTH_COMPILING // 64)  # the smallest templates that are left 
 
 
 @pytest.fixture
-def forget() -> Iterator[None]:
+def forget():
     """What was found out about numba is found out anew, in the test and after it."""
     l1._compiled.cache_clear()
     yield
@@ -31,7 +29,7 @@ def forget() -> Iterator[None]:
 
 
 @pytest.fixture(params=[1, 3], ids=["one thread", "three threads"])
-def compiled(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def compiled(request, monkeypatch):
     """Everything that can be is computed by the compiled loop, and cut into tasks, however small."""
     pytest.importorskip("numba")
     monkeypatch.setattr(l1, "WORTH_COMPILING", 1)
@@ -43,7 +41,7 @@ def compiled(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) ->
     torch.set_num_threads(before)
 
 
-def distances(query: Tensor, templates: Tensor) -> Tensor:
+def distances(query, templates):
     """What the compiled loop gives, never torch."""
     result = l1.compiled_l1(query, templates)
     assert result is not None
@@ -55,9 +53,7 @@ def distances(query: Tensor, templates: Tensor) -> Tensor:
 @pytest.mark.usefixtures("compiled")
 class TestTheCompiledLoop:
     @given(st.integers(1, 9), st.integers(1, 14), st.integers(1, 300), st.integers(0, 2**16))
-    def test_equals_float64_and_does_not_depend_on_where_a_pair_stands(
-        self, queries: int, phases: int, features: int, seed: int
-    ) -> None:
+    def test_equals_float64_and_does_not_depend_on_where_a_pair_stands(self, queries, phases, features, seed):
         torch.manual_seed(seed)
         query, mu = torch.randn(queries, features), torch.randn(phases, features)
         found = distances(query, mu)
@@ -68,24 +64,24 @@ class TestTheCompiledLoop:
         assert torch.equal(equal, equal[:, :1].expand(-1, phases))
 
     @pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
-    def test_nan_and_infinity_arrive(self, value: float) -> None:
+    def test_nan_and_infinity_arrive(self, value):
         query, mu = torch.rand(4, 100), torch.rand(6, 100)
         query[1, 40] = mu[5, 40] = value
         expected = torch.cdist(query, mu, p=1.0)
         assert expected.isfinite().sum() == 3 * 5
         torch.testing.assert_close(distances(query, mu), expected, equal_nan=True)
 
-    def test_rows_need_not_lie_side_by_side(self) -> None:
+    def test_rows_need_not_lie_side_by_side(self):
         query, mu = torch.rand(80, 7).T, torch.rand(20, 161)[::2, 1::2]
         assert torch.equal(distances(query, mu), distances(query.clone(), mu.clone()))
 
     @pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork here")
     @pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
-    def test_after_fork(self) -> None:
+    def test_after_fork(self):
         query, mu = torch.rand(20, 33), torch.rand(21, 33)
         expected = distances(query, mu)
 
-        def child() -> None:
+        def child():
             sys.exit(0 if torch.equal(distances(query, mu), expected) else 3)
 
         process = multiprocessing.get_context("fork").Process(target=child)
@@ -94,19 +90,19 @@ class TestTheCompiledLoop:
         assert process.exitcode == 0
 
 
-def test_a_query_alone_gets_the_bits_it_gets_in_a_batch() -> None:
+def test_a_query_alone_gets_the_bits_it_gets_in_a_batch():
     for templates in (torch.rand(ENOUGH), torch.rand(ENOUGH)[1:]):
         query = torch.rand(5, templates.shape[1])
         alone = torch.cat([phase_distances(row[None], templates) for row in query])
         assert torch.equal(alone, phase_distances(query, templates))
 
 
-def traced(function: Callable[[Tensor, Tensor], Tensor], a: Tensor, b: Tensor) -> list[Tensor]:
+def traced(function, a, b):
     """The function as each tracer records it, on other numbers than it was recorded with."""
     others = torch.rand_like(a), torch.rand_like(b)
 
     class Module(torch.nn.Module):
-        def forward(self, a: Tensor, b: Tensor) -> Tensor:
+        def forward(self, a, b):
             return function(a, b)
 
     with torch.no_grad():
@@ -121,13 +117,13 @@ def traced(function: Callable[[Tensor, Tensor], Tensor], a: Tensor, b: Tensor) -
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::torch.jit.TracerWarning")
-def test_what_traces_finds_operations_of_torch() -> None:
+def test_what_traces_finds_operations_of_torch():
     query, mu = torch.rand(3, ENOUGH[1]), torch.rand(ENOUGH)
     for found in traced(phase_distances, query, mu):
         assert torch.equal(found, torch.cdist(query, mu, p=1.0))
 
 
-def test_gradients_and_vmap_are_left_to_torch() -> None:
+def test_gradients_and_vmap_are_left_to_torch():
     """Sum of |a - b|: the gradient of each number is how many of the others it exceeds, less the rest."""
     mu, query = torch.rand(ENOUGH), torch.full((1, ENOUGH[1]), 2.0)
     slope = torch.func.grad(lambda a: phase_distances(a, mu).sum())(query)
@@ -155,11 +151,11 @@ def test_gradients_and_vmap_are_left_to_torch() -> None:
         lambda query, mu: (query, mu.to_sparse()),
     ],
 )
-def test_what_is_left_to_torch(change: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]) -> None:
+def test_what_is_left_to_torch(change):
     assert l1.compiled_l1(*change(torch.rand(2, ENOUGH[1]), torch.rand(ENOUGH))) is None
 
 
-def test_what_is_not_left_to_torch() -> None:
+def test_what_is_not_left_to_torch():
     pytest.importorskip("numba")
     query, mu = torch.rand(2, ENOUGH[1], requires_grad=True), torch.nn.Parameter(torch.rand(ENOUGH))
     assert l1.compiled_l1(query.detach(), mu.detach()) is not None
@@ -178,10 +174,8 @@ def test_what_is_not_left_to_torch() -> None:
     ],
 )
 @pytest.mark.usefixtures("forget")
-def test_without_numba_one_line_is_logged_and_torch_does_the_work(
-    problem: str, told: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    def njit(*args: object, **options: object) -> None:
+def test_without_numba_one_line_is_logged_and_torch_does_the_work(problem, told, monkeypatch, caplog):
+    def njit(*args, **options):
         raise OSError("libllvm\nis of another time")
 
     if problem == "missing":
@@ -201,11 +195,11 @@ def test_without_numba_one_line_is_logged_and_torch_does_the_work(
 
 
 @pytest.mark.usefixtures("forget")
-def test_there_may_be_nowhere_to_keep_what_is_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_there_may_be_nowhere_to_keep_what_is_compiled(monkeypatch):
     numba = pytest.importorskip("numba")
     njit = numba.njit
 
-    def nowhere(*args: object, cache: bool, **options: object) -> object:
+    def nowhere(*args, cache, **options):
         if cache:
             raise RuntimeError("cannot cache function: no locator available")
         return njit(*args, cache=cache, **options)
@@ -214,7 +208,7 @@ def test_there_may_be_nowhere_to_keep_what_is_compiled(monkeypatch: pytest.Monke
     assert l1.l1_backend() == "numba"
 
 
-def test_numba_waits_until_it_is_needed() -> None:
+def test_numba_waits_until_it_is_needed():
     code = (
         "import sys, torch, dejavu_torch as d; d.phase_distances(torch.rand(99, 9), torch.rand(99, 9));"
         "sys.exit('numba' in sys.modules)"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from fractions import Fraction
 from itertools import pairwise
-from typing import Any
 
 import pytest
 import reference
@@ -13,27 +12,25 @@ import torch
 from helpers import Fixed, refused, scored, template_model
 from hypothesis import given
 from hypothesis import strategies as st
-from torch import Tensor
 
 from dejavu_torch import FrequencyLayer, PhaseTemplates, TemplateMap, best_match
 from dejavu_torch.features.extract import READY
 from dejavu_torch.maps.template_map import log_posterior, segments
 from dejavu_torch.periods.support import common_period
-from dejavu_torch.types import Plan
 
 METRICS = ["l1", "l2", "cosine"]
 
 
-def whole(period: int, stop: int, features: tuple[int, ...] = (0,), start: int = 0) -> FrequencyLayer:
+def whole(period, stop, features=(0,), start=0):
     """The paper's case: as many phases as frames in a period."""
     return FrequencyLayer(Fraction(period), period, start, stop, features)
 
 
-def make(values: Tensor, plan: Plan) -> TemplateMap:
+def make(values, plan):
     return TemplateMap(plan, PhaseTemplates()(values, plan), *values.shape)
 
 
-MIXED: Plan = (
+MIXED = (
     whole(4, 20, (0, 2)),
     FrequencyLayer(Fraction(5, 2), 3, 5, 25, (0, 1)),
     whole(7, 50, (1, 2, 3), start=30),
@@ -45,7 +42,7 @@ MIXED: Plan = (
 
 @pytest.mark.parametrize("reduction", ["sum", "mean"])
 @given(route=reference.routes(), seed=st.integers(0, 2**16))
-def test_scores_equal_reference(reduction: str, route: reference.Route, seed: int) -> None:
+def test_scores_equal_reference(reduction, route, seed):
     values, plan = route
     generator = torch.Generator().manual_seed(seed)
     queries = torch.randn(3, values.shape[1], generator=generator, dtype=torch.float64)
@@ -57,7 +54,7 @@ def test_scores_equal_reference(reduction: str, route: reference.Route, seed: in
 
 
 @given(route=reference.routes())
-def test_the_place_found_is_the_references(route: reference.Route) -> None:
+def test_the_place_found_is_the_references(route):
     """Whole-number templates, so that ties are ties in both."""
     values, plan = route
     mus = [torch.randint(-3, 4, (x.phases, len(x.features))).double() for x in plan]
@@ -77,7 +74,7 @@ def test_the_place_found_is_the_references(route: reference.Route) -> None:
 
 @pytest.mark.parametrize("reduction", ["sum", "mean"])
 @pytest.mark.parametrize("periods", [(4, 6), (3, 5), (5,), (4, 6, 9), (Fraction(7, 2), 6)])
-def test_score_is_0_exactly_at_the_common_period(periods: tuple[Fraction, ...], reduction: str) -> None:
+def test_score_is_0_exactly_at_the_common_period(periods, reduction):
     """A perfectly periodic traverse of dyadic values: S(i) = 0 exactly at i = q mod lcm."""
     common = int(common_period(periods))
     frames = 3 * common
@@ -99,14 +96,14 @@ def test_score_is_0_exactly_at_the_common_period(periods: tuple[Fraction, ...], 
 # ---------------------------------------------------------- coverage, reduction
 
 
-def test_convention_1_h_is_the_querys_and_l_the_covering_layers() -> None:
+def test_convention_1_h_is_the_querys_and_l_the_covering_layers():
     values = torch.tensor([[0.0], [1.0], [2.0], [3.0]])
     plan = (whole(1, 2), whole(1, 4, start=1))  # templates 0.5 and 2
     scores = scored(torch.tensor([[10.0]]), make(values, plan), reduction="sum")
     assert scores.tolist() == [[9.5, 9.5 + 8, 8, 8]]
 
 
-def test_convention_2_uncovered_places_score_inf() -> None:
+def test_convention_2_uncovered_places_score_inf():
     for metric in METRICS:
         for reduction in ("sum", "mean"):
             values = torch.rand(60, 4)
@@ -117,14 +114,14 @@ def test_convention_2_uncovered_places_score_inf() -> None:
             assert scores[:, ~uncovered].isfinite().all()
 
 
-def test_convention_2_a_plan_without_layers_covers_nothing() -> None:
+def test_convention_2_a_plan_without_layers_covers_nothing():
     scores = scored(torch.rand(3, 4), TemplateMap((), (), 20, 4))
     assert scores.shape == (3, 20)
     assert scores.isposinf().all()
     assert best_match(scores).index.tolist() == [-1, -1, -1]
 
 
-def test_convention_3_sum_is_the_letter_and_the_default_is_comparable() -> None:
+def test_convention_3_sum_is_the_letter_and_the_default_is_comparable():
     """Two chunks with 80 and 8 features: the printed sum sends no query of the first to the first."""
     values = torch.zeros(40, 88)
     values[:20, :80] = torch.rand(20, 80).round()
@@ -140,7 +137,7 @@ def test_convention_3_sum_is_the_letter_and_the_default_is_comparable() -> None:
     assert by_mean[:20].tolist() == list(range(20))
 
 
-def test_convention_3_mean_is_the_sum_over_its_number_of_features() -> None:
+def test_convention_3_mean_is_the_sum_over_its_number_of_features():
     values = torch.rand(50, 4)
     route = make(values, MIXED)
     ratio = scored(values, route, reduction="sum") / scored(values, route)
@@ -149,7 +146,7 @@ def test_convention_3_mean_is_the_sum_over_its_number_of_features() -> None:
     torch.testing.assert_close(ratio[:, 30:], torch.full((50, 20), 3.0))
 
 
-def test_mean_does_not_grow_with_the_number_of_features() -> None:
+def test_mean_does_not_grow_with_the_number_of_features():
     """A feature written down nine times is still one feature's worth of distance."""
     for metric in METRICS:
         values = torch.rand(20, 3)
@@ -159,7 +156,7 @@ def test_mean_does_not_grow_with_the_number_of_features() -> None:
 
 
 @given(route=reference.routes())
-def test_segments_cut_the_route_where_coverage_changes(route: reference.Route) -> None:
+def test_segments_cut_the_route_where_coverage_changes(route):
     values, plan = route
     parts = list(segments(plan, len(values)))
     assert parts[0][0] == 0
@@ -177,20 +174,18 @@ def test_segments_cut_the_route_where_coverage_changes(route: reference.Route) -
     ("metric", "reduction", "temperature"),
     [("l1", "mean", None), ("l2", "sum", None), ("cosine", "mean", None), ("l1", "mean", 0.5)],
 )
-def test_gradients_are_right_towards_queries_and_reference(
-    metric: str, reduction: str, temperature: float | None
-) -> None:
+def test_gradients_are_right_towards_queries_and_reference(metric, reduction, temperature):
     plan = (whole(3, 8, (0, 2)), FrequencyLayer(Fraction(5, 2), 2, 4, 10, (0, 1)))
     queries = torch.randn(2, 3, dtype=torch.float64, requires_grad=True)
     values = torch.randn(10, 3, dtype=torch.float64, requires_grad=True)
 
-    def covered(queries: Tensor, values: Tensor) -> Tensor:
+    def covered(queries, values):
         return scored(queries, make(values, plan), metric, reduction, temperature)
 
     assert torch.autograd.gradcheck(covered, (queries, values))
 
 
-def test_convention_10_scores_are_float32_whatever_the_autocast() -> None:
+def test_convention_10_scores_are_float32_whatever_the_autocast():
     values = torch.rand(50, 4)
     route = make(values, MIXED)
     plain = scored(values, route)
@@ -203,15 +198,13 @@ def test_convention_10_scores_are_float32_whatever_the_autocast() -> None:
     torch.testing.assert_close(half, plain, rtol=0, atol=1e-3)
 
 
-def test_convention_10_also_on_a_map_without_layers() -> None:
+def test_convention_10_also_on_a_map_without_layers():
     scores = scored(torch.rand(3, 4).bfloat16(), TemplateMap((), (), 20, 4))
     assert scores.dtype == torch.float32
 
 
 @pytest.mark.parametrize("metric", METRICS)
-def test_convention_10_nothing_of_queries_times_phases_times_features_is_built(
-    metric: str, largest_tensor: type
-) -> None:
+def test_convention_10_nothing_of_queries_times_phases_times_features_is_built(metric, largest_tensor):
     queries, phases, features, places = 40, 50, 60, 300
     route = make(torch.rand(places, features), (whole(phases, places, tuple(range(features))),))
     with largest_tensor() as seen:
@@ -219,12 +212,12 @@ def test_convention_10_nothing_of_queries_times_phases_times_features_is_built(
     assert seen.numel <= queries * places < queries * phases * features
 
 
-def test_convention_10_memory_does_not_grow_with_the_queries(largest_tensor: type) -> None:
+def test_convention_10_memory_does_not_grow_with_the_queries(largest_tensor):
     values = torch.rand(500, 8)
     layer = whole(50, 500, tuple(range(8)))
     model = template_model(periods=Fixed(layer)).learn(values)
 
-    def largest(queries: int) -> int:
+    def largest(queries):
         with largest_tensor() as seen:
             assert model.localize(torch.rand(queries, 8)).index.shape == (queries,)
         return seen.numel
@@ -247,7 +240,7 @@ def test_convention_10_memory_does_not_grow_with_the_queries(largest_tensor: typ
         (lambda _: TemplateMap(temperature=math.nan), ["temperature is nan; expected a number above 0"]),
     ],
 )
-def test_what_makes_no_scores_is_refused(make_scores: Any, words: list[str]) -> None:
+def test_what_makes_no_scores_is_refused(make_scores, words):
     with refused(*words):
         make_scores(make(torch.rand(50, 4), MIXED))
 
@@ -255,7 +248,7 @@ def test_what_makes_no_scores_is_refused(make_scores: Any, words: list[str]) -> 
 # ------------------------------------------------------------------ temperature
 
 
-def literal_posterior(row: list[float], temperature: float) -> list[float]:
+def literal_posterior(row, temperature):
     likely = [math.exp(-score / temperature) for score in row]
     return [-math.log(one / sum(likely)) if one else math.inf for one in likely]
 
@@ -266,14 +259,14 @@ def literal_posterior(row: list[float], temperature: float) -> list[float]:
     ),
     temperature=st.floats(0.1, 5),
 )
-def test_log_posterior_equals_the_loops(rows: list[list[float]], temperature: float) -> None:
+def test_log_posterior_equals_the_loops(rows, temperature):
     found = log_posterior(torch.tensor(rows, dtype=torch.float64), temperature)
     none = [math.inf] * 4
     expected = [none if row == none else literal_posterior(row, temperature) for row in rows]
     torch.testing.assert_close(found, torch.tensor(expected, dtype=torch.float64), rtol=1e-9, atol=1e-12)
 
 
-def test_log_posterior_in_closed_form() -> None:
+def test_log_posterior_in_closed_form():
     """Two places D apart: log(1 + exp(-D / T)) and that of -D; n equal ones: log n."""
     low, high = log_posterior(torch.tensor([[1.0, 1.5]], dtype=torch.float64), 0.25)[0].tolist()
     assert (low, high) == (pytest.approx(math.log1p(math.exp(-2))), pytest.approx(math.log1p(math.exp(2))))
@@ -281,7 +274,7 @@ def test_log_posterior_in_closed_form() -> None:
     assert far.tolist() == [[0.0, pytest.approx(1000.0), math.inf]]
 
 
-def test_a_temperature_leaves_the_order_of_places() -> None:
+def test_a_temperature_leaves_the_order_of_places():
     values, queries = torch.rand(60, 4, dtype=torch.float64), torch.rand(7, 4, dtype=torch.float64)
     plain, scores = (scored(queries, make(values, MIXED), temperature=t) for t in (None, 0.2))
     torch.testing.assert_close(scores, log_posterior(plain, 0.2))
@@ -289,7 +282,7 @@ def test_a_temperature_leaves_the_order_of_places() -> None:
     torch.testing.assert_close((-scores).exp().sum(1), torch.ones(7, dtype=torch.float64))
 
 
-def test_convention_2_a_temperature_leaves_uncovered_places_at_inf() -> None:
+def test_convention_2_a_temperature_leaves_uncovered_places_at_inf():
     values = torch.rand(60, 4)
     plain, scores = (scored(values[:5], make(values, MIXED), temperature=t) for t in (None, 0.1))
     assert plain.isposinf().any()
@@ -299,18 +292,18 @@ def test_convention_2_a_temperature_leaves_uncovered_places_at_inf() -> None:
     assert best_match(log_posterior(torch.full((2, 3), math.inf), 0.1)).index.tolist() == [-1, -1]
 
 
-def test_gradients_of_log_posterior_are_right_towards_scores_and_temperature() -> None:
+def test_gradients_of_log_posterior_are_right_towards_scores_and_temperature():
     scores = torch.rand(3, 5, dtype=torch.float64, requires_grad=True)
     temperature = torch.tensor(0.4, dtype=torch.float64, requires_grad=True)
     closed = torch.tensor([[0, 1, 0, 0, 1], [0, 0, 0, 0, 0], [1, 1, 1, 1, 1]], dtype=torch.bool)
 
-    def reachable(scores: Tensor, temperature: Tensor) -> Tensor:
+    def reachable(scores, temperature):
         return log_posterior(scores.masked_fill(closed, math.inf), temperature)[~closed]
 
     assert torch.autograd.gradcheck(reachable, (scores, temperature))
 
 
-def test_places_at_inf_leave_gradients_finite() -> None:
+def test_places_at_inf_leave_gradients_finite():
     inf = math.inf
     scores = torch.tensor([[1.0, inf, 2.0], [inf, inf, inf], [0.0, 0.0, 0.0]], requires_grad=True)
     temperature = torch.tensor(0.1, requires_grad=True)

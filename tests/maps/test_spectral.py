@@ -5,42 +5,38 @@ from __future__ import annotations
 import copy
 import math
 import re
-from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from helpers import refused
 from processes import python
-from torch import Tensor
 
 from dejavu_torch import DejaVu, PhaseTemplates
 from dejavu_torch.maps import spectral_map
 from dejavu_torch.maps.quantisation import dead_zone, quantise
 from dejavu_torch.maps.spectral import SpectralMapper, encode_chunk
-from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.spectrum import from_spectrum, spectrum
 from dejavu_torch.types import FrequencyLayer, InputError
 
 
-def route(places: int = 400, numbers: int = 12, seed: int = 0) -> Tensor:
+def route(places=400, numbers=12, seed=0):
     """Smooth descriptors of length 1, as whitening gives."""
     noise = torch.randn(places, numbers, generator=torch.Generator().manual_seed(seed))
     lines = spectrum(noise.T) / (1 + torch.arange(places) / 20)
     return torch.nn.functional.normalize(from_spectrum(lines).T, dim=1)
 
 
-def held(learned: SpectralMap) -> Tensor:
+def held(learned):
     return torch.cat([learned.decode(g) for g in range(len(learned.chunks))])
 
 
-def share_held(learned: SpectralMap, descriptors: Tensor) -> float:
+def share_held(learned, descriptors):
     """The share of the descriptors' variance that the lines of a map hold."""
     missing, centred = held(learned) - descriptors, descriptors - descriptors.mean(0)
     return 1 - float(missing.square().sum() / centred.square().sum())
 
 
-def levels_of(learned: SpectralMap) -> Tensor:
+def levels_of(learned):
     """(N,K), all levels, zeros too."""
     levels = torch.zeros(learned.places, learned.dimension, dtype=torch.int64)
     for g, (start, stop) in enumerate(learned.chunks):
@@ -50,23 +46,23 @@ def levels_of(learned: SpectralMap) -> Tensor:
     return levels
 
 
-def grow(learned: SpectralMap, descriptors: Tensor) -> None:
+def grow(learned, descriptors):
     coding = learned.means[-1], learned.step, learned.transform, learned.resolution
     learned.extend(encode_chunk(part, *coding) for part in descriptors.split(learned.chunk))
 
 
-def copied(learned: SpectralMap, empty: SpectralMap) -> SpectralMap:
+def copied(learned, empty):
     empty.load_packed(learned.packed(), learned.get_extra_state())
     return empty
 
 
 @pytest.fixture(params=[True, False], ids=["csr", "scatter"])
-def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+def way(request, monkeypatch):
     """Products of queries with lines by either way."""
     monkeypatch.setattr(spectral_map, "_has_csr", lambda: request.param)
 
 
-SETTINGS: list[dict[str, Any]] = [
+SETTINGS = [
     {},
     {"metric": "l2"},
     {"transform": "dct"},
@@ -77,7 +73,7 @@ SETTINGS: list[dict[str, Any]] = [
 
 @pytest.mark.parametrize("settings", SETTINGS)
 @pytest.mark.usefixtures("way")
-def test_scores_are_those_of_the_decoded_descriptors(settings: dict[str, Any]) -> None:
+def test_scores_are_those_of_the_decoded_descriptors(settings):
     descriptors = route(403)
     learned = SpectralMapper(**settings)(descriptors)
     queries = descriptors[::7] + 0.1 * torch.randn(58, 12)
@@ -91,7 +87,7 @@ def test_scores_are_those_of_the_decoded_descriptors(settings: dict[str, Any]) -
 
 
 @pytest.mark.usefixtures("way")
-def test_gradients_reach_the_queries() -> None:
+def test_gradients_reach_the_queries():
     for settings in SETTINGS[::4]:
         learned = SpectralMapper(**settings)(route(90, 3)).double()
         queries = torch.randn(2, 3, dtype=torch.float64, requires_grad=True)
@@ -99,7 +95,7 @@ def test_gradients_reach_the_queries() -> None:
 
 
 @pytest.mark.parametrize(("budget", "chunk"), [(0.8, 500), (5.0, 10_000)])
-def test_the_written_route_is_within_the_budget(budget: float, chunk: Any, tmp_path: Path) -> None:
+def test_the_written_route_is_within_the_budget(budget, chunk, tmp_path):
     descriptors = route(2000, 24)
     model = DejaVu(mapper=SpectralMapper(budget, chunk=chunk)).learn(descriptors)
     per_place = model.summary().route_bytes / 2000
@@ -116,9 +112,7 @@ def test_the_written_route_is_within_the_budget(budget: float, chunk: Any, tmp_p
     ("places", "numbers", "chunk"),
     [(2, 1, 10_000), (3, 6, 10_000), (8, 300, 4), (12, 2, 10_000)],
 )
-def test_by_default_a_route_of_any_length_is_held(
-    places: int, numbers: int, chunk: Any, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_by_default_a_route_of_any_length_is_held(places, numbers, chunk, caplog):
     descriptors = torch.randn(places, numbers, generator=torch.Generator().manual_seed(0))
     learned = SpectralMapper(chunk=chunk)(descriptors)
     assert share_held(learned, descriptors) >= 0.85 - 1e-5
@@ -138,11 +132,11 @@ def test_by_default_a_route_of_any_length_is_held(
 
 
 @pytest.mark.parametrize(("places", "numbers"), [(10, 2), (64, 3), (500, 6), (500, 64)])
-def test_few_or_smooth_features_are_told_apart_by_what_5_bytes_hold(places: int, numbers: int) -> None:
+def test_few_or_smooth_features_are_told_apart_by_what_5_bytes_hold(places, numbers):
     """Small differences beside a large drift are little of the variance."""
     walk = torch.randn(places, numbers, generator=torch.Generator().manual_seed(0)).cumsum(0)
 
-    def found(**settings: Any) -> float:
+    def found(**settings):
         index = SpectralMapper(**settings)(walk).scores(walk).argmin(1)
         return float((index == torch.arange(places)).float().mean())
 
@@ -150,7 +144,7 @@ def test_few_or_smooth_features_are_told_apart_by_what_5_bytes_hold(places: int,
     assert found(hold=0.85) < 0.8
 
 
-def test_by_default_more_than_5_bytes_are_taken_where_85_percent_need_them() -> None:
+def test_by_default_more_than_5_bytes_are_taken_where_85_percent_need_them():
     noise = torch.randn(400, 60, generator=torch.Generator().manual_seed(0))
     learned = SpectralMapper()(noise)
     assert learned.step == SpectralMapper(hold=0.85)(noise).step
@@ -160,14 +154,14 @@ def test_by_default_more_than_5_bytes_are_taken_where_85_percent_need_them() -> 
     assert smooth.step < SpectralMapper(hold=0.85)(route()).step
 
 
-def test_by_default_few_numbers_take_what_changes_a_score() -> None:
+def test_by_default_few_numbers_take_what_changes_a_score():
     """5 bytes are more than one number takes as a float: by default they only bound it."""
     assert 1 < SpectralMapper()(route(200, 1)).summary().route_bytes / 200 < 4
     with refused("route_bytes_per_place is 6", "at most 4"):
         SpectralMapper(6.0)(route(200, 1))
 
 
-def test_a_step_of_ones_own() -> None:
+def test_a_step_of_ones_own():
     descriptors = route()
     fine, coarse = (SpectralMapper(None, step=step)(descriptors) for step in (0.05, 0.5))
     assert (held(fine) - descriptors).square().mean().sqrt() <= 0.05
@@ -176,7 +170,7 @@ def test_a_step_of_ones_own() -> None:
 
 
 @pytest.mark.parametrize("settings", SETTINGS)
-def test_the_lines_hold_the_share_that_is_asked_for(settings: dict[str, Any]) -> None:
+def test_the_lines_hold_the_share_that_is_asked_for(settings):
     descriptors = route(403)
     sizes = []
     for hold in (0.3, 0.85, 0.99):
@@ -190,7 +184,7 @@ def test_the_lines_hold_the_share_that_is_asked_for(settings: dict[str, Any]) ->
     assert (share_held(coarse, descriptors) < share - 1e-6) == (coarse.resolution > 0)
 
 
-def test_the_step_that_holds_most_of_white_noise_is_known() -> None:
+def test_the_step_that_holds_most_of_white_noise_is_known():
     """What is missing of a number lies between -.35 and .65 of a step."""
     noise = torch.randn(4000, 16, generator=torch.Generator().manual_seed(0))
     for hold, transform in ((0.99, "dft"), (0.999, "dct")):
@@ -201,14 +195,14 @@ def test_the_step_that_holds_most_of_white_noise_is_known() -> None:
     assert share_held(finest, noise) > 0.9999
 
 
-def waves(cycles: int, period: int = 20) -> Tensor:
+def waves(cycles, period=20):
     """Four features of three harmonics each, a whole number of cycles."""
     time = torch.arange(cycles * period, dtype=torch.float64)[:, None] * (2 * math.pi / period)
     features = [sum(torch.sin(h * time + f + h) / h for h in (1, 2, 3)) for f in range(4)]
     return torch.cat(features, 1).float()  # type: ignore[arg-type]
 
 
-def test_at_equal_error_the_file_grows_by_the_logarithm_of_the_cycles() -> None:
+def test_at_equal_error_the_file_grows_by_the_logarithm_of_the_cycles():
     sizes, counts = {}, {}
     for cycles in (10, 1000):
         learned = SpectralMapper(None, step=0.02 * math.sqrt(20 * cycles), chunk=10**6)(waves(cycles))
@@ -217,7 +211,7 @@ def test_at_equal_error_the_file_grows_by_the_logarithm_of_the_cycles() -> None:
     assert sizes[1000] <= sizes[10] + 64 + 24 * math.log2(1000 * 20) / 8 * 2
 
 
-def test_at_the_resolution_the_dead_zone_is_twice_as_wide() -> None:
+def test_at_the_resolution_the_dead_zone_is_twice_as_wide():
     """Waves of one period each, whose lines are 1.2 dead zones high."""
     for transform in ("dft", "dct"):
         time = torch.arange(96, dtype=torch.float64)
@@ -231,7 +225,7 @@ def test_at_the_resolution_the_dead_zone_is_twice_as_wide() -> None:
         assert kept == [1, 1, 0, 0, 0]  # dead zones 1.03, 1.11, 1.44, 2 and 5 times as wide
 
 
-def test_resolution_is_kept_and_extends_alike() -> None:
+def test_resolution_is_kept_and_extends_alike():
     descriptors = route(300)
     mapper = SpectralMapper(None, step=0.3, chunk=100, resolution=6.0)
     grown = mapper(descriptors[:200])
@@ -245,7 +239,7 @@ def test_resolution_is_kept_and_extends_alike() -> None:
     assert not torch.equal(levels[0], levels[1])
 
 
-def test_phase_means_are_the_spectrum_at_the_harmonics_of_the_period() -> None:
+def test_phase_means_are_the_spectrum_at_the_harmonics_of_the_period():
     """Eq. 1 repeated along whole cycles is the projection onto the lines of 1 / tau and its multiples."""
     for period, cycles in ((7, 11), (8, 6)):
         series = torch.randn(period * cycles, 3, dtype=torch.float64)
@@ -258,7 +252,7 @@ def test_phase_means_are_the_spectrum_at_the_harmonics_of_the_period() -> None:
 
 
 @pytest.mark.usefixtures("way")
-def test_a_place_without_a_descriptor_scores_cosine_0() -> None:
+def test_a_place_without_a_descriptor_scores_cosine_0():
     tiny = torch.full((1, 4), 1e-12)
     descriptors = torch.cat([torch.eye(4)[[0, 1]], tiny, -torch.eye(4)[[0, 1]]]).repeat(20, 1)
     learned = SpectralMapper(None, step=3e-7)(descriptors)
@@ -270,7 +264,7 @@ def test_a_place_without_a_descriptor_scores_cosine_0() -> None:
     assert torch.equal(gradient, torch.zeros(3, 4))
 
 
-def test_a_place_without_a_descriptor_is_never_found() -> None:
+def test_a_place_without_a_descriptor_is_never_found():
     descriptors = torch.cat([torch.eye(4)[[0, 1]], torch.zeros(1, 4), -torch.eye(4)[[0, 1]]]).repeat(20, 1)
     learned = SpectralMapper(None, step=3e-7)(descriptors)
     assert learned.summary().covered == 80
@@ -317,7 +311,7 @@ def test_a_place_without_a_descriptor_is_never_found() -> None:
         ({"route_bytes_per_place": 200.0}, ("200", "mean", "at most 48")),
     ],
 )
-def test_settings_out_of_range_are_refused(settings: dict[str, Any], words: tuple[str, ...]) -> None:
+def test_settings_out_of_range_are_refused(settings, words):
     with refused(*words):
         SpectralMapper(**settings)(route())
 
@@ -333,12 +327,12 @@ def test_settings_out_of_range_are_refused(settings: dict[str, Any], words: tupl
         (torch.full((9, 4), math.nan), ("NaN",)),
     ],
 )
-def test_what_is_no_route_is_refused(descriptors: Tensor, words: tuple[str, ...]) -> None:
+def test_what_is_no_route_is_refused(descriptors, words):
     with refused(*words):
         SpectralMapper()(descriptors)
 
 
-def test_what_does_not_fit_a_map_is_refused() -> None:
+def test_what_does_not_fit_a_map_is_refused():
     learned, other = SpectralMapper(chunk=50)(route(60, 5)), SpectralMapper(chunk=50).empty()
     with refused("(3, 4)", "(Q, 5)"):
         learned.scores(torch.rand(3, 4))
@@ -361,7 +355,7 @@ def test_what_does_not_fit_a_map_is_refused() -> None:
     assert other.places == 0
 
 
-def test_a_map_is_that_of_its_chunks_coded_one_by_one() -> None:
+def test_a_map_is_that_of_its_chunks_coded_one_by_one():
     for settings in (("cosine", "dft", 64, 0.0), ("l2", "dct", 64, 8.0)):
         features = route(200) * torch.tensor([50.0, *[1.0] * 11])
         metric, transform, chunk, resolution = settings
@@ -375,7 +369,7 @@ def test_a_map_is_that_of_its_chunks_coded_one_by_one() -> None:
         assert learned.level.abs().max() > 127
 
 
-def test_a_copy_and_other_precisions_score_alike() -> None:
+def test_a_copy_and_other_precisions_score_alike():
     for settings in SETTINGS[::4]:
         learned = SpectralMapper(**settings)(route(170))
         queries, expected = route(20, seed=1), learned.scores(route(20, seed=1))
@@ -388,7 +382,7 @@ def test_a_copy_and_other_precisions_score_alike() -> None:
 
 
 @pytest.mark.slow
-def test_nothing_is_written_to_stderr_when_a_map_scores() -> None:
+def test_nothing_is_written_to_stderr_when_a_map_scores():
     program = "import torch; from dejavu_torch import SpectralMapper; w = torch.rand(90, 5).cumsum(0); "
     program += "SpectralMapper()(w).scores(w[:3])"
     assert python(program).stderr == ""

@@ -5,8 +5,6 @@ from __future__ import annotations
 import errno
 import os
 import tempfile
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +13,6 @@ from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
 from test_spectral import held, levels_of, route
-from torch import Tensor
 
 from dejavu_torch import DejaVu, memory
 from dejavu_torch.maps import quantisation, spectral, spectral_map
@@ -24,7 +21,7 @@ from dejavu_torch.maps.spectral import SpectralMapper, encode_chunk
 from dejavu_torch.maps.spectral_map import Chunk, SpectralMap, sparse_products
 
 
-def coded(levels: Tensor) -> Chunk:
+def coded(levels):
     return Chunk(len(levels), 1.0, encode(levels.int()))
 
 
@@ -35,9 +32,7 @@ def coded(levels: Tensor) -> Chunk:
     share=st.floats(0, 1),
     seed=st.integers(0, 99),
 )
-def test_a_map_holds_the_levels_in_small_types(
-    rows: int, width: int, largest: int, share: float, seed: int
-) -> None:
+def test_a_map_holds_the_levels_in_small_types(rows, width, largest, share, seed):
     draw = torch.Generator().manual_seed(seed)
     levels = torch.randint(-largest, largest + 1, (rows, width), generator=draw)
     levels *= torch.rand(rows, width, generator=draw) < share
@@ -55,7 +50,7 @@ def test_a_map_holds_the_levels_in_small_types(
 
 
 @pytest.mark.parametrize("csr", [True, False])
-def test_sparse_products_are_those_of_the_whole_rows(csr: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sparse_products_are_those_of_the_whole_rows(csr, monkeypatch):
     monkeypatch.setattr(spectral_map, "_has_csr", lambda: csr)
     rows = torch.randint(-9, 9, (40, 300)) * (torch.rand(40, 300) < 0.05)
     rows[3] = 0
@@ -69,14 +64,14 @@ def test_sparse_products_are_those_of_the_whole_rows(csr: bool, monkeypatch: pyt
         torch.testing.assert_close(torch.cat(alone), found, rtol=1e-5, atol=1e-4)
 
 
-def test_a_long_chunk_is_decoded_by_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_chunk_is_decoded_by_parts(monkeypatch):
     learned = SpectralMapper(None, 0.5, 32)(torch.randn(64, 256))
     whole = held(learned)
     monkeypatch.setattr(spectral_map, "LONG", 32 * 100)
     assert torch.allclose(held(learned), whole, atol=1e-6)
 
 
-def test_more_places_than_the_index_type_holds_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_places_than_the_index_type_holds_are_refused(monkeypatch):
     one = encode_chunk(torch.randn(4, 3), torch.zeros(3).bfloat16(), 0.1)
     monkeypatch.setattr(spectral_map, "LARGEST", 11)
     with refused("12 places", "at most 11"):
@@ -84,14 +79,14 @@ def test_more_places_than_the_index_type_holds_are_refused(monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize("budget", [1.0, 4.0])
-def test_a_map_takes_few_bytes_for_each_place(budget: float) -> None:
+def test_a_map_takes_few_bytes_for_each_place(budget):
     walk = torch.randn(4096, 64, generator=torch.Generator().manual_seed(0)).cumsum(0)
     learned = SpectralMapper(budget, chunk=1024)(torch.nn.functional.normalize(walk, dim=1))
     taken = sum(buffer.nbytes for buffer in learned.buffers())
     assert taken / learned.places <= {1.0: 12, 4.0: 36}[budget]  # and 4 of a position
 
 
-def test_a_mean_that_is_next_to_nothing_takes_no_bytes() -> None:
+def test_a_mean_that_is_next_to_nothing_takes_no_bytes():
     centred = route(200, 12)
     centred = centred - centred.mean(0)
     size = float(centred.square().mean().sqrt())
@@ -118,7 +113,7 @@ def test_a_mean_that_is_next_to_nothing_takes_no_bytes() -> None:
 
 
 @pytest.mark.parametrize("shift", [0.0, 1.0])
-def test_a_sample_pays_its_share_of_a_mean(shift: float) -> None:
+def test_a_sample_pays_its_share_of_a_mean(shift):
     features = route(400, 12) - route(400, 12).mean(0) + shift
     mapper = SpectralMapper(6.0)
     whole, part = (mapper.fit(features, 400, share).step for share in (1.0, 0.1))
@@ -126,9 +121,7 @@ def test_a_sample_pays_its_share_of_a_mean(shift: float) -> None:
     assert part == whole or shift
 
 
-def test_a_map_that_was_loaded_is_saved_without_coding_anew(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_map_that_was_loaded_is_saved_without_coding_anew(tmp_path, monkeypatch):
     features = torch.randn(300, 5) * torch.tensor([900.0, 1, 1, 1, 1])
     model = DejaVu(mapper=SpectralMapper(None, step=0.5, chunk=90), whitening="none").learn(features)
     model.save(tmp_path / "a.safetensors")
@@ -139,7 +132,7 @@ def test_a_map_that_was_loaded_is_saved_without_coding_anew(
 
 # routes so long that their lines are made and gone through in blocks
 
-IN_BLOCKS: list[dict[str, Any]] = [
+IN_BLOCKS = [
     {},
     {"chunk": 700, "resolution": 4.0},
     {"transform": "dct", "resolution": 4.0},
@@ -147,16 +140,14 @@ IN_BLOCKS: list[dict[str, Any]] = [
 
 
 @pytest.fixture
-def in_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+def in_blocks(monkeypatch):
     """Every route is a long one; its lines are in a file."""
     monkeypatch.setattr(quantisation, "BLOCK", 1000)
     monkeypatch.setattr(quantisation, "empty", lambda *size: memory.empty(*size, in_memory=0))
 
 
 @pytest.mark.parametrize("settings", IN_BLOCKS)
-def test_in_blocks_a_map_of_a_step_holds_the_same(
-    settings: dict[str, Any], request: pytest.FixtureRequest
-) -> None:
+def test_in_blocks_a_map_of_a_step_holds_the_same(settings, request):
     descriptors = route(2000, 24)
     whole = SpectralMapper(None, step=0.1, **settings)(descriptors)
     request.getfixturevalue("in_blocks")
@@ -169,7 +160,7 @@ def test_in_blocks_a_map_of_a_step_holds_the_same(
 
 @pytest.mark.usefixtures("in_blocks")
 @pytest.mark.parametrize(("budget", "settings"), [*zip((0.7, 4.0, 4.0), IN_BLOCKS, strict=True)])
-def test_in_blocks_the_route_is_within_the_budget(settings: dict[str, Any], budget: float) -> None:
+def test_in_blocks_the_route_is_within_the_budget(settings, budget):
     descriptors = route(2000, 24)
     learned = SpectralMapper(budget, **settings)(descriptors)
     assert 0.98 * budget <= learned.summary().route_bytes / 2000 <= budget
@@ -178,7 +169,7 @@ def test_in_blocks_the_route_is_within_the_budget(settings: dict[str, Any], budg
 
 
 @pytest.mark.usefixtures("in_blocks")
-def test_descriptors_may_be_halves_in_a_file(tmp_path: Path) -> None:
+def test_descriptors_may_be_halves_in_a_file(tmp_path):
     descriptors = route(900, 24).half()
     descriptors.numpy().tofile(tmp_path / "d")
     mapped = torch.from_numpy(np.memmap(tmp_path / "d", np.float16, "c", shape=(900, 24)))
@@ -187,8 +178,8 @@ def test_descriptors_may_be_halves_in_a_file(tmp_path: Path) -> None:
     assert torch.equal(learned.steps, own.steps)
 
 
-def test_there_may_be_no_room_for_the_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    def full(*_: object) -> None:
+def test_there_may_be_no_room_for_the_file(monkeypatch, tmp_path):
+    def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with monkeypatch.context() as patch, refused("1000 x 3", "No space left", "TMPDIR"):

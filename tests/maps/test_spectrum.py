@@ -7,15 +7,14 @@ from fractions import Fraction
 
 import pytest
 import torch
-from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from dejavu_torch.maps.spectrum import Transform, from_spectrum, period_of, spectrum
+from dejavu_torch.maps.spectrum import from_spectrum, period_of, spectrum
 
-TRANSFORMS: tuple[Transform, ...] = ("dft", "dct")
+TRANSFORMS = ("dft", "dct")
 
 
-def definition(count: int, transform: str) -> Tensor:
+def definition(count, transform):
     """The lines as rows (W,W), by the letter of the docstring."""
     time = torch.arange(count, dtype=torch.float64)
     rows = []
@@ -32,7 +31,7 @@ def definition(count: int, transform: str) -> Tensor:
 
 @pytest.mark.parametrize("transform", TRANSFORMS)
 @pytest.mark.parametrize("count", [1, 2, 3, 8, 13, 30])
-def test_lines_are_those_of_the_definition(transform: Transform, count: int) -> None:
+def test_lines_are_those_of_the_definition(transform, count):
     series = torch.randn(2, 3, count, dtype=torch.float64)
     rows = definition(count, transform)
     assert torch.allclose(rows @ rows.T, torch.eye(count, dtype=torch.float64), atol=1e-12)
@@ -42,26 +41,26 @@ def test_lines_are_those_of_the_definition(transform: Transform, count: int) -> 
 
 
 @pytest.mark.parametrize("transform", TRANSFORMS)
-def test_gradients(transform: Transform) -> None:
+def test_gradients(transform):
     for count in (6, 7):
         series = torch.randn(2, count, dtype=torch.float64, requires_grad=True)
         for function in (spectrum, from_spectrum):
             assert torch.autograd.gradcheck(lambda x, f=function: f(x, transform), series)
 
 
-def test_periods() -> None:
+def test_periods():
     assert [period_of(line, 12) for line in (1, 2, 3, 11)] == [12, 12, 6, 2]
     assert [period_of(line, 12, "dct") for line in (1, 2, 5)] == [24, 12, Fraction(24, 5)]
 
 
-def test_a_whole_number_of_cycles_is_one_line_of_the_dft_and_many_of_the_dct() -> None:
+def test_a_whole_number_of_cycles_is_one_line_of_the_dft_and_many_of_the_dct():
     wave = torch.sin(2 * math.pi * torch.arange(120, dtype=torch.float64) / 8 + 1)
     lines = {name: int((spectrum(wave, name).abs() > 1e-9).sum()) for name in TRANSFORMS}
     assert lines["dft"] == 2
     assert lines["dct"] > 50
 
 
-def test_what_an_inference_or_a_fake_tensor_left_serves_gradients() -> None:
+def test_what_an_inference_or_a_fake_tensor_left_serves_gradients():
     with torch.inference_mode():
         from_spectrum(torch.randn(37))
     with FakeTensorMode():

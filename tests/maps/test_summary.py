@@ -8,10 +8,8 @@ import pytest
 import torch
 
 from dejavu_torch import FrequencyLayer, TemplateMap
-from dejavu_torch.maps.summary import MapSummary
-from dejavu_torch.types import Plan
 
-PLAN: Plan = (
+PLAN = (
     FrequencyLayer(Fraction(93), 93, 0, 1024, (0, 1, 2)),
     FrequencyLayer(Fraction(171), 171, 0, 1024, (1, 3)),
     FrequencyLayer(Fraction(195, 2), 98, 1500, 2000, (0,)),
@@ -21,17 +19,17 @@ PLAN: Plan = (
 )
 
 
-def summary_of(plan: Plan, places: int) -> MapSummary:
+def summary_of(plan, places):
     blocks = [torch.zeros(layer.phases, len(layer.features)) for layer in plan]
     return TemplateMap(plan, blocks, places, 4).summary()
 
 
 @pytest.fixture
-def summary() -> MapSummary:
+def summary():
     return summary_of(PLAN, 2500).with_parts(fixed={"header": 1000, "backbone": 0})
 
 
-def test_chunks_of_a_plan_made_by_hand(summary: MapSummary) -> None:
+def test_chunks_of_a_plan_made_by_hand(summary):
     first, second, third = summary.chunks
     assert (first.start, first.stop, first.periods, first.features) == (0, 1024, (93, 171), (3, 2))
     assert first.common_period == 5301  # not the product, 15903
@@ -39,7 +37,7 @@ def test_chunks_of_a_plan_made_by_hand(summary: MapSummary) -> None:
     assert (third.start, third.stop, third.common_period) == (1900, 2100, 60)
 
 
-def test_description_tells_the_numbers(summary: MapSummary) -> None:
+def test_description_tells_the_numbers(summary):
     assert str(summary).splitlines() == [
         "places 0-1023: 2 layers, periods 93 (3 features), 171 (2 features); together 5301 places",
         "places 1500-1999: 1 layer, periods 97.5 (1 features)",
@@ -52,7 +50,7 @@ def test_description_tells_the_numbers(summary: MapSummary) -> None:
     ]
 
 
-def test_description_of_many_layers_stays_short() -> None:
+def test_description_of_many_layers_stays_short():
     plan = tuple(FrequencyLayer(Fraction(p), p, 0, 1024, (0,)) for p in range(8, 108))
     first, *_ = str(summary_of(plan, 1024)).splitlines()
     assert "100 layers" in first

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from fractions import Fraction
-from typing import Any
 
 import pytest
 import reference
@@ -12,12 +11,10 @@ from helpers import refused, scored
 from hypothesis import given
 from hypothesis import strategies as st
 from test_scores import make
-from torch import Tensor
 
 from dejavu_torch import FrequencyLayer, InputError, TemplateMap
-from dejavu_torch.types import Plan
 
-PLAN: Plan = (
+PLAN = (
     FrequencyLayer(Fraction(195, 2), 98, 0, 200, (0, 2)),
     FrequencyLayer(Fraction(7), 7, 100, 250, (1,)),
     FrequencyLayer(Fraction(115), 23, 100, 250, (0, 1, 3)),
@@ -26,12 +23,12 @@ PLACES, DIMENSION = 300, 4
 
 
 @pytest.fixture
-def route() -> TemplateMap:
+def route():
     return make(torch.rand(PLACES, DIMENSION), PLAN)
 
 
 @given(reference.routes())
-def test_state_dict_round_trip_into_an_empty_map(drawn: reference.Route) -> None:
+def test_state_dict_round_trip_into_an_empty_map(drawn):
     route, other = make(drawn.values, drawn.plan), TemplateMap()
     other.load_state_dict(route.state_dict())
     assert other.plan == route.plan == drawn.plan
@@ -43,7 +40,7 @@ def test_state_dict_round_trip_into_an_empty_map(drawn: reference.Route) -> None
         assert getattr(other, name).dtype == tensor.dtype
 
 
-def test_convention_1_places_count_from_0_and_chunks_are_half_open() -> None:
+def test_convention_1_places_count_from_0_and_chunks_are_half_open():
     last = FrequencyLayer(Fraction(2), 2, 3, 5, (0,))
     assert TemplateMap((last,), [torch.zeros(2, 1)], 5, 1).places == 5
     with pytest.raises(InputError, match=r"covers \[3, 5\).*inside 4 places"):
@@ -69,16 +66,14 @@ def test_convention_1_places_count_from_0_and_chunks_are_half_open() -> None:
         ("weights", lambda t: torch.ones(3), "weights (3,); expected (4,) or (0,)"),
     ],
 )
-def test_buffers_that_do_not_fit_together_are_refused(
-    route: TemplateMap, name: str, change: Any, message: str
-) -> None:
+def test_buffers_that_do_not_fit_together_are_refused(route, name, change, message):
     state = route.state_dict()
     state[name] = change(state[name])
     with refused(message):
         TemplateMap().load_state_dict(state)
 
 
-def test_templates_of_another_shape_are_refused() -> None:
+def test_templates_of_another_shape_are_refused():
     with refused("templates of a layer are (2, 98)", "(P,F) = (98, 2)"):
         TemplateMap(PLAN[:1], [torch.zeros(2, 98)], PLACES, DIMENSION)
 
@@ -88,17 +83,17 @@ def test_templates_of_another_shape_are_refused() -> None:
 WEIGHTS = torch.tensor([0.5, -1.5, 0.0, 2.0])
 
 
-def scores(route: TemplateMap, metric: str = "l1") -> Tensor:
+def scores(route, metric="l1"):
     queries = torch.rand(5, DIMENSION, generator=torch.Generator().manual_seed(1))
     return scored(queries, route, metric)
 
 
-def parameters(route: TemplateMap) -> set[str]:
+def parameters(route):
     return {name for name, _ in route.named_parameters()}
 
 
 @given(drawn=reference.routes(), seed=st.integers(0, 2**16))
-def test_weights_and_templates_scale_alike(drawn: reference.Route, seed: int) -> None:
+def test_weights_and_templates_scale_alike(drawn, seed):
     """The map of weighted features, given weighted queries, is the map with weights."""
     generator = torch.Generator().manual_seed(seed)
     weights = torch.rand(drawn.values.shape[1], generator=generator)
@@ -110,9 +105,7 @@ def test_weights_and_templates_scale_alike(drawn: reference.Route, seed: int) ->
 
 
 @pytest.mark.parametrize(("templates", "weights"), [(True, False), (False, True), (True, True)])
-def test_training_is_asked_for_and_frozen_without_a_change_of_scores(
-    route: TemplateMap, templates: bool, weights: bool
-) -> None:
+def test_training_is_asked_for_and_frozen_without_a_change_of_scores(route, templates, weights):
     before = scores(route)
     route.trainable(templates, weights)
     assert parameters(route) == {n for n, on in (("templates", templates), ("weights", weights)) if on}
@@ -124,7 +117,7 @@ def test_training_is_asked_for_and_frozen_without_a_change_of_scores(
 
 
 @pytest.mark.parametrize("metric", ["l1", "l2", "cosine"])
-def test_trained_weights_freeze_to_none_below_0(route: TemplateMap, metric: str) -> None:
+def test_trained_weights_freeze_to_none_below_0(route, metric):
     route.trainable(weights=True)
     with torch.no_grad():
         route.weights.copy_(WEIGHTS)
@@ -135,7 +128,7 @@ def test_trained_weights_freeze_to_none_below_0(route: TemplateMap, metric: str)
     torch.testing.assert_close(scores(route, metric), before, rtol=0, atol=1e-6)
 
 
-def test_training_goes_on_from_weights(route: TemplateMap) -> None:
+def test_training_goes_on_from_weights(route):
     """The templates, made of plain features, become those of weighted ones; once only."""
     plain = [block.clone() for block in route.blocks()]
     route.trainable(weights=True, start=WEIGHTS)
@@ -148,7 +141,7 @@ def test_training_goes_on_from_weights(route: TemplateMap) -> None:
     torch.testing.assert_close(scores(route), before, rtol=0, atol=1e-6)
 
 
-def test_weights_that_are_none_are_refused(route: TemplateMap) -> None:
+def test_weights_that_are_none_are_refused(route):
     with refused("weights start as (4, 1)", "expected (4,)"):
         route.trainable(weights=True, start=torch.ones(4, 1))
     route.trainable(weights=True)
@@ -158,7 +151,7 @@ def test_weights_that_are_none_are_refused(route: TemplateMap) -> None:
         route.freeze()
 
 
-def test_a_state_goes_into_an_empty_map_and_into_one_that_trains(route: TemplateMap) -> None:
+def test_a_state_goes_into_an_empty_map_and_into_one_that_trains(route):
     """As a checkpoint does; weights may be below 0 on the way."""
     route.trainable(weights=True, start=WEIGHTS)
     empty, other = TemplateMap(), make(torch.rand(PLACES, DIMENSION), PLAN)

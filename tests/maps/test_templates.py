@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from fractions import Fraction
 
 import pytest
@@ -15,39 +14,39 @@ from hypothesis import strategies as st
 from dejavu_torch import FrequencyLayer, PhaseTemplates, phase_mask
 
 
-def whole(period: int, stop: int, features: tuple[int, ...] = (0,), start: int = 0) -> FrequencyLayer:
+def whole(period, stop, features=(0,), start=0):
     """The paper's case: as many phases as frames in a period."""
     return FrequencyLayer(Fraction(period), period, start, stop, features)
 
 
 @given(st.integers(1, 12), st.integers(1, 40))
-def test_mask_is_eq_2_to_the_letter(period: int, n: int) -> None:
+def test_mask_is_eq_2_to_the_letter(period, n):
     mask = phase_mask(n, period)
     assert mask.tolist() == [[float((i - k) % period == 0) for i in range(n)] for k in range(period)]
 
 
 @given(reference.routes(most_layers=1))
-def test_mask_equals_reference(route: reference.Route) -> None:
+def test_mask_equals_reference(route):
     (layer,) = route.plan
     n = len(route.values)
     mask = phase_mask(n, layer.period, layer.phases, layer.start, layer.stop)
     assert mask.tolist() == [[reference.mask(i, k, layer) for i in range(n)] for k in range(layer.phases)]
 
 
-def test_phases_of_far_frames_are_exact() -> None:
+def test_phases_of_far_frames_are_exact():
     layer = FrequencyLayer(Fraction(195, 2), 98, 0, 1, (0,))
     far = [10**7, 10**12 + 1]
     assert layer.phase(torch.tensor(far)).tolist() == [reference.phase(i, layer) for i in far]
 
 
-def test_convention_1_phases_count_from_absolute_frame_0() -> None:
+def test_convention_1_phases_count_from_absolute_frame_0():
     assert phase_mask(10, 4, start=3, stop=9)[3].tolist() == [0, 0, 0, 1, 0, 0, 0, 1, 0, 0]
     values = torch.arange(8.0)[:, None]
     (mu,) = PhaseTemplates()(values, [whole(4, stop=8, start=2)])
     assert mu[:, 0].tolist() == [4, 5, (2 + 6) / 2, (3 + 7) / 2]
 
 
-def test_convention_1_the_mask_is_zero_outside_the_half_open_chunk() -> None:
+def test_convention_1_the_mask_is_zero_outside_the_half_open_chunk():
     assert phase_mask(6, 2, start=2, stop=4).sum(0).tolist() == [0, 0, 1, 1, 0, 0]
     values = torch.tensor([[9.0], [9.0], [1.0], [2.0], [9.0], [9.0]])
     (mu,) = PhaseTemplates()(values, [whole(2, stop=4, start=2)])
@@ -55,14 +54,14 @@ def test_convention_1_the_mask_is_zero_outside_the_half_open_chunk() -> None:
 
 
 @given(reference.routes())
-def test_templates_equal_reference(route: reference.Route) -> None:
+def test_templates_equal_reference(route):
     found = PhaseTemplates()(route.values, route.plan)
     for mu, layer in zip(found, route.plan, strict=True):
         expected = torch.tensor(reference.templates(route.values.tolist(), layer), dtype=torch.float64)
         torch.testing.assert_close(mu, expected, rtol=0, atol=1e-12)
 
 
-def test_a_phase_without_frames_is_finite() -> None:
+def test_a_phase_without_frames_is_finite():
     values = torch.ones(3, 1, requires_grad=True)
     (mu,) = PhaseTemplates()(values, [whole(5, stop=3)])
     assert mu[:, 0].tolist() == [1, 1, 1, 0, 0]
@@ -71,7 +70,7 @@ def test_a_phase_without_frames_is_finite() -> None:
     assert values.grad.isfinite().all()
 
 
-def test_gradients_are_right() -> None:
+def test_gradients_are_right():
     values = torch.randn(14, 3, dtype=torch.float64, requires_grad=True)
     plan = [
         whole(4, 14, (0, 2)),
@@ -94,13 +93,13 @@ def test_gradients_are_right() -> None:
         (lambda: PhaseTemplates()(torch.rand(10, 2), [whole(3, 10, (0, 2))]), "and feature 2; expected"),
     ],
 )
-def test_what_makes_no_templates_is_refused(make: Callable[[], object], message: str) -> None:
+def test_what_makes_no_templates_is_refused(make, message):
     with refused(message):
         make()
 
 
 @given(reference.routes())
-def test_templates_are_means_under_the_mask(route: reference.Route) -> None:
+def test_templates_are_means_under_the_mask(route):
     n = len(route.values)
     for mu, layer in zip(PhaseTemplates()(route.values, route.plan), route.plan, strict=True):
         mask = phase_mask(n, layer.period, layer.phases, layer.start, layer.stop, torch.float64)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +11,7 @@ from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
-from torch import Tensor, nn
+from torch import nn
 
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.hog import HOG
@@ -39,22 +37,22 @@ class Net(nn.Module):
         with torch.no_grad():
             self.first.weight[3] = 0
 
-    def forward(self, frames: Tensor) -> Tensor:
+    def forward(self, frames):
         flat = frames.flatten(1)
         return self.first(flat) + self.again(flat.square())
 
 
-def frames(count: int = 64) -> Tensor:
+def frames(count=64):
     return torch.rand(count, 1, 8, 8, generator=torch.Generator().manual_seed(0))
 
 
-def small() -> SmallCNN:
+def small():
     torch.manual_seed(0)
     return SmallCNN(16, channels=1, resize=(16, 16), widths=(8, 16), squeeze=8)
 
 
 @given(MATRICES)
-def test_each_number_is_off_by_half_a_step_of_its_channel(values: Any) -> None:
+def test_each_number_is_off_by_half_a_step_of_its_channel(values):
     weight = torch.from_numpy(values)
     whole, scale = quantised(weight)
     exact = whole.double() * scale.double().view(-1, *[1] * (weight.ndim - 1))
@@ -66,14 +64,14 @@ def test_each_number_is_off_by_half_a_step_of_its_channel(values: Any) -> None:
 
 
 @given(MATRICES)
-def test_what_is_rounded_stays_as_it_is(values: Any) -> None:
+def test_what_is_rounded_stays_as_it_is(values):
     once = rounded(torch.from_numpy(values))
     assert torch.equal(once.view(torch.int32), rounded(once).view(torch.int32))
     for one, other in zip(quantised(once), quantised(torch.from_numpy(values)), strict=True):
         assert torch.equal(one, other)
 
 
-def test_the_closed_form() -> None:
+def test_the_closed_form():
     whole, scale = quantised(torch.tensor([[127.0, 63.4, -0.6], [-254.0, 3.1, 0.9]]))
     assert whole.tolist() == [[127, 63, -1], [-127, 2, 0]]
     assert scale.tolist() == [1.0, 2.0]
@@ -81,7 +79,7 @@ def test_the_closed_form() -> None:
         assert not fits(weight)
 
 
-def test_parameters_alone_are_rounded() -> None:
+def test_parameters_alone_are_rounded():
     net = Net()
     before = {name: tensor.clone() for name, tensor in net.state_dict().items()}
     assert not is_rounded(net)
@@ -93,7 +91,7 @@ def test_parameters_alone_are_rounded() -> None:
     assert {name for name, tensor in packed(net).items() if tensor.dtype == torch.int8} == changed
 
 
-def test_a_network_is_rounded_for_a_while() -> None:
+def test_a_network_is_rounded_for_a_while():
     net = small()
     before = {name: tensor.clone() for name, tensor in net.state_dict().items()}
     with suppress(KeyError), in_bits(net, 8):
@@ -105,14 +103,14 @@ def test_a_network_is_rounded_for_a_while() -> None:
 
 
 @pytest.fixture
-def path(tmp_path: Path) -> Path:
+def path(tmp_path):
     """The map of a network in 8 bits."""
     DejaVu(small(), weight_bits=8).learn(frames()).save(tmp_path / "map.safetensors")
     return tmp_path / "map.safetensors"
 
 
 @pytest.mark.parametrize("make", [small, Net])
-def test_a_file_gives_back_the_network_bit_for_bit(tmp_path: Path, make: Any) -> None:
+def test_a_file_gives_back_the_network_bit_for_bit(tmp_path, make):
     model = DejaVu(make(), weight_bits=8).learn(frames()).eval()
     model.save(path := tmp_path / "map.safetensors")
     again = DejaVu.load(path, make())
@@ -127,14 +125,14 @@ def test_a_file_gives_back_the_network_bit_for_bit(tmp_path: Path, make: Any) ->
 
 
 @pytest.mark.parametrize("whitening", [True, False])
-def test_what_another_map_brings_stays_in_8_bits(path: Path, whitening: bool) -> None:
+def test_what_another_map_brings_stays_in_8_bits(path, whitening):
     model = DejaVu()
     model.descriptor.take(DejaVu.load(path).descriptor, whitening)
     model.learn(frames()).save(other := path.with_name("other.safetensors"))
     assert DejaVu.load(other).weight_bits == 8
 
 
-def test_bits_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+def test_bits_that_do_not_fit_are_refused(tmp_path):
     for features, bits, words in (
         (HOG(), 8, ("weight_bits is 8", "HOG has no", "expected 32")),
         (nn.LazyLinear(3), 8, ("LazyLinear", "yet")),
@@ -153,7 +151,7 @@ def test_bits_that_do_not_fit_are_refused(tmp_path: Path) -> None:
 WEIGHT, SCALES = "features.linear.weight", "features.linear.weight.scale"
 
 
-def test_a_file_of_the_time_before_is_as_it_was(tmp_path: Path) -> None:
+def test_a_file_of_the_time_before_is_as_it_was(tmp_path):
     """Weights of 32 bits are written as ever, and nothing says so."""
     model = DejaVu(small()).learn(frames())
     model.save(path := tmp_path / "map.safetensors")

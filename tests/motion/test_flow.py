@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 import sys
-from pathlib import Path
 
 import pytest
 import torch
 from footage import REFERENCE, STEP, camera, everything, footage
 from helpers import refused, template_model
-from torch import Tensor
 from torch.nn.functional import conv2d
 
 from dejavu_torch import DejaVu
@@ -21,19 +19,19 @@ from dejavu_torch.motion.odometry import GroundOdometry
 pytest.importorskip("cv2")
 
 
-def texture(count: int, rows: int, columns: int = 96) -> Tensor:
+def texture(count, rows, columns=96):
     """(count,1,rows,columns) in about [0.3, 0.7], grains of three pixels."""
     noise = torch.randn(count, 1, rows + 2, columns + 2)
     return 0.5 + 0.2 * conv2d(noise, torch.full((1, 1, 3, 3), 1 / 3))
 
 
-def moved(shift: int, count: int = 4, height: int = 96, columns: int = 96) -> tuple[Tensor, Tensor]:
+def moved(shift, count=4, height=96, columns=96):
     """Two patches of the same ground, the second further by so many whole rows."""
     world = texture(count, height + 2 * 48, columns)
     return world[:, :, 48 : 48 + height], world[:, :, 48 - shift : 48 - shift + height]
 
 
-def test_a_known_shift() -> None:
+def test_a_known_shift():
     for shift in range(-39, 40, 3):
         found, confidence = flow_shift(*moved(shift))
         torch.testing.assert_close(found, torch.full((4,), float(shift)), rtol=0, atol=0.15)
@@ -41,7 +39,7 @@ def test_a_known_shift() -> None:
 
 
 @pytest.mark.parametrize("shift", [-7.5, -0.5, 0.3, 4.8])
-def test_a_part_of_a_pixel(shift: float) -> None:
+def test_a_part_of_a_pixel(shift):
     fine = conv2d(torch.randn(2, 1, 1200, 98), torch.hann_window(31, periodic=False).view(1, 1, -1, 1) / 60)
     fine = 0.5 + conv2d(fine, torch.full((1, 1, 1, 3), 1 / 3))
     start = 100 - round(10 * shift)
@@ -52,14 +50,14 @@ def test_a_part_of_a_pixel(shift: float) -> None:
 
 
 @pytest.mark.parametrize(("gain", "offset"), [(0.3, 0.1), (2.5, -0.6), (1.0, 3.0), (1e-2, 0.0)])
-def test_exposure_changes_nothing(gain: float, offset: float) -> None:
+def test_exposure_changes_nothing(gain, offset):
     first, second = moved(5)
     plain = flow_shift(first, second)
     found = flow_shift(first, gain * second + offset)
     torch.testing.assert_close(found, plain, rtol=0, atol=0.02)
 
 
-def test_noise_and_sway() -> None:
+def test_noise_and_sway():
     first, second = moved(9)
     second = second.roll(2, 3) + 0.05 * torch.randn_like(second)
     found, confidence = flow_shift(first + 0.05 * torch.randn_like(first), second)
@@ -67,7 +65,7 @@ def test_noise_and_sway() -> None:
     assert confidence.min() > 0.5
 
 
-def test_each_pair_by_itself_in_its_number_type() -> None:
+def test_each_pair_by_itself_in_its_number_type():
     pairs = [moved(shift, 1) for shift in (3, -12, 0)]
     first, second = (torch.cat(side).double() for side in zip(*pairs, strict=True))
     found, _ = flow_shift(first, second)
@@ -76,12 +74,12 @@ def test_each_pair_by_itself_in_its_number_type() -> None:
     assert [part.shape for part in flow_shift(nothing, nothing)] == [(0,), (0,)]
 
 
-def test_unrelated_ground_is_not_believed() -> None:
+def test_unrelated_ground_is_not_believed():
     for one, other in (texture(20, 96).split(10), torch.rand(20, 1, 96, 96).split(10)):
         assert flow_shift(one, other)[1].max() < 0.15
 
 
-def test_what_shows_nothing_is_not_believed() -> None:
+def test_what_shows_nothing_is_not_believed():
     ground = texture(1, 96)
     for empty in (torch.zeros(1, 1, 96, 96), torch.full((1, 1, 96, 96), math.nan), ground * 1e-4):
         for pair in ((ground, empty), (empty, ground), (empty, empty)):
@@ -89,7 +87,7 @@ def test_what_shows_nothing_is_not_believed() -> None:
             assert (shift.item(), confidence.item()) == (0, 0)
 
 
-def test_what_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_refused(monkeypatch):
     with refused("flow is 'dis'", "expected phase or lk"):
         GroundOdometry(flow="dis")
     monkeypatch.setitem(sys.modules, "cv2", None)
@@ -98,9 +96,7 @@ def test_what_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     GroundOdometry()(torch.rand(2, 1, 240, 320))
 
 
-def test_a_map_opens_without_opencv_until_it_has_to_measure(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_map_opens_without_opencv_until_it_has_to_measure(monkeypatch, tmp_path, capsys):
     made = template_model(periods=everything(101), velocity=camera(step=STEP)).learn(footage(REFERENCE))
     assert made.velocity is not None
     made.velocity.flow = "lk"

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable
 from functools import cache
-from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -16,13 +13,12 @@ from helpers import all_of, refused
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from kornia.geometry.transform import get_perspective_transform
-from torch import Tensor
 from torch.nn.functional import avg_pool2d, conv2d, grid_sample
 
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.source import open_source
 from dejavu_torch.motion.ground_plane import TRAPEZIUM, ground_patch
-from dejavu_torch.motion.odometry import GroundOdometry, Odometry, interpolated
+from dejavu_torch.motion.odometry import GroundOdometry, interpolated
 from dejavu_torch.motion.resampling import ResampledTraverse
 
 PATCH, AHEAD = 96, 200  # pixels of ground: the patch, and where the drive begins
@@ -30,21 +26,14 @@ SLEEPER = 24
 
 
 @cache
-def ground(texture: float, sleepers: float, length: int = 2400, width: int = 160) -> Tensor:
+def ground(texture, sleepers, length=2400, width=160):
     """Ground around zero, (1,1,length,width): texture that never repeats, stripes that always do."""
     noise = torch.randn(1, 1, length + 2, width + 2, generator=torch.Generator().manual_seed(3))
     stripes = ((torch.arange(length) % SLEEPER) < 8).float().view(1, 1, -1, 1) - 1 / 3
     return texture * conv2d(noise, torch.full((1, 1, 3, 3), 1 / 3)) + sleepers * stripes
 
 
-def drive(
-    position: Tensor,
-    texture: float = 0.12,
-    sleepers: float = 0.1,
-    blur: float = 0.0,
-    noise: float = 0.03,
-    exposure: bool = True,
-) -> Tensor:
+def drive(position, texture=0.12, sleepers=0.1, blur=0.0, noise=0.03, exposure=True):
     """Frames (N,1,240,320) of a camera at each position, pixels of ground; sky above.
 
     Args:
@@ -66,7 +55,7 @@ def drive(
     frames = torch.full((len(position), 1, height, width), 0.8)
     path = world.cumsum(2)  # its differences are the ground, smeared along the way
 
-    def seen_at(position: float, world: Tensor) -> Tensor:
+    def seen_at(position, world):
         rows = (AHEAD + position - row) / (world.shape[2] - 1)
         columns = (right + (world.shape[3] - PATCH) / 2) / (world.shape[3] - 1)
         grid = torch.stack([2 * columns - 1, 2 * rows - 1], -1).view(1, -1, width * over, 2)
@@ -82,7 +71,7 @@ def drive(
     return (frames * gain + noise * torch.randn(frames.shape, generator=generator)).clamp(0, 1)
 
 
-def travelled(*speeds: tuple[float, float, int]) -> Tensor:
+def travelled(*speeds):
     """Positions of a drive whose speed goes from one value to another in so many steps, each."""
     steps = torch.cat([torch.linspace(a, b, n, dtype=torch.float64) for a, b, n in speeds])
     return torch.cat([torch.zeros(1, dtype=torch.float64), steps.cumsum(0)])
@@ -101,7 +90,7 @@ JOURNEY = travelled(
 )
 
 
-def shown(frames: Tensor, place: Tensor | None = None) -> ArrayTraverse:
+def shown(frames, place=None):
     """Frames with known places."""
     traverse = ArrayTraverse(frames, "the drive")
     traverse.places = place
@@ -109,21 +98,21 @@ def shown(frames: Tensor, place: Tensor | None = None) -> ArrayTraverse:
 
 
 @cache
-def journey() -> ArrayTraverse:
+def journey():
     return shown(drive(JOURNEY), JOURNEY)
 
 
 @cache
-def measured() -> Odometry:
+def measured():
     return GroundOdometry().distances(journey(), 100)
 
 
-def distance(frames: Tensor, **settings: Any) -> Tensor:
+def distance(frames, **settings):
     return GroundOdometry(**settings).distances(shown(frames)).distance
 
 
 @cache
-def short() -> ArrayTraverse:
+def short():
     """Twelve frames at 5 pixels of ground a frame."""
     position = travelled((5, 5, 11))
     return shown(drive(position), position)
@@ -132,7 +121,7 @@ def short() -> ArrayTraverse:
 # --- the patch
 
 
-def test_a_region_of_ground_becomes_even() -> None:
+def test_a_region_of_ground_becomes_even():
     """Of a frame that shows how far ahead each pixel of ground is, the patch is a straight ramp."""
     fractions = torch.tensor([[x * 319, y * 239] for x, y in TRAPEZIUM])
     unit = torch.tensor([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
@@ -145,7 +134,7 @@ def test_a_region_of_ground_becomes_even() -> None:
         torch.testing.assert_close(patch[1:-1, 1:-1], even[1:-1, 1:-1], rtol=0, atol=0.003)
 
 
-def test_the_corner_of_the_frame_may_lie_on_the_horizon() -> None:
+def test_the_corner_of_the_frame_may_lie_on_the_horizon():
     """A straight line across the frame stays one, in the row where the region has it."""
     for far in (0.4, 0.45):
         frames = torch.zeros(1, 1, 101, 101)
@@ -156,7 +145,7 @@ def test_the_corner_of_the_frame_may_lie_on_the_horizon() -> None:
         assert patch[..., :40, :].max() < 0.1
 
 
-def test_colours_become_grey() -> None:
+def test_colours_become_grey():
     frames = torch.rand(2, 3, 60, 80)
     grey = (frames * torch.tensor([0.299, 0.587, 0.114]).view(1, 3, 1, 1)).sum(1, keepdim=True)
     torch.testing.assert_close(ground_patch(frames), ground_patch(grey))
@@ -173,7 +162,7 @@ def test_colours_become_grey() -> None:
     offset=st.floats(-0.2, 0.2),
     seed=st.integers(0, 99),
 )
-def test_a_known_shift(shift: float, sway: int, gain: float, offset: float, seed: int) -> None:
+def test_a_known_shift(shift, sway, gain, offset, seed):
     """Ground moved by a whole number of tenths of a pixel, with noise."""
     fine = torch.randn(1, 1, 1900, 102, generator=torch.Generator().manual_seed(seed))
     fine = conv2d(fine, torch.hann_window(31, periodic=False).view(1, 1, -1, 1)) / 31**0.5
@@ -186,7 +175,7 @@ def test_a_known_shift(shift: float, sway: int, gain: float, offset: float, seed
     assert confidence.item() > 0.6
 
 
-def test_patches_of_any_size() -> None:
+def test_patches_of_any_size():
     for height, width in ((33, 32), (97, 71), (64, 128)):
         world = torch.rand(3, 1, height + 9, width)
         shift, confidence = shift_between(world[:, :, 9:], world[:, :, :-9])
@@ -194,14 +183,14 @@ def test_patches_of_any_size() -> None:
         assert confidence.min() > 0.7
 
 
-def test_the_way_back_is_the_negative() -> None:
+def test_the_way_back_is_the_negative():
     patches = ground_patch(journey().values)
     there, back = shift_between(patches[:-1], patches[1:]), shift_between(patches[1:], patches[:-1])
     torch.testing.assert_close(there[0], -back[0], rtol=0, atol=0.1)
     torch.testing.assert_close(there[1], back[1], rtol=0, atol=0.02)
 
 
-def test_confidence_tells_the_same_ground_from_another() -> None:
+def test_confidence_tells_the_same_ground_from_another():
     patches = ground_patch(journey().values, size=(96, 96))
     _, same = shift_between(patches[:-1], patches[1:])
     unrelated = torch.rand(40, 2, 1, 96, 96)
@@ -213,7 +202,7 @@ def test_confidence_tells_the_same_ground_from_another() -> None:
             assert shift_between(*pair)[1].item() < 0.01
 
 
-def test_of_equal_peaks_the_steady_ones() -> None:
+def test_of_equal_peaks_the_steady_ones():
     """Sleepers with texture below the noise look the same a whole period further on."""
     position = travelled((0, 16, 16), (16, 16, 20))
     frames = drive(position, texture=0.02, sleepers=0.3)
@@ -230,13 +219,13 @@ def test_of_equal_peaks_the_steady_ones() -> None:
 # --- a drive
 
 
-def path_error(distance: Tensor, position: Tensor) -> float:
+def path_error(distance, position):
     """Error of the length of the path, as a share of it."""
     true = position.diff().abs().sum()
     return float((distance.diff().abs().sum() - true).abs() / true)
 
 
-def test_a_drive_with_stops_and_a_reversal() -> None:
+def test_a_drive_with_stops_and_a_reversal():
     distance = measured().distance
     assert distance.dtype == torch.float64
     assert path_error(distance, JOURNEY) < 0.01
@@ -247,7 +236,7 @@ def test_a_drive_with_stops_and_a_reversal() -> None:
 
 
 @pytest.mark.parametrize("sleepers", [0.0, 0.1])
-def test_motion_blur(sleepers: float) -> None:
+def test_motion_blur(sleepers):
     """The shutter stays open all the time: each frame is smeared by as much as the ground moves."""
     position = travelled((20, 20, 30))
     frames = drive(position, texture=0.05, sleepers=sleepers, blur=1.0)
@@ -256,13 +245,13 @@ def test_motion_blur(sleepers: float) -> None:
 
 @settings(max_examples=3)
 @given(size=st.integers(1, 90))
-def test_batches_do_not_matter(size: int) -> None:
+def test_batches_do_not_matter(size):
     parts = GroundOdometry().distances(journey(), size)
     torch.testing.assert_close(parts.distance, measured().distance, rtol=0, atol=1e-3)
     torch.testing.assert_close(parts.confidence, measured().confidence, rtol=0, atol=1e-4)
 
 
-def test_a_drop_out_gets_its_neighbours_velocity(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_drop_out_gets_its_neighbours_velocity(caplog):
     position = travelled((4, 12, 20))
     frames = drive(position)
     frames[9], frames[15] = 0, math.nan  # two steps each see nothing
@@ -281,9 +270,7 @@ def test_a_drop_out_gets_its_neighbours_velocity(caplog: pytest.LogCaptureFixtur
         ([*range(0, 28, 4)], "0 to 1, 4 to 5, 8 to 9, 12 to 13, 16 to 17, 20 to 21 and 1 more (7 of 100"),
     ],
 )
-def test_segments_without_ground_are_named(
-    lost: list[int], told: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_segments_without_ground_are_named(lost, told, caplog):
     valid = torch.ones(100, dtype=torch.bool)
     valid[lost] = False
     speed = torch.linspace(3, 4, 100, dtype=torch.float64)
@@ -314,16 +301,14 @@ SIDEWAYS = ((0.1, 0.9), (0.1, 0.2), (0.9, 0.2), (0.9, 0.9))  # its rows run alon
         ((240, 320), {}, ""),
     ],
 )
-def test_a_patch_finer_than_the_frames_is_told(
-    shape: tuple[int, int], settings: dict[str, Any], told: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_patch_finer_than_the_frames_is_told(shape, settings, told, caplog):
     frames = torch.rand(1, 1, *shape).expand(4, -1, -1, -1)
     distance(frames, **settings)
     assert len(caplog.messages) == bool(told)
     assert told in caplog.text
 
 
-def test_a_drive_by_optical_flow() -> None:
+def test_a_drive_by_optical_flow():
     pytest.importorskip("cv2")
     measured = GroundOdometry(flow="lk").distances(journey())
     assert path_error(measured.distance, JOURNEY) < 0.002
@@ -337,7 +322,7 @@ def test_a_drive_by_optical_flow() -> None:
 # --- even spacing
 
 
-def test_places_are_evenly_spaced() -> None:
+def test_places_are_evenly_spaced():
     """What is shown lies within half a frame's motion of even steps along the true way."""
     even = ResampledTraverse(journey(), GroundOdometry(step=8.0))
     true = JOURNEY[even.frame]
@@ -352,7 +337,7 @@ def test_places_are_evenly_spaced() -> None:
     assert torch.equal(all_of(even), journey().values[even.frame])
 
 
-def test_the_median_step_of_moving_frames_is_the_default() -> None:
+def test_the_median_step_of_moving_frames_is_the_default():
     position = travelled((5, 5, 11), (0, 0, 30))
     even = ResampledTraverse(shown(drive(position)), GroundOdometry())
     assert abs(len(even) - 12) <= 1
@@ -360,14 +345,14 @@ def test_the_median_step_of_moving_frames_is_the_default() -> None:
     assert even.places is None
 
 
-def test_a_camera_that_looks_back() -> None:
+def test_a_camera_that_looks_back():
     even = ResampledTraverse(shown(short().values.flip(0)), GroundOdometry(step=5.0))
     assert abs(len(even) - 12) <= 1
     assert even.frame[0] == 0
 
 
 @pytest.mark.parametrize("step", [1.5, 14.0])
-def test_any_batch_size_any_number_of_times(step: float) -> None:
+def test_any_batch_size_any_number_of_times(step):
     even = ResampledTraverse(short(), GroundOdometry(step=step))
     frames = all_of(even, 100)
     for size in (1, 2, 5, 12):
@@ -379,7 +364,7 @@ def test_any_batch_size_any_number_of_times(step: float) -> None:
     assert len(even[len(frames) : len(frames) + 5]) == 0
 
 
-def test_few_frames_are_in_memory(largest_tensor: type) -> None:
+def test_few_frames_are_in_memory(largest_tensor):
     traverse = journey()
     with largest_tensor() as seen:
         even = ResampledTraverse(traverse, GroundOdometry(step=8.0), batch_size=4)
@@ -391,7 +376,7 @@ def test_few_frames_are_in_memory(largest_tensor: type) -> None:
 # --- what is refused
 
 
-def corners(*last: Any) -> GroundOdometry:
+def corners(*last):
     """With another near left corner."""
     return GroundOdometry((*TRAPEZIUM[:3], *last))
 
@@ -424,7 +409,7 @@ BOW_TIE = ((0.2, 0.5), (0.8, 0.9), (0.8, 0.5), (0.2, 0.9))
         (lambda: distance(torch.rand(5, 7)), ("features", "(5, 7)", "expected (B,C,H,W)")),
     ],
 )
-def test_what_is_refused(call: Callable[[], Any], facts: tuple[str, ...]) -> None:
+def test_what_is_refused(call, facts):
     with refused(*facts):
         call()
 
@@ -432,7 +417,7 @@ def test_what_is_refused(call: Callable[[], Any], facts: tuple[str, ...]) -> Non
 # --- real footage
 
 
-def test_a_car_on_a_motorway(data_dir: Path) -> None:
+def test_a_car_on_a_motorway(data_dir):
     """Nearly constant speed over the nine seconds, every step believed."""
     car = open_source(f"{data_dir}/highway/solidWhiteRight.mp4?width=320")
     measured = GroundOdometry().distances(car)
@@ -443,7 +428,7 @@ def test_a_car_on_a_motorway(data_dir: Path) -> None:
     assert over_a_second.max() < 1.1 * over_a_second.min()
 
 
-def test_a_small_car_that_sways(data_dir: Path) -> None:
+def test_a_small_car_that_sways(data_dir):
     """Coarse frames of a road almost without texture: a wide region sees it drive on, lap after lap."""
     car = open_source(f"{data_dir}/rc_car_laps/frames?start=194&stop=983")
     wide = ((0.2, 0.5), (0.8, 0.5), (1.0, 0.95), (0.0, 0.95))

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import pytest
 import torch
 from footage import QUERY, REFERENCE, STEP, camera, everything, footage, positions
@@ -21,23 +17,23 @@ from dejavu_torch.motion.resampling import ResampledTraverse
 
 
 @pytest.fixture(scope="module")
-def model() -> DejaVu:
+def model():
     velocity = camera(step=STEP)  # a whole number
     return template_model(periods=everything(101), velocity=velocity).learn(footage(REFERENCE))
 
 
-def resampled(*speeds: tuple[int, int], begin: int = 0, **settings: object) -> ResampledTraverse:
+def resampled(*speeds, begin=0, **settings):
     return ResampledTraverse(ArrayTraverse(footage(begin + positions(*speeds))), camera(**settings))
 
 
-def test_convention_11_places_are_even_steps_and_a_stop_adds_none(model: DejaVu) -> None:
+def test_convention_11_places_are_even_steps_and_a_stop_adds_none(model):
     assert model.map.places == 600 // STEP + 1
     shown = model.map.frame_of(torch.arange(101))
     assert (REFERENCE[shown] - STEP * torch.arange(101)).abs().max() <= 4.5  # half of the fastest step
     assert not [frame for frame in shown.tolist() if 60 < frame < 85]  # it stands
 
 
-def test_convention_11_all_frames_of_one_place_are_equally_right(model: DejaVu) -> None:
+def test_convention_11_all_frames_of_one_place_are_equally_right(model):
     places = model.map.place_of(torch.arange(len(REFERENCE)))
     assert places[60:86].unique().tolist() == [40]
     assert (STEP * places - REFERENCE).abs().max() <= 4.5
@@ -45,7 +41,7 @@ def test_convention_11_all_frames_of_one_place_are_equally_right(model: DejaVu) 
     assert (model.map.place_of(shown) - torch.arange(101)).abs().max() <= 1
 
 
-def test_queries_are_resampled_by_the_step_of_the_map() -> None:
+def test_queries_are_resampled_by_the_step_of_the_map():
     reference = ResampledTraverse(ArrayTraverse(footage(REFERENCE)), camera(step=None))
     model = template_model(periods=everything(len(reference)), velocity=camera(step=None))
     model.learn(footage(REFERENCE))
@@ -55,27 +51,27 @@ def test_queries_are_resampled_by_the_step_of_the_map() -> None:
     assert (match.index - torch.arange(151)).abs().max() <= 3  # the query shows each frame twice
 
 
-def test_another_speed_and_other_stops_are_found(model: DejaVu) -> None:
+def test_another_speed_and_other_stops_are_found(model):
     match = model.localize(footage(QUERY, noise=0.02))
     assert len(match.index) == 101
     assert (match.index - torch.arange(101)).abs().max() <= 1
 
 
-def test_a_single_frame_and_ready_features_are_queries_as_they_are(model: DejaVu) -> None:
+def test_a_single_frame_and_ready_features_are_queries_as_they_are(model):
     frames = footage(torch.tensor([300]))
     assert model.localize(frames).index.tolist() == [50]
     features = model.features(footage(torch.tensor([300, 300])))
     assert model.localize(features).index.tolist() == [50, 50]
 
 
-def test_a_resampled_traverse_stays_as_it_is(model: DejaVu) -> None:
+def test_a_resampled_traverse_stays_as_it_is(model):
     even = model.resample(ArrayTraverse(footage(QUERY)), model.step)
     assert model.resample(even, model.step) is even
     traverse = ArrayTraverse(footage(QUERY))
     assert DejaVu().resample(traverse) is traverse
 
 
-def test_the_file_keeps_the_step_and_the_table(model: DejaVu, tmp_path: Path) -> None:
+def test_the_file_keeps_the_step_and_the_table(model, tmp_path):
     model.save(tmp_path / "map.safetensors")
     again = DejaVu.load(tmp_path / "map.safetensors")
     assert again.step == model.step
@@ -85,14 +81,14 @@ def test_the_file_keeps_the_step_and_the_table(model: DejaVu, tmp_path: Path) ->
         assert torch.equal(one, other)
 
 
-def test_a_map_learned_from_features_takes_queries_as_they_are() -> None:
+def test_a_map_learned_from_features_takes_queries_as_they_are():
     model = template_model(periods=everything(40), velocity=camera()).learn_features(torch.rand(40, 900))
     assert model.step is None
     assert len(model.map.positions) == 0
     assert len(model.localize(footage(QUERY)).index) == len(QUERY)
 
 
-def test_positions_come_on_top_of_the_budget_of_a_map() -> None:
+def test_positions_come_on_top_of_the_budget_of_a_map():
     mapper = SpectralMapper(12.0)
     model = DejaVu(whitening=Whitening(views=2), mapper=mapper, velocity=camera()).learn(footage(REFERENCE))
     summary = model.summary()
@@ -107,7 +103,7 @@ def test_positions_come_on_top_of_the_budget_of_a_map() -> None:
 # frames and places
 
 
-def test_the_map_has_the_table_of_the_traverse(model: DejaVu) -> None:
+def test_the_map_has_the_table_of_the_traverse(model):
     even = ResampledTraverse(ArrayTraverse(footage(REFERENCE)), camera())
     frames = torch.arange(len(REFERENCE))
     assert torch.equal(model.map.positions, even.positions)
@@ -117,7 +113,7 @@ def test_the_map_has_the_table_of_the_traverse(model: DejaVu) -> None:
     assert torch.equal(model.map.place_of(frames), place_of(even.positions, frames))
 
 
-def test_places_that_show_the_same_frame_are_one() -> None:
+def test_places_that_show_the_same_frame_are_one():
     """16 pixels a frame at a pixel a step: each frame is shown at 16 places."""
     even = resampled((16, 12), step=1.0)
     for frame in (5, 0):
@@ -127,7 +123,7 @@ def test_places_that_show_the_same_frame_are_one() -> None:
         assert shows.min() <= int(place_of(even.positions, torch.tensor(frame))) <= shows.max()
 
 
-def test_the_way_back_belongs_to_the_places_it_passes() -> None:
+def test_the_way_back_belongs_to_the_places_it_passes():
     speeds = ((6, 50), (-6, 15), (6, 40))
     where = positions(*speeds)
     even = resampled(*speeds)
@@ -136,7 +132,7 @@ def test_the_way_back_belongs_to_the_places_it_passes() -> None:
     assert place_of(away.positions, torch.arange(5)).tolist() == [0, -1, -1, -1, -1]  # behind where it began
 
 
-def test_names_and_shape_are_those_of_the_frames_that_are_shown() -> None:
+def test_names_and_shape_are_those_of_the_frames_that_are_shown():
     traverse = ArrayTraverse(footage(REFERENCE))
     traverse.names = [f"frame {i}" for i in range(len(traverse))]
     even = ResampledTraverse(traverse, camera())
@@ -163,18 +159,18 @@ def test_names_and_shape_are_those_of_the_frames_that_are_shown() -> None:
         ),
     ],
 )
-def test_what_is_refused(call: Callable[[], Any], facts: tuple[str, ...]) -> None:
+def test_what_is_refused(call, facts):
     with refused(*facts):
         call()
 
 
-def test_ground_that_moves_to_and_fro_is_told(caplog: pytest.LogCaptureFixture) -> None:
+def test_ground_that_moves_to_and_fro_is_told(caplog):
     with caplog.at_level("WARNING", "dejavu_torch"):
         resampled(*[(4, 2), (-4, 1)] * 10, begin=100)
     assert any("20 of 30 steps go forward and 10 backwards" in line for line in caplog.messages)
 
 
-def test_nan_is_told_by_the_frame_of_the_source() -> None:
+def test_nan_is_told_by_the_frame_of_the_source():
     frames = footage(REFERENCE)
     even = ResampledTraverse(ArrayTraverse(frames), camera())
     frames[30, :, :3, :3] = torch.nan

@@ -20,24 +20,22 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from queue import SimpleQueue
 
 from .by_reader import MUTANTS as BY_READER
 from .by_tester import MUTANTS as BY_TESTER
-from .mutant import Mutant
 
 ROOT = Path(__file__).parents[2]
 FOLDERS, FILES = ("dejavu_torch", "benchmarks", "configs", "tests", "docs"), ("README.md", "CONTRIBUTING.md")
-MUTANTS: list[Mutant] = [*BY_READER, *BY_TESTER]
+MUTANTS = [*BY_READER, *BY_TESTER]
 SLOW_IMPORTS = ("torch", "kornia", "numpy", "pytest", "hypothesis", "PIL.Image", "safetensors.torch")
 LIMIT = 120  # seconds; a mutant whose tests take longer counts as killed
 PYTEST = ("-o", "addopts=", "-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "--tb=line")
 
 
-def problem(mutant: Mutant) -> str:
+def problem(mutant):
     """Why a mutant does not apply; empty where it does."""
     path = ROOT / mutant.file
     if not path.is_file():
@@ -54,7 +52,7 @@ def problem(mutant: Mutant) -> str:
     return ""
 
 
-def copied(copy: Path) -> Path:
+def copied(copy):
     """A copy of the working tree."""
     for name in FOLDERS:
         shutil.copytree(ROOT / name, copy / name)
@@ -63,14 +61,14 @@ def copied(copy: Path) -> Path:
     return copy
 
 
-def rewrite(path: Path, text: str) -> None:
+def rewrite(path, text):
     """Write a module, and forget what Python and numba compiled of it."""
     for stale in (path.parent / "__pycache__").glob(f"{path.stem}.*"):
         stale.unlink()
     path.write_text(text)
 
 
-def outcome(tests: Sequence[str], copy: Path, log: Path) -> int:
+def outcome(tests, copy, log):
     """Exit status of pytest of these tests in a copy: 0 if all pass, 1 if one fails; 124 out of time.
 
     `file::name` are run together, `file::-k EXPRESSION` each alone.
@@ -96,7 +94,7 @@ def outcome(tests: Sequence[str], copy: Path, log: Path) -> int:
     return 0
 
 
-def _run_tests(words: list[str], copy: Path, log: Path) -> None:
+def _run_tests(words, copy, log):
     """In a forked process: the tests of a copy; ends the process."""
     status = 70
     try:
@@ -117,7 +115,7 @@ def _run_tests(words: list[str], copy: Path, log: Path) -> None:
         os._exit(status)
 
 
-def judged(mutant: Mutant, copy: Path, log: Path, unchanged: bool) -> tuple[bool, str]:
+def judged(mutant, copy, log, unchanged):
     """Whether all is well with a mutant in a copy, and what becomes of it."""
     why = problem(mutant)
     if why:
@@ -134,9 +132,9 @@ def judged(mutant: Mutant, copy: Path, log: Path, unchanged: bool) -> tuple[bool
     return status in (1, 124), told.get(status, f"NO TESTS ({status})")
 
 
-def chosen(words: Sequence[str]) -> list[int]:
+def chosen(words):
     """Numbers of mutants, from 1: `12`, `40-50`; all without any."""
-    numbers: list[int] = []
+    numbers = []
     for word in words:
         first, dash, last = word.partition("-")
         numbers += range(int(first), int(last if dash else first) + 1)
@@ -145,7 +143,7 @@ def chosen(words: Sequence[str]) -> list[int]:
     return numbers or list(range(1, len(MUTANTS) + 1))
 
 
-def main() -> int:
+def main():
     parser = argparse.ArgumentParser(prog="python -m tests.mutants", description=__doc__)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("mutants", nargs="*", help="numbers, or ranges of them; all if none is given")
@@ -164,9 +162,9 @@ def main() -> int:
     os.environ["OMP_NUM_THREADS"] = "1"
     for name in SLOW_IMPORTS:
         importlib.import_module(name)
-    free: SimpleQueue[Path] = SimpleQueue()
+    free = SimpleQueue()
 
-    def run(number: int) -> tuple[int, bool, str]:
+    def run(number):
         copy, start = free.get(), time.monotonic()
         try:
             log = (given.log or copy / "tests.log").resolve()

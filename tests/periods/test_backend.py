@@ -9,7 +9,6 @@ import shutil
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import Any
 from unittest import mock
 
 import pytest
@@ -18,7 +17,7 @@ import torch
 from dejavu_torch.periods import spectrogram
 
 
-def loaded_with(torchaudio: Path) -> dict[str, Any]:
+def loaded_with(torchaudio):
     """The names of the module, made anew with the torchaudio of a folder."""
     with mock.patch.dict(sys.modules), mock.patch.object(sys, "path", [str(torchaudio), *sys.path]):
         for name in [name for name in sys.modules if name.split(".")[0] == "torchaudio"]:
@@ -26,7 +25,7 @@ def loaded_with(torchaudio: Path) -> dict[str, Any]:
         return runpy.run_path(spectrogram.__file__)
 
 
-def compare_with(torchaudio: Path) -> None:
+def compare_with(torchaudio):
     theirs = loaded_with(torchaudio)
     assert theirs["BACKEND"] == "torchaudio"
     spectrogram.torchaudio = None
@@ -40,7 +39,7 @@ def compare_with(torchaudio: Path) -> None:
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_fallback_equals_torchaudio(tmp_path: Path) -> None:
+def test_fallback_equals_torchaudio(tmp_path):
     """Against a copy of torchaudio without its compiled library, which may refuse this torch; in a process of
     its own, as its classes would stay, and commands import the modules of all classes."""
     spec = importlib.util.find_spec("torchaudio")
@@ -53,12 +52,12 @@ def test_fallback_equals_torchaudio(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("error", [ImportError, OSError, RuntimeError])
-def test_a_torchaudio_that_does_not_load_is_replaced(error: type[Exception], tmp_path: Path) -> None:
+def test_a_torchaudio_that_does_not_load_is_replaced(error, tmp_path):
     (tmp_path / "torchaudio.py").write_text(f"raise {error.__name__}('no such library')")
     assert loaded_with(tmp_path)["BACKEND"] == "torch.stft"
 
 
-def test_other_errors_are_not_hidden(tmp_path: Path) -> None:
+def test_other_errors_are_not_hidden(tmp_path):
     (tmp_path / "torchaudio.py").write_text("raise KeyError('a bug')")
     with pytest.raises(KeyError):
         loaded_with(tmp_path)

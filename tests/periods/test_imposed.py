@@ -3,33 +3,29 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
-from typing import Any
 
 import pytest
 import torch
 from helpers import Fixed, refused
 from hypothesis import given
 from hypothesis import strategies as st
-from torch import Tensor
 
-from dejavu_torch.maps.template_map import TemplateMap, TemplateMapper
+from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.periods.support import support_of, supportive_periods
 from dejavu_torch.recognition.select import best_match
-from dejavu_torch.types import Plan
 
 
-def learned(features: Tensor, plan: Plan) -> TemplateMap:
+def learned(features, plan):
     return TemplateMapper(Fixed(*plan))(features)
 
 
 @given(
     st.lists(st.integers(2, 12), min_size=1, max_size=4, unique=True), st.integers(1, 6), st.integers(2, 80)
 )
-def test_every_frame_has_the_phase_of_its_bin(periods: list[int], bin: int, frames: int) -> None:
+def test_every_frame_has_the_phase_of_its_bin(periods, bin, frames):
     plan = ImposedPeriods(periods, bin).plan(torch.rand(frames, 3))
     assert [layer.phases for layer in plan] == periods
     for layer in plan:
@@ -38,36 +34,36 @@ def test_every_frame_has_the_phase_of_its_bin(periods: list[int], bin: int, fram
         assert layer.place_phases.tolist() == [i // bin % layer.phases for i in range(frames)]
 
 
-def test_the_plan_does_not_depend_on_the_features() -> None:
+def test_the_plan_does_not_depend_on_the_features():
     finder = ImposedPeriods()
     assert finder.plan(torch.rand(400, 4)) == finder.plan(torch.zeros(400, 4, dtype=torch.float64))
 
 
-def test_no_periods_given_chooses_supportive_ones_for_the_route() -> None:
+def test_no_periods_given_chooses_supportive_ones_for_the_route():
     chosen = tuple(layer.phases for layer in ImposedPeriods(bin=5).plan(torch.rand(2698, 2)))
     assert chosen == supportive_periods(540)  # 2698 frames: the last bin is short
     assert support_of(chosen, 540)[0] >= 3
 
 
 @pytest.mark.parametrize("frames", [2, 5, 6, 11])
-def test_routes_of_a_few_bins(frames: int) -> None:
+def test_routes_of_a_few_bins(frames):
     plan = ImposedPeriods().plan(torch.rand(frames, 2))
     assert {layer.stop for layer in plan} == {frames}
     assert len(plan) >= 3
 
 
-def separate(plan: Plan) -> Plan:
+def separate(plan):
     """The same layers, each of 13 features of its own."""
     slices = [tuple(range(13 * j, 13 * (j + 1))) for j in range(len(plan))]
     return tuple(replace(layer, features=own) for layer, own in zip(plan, slices, strict=True))
 
 
-def one_hot(plan: Plan, place: Tensor) -> Tensor:
+def one_hot(plan, place):
     """Features that repeat perfectly: each layer's slice tells the phase."""
     return torch.cat([torch.eye(13)[layer.phase(place)] for layer in plan], 1)
 
 
-def test_a_wrong_layer_is_corrected() -> None:
+def test_a_wrong_layer_is_corrected():
     plan = separate(ImposedPeriods().plan(torch.rand(2700, 1)))
     features = one_hot(plan, torch.arange(2700))
     route = learned(features, plan)
@@ -79,7 +75,7 @@ def test_a_wrong_layer_is_corrected() -> None:
         assert torch.equal(found // 5, place // 5)
 
 
-def test_places_that_look_alike_are_logged_in_one_line(caplog: pytest.LogCaptureFixture) -> None:
+def test_places_that_look_alike_are_logged_in_one_line(caplog):
     with caplog.at_level(logging.WARNING, "dejavu_torch"):
         ImposedPeriods([4, 6]).plan(torch.rand(60, 2))  # 12 bins, and 12 told apart
         assert caplog.messages == []
@@ -91,7 +87,7 @@ def test_places_that_look_alike_are_logged_in_one_line(caplog: pytest.LogCapture
     assert "\n" not in line
 
 
-def test_staggered_bins_drift_past_each_other() -> None:
+def test_staggered_bins_drift_past_each_other():
     plan = ImposedPeriods([5, 7, 9], bin=5, stagger=True).plan(torch.rand(900, 4))
     assert [layer.period for layer in plan] == [Fraction(51, 2), Fraction(69, 2), Fraction(91, 2)]
     assert [layer.phases for layer in plan] == [5, 7, 9]
@@ -99,7 +95,7 @@ def test_staggered_bins_drift_past_each_other() -> None:
     assert alone.period == 1000
 
 
-def test_staggered_layers_place_a_frame_finer_than_their_bins() -> None:
+def test_staggered_layers_place_a_frame_finer_than_their_bins():
     """Where each layer names its bin, how far off is the place that all of them agree on?"""
     frames, errors = 900, {}
     for stagger in (False, True):
@@ -132,6 +128,6 @@ WHOLE = "distinct integers from 2 to"
         (lambda: ImposedPeriods().plan(torch.zeros(8)), ("(8,)", "(N,D), N >= 2, D >= 1")),
     ],
 )
-def test_what_is_refused(call: Callable[[], Any], facts: tuple[str, ...]) -> None:
+def test_what_is_refused(call, facts):
     with refused(*facts):
         call()

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable
 from fractions import Fraction
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,29 +13,27 @@ import torch
 from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
-from torch import Tensor
 
 from dejavu_torch import SpectrogramAnalysis
 from dejavu_torch.periods import spectrogram
 from dejavu_torch.periods.spectrogram import bin_period, layers_of, noise_share, strongest_bins
-from dejavu_torch.types import Plan
 
 
-def wave(frames: int, cycles: float, over: int | None = None, phase: float = 0.3) -> Tensor:
+def wave(frames, cycles, over=None, phase=0.3):
     """A sine of so many cycles per `over` frames (default: all), (N,) float64."""
     return torch.sin(2 * math.pi * cycles * torch.arange(frames).double() / (over or frames) + phase)
 
 
-def literal(window: int = 1024, **other: object) -> SpectrogramAnalysis:
+def literal(window=1024, **other):
     """The paper's letter."""
     return SpectrogramAnalysis(window, **{"peaks": "bins", "false_alarm": None, "short": "refuse", **other})
 
 
-def periods_of(plan: Plan, feature: int) -> list[int]:
+def periods_of(plan, feature):
     return [int(layer.period) for layer in plan if feature in layer.features]
 
 
-def test_a_known_sine_is_found() -> None:
+def test_a_known_sine_is_found():
     for peaks in ("bins", "local"):
         for cycles, period in ((11, 93), (6, 171), (2, 512), (128, 8)):
             plan = SpectrogramAnalysis(peaks=peaks, strongest=1).plan(wave(1024, cycles)[:, None])
@@ -46,7 +42,7 @@ def test_a_known_sine_is_found() -> None:
             ] == [(Fraction(period), period, 0, 1024, (0,))]
 
 
-def test_power_is_that_of_numpy() -> None:
+def test_power_is_that_of_numpy():
     features = torch.randn(50, 3, dtype=torch.float64)
     (spectrum,) = SpectrogramAnalysis(50)(features)
     centred = features.numpy() - features.numpy().mean(0)
@@ -55,7 +51,7 @@ def test_power_is_that_of_numpy() -> None:
     np.testing.assert_allclose(spectrum.power.numpy(), expected, rtol=1e-5, atol=1e-5)
 
 
-def test_strongest_bins_by_hand() -> None:
+def test_strongest_bins_by_hand():
     power = torch.tensor([[9.0, 8.0, 0.0, 1.0, 4.0, 3.0, 0.0, 2.0, 0.5, 7.0]]).T
     assert strongest_bins(power, 2, 8, "bins").T.tolist() == [[4, 5]]  # the second is leakage of the first
     assert strongest_bins(power, 2, 8, "local").T.tolist() == [[4, 7]]
@@ -70,7 +66,7 @@ def test_strongest_bins_by_hand() -> None:
         assert strongest_bins(torch.zeros(9, 2), 3, 8, peaks).tolist() == [[-1, -1]] * 3
 
 
-def test_as_many_periods_as_asked_for_and_leakage_is_none_of_local_maxima() -> None:
+def test_as_many_periods_as_asked_for_and_leakage_is_none_of_local_maxima():
     features = (wave(256, 8) + 0.8 * wave(256, 20) + 0.6 * wave(256, 28))[:, None]
     for strongest, periods in ((1, [32]), (2, [13, 32]), (3, [9, 13, 32])):
         assert periods_of(SpectrogramAnalysis(256, strongest=strongest).plan(features), 0) == periods
@@ -80,7 +76,7 @@ def test_as_many_periods_as_asked_for_and_leakage_is_none_of_local_maxima() -> N
     assert periods_of(SpectrogramAnalysis(256).plan(features), 0) == [13, 32]
 
 
-def test_periods_lie_between_the_shortest_and_half_the_window() -> None:
+def test_periods_lie_between_the_shortest_and_half_the_window():
     for peaks in ("bins", "local"):
         plan = SpectrogramAnalysis(100, min_period=10, peaks=peaks, false_alarm=None).plan(
             torch.randn(100, 40)
@@ -89,7 +85,7 @@ def test_periods_lie_between_the_shortest_and_half_the_window() -> None:
         assert all(10 <= layer.period <= 50 for layer in plan)
 
 
-def test_chunks() -> None:
+def test_chunks():
     for arguments, frames, chunks in (
         ({"window": 100}, 300, [(0, 100), (100, 200), (200, 300)]),
         ({"window": 100}, 350, [(0, 100), (100, 200), (200, 300), (300, 350)]),
@@ -110,7 +106,7 @@ def test_chunks() -> None:
 
 
 @given(st.integers(16, 60), st.integers(1, 60), st.integers(16, 400))
-def test_chunks_leave_out_less_than_two_of_the_shortest_periods(window: int, hop: int, frames: int) -> None:
+def test_chunks_leave_out_less_than_two_of_the_shortest_periods(window, hop, frames):
     chunks = SpectrogramAnalysis(window, hop=min(hop, window), min_period=8).chunks(frames)
     assert all(16 <= stop - start <= window for start, stop in chunks)
     assert chunks[0][0] == 0
@@ -118,7 +114,7 @@ def test_chunks_leave_out_less_than_two_of_the_shortest_periods(window: int, hop
     assert 0 <= frames - chunks[-1][1] < 16
 
 
-def test_each_chunk_has_its_own_periods() -> None:
+def test_each_chunk_has_its_own_periods():
     features = torch.cat([wave(100, 10), wave(100, 5), wave(50, 5)])[:, None]
     plan = SpectrogramAnalysis(100, strongest=1).plan(features)
     assert [(layer.start, layer.stop, int(layer.period)) for layer in plan] == [
@@ -128,7 +124,7 @@ def test_each_chunk_has_its_own_periods() -> None:
     ]
 
 
-def test_convention_3_hann_window_of_1024_not_centred_remainder_of_its_own() -> None:
+def test_convention_3_hann_window_of_1024_not_centred_remainder_of_its_own():
     analysis = SpectrogramAnalysis()
     assert (analysis.window, analysis.strongest) == (1024, 2)
     assert analysis.chunks(3072) == [(0, 1024), (1024, 2048), (2048, 3072)]
@@ -138,7 +134,7 @@ def test_convention_3_hann_window_of_1024_not_centred_remainder_of_its_own() -> 
     torch.testing.assert_close(analysis(features)[1].power, alone)
 
 
-def test_convention_3_others_shrink_a_long_window_and_say_so(caplog: pytest.LogCaptureFixture) -> None:
+def test_convention_3_others_shrink_a_long_window_and_say_so(caplog):
     features = wave(300, 10)[:, None]
     with caplog.at_level(logging.WARNING, "dejavu_torch"):
         (layer,) = SpectrogramAnalysis(1024, strongest=1).plan(features)
@@ -148,27 +144,27 @@ def test_convention_3_others_shrink_a_long_window_and_say_so(caplog: pytest.LogC
     assert "300" in record.getMessage()
 
 
-def test_convention_3_the_paper_refuses_a_long_window() -> None:
+def test_convention_3_the_paper_refuses_a_long_window():
     with refused("300 places", "1024"):
         literal()(torch.randn(300, 1))
     assert len(literal()(torch.randn(1024, 1))) == 1
 
 
-def test_a_chunk_too_short_to_tell_says_so(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_chunk_too_short_to_tell_says_so(caplog):
     features = wave(24, 2)[:, None].repeat(1, 500)
     assert SpectrogramAnalysis(24).plan(features) == ()
     assert "places 0-23: too few to distinguish" in caplog.text
     assert SpectrogramAnalysis(24, false_alarm=None).plan(features) != ()
 
 
-def test_white_noise_gives_no_layers() -> None:
+def test_white_noise_gives_no_layers():
     for frames in (64, 256, 1000):
         for _ in range(5):
             assert SpectrogramAnalysis(256).plan(torch.randn(frames, 30)) == ()
     assert SpectrogramAnalysis(512).plan(torch.randn(512, 20).cumsum(0)) != ()  # it is smooth
 
 
-def test_one_periodic_feature_among_noise_is_enough_for_its_chunk() -> None:
+def test_one_periodic_feature_among_noise_is_enough_for_its_chunk():
     features = torch.randn(1024, 20)
     features[512:, 7] += 1.5 * wave(512, 16).float()
     plan = SpectrogramAnalysis(512, strongest=1).plan(features)
@@ -177,7 +173,7 @@ def test_one_periodic_feature_among_noise_is_enough_for_its_chunk() -> None:
     assert {(layer.start, layer.stop) for layer in plan} == {(512, 1024)}
 
 
-def test_noise_share_is_fishers_test() -> None:
+def test_noise_share_is_fishers_test():
     """Shares of independent, exponentially distributed powers: the case the bound is made for."""
     least = noise_share(64, 5, 0.2)
     power = torch.empty(4000, 64, 5).exponential_()
@@ -189,7 +185,7 @@ def test_noise_share_is_fishers_test() -> None:
 
 
 @pytest.mark.parametrize("value", [0.0, -3.7, 1e6])
-def test_a_constant_feature_has_no_period(value: float) -> None:
+def test_a_constant_feature_has_no_period(value):
     features = torch.stack([torch.full((512,), value), wave(512, 16).float()], 1)
     for analysis in (literal(256), SpectrogramAnalysis(256)):
         assert all(spectrum.power[:, 0].count_nonzero() == 0 for spectrum in analysis(features))
@@ -199,7 +195,7 @@ def test_a_constant_feature_has_no_period(value: float) -> None:
         assert analysis.plan(features[:, :1]) == ()
 
 
-def test_offset_and_scale_do_not_matter() -> None:
+def test_offset_and_scale_do_not_matter():
     for analysis in (literal(128), SpectrogramAnalysis(128)):
         features = torch.randn(300, 6, dtype=torch.float64) + 3 * wave(300, 16, over=128)[:, None]
         assert analysis.plan(features)
@@ -207,19 +203,19 @@ def test_offset_and_scale_do_not_matter() -> None:
 
 
 @pytest.mark.parametrize(("k", "period"), [(11, 93), (6, 171), (2, 512), (128, 8), (3, 341), (10, 102)])
-def test_golden_bins_of_1024(k: int, period: int) -> None:
+def test_golden_bins_of_1024(k, period):
     assert bin_period(1024, k) == period
 
 
 @given(st.integers(16, 4096), st.data())
-def test_a_bin_names_the_nearest_whole_period(length: int, data: st.DataObject) -> None:
+def test_a_bin_names_the_nearest_whole_period(length, data):
     k = data.draw(st.integers(1, length // 2))
     period = bin_period(length, k)
     assert abs(period - Fraction(length, k)) <= Fraction(1, 2)
     assert int(bin_period(length, torch.tensor(k))) == period
 
 
-def test_features_of_the_same_whole_period_share_a_layer() -> None:
+def test_features_of_the_same_whole_period_share_a_layer():
     layers = layers_of(torch.tensor([[6, 11, 11, -1], [11, -1, 6, -1]]), 1024, 2048)
     assert [(layer.period, layer.phases, layer.features) for layer in layers] == [
         (Fraction(93), 93, (0, 1, 2)),
@@ -232,7 +228,7 @@ def test_features_of_the_same_whole_period_share_a_layer() -> None:
     assert layers_of(torch.full((2, 5), -1), 0, 100) == []
 
 
-def test_gradients_are_right() -> None:
+def test_gradients_are_right():
     features = torch.randn(28, 2, dtype=torch.float64, requires_grad=True)
     analysis = SpectrogramAnalysis(12, min_period=2)
     assert len(analysis(features)) == 3
@@ -259,16 +255,16 @@ def test_gradients_are_right() -> None:
         (lambda: SpectrogramAnalysis().plan(torch.randn(1, 2)), ("1 place;", "at least 8")),
     ],
 )
-def test_what_is_refused(call: Callable[[], Any], facts: tuple[str, ...]) -> None:
+def test_what_is_refused(call, facts):
     with refused(*facts):
         call()
 
 
-def test_planning_transforms_few_features_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_planning_transforms_few_features_at_a_time(monkeypatch):
     sizes = []
     power = spectrogram.chunk_power
 
-    def watched(chunk: Tensor) -> Tensor:
+    def watched(chunk):
         sizes.append(chunk.numel())
         return power(chunk)
 
@@ -281,7 +277,7 @@ def test_planning_transforms_few_features_at_a_time(monkeypatch: pytest.MonkeyPa
     assert plan == SpectrogramAnalysis(window=128).plan(features) != ()
 
 
-def test_a_feature_without_candidates_passes_no_test_for_noise() -> None:
+def test_a_feature_without_candidates_passes_no_test_for_noise():
     """All its power lies in bin 1, where no period is sought."""
     features = torch.stack([wave(256, 1), torch.randn(256, dtype=torch.float64)], 1)
     assert SpectrogramAnalysis(window=256, min_period=100, false_alarm=1e-6).plan(features) == ()

@@ -16,15 +16,15 @@ PERIODS = st.builds(Fraction, st.integers(1, 60), st.integers(1, 6))
 WHOLE = st.lists(st.integers(1, 15), min_size=1, max_size=4)
 
 
-def around(lag: int, period: int) -> int:
+def around(lag, period):
     return min(abs(lag - k * period) for k in range(lag // period + 2))
 
 
-def differing(a: int, b: int, periods: list[int]) -> int:
+def differing(a, b, periods):
     return sum(a % period != b % period for period in periods)
 
 
-def best_by_trying_all(places: int) -> tuple[int, ...]:
+def best_by_trying_all(places):
     for total in count(4):
         fitting = [
             chosen
@@ -40,12 +40,12 @@ def best_by_trying_all(places: int) -> tuple[int, ...]:
     raise AssertionError
 
 
-def test_the_papers_periods_share_a_factor_3() -> None:
+def test_the_papers_periods_share_a_factor_3():
     assert common_period([93, 171]) == 93 * 171 / 3
 
 
 @given(st.lists(PERIODS, min_size=1, max_size=3))
-def test_common_period_is_the_first_time_all_are_back(periods: list[Fraction]) -> None:
+def test_common_period_is_the_first_time_all_are_back(periods):
     common = common_period(periods)
     first = next(
         n * periods[0] for n in count(1) if all((n * periods[0] / p).denominator == 1 for p in periods)
@@ -54,7 +54,7 @@ def test_common_period_is_the_first_time_all_are_back(periods: list[Fraction]) -
 
 
 @given(WHOLE, st.integers(3, 30))
-def test_code_distance_and_torus_distance_are_those_of_all_pairs(periods: list[int], places: int) -> None:
+def test_code_distance_and_torus_distance_are_those_of_all_pairs(periods, places):
     pairs = list(combinations(range(places), 2))
     code, torus = support_of(periods, places)
     assert code == min(differing(a, b, periods) for a, b in pairs)
@@ -64,19 +64,19 @@ def test_code_distance_and_torus_distance_are_those_of_all_pairs(periods: list[i
 
 
 @given(WHOLE, st.integers(1, 15), st.integers(3, 60))
-def test_one_more_layer_never_brings_places_closer(periods: list[int], more: int, places: int) -> None:
+def test_one_more_layer_never_brings_places_closer(periods, more, places):
     before, after = support_of(periods, places), support_of([*periods, more], places)
     assert 0 <= after[0] - before[0] <= 1
     assert after[1] >= before[1]
 
 
 @pytest.mark.parametrize("places", [3, 6, 12, 25, 40])
-def test_the_chosen_set_is_the_best_of_all(places: int) -> None:
+def test_the_chosen_set_is_the_best_of_all(places):
     assert supportive_periods(places) == best_by_trying_all(places)
 
 
 @pytest.mark.parametrize(("places", "templates"), [(540, 49), (20000, 70), (2, 16)])
-def test_the_chosen_set_keeps_what_it_promises(places: int, templates: int) -> None:
+def test_the_chosen_set_keeps_what_it_promises(places, templates):
     chosen = supportive_periods(places)
     assert sum(chosen) == templates
     assert support_of(chosen, max(places, 3))[0] >= 3  # one wrong layer is survived

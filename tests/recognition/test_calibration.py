@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
-from pathlib import Path
 
 import pytest
 import torch
@@ -34,7 +32,7 @@ INF = math.inf
 ROUTE, AGAIN = "sim:aerial?frames=160", "sim:aerial?frames=160&traverse=1"
 
 
-def answers(seed: int, count: int = 200) -> tuple[Tensor, Tensor]:
+def answers(seed, count=200):
     draw = torch.Generator().manual_seed(seed)
     evidence = torch.randn(count, generator=draw, dtype=torch.float64)
     return evidence, torch.rand(count, generator=draw) < torch.sigmoid(2 * evidence - 1)
@@ -43,12 +41,12 @@ def answers(seed: int, count: int = 200) -> tuple[Tensor, Tensor]:
 # the fit
 
 
-def test_the_fit_is_the_most_likely_one() -> None:
+def test_the_fit_is_the_most_likely_one():
     evidence, right = answers(0)
     hits, misses = int(right.sum()), int((~right).sum())
     aim = torch.where(right, (hits + 1) / (hits + 2), 1 / (misses + 2)).double()
 
-    def loss(at: list[float]) -> float:
+    def loss(at):
         p = torch.sigmoid(at[0] * evidence + at[1])
         return -float((aim * p.log() + (1 - aim) * (1 - p).log()).sum())
 
@@ -57,14 +55,14 @@ def test_the_fit_is_the_most_likely_one() -> None:
 
 
 @given(st.floats(1e-3, 1e3), st.floats(-1e3, 1e3))
-def test_the_unit_and_zero_of_evidence_do_not_matter(unit: float, zero: float) -> None:
+def test_the_unit_and_zero_of_evidence_do_not_matter(unit, zero):
     evidence, right = answers(0)
     other = fit(unit * evidence + zero, right).probability(unit * evidence + zero)
     torch.testing.assert_close(other, fit(evidence, right).probability(evidence), atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("wrong", [0, 1, 50])
-def test_what_is_told_apart_wholly_stays_finite(wrong: int) -> None:
+def test_what_is_told_apart_wholly_stays_finite(wrong):
     right = torch.arange(100) >= wrong
     p = fit(torch.arange(100.0), right).probability(torch.arange(100.0))
     assert bool(((p > 0) & (p < 1)).all())
@@ -72,7 +70,7 @@ def test_what_is_told_apart_wholly_stays_finite(wrong: int) -> None:
     assert float(p.mean()) == pytest.approx(float(right.double().mean()), abs=0.02)
 
 
-def test_evidence_that_tells_nothing_or_the_opposite_gives_the_share() -> None:
+def test_evidence_that_tells_nothing_or_the_opposite_gives_the_share():
     right = torch.arange(8) % 4 != 0
     for evidence in (torch.zeros(8), -right.double()):
         platt = fit(evidence, right)
@@ -80,7 +78,7 @@ def test_evidence_that_tells_nothing_or_the_opposite_gives_the_share() -> None:
         assert platt.probability(evidence).tolist() == pytest.approx([0.7] * 8, abs=0.03)
 
 
-def test_no_right_answer_is_refused_and_no_answer_has_no_probability() -> None:
+def test_no_right_answer_is_refused_and_no_answer_has_no_probability():
     with refused("none of 3 answers is right"):
         fit(torch.zeros(3), torch.zeros(3, dtype=torch.bool))
     found = Platt(1.0, 9.0).probability(torch.tensor([-INF, 0.0])).tolist()
@@ -90,7 +88,7 @@ def test_no_right_answer_is_refused_and_no_answer_has_no_probability() -> None:
 # evidence
 
 
-def test_single_evidence_is_the_margin_beyond_the_tolerance_and_the_score() -> None:
+def test_single_evidence_is_the_margin_beyond_the_tolerance_and_the_score():
     scores = torch.full((3, 30), 9.0)
     # best at 11, 4 lies 5 after it: the next is 9
     scores[0, 10:17] = torch.tensor([1.0, 0, 0, 0, 0, 2.0, 4.0])
@@ -100,7 +98,7 @@ def test_single_evidence_is_the_margin_beyond_the_tolerance_and_the_score() -> N
     assert confidence_of(torch.tensor([[2.0]])).tolist() == [-2]  # nothing to compare with
 
 
-def test_a_track_remembers_how_its_answers_stood_out() -> None:
+def test_a_track_remembers_how_its_answers_stood_out():
     single = torch.full((3, 20), 1.0)
     single[:, 4] = torch.tensor([0.0, 0.0, 0.8])
     single[:, 9], single[:, 10] = 0.4, 0.5  # 9 is within the tolerance of 4, 10 is not
@@ -119,7 +117,7 @@ def test_a_track_remembers_how_its_answers_stood_out() -> None:
     assert parts.tolist() == pytest.approx(expected, rel=1e-5)  # whatever the batches
 
 
-def test_calibrating_looks_for_places_that_are_there_and_that_are_not() -> None:
+def test_calibrating_looks_for_places_that_are_there_and_that_are_not():
     draw = torch.Generator().manual_seed(0)
     places = torch.arange(40)
     scores = 1 + 0.1 * torch.randn(40, 40, generator=draw)
@@ -147,7 +145,7 @@ def test_calibrating_looks_for_places_that_are_there_and_that_are_not() -> None:
 @pytest.mark.parametrize(
     ("frames", "stretch", "starts"), [(160, 16, [0]), (1000, 20, [0, 200, 400, 600, 800]), (7, 1, [0])]
 )
-def test_every_tenth_stretch_is_taken(frames: int, stretch: int, starts: list[int]) -> None:
+def test_every_tenth_stretch_is_taken(frames, stretch, starts):
     route = open_source(f"sim:aerial?frames={frames}")
     changed = augmented_segments(route, frames, {"noise": 0.01})
     shown = changed.places.view(len(starts), -1, stretch)
@@ -156,7 +154,7 @@ def test_every_tenth_stretch_is_taken(frames: int, stretch: int, starts: list[in
     assert bool((shown == shown[:, :1]).all())
 
 
-def test_long_routes_are_looked_at_in_fewer_frames() -> None:
+def test_long_routes_are_looked_at_in_fewer_frames():
     route = open_source("sim:aerial?frames=30")  # none of it is read
     for frames, places, most in ((10**5, None, 1200), (10**6, None, 260), (10**5, 10**7, 260)):
         changed = augmented_segments(route, frames, {"noise": 0.01}, places=places)
@@ -164,7 +162,7 @@ def test_long_routes_are_looked_at_in_fewer_frames() -> None:
         assert int(changed.places.max()) > 0.8 * frames
 
 
-def test_what_looks_like_a_map_elsewhere_limits_the_probability() -> None:
+def test_what_looks_like_a_map_elsewhere_limits_the_probability():
     """Of 200 own frames, 4 have look-alikes as sure as 2, and 8 as sure as 1: half of the right answers are
     above either."""
     right, own = torch.tensor([0.5, 3.0]).repeat(50), torch.full((200,), 3.0)
@@ -183,7 +181,7 @@ def test_what_looks_like_a_map_elsewhere_limits_the_probability() -> None:
     assert look_alikes(Platt(5.0, 0.0), right, own, again).most == ()
 
 
-def test_limits_are_kept_in_files(tmp_path: Path) -> None:
+def test_limits_are_kept_in_files(tmp_path):
     route = torch.randn(60, 6)
     model = DejaVu(whitening="none", mapper=SpectralMapper(12.0)).learn(route)
     for most in ((), ((1.5, 0.98), (0.25, 0.9))):
@@ -192,7 +190,7 @@ def test_limits_are_kept_in_files(tmp_path: Path) -> None:
         assert DejaVu.load(tmp_path / "a.safetensors").calibration == model.calibration
 
 
-def test_a_floor_that_was_never_learned_is_known_by_look_alikes(data_dir: Path) -> None:
+def test_a_floor_that_was_never_learned_is_known_by_look_alikes(data_dir):
     """Three floors of one plan are learned; a fourth looks like them."""
     floors, queries = (
         open_source(f"{data_dir}/floors_rejection/{name}.npy") for name in ("reference", "query")
@@ -204,14 +202,14 @@ def test_a_floor_that_was_never_learned_is_known_by_look_alikes(data_dir: Path) 
     assert int((right & match.accepted).sum()) >= 250
 
 
-def test_of_many_views_evenly_spaced_stretches_are_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_many_views_evenly_spaced_stretches_are_taken(monkeypatch):
     route, seen = torch.randn(2000, 6), list[Tensor]()
     views = LabelledFrames(as_traverse(route + 0.2 * torch.randn_like(route)), torch.arange(2000))
     model = DejaVu(whitening="none", mapper=SpectralMapper(12.0)).learn(route)
     monkeypatch.setattr("dejavu_torch.learning.MAX_SEGMENT", 20)
     monkeypatch.setattr("dejavu_torch.learning.CALIBRATION_SCORES", 400 * 2000)
 
-    def noted(_: object, segments: Iterable[tuple[Tensor, Tensor]], *more: object) -> Calibration:
+    def noted(_, segments, *more):
         seen.extend(places for _, places in segments)
         return Calibration()
 
@@ -223,7 +221,7 @@ def test_of_many_views_evenly_spaced_stretches_are_taken(monkeypatch: pytest.Mon
     assert set(starts.diff().tolist()) <= {100, 120}
 
 
-def test_changed_frames_show_their_places_whatever_the_batch() -> None:
+def test_changed_frames_show_their_places_whatever_the_batch():
     route = open_source("sim:aerial?frames=300")
     frames = all_of(route)
     nothing = dict.fromkeys(("rotation", "scale", "gamma", "illumination", "blur", "occlusion"), 0.0)
@@ -246,12 +244,12 @@ def test_changed_frames_show_their_places_whatever_the_batch() -> None:
 
 
 @pytest.fixture(scope="module")
-def model() -> DejaVu:
+def model():
     route = open_source(ROUTE)
     return DejaVu().learn(route).calibrate(route)
 
 
-def test_probabilities_hold_on_another_day_and_off_the_map(model: DejaVu) -> None:
+def test_probabilities_hold_on_another_day_and_off_the_map(model):
     for sequence in (None, PlaceFilter()):
         match = model.localize(open_source(AGAIN), sequence=sequence)
         assert match.probability is not None
@@ -263,7 +261,7 @@ def test_probabilities_hold_on_another_day_and_off_the_map(model: DejaVu) -> Non
         assert float((off >= 0.99).double().mean()) < 0.01 < float((match.probability >= 0.9).double().mean())
 
 
-def test_batches_and_files_do_not_change_probabilities(model: DejaVu, tmp_path: Path) -> None:
+def test_batches_and_files_do_not_change_probabilities(model, tmp_path):
     queries = all_of(open_source(AGAIN))[:40]
     model.save(tmp_path / "map.safetensors")
     again = DejaVu.load(tmp_path / "map.safetensors")
@@ -274,7 +272,7 @@ def test_batches_and_files_do_not_change_probabilities(model: DejaVu, tmp_path: 
         torch.testing.assert_close(whole, parts, atol=1e-5, rtol=0)
 
 
-def test_convention_4_without_a_threshold_a_calibrated_map_accepts_from_a_half_on(model: DejaVu) -> None:
+def test_convention_4_without_a_threshold_a_calibrated_map_accepts_from_a_half_on(model):
     queries = all_of(open_source(AGAIN))[::2]
     queries[40:] = queries[40:].flip(-1)  # some that are hard to find
     for sequence in (None, PlaceFilter()):
@@ -300,7 +298,7 @@ def test_convention_4_without_a_threshold_a_calibrated_map_accepts_from_a_half_o
     assert other.acceptance(PlaceFilter()) == (math.log(2), None, False)
 
 
-def test_precision_accepts_what_is_probable_enough(model: DejaVu, tmp_path: Path) -> None:
+def test_precision_accepts_what_is_probable_enough(model, tmp_path):
     strange = all_of(open_source("sim:aerial?frames=20&seed=5")).flip(2)
     queries = torch.cat([all_of(open_source(AGAIN)), strange])
     sure = DejaVu(**(model.settings() | {"precision": 0.99}))
@@ -318,7 +316,7 @@ def test_precision_accepts_what_is_probable_enough(model: DejaVu, tmp_path: Path
         sure.localize(torch.rand(2, 8))
 
 
-def test_a_map_without_calibration_tells_no_probability() -> None:
+def test_a_map_without_calibration_tells_no_probability():
     features = torch.rand(64, 8)
     model = DejaVu(whitening="none").learn(features)
     assert model.localize(features).probability is None
@@ -326,7 +324,7 @@ def test_a_map_without_calibration_tells_no_probability() -> None:
     assert model.localize(features).probability is not None
 
 
-def views_of(frames: int, first: int = 0) -> LabelledFrames:
+def views_of(frames, first=0):
     """Random frames that no place looks like."""
     return LabelledFrames(as_traverse(torch.rand(frames, 8)), torch.arange(first, first + frames))
 
@@ -348,17 +346,13 @@ def views_of(frames: int, first: int = 0) -> LabelledFrames:
         (lambda _: DejaVu(threshold=1.0, precision=0.9), ["threshold", "precision", "one of them"]),
     ],
 )
-def test_what_cannot_be_calibrated_is_refused(
-    calibrate: Callable[[DejaVu], object], words: list[str]
-) -> None:
+def test_what_cannot_be_calibrated_is_refused(calibrate, words):
     model = DejaVu(whitening="none").learn(torch.rand(64, 8))
     with refused(*words):
         calibrate(model)
 
 
-def test_an_export_tells_how_to_get_probabilities(
-    model: DejaVu, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_export_tells_how_to_get_probabilities(model, tmp_path, monkeypatch):
     pytest.importorskip("onnxruntime")
     for name, made in {"_program": None, "_serialised": b"", "session_of": None}.items():
         monkeypatch.setattr(export, name, lambda *_, made=made: made)

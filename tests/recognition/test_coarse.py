@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
 from functools import cache
-from typing import Any, get_args
+from typing import get_args
 
 import pytest
 import torch
 from helpers import refused
 from test_search import walk
-from torch import Tensor
 
 from dejavu_torch import DejaVu, SpectralMapper
 from dejavu_torch.growth import append
@@ -19,34 +17,34 @@ from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.recognition import coarse
 from dejavu_torch.recognition.calibration import Calibration, Platt
 from dejavu_torch.recognition.coarse import CoarseSearch, SamplingPlan, plan, searcher
-from dejavu_torch.recognition.search import NmsSpec, Scan, Search, TopK
+from dejavu_torch.recognition.search import NmsSpec, Scan, Search
 from dejavu_torch.recognition.select import best_candidates
 
 
 @pytest.fixture
-def searched(monkeypatch: pytest.MonkeyPatch) -> None:
+def searched(monkeypatch):
     """Maps of a few hundred places are searched as long ones are."""
     monkeypatch.setattr(coarse, "MIN_PLACES", 500)
 
 
-def smooth_model(places: int = 3000, seed: int = 0, **settings: Any) -> DejaVu:
+def smooth_model(places=3000, seed=0, **settings):
     return copy.deepcopy(_learned(places, seed, **settings))
 
 
 @cache
-def _learned(places: int, seed: int, **settings: Any) -> DejaVu:
+def _learned(places, seed, **settings):
     mapper = SpectralMapper(None, 0.1, 256, **settings)
     return DejaVu(whitening="none", mapper=mapper).learn(walk(places, 24, seed, 0.99))
 
 
-def queries_of(places: int = 3000, noise: float = 0.3) -> torch.Tensor:
+def queries_of(places=3000, noise=0.3):
     route = walk(places, 24, 0, 0.99)[::13]
     return route + noise * torch.randn(route.shape, generator=torch.Generator().manual_seed(9))
 
 
 @pytest.mark.usefixtures("searched")
 @pytest.mark.parametrize("settings", [{}, {"transform": "dct"}], ids=str)
-def test_coarse_finds_nearly_what_a_scan_finds(settings: dict[str, Any]) -> None:
+def test_coarse_finds_nearly_what_a_scan_finds(settings):
     model, queries = smooth_model(**settings), queries_of()
     chosen = plan(model.map)
     assert chosen is not None
@@ -60,7 +58,7 @@ def test_coarse_finds_nearly_what_a_scan_finds(settings: dict[str, Any]) -> None
 
 
 @pytest.mark.usefixtures("searched")
-def test_coarse_probabilities_are_those_of_a_scan() -> None:
+def test_coarse_probabilities_are_those_of_a_scan():
     model, queries = smooth_model(), queries_of()
     model.calibration = Calibration(Platt(4.0, 1.0), None)
     expected = model.localize(queries, search="scan").probability
@@ -71,7 +69,7 @@ def test_coarse_probabilities_are_those_of_a_scan() -> None:
 
 
 @pytest.mark.usefixtures("searched")
-def test_a_query_that_is_like_no_place_is_scanned() -> None:
+def test_a_query_that_is_like_no_place_is_scanned():
     learned = SpectralMapper(None, 0.1, 256)(walk(1000, 24, 0, 0.99).abs() + 1)
     search = searcher(learned)
     assert isinstance(search, CoarseSearch)
@@ -81,7 +79,7 @@ def test_a_query_that_is_like_no_place_is_scanned() -> None:
     assert torch.equal(best_candidates(score, 1, 0, place).index, expected.index)
 
 
-def test_products_are_the_same_without_those_of_integers(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_products_are_the_same_without_those_of_integers(monkeypatch):
     learned, queries = smooth_model(700).map, queries_of(700)
     assert isinstance(learned, SpectralMap)
     found = []
@@ -94,9 +92,7 @@ def test_products_are_the_same_without_those_of_integers(monkeypatch: pytest.Mon
 
 @pytest.mark.usefixtures("searched")
 @pytest.mark.parametrize(("least", "a_place", "chosen"), [(10**8, 0, True), (1, 100, True), (1, 1, False)])
-def test_the_memory_by_default_grows_with_the_places(
-    least: int, a_place: int, chosen: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_memory_by_default_grows_with_the_places(least, a_place, chosen, monkeypatch):
     learned = smooth_model().map
     expected = plan(learned, 10**9)
     monkeypatch.setattr(coarse, "MEMORY", least)
@@ -108,7 +104,7 @@ def test_the_memory_by_default_grows_with_the_places(
 
 
 @pytest.mark.usefixtures("searched")
-def test_samples_follow_from_the_energy_of_the_lines_and_the_memory() -> None:
+def test_samples_follow_from_the_energy_of_the_lines_and_the_memory():
     learned = smooth_model().map
     chosen = plan(learned)
     assert chosen is not None
@@ -127,7 +123,7 @@ def test_samples_follow_from_the_energy_of_the_lines_and_the_memory() -> None:
 
 
 @pytest.mark.usefixtures("searched")
-def test_what_is_scanned() -> None:
+def test_what_is_scanned():
     rough = SpectralMapper(None, 0.1, 256)(walk(1000, 24, 0, 0.0))
     one_chunk = SpectralMapper(None, 0.1, 1000)(walk(1000, 24, 0, 0.99))
     distances = SpectralMapper(None, 0.1, 256, metric="l2")(walk(1000, 24, 0, 0.99))
@@ -138,31 +134,29 @@ def test_what_is_scanned() -> None:
     assert type(searcher(rough)) is Scan
 
 
-def appended(model: DejaVu, more: Tensor) -> None:
+def appended(model, more):
     append(model, more)
 
 
-def learned_anew(model: DejaVu, more: Tensor) -> None:
+def learned_anew(model, more):
     model.learn(torch.cat([walk(1000, 24, 0, 0.99), more]))
 
 
-def loaded(model: DejaVu, more: Tensor) -> None:
+def loaded(model, more):
     model.load_state_dict(append(copy.deepcopy(model), more).state_dict())
 
 
-def map_loaded(model: DejaVu, more: Tensor) -> None:
+def map_loaded(model, more):
     model.map.load_state_dict(append(copy.deepcopy(model), more).map.state_dict())
 
 
-def map_set(model: DejaVu, more: Tensor) -> None:
+def map_set(model, more):
     model.map = append(copy.deepcopy(model), more).map
 
 
 @pytest.mark.usefixtures("searched")
 @pytest.mark.parametrize("change", [appended, learned_anew, loaded, map_loaded, map_set])
-def test_samples_are_made_once_for_a_map_and_anew_for_another(
-    change: Callable[[DejaVu, Tensor], None],
-) -> None:
+def test_samples_are_made_once_for_a_map_and_anew_for_another(change):
     model, more = smooth_model(1000), walk(1000, 24, 5, 0.99)
     model.localize(more[:3])
     first = model.searcher
@@ -176,10 +170,10 @@ def test_samples_are_made_once_for_a_map_and_anew_for_another(
     assert model.searcher is not first
 
 
-def test_a_searcher_of_the_user_finds_the_places_until_the_map_is_another() -> None:
+def test_a_searcher_of_the_user_finds_the_places_until_the_map_is_another():
     model, asked = smooth_model(700), list[list[NmsSpec]]()
 
-    def own(queries: Tensor, wanted: list[NmsSpec]) -> TopK:
+    def own(queries, wanted):
         asked.append(wanted)
         return torch.tensor([[0.0, 1.0]]).expand(len(queries), 2), torch.tensor([[7, 99]]).expand(
             len(queries), 2
@@ -196,7 +190,7 @@ def test_a_searcher_of_the_user_finds_the_places_until_the_map_is_another() -> N
     assert len(asked) == 1
 
 
-def test_the_cosine_of_samples_is_near_that_of_places() -> None:
+def test_the_cosine_of_samples_is_near_that_of_places():
     """Samples are descriptors of their places, low-passed."""
     for transform in ("dft", "dct"):
         learned = smooth_model(700, transform=transform).map
@@ -211,7 +205,7 @@ def test_the_cosine_of_samples_is_near_that_of_places() -> None:
 
 
 @pytest.mark.usefixtures("searched")
-def test_many_candidates_are_those_of_a_scan_and_no_query_has_none() -> None:
+def test_many_candidates_are_those_of_a_scan_and_no_query_has_none():
     learned, queries = smooth_model().map, queries_of()[:5]
     search, wanted = searcher(learned), [(40, 5)]
     assert isinstance(search, CoarseSearch)

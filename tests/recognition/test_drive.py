@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import pytest
 import torch
 from devices import pretend
 from test_smoother import noise, shown
-from torch import Tensor
 
 from dejavu_torch import DejaVu, Whitening, open_source
 from dejavu_torch.data.traverse import fitted
@@ -20,18 +18,17 @@ from dejavu_torch.recognition import smoother as smoothing
 from dejavu_torch.recognition.calibration import Platt, confidence_of
 from dejavu_torch.recognition.drive import DriveQuery, doubt, localize_drive, localize_drives
 from dejavu_torch.recognition.smoother import PlaceSmoother
-from dejavu_torch.types import Match
 
 PLATT = Platt(3.0, 0.5)
 
 
-def localized(scores: Tensor, smoother: PlaceSmoother, k: int = 1, platt: Platt | None = None) -> Match:
+def localized(scores, smoother, k=1, platt=None):
     """Of scores of which some are asked for at a time."""
     drive = noise(len(scores), 16, seed=8)
     return localize_drive(DriveQuery(smoothing.rows_of(scores), drive, smoother, k, 4, platt=platt))
 
 
-def test_an_answer_has_the_most_mass_around_it() -> None:
+def test_an_answer_has_the_most_mass_around_it():
     scores, smoother = shown(80, [*range(5, 75), *range(74, 40, -1)]), PlaceSmoother(within=3)
     match = localized(scores, smoother, platt=PLATT)
     assert smoother.is_drive
@@ -51,7 +48,7 @@ def test_an_answer_has_the_most_mass_around_it() -> None:
     assert ((-match.score[:, 0]).exp() <= match.probability[:, 0] + 1e-6).all()
 
 
-def test_candidates_are_apart_and_the_first_is_the_answer() -> None:
+def test_candidates_are_apart_and_the_first_is_the_answer():
     scores = shown(80, range(5, 75))
     best, four = localized(scores, PlaceSmoother()), localized(scores, PlaceSmoother(), k=4)
     assert four.index.shape == (70, 4)
@@ -66,7 +63,7 @@ def test_candidates_are_apart_and_the_first_is_the_answer() -> None:
     assert four.confidence[:, 1:].isnan().all()
 
 
-def test_what_is_no_drive_is_answered_by_single_queries() -> None:
+def test_what_is_no_drive_is_answered_by_single_queries():
     scores, smoother = noise(80, 100), PlaceSmoother(within=5)
     match, alone = localized(scores, smoother, platt=PLATT), localized(scores, PlaceSmoother(within=5))
     assert not smoother.is_drive
@@ -85,7 +82,7 @@ def test_what_is_no_drive_is_answered_by_single_queries() -> None:
 
 
 @pytest.mark.parametrize("drives", [True, False])
-def test_blocks_give_what_the_whole_gives(drives: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_blocks_give_what_the_whole_gives(drives, monkeypatch):
     scores = shown(80, range(70), clear=2.5 if drives else 0.0)
     whole = localized(scores, PlaceSmoother(), k=2, platt=PLATT)
     monkeypatch.setattr(smoothing, "BLOCK", 1)
@@ -94,7 +91,7 @@ def test_blocks_give_what_the_whole_gives(drives: bool, monkeypatch: pytest.Monk
         assert torch.allclose(parts.columns[name], column, atol=1e-5, equal_nan=True)
 
 
-def test_doubt_grows_with_the_distance_from_what_is_usual() -> None:
+def test_doubt_grows_with_the_distance_from_what_is_usual():
     """.1 nats for each standard deviation above the median, by the median absolute deviation."""
     own = torch.tensor([1.0, 2, 3, 4, 5, 9, -9, math.inf, math.nan, 1e9])
     expected = [0, 0, 0, 0.1 / (2 * 1.4826), 0.2 / (2 * 1.4826), 0.6 / (2 * 1.4826), 0, 0, 0, 10]
@@ -105,7 +102,7 @@ def test_doubt_grows_with_the_distance_from_what_is_usual() -> None:
     assert doubt(torch.full((4,), 2.0)).tolist() == [0] * 4
 
 
-def test_places_and_queries_without_scores_are_not_answered() -> None:
+def test_places_and_queries_without_scores_are_not_answered():
     scores = shown(80, range(70))
     scores[:, 40:50], scores[20], scores[25] = math.inf, math.inf, math.nan
     for one in (scores, torch.where(scores.isfinite(), noise(70, 80), scores)):  # a drive, and none
@@ -119,7 +116,7 @@ def test_places_and_queries_without_scores_are_not_answered() -> None:
         assert match.accepted.sum() == 68
 
 
-def test_answers_that_are_nearly_sure_have_different_scores() -> None:
+def test_answers_that_are_nearly_sure_have_different_scores():
     sure = PlaceSmoother((0.0, 1.0), jump=1e-9, leave=1e-9, within=3)
     match = localized(shown(80, range(80), clear=9.0), sure)
     assert match.index[:, 0].tolist() == [*range(80)]
@@ -127,7 +124,7 @@ def test_answers_that_are_nearly_sure_have_different_scores() -> None:
     assert len(match.score.unique()) > 60
 
 
-def test_what_is_no_drive_is_answered_by_queries_as_they_are() -> None:
+def test_what_is_no_drive_is_answered_by_queries_as_they_are():
     centred, plain = noise(60, 80, seed=1), noise(60, 80, seed=2)
     descriptors = noise(60, 16, seed=8)
     rows, single = smoothing.rows_of(centred), smoothing.rows_of(plain)
@@ -138,13 +135,13 @@ def test_what_is_no_drive_is_answered_by_queries_as_they_are() -> None:
     assert (match.index[:, 0] - torch.arange(60)).abs().max() <= 1
 
 
-def test_drives_are_matched_together_as_each_by_itself() -> None:
+def test_drives_are_matched_together_as_each_by_itself():
     path, descriptors = [*range(5, 65)], noise(60, 16, seed=8)
     scores = [shown(80, path), shown(80, path[::-1]), noise(60, 80, seed=1), shown(90, path)]
     scores[1][7] = math.nan
     links = ((64, 5, 0.5),)
 
-    def asked() -> list[DriveQuery]:
+    def asked():
         rows = map(smoothing.rows_of, scores)
         drives = [DriveQuery(one, descriptors, PlaceSmoother(within=3), 2, 4, platt=PLATT) for one in rows]
         linked = PlaceSmoother(links=links)
@@ -166,13 +163,13 @@ def test_drives_are_matched_together_as_each_by_itself() -> None:
 
 
 @pytest.mark.parametrize("kept", [0, 2**26])
-def test_scores_are_computed_once_if_they_can_be_kept(kept: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scores_are_computed_once_if_they_can_be_kept(kept, monkeypatch):
     monkeypatch.setattr(driving, "KEPT", kept)
     monkeypatch.setattr(smoothing, "BLOCK", 2**12)
     monkeypatch.setattr(smoothing, "HELD", 2**12)
     scores, asked = shown(80, [*range(5, 75)]), torch.zeros(70)
 
-    def rows(numbers: Tensor) -> Tensor:
+    def rows(numbers):
         asked[numbers] += 1
         return scores[numbers]
 
@@ -185,7 +182,7 @@ def test_scores_are_computed_once_if_they_can_be_kept(kept: int, monkeypatch: py
     assert int((asked - 2 * fitted)[1:].max()) == (1 if kept else 2)
 
 
-def test_a_threshold_is_of_a_probability_for_what_is_no_drive_too() -> None:
+def test_a_threshold_is_of_a_probability_for_what_is_no_drive_too():
     route, other = noise(80, 12, seed=3).cumsum(0), noise(60, 12, seed=4)
     model = DejaVu(None, "none").learn(route)
     for threshold in (math.log(2), 1e-3):
@@ -197,7 +194,7 @@ def test_a_threshold_is_of_a_probability_for_what_is_no_drive_too() -> None:
         assert not match.accepted.any()
 
 
-def test_frames_that_are_no_drive_are_localized_as_if_in_no_order() -> None:
+def test_frames_that_are_no_drive_are_localized_as_if_in_no_order():
     features = noise(80, 12, seed=3).cumsum(0)
     model = DejaVu(None, "none").learn(features)
     other, smoother = noise(60, 12, seed=4) + 5, PlaceSmoother()
@@ -207,7 +204,7 @@ def test_frames_that_are_no_drive_are_localized_as_if_in_no_order() -> None:
     assert not torch.equal(match.index, model.localize(other, sequence=None, centre=True).index)
 
 
-def test_few_queries_and_places_have_answers() -> None:
+def test_few_queries_and_places_have_answers():
     scores = noise(30, 20)
     none, one = (localized(scores[:n], PlaceSmoother(), k=2, platt=PLATT) for n in (0, 1))
     assert {name: column.shape for name, column in none.columns.items()} == dict.fromkeys(one.columns, (0, 2))
@@ -221,10 +218,10 @@ def test_few_queries_and_places_have_answers() -> None:
 
 
 @pytest.mark.parametrize("clear", [3.0, 0.0])
-def test_a_device_finds_what_the_cpu_finds(clear: float) -> None:
+def test_a_device_finds_what_the_cpu_finds(clear):
     scores, descriptors = shown(20, range(16), clear=clear).double(), noise(16, 4)
 
-    def found(scores: Tensor, descriptors: Tensor) -> Match:
+    def found(scores, descriptors):
         rows = smoothing.rows_of(scores)
         return localize_drive(DriveQuery(rows, descriptors, PlaceSmoother(MOVES), 2, 4, platt=PLATT))
 
@@ -248,8 +245,8 @@ MOVES = (0.2, 0.6, 0.2)
     ],
 )
 def test_a_drive_is_found_in_another_season_and_another_route_is_not(
-    data_dir: Path, folder: str, names: tuple[str, str], tolerance: int, area: float, other: str
-) -> None:
+    data_dir, folder, names, tolerance, area, other
+):
     reference, queries = (open_source(data_dir / folder / name) for name in names)
     truth = ground_truth_of(str(data_dir / folder / "truth.csv"), reference, queries)
     assert truth is not None

@@ -8,7 +8,6 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from torch import Tensor
 
 from dejavu_torch.recognition.evidence import (
     RankTable,
@@ -22,11 +21,11 @@ from dejavu_torch.recognition.evidence import (
 )
 
 
-def noise(rows: int, columns: int, seed: int = 0) -> Tensor:
+def noise(rows, columns, seed=0):
     return torch.randn(rows, columns, generator=torch.Generator().manual_seed(seed))
 
 
-def remembering(rows: int, columns: int, share: float) -> Tensor:
+def remembering(rows, columns, share):
     """Queries that keep a share of the one before: their autocorrelation at lag k is share^k."""
     queries = noise(rows, columns)
     for t in range(1, rows):
@@ -35,7 +34,7 @@ def remembering(rows: int, columns: int, share: float) -> Tensor:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 0.8, -0.5])
-def test_queries_that_remember_say_as_much_as_fewer(share: float) -> None:
+def test_queries_that_remember_say_as_much_as_fewer(share):
     """1 + 2 sum share^k up to the first lag below .05; (1 + share) / (1 - share) if it goes on."""
     lags = [share**k for k in range(1, 100) if min(share**j for j in range(1, k + 1)) >= 0.05]
     assert correlation_time(remembering(4000, 50, share)) == pytest.approx(1 + 2 * sum(lags), rel=0.05)
@@ -44,7 +43,7 @@ def test_queries_that_remember_say_as_much_as_fewer(share: float) -> None:
 
 
 @given(st.integers(0, 9), st.integers(1, 30))
-def test_the_correlation_time_is_a_sum_over_pairs(seed: int, rows: int) -> None:
+def test_the_correlation_time_is_a_sum_over_pairs(seed, rows):
     queries = noise(rows, 3, seed).cumsum(0)
     centred = (queries - queries.mean(0)).double()
     lags = [float((centred[k:] * centred[: rows - k]).sum() / (rows - k)) for k in range(rows)]
@@ -57,7 +56,7 @@ def test_the_correlation_time_is_a_sum_over_pairs(seed: int, rows: int) -> None:
     assert correlation_time(torch.ones(rows, 3)) == 1
 
 
-def test_slow_changes_are_no_noise() -> None:
+def test_slow_changes_are_no_noise():
     slow = torch.sin(torch.arange(1000.0) / 200)[:, None] * torch.ones(20)
     spacing = spacing_of(noise(1000, 20) + 3 * slow)
     assert spacing.correlation > 50
@@ -67,7 +66,7 @@ def test_slow_changes_are_no_noise() -> None:
     assert torch.allclose(local_mean(queries, 2), torch.stack(means))
 
 
-def test_a_stop_counts_once() -> None:
+def test_a_stop_counts_once():
     """30 repeats of the fifth query with little noise, and one frame that is there twice."""
     moving = noise(40, 8)
     queries = torch.cat([moving[:5], moving[4:5] + 0.001 * noise(30, 8, 1), moving[5:], moving[-1:]])
@@ -86,7 +85,7 @@ def test_a_stop_counts_once() -> None:
     assert spacing_of(queries.half())[2:] == pytest.approx(alone[2:], rel=0.01)
 
 
-def test_a_slow_drift_is_no_stop() -> None:
+def test_a_slow_drift_is_no_stop():
     """Each query is near the one before it, but not near the first of the stop."""
     queries = torch.cat([noise(300, 2), torch.linspace(3, 6, 200)[:, None] * torch.ones(2)])
     assert int(unchanged(queries)[300:].sum()) > 90
@@ -95,7 +94,7 @@ def test_a_slow_drift_is_no_stop() -> None:
 
 
 @pytest.mark.parametrize("queries", [torch.zeros(0, 3), torch.zeros(1, 3), torch.zeros(4, 3), noise(2, 3)])
-def test_few_queries_and_equal_ones_have_a_spacing(queries: Tensor) -> None:
+def test_few_queries_and_equal_ones_have_a_spacing(queries):
     spacing = spacing_of(queries)
     same = len(queries) == 4
     assert spacing.weight.tolist() == [0.25 if same else 1] * len(queries)
@@ -103,12 +102,12 @@ def test_few_queries_and_equal_ones_have_a_spacing(queries: Tensor) -> None:
     assert not spacing.still.any()
 
 
-def z_of(scores: Tensor) -> Tensor:
+def z_of(scores):
     return standardised(scores, place_means(scores, scores.new_ones(len(scores)))).z
 
 
 @given(st.integers(0, 99), st.sampled_from([0.01, 3.0, 1000.0]))
-def test_a_score_counts_beside_those_of_its_query_and_of_its_place(seed: int, scale: float) -> None:
+def test_a_score_counts_beside_those_of_its_query_and_of_its_place(seed, scale):
     scores = noise(6, 9, seed).double()
     z = z_of(scores)
     query, place = noise(6, 1, seed + 1).double(), noise(1, 9, seed + 2).double()
@@ -120,7 +119,7 @@ def test_a_score_counts_beside_those_of_its_query_and_of_its_place(seed: int, sc
     assert torch.allclose(z, -double / double.square().mean(1, keepdim=True).sqrt())
 
 
-def test_queries_that_say_nothing_change_nothing() -> None:
+def test_queries_that_say_nothing_change_nothing():
     scores = noise(6, 9).double()
     silent = torch.stack([torch.full((9,), 2.0), torch.full((9,), math.inf), torch.full((9,), math.nan)])
     silent = torch.cat([silent, torch.where(torch.arange(9) == 4, math.nan, scores[:1])])
@@ -136,7 +135,7 @@ def test_queries_that_say_nothing_change_nothing() -> None:
     assert found.z.isfinite().all()
 
 
-def test_places_that_nothing_covers_are_left_out() -> None:
+def test_places_that_nothing_covers_are_left_out():
     scores = noise(6, 9)
     holes = scores.clone()
     holes[:, 4] = math.inf
@@ -147,20 +146,20 @@ def test_places_that_nothing_covers_are_left_out() -> None:
     assert found.valid[:, kept].all()
 
 
-def test_means_are_weighted_and_a_single_query_keeps_its_scores() -> None:
+def test_means_are_weighted_and_a_single_query_keeps_its_scores():
     scores, weight = noise(5, 4), torch.tensor([1.0, 0.25, 0.5, 1, 1])
     assert torch.allclose(place_means(scores, weight), (weight @ scores) / weight.sum())
     assert (place_means(scores[:1], weight[:1]) == 0).all()
 
 
-def table_of(z: Tensor, weight: Tensor | None = None) -> RankTable:
+def table_of(z, weight=None):
     table = RankTable()
     for part in torch.arange(len(z)).split(7):
         table.add(z[part], torch.ones_like(z[part]) if weight is None else weight[part])
     return table
 
 
-def test_ranks_are_exact_at_the_edges_of_bins() -> None:
+def test_ranks_are_exact_at_the_edges_of_bins():
     """x = -Phi^-1((n + 1/2) / (N + 1)) for the n of N values that reach a z."""
     z, weight = noise(500, 4) * 2 + 1, torch.rand(500, 4)
     edges = torch.arange(-100, 300) / 64
@@ -170,13 +169,13 @@ def test_ranks_are_exact_at_the_edges_of_bins() -> None:
     assert torch.allclose(found.double(), expected, atol=1e-5)
 
 
-def test_normal_scores_of_gaussian_noise_are_itself() -> None:
+def test_normal_scores_of_gaussian_noise_are_itself():
     z = noise(1000, 1000)
     at = torch.linspace(-3, 3, 50)
     assert torch.allclose(RankTable.look_up(table_of(z).values, at), at, atol=0.03)
 
 
-def test_normal_scores_rise_with_z_and_their_slope_is_the_gradient() -> None:
+def test_normal_scores_rise_with_z_and_their_slope_is_the_gradient():
     values = table_of(noise(300, 3)).values
     assert (values.diff() >= 0).all()
     z = torch.linspace(-12, 50, 1001, dtype=torch.float64)  # beyond the table as well
@@ -189,7 +188,7 @@ def test_normal_scores_rise_with_z_and_their_slope_is_the_gradient() -> None:
     assert slope.max() > 0.5
 
 
-def test_values_of_no_weight_are_not_counted() -> None:
+def test_values_of_no_weight_are_not_counted():
     z = noise(200, 3)
     weight = (torch.arange(600).view(200, 3) % 2).float()
     assert torch.equal(table_of(z, weight).values, table_of(z[weight > 0][:, None]).values)

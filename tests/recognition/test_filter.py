@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 
 import pytest
 import torch
 from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
-from torch import Tensor
 
 from dejavu_torch import DejaVu, PlaceFilter, SequenceMatcher
 from dejavu_torch.maps.place_map import PlaceMap
@@ -23,7 +21,7 @@ from dejavu_torch.types import Match, SequenceModel
 
 
 @torch.no_grad()
-def literal(filter_: PlaceFilter, scores: list[list[float]]) -> list[list[float]]:
+def literal(filter_, scores):
     """Each transition from one state to another in a loop of its own; state N is off the map."""
     places = len(scores[0])
     moves = filter_.move_logits.softmax(0).tolist()
@@ -74,7 +72,7 @@ FILTER = st.builds(
 
 
 @given(TABLE, FILTER)
-def test_equals_a_literal_loop(rows: list[list[float]], filter_: PlaceFilter) -> None:
+def test_equals_a_literal_loop(rows, filter_):
     filter_ = filter_.double()
     found = filter_.posterior(torch.tensor(rows, dtype=torch.float64))
     assert torch.allclose(found, torch.tensor(literal(filter_, rows), dtype=torch.float64), atol=1e-9)
@@ -82,9 +80,7 @@ def test_equals_a_literal_loop(rows: list[list[float]], filter_: PlaceFilter) ->
 
 
 @given(TABLE, FILTER, st.integers(1, 4), st.integers(0, 3), st.booleans())
-def test_batches_do_not_matter(
-    rows: list[list[float]], filter_: PlaceFilter, size: int, lag: int, learns: bool
-) -> None:
+def test_batches_do_not_matter(rows, filter_, size, lag, learns):
     scores, filter_.lag, filter_.learns = torch.tensor(rows), lag, learns
     state, found = filter_.start(scores.shape[1]), []
     for part in scores.split(size):
@@ -96,7 +92,7 @@ def test_batches_do_not_matter(
     assert len(filter_.finish(state)[0]) == 0
 
 
-def forward_backward(filter_: PlaceFilter, scores: Tensor, empty: Sequence[int] = ()) -> Tensor:
+def forward_backward(filter_, scores, empty=()):
     """Posteriors given all queries, those of `empty` saying nothing."""
     filled = scores.clone()
     filled[[*empty]] = 0.0
@@ -108,7 +104,7 @@ def forward_backward(filter_: PlaceFilter, scores: Tensor, empty: Sequence[int] 
 
 @torch.no_grad()
 @pytest.mark.parametrize("lag", [39, 100])
-def test_with_a_lag_of_all_queries_it_is_a_smoother(lag: int) -> None:
+def test_with_a_lag_of_all_queries_it_is_a_smoother(lag):
     scores = standing_out(30, [*range(2, 22)] * 2).double()
     filter_ = PlaceFilter(lag=lag).double()
     torch.testing.assert_close(filter_.posterior(scores), forward_backward(filter_, scores))
@@ -126,7 +122,7 @@ def test_with_a_lag_of_all_queries_it_is_a_smoother(lag: int) -> None:
     )
 
 
-def test_a_lagged_answer_has_the_probability_and_score_of_its_own_query() -> None:
+def test_a_lagged_answer_has_the_probability_and_score_of_its_own_query():
     scores, filter_ = standing_out(30, [*range(2, 22)]), PlaceFilter(lag=4)
     localizer = Localizer(Watched(30), Matching(filter_, k=2, platt=Platt(1.0, 0.0)))
     found = Match.joined([*map(localizer, scores.split(3)), localizer.finish()])
@@ -137,7 +133,7 @@ def test_a_lagged_answer_has_the_probability_and_score_of_its_own_query() -> Non
 
 
 @torch.no_grad()
-def test_an_answer_knows_of_the_lag_and_no_more() -> None:
+def test_an_answer_knows_of_the_lag_and_no_more():
     scores = standing_out(30, [*range(2, 22)]).double()
     lagged = PlaceFilter(lag=4).double()
     for t in (0, 7, 15, 19):
@@ -146,13 +142,13 @@ def test_an_answer_knows_of_the_lag_and_no_more() -> None:
 
 
 @torch.no_grad()
-def test_what_is_learned_are_the_moves_and_how_far_right_places_stand_out() -> None:
+def test_what_is_learned_are_the_moves_and_how_far_right_places_stand_out():
     shown = [t // 3 for t in range(150)]
     scores = standing_out(60, shown)
     learning, fixed = PlaceFilter(learns=True), PlaceFilter()
     assert torch.equal(learning.posterior(scores)[0], fixed.posterior(scores)[0])
 
-    def learned(scores: Tensor) -> tuple[list[float], float, float]:
+    def learned(scores):
         state = learning.step(scores, learning.start(60))[1]
         _, _, sums, _ = learning._parts(state)
         assert sums is not None
@@ -170,7 +166,7 @@ def test_what_is_learned_are_the_moves_and_how_far_right_places_stand_out() -> N
 
 
 @pytest.mark.parametrize("alike", [1, 25])
-def test_sharpness_is_the_mean_at_right_places_by_the_correlation_time(alike: int) -> None:
+def test_sharpness_is_the_mean_at_right_places_by_the_correlation_time(alike):
     """Queries of which so many in a row are the same, each surely at its best place."""
     rows = torch.randn(5000 // alike, 400, generator=torch.Generator().manual_seed(0))
     rows = ((rows - rows.mean(1, keepdim=True)) / rows.std(1, keepdim=True, correction=0)).repeat_interleave(
@@ -190,13 +186,13 @@ def test_sharpness_is_the_mean_at_right_places_by_the_correlation_time(alike: in
     )
 
 
-def test_gradients_reach_the_scores_and_every_parameter() -> None:
+def test_gradients_reach_the_scores_and_every_parameter():
     scores = torch.rand(4, 6, dtype=torch.float64, requires_grad=True)
     filter_ = PlaceFilter().double()
     assert torch.autograd.gradcheck(filter_, (scores,))
     names, values = zip(*filter_.named_parameters(), strict=True)
 
-    def run(*values: Tensor) -> Tensor:
+    def run(*values):
         given_ = dict(zip(names, values, strict=True))
         return torch.func.functional_call(filter_, given_, (scores.detach(),))
 
@@ -205,7 +201,7 @@ def test_gradients_reach_the_scores_and_every_parameter() -> None:
     assert all(bool((gradient != 0).all()) for gradient in gradients)
 
 
-def test_the_score_is_the_probability_of_a_place_and_its_neighbours() -> None:
+def test_the_score_is_the_probability_of_a_place_and_its_neighbours():
     scores = torch.rand(3, 9, dtype=torch.float64)
     posterior = PlaceFilter().posterior(scores)[:, :-1]
     assert torch.allclose((-PlaceFilter(within=0)(scores)).exp(), posterior)
@@ -214,7 +210,7 @@ def test_the_score_is_the_probability_of_a_place_and_its_neighbours() -> None:
     assert torch.allclose(near[:, 0], (posterior[:, :3] * torch.tensor([3, 2, 1]) / 3).sum(1))
 
 
-def standing_out(places: int, shown: list[int], seed: int = 0) -> Tensor:
+def standing_out(places, shown, seed=0):
     """Scores of queries that show a place each, or -1 where they show none."""
     scores = torch.randn(len(shown), places, generator=torch.Generator().manual_seed(seed))
     for t, place in enumerate(shown):
@@ -223,7 +219,7 @@ def standing_out(places: int, shown: list[int], seed: int = 0) -> Tensor:
     return scores
 
 
-def test_a_route_at_any_speed_is_found() -> None:
+def test_a_route_at_any_speed_is_found():
     """Standing, then twice as fast as the reference: no sum at one speed finds it."""
     shown = [20] * 30 + list(range(20, 140, 2))
     scores, truth = standing_out(200, shown), torch.tensor(shown)
@@ -235,7 +231,7 @@ def test_a_route_at_any_speed_is_found() -> None:
     assert near["sum"] < 0.5
 
 
-def test_off_the_map_is_noticed_and_left() -> None:
+def test_off_the_map_is_noticed_and_left():
     shown = [*range(50, 100), *[-1] * 60, *range(10, 60)]
     off = PlaceFilter().posterior(standing_out(200, shown))[:, -1]
     assert off[30:50].max() < 0.5
@@ -243,7 +239,7 @@ def test_off_the_map_is_noticed_and_left() -> None:
     assert off[140:].max() < 0.5
 
 
-def test_the_model_localizes_with_it_and_accepts_what_is_likely() -> None:
+def test_the_model_localizes_with_it_and_accepts_what_is_likely():
     route = torch.randn(80, 32, generator=torch.Generator().manual_seed(3))
     model = DejaVu(whitening="none", threshold=1e-9).learn(route)
     found = model.localize(route[10:50], sequence=PlaceFilter())
@@ -257,7 +253,7 @@ def test_the_model_localizes_with_it_and_accepts_what_is_likely() -> None:
     assert torch.allclose(again.score, found.score, rtol=1e-3)
 
 
-def test_gradients_are_finite_where_something_is_impossible() -> None:
+def test_gradients_are_finite_where_something_is_impossible():
     for impossible in ("jump", "leave", "enter"):
         filter_ = PlaceFilter(**{impossible: 0.0}, sharpness=2.2)  # type: ignore[arg-type]
         scores = standing_out(400, [0, 150, 300, -1, 20]).requires_grad_()
@@ -266,7 +262,7 @@ def test_gradients_are_finite_where_something_is_impossible() -> None:
         assert all(one is not None and bool(one.isfinite().all()) for one in gradients)
 
 
-def test_no_graph_grows_from_batch_to_batch() -> None:
+def test_no_graph_grows_from_batch_to_batch():
     scores = standing_out(50, [*range(40)])
     assert not followed(PlaceFilter(), scores, Watched(50), 4).requires_grad
 
@@ -294,7 +290,7 @@ def test_no_graph_grows_from_batch_to_batch() -> None:
         (lambda: PlaceFilter(lag=2).step(torch.rand(2, 4), torch.zeros(5)), ["(5,)", "(2, 5)"]),
     ],
 )
-def test_bad_input_is_refused(make: Callable[[], object], told: list[str]) -> None:
+def test_bad_input_is_refused(make, told):
     with refused(*told):
         make()
 
@@ -308,20 +304,20 @@ class Watched(PlaceMap):
     def __init__(self, places: int) -> None:
         super().__init__(places, places)
 
-    def scores(self, queries: Tensor) -> Tensor:
+    def scores(self, queries):
         return queries
 
 
-def followed(model: SequenceModel | None, scores: Tensor, route: PlaceMap, size: int = 33) -> Tensor:
+def followed(model, scores, route, size=33):
     """The scores that places are found by."""
-    rows: list[Tensor] = []
+    rows = []
     localizer = Localizer(route, Matching(model, callback=rows.append))
     for part in scores.split(size):
         localizer(part)
     return torch.cat(rows)
 
 
-def test_convention_2_a_place_that_nothing_covers_is_not_reported_by_a_filter() -> None:
+def test_convention_2_a_place_that_nothing_covers_is_not_reported_by_a_filter():
     scores = standing_out(300, [*range(20, 80)])
     scores[:, 200:220] = math.inf
     found = followed(PlaceFilter(), scores, Watched(300), 7)
@@ -331,7 +327,7 @@ def test_convention_2_a_place_that_nothing_covers_is_not_reported_by_a_filter() 
 
 
 @pytest.mark.parametrize("model", [PlaceFilter(), SequenceMatcher(3), None])
-def test_an_empty_batch_changes_nothing(model: SequenceModel | None) -> None:
+def test_an_empty_batch_changes_nothing(model):
     scores = standing_out(50, [*range(12)])
     localizer = Localizer(Watched(50), Matching(model))
     found = Match.joined(map(localizer, (scores[:5], scores[:0], scores[5:])))
@@ -350,7 +346,7 @@ MODELS = {
 }
 
 
-def with_gaps() -> Tensor:
+def with_gaps():
     """Scores of queries that pass places 3, 4, .., some of which are not covered."""
     scores = torch.rand(30, 25)
     scores[torch.arange(30), (torch.arange(30) + 3) % 25] -= 0.5
@@ -363,12 +359,12 @@ class Step(torch.nn.Module):
         super().__init__()
         self.model = model
 
-    def forward(self, scores: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, scores, state):
         return self.model.step(scores, state)
 
 
 @pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
-def test_steps_are_the_batch_and_are_exported(model: SequenceModel) -> None:
+def test_steps_are_the_batch_and_are_exported(model):
     scores, state = with_gaps(), model.start(25, fixed=True)
     run = torch.export.export(Step(model).eval(), (scores[:1], state)).module()
     with torch.no_grad():

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import pytest
 import torch
 import torch.nn.functional as F
 from test_smoother import noise, shown
-from torch import Tensor
 
-from dejavu_torch.maps.place_map import ScoreBlocks
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.recognition import drive as driving
 from dejavu_torch.recognition import large
@@ -20,15 +17,12 @@ from dejavu_torch.recognition.large import LargeDrive, Tiles, is_large
 from dejavu_torch.recognition.localizer import Localizer, Matching
 from dejavu_torch.recognition.motion import Layout, Motion, Rates
 from dejavu_torch.recognition.smoother import PlaceSmoother
-from dejavu_torch.types import Match
 
 
-def both(
-    scores: Tensor, monkeypatch: pytest.MonkeyPatch, starts: Sequence[int] = (0,), **settings: object
-) -> tuple[Match, Match, PlaceSmoother, PlaceSmoother]:
+def both(scores, monkeypatch, starts=(0,), **settings):
     """Matches by the smoother of all places, and coarse to fine with scores of a few places at a time."""
 
-    def blocks(numbers: Tensor) -> ScoreBlocks:
+    def blocks(numbers):
         for start in range(0, scores.shape[1], 70):
             yield start, scores[numbers, start : start + 70]
 
@@ -57,7 +51,7 @@ PATHS = {
 
 
 @pytest.mark.parametrize("name", PATHS)
-def test_answers_are_those_of_all_places(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_answers_are_those_of_all_places(name, monkeypatch):
     path = torch.tensor(PATHS[name])
     monkeypatch.setattr(large, "WINDOW", 120)
     monkeypatch.setattr(large, "MARGIN", 40)
@@ -78,7 +72,7 @@ def test_answers_are_those_of_all_places(name: str, monkeypatch: pytest.MonkeyPa
     )
 
 
-def test_only_likely_places_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_likely_places_are_looked_at(monkeypatch):
     monkeypatch.setattr(large, "WINDOW", 100)
     scores = shown(4000, range(1008, 1408), clear=9.0)
     drive = LargeDrive(
@@ -95,7 +89,7 @@ def test_only_likely_places_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 @pytest.mark.parametrize("kind", ["equal", "none", "few"])
-def test_no_drive_looks_at_more_places_than_it_may(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_drive_looks_at_more_places_than_it_may(kind, monkeypatch):
     monkeypatch.setattr(large, "LOOKED", 320)
     monkeypatch.setattr(large, "WINDOW", 100)
     scores = noise(300, 4000)
@@ -112,7 +106,7 @@ def test_no_drive_looks_at_more_places_than_it_may(kind: str, monkeypatch: pytes
     assert [len(own) for _, own, *_ in drive] == [100, 100, 100]
 
 
-def test_a_drive_is_fitted_to_no_more_queries_than_it_may() -> None:
+def test_a_drive_is_fitted_to_no_more_queries_than_it_may():
     walk = F.avg_pool1d(noise(4039, 4, seed=1).T[None], 40, 1)[0].T  # few are independent
     scores = noise(4000, 300)
     drive = LargeDrive(Tiles(lambda numbers: iter([(0, scores[numbers])]), 300), walk, 300, PlaceSmoother())
@@ -120,7 +114,7 @@ def test_a_drive_is_fitted_to_no_more_queries_than_it_may() -> None:
     assert 500 < sum(drive._fitted().values()) <= 1000
 
 
-def test_scores_of_windows_are_those_that_were_given(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scores_of_windows_are_those_that_were_given(monkeypatch):
     scores = shown(300, range(20, 280))
     drive = LargeDrive(
         Tiles(lambda numbers: iter([(0, scores[numbers])]), 300), noise(260, 8), 300, PlaceSmoother()
@@ -130,7 +124,7 @@ def test_scores_of_windows_are_those_that_were_given(monkeypatch: pytest.MonkeyP
         assert torch.allclose(own, scores[first : first + len(own)][:, places], atol=0.01)
 
 
-def test_another_route_is_answered_by_single_queries(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_route_is_answered_by_single_queries(monkeypatch):
     scores = shown(400, [-1] * 200)
     single = noise(200, 400, seed=3)
     _, two, _, coarse = both(scores, monkeypatch, single=single.__getitem__)
@@ -141,7 +135,7 @@ def test_another_route_is_answered_by_single_queries(monkeypatch: pytest.MonkeyP
     assert float(two.probability.max()) < 0.5
 
 
-def test_queries_and_places_without_scores(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_queries_and_places_without_scores(monkeypatch):
     scores = shown(400, range(50, 250))
     scores[30] = math.nan
     scores[60] = 1.0
@@ -154,14 +148,14 @@ def test_queries_and_places_without_scores(monkeypatch: pytest.MonkeyPatch) -> N
     assert two.index[60, 0] == 110 or abs(int(two.index[60, 0]) - 110) <= 4
 
 
-def test_candidates_are_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_candidates_are_apart(monkeypatch):
     _, four, *_ = both(shown(400, range(50, 250)), monkeypatch, k=4)
     assert four.index.shape == (200, 4)
     apart = (four.index[:, :, None] - four.index[:, None]).abs() + 99 * torch.eye(4)
     assert apart[(four.index >= 0).all(1)].min() > 4
 
 
-def test_routes_and_circuits_end_where_they_say(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_routes_and_circuits_end_where_they_say(monkeypatch):
     whole = Layout(10, 2, (0, 6), ((9, 6, 1.0), (2, 0, 0.5)))
     some = whole.of(torch.tensor([0, 1, 2, 5, 6, 7, 9]))
     assert some.route_starts == (0, 3, 4, 6)
@@ -183,7 +177,7 @@ def test_routes_and_circuits_end_where_they_say(monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.parametrize("room", [5.0, 0.5])
-def test_few_bytes_are_placed_as_by_all_places(room: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_few_bytes_are_placed_as_by_all_places(room, monkeypatch):
     places, queries = 3000, 400
     smooth = F.avg_pool1d(noise(places + 15, 64, seed=1).T[None], 16, 1)[0].T
     route = F.normalize(smooth)
@@ -200,7 +194,7 @@ def test_few_bytes_are_placed_as_by_all_places(room: float, monkeypatch: pytest.
     assert found[1] >= found[0] - 0.01
 
 
-def test_large_maps_and_long_drives_are_large() -> None:
+def test_large_maps_and_long_drives_are_large():
     assert not is_large(1000, 4000)
     assert not is_large(1, 10**6)
     assert is_large(100, 10**5)

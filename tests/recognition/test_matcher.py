@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 
 import pytest
 import torch
 from helpers import streamed
-from torch import Tensor
 
 from dejavu_torch.evaluation.contenders import models_beside
 from dejavu_torch.maps.spectral import SpectralMapper
@@ -17,21 +15,21 @@ from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.localizer import Localizer, Matching
 from dejavu_torch.recognition.select import Acceptance, best_candidates, best_match
 from dejavu_torch.recognition.sequence import SequenceMatcher
-from dejavu_torch.types import Match, SequenceModel, Together
+from dejavu_torch.types import Match
 
 SCORES = torch.rand(30, 40, generator=torch.Generator().manual_seed(3))
 
 
-def matched(matching: Matching, scores: Tensor = SCORES, size: int = 30) -> Match:
+def matched(matching, scores=SCORES, size=30):
     matcher = Localizer(None, matching)
     return Match.joined(map(matcher.match, scores.split(size)))
 
 
-def lengths(speeds: list[float]) -> dict[Together, SequenceModel]:
+def lengths(speeds):
     return {length: SequenceMatcher(length, speeds) for length in (1, 5, 11)}
 
 
-def same(one: Match, other: Match) -> bool:
+def same(one, other):
     return all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
 
 
@@ -39,9 +37,7 @@ def same(one: Match, other: Match) -> bool:
 @pytest.mark.parametrize(
     ("sequence", "speeds"), [(SequenceMatcher(5, [1, 0.5]), [1, 0.5]), (PlaceFilter(within=2), [1.0])]
 )
-def test_a_sequence_and_what_stands_beside_it(
-    sequence: SequenceModel, speeds: list[float], size: int
-) -> None:
+def test_a_sequence_and_what_stands_beside_it(sequence, speeds, size):
     """All out of the scores of single queries."""
     found = matched(Matching(sequence, lengths(speeds)), size=size)
     with torch.no_grad():
@@ -54,13 +50,11 @@ def test_a_sequence_and_what_stands_beside_it(
 
 
 @pytest.mark.parametrize("sequence", [SequenceMatcher(5), PlaceFilter()])
-def test_scores_pass_by_once_and_are_not_held(
-    sequence: SequenceModel, largest_tensor: type, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_scores_pass_by_once_and_are_not_held(sequence, largest_tensor, monkeypatch):
     """A batch is asked for when those before it are matched, and none is asked for twice."""
-    asked: list[int] = []
+    asked = []
 
-    def batches() -> Iterator[Tensor]:
+    def batches():
         for number in range(40):
             asked.append(number)
             yield torch.rand(2, 50)
@@ -73,7 +67,7 @@ def test_scores_pass_by_once_and_are_not_held(
     assert seen.numel <= (11 - 1 + 2) * (50 + 2 * 10)  # a trajectory's places to each side
 
 
-def test_single_queries_alone_where_there_is_no_sequence() -> None:
+def test_single_queries_alone_where_there_is_no_sequence():
     found = matched(Matching(acceptance=Acceptance(0.01)), size=7)
     assert same(found, best_match(SCORES, 0.01))
     assert found.sequences == {}
@@ -82,7 +76,7 @@ def test_single_queries_alone_where_there_is_no_sequence() -> None:
     assert (several.index.sort(1).values.diff(dim=1) > 4).all()
 
 
-def test_of_several_candidates_the_first_has_the_probability_and_is_accepted_by_it() -> None:
+def test_of_several_candidates_the_first_has_the_probability_and_is_accepted_by_it():
     platt = Platt(1.0, 0.0)
     probability = platt.probability(confidence_of(SCORES))
     middle = float(probability.median())
@@ -103,7 +97,7 @@ def test_of_several_candidates_the_first_has_the_probability_and_is_accepted_by_
     assert alone.probability is None
 
 
-def test_places_are_renumbered_everywhere() -> None:
+def test_places_are_renumbered_everywhere():
     match = Match(torch.tensor([3, -1]), torch.tensor([0.0, math.inf]), torch.tensor([True, False]))
     several = Match(torch.tensor([[1, 2], [3, -1]]), torch.zeros(2, 2), torch.ones(2, 2) > 0)
     probability = torch.rand(2, 2)
@@ -131,9 +125,7 @@ def test_places_are_renumbered_everywhere() -> None:
         (SequenceMatcher(30), False, 30, 30, [1, 5, 11, 21, 30]),
     ],
 )
-def test_ways_to_match_that_there_is_room_for(
-    sequence: SequenceModel | None, ordered: bool, queries: int, places: int, keys: list[Together]
-) -> None:
+def test_ways_to_match_that_there_is_room_for(sequence, ordered, queries, places, keys):
     found = models_beside(sequence, ordered, queries, places, within=3)
     assert [*found] == keys
     if isinstance(sequence, PlaceFilter):
@@ -142,10 +134,10 @@ def test_ways_to_match_that_there_is_room_for(
         assert getattr(found["filter"], "within", None) == 3
 
 
-def test_sequences_and_a_filter_beside_single_queries_change_nothing_of_them() -> None:
+def test_sequences_and_a_filter_beside_single_queries_change_nothing_of_them():
     route = SpectralMapper(12.0)(torch.randn(60, 8).cumsum(0))
     queries = route.decode(0)[10:40] + 0.3 * torch.randn(30, 8)
-    also: dict[Together, SequenceModel] = {5: SequenceMatcher(5), "filter": PlaceFilter()}
+    also = {5: SequenceMatcher(5), "filter": PlaceFilter()}
     platt = Platt(3.0, -1.0)
     batches = queries.split(7)  # the same for both: another size of a product rounds otherwise
     alone = Match.joined(map(Localizer(route, Matching(platt=platt)), batches))

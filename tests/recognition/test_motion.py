@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import pytest
 import torch
@@ -11,13 +10,12 @@ from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
 from reference import Steps
-from torch import Tensor
 
 from dejavu_torch.recognition.motion import Layout, Motion, Rates, checked_rates
 
 
 @st.composite
-def steps_of(draw: Callable) -> Steps:
+def steps_of(draw):
     """Small maps of up to three routes, with links, which may part from and meet at one place."""
     places = draw(st.integers(1, 7))
     starts = (0, *sorted(draw(st.sets(st.integers(1, places - 1), max_size=2)) if places > 1 else ()))
@@ -36,18 +34,18 @@ def steps_of(draw: Callable) -> Steps:
     )
 
 
-def motion_of(steps: Steps) -> Motion:
+def motion_of(steps):
     rates = (torch.tensor(one, dtype=torch.float64) for one in steps[1:5])
     layout = Layout(steps.places, steps.directions, tuple(steps.starts), tuple(steps.links), steps.turn)
     return Motion(layout, Rates(*rates))
 
 
-def matrix_of(steps: Steps) -> Tensor:
+def matrix_of(steps):
     return torch.tensor(steps.transitions(), dtype=torch.float64)
 
 
 @given(steps_of())
-def test_a_step_is_that_of_the_matrix_and_keeps_the_mass(steps: Steps) -> None:
+def test_a_step_is_that_of_the_matrix_and_keeps_the_mass(steps):
     matrix, motion = matrix_of(steps), motion_of(steps)
     states = torch.eye(len(matrix), dtype=torch.float64)
     assert torch.allclose(motion.moved(states), matrix, atol=1e-12)
@@ -57,7 +55,7 @@ def test_a_step_is_that_of_the_matrix_and_keeps_the_mass(steps: Steps) -> None:
 
 
 @given(steps_of(), st.integers(0, 99))
-def test_leading_dimensions_are_steps_of_their_own(steps: Steps, seed: int) -> None:
+def test_leading_dimensions_are_steps_of_their_own(steps, seed):
     motion, generator = motion_of(steps), torch.Generator().manual_seed(seed)
     beliefs = torch.rand(2, 3, len(steps.start()), dtype=torch.float64, generator=generator)
     for step in (motion.moved, motion.expected):
@@ -67,7 +65,7 @@ def test_leading_dimensions_are_steps_of_their_own(steps: Steps, seed: int) -> N
 
 @pytest.mark.parametrize("directions", [1, 2])
 @pytest.mark.parametrize("links", [(), ((4, 0, 1.0), (10, 5, 1.0))], ids=["routes", "circuits"])
-def test_the_best_way_is_the_largest_term_of_the_matrix(directions: int, links: tuple) -> None:
+def test_the_best_way_is_the_largest_term_of_the_matrix(directions, links):
     """Where no two ways lead from one place to another, as on circuits that are longer than a move."""
     steps = Steps(11, (0.5, 0.125, 0.125, 0.25), 0.01, 0.02, 0.1, 0.2, directions, (0, 5), links)
     for log in torch.randn(20, 11 * directions + 1, dtype=torch.float64) * 3:
@@ -76,7 +74,7 @@ def test_the_best_way_is_the_largest_term_of_the_matrix(directions: int, links: 
 
 
 @given(steps_of(), st.integers(0, 99))
-def test_counts_are_those_of_each_pair_of_states(steps: Steps, seed: int) -> None:
+def test_counts_are_those_of_each_pair_of_states(steps, seed):
     generator = torch.Generator().manual_seed(seed)
     before, after = torch.rand(2, 4, len(steps.start()), dtype=torch.float64, generator=generator)
     kinds, stay = [], 1 - steps.jump - steps.leave
@@ -95,7 +93,7 @@ def test_counts_are_those_of_each_pair_of_states(steps: Steps, seed: int) -> Non
     assert torch.allclose(torch.cat([counts.moves, torch.stack(counts[1:])]), expected)
 
 
-def test_routes_end_and_a_circuit_does_not() -> None:
+def test_routes_end_and_a_circuit_does_not():
     """Two routes of 3 and 4 places; the second becomes a circuit."""
     steps = Steps(7, (0.0, 1.0), enter=0.5, starts=(0, 3))
     moved = motion_of(steps).moved(torch.eye(15, dtype=torch.float64)).argmax(1).tolist()
@@ -106,7 +104,7 @@ def test_routes_end_and_a_circuit_does_not() -> None:
     assert moved == [1, 2, off, 4, 5, 6, 3, 8, 9, 10, 7, 12, 13, off, off]
 
 
-def test_single_precision_loses_nobody_off_the_end_of_a_road() -> None:
+def test_single_precision_loses_nobody_off_the_end_of_a_road():
     """With nobody leaving, rounding makes no mass negative, whose logarithm would be NaN."""
     moves = torch.tensor([0.2, 0.5, 0.2, 0.05, 0.02, 0.015, 0.015])
     none = torch.tensor(0.0)
@@ -128,6 +126,6 @@ def test_single_precision_loses_nobody_off_the_end_of_a_road() -> None:
         (((1.0,), 0.1, 0.1, math.nan), ["enter nan", "probabilities"]),
     ],
 )
-def test_rates_that_are_no_probabilities_are_refused(given_: tuple, told: list[str]) -> None:
+def test_rates_that_are_no_probabilities_are_refused(given_, told):
     with refused(*told):
         checked_rates(*given_)

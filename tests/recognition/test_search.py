@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import pytest
 import torch
@@ -18,11 +17,11 @@ from dejavu_torch.recognition import localizer
 from dejavu_torch.recognition import search as searching
 from dejavu_torch.recognition.calibration import Calibration, Platt, confidence_of
 from dejavu_torch.recognition.localizer import Localizer, Matching
-from dejavu_torch.recognition.search import Scan, TopK, merge_topk, topk
+from dejavu_torch.recognition.search import Scan, merge_topk, topk
 from dejavu_torch.recognition.select import best_candidates
 
 
-def walk(places: int, numbers: int = 6, seed: int = 0, smooth: float = 0.9) -> Tensor:
+def walk(places, numbers=6, seed=0, smooth=0.9):
     """Descriptors that change slowly, the more slowly the nearer `smooth` is to 1."""
     draw = torch.randn(places, numbers, generator=torch.Generator().manual_seed(seed))
     rows = [draw[0]]
@@ -42,24 +41,24 @@ class Scored(PlaceMap):
         self.rows, self.size, self.batches = table, size, list[int]()
 
     @property
-    def block_places(self) -> int:
+    def block_places(self):
         return self.size
 
-    def scores(self, queries: Tensor) -> Tensor:
+    def scores(self, queries):
         return self.rows[queries[:, 0].long()]
 
-    def score_blocks(self, queries: Tensor) -> Any:
+    def score_blocks(self, queries):
         self.batches.append(len(queries))
         scores = self.scores(queries)
         for first in range(0, self.places, self.size):
             yield first, scores[:, first : first + self.size]
 
 
-def rows_of(route: Scored) -> Tensor:
+def rows_of(route):
     return torch.arange(float(len(route.rows)))[:, None]
 
 
-def table(rows: int, places: int, values: int, seed: int) -> Tensor:
+def table(rows, places, values, seed):
     """Of few different values, so that there are ties, and some places that nothing covers."""
     draw = torch.Generator().manual_seed(seed)
     scores = torch.randint(values, (rows, places), generator=draw).float()
@@ -67,7 +66,7 @@ def table(rows: int, places: int, values: int, seed: int) -> Tensor:
     return scores
 
 
-def assert_equal(found: TopK, expected: TopK) -> None:
+def assert_equal(found, expected):
     assert torch.equal(found[0], expected[0])
     finite = expected[0].isfinite()
     assert torch.equal(found[1][finite], expected[1][finite])
@@ -81,9 +80,7 @@ def assert_equal(found: TopK, expected: TopK) -> None:
     n=st.integers(1, 70),
     seed=st.integers(0, 999),
 )
-def test_the_best_of_blocks_are_those_of_all_scores(
-    rows: int, places: int, values: int, block: int, n: int, seed: int
-) -> None:
+def test_the_best_of_blocks_are_those_of_all_scores(rows, places, values, block, n, seed):
     scores, n = table(rows, places, values, seed), min(n, places)
     score, index = scores.sort(dim=1, stable=True)
     expected = score[:, :n], index[:, :n]
@@ -104,7 +101,7 @@ def test_the_best_of_blocks_are_those_of_all_scores(
     values=st.integers(1, 9),
     seed=st.integers(0, 999),
 )
-def test_candidates_are_those_of_all_scores(places: int, k: int, radius: int, values: int, seed: int) -> None:
+def test_candidates_are_those_of_all_scores(places, k, radius, values, seed):
     scores, k = table(3, places, values, seed), min(k, places)
     route = Scored(scores, 7)
     found = Localizer(
@@ -115,9 +112,7 @@ def test_candidates_are_those_of_all_scores(places: int, k: int, radius: int, va
 
 
 @pytest.mark.parametrize("settings", [{"chunk": 50}, {"chunk": 50, "metric": "l2"}], ids=str)
-def test_a_calibrated_map_finds_the_same_without_all_scores(
-    settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_calibrated_map_finds_the_same_without_all_scores(settings, monkeypatch):
     route = walk(600)
     model = DejaVu(whitening="none", mapper=SpectralMapper(6.0, **settings)).learn(route)
     platt = Platt(4.0, 1.0)
@@ -133,7 +128,7 @@ def test_a_calibrated_map_finds_the_same_without_all_scores(
     torch.testing.assert_close(several.score, best_candidates(scores, 4, 6).score, rtol=1e-5, atol=1e-5)
 
 
-def test_many_of_the_best_are_taken_from_all_scores(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_of_the_best_are_taken_from_all_scores(monkeypatch):
     """Few of them block by block, for as many queries at a time as memory allows."""
     route = Scored(torch.rand(21, 2000), 1000)
     for k, radius, batches in ((3, 5, [21]), (6, 100, [])):
@@ -150,7 +145,7 @@ def test_many_of_the_best_are_taken_from_all_scores(monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.parametrize("metric", ["cosine", "l2"])
-def test_convention_10_scores_are_float32_whatever_the_autocast(metric: Any) -> None:
+def test_convention_10_scores_are_float32_whatever_the_autocast(metric):
     route = SpectralMapper(None, 0.5, 32, metric=metric)(walk(300))
     for queries in (walk(300)[:1], walk(300)[::5]):
         with torch.autocast("cpu", torch.bfloat16):
@@ -158,7 +153,7 @@ def test_convention_10_scores_are_float32_whatever_the_autocast(metric: Any) -> 
         assert_equal(found, Scan(route)(queries, [(3, 0)]))
 
 
-def test_what_cannot_be_searched_so_is_refused() -> None:
+def test_what_cannot_be_searched_so_is_refused():
     wave = walk(128)
     model = DejaVu(whitening="none").learn(wave)
     with refused("search 'all'", "expected auto, coarse, exact or scan"):

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import pytest
 import torch
 from helpers import Fixed, refused, streamed, template_model
 from hypothesis import example, given
 from hypothesis import strategies as st
-from torch import Tensor
 
 from dejavu_torch import DejaVu, SequenceMatcher, compare
-from dejavu_torch.types import FrequencyLayer, Match
+from dejavu_torch.types import FrequencyLayer
 
 
-def literal(scores: list[list[float]], length: int, speeds: list[float]) -> list[list[float]]:
+def literal(scores, length, speeds):
     """Each query, place, speed and step in a loop of its own."""
     places, found = len(scores[0]), []
     for t in range(len(scores)):
@@ -45,7 +43,7 @@ SPEEDS = st.lists(st.sampled_from([1.0, 0.0, 0.5, 2.0, -1.0, 1.3]), min_size=1, 
 
 
 @given(TABLE, st.integers(1, 12), SPEEDS)
-def test_equals_a_literal_loop(rows: list[list[float]], length: int, speeds: list[float]) -> None:
+def test_equals_a_literal_loop(rows, length, speeds):
     found = SequenceMatcher(length, speeds)(torch.tensor(rows, dtype=torch.float64))
     expected = torch.tensor(literal(rows, length, speeds), dtype=torch.float64)
     assert torch.allclose(found, expected, atol=1e-12)
@@ -54,15 +52,13 @@ def test_equals_a_literal_loop(rows: list[list[float]], length: int, speeds: lis
 
 @given(TABLE, st.integers(1, 12), SPEEDS, st.integers(1, 4))
 @example([[0.0, 3.0], [1.0, 0.0], [5.0, 0.0], [0.0, 1.0]], 3, [1.0], 2)  # a batch after whole sequences
-def test_batches_do_not_matter(rows: list[list[float]], length: int, speeds: list[float], size: int) -> None:
+def test_batches_do_not_matter(rows, length, speeds, size):
     matcher, scores = SequenceMatcher(length, speeds), torch.tensor(rows)
     assert torch.equal(torch.cat(list(streamed(matcher, scores.split(size)))), matcher(scores))
 
 
 @given(TABLE, st.integers(1, 12), SPEEDS)
-def test_a_score_is_the_mean_of_its_trajectory(
-    rows: list[list[float]], length: int, speeds: list[float]
-) -> None:
+def test_a_score_is_the_mean_of_its_trajectory(rows, length, speeds):
     matcher, scores = SequenceMatcher(length, speeds), torch.tensor(rows, dtype=torch.float64)
     for place, score in enumerate(matcher(scores)[-1].tolist()):
         if math.isfinite(score):
@@ -72,9 +68,7 @@ def test_a_score_is_the_mean_of_its_trajectory(
 
 
 @given(TABLE, st.integers(1, 12), SPEEDS, st.integers(0, 7))
-def test_trajectories_stay_on_their_route(
-    rows: list[list[float]], length: int, speeds: list[float], cut: int
-) -> None:
+def test_trajectories_stay_on_their_route(rows, length, speeds, cut):
     matcher, scores, cut = SequenceMatcher(length, speeds), torch.tensor(rows), min(cut, len(rows[0]))
     found, _ = matcher.step(scores, matcher.start(len(rows[0])), (0, cut))
     parts = [matcher(part) for part in (scores[:, :cut], scores[:, cut:])]
@@ -82,7 +76,7 @@ def test_trajectories_stay_on_their_route(
 
 
 @given(TABLE, st.integers(1, 12), SPEEDS)
-def test_a_fixed_state_of_nan_is_no_query(rows: list[list[float]], length: int, speeds: list[float]) -> None:
+def test_a_fixed_state_of_nan_is_no_query(rows, length, speeds):
     matcher, scores = SequenceMatcher(length, speeds), torch.tensor(rows)
     state = matcher.start(scores.shape[1], fixed=True)
     for row, expected in zip(scores.split(1), matcher(scores).split(1), strict=True):
@@ -91,7 +85,7 @@ def test_a_fixed_state_of_nan_is_no_query(rows: list[list[float]], length: int, 
         assert torch.equal(found, expected)
 
 
-def test_gradients_reach_every_score_of_a_trajectory() -> None:
+def test_gradients_reach_every_score_of_a_trajectory():
     scores = torch.rand(4, 6, dtype=torch.float64, requires_grad=True)
     matcher = SequenceMatcher(3, [1.0, 2.0])
     finite = matcher(scores).isfinite()
@@ -100,14 +94,14 @@ def test_gradients_reach_every_score_of_a_trajectory() -> None:
     assert gradient.nonzero().tolist() == [[1, 2], [2, 3], [3, 4]]
 
 
-def route(noise: int) -> Tensor:
+def route(noise):
     fresh = torch.Generator().manual_seed(noise)
     places = torch.rand(200, 4, generator=torch.Generator().manual_seed(9))
     return places + 0.2 * torch.randn(200, 4, generator=fresh)
 
 
 @pytest.mark.parametrize("kind", ["templates", "spectral"])
-def test_a_sequence_finds_what_single_frames_do_not(kind: str) -> None:
+def test_a_sequence_finds_what_single_frames_do_not(kind):
     if kind == "templates":
         layer = FrequencyLayer(200, 200, 0, 200, (0, 1, 2, 3))
         model = template_model(periods=Fixed(layer))
@@ -116,7 +110,7 @@ def test_a_sequence_finds_what_single_frames_do_not(kind: str) -> None:
     model.learn(route(0))
     single, many = model.localize(route(1)), model.localize(route(1), sequence=SequenceMatcher(15))
 
-    def right(match: Match) -> float:
+    def right(match):
         return float((match.index == torch.arange(200)).float().mean())
 
     assert right(single) < 0.5
@@ -125,7 +119,7 @@ def test_a_sequence_finds_what_single_frames_do_not(kind: str) -> None:
     assert torch.equal(model.localize(route(1), sequence=SequenceMatcher(15)).index, many.index)
 
 
-def test_a_sequence_longer_than_the_queries_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_sequence_longer_than_the_queries_is_told_once(caplog):
     model = DejaVu(whitening="none")
     compare(route(0), route(1)[:6], "0", model, sequence=SequenceMatcher(11))
     told = [line for line in caplog.messages if "sequence" in line]
@@ -140,7 +134,7 @@ def test_a_sequence_longer_than_the_queries_is_told_once(caplog: pytest.LogCaptu
     SequenceMatcher(11, [0]).check(None, 1)
 
 
-def test_convention_2_a_place_that_nothing_covers_is_not_reported() -> None:
+def test_convention_2_a_place_that_nothing_covers_is_not_reported():
     layer = FrequencyLayer(20, 20, 0, 80, (0, 1, 2, 3))
     model = template_model(periods=Fixed(layer)).learn(route(0)[:90])
     found = model.localize(route(1)[:90], sequence=SequenceMatcher(9))
@@ -160,6 +154,6 @@ def test_convention_2_a_place_that_nothing_covers_is_not_reported() -> None:
         (lambda: SequenceMatcher(3)(torch.rand(2, 4), torch.rand(2, 5)), ["(2, 4)", "after (2, 5)"]),
     ],
 )
-def test_settings_that_make_no_sequence_are_refused(make: Callable[[], object], words: list[str]) -> None:
+def test_settings_that_make_no_sequence_are_refused(make, words):
     with refused(*words):
         make()

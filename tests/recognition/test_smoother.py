@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 from itertools import product
 
 import pytest
@@ -13,7 +12,6 @@ from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
 from reference import Steps, all_paths, forward_backward
-from torch import Tensor
 
 from dejavu_torch.recognition.motion import Motion
 from dejavu_torch.recognition.smoother import PlaceSmoother, normalised, stretches, sweep, updated_rates
@@ -21,24 +19,24 @@ from dejavu_torch.recognition.smoother import PlaceSmoother, normalised, stretch
 MOVES = (0.2, 0.5, 0.2, 0.1)
 
 
-def noise(*shape: int, seed: int = 0) -> Tensor:
+def noise(*shape, seed=0):
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
 
 
-def shown(places: int, path: Sequence[int], seed: int = 0, clear: float = 2.5) -> Tensor:
+def shown(places, path, seed=0, clear=2.5):
     """Scores of queries that show a place each, and its neighbours a little; -1 shows none."""
     scores, at = noise(len(path), places, seed=seed), torch.tensor(path)[:, None]
     near = (torch.arange(places) - at).abs()
     return scores - clear * torch.where(at < 0, 0, 0.5 ** near.float())
 
 
-def evidence(smoother: PlaceSmoother, scores: Tensor) -> tuple[Tensor, Tensor]:
+def evidence(smoother, scores):
     """What the scores say of the places, and which queries are in a stop."""
     drive = smoother.drive(scores)
     return drive.log_likelihood(torch.arange(len(scores))), drive.spacing.still
 
 
-def steps_of(smoother: PlaceSmoother, places: int, starts: Sequence[int] = (0,)) -> Steps:
+def steps_of(smoother, places, starts=(0,)):
     with torch.no_grad():
         _, jump, leave = smoother.rate_logits.softmax(0).tolist()
         moves, enter = smoother.move_logits.softmax(0).tolist(), float(smoother.enter_logit.sigmoid())
@@ -64,9 +62,7 @@ SHAPE = st.tuples(st.integers(1, 9), st.integers(2, 6), st.integers(0, 99))
 
 
 @given(SMOOTHER, SHAPE, st.integers(1, 5), st.booleans())
-def test_equals_a_literal_loop_in_blocks_of_any_size(
-    smoother: PlaceSmoother, shape: tuple[int, int, int], size: int, two_routes: bool
-) -> None:
+def test_equals_a_literal_loop_in_blocks_of_any_size(smoother, shape, size, two_routes):
     queries, places, seed = shape
     scores, starts = noise(queries, places, seed=seed).double(), (0, 1) if two_routes else (0,)
     smoother = smoother.double()
@@ -84,13 +80,13 @@ def test_equals_a_literal_loop_in_blocks_of_any_size(
     assert sum(block.log.sum().item() for block in blocks) == pytest.approx(total, abs=1e-9)
 
 
-def stopped() -> Tensor:
+def stopped():
     """24 queries, 22 of them of a stop."""
     moving = noise(3, 2, seed=4)
     return torch.cat([moving[:2], moving[1:2].expand(21, 2), moving[2:]]).double()
 
 
-def test_a_stop_moves_nowhere_and_counts_once() -> None:
+def test_a_stop_moves_nowhere_and_counts_once():
     smoother, scores = PlaceSmoother(MOVES, 0.1, 0.1, 0.1, 0.3).double(), stopped()
     log, still = evidence(smoother, scores)
     assert still.tolist() == [False] * 2 + [True] * 21 + [False]
@@ -104,7 +100,7 @@ def test_a_stop_moves_nowhere_and_counts_once() -> None:
 
 
 @given(SMOOTHER, st.integers(0, 99))
-def test_the_path_and_the_likelihood_are_those_of_all_sequences(smoother: PlaceSmoother, seed: int) -> None:
+def test_the_path_and_the_likelihood_are_those_of_all_sequences(smoother, seed):
     smoother.links, smoother.loop = (), False  # where two ways lead to a place, each is one of its own
     smoother, scores = smoother.double(), 3 * noise(4, 3, seed=seed).double()
     log, still = evidence(smoother, scores)
@@ -114,7 +110,7 @@ def test_the_path_and_the_likelihood_are_those_of_all_sequences(smoother: PlaceS
     assert smoother.log_evidence(scores).item() == pytest.approx(math.log(sum(values.values())))
 
 
-def test_the_path_stands_still_and_leaves_the_map() -> None:
+def test_the_path_stands_still_and_leaves_the_map():
     path = [*range(10, 40), *[40] * 40, *range(40, 60), *[-1] * 60, *range(20, 50)]
     scores = shown(80, path, clear=5.0)
     scores[31:70] = scores[30]
@@ -132,16 +128,16 @@ class Likelihood(torch.nn.Module):
         super().__init__()
         self.smoother = smoother
 
-    def forward(self, scores: Tensor) -> Tensor:
+    def forward(self, scores):
         return self.smoother.log_evidence(scores)
 
 
-def test_gradients_reach_moves_and_rates_but_not_what_is_tempered() -> None:
+def test_gradients_reach_moves_and_rates_but_not_what_is_tempered():
     model, scores = Likelihood(PlaceSmoother(MOVES, 0.1, 0.1, 0.2)).double(), noise(6, 4).double()
     names, values = zip(*model.named_parameters(), strict=True)
     assert names == ("smoother.move_logits", "smoother.rate_logits", "smoother.enter_logit")
 
-    def run(*values: Tensor) -> Tensor:
+    def run(*values):
         return torch.func.functional_call(model, dict(zip(names, values, strict=True)), (scores,))
 
     assert torch.autograd.gradcheck(run, values)
@@ -151,7 +147,7 @@ def test_gradients_reach_moves_and_rates_but_not_what_is_tempered() -> None:
 
 
 @pytest.mark.parametrize("none", [{"jump": 0.0}, {"leave": 0.0}, {"enter": 0.0}, {"jump": 0.0, "leave": 0.0}])
-def test_what_cannot_happen_stays_finite_in_single_precision(none: dict[str, float]) -> None:
+def test_what_cannot_happen_stays_finite_in_single_precision(none):
     """Queries that contradict each other by more than single precision holds."""
     scores = shown(60, [*range(20), *range(40, 60), *range(20, 40)], clear=20.0)
     smoother = PlaceSmoother((0.0, 1.0), separation=6.0, turn=0.0, **none)
@@ -160,7 +156,7 @@ def test_what_cannot_happen_stays_finite_in_single_precision(none: dict[str, flo
     assert all(one.grad is not None and bool(one.grad.isfinite().all()) for one in smoother.parameters())
 
 
-def test_climbing_the_likelihood_finds_the_moves_that_counting_finds() -> None:
+def test_climbing_the_likelihood_finds_the_moves_that_counting_finds():
     """With the same evidence, and the prior of five more steps of each kind of move."""
     scores = shown(15, [*range(0, 15, 2), *range(14, 0, -3), *range(8)], clear=3.0).double()
     smoother, prior = PlaceSmoother(MOVES, 0.02, 0.02, 0.05).double(), torch.full((4,), 5.0).double()
@@ -178,7 +174,7 @@ def test_climbing_the_likelihood_finds_the_moves_that_counting_finds() -> None:
         smoother.enter_logit.copy_(rates.enter.logit())
     climber = torch.optim.LBFGS([smoother.move_logits], max_iter=100, tolerance_grad=1e-9)
 
-    def loss() -> Tensor:
+    def loss():
         climber.zero_grad()
         value = -smoother.log_evidence(scores) - prior @ smoother.move_logits.log_softmax(0)
         value.backward()
@@ -203,7 +199,7 @@ DRIVES = {
 
 
 @pytest.mark.parametrize("drive", DRIVES.values(), ids=DRIVES)
-def test_drives_of_any_kind_are_found_where_single_queries_are_not(drive: Sequence[int]) -> None:
+def test_drives_of_any_kind_are_found_where_single_queries_are_not(drive):
     truth, places = torch.tensor(drive), 400 if max(drive) > 199 else 200
     scores = shown(places, drive, clear=2.0)
     if drive is DRIVES["a stop"]:
@@ -220,7 +216,7 @@ def test_drives_of_any_kind_are_found_where_single_queries_are_not(drive: Sequen
 
 
 @pytest.mark.slow
-def test_a_stop_is_one_of_the_queries_that_another_speed_has_to_explain() -> None:
+def test_a_stop_is_one_of_the_queries_that_another_speed_has_to_explain():
     """80 queries that are alike, at four times the speed, and 800 of a stop."""
     scores, descriptors = shown(400, range(0, 320, 4), clear=3.5), noise(80, 16, seed=3)
     for t in range(1, 80):
@@ -235,7 +231,7 @@ def test_a_stop_is_one_of_the_queries_that_another_speed_has_to_explain() -> Non
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_another_route_is_no_drive(seed: int) -> None:
+def test_another_route_is_no_drive(seed):
     scores = noise(200, 300, seed=seed)
     smoother = PlaceSmoother().fit(scores)
     assert not smoother.is_drive
@@ -243,7 +239,7 @@ def test_another_route_is_no_drive(seed: int) -> None:
     assert (-smoother(scores)).exp().max() < 0.5
 
 
-def test_circuits_links_and_routes_lead_where_they_say() -> None:
+def test_circuits_links_and_routes_lead_where_they_say():
     laps = [t % 50 for t in range(30, 130)]
     scores = shown(50, laps, clear=2.5)
     once, round_ = PlaceSmoother(MOVES, jump=1e-6), PlaceSmoother(MOVES, jump=1e-6, loop=True)
@@ -257,7 +253,7 @@ def test_circuits_links_and_routes_lead_where_they_say() -> None:
     assert once.log_evidence(scores, route_starts=(0, 10)) < once.log_evidence(scores)
 
 
-def test_queries_that_say_nothing_are_as_without_them() -> None:
+def test_queries_that_say_nothing_are_as_without_them():
     """What lies between is filled in by the queries before and after: the same for all kinds of silence."""
     scores = shown(60, range(60))
     smoother = PlaceSmoother().fit(scores)
@@ -274,7 +270,7 @@ def test_queries_that_say_nothing_are_as_without_them() -> None:
     assert found[0][20:25, :-1].argmax(1).tolist() == [*range(20, 25)]
 
 
-def test_only_what_is_scored_is_answered() -> None:
+def test_only_what_is_scored_is_answered():
     scores = shown(60, range(60))
     scores[:, 30:40], scores[7], scores[9, 3] = math.inf, math.inf, math.nan
     found = PlaceSmoother(within=1).fit(scores)(scores)
@@ -284,7 +280,7 @@ def test_only_what_is_scored_is_answered() -> None:
     assert PlaceSmoother().fit(closed)(closed).isinf().all()
 
 
-def test_few_queries_and_places_are_answered() -> None:
+def test_few_queries_and_places_are_answered():
     scores = shown(20, [7, 8], clear=9.0)
     for queries in (0, 1, 2):
         for smoother in (PlaceSmoother(within=0), PlaceSmoother(within=0).fit(scores[:queries])):
@@ -300,7 +296,7 @@ def test_few_queries_and_places_are_answered() -> None:
     assert alone(noise(30, 1)).shape == (30, 1)
 
 
-def test_leading_dimensions_are_drives_of_their_own() -> None:
+def test_leading_dimensions_are_drives_of_their_own():
     scores, smoother = noise(2, 3, 8, 9), PlaceSmoother(within=1)
     found = smoother(scores)
     assert torch.equal(found[1, 2], smoother(scores[1, 2]))
@@ -309,7 +305,7 @@ def test_leading_dimensions_are_drives_of_their_own() -> None:
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float16, torch.bfloat16])
-def test_other_precisions_give_the_same_places(dtype: torch.dtype) -> None:
+def test_other_precisions_give_the_same_places(dtype):
     scores = shown(80, range(80), clear=3.0)
     found = PlaceSmoother(within=0).fit(scores)(scores)
     smoother = PlaceSmoother(within=0).to(dtype).fit(scores.to(dtype))
@@ -319,7 +315,7 @@ def test_other_precisions_give_the_same_places(dtype: torch.dtype) -> None:
     assert smoother(scores).isfinite().all()
 
 
-def test_a_device_gives_what_the_cpu_gives() -> None:
+def test_a_device_gives_what_the_cpu_gives():
     scores = shown(8, [*range(5), *[5] * 22], clear=3.0).double()
     scores[5:] = scores[5]
     smoother = PlaceSmoother(MOVES).double().fit(scores)
@@ -332,11 +328,11 @@ def test_a_device_gives_what_the_cpu_gives() -> None:
             assert torch.equal(path.cpu(), smoother.path(scores))
 
 
-def test_scores_may_be_made_as_they_are_asked_for() -> None:
+def test_scores_may_be_made_as_they_are_asked_for():
     scores, descriptors = shown(50, range(50)), noise(50, 8)
-    asked: list[int] = []
+    asked = []
 
-    def rows(numbers: Tensor) -> Tensor:
+    def rows(numbers):
         asked.extend(numbers.tolist())
         return scores[numbers]
 
@@ -352,7 +348,7 @@ def test_scores_may_be_made_as_they_are_asked_for() -> None:
 
 
 @given(st.integers(1, 5000), st.floats(1, 2000))
-def test_stretches_are_spread_over_the_drive(queries: int, correlation: float) -> None:
+def test_stretches_are_spread_over_the_drive(queries, correlation):
     picked = stretches(queries, correlation)
     assert picked.numel() <= min(queries, 1000) < picked.numel() + 10
     assert picked[0, 0] == 0
@@ -361,7 +357,7 @@ def test_stretches_are_spread_over_the_drive(queries: int, correlation: float) -
     assert (picked[1:, 0] > picked[:-1, -1]).all()
 
 
-def test_changes_that_are_slow_make_no_query_say_less() -> None:
+def test_changes_that_are_slow_make_no_query_say_less():
     """Light that comes and goes in 200 queries, beside noise of a query."""
     slow = torch.sin(torch.arange(800) / 200 * 2 * math.pi)[:, None] + noise(800, 4)
     clear, unclear = (shown(900, range(800), clear=one) for one in (6.0, 1.2))
@@ -371,7 +367,7 @@ def test_changes_that_are_slow_make_no_query_say_less() -> None:
     assert PlaceSmoother().fit(unclear, slow).tempering > 9
 
 
-def test_queries_that_say_nothing_do_not_make_the_others_say_more() -> None:
+def test_queries_that_say_nothing_do_not_make_the_others_say_more():
     walk = noise(200, 12, seed=1).cumsum(0)
     scores = torch.cdist(walk[20:180], walk) + 50
     clean = PlaceSmoother().fit(scores)
@@ -381,13 +377,13 @@ def test_queries_that_say_nothing_do_not_make_the_others_say_more() -> None:
         assert PlaceSmoother().fit(odd).correlation == pytest.approx(clean.correlation, rel=0.4)
 
 
-def test_a_camera_that_never_leaves_the_map_has_a_place() -> None:
+def test_a_camera_that_never_leaves_the_map_has_a_place():
     smoother = PlaceSmoother(jump=0.0, leave=0.0, enter=0.0)
     scores = shown(30, range(30))
     assert (smoother.fit(scores)(scores).argmin(1) - torch.arange(30)).abs().max() <= 1
 
 
-def test_rates_and_moves_are_the_priors_of_a_fit() -> None:
+def test_rates_and_moves_are_the_priors_of_a_fit():
     scores = shown(90, range(80))
     plain = PlaceSmoother().fit(scores).settled()
     given = PlaceSmoother((0.5, 0.5), jump=0.1, enter=0.3).fit(scores).settled()
@@ -396,7 +392,7 @@ def test_rates_and_moves_are_the_priors_of_a_fit() -> None:
     assert len(given["moves"]) == 2
 
 
-def test_the_module_says_what_it_has_settled_on() -> None:
+def test_the_module_says_what_it_has_settled_on():
     told = repr(PlaceSmoother((0.25, 0.75), jump=0.01, leave=0.02, enter=0.1, separation=2, tempering=3))
     assert "moves=[0.25, 0.75], jump=0.01, leave=0.02, enter=0.1, separation=2, " in told
     assert "tempering=3, " in told
@@ -432,6 +428,6 @@ def test_the_module_says_what_it_has_settled_on() -> None:
         (lambda: PlaceSmoother().step(torch.rand(2, 4), torch.rand(5)), ["whole drive", "SequenceMatcher"]),
     ],
 )
-def test_bad_input_is_refused(make: Callable[[], object], told: list[str]) -> None:
+def test_bad_input_is_refused(make, told):
     with refused(*told):
         make()

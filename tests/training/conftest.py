@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from small_training import CONFIG, MINE, footage, train
@@ -15,7 +13,7 @@ CALIBRATED = ("test_export", "test_train_command")
 
 
 @pytest.fixture(scope="session")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made(tmp_path_factory):
     """A folder with traverses, a config, a user's module, and a training."""
     folder = tmp_path_factory.mktemp("train")
     arrays = {"one": footage(), "two": footage(0.1), "short": footage()[:2], "single": footage()[:1]}
@@ -34,21 +32,21 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(autouse=True)
-def _without_calibration(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+def _without_calibration(request, monkeypatch):
     """Of many small trainings, of which it takes a third; those of the command are calibrated."""
     if request.path.stem not in CALIBRATED:
         monkeypatch.setattr(DejaVu, "calibrate", lambda self, *_, **__: self)
 
 
 @pytest.fixture(autouse=True)
-def _without_a_word_on_short_routes(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+def _without_a_word_on_short_routes(request, monkeypatch):
     """As all of these are; test_held_out.py is about it."""
     if request.path.stem != "test_held_out":
         monkeypatch.setattr(RouteTask, "_say_few", lambda _: None)
 
 
 @pytest.fixture
-def folder(made: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(made, monkeypatch):
     monkeypatch.chdir(made)
     monkeypatch.syspath_prepend(str(made))
     return made

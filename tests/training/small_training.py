@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
 
-import pytest
 import torch
 from pytorch_lightning import Callback, Trainer
 from pytorch_lightning.callbacks import ModelCheckpoint
-from torch import Tensor, nn
+from torch import nn
 
 from dejavu_torch import DejaVu, ImposedPeriods, SpectralMapper, TemplateMapper
 from dejavu_torch.cli import main
@@ -19,17 +17,15 @@ from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.embedding import Embedding
-from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.training.datamodule import RouteData
 from dejavu_torch.training.descriptors import DescriptorTask
 from dejavu_torch.training.export import MapExport
-from dejavu_torch.training.task import RouteTask
 from dejavu_torch.training.templates import TemplateTask
 
 FRAMES = 40
 
 
-def footage(noise: float = 0.0, frames: int = FRAMES, side: int = 16) -> Tensor:
+def footage(noise=0.0, frames=FRAMES, side=16):
     """(N,side,side) uint8, a window slid along a smooth strip by 2 pixels a frame."""
     random = torch.Generator().manual_seed(0)
     strip = torch.rand(1, 1, 4, frames, generator=random)
@@ -39,76 +35,76 @@ def footage(noise: float = 0.0, frames: int = FRAMES, side: int = 16) -> Tensor:
     return (255 * noisy.clamp(0, 1)).byte()
 
 
-def backbone(dimension: int = 8) -> SmallCNN:
+def backbone(dimension=8):
     return SmallCNN(dimension, channels=1, resize=(16, 16), widths=(4, 8), squeeze=4)
 
 
-def coded(**settings: Any) -> Embedding:
+def coded(**settings):
     """With a hidden layer: a descriptor, and a code of it."""
     given = {"dimension": 12, "channels": 1, "resize": (16, 16), "hidden": 16} | settings
     return Embedding(**{"network": backbone()} | given)
 
 
-def mapper(periods: PeriodFinder | None = None, **settings: Any) -> TemplateMapper:
+def mapper(periods=None, **settings):
     return TemplateMapper(ImposedPeriods([3, 4, 5], bin=2) if periods is None else periods, **settings)
 
 
-def new_task(**settings: Any) -> TemplateTask:
+def new_task(**settings):
     return TemplateTask(**{"backbone": backbone(), "mapper": mapper()} | settings)
 
 
-def new_descriptor(**settings: Any) -> DescriptorTask:
+def new_descriptor(**settings):
     return DescriptorTask(**{"backbone": coded(), "mapper": SpectralMapper(20.0)} | settings)
 
 
-def still(**strengths: Any) -> Augmentation:
+def still(**strengths):
     """Which changes nothing but what is given."""
     none = dict.fromkeys(("rotation", "scale", "gamma", "illumination", "blur", "occlusion", "noise"), 0.0)
     pairs = dict.fromkeys(("colour", "shift", "exposure"), (0.0, 0.0))
     return Augmentation(**none | pairs | strengths)  # type: ignore[arg-type]
 
 
-def data_of(source: Tensor | None = None, **settings: Any) -> RouteData:
+def data_of(source=None, **settings):
     given = {"tolerance": 2, "batch_size": 16} | settings
     return RouteData(ArrayTraverse(footage() if source is None else source), **given)
 
 
-def trainer(folder: Path, *callbacks: Callback, **settings: Any) -> Trainer:
+def trainer(folder, *callbacks, **settings):
     given = {"max_steps": 4, "accelerator": "cpu", "enable_checkpointing": bool(callbacks)} | settings
     quiet = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False}
     return Trainer(default_root_dir=folder, callbacks=[*callbacks, MapExport()], **quiet, **given)
 
 
-def last(folder: Path, **settings: Any) -> ModelCheckpoint:
+def last(folder, **settings):
     """Keeps `checkpoints/last.ckpt`, as the command does."""
     return ModelCheckpoint(folder / "checkpoints", save_last=True, save_top_k=0, **settings)
 
 
-def heights(steps: int) -> list[float]:
+def heights(steps):
     """The learning rates of so many steps, beside the highest."""
     rise = max(1, steps // 10)
     falls = [0.5 + 0.5 * math.cos(math.pi * k / (steps - rise)) for k in range(steps - rise)]
     return [(k + 1) / rise for k in range(rise)] + falls
 
 
-def fit(folder: Path, task: RouteTask, data: RouteData, **settings: Any) -> DejaVu:
+def fit(folder, task, data, **settings):
     """The map that a training writes."""
     trainer(folder, **settings).fit(task, data)
     return DejaVu.load(folder / "map.safetensors")
 
 
-def warned(caplog: pytest.LogCaptureFixture) -> list[str]:
+def warned(caplog):
     """The package's warnings, but for those that tell of this machine."""
     told = [record.getMessage() for record in caplog.records if record.name == "dejavu_torch"]
     return [line for line in told if "bfloat16" not in line and "GPU available but not used" not in line]
 
 
-def recall(model: DejaVu, query: Tensor) -> float:
+def recall(model, query):
     truth = torch.arange(len(query))[:, None]
     return evaluate(model.localize(ArrayTraverse(query)), truth, tolerance=2).recall_at_1
 
 
-def assert_same_scores(task: RouteTask, model: DejaVu) -> None:
+def assert_same_scores(task, model):
     """Of the task, of its map, and of the exported program."""
     frames = footage(0.1)[:7, None] / 255
     with torch.no_grad():
@@ -128,7 +124,7 @@ class Stop(Callback):
     def __init__(self, steps: int, path: Path | None = None, exception: BaseException | None = None) -> None:
         self.steps, self.path, self.exception = steps, path, exception
 
-    def on_train_batch_end(self, trainer: Any, *_: Any) -> None:
+    def on_train_batch_end(self, trainer, *_):
         if trainer.global_step == self.steps:
             if self.path is not None:
                 trainer.save_checkpoint(self.path)
@@ -198,5 +194,5 @@ class Interrupted(Plain):
 DESCRIPTOR = ["--model", "DescriptorTask", "--model.mapper", "SpectralMapper"]
 
 
-def train(command: str, *options: object, config: str = "train.yaml") -> None:
+def train(command, *options, config="train.yaml"):
     main(["train", command, "--config", config, *map(str, options)])

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
-
 import pytest
 import torch
 from helpers import refused
@@ -21,17 +18,17 @@ from small_training import (
     trainer,
     warned,
 )
-from torch import Tensor, nn
+from torch import nn
 
 from dejavu_torch import HOG, DejaVu
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.embedding import Embedding
-from dejavu_torch.training.task import RouteTask, freeze_parts, start_from
+from dejavu_torch.training.task import freeze_parts, start_from
 
 RUNNING = ("running_mean", "running_var", "num_batches_tracked")
 
 
-def changed(tmp_path: Path, module: nn.Module, **settings: Any) -> tuple[set[str], RouteTask]:
+def changed(tmp_path, module, **settings):
     """The names in the backbone's state that a training changes."""
     before = {name: value.clone() for name, value in module.state_dict().items()}
     task = new_task(backbone=module, **settings)
@@ -40,11 +37,11 @@ def changed(tmp_path: Path, module: nn.Module, **settings: Any) -> tuple[set[str
     return {name for name, value in before.items() if not torch.equal(value, after[name])}, task
 
 
-def trained(task: RouteTask) -> set[str]:
+def trained(task):
     return {name for name, parameter in task.named_parameters() if parameter.requires_grad}
 
 
-def test_frozen_wholly_it_stays_as_it_was(tmp_path: Path) -> None:
+def test_frozen_wholly_it_stays_as_it_was(tmp_path):
     start = fit(tmp_path, new_task(backbone=(module := backbone()), freeze=[""], lr=1e-12), data_of())
     names, task = changed(tmp_path, module, freeze=[""])
     assert names == set()
@@ -52,12 +49,12 @@ def test_frozen_wholly_it_stays_as_it_was(tmp_path: Path) -> None:
     assert trained(task) == {"log_temperature", "dejavu.map.templates"}
 
 
-def normed() -> nn.Module:
+def normed():
     norm = nn.InstanceNorm2d(2, affine=True, track_running_stats=True)
     return nn.Sequential(nn.Conv2d(1, 2, 5, stride=4), norm, nn.Flatten(), nn.Linear(18, 4))
 
 
-def test_frozen_in_part_only_that_part_stays(tmp_path: Path) -> None:
+def test_frozen_in_part_only_that_part_stays(tmp_path):
     """With its running statistics, also those of instances."""
     names, _ = changed(tmp_path, module := backbone(), freeze=["convolutions.1"])
     # the bias before a standardisation is taken out again
@@ -69,7 +66,7 @@ def test_frozen_in_part_only_that_part_stays(tmp_path: Path) -> None:
     assert {"1.running_mean", "1.running_var"} < names
 
 
-def test_frozen_batch_norm_keeps_its_statistics_and_learns_its_weights(tmp_path: Path) -> None:
+def test_frozen_batch_norm_keeps_its_statistics_and_learns_its_weights(tmp_path):
     names, task = changed(tmp_path, module := backbone(), batch_norm="frozen")
     statistics = {name for name in module.state_dict() if name.endswith(RUNNING)}
     assert statistics
@@ -79,14 +76,14 @@ def test_frozen_batch_norm_keeps_its_statistics_and_learns_its_weights(tmp_path:
     assert module.training
 
 
-def test_a_prefix_of_nothing_is_refused() -> None:
+def test_a_prefix_of_nothing_is_refused():
     with refused("'nix'", "SmallCNN", "convolutions, linear"):
         new_task(freeze=["linear", "nix"])
     with refused("''", "HOG", "it has none"):
         freeze_parts(HOG(), [""], "train")
 
 
-def test_a_map_gives_a_backbone_to_start_from(tmp_path: Path) -> None:
+def test_a_map_gives_a_backbone_to_start_from(tmp_path):
     first, path = new_task(weight_bits=32), tmp_path / "map.safetensors"
     fit(tmp_path, first, data_of())
     start_from(module := backbone(), path)
@@ -98,7 +95,7 @@ def test_a_map_gives_a_backbone_to_start_from(tmp_path: Path) -> None:
         start_from(module, tmp_path / "gone")
 
 
-def test_a_foreign_network_learns(tmp_path: Path) -> None:
+def test_a_foreign_network_learns(tmp_path):
     """Two trainings of a step and of many, whose maps take its weights along."""
     noisy, found = footage(0.1), []
     for lr, steps in ((1e-9, 1), (3e-3, 60)):
@@ -114,14 +111,14 @@ def test_a_foreign_network_learns(tmp_path: Path) -> None:
         DejaVu.load(tmp_path / "map.safetensors")
 
 
-def test_hog_has_nothing_to_train_but_the_map_is(tmp_path: Path) -> None:
+def test_hog_has_nothing_to_train_but_the_map_is(tmp_path):
     task = new_task(backbone=HOG(cell=4, block=1))
     model = fit(tmp_path, task, data_of())
     assert trained(task) == {"log_temperature", "dejavu.map.templates"}
     assert recall(model, footage(0.02)) > 0.5
 
 
-def test_ready_features_leave_a_backbone_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_ready_features_leave_a_backbone_out(tmp_path, caplog):
     features, task = torch.randn(FRAMES, 6), new_task()
     running = trainer(tmp_path)
     running.fit(task, data_of(features))
@@ -141,8 +138,8 @@ class Wrong(nn.Module):
         self.linear = nn.Linear(256, 8)
         self.what, self.calls = what, 0
 
-    def forward(self, frames: Tensor) -> Tensor:
-        features: Tensor = self.linear(frames.flatten(1))
+    def forward(self, frames):
+        features = self.linear(frames.flatten(1))
         self.calls += self.training
         late = {1: float("nan")}.get(self.calls // 4, 1.0)
         return {"3d": features[..., None], "half": features[::2], "nan": features / 0 * 0}.get(
@@ -165,8 +162,6 @@ class Wrong(nn.Module):
     ],
     ids=["3d", "half", "nan", "late", "CNN's channels", "channels"],
 )
-def test_wrong_features_and_channels_are_told_at_once(
-    tmp_path: Path, module: nn.Module, facts: tuple[str, ...]
-) -> None:
+def test_wrong_features_and_channels_are_told_at_once(tmp_path, module, facts):
     with refused(*facts):
         fit(tmp_path, new_task(backbone=module), data_of(), max_steps=9)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from fractions import Fraction
-from pathlib import Path
 
 import pytest
 import torch
@@ -18,7 +17,6 @@ from dejavu_torch.training.losses import (
     place_chance,
     place_cross_entropy,
 )
-from dejavu_torch.training.task import RouteTask
 from dejavu_torch.types import FrequencyLayer
 
 FEW, STEPS = 20, 30  # steps that tell, and of a training
@@ -26,17 +24,17 @@ ALIKE = torch.full((FRAMES, 16, 16), 128, dtype=torch.uint8)
 
 
 @pytest.fixture
-def few(monkeypatch: pytest.MonkeyPatch) -> None:
+def few(monkeypatch):
     """Losses of fewer steps tell."""
     monkeypatch.setattr("dejavu_torch.training.losses.LAST", FEW)
 
 
-def task_of(kind: str) -> RouteTask:
+def task_of(kind):
     return new_descriptor(backbone=backbone(32)) if kind == "spectral" else new_task()
 
 
 @pytest.mark.parametrize("tolerance", [0, 3])
-def test_no_blind_guess_of_the_place_is_better(tolerance: int) -> None:
+def test_no_blind_guess_of_the_place_is_better(tolerance):
     """Whatever places it prefers."""
     torch.manual_seed(0)
     places, guesses = torch.arange(60)[:, None], [torch.zeros(60), *(5 * torch.randn(20, 60))]
@@ -46,7 +44,7 @@ def test_no_blind_guess_of_the_place_is_better(tolerance: int) -> None:
     assert place_chance(2 * tolerance + 1, tolerance) == 0
 
 
-def test_no_blind_guess_of_the_phase_is_better() -> None:
+def test_no_blind_guess_of_the_phase_is_better():
     torch.manual_seed(0)
     plan = (FrequencyLayer(Fraction(7), 7, 0, 10, (0,)), FrequencyLayer(Fraction(20), 4, 0, 10, (0,)))
     places = torch.arange(10)[:, None]
@@ -68,9 +66,7 @@ def test_no_blind_guess_of_the_phase_is_better() -> None:
         ((3.3, 3.27), 9.0, LAST, True),  # hardly
     ],
 )
-def test_chance_is_told_by_the_losses_of_the_last_steps(
-    place: tuple[float, float], phase: float, steps: int, refused_: bool
-) -> None:
+def test_chance_is_told_by_the_losses_of_the_last_steps(place, phase, steps, refused_):
     last = LastLosses()
     for i in range(steps):
         last.append({"place": torch.tensor(place[2 * i // LAST]), "phase": torch.tensor(phase)})
@@ -83,7 +79,7 @@ def test_chance_is_told_by_the_losses_of_the_last_steps(
 
 @pytest.mark.parametrize("kind", ["templates", "spectral"])
 @pytest.mark.usefixtures("few")
-def test_frames_that_are_all_alike_end_a_training_ahead_of_its_last_step(tmp_path: Path, kind: str) -> None:
+def test_frames_that_are_all_alike_end_a_training_ahead_of_its_last_step(tmp_path, kind):
     running = trainer(tmp_path, max_steps=9 * FEW, limit_val_batches=0)
     with refused("nothing is learned", "chance 2.08"):  # log(40 places / 5 right ones)
         running.fit(task_of(kind), data_of(ALIKE))

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import resource
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -30,10 +28,9 @@ from torch import Tensor
 from dejavu_torch import DejaVu, ImposedPeriods, SpectralMapper
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.training.checkpoint import read_checkpoint
-from dejavu_torch.training.task import RouteTask
 
 STEPS = 10
-KINDS: dict[str, Callable[..., RouteTask]] = {
+KINDS = {
     "templates": new_task,
     "code": lambda **given: new_task(**{"backbone": coded()} | given),
     "spectral": new_descriptor,
@@ -42,7 +39,7 @@ KINDS: dict[str, Callable[..., RouteTask]] = {
 
 
 @pytest.fixture(scope="module")
-def parts(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def parts(tmp_path_factory):
     """Checkpoints of trainings that ended at step 4."""
     folder = tmp_path_factory.mktemp("parts")
     for kind, task in KINDS.items():
@@ -51,13 +48,11 @@ def parts(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_resumed_run_takes_the_steps_that_are_left(
-    tmp_path: Path, parts: dict[str, Path], kind: str
-) -> None:
+def test_a_resumed_run_takes_the_steps_that_are_left(tmp_path, parts, kind):
     again, running, rates = KINDS[kind](), trainer(tmp_path, max_steps=STEPS), []
     take = again.training_step
 
-    def taken(*given: Any) -> Any:
+    def taken(*given):
         loss = take(*given)
         rates.append(running.optimizers[0].param_groups[0]["lr"] / again.lr)
         return loss
@@ -70,7 +65,7 @@ def test_a_resumed_run_takes_the_steps_that_are_left(
     assert (model.trained.steps, model.map.places) == (STEPS, FRAMES)
 
 
-def test_what_a_checkpoint_holds_is_taken_over(tmp_path: Path, parts: dict[str, Path]) -> None:
+def test_what_a_checkpoint_holds_is_taken_over(tmp_path, parts):
     for kind in ("templates", "code"):
         task = KINDS[kind]()
         trainer(tmp_path).validate(task, data_of(), ckpt_path=parts[kind], verbose=False)
@@ -78,9 +73,7 @@ def test_what_a_checkpoint_holds_is_taken_over(tmp_path: Path, parts: dict[str, 
         assert all(torch.equal(own[n], value) for n, value in state.items() if isinstance(value, Tensor))
 
 
-def test_a_spectral_checkpoint_has_no_map_and_validating_it_makes_one(
-    tmp_path: Path, parts: dict[str, Path]
-) -> None:
+def test_a_spectral_checkpoint_has_no_map_and_validating_it_makes_one(tmp_path, parts):
     state = torch.load(parts["spectral"], weights_only=True)["state_dict"]
     assert not [name for name in state if "dejavu.map" in name or "whitening" in name]
     task = new_descriptor(mapper=SpectralMapper(6.0))  # this run's budget
@@ -115,14 +108,7 @@ def test_a_spectral_checkpoint_has_no_map_and_validating_it_makes_one(
     ],
     ids=range(8),
 )
-def test_a_checkpoint_of_another_training_is_refused(
-    tmp_path: Path,
-    parts: dict[str, Path],
-    kind: str,
-    task: Callable[[], RouteTask],
-    frames: int,
-    facts: list[str],
-) -> None:
+def test_a_checkpoint_of_another_training_is_refused(tmp_path, parts, kind, task, frames, facts):
     running, data, own = trainer(tmp_path, max_steps=STEPS), data_of(footage(frames=frames)), task()
     with refused(*facts):
         from dejavu_torch.training.checkpoint import taking_over
@@ -131,7 +117,7 @@ def test_a_checkpoint_of_another_training_is_refused(
             running.fit(own, data, ckpt_path=parts[kind])
 
 
-def test_a_task_is_not_fitted_to_a_second_route(tmp_path: Path) -> None:
+def test_a_task_is_not_fitted_to_a_second_route(tmp_path):
     task = new_task()
     model = fit(tmp_path, task, data_of())
     for stage in ("fit", "validate"):
@@ -150,13 +136,11 @@ def test_a_task_is_not_fitted_to_a_second_route(tmp_path: Path) -> None:
 class Touch:
     """Runs code if it is unpickled."""
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self):
         return Path.touch, (Path("executed"),)
 
 
-def test_a_pickle_runs_nothing_whatever_the_config_says(
-    folder: Path, parts: dict[str, Path], tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_pickle_runs_nothing_whatever_the_config_says(folder, parts, tmp_path, capfd):
     bad, root = tmp_path / "bad.ckpt", tmp_path / "new"
     torch.save(torch.load(parts["templates"], weights_only=True) | {"more": Touch()}, bad)
     words = ["--config", "train.yaml", "--ckpt_path", bad, "--weights_only", "false"]
@@ -177,15 +161,13 @@ def test_a_pickle_runs_nothing_whatever_the_config_says(
         (lambda path, _: torch.save({"epoch": 1}, path), ["has no global_step"]),
     ],
 )
-def test_what_is_no_checkpoint(
-    tmp_path: Path, parts: dict[str, Path], make: Callable[[Path, bytes], object], facts: list[str]
-) -> None:
+def test_what_is_no_checkpoint(tmp_path, parts, make, facts):
     make(tmp_path / "bad.ckpt", parts["templates"].read_bytes())
     with refused("bad.ckpt", *facts, "expected a checkpoint that `dejavu train fit` wrote"):
         read_checkpoint(tmp_path / "bad.ckpt")
 
 
-def test_a_full_disk_leaves_the_checkpoint_of_before(tmp_path: Path) -> None:
+def test_a_full_disk_leaves_the_checkpoint_of_before(tmp_path):
     trainer(tmp_path, last(tmp_path)).fit(new_task(), data_of())
     path = tmp_path / "checkpoints" / "last.ckpt"
     before, limits = path.read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
@@ -13,7 +10,6 @@ from footage import footage as ground
 from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
-from torch import Tensor
 
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth
@@ -22,13 +18,13 @@ from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.training.datamodule import Batch, Clips, RouteData, as_frames, store
 
 
-def numbered(frames: int, first: int = 0, side: int = 8) -> ArrayTraverse:
+def numbered(frames, first=0, side=8):
     """Frames that show their number: all pixels of frame i are first + i."""
     numbers = torch.arange(first, first + frames, dtype=torch.uint8)
     return ArrayTraverse(numbers[:, None, None].expand(frames, side, side), f"from {first}")
 
 
-def route(frames: int = 24, stage: str = "fit", **settings: Any) -> RouteData:
+def route(frames=24, stage="fit", **settings):
     """A route that is read; its loaders give the frames as they are."""
     data = RouteData(numbered(frames), **{"tolerance": 2, "batch_size": 8} | settings)
     data.setup(stage)
@@ -38,10 +34,10 @@ def route(frames: int = 24, stage: str = "fit", **settings: Any) -> RouteData:
 # right places --------------------------------------------------------------------------------------------
 
 
-def test_every_frame_is_drawn_once_an_epoch_with_the_places_it_shows(tmp_path: Path) -> None:
+def test_every_frame_is_drawn_once_an_epoch_with_the_places_it_shows(tmp_path):
     (tmp_path / "truth.csv").write_text("0,5\n1\n2,7,9,11\n3,-1\n")  # 4 and on are not known
     data = route(second=numbered(8, 100), second_truth=str(tmp_path / "truth.csv"))
-    seen: dict[int, list[list[int]]] = {}
+    seen = {}
     for frames, truth in data.train_dataloader():
         assert frames.dtype == torch.float32
         for frame, right in zip(frames, truth.positives.tolist(), strict=True):
@@ -51,7 +47,7 @@ def test_every_frame_is_drawn_once_an_epoch_with_the_places_it_shows(tmp_path: P
     assert seen == {i: [[i]] for i in range(24)} | {100 + i: [right] for i, right in enumerate(second)}
 
 
-def test_what_is_judged_and_ignored_reaches_the_metric(tmp_path: Path) -> None:
+def test_what_is_judged_and_ignored_reaches_the_metric(tmp_path):
     hard, soft = np.zeros((24, 6), bool), np.zeros((24, 6), bool)
     hard[[3, 4], 1] = soft[9, 2] = hard[8, 2] = True
     np.savez(tmp_path / "truth.npz", GThard=hard, GTsoft=soft)
@@ -68,7 +64,7 @@ def test_what_is_judged_and_ignored_reaches_the_metric(tmp_path: Path) -> None:
     assert batch.truth.positives.tolist() == [[5], [-1], [7], [-1], [-1], [-1]]
 
 
-def test_validation_and_query_come_in_order_as_they_are() -> None:
+def test_validation_and_query_come_in_order_as_they_are():
     data = route(validation=numbered(24, 100), validation_truth="0", query=numbered(20, 200), truth="2")
     data.setup("test")
     for loader, there, shift in (
@@ -82,7 +78,7 @@ def test_validation_and_query_come_in_order_as_they_are() -> None:
         assert right.tolist() == list(range(shift, shift + len(right)))
 
 
-def test_each_of_several_routes_has_even_steps_of_its_own() -> None:
+def test_each_of_several_routes_has_even_steps_of_its_own():
     routes = [ArrayTraverse(ground(start), name) for name, start in (("a", REFERENCE), ("b", QUERY))]
     data = RouteData(routes, velocity=camera(step=None))
     data.setup("fit")
@@ -93,7 +89,7 @@ def test_each_of_several_routes_has_even_steps_of_its_own() -> None:
     assert data.lengths == [len(first), len(second)]
 
 
-def test_other_traverses_come_at_the_reference_s_steps(tmp_path: Path) -> None:
+def test_other_traverses_come_at_the_reference_s_steps(tmp_path):
     """Of their own they would take twice as large ones, and their truth tells frames."""
     nearest = (REFERENCE - QUERY[:, None]).abs().argmin(1).tolist()
     (tmp_path / "truth.csv").write_text("".join(f"{q},{p}\n" for q, p in enumerate(nearest)))
@@ -112,7 +108,7 @@ def test_other_traverses_come_at_the_reference_s_steps(tmp_path: Path) -> None:
 # batches -------------------------------------------------------------------------------------------------
 
 
-def runs_of(lengths: list[int]) -> list[range]:
+def runs_of(lengths):
     """Of traverses, one after the other."""
     return [range(sum(lengths[:i]), sum(lengths[: i + 1])) for i in range(len(lengths))]
 
@@ -123,7 +119,7 @@ def runs_of(lengths: list[int]) -> list[range]:
     clips=st.integers(1, 8),
     seed=st.integers(0, 99),
 )
-def test_clips(lengths: list[int], clip: int, clips: int, seed: int) -> None:
+def test_clips(lengths, clip, clips, seed):
     if max(lengths) < clip:
         lengths = [*lengths, clip]
     torch.manual_seed(seed)
@@ -144,7 +140,7 @@ def test_clips(lengths: list[int], clip: int, clips: int, seed: int) -> None:
     assert list(Clips(runs_of(lengths), clip * clips, clip)) == batches
 
 
-def test_clips_differ_from_epoch_to_epoch_and_reach_every_frame() -> None:
+def test_clips_differ_from_epoch_to_epoch_and_reach_every_frame():
     sampler = Clips(runs_of([10, 7]), 8, 4)
     epochs = [list(sampler) for _ in range(60)]
     assert epochs[0] != epochs[1]
@@ -154,18 +150,18 @@ def test_clips_differ_from_epoch_to_epoch_and_reach_every_frame() -> None:
 # augmentation --------------------------------------------------------------------------------------------
 
 
-def test_a_clip_gets_one_change_and_clips_differ() -> None:
+def test_a_clip_gets_one_change_and_clips_differ():
     data, frames = route(augmentation=Augmentation(noise=0.0)), torch.rand(1, 1, 8, 8).expand(8, 1, 8, 8)
     clips = data.augmented(frames, 4).unflatten(0, (2, 4))
     torch.testing.assert_close(clips, clips[:, :1].expand_as(clips))
     assert not torch.allclose(clips[0], clips[1], atol=1e-3)
 
 
-def validated(data: RouteData, frames: Tensor, first: int = 0) -> Tensor:
+def validated(data, frames, first=0):
     return data.validated(Batch(frames, as_ground_truth(torch.arange(first, first + len(frames))[:, None])))
 
 
-def test_the_reference_is_validated_under_the_same_changes_each_time() -> None:
+def test_the_reference_is_validated_under_the_same_changes_each_time():
     data, frames = route(), torch.rand(8, 1, 8, 8)
     state = torch.get_rng_state()
     one = validated(data, frames)
@@ -177,7 +173,7 @@ def test_the_reference_is_validated_under_the_same_changes_each_time() -> None:
     assert torch.equal(validated(route(validation=numbered(24, 100), validation_truth="0"), frames), frames)
 
 
-def test_ready_features_are_left_as_they_are() -> None:
+def test_ready_features_are_left_as_they_are():
     features = torch.randn(24, 5, dtype=torch.float64)
     data = RouteData(features, tolerance=2, batch_size=24)
     data.setup("fit")
@@ -190,7 +186,7 @@ def test_ready_features_are_left_as_they_are() -> None:
 # what is kept, and what is refused -----------------------------------------------------------------------
 
 
-def test_frames_are_kept_as_bytes_and_resized(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_are_kept_as_bytes_and_resized(monkeypatch):
     """With room for a batch alone: what is stored of all of them may lie in a file."""
     monkeypatch.setattr("dejavu_torch.memory.free_memory", lambda: 4.0 * 64 * 12 * 16)
     values = store(numbered(200, side=24), (12, 16))
@@ -204,7 +200,7 @@ def test_frames_are_kept_as_bytes_and_resized(monkeypatch: pytest.MonkeyPatch) -
 class Mixed(ArrayTraverse):
     """Frames of two sizes."""
 
-    def batches(self, size: int = 64) -> Any:
+    def batches(self, size=64):
         yield torch.rand(12, 1, 4, 4)
         yield torch.rand(12, 1, 4, 5)
 
@@ -233,6 +229,6 @@ class Mixed(ArrayTraverse):
     ],
     ids=lambda value: " ".join(value),
 )
-def test_what_does_not_fit_is_refused(settings: dict[str, Any], facts: tuple[str, ...]) -> None:
+def test_what_does_not_fit_is_refused(settings, facts):
     with refused(*facts):
         route(**settings).train_dataloader()

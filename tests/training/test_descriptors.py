@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -23,22 +21,21 @@ from small_training import (
     trainer,
     warned,
 )
-from torch import Tensor, nn
+from torch import nn
 
 from dejavu_torch import HOG, SpectralMapper
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.training.datamodule import StoredFrames
 from dejavu_torch.training.descriptors import similar_span
-from dejavu_torch.training.templates import TemplateTask
 
 
-def stored(*routes: Tensor) -> StoredFrames:
+def stored(*routes):
     count = sum(map(len, routes))
     return StoredFrames([(255 * one).byte() for one in routes], as_ground_truth(torch.arange(count)[:, None]))
 
 
-def slid(step: int, count: int = 200, noise: float = 0.0, seed: int = 0) -> Tensor:
+def slid(step, count=200, noise=0.0, seed=0):
     """A window of 64 x 64 pixels, slid so many pixels a frame along a picture in which nothing repeats."""
     random = torch.Generator().manual_seed(seed)
     coarse = torch.rand(1, 1, 4, (64 + step * count) // 16 + 1, generator=random)
@@ -48,7 +45,7 @@ def slid(step: int, count: int = 200, noise: float = 0.0, seed: int = 0) -> Tens
 
 
 @pytest.mark.parametrize(("step", "noise", "expected"), [(1, 0.0, 5), (1, 0.1, 5), (80, 0.0, 1)])
-def test_a_stretch_is_as_long_as_frames_stay_alike(step: int, noise: float, expected: int) -> None:
+def test_a_stretch_is_as_long_as_frames_stay_alike(step, noise, expected):
     frames = slid(step, noise=noise)
     assert similar_span(stored(frames), [200], 5) == expected
     assert [similar_span(stored(frames), [200], most) for most in (1, 0)] == [1, 1]  # the tolerance at most
@@ -56,7 +53,7 @@ def test_a_stretch_is_as_long_as_frames_stay_alike(step: int, noise: float, expe
     assert similar_span(stored(stop), [260], 5) == expected
 
 
-def test_what_a_route_always_shows_is_no_likeness() -> None:
+def test_what_a_route_always_shows_is_no_likeness():
     below, other = torch.rand(2, 1, 32, 64, generator=torch.Generator().manual_seed(1))
     routes = [slid(80, 60, seed=seed) for seed in (2, 3)]
     routes[0][:, :, 32:], routes[1][:, :, 32:] = below, other
@@ -64,14 +61,14 @@ def test_what_a_route_always_shows_is_no_likeness() -> None:
     assert similar_span(stored(slid(1)[:60], *routes), [60, 60, 60], 5) == 1  # not the first route alone
 
 
-def test_frames_too_small_for_hog_have_stretches_of_the_tolerance() -> None:
+def test_frames_too_small_for_hog_have_stretches_of_the_tolerance():
     small = StoredFrames(
         [torch.zeros(9, 1, 4, 4, dtype=torch.uint8)], as_ground_truth(torch.arange(9)[:, None])
     )
     assert similar_span(small, [9], 5) == 5
 
 
-def test_places_are_right_within_a_stretch(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_places_are_right_within_a_stretch(tmp_path, caplog):
     task = new_descriptor(backbone=backbone(), mapper=SpectralMapper(6.0))
     fit(tmp_path, task, data_of(slid(80), tolerance=5), max_steps=1)
     assert (task.every, len(task.proxies)) == (1, 200)
@@ -84,14 +81,14 @@ def test_places_are_right_within_a_stretch(tmp_path: Path, caplog: pytest.LogCap
 # codes ---------------------------------------------------------------------------------------------------
 
 
-def code_of(folder: Path, **settings: Any) -> TemplateTask:
+def code_of(folder, **settings):
     task = new_task(backbone=coded(network=HOG()))
     trainer(folder).fit(task, data_of(**settings))
     assert task.views is not None
     return task
 
 
-def test_a_code_is_learned_of_a_network_that_stays(tmp_path: Path) -> None:
+def test_a_code_is_learned_of_a_network_that_stays(tmp_path):
     embedding = coded()
     before = {name: value.clone() for name, value in embedding.state_dict().items()}
     fit(tmp_path, new_task(backbone=embedding, weight_bits=32), data_of())
@@ -101,7 +98,7 @@ def test_a_code_is_learned_of_a_network_that_stays(tmp_path: Path) -> None:
     assert after["linear.whitened"]
 
 
-def test_what_is_learned_finds_places_on_another_day(tmp_path: Path) -> None:
+def test_what_is_learned_finds_places_on_another_day(tmp_path):
     mild = still(noise=0.1, exposure=(0.1, 0.1))
     given = {"max_steps": 300, "limit_val_batches": 0}
     fit(tmp_path / "one", new_descriptor(), data_of(augmentation=mild), **given)
@@ -110,7 +107,7 @@ def test_what_is_learned_finds_places_on_another_day(tmp_path: Path) -> None:
     assert recall(fit(tmp_path / "two", task, data_of(augmentation=mild), **given), footage(0.05)) > 0.7
 
 
-def test_a_second_traverse_tells_what_a_season_changes(tmp_path: Path) -> None:
+def test_a_second_traverse_tells_what_a_season_changes(tmp_path):
     """Winter is darker at the left: without augmentation that is all the change that there is."""
     winter = (footage().float() * torch.linspace(0.2, 1, 16)).byte()
     given = {"second": ArrayTraverse(winter), "second_truth": "0", "augmentation": still()}
@@ -120,7 +117,7 @@ def test_a_second_traverse_tells_what_a_season_changes(tmp_path: Path) -> None:
         code_of(tmp_path / "one", augmentation=still())
 
 
-def test_frames_of_no_known_place_are_not_learned_from(tmp_path: Path) -> None:
+def test_frames_of_no_known_place_are_not_learned_from(tmp_path):
     truth = tmp_path / "truth.csv"
     truth.write_text("query,place\n" + "".join(f"{i},{i}\n" for i in range(10)))
     given = {"second": ArrayTraverse(footage(0.1)), "second_truth": str(truth), "batch_size": 2}

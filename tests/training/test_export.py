@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import signal
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
-from pytorch_lightning import Callback, Trainer
+from pytorch_lightning import Callback
 from pytorch_lightning.callbacks import EarlyStopping, ModelCheckpoint
 from small_training import Stop, data_of, footage, last, new_task, trainer, warned
 
@@ -20,12 +19,12 @@ class Wreck(Callback):
     """Spoils what was learned, from the second epoch on."""
 
     @torch.no_grad()
-    def on_train_epoch_end(self, trainer: Trainer, pl_module: Any) -> None:
+    def on_train_epoch_end(self, trainer, pl_module):
         if trainer.current_epoch:
             pl_module.route.templates.fill_(trainer.current_epoch)
 
 
-def test_the_map_is_of_the_best_checkpoint_and_training_stops_early(tmp_path: Path) -> None:
+def test_the_map_is_of_the_best_checkpoint_and_training_stops_early(tmp_path):
     best = ModelCheckpoint(tmp_path, monitor="val/auc", mode="max")
     every = ModelCheckpoint(tmp_path, save_last=True)
     stop = EarlyStopping("val/auc", mode="max", patience=2)
@@ -46,13 +45,11 @@ def test_the_map_is_of_the_best_checkpoint_and_training_stops_early(tmp_path: Pa
 class Tidy(Callback):
     """Deletes the best checkpoint."""
 
-    def on_train_end(self, trainer: Trainer, pl_module: Any) -> None:
+    def on_train_end(self, trainer, pl_module):
         Path(trainer.checkpoint_callbacks[0].best_model_path).unlink()  # type: ignore[attr-defined]
 
 
-def test_what_leaves_no_map_or_another_than_expected_warns(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_what_leaves_no_map_or_another_than_expected_warns(tmp_path, caplog):
     trainer(tmp_path, limit_train_batches=0).fit(new_task(), data_of())
     assert warned(caplog) == ["no training step was made: no map is written"]
     assert not (tmp_path / "map.safetensors").exists()
@@ -67,7 +64,7 @@ def test_what_leaves_no_map_or_another_than_expected_warns(
     assert torch.equal(DejaVu.load(tmp_path / "map.safetensors").map.templates, task.route.templates)
 
 
-def test_an_interrupt_leaves_the_map_and_the_checkpoint_of_the_last_step(tmp_path: Path) -> None:
+def test_an_interrupt_leaves_the_map_and_the_checkpoint_of_the_last_step(tmp_path):
     kept = last(tmp_path, save_on_exception=True)
     stop, handler = Stop(3, exception=KeyboardInterrupt()), signal.getsignal(signal.SIGINT)
     running = trainer(tmp_path, kept, stop, max_steps=9)

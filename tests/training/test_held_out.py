@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from importlib import import_module
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -27,10 +25,9 @@ from dejavu_torch import DejaVu, Preprocess, RouteData, SpectralMapper
 from dejavu_torch.cli.train import MapTrainer
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import as_ground_truth
-from dejavu_torch.features.views import SEGMENT, LabelledFrames
+from dejavu_torch.features.views import SEGMENT
 from dejavu_torch.training import export
 from dejavu_torch.training.export import UNTRAINED, compare_with_untrained
-from dejavu_torch.types import Match
 
 FRAMES = 320
 MADE = {"mapper": SpectralMapper(6.0), "whitening": "none"}  # a descriptor and its map
@@ -38,27 +35,27 @@ SHORT = {"max_steps": 2, "limit_val_batches": 0}
 CALIBRATE = DejaVu.calibrate  # which conftest.py patches away
 
 
-def long(**settings: Any) -> RouteData:
+def long(**settings):
     data = data_of(footage(frames=FRAMES), **settings)
     data.setup("fit")
     return data
 
 
-def places_of(data: RouteData) -> set[int]:
+def places_of(data):
     """Those that an epoch shows."""
     return {place for batch in data.training_batches() for place in batch.truth.positives[:, 0].tolist()}
 
 
-def held(data: RouteData) -> set[int]:
+def held(data):
     return {start + i for start in data.held for i in range(SEGMENT)}
 
 
 @pytest.fixture
-def calibrations(monkeypatch: pytest.MonkeyPatch) -> list[set[int]]:
+def calibrations(monkeypatch):
     """The places of the views that maps are calibrated by."""
-    seen: list[set[int]] = []
+    seen = []
 
-    def taken(model: DejaVu, reference: object, views: LabelledFrames) -> None:
+    def taken(model, reference, views):
         seen.append(set(views.places.tolist()))
 
     monkeypatch.setattr(DejaVu, "calibrate", taken)
@@ -70,7 +67,7 @@ def calibrations(monkeypatch: pytest.MonkeyPatch) -> list[set[int]]:
     ("frames", "share", "expected"),
     [(320, 0.05, 2), (320, 0.25, 4), (2697, 0.05, 7), (299, 0.05, 0), (320, 0.0, 0)],
 )
-def test_stretches_are_evenly_spaced(frames: int, share: float, expected: int) -> None:
+def test_stretches_are_evenly_spaced(frames, share, expected):
     data = data_of(torch.zeros(frames, 4, 4, dtype=torch.uint8), held_out=share)
     data.setup("fit")
     assert len(data.held) == expected
@@ -82,15 +79,13 @@ def test_stretches_are_evenly_spaced(frames: int, share: float, expected: int) -
 
 
 @pytest.mark.parametrize("clip", [1, 4])
-def test_training_never_sees_them_in_any_traverse(clip: int) -> None:
+def test_training_never_sees_them_in_any_traverse(clip):
     data = long(clip=clip, second=ArrayTraverse(footage(0.1, FRAMES)), batch_size=8)
     assert len(held(data)) == 2 * SEGMENT
     assert set().union(*(places_of(data) for _ in range(8))) == set(range(FRAMES)) - held(data)
 
 
-def test_nothing_is_held_out_if_it_would_serve_for_nothing(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_nothing_is_held_out_if_it_would_serve_for_nothing(tmp_path, caplog):
     """Of features, of several routes, with a validation, or of templates."""
     for source in (torch.rand(FRAMES, 6), [footage(frames=FRAMES), footage(frames=FRAMES)]):
         data = RouteData(source, tolerance=2)
@@ -105,21 +100,14 @@ def test_nothing_is_held_out_if_it_would_serve_for_nothing(
 
 
 @pytest.mark.parametrize("validated", [False, True])
-def test_what_training_has_not_seen_calibrates(
-    tmp_path: Path, calibrations: list[set[int]], validated: bool
-) -> None:
+def test_what_training_has_not_seen_calibrates(tmp_path, calibrations, validated):
     data = long(validation=ArrayTraverse(footage(0.1, FRAMES)), validation_truth="0") if validated else long()
     trainer(tmp_path, **SHORT).fit(new_descriptor(backbone=backbone(), **MADE), data)
     assert calibrations == [set(range(FRAMES)) if validated else held(data)]
 
 
 @pytest.mark.parametrize("first", [{"held_out": 0}, {}], ids=["all seen", "held out"])
-def test_what_the_checkpoint_s_training_saw_does_not_calibrate(
-    tmp_path: Path,
-    caplog: pytest.LogCaptureFixture,
-    calibrations: list[set[int]],
-    first: dict[str, Any],
-) -> None:
+def test_what_the_checkpoint_s_training_saw_does_not_calibrate(tmp_path, caplog, calibrations, first):
     trainer(tmp_path / "one", last(tmp_path / "one"), **SHORT).fit(
         new_descriptor(backbone=backbone(), **MADE), long(**first)
     )
@@ -136,8 +124,8 @@ def test_what_the_checkpoint_s_training_saw_does_not_calibrate(
 
 
 def test_at_the_end_the_map_is_calibrated_and_set_beside_the_untrained_one(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+    folder, tmp_path, capsys, monkeypatch
+):
     """At another size than the reference's, with a backbone that takes no other."""
     monkeypatch.setattr(DejaVu, "calibrate", CALIBRATE)
     monkeypatch.setattr("dejavu_torch.features.views.FEWEST", 40)
@@ -155,8 +143,8 @@ def test_at_the_end_the_map_is_calibrated_and_set_beside_the_untrained_one(
     assert model.calibration is not None
 
 
-def test_a_calibration_that_fails_loses_no_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def failing(*_: object) -> None:
+def test_a_calibration_that_fails_loses_no_training(tmp_path, monkeypatch):
+    def failing(*_):
         raise RuntimeError("shapes cannot be multiplied")
 
     monkeypatch.setattr(DejaVu, "calibrate", failing)
@@ -166,9 +154,7 @@ def test_a_calibration_that_fails_loses_no_training(tmp_path: Path, monkeypatch:
 
 
 @pytest.mark.parametrize("size", [None, 160])
-def test_the_untrained_map_is_of_frames_of_the_queries_size(
-    caplog: pytest.LogCaptureFixture, size: int | None
-) -> None:
+def test_the_untrained_map_is_of_frames_of_the_queries_size(caplog, size):
     """Of raw frames as `data.resize` leaves them, above what a map reduces them to by default."""
     reference, query = (ArrayTraverse(footage(noise, 24, 176)) for noise in (0.0, 0.1))
     model = DejaVu(backbone(), mapper=SpectralMapper(6.0), preprocess=Preprocess(size=size))
@@ -179,15 +165,13 @@ def test_the_untrained_map_is_of_frames_of_the_queries_size(
 
 
 @pytest.mark.parametrize("settings", [{"hold": 0.9}, {"step": 1.0}])
-def test_the_untrained_map_takes_as_many_bytes(
-    settings: dict[str, float], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_untrained_map_takes_as_many_bytes(settings, monkeypatch):
     """Its own descriptor would take others to hold as much, and a step is in units of the trained one."""
     reference, query = (ArrayTraverse(footage(noise, 24, 64)) for noise in (0.0, 0.1))
     model = DejaVu(backbone(), mapper=SpectralMapper(**settings)).learn(reference)  # type: ignore[arg-type]
     sizes, match = [], export._match
 
-    def noted(model: DejaVu, query: ArrayTraverse) -> Match:
+    def noted(model, query):
         sizes.append(model.summary().route_bytes)
         return match(model, query)
 
@@ -199,16 +183,14 @@ def test_the_untrained_map_takes_as_many_bytes(
 # short routes, and channels ------------------------------------------------------------------------------
 
 
-def test_a_short_route_is_told_before_the_training(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_short_route_is_told_before_the_training(tmp_path, caplog):
     trainer(tmp_path, **SHORT).fit(new_task(), data_of())
     (line,) = warned(caplog)
     assert all(fact in line for fact in ("40 frames, fewer than 300", "dejavu learn", "data.validation"))
     assert DejaVu.load(tmp_path / "map.safetensors").calibration is None
 
 
-def test_too_few_bytes_are_told_before_the_training(
-    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_too_few_bytes_are_told_before_the_training(folder, tmp_path, capfd):
     words = ["--config", "train.yaml", *DESCRIPTOR, "--model.mapper.route_bytes_per_place", "0.3"]
     words += ["--trainer.default_root_dir", tmp_path / "run"]
     assert "route_bytes_per_place is 0.3; expected more than" in fails(capfd, "train", "fit", *words)
@@ -216,7 +198,7 @@ def test_too_few_bytes_are_told_before_the_training(
 
 
 @pytest.mark.parametrize("channels", [1, 3])
-def test_a_network_takes_as_many_channels_as_the_frames_have(tmp_path: Path, channels: int) -> None:
+def test_a_network_takes_as_many_channels_as_the_frames_have(tmp_path, channels):
     frames = footage()[..., None].expand(-1, -1, -1, channels)
     network, again = (type(backbone())(8, resize=(16, 16), widths=(4, 8), squeeze=4) for _ in range(2))
     trainer(tmp_path, last(tmp_path), **SHORT).fit(new_task(backbone=network), data_of(frames))

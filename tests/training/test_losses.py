@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from fractions import Fraction
 
 import pytest
@@ -12,32 +11,31 @@ import torch
 from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
-from torch import Tensor
 
 from dejavu_torch import PhaseTemplates, TemplateMap
-from dejavu_torch.maps.template_map import Reduction, log_posterior
-from dejavu_torch.training.losses import Losses, Objective, phase_cross_entropy, place_cross_entropy
-from dejavu_torch.types import FrequencyLayer, Plan
+from dejavu_torch.maps.template_map import log_posterior
+from dejavu_torch.training.losses import Objective, phase_cross_entropy, place_cross_entropy
+from dejavu_torch.types import FrequencyLayer
 
 INF = math.inf
-PLAN: Plan = (
+PLAN = (
     FrequencyLayer(Fraction(4), 4, 0, 12, (0, 2)),
     FrequencyLayer(Fraction(5, 2), 3, 6, 20, (0, 1, 3)),
 )
 
 
-def normal(*shape: int, grad: bool = False) -> Tensor:
+def normal(*shape, grad=False):
     return torch.randn(shape, dtype=torch.float64, requires_grad=grad)
 
 
-def close(a: Tensor, b: float | Tensor, atol: float = 1e-12) -> None:
+def close(a, b, atol=1e-12):
     torch.testing.assert_close(a, torch.as_tensor(b, dtype=a.dtype), rtol=0, atol=atol)
 
 
 # ------------------------------------------------------------------------ places
 
 
-def share(row: list[float], right: list[int], temperature: float) -> float:
+def share(row, right, temperature):
     """-log of what the softmax of -row / T gives to the right ones."""
     weights = [math.exp(-value / temperature) for value in row]
     return -math.log(sum(weights[i] for i in right) / sum(weights))
@@ -56,7 +54,7 @@ def share(row: list[float], right: list[int], temperature: float) -> float:
     ),
     st.integers(0, 10),
 )
-def test_the_place_loss_is_the_literal_one(rows: list[tuple[list[float], list[int]]], tolerance: int) -> None:
+def test_the_place_loss_is_the_literal_one(rows, tolerance):
     losses = []
     for row, places in rows:
         right = [i for i in range(len(row)) if any(p >= 0 and abs(i - p) <= tolerance for p in places)]
@@ -71,18 +69,18 @@ def test_the_place_loss_is_the_literal_one(rows: list[tuple[list[float], list[in
     assert (gradient[scores.isposinf()] == 0).all()
 
 
-def test_gradients_of_the_place_loss_reach_scores_and_temperature() -> None:
+def test_gradients_of_the_place_loss_reach_scores_and_temperature():
     scores, temperature = normal(3, 8, grad=True), torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
     places, gap = torch.tensor([[1, 6], [4, -1], [-1, -1]]), torch.arange(8) == 2
 
-    def loss(scores: Tensor, temperature: Tensor) -> Tensor:
+    def loss(scores, temperature):
         return place_cross_entropy(scores.masked_fill(gap, INF), places, 1, temperature).loss
 
     assert torch.autograd.gradcheck(loss, (scores, temperature))
 
 
 @pytest.mark.parametrize("scores", [torch.full((2, 5), INF), torch.rand(2, 5), torch.rand(0, 5)])
-def test_where_no_place_counts_the_loss_and_its_gradients_are_0(scores: Tensor) -> None:
+def test_where_no_place_counts_the_loss_and_its_gradients_are_0(scores):
     places = torch.full((len(scores), 3), 0 if scores.isinf().any() else -1)
     temperature = torch.tensor(0.5, requires_grad=True)
     scores = scores.clone().requires_grad_()
@@ -94,20 +92,20 @@ def test_where_no_place_counts_the_loss_and_its_gradients_are_0(scores: Tensor) 
         assert (leaf.grad == 0).all()
 
 
-def test_half_scores_are_summed_in_single_precision() -> None:
+def test_half_scores_are_summed_in_single_precision():
     scores = torch.rand(4, 3000).half()
     loss = place_cross_entropy(scores, torch.arange(4)[:, None], 0, 0.01).loss
     assert loss.dtype == torch.float32
     close(loss, place_cross_entropy(scores.double(), torch.arange(4)[:, None], 0, 0.01).loss.float(), 1e-3)
 
 
-def test_the_place_loss_builds_nothing_of_queries_times_places_times_answers(largest_tensor: type) -> None:
+def test_the_place_loss_builds_nothing_of_queries_times_places_times_answers(largest_tensor):
     with largest_tensor() as seen:
         place_cross_entropy(torch.rand(16, 500), torch.randint(0, 500, (16, 40)), 5, 0.1)
     assert seen.numel <= 16 * 501
 
 
-def test_phase_loss_is_the_literal_one() -> None:
+def test_phase_loss_is_the_literal_one():
     distances = [normal(4, layer.phases).abs() for layer in PLAN]
     places = torch.tensor([[2, 9, 15], [7, 11, -1], [19, -1, -1], [-1, -1, -1]])
     losses = []
@@ -119,7 +117,7 @@ def test_phase_loss_is_the_literal_one() -> None:
     close(phase_cross_entropy(distances, PLAN, places, 0.3), sum(losses) / 5)
 
 
-def test_gradients_of_the_phase_loss_and_none_where_nothing_is_covered() -> None:
+def test_gradients_of_the_phase_loss_and_none_where_nothing_is_covered():
     temperature = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
     distances = [normal(3, layer.phases, grad=True) for layer in PLAN]
     places = torch.tensor([[2, 9], [15, -1], [-1, -1]])
@@ -136,19 +134,19 @@ def test_gradients_of_the_phase_loss_and_none_where_nothing_is_covered() -> None
 T = torch.tensor(0.5)
 
 
-def route_of(reduction: Reduction = "mean") -> tuple[TemplateMap, Tensor]:
+def route_of(reduction="mean"):
     """A route of 30 places with a layer of 3 phases and one of 5, and features of its frames."""
     plan = (FrequencyLayer(6, 3, 0, 30, (0, 1)), FrequencyLayer(5, 5, 0, 30, (2,)))
     features = torch.randn(30, 3)
     return TemplateMap(plan, PhaseTemplates()(features, plan), 30, 3, reduction=reduction), features
 
 
-def losses(route: TemplateMap, features: Tensor, places: Tensor, objective: Objective) -> Losses:
+def losses(route, features, places, objective):
     distances = route.distances(features)
     return objective(distances, log_posterior(route.combine(distances), T), places, route, T, 1)
 
 
-def test_the_total_is_the_weighted_sum_of_the_parts() -> None:
+def test_the_total_is_the_weighted_sum_of_the_parts():
     route, features = route_of()
     places = torch.arange(30)[:, None]
     places[4] = -1
@@ -166,7 +164,7 @@ def test_the_total_is_the_weighted_sum_of_the_parts() -> None:
 
 
 @pytest.mark.parametrize(("reduction", "per"), [("mean", (2, 1)), ("sum", (1, 1))])
-def test_phases_are_in_the_units_of_the_scores(reduction: Reduction, per: tuple[int, int]) -> None:
+def test_phases_are_in_the_units_of_the_scores(reduction, per):
     route, features = route_of(reduction)
     places = torch.arange(30)[:, None]
     distances = [one / count for one, count in zip(route.distances(features), per, strict=True)]
@@ -198,6 +196,6 @@ SCORES, PLACES = torch.rand(3, 9), torch.zeros(3, 2, dtype=torch.int64)
         (lambda: Objective(0.0, 0.0), ["one above 0"]),
     ],
 )
-def test_bad_input_is_refused(call: Callable[[], object], words: list[str]) -> None:
+def test_bad_input_is_refused(call, words):
     with refused(*words):
         call()

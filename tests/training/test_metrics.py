@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
-
 import pytest
 import torch
 from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
-from torch import Tensor
 
 from dejavu_torch.data.ground_truth import GroundTruth
 from dejavu_torch.evaluation.curves import Scores, evaluate
@@ -29,21 +25,21 @@ QUERY = st.tuples(
 BATCHES = st.lists(st.lists(QUERY, max_size=6), min_size=1, max_size=5)
 
 
-def table(rows: Sequence[list[int]]) -> Tensor:
+def table(rows):
     """As wide as the widest row: batches differ."""
     width = max((len(row) for row in rows), default=0)
     padded = [row + [-1] * (width - len(row)) for row in rows]
     return torch.tensor(padded, dtype=torch.int64).reshape(len(rows), width)
 
 
-def batch_of(queries: list[Any]) -> tuple[Match, GroundTruth]:
+def batch_of(queries):
     score, index, right, judged, ignored = zip(*queries, strict=True) if queries else ((),) * 5
     scores = torch.tensor(score, dtype=torch.float64)
     match = Match(torch.tensor(index, dtype=torch.int64), scores, scores < 1)
     return match, GroundTruth(table(right), torch.tensor(judged, dtype=torch.bool), table(ignored))
 
 
-def assert_evaluated(metric: PlaceRecognition, batches: list[Any]) -> None:
+def assert_evaluated(metric, batches):
     """The figures are those of `evaluate` on all batches, NaN if no query counts."""
     match, truth = batch_of([query for queries in batches for query in queries])
     near = (match.index[:, None] - truth.positives).abs() <= metric.tolerance
@@ -57,7 +53,7 @@ def assert_evaluated(metric: PlaceRecognition, batches: list[Any]) -> None:
 
 
 @given(BATCHES, st.integers(0, 2))
-def test_it_is_evaluate_on_all_data_whatever_the_batches(batches: list[Any], tolerance: int) -> None:
+def test_it_is_evaluate_on_all_data_whatever_the_batches(batches, tolerance):
     metric = PlaceRecognition(tolerance)
     for queries in batches:
         metric.update(*batch_of(queries))
@@ -65,13 +61,13 @@ def test_it_is_evaluate_on_all_data_whatever_the_batches(batches: list[Any], tol
 
 
 @given(BATCHES, st.one_of(BATCHES, st.just([])))
-def test_processes_are_joined(here: list[Any], elsewhere: list[Any]) -> None:
+def test_processes_are_joined(here, elsewhere):
     """As torchmetrics syncs: one tensor from each process, of the same type and number of dimensions."""
     other = PlaceRecognition(1)
     for queries in elsewhere:
         other.update(*batch_of(queries))
 
-    def gather(mine: Tensor, group: object) -> list[Tensor]:
+    def gather(mine, group):
         theirs = torch.cat(other.rows) if other.rows else torch.zeros(0, dtype=torch.float64)
         assert (mine.ndim, mine.dtype) == (theirs.ndim, theirs.dtype) == (1, torch.float64)
         return [mine, theirs]
@@ -94,7 +90,7 @@ NAN = Match(MATCH.index, MATCH.score * float("nan"), MATCH.accepted)
     ],
     ids=["NaN", "truth"],
 )
-def test_what_does_not_fit_is_refused(match: Match, truth: Tensor, facts: list[str]) -> None:
+def test_what_does_not_fit_is_refused(match, truth, facts):
     metric = PlaceRecognition(tolerance=1)
     with refused(*facts):
         metric.update(match, truth)

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -13,38 +10,36 @@ from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
 from small_training import Stop, data_of, fit, footage, new_descriptor, recall, trainer
-from torch import Tensor
 
 from dejavu_torch import SpectralMapper
 from dejavu_torch.maps.quantisation import quantise
-from dejavu_torch.maps.spectrum import Transform, from_spectrum, spectrum
-from dejavu_torch.training.descriptors import DescriptorTask
+from dejavu_torch.maps.spectrum import from_spectrum, spectrum
 from dejavu_torch.training.losses import bands_of, coded_proxies, laplace_bits
 
 
-def rated(rate: float = 1.0, **settings: Any) -> DescriptorTask:
+def rated(rate=1.0, **settings):
     return new_descriptor(rate=rate, **settings)
 
 
 # ------------------------------------------------------------------------ bits
 
 
-def mass(level: float, width: float) -> float:
+def mass(level, width):
     """Of a Laplace distribution within half a step, from its distribution function."""
 
-    def below(x: float) -> float:
+    def below(x):
         return 0.5 * math.exp(x / width) if x < 0 else 1 - 0.5 * math.exp(-x / width)
 
     return below(level + 0.5) - below(level - 0.5)
 
 
 @given(st.floats(-6, 6), st.floats(0.3, 20))
-def test_the_bits_are_those_of_the_mass_within_half_a_step(level: float, width: float) -> None:
+def test_the_bits_are_those_of_the_mass_within_half_a_step(level, width):
     bits = laplace_bits(torch.tensor(level, dtype=torch.float64), torch.tensor(width, dtype=torch.float64))
     assert float(bits) == pytest.approx(-math.log2(mass(level, width)), rel=1e-6, abs=1e-9)
 
 
-def test_bits_and_their_gradients_are_finite_however_far_a_level_lies_out() -> None:
+def test_bits_and_their_gradients_are_finite_however_far_a_level_lies_out():
     levels = torch.tensor([0.0, 0.5, 1e4, -1e4, 0.49999], requires_grad=True)
     widths = torch.tensor([1e-3, 1e-3, 1e-2, 1e4, 1e-4], requires_grad=True)
     bits = laplace_bits(levels, widths)
@@ -58,16 +53,16 @@ def test_bits_and_their_gradients_are_finite_however_far_a_level_lies_out() -> N
 # --------------------------------------------------------------------- proxies
 
 
-def widths_of(lines: Tensor, width: float, transform: Transform = "dft") -> Tensor:
+def widths_of(lines, width, transform="dft"):
     return torch.full((int(bands_of(len(lines), transform).max() + 1) * lines.shape[1],), math.log(width))
 
 
-def noise(count: int, dimension: int, seed: int = 0) -> Tensor:
+def noise(count, dimension, seed=0):
     return torch.randn(count, dimension, generator=torch.Generator().manual_seed(seed))
 
 
 @pytest.mark.parametrize("transform", ["dft", "dct"])
-def test_proxies_are_rebuilt_from_their_quantised_lines(transform: Transform) -> None:
+def test_proxies_are_rebuilt_from_their_quantised_lines(transform):
     lines, step = 3 * noise(21, 3), torch.tensor(0.4)
     coded = coded_proxies(lines, step.log(), widths_of(lines, 0.7, transform), transform, noise=False)
     unit = lines / lines.square().mean().sqrt()
@@ -76,12 +71,12 @@ def test_proxies_are_rebuilt_from_their_quantised_lines(transform: Transform) ->
 
 
 @pytest.mark.parametrize(("transform", "halves"), [("dft", [0, 2, 2, 4, 4, 6]), ("dct", range(6))])
-def test_bands_are_half_an_octave_wide(transform: Transform, halves: Sequence[int]) -> None:
+def test_bands_are_half_an_octave_wide(transform, halves):
     wanted = [1 + math.floor(2 * math.log2(cycles)) if cycles else 0 for cycles in halves]
     assert bands_of(6, transform).tolist() == wanted
 
 
-def test_the_widths_are_of_one_band_and_feature() -> None:
+def test_the_widths_are_of_one_band_and_feature():
     lines, band = noise(40, 3), bands_of(40)
     widths = widths_of(lines, 1.0).unflatten(0, (-1, 3)).clone()
     widths[4, 1] = math.log(5.0)
@@ -90,7 +85,7 @@ def test_the_widths_are_of_one_band_and_feature() -> None:
     assert torch.allclose(coded.bits, changed)
 
 
-def test_a_wave_costs_one_line_and_noise_costs_all() -> None:
+def test_a_wave_costs_one_line_and_noise_costs_all():
     time = torch.arange(64.0)
     wave = torch.cos(time * (2 * math.pi * 4 / 64))[:, None]
     cost = []
@@ -102,13 +97,13 @@ def test_a_wave_costs_one_line_and_noise_costs_all() -> None:
     assert cost[0] < cost[1] / 3
 
 
-def test_gradients_of_the_code() -> None:
+def test_gradients_of_the_code():
     """Straight through the rounding to the lines; of bits to all three."""
     lines = noise(12, 3).double().requires_grad_()
     step = torch.tensor(-0.5, dtype=torch.float64, requires_grad=True)
     widths = widths_of(lines, 0.8).double().requires_grad_()
 
-    def bits(*given: Tensor) -> Tensor:
+    def bits(*given):
         return coded_proxies(*given, noise=False).bits
 
     assert torch.autograd.gradcheck(bits, (lines, step, widths))
@@ -131,7 +126,7 @@ def test_gradients_of_the_code() -> None:
     ],
     ids=["short", "empty", "widths"],
 )
-def test_shapes_that_do_not_fit(lines: Tensor, widths: Tensor, facts: tuple[str, ...]) -> None:
+def test_shapes_that_do_not_fit(lines, widths, facts):
     with refused(*facts):
         coded_proxies(lines, torch.zeros(()), widths)
 
@@ -140,9 +135,7 @@ def test_shapes_that_do_not_fit(lines: Tensor, widths: Tensor, facts: tuple[str,
 
 
 @pytest.mark.parametrize("transform", ["dft", "dct"])
-def test_a_training_with_a_rate_ends_in_a_map_that_finds_its_places(
-    tmp_path: Path, transform: Transform
-) -> None:
+def test_a_training_with_a_rate_ends_in_a_map_that_finds_its_places(tmp_path, transform):
     task = rated(mapper=SpectralMapper(20.0, transform=transform))
     model = fit(tmp_path, task, data_of(), max_steps=8)
     assert model.whitening is None  # it would mix what few frequencies make
@@ -152,12 +145,12 @@ def test_a_training_with_a_rate_ends_in_a_map_that_finds_its_places(
     assert figures["train/loss"] > figures["train/descriptor"]
 
 
-def test_bits_count_for_more_and_more(tmp_path: Path) -> None:
+def test_bits_count_for_more_and_more(tmp_path):
     """Nothing at the first step, so that the descriptor learns places first."""
     seen = []
 
     class Losses(Stop):
-        def on_train_batch_end(self, trainer: Any, *_: Any) -> None:
+        def on_train_batch_end(self, trainer, *_):
             now = {name: float(value) for name, value in trainer.callback_metrics.items()}
             seen.append((now["train/loss"] - now["train/descriptor"]) / now["train/bits"])
 
@@ -165,7 +158,7 @@ def test_bits_count_for_more_and_more(tmp_path: Path) -> None:
     assert seen == pytest.approx([0.0, 0.5, 1.0, 1.5], abs=1e-3)
 
 
-def test_bits_are_saved_where_they_count(tmp_path: Path) -> None:
+def test_bits_are_saved_where_they_count(tmp_path):
     bits = []
     for rate in (1e-6, 10.0):
         torch.manual_seed(1)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +24,7 @@ WEIGHTS = "out/descriptor.safetensors"
 FIT = ("train", "fit", "--config", "train.yaml", "--data.source")
 
 
-def routes(sizes: tuple[int, ...] = (16, 16, 16)) -> list[ArrayTraverse]:
+def routes(sizes=(16, 16, 16)):
     """Different routes; their names are their numbers."""
     made = []
     for i, (length, side) in enumerate(zip(LENGTHS, sizes, strict=True)):
@@ -34,18 +33,18 @@ def routes(sizes: tuple[int, ...] = (16, 16, 16)) -> list[ArrayTraverse]:
     return made
 
 
-def listed(source: object = None, **settings: Any) -> RouteData:
+def listed(source=None, **settings):
     return RouteData(routes() if source is None else source, **{"tolerance": 2, "batch_size": 16} | settings)
 
 
-def task_of(**settings: Any) -> DescriptorTask:
+def task_of(**settings):
     return DescriptorTask(**{"backbone": backbone(), "mapper": SpectralMapper(20.0)} | settings)
 
 
 # what is trained on --------------------------------------------------------------------------------------
 
 
-def test_places_are_numbered_one_route_after_the_other_and_no_clip_crosses() -> None:
+def test_places_are_numbered_one_route_after_the_other_and_no_clip_crosses():
     data = listed(clip=4)
     data.setup("fit")
     frames, truth = data.sets["reference"][[0, 39, 40, 70, 71, 93]]
@@ -58,7 +57,7 @@ def test_places_are_numbered_one_route_after_the_other_and_no_clip_crosses() -> 
         assert bool((clips.view(-1, 4) == clips[::4, None]).all())
 
 
-def test_neither_stretches_nor_the_tolerance_cross_from_one_route_to_the_next(tmp_path: Path) -> None:
+def test_neither_stretches_nor_the_tolerance_cross_from_one_route_to_the_next(tmp_path):
     """The loss is that of literal loops over places and proxies."""
     data, task = listed(tolerance=3), task_of()
     running = trainer(tmp_path, max_steps=1)
@@ -88,13 +87,13 @@ def test_neither_stretches_nor_the_tolerance_cross_from_one_route_to_the_next(tm
     assert all(bool(p.grad.isfinite().all()) for p in task.parameters() if p.grad is not None)
 
 
-def test_an_answer_within_the_tolerance_beyond_the_end_of_a_route_is_wrong(tmp_path: Path) -> None:
+def test_an_answer_within_the_tolerance_beyond_the_end_of_a_route_is_wrong(tmp_path):
     """Every answer is one place after the right one."""
     data, task, asked = listed(tolerance=2), task_of(), []
     every = {"val_check_interval": 1, "check_val_every_n_epoch": None, "num_sanity_val_steps": 0}
     running = trainer(tmp_path, max_steps=1, **every)
 
-    def scores(frames: Tensor) -> Tensor:
+    def scores(frames):
         answers = (torch.arange(len(frames)) + len(asked) + 1) % sum(LENGTHS)
         asked.extend(frames)
         return 1.0 - nn.functional.one_hot(answers, sum(LENGTHS)).float()
@@ -114,15 +113,13 @@ def test_an_answer_within_the_tolerance_beyond_the_end_of_a_route_is_wrong(tmp_p
     ],
     ids=str,
 )
-def test_all_routes_are_of_one_size(
-    tmp_path: Path, sizes: tuple[int, ...], resize: tuple[int, int] | None, stored: tuple[int, int]
-) -> None:
+def test_all_routes_are_of_one_size(tmp_path, sizes, resize, stored):
     data = listed(routes(sizes), resize=resize)
     trainer(tmp_path, max_steps=1).fit(task_of(), data)
     assert {tuple(part.shape[1:]) for part in data.sets["reference"].parts} == {(1, *stored)}
 
 
-def test_second_traverses_are_of_their_own_routes(tmp_path: Path) -> None:
+def test_second_traverses_are_of_their_own_routes(tmp_path):
     second = [None, None, ArrayTraverse(footage(0.1, frames=20), "winter")]
     data = listed(second=second, second_truth=[None, None, "3"])
     trainer(tmp_path).fit(task_of(), data)
@@ -134,7 +131,7 @@ def test_second_traverses_are_of_their_own_routes(tmp_path: Path) -> None:
 # what it leaves ------------------------------------------------------------------------------------------
 
 
-def test_a_training_leaves_a_descriptor_with_which_another_route_is_learned(tmp_path: Path) -> None:
+def test_a_training_leaves_a_descriptor_with_which_another_route_is_learned(tmp_path):
     trainer(tmp_path, max_steps=30).fit(task_of(), listed())
     base = DejaVu.load(tmp_path / "descriptor.safetensors")
     assert not (tmp_path / "map.safetensors").exists()
@@ -158,7 +155,7 @@ def test_a_training_leaves_a_descriptor_with_which_another_route_is_learned(tmp_
         base.localize(routes()[0])
 
 
-def test_an_interrupted_run_resumes_with_the_same_list_and_no_other(tmp_path: Path) -> None:
+def test_an_interrupted_run_resumes_with_the_same_list_and_no_other(tmp_path):
     part, alone = tmp_path / "part.ckpt", tmp_path / "alone.ckpt"
     trainer(tmp_path, Stop(4, part), max_steps=8).fit(task_of(), listed())
     trainer(tmp_path, Stop(4, alone), max_steps=8).fit(task_of(), data_of())
@@ -196,9 +193,7 @@ POOLED = nn.Sequential(nn.AdaptiveAvgPool2d(4), nn.Flatten(), nn.Linear(16, 8))
     ],
     ids=["empty", "none", "twice", "one second", "one truth", "query", "sizes", "rate"],
 )
-def test_what_does_not_fit_several_routes_is_refused(
-    tmp_path: Path, source: object, settings: dict[str, Any], task: dict[str, Any], facts: tuple[str, ...]
-) -> None:
+def test_what_does_not_fit_several_routes_is_refused(tmp_path, source, settings, task, facts):
     with refused(*facts):
         trainer(tmp_path).fit(task_of(**task), listed(source, **settings))
 
@@ -207,7 +202,7 @@ def test_what_does_not_fit_several_routes_is_refused(
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """A folder of two routes in `photos`, a third route in `third.npy`, and a training in `out`."""
     folder = tmp_path_factory.mktemp("routes")
     (folder / "photos").mkdir()
@@ -225,11 +220,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(autouse=True)
-def _here(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def _here(folder, monkeypatch):
     monkeypatch.chdir(folder)
 
 
-def test_a_folder_of_folders_is_a_route_each(tmp_path: Path) -> None:
+def test_a_folder_of_folders_is_a_route_each(tmp_path):
     assert routes_of(Path("photos")) == ["photos/day9", "photos/day10"]
     assert routes_of("photos?width=8") == ["photos/day9?width=8", "photos/day10?width=8"]
     assert len(open_source(routes_of("photos?width=8")[1])) == LENGTHS[1]
@@ -237,7 +232,7 @@ def test_a_folder_of_folders_is_a_route_each(tmp_path: Path) -> None:
         assert routes_of(whole) == [whole]
 
 
-def test_what_is_printed_leads_to_a_map(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_what_is_printed_leads_to_a_map(capsys, tmp_path):
     out = str(tmp_path / "run")
     run(*FIT, "[photos/day9,third.npy]", "--trainer.default_root_dir", out)
     line = capsys.readouterr().out.splitlines()[-1]
@@ -252,7 +247,7 @@ def test_what_is_printed_leads_to_a_map(capsys: pytest.CaptureFixture[str], tmp_
     assert model.map.places == LENGTHS[1]
 
 
-def test_info_says_what_it_is(capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_says_what_it_is(capsys):
     run("info", WEIGHTS)
     told = capsys.readouterr().out
     hint = f"next: dejavu learn ROUTE --descriptor {WEIGHTS}"
@@ -261,7 +256,7 @@ def test_info_says_what_it_is(capsys: pytest.CaptureFixture[str]) -> None:
     ] == []
 
 
-def test_compare_learns_with_a_descriptor_of_a_map_as_well(tmp_path: Path) -> None:
+def test_compare_learns_with_a_descriptor_of_a_map_as_well(tmp_path):
     bytes_ = ("--mapper.route_bytes_per_place", "20")
     run("learn", "third.npy", "--map", tmp_path / "m.safetensors", "--descriptor", WEIGHTS, *bytes_)
     for name, given in (("base", WEIGHTS), ("map", tmp_path / "m.safetensors")):
@@ -291,9 +286,7 @@ LEARN = ["learn", "third.npy", "--map", "new.safetensors", "--descriptor", WEIGH
     ],
     ids=lambda given: " ".join(given)[:60],
 )
-def test_a_mistake_is_one_line(
-    capsys: pytest.CaptureFixture[str], words: list[str], facts: list[str]
-) -> None:
+def test_a_mistake_is_one_line(capsys, words, facts):
     error = fails(capsys, *words)
     assert [fact for fact in facts if fact not in error] == [], error
     assert not Path("new.safetensors").exists()

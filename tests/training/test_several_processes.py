@@ -18,9 +18,7 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.mark.slow
 @pytest.mark.parametrize("task", [[], DESCRIPTOR], ids=["templates", "descriptor"])
-def test_two_processes_write_one_map_that_finds_its_places(
-    folder: Path, tmp_path: Path, task: list[str]
-) -> None:
+def test_two_processes_write_one_map_that_finds_its_places(folder, tmp_path, task):
     words = ["--config", "train.yaml", *task, "--trainer.devices", "2", "--trainer.strategy", "ddp"]
     words += ["--trainer.max_steps", "6", "--trainer.default_root_dir", str(tmp_path)]
     alone = {name: value for name, value in os.environ.items() if name != "PL_GLOBAL_SEED"}
@@ -37,7 +35,7 @@ def test_two_processes_write_one_map_that_finds_its_places(
     assert not task or recall(model, footage()) > 0.9  # templates take more steps
 
 
-def test_parts_of_a_batch_are_those_of_one_process() -> None:
+def test_parts_of_a_batch_are_those_of_one_process():
     torch.manual_seed(0)
     whole = data_of(batch_size=8, clip=2)
     whole.setup("fit")

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -45,7 +43,7 @@ class Plain(SpectralMapper):
     whitens = False
 
 
-def levels(model: DejaVu) -> torch.Tensor:
+def levels(model):
     assert isinstance(model.map, SpectralMap)
     return model.map.level
 
@@ -61,7 +59,7 @@ def levels(model: DejaVu) -> torch.Tensor:
     ],
     ids=["code", "foreign", "no whitening", "l2", "frozen"],
 )
-def test_a_training_ends_in_a_map_that_finds_its_own_places(tmp_path: Path, settings: dict[str, Any]) -> None:
+def test_a_training_ends_in_a_map_that_finds_its_own_places(tmp_path, settings):
     task = spectral(**settings)
     trainer(tmp_path).fit(task, data_of())
     named = type(task.dejavu.mapper) is SpectralMapper  # a map file names no other
@@ -74,7 +72,7 @@ def test_a_training_ends_in_a_map_that_finds_its_own_places(tmp_path: Path, sett
     assert model.trained.steps == 4
 
 
-def test_members_of_joined_features_are_whitened_by_themselves(tmp_path: Path) -> None:
+def test_members_of_joined_features_are_whitened_by_themselves(tmp_path):
     task = spectral(backbone=Joined([HOG(cell=4), backbone()]))
     trainer(tmp_path).fit(task, data_of())
     model = DejaVu.load(tmp_path / "map.safetensors")
@@ -84,7 +82,7 @@ def test_members_of_joined_features_are_whitened_by_themselves(tmp_path: Path) -
     assert recall(model, footage()) > 0.9
 
 
-def test_the_file_holds_the_network_alone(tmp_path: Path) -> None:
+def test_the_file_holds_the_network_alone(tmp_path):
     model = fit(tmp_path, spectral(weight_bits=32), data_of())
     assert isinstance(model.features, Embedding)
     network = model.features.network.state_dict()
@@ -95,14 +93,14 @@ def test_the_file_holds_the_network_alone(tmp_path: Path) -> None:
     assert model.whitening.learned
 
 
-def test_the_map_is_of_the_last_features_not_of_those_validated_before(tmp_path: Path) -> None:
+def test_the_map_is_of_the_last_features_not_of_those_validated_before(tmp_path):
     every = {"val_check_interval": 2, "check_val_every_n_epoch": None}
     model = fit(tmp_path, spectral(), data_of(), max_steps=3, **every)
     features = model.descriptor.all_of(ArrayTraverse(footage()))
     assert torch.equal(levels(model), SpectralMapper(20.0)(features).level)
 
 
-def test_making_a_map_changes_nothing_and_gives_the_same_again(tmp_path: Path) -> None:
+def test_making_a_map_changes_nothing_and_gives_the_same_again(tmp_path):
     task = spectral()
     trainer(tmp_path).fit(task, data_of())
     task.train()
@@ -116,9 +114,7 @@ def test_making_a_map_changes_nothing_and_gives_the_same_again(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("alone", [False, True], ids=["augmented", "second alone"])
-def test_a_second_traverse_tells_what_a_visit_changes(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, alone: bool
-) -> None:
+def test_a_second_traverse_tells_what_a_visit_changes(tmp_path, caplog, alone):
     """Of a checkpoint as in the training: what is tested is the map of the file."""
     winter = ArrayTraverse((footage().float() * torch.linspace(0.2, 1, 16)).byte())
     given = {"augmentation": still() if alone else None, "second": winter, "second_truth": "0"}
@@ -134,7 +130,7 @@ def test_a_second_traverse_tells_what_a_visit_changes(
     assert figures == pytest.approx({f"test/{name}": one for name, one in expected.items()}, abs=1e-6)
 
 
-def test_without_anything_that_changes_nothing_is_whitened(tmp_path: Path) -> None:
+def test_without_anything_that_changes_nothing_is_whitened(tmp_path):
     running = trainer(tmp_path / "whitened")
     with refused("data.augmentation", "data.second", "model.whitening none"):
         running.fit(spectral(), data_of(augmentation=still()))
@@ -144,7 +140,7 @@ def test_without_anything_that_changes_nothing_is_whitened(tmp_path: Path) -> No
     assert recall(model, footage()) > 0.9
 
 
-def test_a_map_gives_its_network_to_start_from(tmp_path: Path) -> None:
+def test_a_map_gives_its_network_to_start_from(tmp_path):
     task = spectral(weight_bits=32)
     fit(tmp_path, task, data_of(), max_steps=4)
     kept = task.features.network.state_dict()  # type: ignore[union-attr,operator]
@@ -182,7 +178,7 @@ def test_a_map_gives_its_network_to_start_from(tmp_path: Path) -> None:
     ],
     ids=str,
 )
-def test_settings_that_do_not_fit_are_refused(settings: dict[str, Any], facts: tuple[str, ...]) -> None:
+def test_settings_that_do_not_fit_are_refused(settings, facts):
     with refused(*facts):
         spectral(**settings)
 
@@ -197,9 +193,7 @@ def test_settings_that_do_not_fit_are_refused(settings: dict[str, Any], facts: t
     ],
     ids=["HOG", "frozen", "features", "budget"],
 )
-def test_what_cannot_be_trained_is_told_before(
-    tmp_path: Path, settings: dict[str, Any], frames: torch.Tensor | None, facts: tuple[str, ...]
-) -> None:
+def test_what_cannot_be_trained_is_told_before(tmp_path, settings, frames, facts):
     running = trainer(tmp_path, num_sanity_val_steps=0)
     with refused(*facts):
         running.fit(spectral(**settings), data_of(frames))

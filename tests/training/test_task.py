@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from footage import QUERY, REFERENCE, STEP, camera
 from footage import footage as ground
 from helpers import Fixed, refused
-from pytorch_lightning import Callback, Trainer
+from pytorch_lightning import Callback
 from small_training import (
     FRAMES,
     assert_same_scores,
@@ -32,7 +31,6 @@ from dejavu_torch.data.ground_truth import find_ground_truth
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.training.datamodule import RouteData
-from dejavu_torch.training.task import RouteTask
 from dejavu_torch.types import FrequencyLayer, Training
 
 EPOCHS = {"max_steps": -1, "enable_checkpointing": False}
@@ -47,7 +45,7 @@ EPOCHS = {"max_steps": -1, "enable_checkpointing": False}
     ],
     ids=str,
 )
-def test_task_map_and_exported_program_give_the_same_scores(tmp_path: Path, settings: dict[str, Any]) -> None:
+def test_task_map_and_exported_program_give_the_same_scores(tmp_path, settings):
     task = new_task(**settings)
     model = fit(tmp_path, task, data_of(batch_size=20))
     assert_same_scores(task, model)
@@ -56,9 +54,7 @@ def test_task_map_and_exported_program_give_the_same_scores(tmp_path: Path, sett
     assert model.map.temperature == model.mapper.temperature == pytest.approx(temperature)
 
 
-def test_the_map_holds_how_it_was_trained_and_counts_the_backbone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_map_holds_how_it_was_trained_and_counts_the_backbone(tmp_path, monkeypatch):
     monkeypatch.delenv("PL_GLOBAL_SEED", raising=False)
     task = new_task(weight_bits=32)
     model = fit(tmp_path, task, data_of())
@@ -71,7 +67,7 @@ def test_the_map_holds_how_it_was_trained_and_counts_the_backbone(
     assert fit(tmp_path, new_task(), data_of()).trained == Training(4, 7)
 
 
-def test_training_finds_places_that_the_untrained_start_does_not(tmp_path: Path) -> None:
+def test_training_finds_places_that_the_untrained_start_does_not(tmp_path):
     torch.manual_seed(0)
     noisy = footage(0.15)
     given = {"limit_val_batches": 0}
@@ -80,7 +76,7 @@ def test_training_finds_places_that_the_untrained_start_does_not(tmp_path: Path)
     assert trained > start + 0.2, (start, trained)
 
 
-def test_a_seed_repeats_a_training_and_a_validation_changes_nothing_in_it(tmp_path: Path) -> None:
+def test_a_seed_repeats_a_training_and_a_validation_changes_nothing_in_it(tmp_path):
     states = []
     for seed, batches in ((1, 1.0), (1, 0), (2, 0)):
         torch.manual_seed(seed)
@@ -94,7 +90,7 @@ def test_a_seed_repeats_a_training_and_a_validation_changes_nothing_in_it(tmp_pa
 # layers --------------------------------------------------------------------------------------------------
 
 
-def test_places_without_a_layer_are_left_out(tmp_path: Path) -> None:
+def test_places_without_a_layer_are_left_out(tmp_path):
     gap = [FrequencyLayer(4, 4, start, start + 16, (0, 1, 2)) for start in (0, 24)]
     running, task = trainer(tmp_path, max_epochs=1, max_steps=-1), new_task(mapper=mapper(Fixed(*gap)))
     running.fit(task, data_of(batch_size=20))
@@ -111,14 +107,12 @@ def test_places_without_a_layer_are_left_out(tmp_path: Path) -> None:
     ],
     ids=["no layer", "no end"],
 )
-def test_what_cannot_be_trained_is_refused(
-    tmp_path: Path, settings: dict[str, Any], steps: dict[str, Any], facts: list[str]
-) -> None:
+def test_what_cannot_be_trained_is_refused(tmp_path, settings, steps, facts):
     with refused(*facts):
         fit(tmp_path, new_task(**settings), data_of(), **steps)
 
 
-def test_the_task_of_before_names_those_that_took_its_place() -> None:
+def test_the_task_of_before_names_those_that_took_its_place():
     with refused("DescriptorTask for a spectral map", "TemplateTask for templates"):
         dejavu_torch.PlaceRecognitionTask(backbone=nn.Identity())  # type: ignore[operator]
 
@@ -126,7 +120,7 @@ def test_the_task_of_before_names_those_that_took_its_place() -> None:
 # frames --------------------------------------------------------------------------------------------------
 
 
-def test_even_steps_are_places(tmp_path: Path) -> None:
+def test_even_steps_are_places(tmp_path):
     small = SmallCNN(8, channels=1, resize=(16, 16), widths=(4,), squeeze=4)
     data = RouteData(ArrayTraverse(ground(REFERENCE)), velocity=camera(), batch_size=32)
     model = fit(tmp_path, new_task(backbone=small), data)
@@ -146,9 +140,7 @@ def test_even_steps_are_places(tmp_path: Path) -> None:
         ({"backbone": nn.Sequential(nn.Flatten(), nn.Linear(576, 8))}, None, (1, 24, 24), (1, 24, 24)),
     ],
 )
-def test_frames_are_resized_when_they_are_stored(
-    tmp_path: Path, settings: dict[str, Any], resize: Any, stored: tuple[int, ...], shape: tuple[int, ...]
-) -> None:
+def test_frames_are_resized_when_they_are_stored(tmp_path, settings, resize, stored, shape):
     data, task = data_of(footage(side=24), resize=resize), new_task(**settings)
     trainer(tmp_path, max_steps=1).fit(task, data)
     assert data.sets["reference"].values.shape == (FRAMES, *stored)
@@ -158,7 +150,7 @@ def test_frames_are_resized_when_they_are_stored(
 # figures -------------------------------------------------------------------------------------------------
 
 
-def assert_figures(running: Trainer, task: RouteTask, noisy: Tensor, truth: str = "0") -> None:
+def assert_figures(running, task, noisy, truth="0"):
     """The figures of a test are those of `evaluate` on the map in the trainer's folder."""
     data = data_of(query=ArrayTraverse(noisy), truth=truth)
     (figures,) = running.test(task, data, verbose=False)
@@ -169,7 +161,7 @@ def assert_figures(running: Trainer, task: RouteTask, noisy: Tensor, truth: str 
     assert figures == pytest.approx({f"test/{name}": value for name, value in expected.items()}, abs=1e-6)
 
 
-def test_the_figures_are_those_of_evaluate_on_the_map(tmp_path: Path) -> None:
+def test_the_figures_are_those_of_evaluate_on_the_map(tmp_path):
     """Also of queries without a right place, or of which nothing is known."""
     rows = [f"{i},{i},{i // 2}" if i % 3 else f"{i}" for i in range(30)]
     (tmp_path / "truth.csv").write_text("\n".join(rows) + "\n")
@@ -178,13 +170,13 @@ def test_the_figures_are_those_of_evaluate_on_the_map(tmp_path: Path) -> None:
     assert_figures(running, task, footage(0.2), str(tmp_path / "truth.csv"))
 
 
-def test_figures_are_made_in_32_bits(tmp_path: Path) -> None:
+def test_figures_are_made_in_32_bits(tmp_path):
     running, task = trainer(tmp_path, precision="bf16-mixed", max_steps=30), new_task()
     running.fit(task, data_of())
     assert_figures(running, task, footage(0.2))
 
 
-def test_without_training_the_phase_means_are_evaluated(tmp_path: Path) -> None:
+def test_without_training_the_phase_means_are_evaluated(tmp_path):
     """Of the augmented reference the figures are called so."""
     running, task = trainer(tmp_path), new_task()
     given = {"validation": ArrayTraverse(footage(0.2)), "validation_truth": "0"}
@@ -202,16 +194,16 @@ class Rates(Callback):
     """The learning rate of each step, beside that of the task."""
 
     def __init__(self) -> None:
-        self.seen: list[float] = []
+        self.seen = []
 
-    def on_before_optimizer_step(self, trainer: Trainer, pl_module: Any, optimizer: Any) -> None:
+    def on_before_optimizer_step(self, trainer, pl_module, optimizer):
         self.seen.append(optimizer.param_groups[0]["lr"] / pl_module.lr)
         decays = {id(p): group["weight_decay"] for group in optimizer.param_groups for p in group["params"]}
         assert decays == {id(p): 0.3 if p.ndim > 1 else 0 for p in pl_module.parameters()}
 
 
 @pytest.mark.parametrize("steps", [20, 1])
-def test_the_rate_rises_over_a_tenth_and_falls_to_0(tmp_path: Path, steps: int) -> None:
+def test_the_rate_rises_over_a_tenth_and_falls_to_0(tmp_path, steps):
     """And only what is multiplied decays."""
     rates, task = Rates(), new_task(weight_decay=0.3)
     running = trainer(tmp_path, rates, max_steps=steps, enable_checkpointing=False, limit_val_batches=0)

@@ -9,7 +9,6 @@ import signal
 import sys
 from functools import wraps
 from importlib import import_module
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +18,7 @@ from command_line import fails, run
 from pytorch_lightning import Trainer
 from small_training import CONFIG, DESCRIPTOR, FRAMES, MINE, footage, train, warned
 
-from dejavu_torch import DejaVu, RouteData, TemplateMap
+from dejavu_torch import DejaVu, TemplateMap
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.features.cnn import SmallCNN
@@ -27,7 +26,7 @@ from dejavu_torch.maps.file import read_map
 from dejavu_torch.maps.spectral_map import SpectralMap
 
 
-def figures(folder: Path) -> dict[str, list[float]]:
+def figures(folder):
     rows = list(csv.DictReader((folder / "lightning_logs" / "version_0" / "metrics.csv").open()))
     return {name: [float(row[name]) for row in rows if row[name]] for name in rows[0]}
 
@@ -35,7 +34,7 @@ def figures(folder: Path) -> dict[str, list[float]]:
 # what it does --------------------------------------------------------------------------------------------
 
 
-def test_a_fit_leaves_a_map_a_checkpoint_figures_and_its_config(folder: Path) -> None:
+def test_a_fit_leaves_a_map_a_checkpoint_figures_and_its_config(folder):
     assert [path.name for path in (folder / "run" / "checkpoints").iterdir()] == ["last.ckpt"]
     assert (folder / "run" / "lightning_logs" / "version_0" / "config.yaml").is_file()
     seen = figures(folder / "run")
@@ -47,7 +46,7 @@ def test_a_fit_leaves_a_map_a_checkpoint_figures_and_its_config(folder: Path) ->
     assert model.calibration is None  # training has seen all of it
 
 
-def test_test_and_validate_take_the_last_checkpoint(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_test_and_validate_take_the_last_checkpoint(folder, capsys):
     """And say what the figures are of, and which command scores the map."""
     match = DejaVu.load("run/map.safetensors").localize(ArrayTraverse(footage(0.1)))
     scores = evaluate(match, torch.arange(FRAMES)[:, None], tolerance=2)._asdict()
@@ -65,14 +64,14 @@ def test_test_and_validate_take_the_last_checkpoint(folder: Path, capsys: pytest
         assert {row[0]: float(row[1]) for row in rows} == pytest.approx(expected, abs=1e-6)
 
 
-def test_a_source_alone_is_enough(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_source_alone_is_enough(tmp_path, monkeypatch):
     """Steps, validations and checkpoints have defaults; here but a few steps are taken."""
     monkeypatch.chdir(tmp_path)
     np.save("photos.npy", np.random.default_rng(0).integers(0, 255, (12, 120, 160, 3), dtype=np.uint8))
-    seen: dict[str, object] = {}
+    seen = {}
 
     @wraps(Trainer.fit)  # of which the parser takes its options
-    def taken(self: Trainer, model: object, datamodule: RouteData, **_: object) -> None:
+    def taken(self, model, datamodule, **_):
         seen.update(steps=self.max_steps, every=self.val_check_interval, epochs=self.check_val_every_n_epoch)
         self.fit_loop.epoch_loop.max_steps = 2
         Trainer.fit(self, model, datamodule=datamodule)  # type: ignore[arg-type]
@@ -84,7 +83,7 @@ def test_a_source_alone_is_enough(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert DejaVu.load("dejavu_train/map.safetensors").frame_shape == (3, 120, 160)
 
 
-def test_options_of_our_own_parts_need_no_class_name(folder: Path, tmp_path: Path) -> None:
+def test_options_of_our_own_parts_need_no_class_name(folder, tmp_path):
     (tmp_path / "short.yaml").write_text(
         "model: {class_path: TemplateTask, init_args: {mapper: {class_path: TemplateMapper,\n"
         "  init_args: {periods: {class_path: dejavu_torch.ImposedPeriods}}}, backbone:\n"
@@ -116,7 +115,7 @@ def test_options_of_our_own_parts_need_no_class_name(folder: Path, tmp_path: Pat
     np.testing.assert_allclose(seen["train/loss"], expected, rtol=1e-4)
 
 
-def test_a_class_in_the_current_folder_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_class_in_the_current_folder_is_found(tmp_path, monkeypatch):
     """As by the console command, whose first path is that of its script."""
     np.save(tmp_path / "one.npy", footage().numpy())
     (tmp_path / "own_classes.py").write_text(MINE)
@@ -129,7 +128,7 @@ def test_a_class_in_the_current_folder_is_found(tmp_path: Path, monkeypatch: pyt
     del sys.modules["own_classes"]
 
 
-def test_a_users_own_checkpoints_decide_which_is_the_map(folder: Path, tmp_path: Path) -> None:
+def test_a_users_own_checkpoints_decide_which_is_the_map(folder, tmp_path):
     text = CONFIG.partition("trainer:")[0]
     text += """
 trainer:
@@ -152,9 +151,7 @@ trainer:
     assert checkpoint["epoch"] == 0  # stopped at the first
 
 
-def test_export_makes_a_map_of_a_checkpoint(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_export_makes_a_map_of_a_checkpoint(folder, tmp_path, capsys):
     """With the config that the fit has left."""
     last = folder / "run" / "checkpoints" / "last.ckpt"
     config = str(folder / "run" / "lightning_logs" / "version_0" / "config.yaml")
@@ -167,9 +164,7 @@ def test_export_makes_a_map_of_a_checkpoint(
     assert f"--map {tmp_path}/new/map.safetensors" in capsys.readouterr().out
 
 
-def test_a_spectral_map_whatever_mapper_a_preset_has(
-    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_spectral_map_whatever_mapper_a_preset_has(folder, tmp_path, capfd, caplog):
     chosen = [*DESCRIPTOR, "--model.mapper.route_bytes_per_place", 12]
     train("fit", *chosen, "--trainer.default_root_dir", tmp_path / "fit")
     assert warned(caplog) == []
@@ -187,7 +182,7 @@ def test_a_spectral_map_whatever_mapper_a_preset_has(
     assert len(maps[2].map.level) < len(maps[1].map.level)  # type: ignore[arg-type]
 
 
-def test_a_preset_by_name_and_options_that_have_the_last_word(tmp_path: Path) -> None:
+def test_a_preset_by_name_and_options_that_have_the_last_word(tmp_path):
     options = ["--trainer.max_steps=2", "--data.source=sim:aerial?frames=40", "--trainer.accelerator=cpu"]
     options += ["--trainer.precision", "32-true", "--trainer.default_root_dir", str(tmp_path)]
     run("train", "fit", *options, "--config", "train_road")
@@ -197,7 +192,7 @@ def test_a_preset_by_name_and_options_that_have_the_last_word(tmp_path: Path) ->
     assert model.features.squeeze == 24
 
 
-def test_help_has_our_options_first(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_has_our_options_first(capsys):
     with pytest.raises(SystemExit) as stop:
         run("train", "fit", "--help")
     assert stop.value.code == 0
@@ -212,13 +207,8 @@ def test_help_has_our_options_first(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_normal_run_prints_its_map_and_what_to_do_next(
-    folder: Path,
-    tmp_path: Path,
-    capfd: pytest.CaptureFixture[str],
-    caplog: pytest.LogCaptureFixture,
-    recwarn: pytest.WarningsRecorder,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    folder, tmp_path, capfd, caplog, recwarn, monkeypatch
+):
     monkeypatch.setattr("dejavu_torch.cli.train.has_bf16", lambda: True)  # others are told
     for expected in ([], [f"{tmp_path} holds an earlier run, which this one replaces"]):
         caplog.clear()
@@ -240,12 +230,8 @@ def test_a_normal_run_prints_its_map_and_what_to_do_next(
     "option", [("--data.validation_truth", "0", "--data.validation"), ("--data.truth", "0", "--data.query")]
 )
 def test_a_second_traverse_shows_a_trained_map_beside_untrained_ones(
-    folder: Path,
-    tmp_path: Path,
-    caplog: pytest.LogCaptureFixture,
-    capsys: pytest.CaptureFixture[str],
-    option: tuple[str, ...],
-) -> None:
+    folder, tmp_path, caplog, capsys, option
+):
     """Two steps of a tiny rate teach nothing, so that HOG is better, and is said to be."""
     np.save(tmp_path / "first.npy", footage(side=32).numpy())
     np.save(tmp_path / "second.npy", footage(0.1, side=32).numpy())
@@ -266,9 +252,7 @@ def test_a_second_traverse_shows_a_trained_map_beside_untrained_ones(
     assert logged[-1] == pytest.approx(auc["HOG of all frames"], abs=6e-4)
 
 
-def test_a_trial_run_leaves_an_earlier_run_as_it_is(
-    folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_trial_run_leaves_an_earlier_run_as_it_is(folder, tmp_path, caplog, capsys):
     shutil.copytree(folder / "run", tmp_path / "run")
     files = [tmp_path / "run" / "map.safetensors", *(tmp_path / "run" / "checkpoints").iterdir()]
     before = [path.read_bytes() for path in files]
@@ -279,9 +263,7 @@ def test_a_trial_run_leaves_an_earlier_run_as_it_is(
     assert not [line for line in warned(caplog) if "earlier run" in line]
 
 
-def test_an_interrupt_is_one_line_and_130_and_leaves_a_map(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_interrupt_is_one_line_and_130_and_leaves_a_map(folder, tmp_path, capsys):
     handler = signal.getsignal(signal.SIGINT)
     try:
         with pytest.raises(SystemExit) as stop:
@@ -341,13 +323,7 @@ def test_an_interrupt_is_one_line_and_130_and_leaves_a_map(
     ],
     ids=str,
 )
-def test_a_mistake_is_one_line_and_leaves_no_empty_folder(
-    folder: Path,
-    capfd: pytest.CaptureFixture[str],
-    tmp_path: Path,
-    options: list[str],
-    facts: list[str],
-) -> None:
+def test_a_mistake_is_one_line_and_leaves_no_empty_folder(folder, capfd, tmp_path, options, facts):
     root = tmp_path / "nest" / "run"
     words = ["--config", "train.yaml", "--trainer.default_root_dir", root, *options]
     error = fails(capfd, "train", "fit", *words)
@@ -365,15 +341,7 @@ def test_a_mistake_is_one_line_and_leaves_no_empty_folder(
     ],
     ids=str,
 )
-def test_a_mistake_in_the_config_is_one_line(
-    folder: Path,
-    capfd: pytest.CaptureFixture[str],
-    tmp_path: Path,
-    command: str,
-    before: str,
-    after: str,
-    facts: list[str],
-) -> None:
+def test_a_mistake_in_the_config_is_one_line(folder, capfd, tmp_path, command, before, after, facts):
     (tmp_path / "bad.yaml").write_text(CONFIG.replace(before, after))
     error = fails(capfd, "train", command, "--config", tmp_path / "bad.yaml")
     assert [fact for fact in facts if fact not in error] == [], error

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import nullcontext
-from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -19,14 +16,13 @@ from dejavu_torch import DejaVu, SpectralMapper
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.training.descriptors import DescriptorTask
-from dejavu_torch.training.task import RouteTask
 from dejavu_torch.training.templates import TemplateTask
 
 CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
 GPU = pytest.param("cuda", marks=[pytest.mark.gpu, CUDA])
 
 
-CASES: dict[str, Callable[[], RouteTask]] = {
+CASES = {
     "templates": lambda: TemplateTask(backbone(), mapper(), lr=1e-2, freeze=["linear.bias"]),
     "rate": lambda: DescriptorTask(backbone(), SpectralMapper(8.0), rate=0.3, lr=1e-2),
     "code": lambda: TemplateTask(coded(noise=0.3), mapper(), lr=1e-2),
@@ -37,20 +33,20 @@ class Steps(Callback):
     """What each step logs."""
 
     def __init__(self) -> None:
-        self.figures: list[dict[str, float]] = []
+        self.figures = []
 
-    def on_train_batch_end(self, trainer: Any, *_: Any) -> None:
+    def on_train_batch_end(self, trainer, *_):
         self.figures.append({name: float(value) for name, value in trainer.callback_metrics.items()})
 
 
 class Accelerator(CPUAccelerator):
     """Of the pretended device."""
 
-    def setup_device(self, device: torch.device) -> None:
+    def setup_device(self, device):
         pass
 
 
-def trained(case: str, device: str, folder: Path, **settings: Any) -> tuple[list[dict[str, float]], DejaVu]:
+def trained(case, device, folder, **settings):
     """What the steps log, and the map that is written."""
     torch.manual_seed(0)
     task = CASES[case]()
@@ -66,9 +62,7 @@ def trained(case: str, device: str, folder: Path, **settings: Any) -> tuple[list
 
 @pytest.mark.parametrize("device", [DEVICE.type, GPU])
 @pytest.mark.parametrize("case", CASES)
-def test_losses_are_those_of_the_cpu(
-    case: str, device: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_losses_are_those_of_the_cpu(case, device, tmp_path, monkeypatch):
     monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
     steps, _ = trained(case, "cpu", tmp_path / "here")
     found, model = trained(case, device, tmp_path / "there")
@@ -81,9 +75,7 @@ def test_losses_are_those_of_the_cpu(
 
 
 @pytest.mark.parametrize("device", [DEVICE.type, GPU])
-def test_a_map_trained_on_a_gpu_scores_alike_on_both(
-    device: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_map_trained_on_a_gpu_scores_alike_on_both(device, tmp_path, monkeypatch):
     monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
     given = {"validation": footage(0.05), "validation_truth": "0"}
     _, model = trained("templates", device, tmp_path, augmentation=Augmentation(), **given)

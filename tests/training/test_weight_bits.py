@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
-
 import pytest
 import torch
 from helpers import refused
@@ -16,7 +13,7 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.maps.file import read_map, write_map
 from dejavu_torch.maps.weights import is_rounded
 from dejavu_torch.training.descriptors import DescriptorTask
-from dejavu_torch.training.task import RouteTask, start_from
+from dejavu_torch.training.task import start_from
 from dejavu_torch.training.templates import TemplateTask
 
 
@@ -24,14 +21,14 @@ class Watch(Callback):
     """The backbone's weights after every step."""
 
     def __init__(self) -> None:
-        self.weights: list[torch.Tensor] = []
+        self.weights = []
 
-    def on_train_batch_end(self, trainer: Any, pl_module: Any, *_: Any) -> None:
+    def on_train_batch_end(self, trainer, pl_module, *_):
         assert not is_rounded(pl_module.dejavu.features)
         self.weights.append(pl_module.dejavu.features.linear.weight.detach().clone())
 
 
-def trained(folder: Path, **settings: Any) -> tuple[RouteTask, list[torch.Tensor], DejaVu]:
+def trained(folder, **settings):
     torch.manual_seed(0)
     kind = DescriptorTask if settings.get("mapper") else TemplateTask
     task, watch = kind(**{"backbone": backbone(), "mapper": mapper()} | settings), Watch()
@@ -41,9 +38,7 @@ def trained(folder: Path, **settings: Any) -> tuple[RouteTask, list[torch.Tensor
 
 
 @pytest.mark.parametrize("settings", [{}, {"mapper": SpectralMapper(20.0)}], ids=["templates", "spectral"])
-def test_the_map_is_of_the_rounded_network_and_the_training_is_not(
-    tmp_path: Path, settings: dict[str, Any]
-) -> None:
+def test_the_map_is_of_the_rounded_network_and_the_training_is_not(tmp_path, settings):
     task, narrow, model = trained(tmp_path / "8", **settings)
     assert model.weight_bits == 8
     assert is_rounded(model.features)
@@ -61,7 +56,7 @@ def test_the_map_is_of_the_rounded_network_and_the_training_is_not(
     assert model.summary().fixed["backbone"] < 0.4 * large.summary().fixed["backbone"]
 
 
-def test_a_training_starts_from_8_bits_and_refuses_damaged_ones(tmp_path: Path) -> None:
+def test_a_training_starts_from_8_bits_and_refuses_damaged_ones(tmp_path):
     _, _, model = trained(tmp_path)
     start_from(again := backbone(), path := tmp_path / "map.safetensors")
     own = model.features.state_dict()
