@@ -7,6 +7,7 @@ from typing import Any
 
 from benchmarks import (
     alike,
+    chunks,
     cluster,
     distil,
     drives,
@@ -38,6 +39,7 @@ BENCHES: dict[str, Any] = {  # each returns the lines to print
     "visits": visits.run_visits,
     "alike": alike.run_alike,
     "features": features.run_features,
+    "chunks": chunks.run_chunks,
     "train": train.run_train,
     "trainings": trainings.run_trainings,
     "distil": distil.run_distil,

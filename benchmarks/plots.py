@@ -11,7 +11,7 @@ from types import MappingProxyType
 from typing import Any
 
 from dejavu_torch.evaluation.contenders import COLOURS
-from dejavu_torch.evaluation.plots import GREY, LETTERS, LINE, Plot, canvas, label
+from dejavu_torch.evaluation.plots import GREY, LETTERS, LINE, Plot, canvas, label, legend, set_title
 from dejavu_torch.evaluation.score_plots import area_axis, drawn_areas
 
 OURS = COLOURS["map"]
@@ -59,7 +59,7 @@ def plot_ratios(cases: Mapping[str, Mapping[str, float]], label: str = RATIO) ->
         axis.bar_label(drawn, [f"{ratio:.1f}" for ratio in ratios.values()], padding=3, fontsize=9)
         if label == RATIO:
             axis.axvline(1, color=OURS, linewidth=0.8, linestyle=":")
-        axis.set_title(fill(case, LETTERS), loc="left", fontsize=10, weight="bold")
+        set_title(axis, fill(case, LETTERS))
         axis.set(xlim=(0, 1.15 * max(ratios.values())), ylim=(len(ratios) - 0.6, -0.8), yticks=[])
     axes[-1, 0].set_xlabel(label)
     return figure, axes[:, 0]
@@ -85,9 +85,9 @@ def plot_areas(cases: Mapping[str, Mapping[str, float]], kinds: Mapping[str, str
         axis.plot([], [], "-", color=colour, linewidth=4, label=kind)
     axis.set(yticks=range(len(cases)), yticklabels=[fill(case, 18) for case in cases], xlim=(-0.02, 1.02))
     axis.set_ylim(len(cases) - 0.5, -0.5)
-    axis.grid(axis="x", alpha=0.3)
+    axis.grid(axis="x", alpha=0.25)
     axis.set_xlabel("AUC, mean of the seeds")
-    figure.legend(*axis.get_legend_handles_labels(), loc="outside lower left", ncols=2, frameon=False)
+    legend(figure, *axis.get_legend_handles_labels(), ncols=2)
     return figure, axis
 
 
@@ -102,13 +102,13 @@ def plot_visits(cases: Mapping[str, Mapping[str, Sequence[float]]]) -> Plot:
             (drawn[way],) = axis.plot(range(len(areas)), areas, style, color=colour, markersize=5)
         low, high = min(map(min, ways.values())), max(map(max, ways.values()))
         axis.set_ylim(min(low - 0.03, high - 0.2), min(high + 0.03, 1.005))
-        axis.set_title(label(case.removesuffix(" asked")), loc="left", fontsize=9)
+        set_title(axis, label(case.removesuffix(" asked")))
         axis.set_xticks(range(most))
-        axis.grid(alpha=0.3)
+        axis.grid(alpha=0.25)
     for axis in axes[-1]:
         axis.set_xlabel("drives that taught", fontsize=9)
     axes[0, 0].set_ylabel("AUC of another, one image", fontsize=9)
-    figure.legend([*drawn.values()], [*drawn], loc="outside lower left", frameon=False, fontsize=9)
+    legend(figure, [*drawn.values()], [*drawn])
     return figure, axes
 
 
@@ -134,11 +134,11 @@ def plot_growth(
             axis.set_ylim(0, 1.02)
         else:
             axis.set_yscale("log")
-        axis.set_title(heading, loc="left", fontsize=10, weight="bold")
+        set_title(axis, heading)
         axis.grid(alpha=0.25)
     axes[-1, 0].set_xlabel("places")
     handles = [drawn[name] for name in names]
-    figure.legend(handles, names, loc="outside lower left", frameon=False, fontsize=9, handlelength=4)
+    legend(figure, handles, names, handlelength=4)
     return figure, axes[:, 0]
 
 
@@ -200,13 +200,13 @@ def plot_frontiers(
         axis.minorticks_off()
         area_axis(axis)
         title = re.sub(r"[^ :]*/", "", case)  # sources without their folders
-        axis.set_title(fill(label(title), LETTERS - 10), loc="left", fontsize=10, weight="bold")
+        set_title(axis, fill(label(title), LETTERS - 10))
         axis.set_xlabel("route bytes per place")
         if case in whitenings:
             _plot_whitenings(next(column), whitenings[case])
     lines = {text: h for a in shown for h, text in zip(*a.get_legend_handles_labels(), strict=True)}
     handles = [lines[name] for name in names]
-    figure.legend(handles, names, loc="outside lower left", frameon=False, fontsize=9, ncols=2)
+    legend(figure, handles, names, ncols=2)
     return figure, axes[:, 0]
 
 
@@ -252,10 +252,10 @@ def plot_both_ways(
             area_axis(axis)
             axis.set_ylabel("")
             heading = f"{heading}\n" if axis in axes[0] else ""
-            axis.set_title(f"{heading}{label(case)}", loc="left", fontsize=9)
+            set_title(axis, f"{heading}{label(case)}")
     for axis in axes[-1]:
         axis.set_xlabel("route bytes per place", fontsize=9)
     names = [name for name in FAMILIES if name in drawn]
     handles = [drawn[name] for name in names]
-    figure.legend(handles, names, loc="outside lower left", frameon=False, fontsize=9, ncols=2)
+    legend(figure, handles, names, ncols=2)
     return figure, axes

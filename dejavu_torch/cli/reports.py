@@ -233,7 +233,7 @@ def run_reproduce(
     """
     from dejavu_torch.evaluation import paper_tables as tables
     from dejavu_torch.evaluation.report import report_folder, text_table, write_index, write_report
-    from dejavu_torch.evaluation.reproduce import lengths_picture, reproduce
+    from dejavu_torch.evaluation.reproduce import reproduce
 
     names = list(tables.PUBLISHED) if dataset == "all" else [dataset]
     if not {*names} <= {*tables.PUBLISHED}:
@@ -241,7 +241,7 @@ def run_reproduce(
     check_output_folder(out)
     reports: dict[str, Report] = {}
     for name in names:
-        print(f"{name}: a second traverse, the reference itself, other chunk lengths", flush=True)
+        print(f"{name}: a second traverse, and the reference itself", flush=True)
         result = reproduce(name, tolerance=tolerance, seed=seed, progress=True)
         run, title = result.run, f"dejavu reproduce: {name}"
         plan = str(run.model.summary())
@@ -253,7 +253,7 @@ def run_reproduce(
     notes = [*tables.route_lines(reports), *tables.boundary_lines(reports), tables.FOOTAGE]
     pages = {name: f"{name}/index.html" for name in names}
     with whole_folder(out) as folder:
-        write_index(folder, rows, notes, lengths_picture(reports), pages, "the paper's experiments", command)
+        write_index(folder, rows, notes, pages, "the paper's experiments", command)
     print("\n".join([text_table(rows), *notes]))
     say(f"right within {tolerance} places; next: open {out / 'index.html'}")
 

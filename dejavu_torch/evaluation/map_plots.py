@@ -37,14 +37,14 @@ def plot_answers(
     if strip is not None:
         rows[0].imshow(plots.pixels(strip), extent=(begin, end, 0, 1), aspect="auto")
         rows[0].set_yticks([])
-        rows[0].set_title("middle column of each frame", loc="left", fontsize=10)
+        plots.set_title(rows[0], "middle column of each frame")
     where = run.borders[slice(*chunk)]
     for axis, (title, values, colour) in zip(rows[above:], curves, strict=True):
         axis.plot(where, values, color=colour, linewidth=1.1)
         best = int(values.argmin())
         style = {"color": plots.WRONG, "markersize": 7, "clip_on": False, "label": "best (first of equals)"}
         axis.plot(where[best], values[best], "v", **style)
-        axis.set_title(title, loc="left", fontsize=9)
+        plots.set_title(axis, title)
         axis.set_yticks([])
     for axis in rows:
         for place in places:
@@ -52,7 +52,7 @@ def plot_answers(
             axis.axvline(int(run.borders[place]), **style)
     handles, labels = rows[-1].get_legend_handles_labels()
     unique = dict(zip(labels, handles, strict=True))
-    figure.legend(unique.values(), unique.keys(), ncols=2, frameon=False, loc="outside lower right")
+    plots.legend(figure, unique.values(), unique.keys(), ncols=2, loc="outside lower right")
     figure.supylabel(f"difference of query {run.query_frames[query]} (lower is better)", fontsize=10)
     rows[-1].set(xlabel=plots.PLACE, xlim=(begin, end))
     return figure, rows
@@ -87,7 +87,7 @@ def plot_velocity(distances: Mapping[str, Tensor], step: float) -> plots.Plot:
         axis.axhline(0, color=plots.GREY, linewidth=0.6)
         axis.axhline(step, color=plots.DARK, linewidth=0.8, linestyle=":")
         axis.set(xlim=(0, len(travelled)), ylabel="pixels of ground\nper frame")
-        axis.set_title(fill(name, plots.LETTERS - 10), loc="left", fontsize=9)
+        plots.set_title(axis, fill(name, plots.LETTERS - 10))
         axis.grid(alpha=0.25)
     axes[-1, 0].set_xlabel("frame (dotted: step between places)")
     return figure, axes

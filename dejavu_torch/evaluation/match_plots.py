@@ -140,7 +140,7 @@ def draw_coverage(
         groups.append((reported & ~scored, plots.GREY, 3, f"{(~scored).sum()} not scored"))
         groups.append((wrong, plots.WRONG, 3, f"{wrong.sum()} wrong"))
         groups.append((right, plots.RIGHT, 4, f"{right.sum()} right"))
-        axis.set_title(f"right within {tolerance} {unit}", fontsize=10)
+        plots.set_title(axis, f"right within {tolerance} {unit}")
         missing = missing & scored
     elif probability is not None:
         order = probability.argsort()  # the surest drawn last
@@ -160,7 +160,7 @@ def draw_coverage(
     axis.set(xlabel=plots.QUERY, ylabel=f"reported {plots.PLACE}")
     axis.set(xlim=(first, max(last, first + 1)), ylim=(-0.01 * frames, frames))
     if axis.get_legend_handles_labels()[0]:
-        figure.legend(loc="outside lower left", ncols=2, frameon=False, markerscale=3)
+        plots.legend(figure, ncols=2, markerscale=3)
     return plots.picture("coverage", (figure, axis), truth=truth, probable=probability is not None)
 
 
@@ -183,8 +183,8 @@ def draw_scores(run: Localization, cells: int = CELLS) -> plots.Pictures:
     bar = figure.colorbar(image, ax=axis, pad=0.01, aspect=30, ticks=[0, 1], label="score of the query")
     bar.ax.set_yticklabels(["best", "median"])
     handles, names = axis.get_legend_handles_labels()
-    style = {"ncols": len(names), "markerscale": 4, "handlelength": 1.5, "columnspacing": 1}
-    figure.legend(handles, names, loc="outside lower left", frameon=False, **style)
+    style: dict[str, Any] = {"markerscale": 4, "handlelength": 1.5, "columnspacing": 1}
+    plots.legend(figure, handles, names, ncols=len(names), **style)
     shown = []
     if len(chosen) < len(queries):
         shown.append(f"{len(chosen)} of {len(queries)} queries")
@@ -259,7 +259,7 @@ def draw_posterior(run: Localization, cells: int = PIXELS) -> plots.Pictures:
         right, some = _right_frames(truth, borders), slice(None, None, -(-len(queries) // MARKS))
         style = {"color": plots.RIGHT, "markersize": 5, "markerfacecolor": "none", "clip_on": False}
         axis.plot(queries[some], right[some], "o", **style)
-        figure.legend(axis.lines[:1], ["right place"], loc="outside lower left", frameon=False)
+        plots.legend(figure, axis.lines[:1], ["right place"])
         off_map = truth.judged & right.isnan().all(1)
         if off_map.any():
             style = {"step": "mid", "color": plots.GREY, "linewidth": 0}

@@ -70,10 +70,25 @@ def canvas(height: float, rows: int = 1, columns: int = 1, **grid: Any) -> Plot:
     return figure, axes
 
 
-def show_frame(axis: Any, frame: Tensor | None, title: str) -> None:
+def set_title(axis: Any, text: str) -> None:
+    """The title of a part of a picture, above its left corner."""
+    axis.set_title(text, loc="left", fontsize=9)
+
+
+def legend(owner: Any, *names: Any, loc: str = "outside lower left", **settings: Any) -> None:
+    """The legend of a figure, below it, or of axes."""
+    owner.legend(*names, loc=loc, frameon=False, fontsize=9, **settings)
+
+
+def colour_bar(figure: Figure, image: Any, axis: Any, label: str, **settings: Any) -> Any:
+    """A thin bar of the colours of an image, beside its axes."""
+    return figure.colorbar(image, ax=axis, label=label, pad=0.01, aspect=30, **settings)
+
+
+def show_frame(axis: Any, frame: Tensor | None, text: str) -> None:
     """Draw a frame (C,H,W) in [0,1] without axes; None leaves it empty."""
     axis.set_axis_off()
-    axis.set_title(title, loc="left", fontsize=9, pad=3)
+    axis.set_title(text, loc="left", fontsize=9, pad=3)
     if frame is not None:
         axis.imshow(pixels(frame))
 

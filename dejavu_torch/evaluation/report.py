@@ -154,11 +154,6 @@ def text_table(rows: list[list[str]]) -> str:
     )
 
 
-def headline(report: Report) -> str:
-    """The main results in plain words."""
-    return _sentences(report, "headline")
-
-
 def summary(report: Report) -> str:
     """The counts, thresholds and times in a few sentences."""
     return _sentences(report, "summary")
@@ -205,12 +200,12 @@ def steps_after(facts: Mapping[str, Any]) -> str:
 def as_html(report: Report, pictures: Pictures) -> str:
     """The table of scores and two pictures for a notebook, without references to other files."""
     shown = [name for name in ("pr", "coverage", "pairs") if name in pictures][:2]
-    rows = [[html.escape(printable(cell)) for cell in row] for row in score_table(report)]
-    table = [f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows]
+    page = templates(page=True).get_template("report.html.j2").module
+    table = page.table_of(score_table(report)) if report.ours.scores else ""  # type: ignore[attr-defined]
     style = 'style="width:25rem"'
     images = [f'<img src="{_embedded(as_png(pictures[name]))}" {style} alt="{name}"/>' for name in shown]
     text = html.escape(printable(summary(report)))
-    return f"<table>{''.join(table)}</table><p>{text}</p>{''.join(images)}"
+    return f"{table}<p>{text}</p>{''.join(images)}"
 
 
 def report_folder(path: Path) -> AbstractContextManager[Path]:
@@ -236,10 +231,9 @@ def write_report(
         folder,
         title=printable(title),
         verdict=verdict(report),
-        lead=headline(report),
+        summary=summary(report),
         steps=steps(report),
         first=embedded.pop(first, None),
-        notes=[summary(report)],
         rows=rows,
         colours=[colour_of(key) for key in (*sizes, *shown)],
         sequence_rows=sequence_table(report),
@@ -260,15 +254,13 @@ def write_index(
     folder: Path,
     rows: list[list[str]],
     notes: Sequence[str],
-    picture: Picture,
     pages: Mapping[str, str],
     title: str,
     command: str,
 ) -> None:
-    """Write the index.html of several reports, with one table, one picture, and links to their pages."""
+    """Write the index.html of several reports, with one table, and links to their pages."""
     parts = {"title": printable(title), "notes": notes, "links": pages, "rows": rows}
-    pictures = [(picture, _embedded(as_png(picture)))]
-    _write_page(folder, **parts, pictures=pictures, made_by=printable(command))
+    _write_page(folder, **parts, made_by=printable(command))
 
 
 def as_png(picture: Picture) -> bytes:

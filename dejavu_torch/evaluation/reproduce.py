@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -13,13 +13,10 @@ from dejavu_torch.data.source import open_source
 from dejavu_torch.evaluation.activation import share
 from dejavu_torch.evaluation.compare import Comparison, compare
 from dejavu_torch.evaluation.contenders import Contender, contend
-from dejavu_torch.evaluation.controls import leave_out_match, template_map_of, with_mapper
-from dejavu_torch.evaluation.curves import evaluate
+from dejavu_torch.evaluation.controls import leave_out_match, with_mapper
 from dejavu_torch.evaluation.paper_tables import PUBLISHED
 from dejavu_torch.evaluation.pictures import paper_pictures
-from dejavu_torch.evaluation.plots import Picture, picture
 from dejavu_torch.evaluation.report import Report
-from dejavu_torch.evaluation.score_plots import Length, plot_lengths
 from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.odometry import GroundOdometry
@@ -27,8 +24,8 @@ from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.types import InputError, Match, Traverse
 
-LENGTHS = (256, 512, 1024, 2048)
 PATCH = (32, 32)  # pixels: slightly more rows than the region of ground has in a frame
+PAPER: dict[str, Any] = {"min_period": 8, "peaks": "bins", "false_alarm": None, "short": "refuse"}
 SETTINGS = ("min_period", "strongest", "peaks", "false_alarm", "short")  # of the analysis, except its chunks
 
 
@@ -38,7 +35,7 @@ def paper_model(reference: Traverse | None = None) -> DejaVu:
     Args:
         reference: a traverse; if it has `corners`, they give the velocity (section IV-B).
     """
-    periods = SpectrogramAnalysis(min_period=8, peaks="bins", false_alarm=None, short="refuse")
+    periods = SpectrogramAnalysis(**PAPER)
     ground = getattr(reference, "corners", None)
     velocity = None if ground is None else GroundOdometry(ground, PATCH)
     return DejaVu(mapper=TemplateMapper(periods, reduction="sum"), velocity=velocity)
@@ -51,7 +48,6 @@ def reproduce(
     tolerance: int = 5,
     seed: int = 0,
     frames: int | None = None,
-    lengths: Sequence[int] = LENGTHS,
     progress: bool = False,
 ) -> Comparison:
     """One of the paper's datasets: a second traverse, and the database queried with itself.
@@ -61,7 +57,6 @@ def reproduce(
         model: settings; None is `paper_model` of the dataset.
         tolerance: places within which one is right, inclusive.
         seed: of the simulated route. frames: its length; None is the simulator's default.
-        lengths: chunk lengths to compare, in places.
         progress: show progress bars on a terminal.
 
     Returns:
@@ -71,7 +66,7 @@ def reproduce(
           templates; `ideal_leave_out`, without the frames within the tolerance of the query in any mean;
         - `comparable` and `known_boundaries`, if the simulator knows the route's structures, see
           `known_boundaries`; the fact `boundaries` has their `BoundaryEffect`;
-        - the facts `published`, `chunk_lengths` (a `Length` each), and `measured_distance` of a train.
+        - the facts `published`, and `measured_distance` of a train.
 
     Raises:
         InputError: an unknown dataset, or bad input of any of the stages.
@@ -93,7 +88,6 @@ def reproduce(
     facts: dict[str, Any] = {
         **result.report.facts,
         "published": PUBLISHED[dataset]._asdict(),
-        "chunk_lengths": [row._asdict() for row in chunk_lengths(result, lengths)],
     }
     first, second = result.run.reference, result.run.query
     if isinstance(first, ResampledTraverse) and isinstance(second, ResampledTraverse):
@@ -108,30 +102,6 @@ def reproduce(
         facts["boundaries"] = {"cuts": len(cuts), **effects}
     report, pictures = Report(result.report.ours, contenders, facts), paper_pictures(result.run)
     return result._replace(report=report, pictures={**pictures, **result.pictures})
-
-
-def chunk_lengths(result: Comparison, lengths: Sequence[int] = LENGTHS) -> list[Length]:
-    """Recall and storage of maps with chunks of other lengths (section VI)."""
-    mapper, places = _mapper(result.run.model), len(result.run.reference_features)
-    truth, tolerance = result.run.truth, result.run.tolerance
-    if truth is None or mapper is None:
-        return []
-    rows = []
-    for window in (length for length in lengths if length <= places):
-        periods = SpectrogramAnalysis(window, **_settings(mapper))
-        model = _learned(result, TemplateMapper(periods, mapper.metric, mapper.reduction))
-        size = model.summary().map_bytes
-        scores = evaluate(_localized(model, result), truth, tolerance)
-        template_map_of(model, "a comparable score").reduction = "mean"
-        comparable = evaluate(_localized(model, result), truth, tolerance).recall_at_1
-        rows.append(Length(window, scores.recall_at_1, scores.auc, comparable, size, size / places))
-    return rows
-
-
-def lengths_picture(reports: Mapping[str, Report]) -> Picture:
-    """Recall and bytes over the length of the chunks, a line for each dataset."""
-    lengths = {name: [Length(**row) for row in one.facts["chunk_lengths"]] for name, one in reports.items()}
-    return picture("lengths", plot_lengths(lengths))["lengths"]
 
 
 def measured_distance(resampled: ResampledTraverse) -> float | None:

@@ -1,4 +1,4 @@
-"""Pictures of scores: curves, storage, sequences and chunk lengths."""
+"""Pictures of scores: curves, storage and sequences."""
 
 from __future__ import annotations
 
@@ -10,7 +10,16 @@ from typing import Any, NamedTuple
 
 from dejavu_torch.evaluation.contenders import COLOURS, Contender, colour_of, distinct, sequences_as_json
 from dejavu_torch.evaluation.curves import Scores
-from dejavu_torch.evaluation.plots import LETTERS, LINE, Pictures, Plot, canvas, label, picture
+from dejavu_torch.evaluation.plots import (
+    LETTERS,
+    LINE,
+    Pictures,
+    canvas,
+    label,
+    legend,
+    picture,
+    set_title,
+)
 from dejavu_torch.types import Together
 
 _SHADES = (COLOURS["map"], "#00406b", "#5aa9d6")  # one map on several datasets
@@ -35,20 +44,6 @@ class Stored(NamedTuple):
         return {name: value for name, value in entry.items() if value != {}}
 
 
-class Length(NamedTuple):
-    """Scores and storage of a map with chunks of `window` places.
-
-    recall_at_1_comparable: with scores that are comparable between chunks, `reduction="mean"`.
-    """
-
-    window: int
-    recall_at_1: float
-    auc: float
-    recall_at_1_comparable: float
-    map_bytes: int
-    bytes_per_place: float
-
-
 def _style(key: str) -> dict[str, Any]:
     """The colour and line of a contender, by its key."""
     line = _LINES.get(key.partition("_")[0], "-")
@@ -69,34 +64,10 @@ def draw_curves(contenders: Mapping[str, Contender], tolerance: str) -> Pictures
         name += " (reports nothing)" * (len(curve.recall) == 0)
         axis.plot(curve.recall, curve.precision, label=fill(name, LETTERS - 8), **_style(key))
     axis.set(xlim=(0, 1.01), ylim=(0, 1.02), xlabel="recall (of all queries)", ylabel="precision")
-    axis.set_title(f"right within {tolerance}", fontsize=10)
+    set_title(axis, f"right within {tolerance}")
     axis.grid(alpha=0.25)
-    figure.legend(reverse=True, loc="outside lower left", frameon=False, fontsize=9)
+    legend(figure, reverse=True)
     return picture("pr", (figure, axis))
-
-
-def plot_lengths(datasets: Mapping[str, Sequence[Length]]) -> Plot:
-    """Recall and storage over the chunk length (section VI)."""
-    figure, (above, below) = canvas(4.6, 2, sharex=True)
-    for number, (name, rows) in enumerate(datasets.items()):
-        colour, mark = _SHADES[number % len(_SHADES)], "osD^v"[number % 5]
-        windows = [row.window for row in rows]
-        style = {"color": colour, "marker": mark, "markersize": 6}
-        above.plot(windows, [row.recall_at_1_comparable for row in rows], label=name, **style)
-        above.plot(windows, [row.recall_at_1 for row in rows], linestyle=":", **style | {"markersize": 3})
-        below.plot(windows, [row.bytes_per_place for row in rows], **style)
-    windows = sorted({row.window for rows in datasets.values() for row in rows})
-    below.set_xscale("log", base=2)
-    below.set_xticks(windows, [str(window) for window in windows])
-    below.minorticks_off()
-    above.set(ylabel="recall@1", ylim=(0, 1.02))
-    below.set(xlabel="length of a chunk (places)", ylabel="bytes per place")
-    below.set_ylim(bottom=0)
-    for axis in (above, below):
-        axis.grid(alpha=0.25)
-    if windows:
-        above.legend(loc="best", frameon=False, fontsize=9)
-    return figure, (above, below)
 
 
 def draw_storage(
@@ -129,9 +100,9 @@ def draw_storage(
     axis.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
     axis.minorticks_off()
     axis.set(ylim=(0, 1.02), xlabel="route bytes per place", ylabel="area under the PR curve")
-    axis.set_title(f"right within {tolerance}", fontsize=10)
+    set_title(axis, f"right within {tolerance}")
     axis.grid(alpha=0.25)
-    figure.legend(loc="outside lower left", frameon=False, fontsize=9)
+    legend(figure)
     factors = [null / ours for ours, null in equally_good(*(storage.get(key, ()) for key in ("map", "null")))]
     numbers: dict[str, Any] = {key: [one.as_json() for one in points] for key, points in storage.items()}
     numbers["null_over_map"] = factors
@@ -174,8 +145,8 @@ def draw_sequences(
     axis.set_xticks([*at.values()], [str(T) for T in at])
     area_axis(axis)
     axis.set(xlabel="queries matched together, T")
-    axis.set_title(f"right within {tolerance}", fontsize=10)
-    figure.legend(reverse=True, loc="outside lower left", frameon=False, fontsize=9)
+    set_title(axis, f"right within {tolerance}")
+    legend(figure, reverse=True)
     return picture("sequences", (figure, axis))
 
 

@@ -119,7 +119,7 @@ def draw_chunks(plan: Plan, borders: Tensor, unit: str) -> plots.Pictures:
         axis.axvline(int(borders[edge]), color=plots.GREY, linewidth=0.8, linestyle=":")
     periods = [float(layer.period) for layer in plan]
     plots.period_axis(axis, min(periods) / 1.2, max(periods) * 1.2, unit)
-    axis.set_title(f"widest bar: {most} features", fontsize=10, loc="left")
+    plots.set_title(axis, f"widest bar: {most} features")
     return plots.picture("chunks", (figure, axis))
 
 
@@ -134,8 +134,8 @@ def draw_layers(layers: Sequence[FrequencyLayer], borders: Tensor, unit: str) ->
     axis.invert_yaxis()
     axis.set_yticks(range(len(shown)), [f"{float(layer.period):.4g}" for layer in shown])
     axis.set(xlabel=plots.PLACE, ylabel=f"period ({unit})")
-    axis.set_title(f"phase in {len(shown)} of {len(layers)} layers", loc="left", fontsize=10)
-    figure.colorbar(image, ax=axis, label="phase / period", pad=0.01, aspect=20)
+    plots.set_title(axis, f"phase in {len(shown)} of {len(layers)} layers")
+    plots.colour_bar(figure, image, axis, "phase / period")
     return plots.picture("layers", (figure, axis))
 
 
@@ -149,9 +149,9 @@ def draw_autocorrelogram(values: Tensor, periods: Sequence[float], feature: int,
         lags = [k * period for k in range(1, MARKED) if k * period < len(values)]
         axis.vlines(lags, -1, 1, color=colour, linewidth=0.9, linestyle=":", label=f"multiples of {period:g}")
     axis.set(xlim=(0, len(values)), ylim=(-1, 1.02), xlabel=f"lag ({unit})", ylabel="autocorrelation")
-    axis.set_title(f"feature {feature}", loc="left", fontsize=10)
+    plots.set_title(axis, f"feature {feature}")
     if periods:
-        axis.legend(loc="upper right", ncols=2, frameon=False, fontsize=9)
+        plots.legend(axis, ncols=2, loc="upper right")
     return plots.picture("autocorrelogram", (figure, axis))
 
 
@@ -170,7 +170,7 @@ def draw_spectrogram(run: Localization, plan: Plan, feature: int) -> plots.Pictu
     step = max(1, len(values) // DOTS)
     low, high = (sign * max_pool1d(sign * values.T, step, ceil_mode=True)[0] for sign in (-1, 1))
     above.fill_between(borders[:-1:step], low, high, color=plots.DARK, linewidth=0.4)
-    above.set_title(f"feature {feature} along the route", loc="left", fontsize=10)
+    plots.set_title(above, f"feature {feature} along the route")
     above.set(ylabel="value")
     shares = [(power[2:] / power[1:].sum()).nan_to_num() for _, _, power in spectra]
     norm = PowerNorm(0.5, 0, 100 * max(1e-6, *(float(share.max()) for share in shares)))
@@ -191,11 +191,11 @@ def draw_spectrogram(run: Localization, plan: Plan, feature: int) -> plots.Pictu
             if len(spectra) <= plots.LABELLED:
                 style = {"textcoords": "offset points", "va": "center", "fontsize": 9, "bbox": plots.BOX}
                 below.annotate(f"{at[1]:.4g}", at, (10, 0), **style)
-    figure.colorbar(mesh, ax=below, label="% of the feature's power", pad=0.01, aspect=30)
+    plots.colour_bar(figure, mesh, below, "% of the feature's power")
     longest = max((stop - start) / 1.5 for start, stop, _ in spectra)
     plots.period_axis(below, analysis.min_period, longest, run.unit)
     below.set(xlim=(0, int(borders[-1])), xlabel=plots.PLACE)
-    below.set_title("power at each period; circles: kept", loc="left", fontsize=10)
+    plots.set_title(below, "power at each period; circles: kept")
     return plots.picture("spectrogram", (figure, axes))
 
 
@@ -221,7 +221,7 @@ def draw_templates(
     phase = (torch.arange(layer.phases) + 0.5) * period / layer.phases - 0.5
     above.plot(phase, templates[:, chosen], color=BLUE, linewidth=2.2)
     thick = "the trained template" if run.model.trained else "their mean"
-    above.set_title(f"feature {feature}, {len(cycles)} cycles; thick: {thick}", loc="left", fontsize=10)
+    plots.set_title(above, f"feature {feature}, {len(cycles)} cycles; thick: {thick}")
     above.set(ylabel="value")
     rows = templates.var(0, correction=0).argsort(descending=True, stable=True)[:ROWS]
     wave = torch.fft.fft(templates[:, rows].double(), dim=0)[1 % layer.phases]
@@ -232,7 +232,7 @@ def draw_templates(
     extent = (-0.5, period - 0.5, len(rows) - 0.5, -0.5)
     below.imshow(image.numpy(), aspect="auto", extent=extent, cmap="Blues", interpolation="nearest")
     shown = f"{len(rows)} of " * (len(rows) < len(layer.features)) + f"{len(layer.features)} features"
-    below.set_title(f"templates of {shown}; dark: highest", loc="left", fontsize=10)
+    plots.set_title(below, f"templates of {shown}; dark: highest")
     mark = (rows == chosen).nonzero().flatten().tolist()
     below.set_yticks(mark, [str(feature)] * len(mark))
     below.set(xlabel=f"phase, of a period of {period:.4g} ({run.unit})", ylabel="feature")
@@ -269,7 +269,7 @@ def draw_features(run: Localization, layers: Sequence[FrequencyLayer]) -> plots.
         lines.set_linewidth((points * (0.02 + 0.07 * strength)).tolist())
         axis.add_collection(lines)
         axis.set_axis_off()
-        axis.set_title(f"period {float(layer.period):.4g},\n{len(layer.features)} features", fontsize=10)
+        plots.set_title(axis, f"period {float(layer.period):.4g},\n{len(layer.features)} features")
     return plots.picture("features", (figure, axes), frame=int(run.borders[middle]))
 
 

@@ -52,7 +52,7 @@ def shorter(dataset, window):
 @pytest.fixture(scope="module")
 def aerial():
     """The first 512 frames, one chunk."""
-    return reproduce("aerial", shorter("aerial", 512), frames=FRAMES, lengths=LENGTHS)
+    return reproduce("aerial", shorter("aerial", 512), frames=FRAMES)
 
 
 def test_the_paper_s_settings_are_the_default(monkeypatch):
@@ -78,23 +78,6 @@ def test_the_database_itself_is_found_and_leaving_out_undoes_it(aerial):
     assert report["ideal"]["recall_at_1"] > 0.99 > report["recall_at_1"]
     assert report["ideal_leave_out"]["recall_at_1"] < 0.1
     assert report["published"] == PUBLISHED["aerial"]._asdict()
-
-
-@pytest.mark.slow
-def test_chunks_of_other_lengths_are_maps_of_their_own(aerial):
-    rows = aerial.report.facts["chunk_lengths"]
-    assert [row["window"] for row in rows] == [256, 512]  # 1024 is longer than the route
-    assert rows[1]["auc"] == aerial.report.as_json()["auc"]
-    assert rows[1]["map_bytes"] == pytest.approx(aerial.report.facts["map_bytes"], abs=200)  # calibrated
-    mapper = TemplateMapper(SpectrogramAnalysis(256, **PAPER), reduction="sum")
-    other = DejaVu(mapper=mapper).learn_features(aerial.run.reference_features)
-    scores = evaluate(other.localize(aerial.run.query_features), aerial.run.truth, 5)
-    assert (rows[0]["auc"], rows[0]["recall_at_1"]) == (scores.auc, scores.recall_at_1)
-    assert rows[0]["bytes_per_place"] == rows[0]["map_bytes"] / FRAMES
-    other = DejaVu(mapper=TemplateMapper(SpectrogramAnalysis(256, **PAPER)))
-    other.learn_features(aerial.run.reference_features)
-    again = evaluate(other.localize(aerial.run.query_features), aerial.run.truth, 5)
-    assert rows[0]["recall_at_1_comparable"] == again.recall_at_1
 
 
 @pytest.mark.slow
@@ -130,13 +113,13 @@ def test_the_command_writes_an_index_over_the_reports(aerial, tmp_path, monkeypa
     assert "0.9813" in page
     assert f"aerial: {FRAMES} places, {FRAMES} queries; " in page
     report = json.loads((tmp_path / "out" / "aerial" / "report.json").read_text())
-    assert {"ideal", "ideal_leave_out", "chunk_lengths", "published", "auc", "null"} <= set(report)
+    assert {"ideal", "ideal_leave_out", "published", "auc", "null"} <= set(report)
 
 
 @pytest.fixture(scope="module")
 def outdoor():
     """The first 310 frames, from the start of the train on, in chunks of 64."""
-    return reproduce("outdoor", shorter("outdoor", 64), frames=310, lengths=(32, 64))
+    return reproduce("outdoor", shorter("outdoor", 64), frames=310)
 
 
 def metres_of(result, traverse, frames):

@@ -7,18 +7,16 @@ from itertools import combinations
 import numpy as np
 import pytest
 import torch
-from drawn import render, texts
+from drawn import texts
 
 from dejavu_torch.evaluation.contenders import COLOURS, Contender
 from dejavu_torch.evaluation.curves import PRCurve, Scores
 from dejavu_torch.evaluation.plots import DARK, GREY, LAYERS, RIGHT, WRONG
 from dejavu_torch.evaluation.score_plots import (
-    Length,
     Stored,
     draw_curves,
     draw_sequences,
     draw_storage,
-    plot_lengths,
 )
 
 
@@ -143,13 +141,3 @@ def test_colours_that_share_a_picture_differ_for_the_colour_blind(together, sigh
 
 def test_a_colour_means_one_contender():
     assert len({*COLOURS.values(), RIGHT, WRONG, GREY, DARK, *LAYERS}) == len(COLOURS) + 6
-
-
-def test_recall_and_bytes_over_the_length_of_a_chunk():
-    rows = [Length(256, 0.8, 0.7, 0.85, 4000, 40.0), Length(512, 0.9, 0.8, 0.95, 3000, 30.0)]
-    plot = plot_lengths({"aerial": rows, "nothing": []})
-    render(plot[0])
-    comparable, printed, *_ = (list(line.get_ydata()) for line in plot[1][0].lines)
-    assert (comparable, printed) == ([0.85, 0.95], [0.8, 0.9])
-    assert list(plot[1][1].lines[0].get_ydata()) == [40.0, 30.0]
-    assert {line.get_color() for line in plot[1][1].lines[:1]} == {COLOURS["map"]}

@@ -59,7 +59,8 @@ def test_test_and_validate_take_the_last_checkpoint(folder, capsys):
         lines = capsys.readouterr().out.splitlines()
         assert lines[-2].endswith(".ckpt")
         assert lines[-1] == f"next: {compare}"
-        rows = [line.replace("│", " ").split() for line in lines if prefix in line]  # a table of rich, if installed
+        # a table of rich, if that is installed
+        rows = [line.replace("│", " ").split() for line in lines if prefix in line]
         expected = {prefix + name: value for name, value in scores.items()}
         assert {row[0]: float(row[1]) for row in rows} == pytest.approx(expected, abs=1e-6)
 
