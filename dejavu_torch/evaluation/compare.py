@@ -4,34 +4,29 @@ from __future__ import annotations
 
 import copy
 import logging
-import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from dejavu_torch.data.arrays import UNNAMED
-from dejavu_torch.data.coordinates import Near, coordinates_of
 from dejavu_torch.data.ground_truth import (
     Truth,
     check_ground_truth,
-    describe_ground_truth,
     ground_truth_in_places,
     of_loops,
-    offset_of,
 )
 from dejavu_torch.data.source import Source, as_traverse
 from dejavu_torch.data.traverse import fitted
-from dejavu_torch.evaluation.answers import answer_facts
 from dejavu_torch.evaluation.baselines import Baseline, baselines_of, with_drives
 from dejavu_torch.evaluation.contenders import Contender, contend, models_beside
-from dejavu_torch.evaluation.curves import auc_error
-from dejavu_torch.evaluation.evaluate import RANKS, evaluation_facts
+from dejavu_torch.evaluation.evaluate import RANKS
+from dejavu_torch.evaluation.facts import facts_of, match_facts, metric_facts
 from dejavu_torch.evaluation.localization import NOTHING, Localization
 from dejavu_torch.evaluation.pictures import draw_pictures
 from dejavu_torch.evaluation.plots import Pictures
@@ -41,28 +36,21 @@ from dejavu_torch.evaluation.storage import coded_at_sizes, noise_over_map
 from dejavu_torch.features.descriptor import is_ready
 from dejavu_torch.features.views import LabelledFrames
 from dejavu_torch.growth import calibrate_if_possible
-from dejavu_torch.maps.distance import l1_backend
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import SpectralMap
-from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import DejaVu, check_apart, check_queries, features_per_frame
-from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, resampled, source_of
-from dejavu_torch.periods.spectrogram import BACKEND
+from dejavu_torch.motion.resampling import ground_truth_of, resampled, source_of
 from dejavu_torch.recognition.centring import centred
-from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.localizer import SINGLE, Matching
 from dejavu_torch.recognition.select import check_candidates
-from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.types import InputError, Match, SequenceModel, Traverse
 
 log = logging.getLogger("dejavu_torch")
 
-QUANTILES = 0.5, 0.9, 0.99  # of errors in metres
 SAMPLED = 256  # reference frames that a given map is checked with
-STANDING, FAR = 0.01, 256  # of the distance between places drawn at random: a camera that stands still
-NEAR = 10  # places within which it should find them, at least
+NEAR = 10  # places within which the map should find them, at least
 MAX_FILTERED = 2**25  # scores up to which ordered queries are also filtered by default
 
 Seconds = dict[str, float]  # that each stage took
@@ -143,58 +131,45 @@ def compare(
     Raises:
         InputError: bad input to any of the stages, or a map of another number of places.
     """
-    model = DejaVu() if model is None else model
+    model, itself = DejaVu() if model is None else model, loops is not None
     has_map, seconds = model.map.places > 0, dict.fromkeys(("describe", "learn", "localize"), 0.0)
     _check_settings(model, truth, interpolate, tolerance, top, leave_out)
     if loops is not None:
-        if query is not None or distractors or storage_curve or leave_out is not None or top != 1:
-            expected = "without query, distractors, storage_curve, leave_out and top"
-            raise InputError(f"loops: {loops}; expected the reference alone, {expected}")
-        if sequence is not None and not isinstance(sequence, str | PlaceSmoother):
-            raise InputError(f"loops: {loops} and {sequence}; expected a smoother, or None")
+        alone = query is None and leave_out is None and not (distractors or storage_curve or top != 1)
+        _check_loops(loops, alone, sequence)
         reference, centre = as_traverse(reference), False  # the mean is that of the map
     elif query is None:
         raise InputError("there is no query; expected a second traverse, or loops within the reference")
     query = reference if query is None else query
     reference, query, off = _prepared(model, reference, query, distractors, seconds, progress, loops)
     check_candidates(top, tolerance, len(reference))
-    given, ordered = ordered, source_of(query).ordered if ordered is None else ordered
-    if isinstance(sequence, str):
-        sequence = PlaceSmoother(within=tolerance) if ordered and len(query) > 1 else None
-    smoother = sequence if isinstance(sequence, PlaceSmoother) else None
-    if smoother is not None:
-        sequence = None
-    elif sequence is not None:
-        sequence.check(None, len(reference))
-    itself = loops is not None
+    in_order = source_of(query).ordered if ordered is None else ordered
+    smoother, causal = _ways(sequence, in_order and len(query) > 1, tolerance)
+    if causal is not None:
+        causal.check(None, len(reference))
     # without a given truth, each place would be its own answer
     known = None if itself and truth is None else ground_truth_of(truth, reference, query, interpolate)
 
     with timed(seconds, "describe" if has_map else "learn"):
-        if has_map:
-            places = model.descriptor.all_of(reference, progress)
-            _check_given_map(model, places, reference.name, tolerance)
-        else:
-            spectral = isinstance(model.mapper, SpectralMapper)
-            places = model.descriptor.learn(reference, second, progress, spectral)
-            model.learn_features(places, reference, second)
+        places = _learned(model, reference, second, tolerance, progress)
         if isinstance(calibration, LabelledFrames) or (calibration is None and not has_map):
             calibrate_if_possible(model, reference, calibration, progress=progress)
     with timed(seconds, "localize"):
-        beside = ordered and known is not None and not itself  # without truth they have no scores
-        beside = beside and (given is not None or len(query) * model.map.places <= MAX_FILTERED)
-        also = models_beside(sequence, beside, len(query), model.map.places, tolerance)
+        beside = in_order and known is not None and not itself  # without truth they have no scores
+        beside = beside and (ordered is not None or len(query) * model.map.places <= MAX_FILTERED)
+        also = models_beside(causal, beside, len(query), model.map.places, tolerance)
         alike = PlaceSmoother(within=tolerance) if beside and len(query) > 1 else None
-        matching = Matching(sequence, also, apart=loops)
-        centring = ordered and model.centres(len(query)) if centre is None else centre
-        settings = matching, centring, smoother is not None, tolerance, top, progress
-        run, found = _localized(model, reference, query, places, *settings)
+        centring = in_order and model.centres(len(query)) if centre is None else centre
+        run = _described(model, reference, query, places, centring, tolerance, progress)
+        run = run._replace(matching=Matching(causal, also, apart=loops))
+        run, found = _localized(run, smoother is not None, top, progress)
         run, candidates = _smoothed(run, found, smoother, alike, progress)
-    off_map = _match_distractors(model, off, smoother or sequence, centring, progress)
+    off_map = _match_distractors(model, off, smoother or causal, centring, progress)
 
     model.cpu()
-    known = known and ground_truth_in_places(known, model.map.place_of)
-    known = of_loops(known, torch.arange(len(query)), loops) if known and loops is not None else known
+    if known is not None:
+        known = ground_truth_in_places(known, model.map.place_of)
+        known = of_loops(known, torch.arange(len(query)), loops) if loops is not None else known
     run = run._replace(truth=known, reference_features=places.cpu(), query_features=run.query_features.cpu())
     ours = run.contend("this map", run.judged.renumbered(model.map.table.scored), model)
     contenders = _other_contenders(run, others or {}, leave_out, seed, progress)
@@ -203,12 +178,10 @@ def compare(
     pictures = draw_pictures(run, {"map": ours, **contenders}, storage)
     pictures |= draw_reliability(run.scored, known, tolerance)
     facts = {
-        **_map_facts(model.summary(), run.reference_features),
-        **_run_facts(run, seconds),
-        **_match_facts(run, found, truth, interpolate, off_map),
+        **facts_of(run, seconds),
+        **match_facts(run, found, truth, interpolate, off_map),
         "centred": centring,
-        **_metric_facts(run, truth),
-        **_standing_facts(run),
+        **metric_facts(run, truth),
         **({"second": second.placed_facts()} if second is not None and second.placed else {}),
         **{name: dict(picture.numbers) for name, picture in pictures.items() if picture.numbers},
     }
@@ -235,6 +208,24 @@ def _check_settings(
     if truth is not None:
         check_ground_truth(truth, interpolate)
     check_candidates(top, tolerance)
+
+
+def _check_loops(loops: int, alone: bool, sequence: object) -> None:
+    """Refuse what a drive by itself has no use for."""
+    if not alone:
+        expected = "without query, distractors, storage_curve, leave_out and top"
+        raise InputError(f"loops: {loops}; expected the reference alone, {expected}")
+    if sequence is not None and not isinstance(sequence, str | PlaceSmoother):
+        raise InputError(f"loops: {loops} and {sequence}; expected a smoother, or None")
+
+
+def _ways(
+    sequence: SequenceModel | Literal["auto"] | None, drive: bool, tolerance: int
+) -> tuple[PlaceSmoother | None, SequenceModel | None]:
+    """The smoother, or else the other sequence model that answers; "auto" is a smoother for a drive."""
+    if isinstance(sequence, str):
+        sequence = PlaceSmoother(within=tolerance) if drive else None
+    return (sequence, None) if isinstance(sequence, PlaceSmoother) else (None, sequence)
 
 
 def _prepared(
@@ -273,32 +264,48 @@ def _prepared(
     return reference, query, [even(other, step=step) for other in off]
 
 
-def _localized(
+def _learned(
+    model: DejaVu, reference: Traverse, second: LabelledFrames | None, tolerance: int, progress: bool
+) -> Tensor:
+    """The descriptors (N,K) of the reference, which the model learns unless it has its map."""
+    if model.map.places:
+        places = model.descriptor.all_of(reference, progress)
+        _check_given_map(model, places, reference.name, tolerance)
+        return places
+    places = model.descriptor.learn(reference, second, progress, isinstance(model.mapper, SpectralMapper))
+    model.learn_features(places, reference, second)
+    return places
+
+
+def _described(
     model: DejaVu,
     reference: Traverse,
     query: Traverse,
     places: Tensor,
-    matching: Matching,
     centring: bool,
-    drive: bool,
     tolerance: int,
-    top: int,
     progress: bool,
-) -> tuple[Localization, Match]:
-    """The run, and the best places of each query as far as recall@N or `top` needs."""
+) -> Localization:
+    """The run with the descriptors of its queries, and no answers yet."""
     check_queries(model, query.frame_shape, features_per_frame(model), query.name)
     queries = places if query is reference else model.descriptor.all_of(query, progress)
-    if matching.sequence is not None:
-        matching.sequence.check(len(queries), model.map.places)
+    run = Localization(model, reference, query, places, queries, NOTHING, None, tolerance)
+    if centring:
+        run = run._replace(query_features=centred(model.map, queries), causal_features=queries)
+    return run
+
+
+def _localized(run: Localization, drive: bool, top: int, progress: bool) -> tuple[Localization, Match]:
+    """The run, and the best places of each query as far as recall@N or `top` needs."""
+    model = run.model
+    if run.sequence is not None:
+        run.sequence.check(len(run.query_features), model.map.places)
     ranks = max(top, min(max(RANKS), model.map.places))
-    moved = centred(model.map, queries) if centring else queries
-    causal = queries if centring else None
-    run = Localization(model, reference, query, places, moved, NOTHING, None, tolerance, matching, causal)
 
     def match(queries: Tensor, how: Matching) -> Match:
         # whose acceptance is not asked for beside a drive
         own = Matching(how.sequence) if drive else model.matching(how.sequence)
-        own = own._replace(also=how.also, k=ranks, radius=tolerance, apart=how.apart)
+        own = own._replace(also=how.also, k=ranks, radius=run.tolerance, apart=how.apart)
         return model.localize_descriptors(queries, own, progress=progress)
 
     found = run.match_by(match)
@@ -403,111 +410,3 @@ def timed(seconds: Seconds, name: str) -> Iterator[None]:
     began = time.perf_counter()
     yield
     seconds[name] += time.perf_counter() - began
-
-
-def _map_facts(summary: MapSummary, features: Tensor) -> dict[str, Any]:
-    """The entries of report.json about the map, whose places have these features (N,D)."""
-    chunks = [chunk._asdict() | {"periods": [*map(plain_number, chunk.periods)]} for chunk in summary.chunks]
-    names = ("kind", "map_bytes", "fixed_bytes", "route_bytes", "bytes_per_place", "lines")
-    return {
-        **{name: getattr(summary, name) for name in (*names, "templates", "template_numbers")},
-        "frames": len(features),
-        "backbone_bytes": summary.fixed.get("backbone", 0),
-        "route_bytes_per_place": summary.route_bytes / len(features),
-        "full_bytes": features.nbytes,
-        "periods": sorted({period for chunk in chunks for period in chunk["periods"]}),
-        "chunks": chunks,
-    }
-
-
-def _run_facts(run: Localization, seconds: Seconds) -> dict[str, Any]:
-    """The entries of report.json about the run; no seconds to learn if the map is given."""
-    model, reference, query = run.model, run.reference, run.query
-    acceptance = model.acceptance(run.smoother or run.sequence)
-    facts = {
-        "answers": run.answers,
-        "seconds_learn": seconds["learn"],
-        "seconds_localize": seconds["localize"],
-        "l1_backend": l1_backend(),
-        "spectrogram_backend": BACKEND,
-        "threshold": acceptance.threshold,
-        "least_probability": acceptance.precision,
-        "sequence": run.sequence.length if isinstance(run.sequence, SequenceMatcher) else 1,
-        "speeds": list(run.sequence.speeds) if isinstance(run.sequence, SequenceMatcher) else None,
-        "filter": isinstance(run.sequence, PlaceFilter),
-        "trained": model.trained and model.trained._asdict(),
-        "reference": reference.name,
-        "query": query.name,
-    }
-    if run.smoother is not None:
-        facts["drive"] = drive = run.smoother.settled()
-        if run.truth is not None:
-            block = math.ceil(run.smoother.correlation)
-            drive["auc_error"] = auc_error(run.scored, run.truth, run.tolerance, block)
-    if run.matching.apart is not None:
-        facts["loops"] = run.matching.apart
-    if isinstance(reference, ResampledTraverse):
-        facts["resampling"] = {
-            "step": reference.step,
-            "reference_frames": len(reference.positions),
-            "query_frames": len(query.positions) if isinstance(query, ResampledTraverse) else None,
-        }
-    return facts
-
-
-def _match_facts(
-    run: Localization, candidates: Match, truth: Truth | None, interpolate: bool, off: Mapping[str, Tensor]
-) -> dict[str, Any]:
-    """The entries of report.json about the answers; `off`: see `rejection_facts`."""
-    place_map, tolerance = run.model.map, run.tolerance
-    carried = all(source_of(traverse).places is not None for traverse in (run.reference, run.query))
-    words, offset = describe_ground_truth(truth, interpolate, carried), offset_of(truth, carried)
-    ranked, shown = place_map.table.scored(candidates.index), run.match.renumbered(place_map.frame_of)
-    facts = evaluation_facts(run.scored, ranked, run.truth, tolerance, place_map.positions, words, off)
-    alone = answer_facts(shown, run.query_frames, tolerance, run.truth is not None, offset)
-    if run.matching.apart is not None:
-        alone.pop("line", None)  # a second lap lies on one
-    return facts | alone
-
-
-def _metric_facts(run: Localization, truth: Truth | None) -> dict[str, Any]:
-    """The entry `error_metres` of report.json: quantiles of the distances between queries and the places
-    reported for them, where the truth is by coordinates."""
-    parsed = None if truth is None else check_ground_truth(truth)
-    if not isinstance(parsed, Near):
-        return {}
-    stored, asked = coordinates_of([source_of(run.reference), source_of(run.query)], parsed.kind)
-    index = run.match.index
-    distance = (asked[run.query_frames] - stored[run.model.map.frame_of(index)]).norm(dim=1)
-    known = distance.isfinite() & (index >= 0)
-    if run.truth is not None and run.matching.apart is not None:
-        known &= (run.truth.positives >= 0).any(1)  # most places are no loop
-    facts: dict[str, Any] = {}
-    for name, chosen in (("all", known), ("accepted", known & run.match.accepted)):
-        if chosen.any():
-            quantiles = distance[chosen].quantile(torch.tensor(QUANTILES, dtype=torch.float64)).tolist()
-            facts[name] = {f"{share:g}": round(at, 3) for share, at in zip(QUANTILES, quantiles, strict=True)}
-    return {"error_metres": facts}
-
-
-def _standing_facts(run: Localization) -> dict[str, int]:
-    """The entry `standing` of report.json: places where the camera stands, if there are some."""
-    if isinstance(run.reference, ResampledTraverse):
-        return {}
-    count = count_standing(run.reference_features)
-    return {"standing": count} if count else {}
-
-
-def count_standing(descriptors: Tensor) -> int:
-    """How many of the places (N,K) look like the one before, as where the camera stands."""
-    drawn = torch.linspace(0, len(descriptors) - 1, min(FAR, len(descriptors))).round().long()
-    some = descriptors[drawn].float()
-    far = float((some - some.flip(0)).square().sum(1).median())
-    steps = descriptors.float().diff(dim=0).square().sum(1)
-    return int((steps < STANDING * far).sum())
-
-
-def plain_number(period: object) -> int | float:
-    """An exact period as a JSON number."""
-    value = float(period)  # type: ignore[arg-type]
-    return int(value) if value.is_integer() else value

@@ -16,7 +16,7 @@ from dejavu_torch.data.coordinates import coordinates_of, read_coordinates
 from dejavu_torch.data.ground_truth import find_ground_truth
 from dejavu_torch.data.source import check_not_read
 from dejavu_torch.data.traverse import Chain, Part
-from dejavu_torch.evaluation.compare import count_standing
+from dejavu_torch.evaluation.facts import count_standing
 
 NAN = math.nan
 
