@@ -25,7 +25,7 @@ from dejavu_torch.model import DejaVu, features_per_frame, require_map
 from dejavu_torch.model_file import ModelState, Recipe, difference, recipe_of, run_key, weights_of
 from dejavu_torch.motion.resampling import ResampledTraverse, source_of
 from dejavu_torch.teaching import LEAST, place_drives
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.types import InputError, Traverse, expect
 
 log = logging.getLogger("dejavu_torch")
 
@@ -214,8 +214,7 @@ def _known_places(
     else:
         seen = f"{second.name} has {frames} frames and {name} {table.frames}"
         return second, None, seen + (" at even steps" if step is not None else "")
-    if not (places >= 0).any():
-        raise InputError(f"no frame of {second.name} shows a place of {name}; expected some")
+    expect((places >= 0).any(), "some", f"no frame of {second.name} shows a place of {name}")
     return second, places, ""
 
 
@@ -419,8 +418,7 @@ def _check_compatible(model: DejaVu, added: Traverse) -> None:
         )
         raise InputError(f"{added.name} has {seen}, the map was learned from {learned}; expected the same")
     count, expected = model.descriptor.count_features(added), features_per_frame(model)
-    if count != expected:
-        raise InputError(f"{added.name} gives {count} features per frame; expected {expected}, as in the map")
+    expect(count == expected, f"{expected}, as in the map", f"{added.name} gives {count} features per frame")
 
 
 def _compatible(model: DejaVu, stored: tuple[int, ...], shape: tuple[int, ...]) -> bool:

@@ -38,7 +38,7 @@ from dejavu_torch.recognition.select import HIGHEST, PROBABLE, Acceptance, check
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.resize import reduced_size
 from dejavu_torch.text import with_progress
-from dejavu_torch.types import InputError, Match, SequenceModel, Traverse
+from dejavu_torch.types import InputError, Match, SequenceModel, Traverse, expect
 
 if TYPE_CHECKING:
     from dejavu_torch.recognition.calibration import Calibration
@@ -122,14 +122,11 @@ class DejaVu(nn.Module):
         super().__init__()
         if whitening not in (None, "none") and not isinstance(whitening, Whitening):
             raise InputError(f"the whitening is {whitening!r}; expected a Whitening, 'none' or None")
-        if mapper is not None and not isinstance(mapper, Mapper):
-            raise InputError(f"the mapper is a {type(mapper).__name__}; expected a Mapper or None")
+        expect(mapper is None or isinstance(mapper, Mapper), "a Mapper or None", mapper=type(mapper))
         if not isinstance(batch_size, int) or batch_size < 1:
             raise InputError(f"batch_size is {batch_size}; expected a whole number of at least 1")
-        if threshold is not None and not threshold > -math.inf:
-            raise InputError(f"the threshold is {threshold}; expected a number, or None")
-        if weight_bits not in BITS:
-            raise InputError(f"weight_bits is {weight_bits!r}; expected one of {', '.join(map(str, BITS))}")
+        expect(threshold is None or threshold > -math.inf, "a number, or None", threshold=threshold)
+        expect(weight_bits in BITS, f"one of {', '.join(map(str, BITS))}", weight_bits=weight_bits)
         check_precision(precision)
         if precision is not None and threshold is not None:
             raise InputError(f"threshold is {threshold} and precision is {precision}; expected one of them")
@@ -630,8 +627,7 @@ def _state_of(model: DejaVu, place_map: PlaceMap, traverse: Traverse | None) -> 
 def require_map(model: DejaVu, purpose: str = "") -> None:
     """Refuse a model without a map; `purpose` is for the message, such as " to append to"."""
     if not model.map.places:
-        if model.trained is None:
-            raise InputError(f"there is no map yet{purpose}; expected learn(...) or load(...) first")
+        expect(model.trained is not None, "learn(...) or load(...) first", f"there is no map yet{purpose}")
         seen = f"this is a descriptor without a map{purpose}"
         raise InputError(f"{seen}; expected learn(...) with it first")
 
@@ -644,8 +640,7 @@ def features_per_frame(model: DejaVu) -> int:
 
 def check_apart(apart: int, places: int) -> None:
     """Refuse loops closer than a place, or none."""
-    if not 1 <= apart < places:
-        raise InputError(f"loops: {apart}; expected a number of places from 1 to {places - 1}")
+    expect(1 <= apart < places, f"a number of places from 1 to {places - 1}", f"loops: {apart}")
 
 
 def check_queries(model: DejaVu, shape: tuple[int, ...], dimension: int, name: str) -> None:

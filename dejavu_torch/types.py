@@ -38,6 +38,29 @@ class InputError(ValueError):
         super().__init__(text)
 
 
+def expect(fits: object, to_be: object, seen: object = "", /, **given: object) -> None:
+    """Refuse bad input unless it `fits`: "`seen`; expected `to_be`", where `given` reads "name is value".
+
+    Example:
+        >>> expect(2 > 1, "at least 1", k=2)
+    """
+    if not fits:
+        shown = {
+            name: value.__name__ if isinstance(value, type) else repr(value) for name, value in given.items()
+        }
+        raise InputError(f"{seen or ' and '.join(map(' is '.join, shown.items()))}; expected {to_be}")
+
+
+def check_shape(x: Tensor, dims: str, name: str) -> None:
+    """Refuse a tensor of another shape than `dims`, such as "Q 16": a word is any size, a number that one."""
+    sizes = dims.split()
+    fits = x.ndim == len(sizes) and all(
+        w.isalpha() or n == int(w) for w, n in zip(sizes, x.shape, strict=True)
+    )
+    if not fits:
+        raise InputError(f"{name} {tuple(x.shape)}; expected ({','.join(sizes)})")
+
+
 class Traverse(Dataset[Tensor], ABC):
     """Frames along a route, indexed from 0: a sequence that is read as needed, never all of it in memory.
 
@@ -130,14 +153,12 @@ class Traverse(Dataset[Tensor], ABC):
     @cached_property
     def frame_shape(self) -> tuple[int, ...]:
         """Shape of a frame: (C,H,W), or (D,) of ready features."""
-        if not len(self):
-            raise InputError(f"{self.name} holds no frames; expected at least one")
+        expect(len(self), "at least one", f"{self.name} holds no frames")
         return tuple(self.read(range(1)).shape[1:])
 
     def at_once(self, most: int = BATCH_SIZE) -> int:
         """How many frames to read at a time: `most`, or fewer if they are large; refuses too large ones."""
-        if most < 1:
-            raise InputError(f"a batch holds {most} frames; expected at least 1")
+        expect(most >= 1, "at least 1", f"a batch holds {most} frames")
         values = math.prod(self.frame_shape)
         if values > FRAME_NUMBERS:
             seen = f"{self.name} has frames of {' x '.join(map(str, self.frame_shape))} numbers"
@@ -192,8 +213,7 @@ class FrequencyLayer:
         object.__setattr__(self, "period", Fraction(self.period))
         a, b = self.period.as_integer_ratio()
         seen = f"a layer has period {self.period} and {self.phases} phases"
-        if a <= 0 or self.phases < 1:
-            raise InputError(f"{seen}; expected period > 0, phases >= 1")
+        expect(a > 0 and self.phases >= 1, "period > 0, phases >= 1", seen)
         if not 0 <= self.start < self.stop:
             raise InputError(f"a layer covers [{self.start}, {self.stop}); expected 0 <= start < stop")
         if max(self.stop * b, a * self.phases) >= 2**63:

@@ -37,7 +37,7 @@ from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.recognition.calibration import Calibration
 from dejavu_torch.recognition.coarse import plan
 from dejavu_torch.text import printable
-from dejavu_torch.types import InputError, Match, Traverse
+from dejavu_torch.types import InputError, Match, Traverse, expect
 
 if TYPE_CHECKING:
     from dejavu_torch.teaching import Refinement
@@ -144,8 +144,7 @@ def run_export(
     """
     from dejavu_torch.export import OPSET, export_onnx
 
-    if onnx.suffix != ".onnx":
-        raise InputError(f"--onnx {onnx} is no name of an ONNX file; expected one such as route.onnx")
+    expect(onnx.suffix == ".onnx", "one such as route.onnx", f"--onnx {onnx} is no name of an ONNX file")
     check_output_file(onnx)
     check_not_read(onnx, map)
     matcher = sequences.matcher(SUPPRESSION, threshold)
@@ -240,8 +239,7 @@ def run_merge(maps: Sequence[Path], *, map: Path, features: nn.Module | None = N
     for one, other in combinations(maps, 2):
         if one.exists() and other.exists() and one.samefile(other):
             raise InputError(f"{other} and {one} are the same file; expected each map once")
-    if len(maps) < 2:
-        raise InputError(f"{maps[0]} alone; expected at least two maps to merge")
+    expect(len(maps) >= 2, "at least two maps to merge", f"{maps[0]} alone")
     models = [options.load_map(path, copy.deepcopy(features)) for path in maps]
     model = growth.merge(models, [path.stem for path in maps])
     model.save(map)

@@ -20,7 +20,7 @@ from dejavu_torch.live.localizer import LiveLocalizer, LiveMatch
 from dejavu_torch.live.page import Page, ReferencePictures, Snapshot, without_nan
 from dejavu_torch.model import DejaVu
 from dejavu_torch.text import printable
-from dejavu_torch.types import InputError, SequenceModel
+from dejavu_torch.types import InputError, SequenceModel, expect
 
 RECENT = 10_000  # answers whose times are kept
 RATE = 10  # frames per second on the page, for a source without times
@@ -126,8 +126,7 @@ def frames_from(
     size = (shape[1], shape[2]) if shape is not None and len(shape) == 3 else None
     if is_stream(source):
         camera = Camera(source, size)
-        if realtime:
-            raise InputError(f"--realtime: {camera.name} is live already; expected a video file with it")
+        expect(not realtime, "a video file with it", f"--realtime: {camera.name} is live already")
         return _with_warning(camera), True, camera.name
     own, traverse = open_source(source).frame_shape, open_source(source, size)
     if traverse.frame_shape != own and size is not None:

@@ -25,7 +25,7 @@ from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.search import Search, check_search
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.recognition.smoother import PlaceSmoother
-from dejavu_torch.types import InputError, SequenceModel, Traverse
+from dejavu_torch.types import InputError, SequenceModel, Traverse, expect
 
 NO_CALIBRATION = "none"
 UNREAD = (None, NO_CALIBRATION)  # values of --calibration that name no source
@@ -71,8 +71,7 @@ class Sequences:
         way, length = self.way, None
         if way is not None and way.startswith("sequence:"):
             length = as_number(way.removeprefix("sequence:"))
-            if length is None or length % 1:
-                raise InputError(f"--match {way}; expected {WAYS}")
+            expect(length is not None and not (length % 1), WAYS, f"--match {way}")
         elif way not in (None, "drive", "filter", "single"):
             raise InputError(f"--match {way}; expected {WAYS}")
         if self.speeds is not None and length in (None, 1):
@@ -409,8 +408,7 @@ def refuse_with(option: str, **others: object) -> None:
 
 def check_no_truth(option: str, truth: object) -> None:
     """Refuse the truth of a traverse that is not given."""
-    if truth is not None:
-        raise InputError(f"--{option}_truth {truth} without --{option}; expected --{option} SOURCE with it")
+    expect(truth is None, f"--{option} SOURCE with it", f"--{option}_truth {truth} without --{option}")
 
 
 def several(given: Any) -> list[Any]:

@@ -22,7 +22,7 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import recipe_of
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.smoother import PlaceSmoother
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, expect
 
 if TYPE_CHECKING:
     from dejavu_torch.evaluation.compare import Comparison
@@ -155,11 +155,9 @@ def _check_loops(
 ) -> None:
     """Refuse a comparison without a query, and loops with what needs one."""
     if loops is None:
-        if query is None:
-            raise InputError("compare without QUERY; expected a second traverse, or --loops within the first")
+        expect(query is not None, "a second traverse, or --loops within the first", "compare without QUERY")
         return
-    if query is not None:
-        raise InputError(f"--loops {loops} and the query {query}; expected the reference alone")
+    expect(query is None, "the reference alone", f"--loops {loops} and the query {query}")
     of_routes = {
         name: getattr(judging, name) for name in ("top", "distractors", "storage_curve", "leave_out")
     }

@@ -34,7 +34,7 @@ from dejavu_torch.training.descriptors import DescriptorTask
 from dejavu_torch.training.export import DESCRIPTOR, MapExport, has_bf16
 from dejavu_torch.training.task import RouteTask, load_weights
 from dejavu_torch.training.templates import TemplateTask
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, expect
 
 TASKS = DescriptorTask, TemplateTask  # which --model names
 BF16 = ("bf16-mixed", "bf16")
@@ -167,8 +167,7 @@ class TrainCLI(LightningCLI):
             ("trainer.overfit_batches", trainer["overfit_batches"], not trainer["overfit_batches"], "0"),
             ("seed_everything", seed, seed is None or 0 <= seed < 2**32, "a number from 0 to 2^32 - 1"),
         ):
-            if not fits:
-                raise InputError(f"{name} is {value!s:.40}; expected {expected}")
+            expect(fits, expected, f"{name} is {value!s:.40}")
         if trainer["num_nodes"] != 1 and not {"MASTER_ADDR", "SLURM_JOB_ID"} & os.environ.keys():
             raise InputError(  # the machines would wait for each other forever
                 f"trainer.num_nodes is {trainer['num_nodes']}, but no address of the first is set; expected "

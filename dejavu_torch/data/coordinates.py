@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.files import as_number, read_rows
-from dejavu_torch.types import Coordinates, InputError, Traverse
+from dejavu_torch.types import Coordinates, InputError, Traverse, expect
 
 log = logging.getLogger("dejavu_torch")
 
@@ -92,8 +92,7 @@ def read_coordinates(path: Path, traverse: Traverse) -> Coordinates:
         for line, cells in read_rows(path, EXPECTED)
         if not cells[0].startswith("#")
     ]
-    if not rows:
-        raise InputError(f"{path} has no rows; expected {EXPECTED}")
+    expect(rows, EXPECTED, f"{path} has no rows")
     key, degrees, columns = _columns(path, rows)
     for line, cells in rows:
         if len(cells) < max(columns) + 1:
@@ -113,8 +112,7 @@ def read_coordinates(path: Path, traverse: Traverse) -> Coordinates:
     else:
         values = _at_times(path, np.array([_value(cells[key[0]]) for _, cells in rows]), values, traverse)
     missing = int(np.isnan(values).any(1).sum()) if len(values) else len(traverse)
-    if missing == len(traverse):
-        raise InputError(f"{path} tells of no frame of {traverse.name}; expected its names or times")
+    expect(missing != len(traverse), "its names or times", f"{path} tells of no frame of {traverse.name}")
     if missing:
         log.warning("%s: %d of %d frames have no coordinates", traverse.name, missing, len(traverse))
     return Coordinates(torch.from_numpy(values), degrees)
@@ -235,9 +233,7 @@ def in_metres(tables: Sequence[Tensor]) -> list[Tensor]:
 
 def _fixes(traverse: Traverse, kind: Kind) -> list[Fix]:
     names = traverse.names
-    if not names:
-        seen = f"{traverse.name} has no image names"
-        raise InputError(f"{seen}; expected a folder of images for truth {kind}")
+    expect(names, f"a folder of images for truth {kind}", f"{traverse.name} has no image names")
     fixes = [_fix(name) for name in names]
     missing = [name for name, fix in zip(names, fixes, strict=True) if math.isnan(fix.first)]
     if len(missing) == len(names):

@@ -24,7 +24,7 @@ from dejavu_torch.data.coordinates import Near, coordinates_of
 from dejavu_torch.data.files import LARGEST, as_number, check_regular, read_rows, read_text, reading
 from dejavu_torch.memory import check_room
 from dejavu_torch.text import one_line
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.types import InputError, Traverse, expect
 
 log = logging.getLogger("dejavu_torch")
 
@@ -190,8 +190,7 @@ def near_truth(reference: Tensor, query: Tensor, radius: float) -> Tensor:
 def of_loops(truth: GroundTruth, queries: Tensor, apart: int) -> GroundTruth:
     """A ground truth (Q,R) of which only places over `apart` frames before the query (Q,) are right."""
     positives = torch.where(truth.positives < queries[:, None] - apart, truth.positives, -1)
-    if not (positives >= 0).any():
-        raise InputError(f"no query comes back to a place over {apart} frames before; expected loops")
+    expect((positives >= 0).any(), "loops", f"no query comes back to a place over {apart} frames before")
     return truth._replace(positives=positives)
 
 
@@ -235,8 +234,7 @@ def is_given(truth: Truth | None) -> TypeGuard[Tensor | NDArray[Any] | Sequence[
 def check_ground_truth(truth: Truth, interpolate: bool = False) -> int | Near | Path | GroundTruth:
     """Parse a ground truth as an offset, a radius in metres, or an existing file, before long work starts."""
     if is_given(truth):
-        if interpolate:
-            raise InputError("the truth is given, not listed; expected a .csv of query,place to interpolate")
+        expect(not interpolate, "a .csv of query,place to interpolate", "the truth is given, not listed")
         return as_ground_truth(truth)
     truth = str(truth)  # YAML gives an offset as a number
     path = Path(truth)
@@ -472,8 +470,7 @@ def _read_csv(path: Path, frames: int | None, interpolate: bool) -> Listed:
         if problem:
             raise InputError(f"{path}, line {line}: {problem}")
         listed[int(query)] = places
-    if not listed:
-        raise InputError(f"{path} lists no query; expected lines of query,place")
+    expect(listed, "lines of query,place", f"{path} lists no query")
     return listed
 
 
@@ -519,10 +516,8 @@ def _read_matrices(path: Path, numbers: Tensor, frames: int | None, every: bool)
             if len(data) != size:
                 raise ValueError(f"{name} has {len(data)} bytes or more instead of {size}")
             matrices.append(np.frombuffer(data, dtype).reshape(shape, order="F" if by_columns else "C"))
-    if not matrices:
-        raise InputError(f"{path} contains {', '.join(stored) or 'nothing'}; expected {expected}")
-    if matrices[0].shape != matrices[-1].shape:
-        raise InputError(f"{path}: GThard and GTsoft differ in shape; expected the same")
+    expect(matrices, expected, f"{path} contains {', '.join(stored) or 'nothing'}")
+    expect(matrices[0].shape == matrices[-1].shape, "the same", f"{path}: GThard and GTsoft differ in shape")
     if not all(np.isfinite(matrix).all() for matrix in matrices):
         raise InputError(f"{path} contains values that are not finite; expected {expected}")
     hard, *soft = (torch.from_numpy(matrix[:, numbers.numpy()] != 0).T for matrix in matrices)

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, expect
 
 PREFIX = ".dejavu-"  # of the temporary folders for incomplete files
 _temporary: set[Path] = set()  # this process's temporary folders
@@ -19,8 +19,7 @@ def check_output_file(path: Path) -> None:
     """Refuse a file that could not be written, before long work starts. Links are followed."""
     with _refusing(path, "cannot be written"):
         target = _target(path)
-        if target.is_dir():
-            raise InputError(f"{path} is a folder; expected a file to write")
+        expect(not target.is_dir(), "a file to write", f"{path} is a folder")
         if path.exists() and not path.is_file():  # not target: /dev/stdout resolves to no path
             raise InputError(f"{path} is not a regular file; expected a file to write")
         if not target.parent.is_dir():

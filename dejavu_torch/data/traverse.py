@@ -17,7 +17,7 @@ from torch import Tensor
 
 from dejavu_torch.data.files import LARGEST
 from dejavu_torch.resize import is_stretched, resize_frames
-from dejavu_torch.types import Coordinates, InputError, Traverse
+from dejavu_torch.types import Coordinates, InputError, Traverse, expect
 
 log = logging.getLogger("dejavu_torch")
 
@@ -98,8 +98,7 @@ class Chain(Traverse):
 
     def __init__(self, traverses: Sequence[Traverse]) -> None:
         self.traverses = list(traverses)
-        if not self.traverses:
-            raise InputError("a chain of no traverses; expected at least one")
+        expect(self.traverses, "at least one", "a chain of no traverses")
         first = self.traverses[0]
         for other in self.traverses:
             if other.frame_shape != first.frame_shape:
@@ -296,8 +295,7 @@ class Frames(Traverse):
 
     def __init__(self, dataset: Any, name: str = "the dataset") -> None:
         self.dataset, self.name = dataset, name
-        if not len(dataset):
-            raise InputError(f"{name} is empty; expected at least one frame")
+        expect(len(dataset), "at least one frame", f"{name} is empty")
         first = self._item(0)
         self.shape, how = tuple(first.shape), []
         if isinstance(dataset[0], tuple | list):

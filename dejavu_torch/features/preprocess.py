@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from dejavu_torch.text import settings_of
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, expect
 
 MOST_CLIP = 1e6
 Contrast = Literal["patch", "clahe"]
@@ -55,8 +55,7 @@ def select_channel(frames: Tensor, channel: str) -> Tensor:
     name, count = channel_name(channel), frames.shape[1]
     if name == "grey" and count == 1:
         return frames
-    if count != 3:
-        raise InputError(f"channel {name!r} of frames with {count} channels; expected the 3 of RGB")
+    expect(count == 3, "the 3 of RGB", f"channel {name!r} of frames with {count} channels")
     if name == "grey":
         from kornia.color import rgb_to_grayscale  # loading kornia takes a third of a second
 
@@ -148,8 +147,7 @@ def equalise(frames: Tensor, clip_limit: float = 2.0, grid: tuple[int, int] = (8
         return frames
     detached = frames.detach()
     low, high = (bound.item() for bound in detached.aminmax())
-    if not (low >= 0 and high <= 1):
-        raise InputError(f"clahe got values from {low:g} to {high:g}; expected values in [0, 1]")
+    expect(low >= 0 and high <= 1, "values in [0, 1]", f"clahe got values from {low:g} to {high:g}")
     equalised = in_parts(lambda part: equalize_clahe(part, clip_limit, grid), detached)
     return frames + (equalised - detached) if frames.requires_grad else equalised
 
@@ -207,8 +205,7 @@ class Preprocess(nn.Module):
             (0 <= blank < 1, f"{blank=}", "a standard deviation of at least 0, below 1"),
             (tiled, f"grid={tuple(grid)}", "(rows, columns), integers of at least 1"),
         ):
-            if not fits:
-                raise InputError(f"preprocess got {seen}; expected {expected}")
+            expect(fits, expected, f"preprocess got {seen}")
         self.channel = None if channel is None else channel_name(channel)
         self.contrast: Contrast | None = contrast
         self.patch, self.clip_limit, self.size = patch, float(clip_limit), size

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.memory import without_autocast
 from dejavu_torch.text import settings_of
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, expect
 
 log = logging.getLogger("dejavu_torch")
 
@@ -386,8 +386,7 @@ def _projected_views(
         both = (rows.split(sizes, 1) for rows in (view, places[place.to(places.device)]))
         for held, (mean, basis, *_), *parts in zip(pairs, bases, *both, strict=True):
             held.append(torch.stack([_projected(part, mean, basis) for part in parts]))
-    if not pairs[0]:
-        raise InputError("there are no views for whitening; expected at least one batch, or None")
+    expect(pairs[0], "at least one batch, or None", "there are no views for whitening")
     return [torch.cat(held, 1) for held in pairs]
 
 

@@ -15,7 +15,7 @@ from dejavu_torch.features.extract import features_of, in_mode
 from dejavu_torch.model import DejaVu, check_queries
 from dejavu_torch.recognition.centring import running_mean
 from dejavu_torch.recognition.filter import PlaceFilter
-from dejavu_torch.types import InputError, Match, SequenceModel
+from dejavu_torch.types import InputError, Match, SequenceModel, expect
 
 EXPECTED = "uint8 (H,W), (H,W,3) or (3,H,W), or float in [0, 1], or float (D,) for a map of ready features"
 DTYPES = ("uint8", "float16", "bfloat16", "float32", "float64")
@@ -101,8 +101,7 @@ class LiveLocalizer:
         self.scores = scores[-1] if len(scores) else self.scores
 
     def __call__(self, frame: Tensor | np.ndarray, left_out: int = 0) -> LiveMatch:
-        if self.lag:
-            raise InputError(f"an answer for each frame with a lag of {self.lag}; expected due(frame)")
+        expect(not self.lag, "due(frame)", f"an answer for each frame with a lag of {self.lag}")
         return self.due(frame, left_out)[0]
 
     @torch.no_grad()
@@ -166,8 +165,7 @@ class LiveLocalizer:
         descriptor = features if whitening is None else whitening(features, self._projection)
         if descriptor.shape[1] != dimension:
             raise InputError(f"the frame gives {descriptor.shape[1]} features; the map expects {dimension}")
-        if not descriptor.isfinite().all():
-            raise InputError("the frame gives NaN or infinite features; expected finite numbers")
+        expect(descriptor.isfinite().all(), "finite numbers", "the frame gives NaN or infinite features")
         return descriptor
 
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from dejavu_torch.data.files import check_regular
 from dejavu_torch.data.output import whole_file
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, expect
 
 FORMAT = 11
 NAME = "dejavu_torch-map"
@@ -84,8 +84,7 @@ def read_map(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
                 raise InputError(f"{path} is a checkpoint or another archive; expected {EXPECTED}, {cure}")
         with safe_open(path, framework="pt") as archive:
             metadata = archive.metadata() or {}
-            if NAME not in metadata:
-                raise InputError(f"{path} is not a map of dejavu_torch; expected {EXPECTED}")
+            expect(NAME in metadata, EXPECTED, f"{path} is not a map of dejavu_torch")
             sealed = json.loads(metadata[NAME])
             if (version := sealed["version"]) != FORMAT:
                 seen = f"{path} has map format {version!r:.40}, of another dejavu_torch"
@@ -98,8 +97,7 @@ def read_map(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         raise
     except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path} is truncated or not a map file ({error}); expected a whole one") from error
-    if damaged:
-        raise InputError(f"{path} is damaged: its {' and '.join(damaged)}; expected it as it was written")
+    expect(not damaged, "it as it was written", f"{path} is damaged: its {' and '.join(damaged)}")
     return tensors, header
 
 

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from dejavu_torch.data.positions import count_places
 from dejavu_torch.maps.frame_table import FrameTable, Link, Route
 from dejavu_torch.maps.summary import MapSummary
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, expect
 
 log = logging.getLogger("dejavu_torch")
 
@@ -32,8 +32,7 @@ def require(fits: bool, seen: str) -> None:
 
 def one_of(value: L, kind: Any, name: str) -> L:
     """A value that a Literal names, else an InputError; `name`: of the value in the message."""
-    if value not in get_args(kind):
-        raise InputError(f"{name} is {value!r:.60}; expected {str(kind).removeprefix('typing.')}")
+    expect(value in get_args(kind), str(kind).removeprefix("typing."), f"{name} is {value!r:.60}")
     return value
 
 
@@ -180,8 +179,7 @@ class PlaceMap(nn.Module, ABC):
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore the result of `get_extra_state`; another kind or other settings are an InputError."""
         for name, value in {"kind": self.kind, **self.settings()}.items():
-            if state.get(name) != value:
-                raise InputError(f"the map's {name} is {state.get(name)!r}; expected {value!r}")
+            expect(state.get(name) == value, f"{value!r}", f"the map's {name} is {state.get(name)!r}")
         self.places, self.dimension = state["places"], state["dimension"]
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:

@@ -10,7 +10,7 @@ from dejavu_torch.data.ground_truth import GroundTruth, Truth, find_ground_truth
 from dejavu_torch.data.positions import NEAR, shown_frames
 from dejavu_torch.data.traverse import Part
 from dejavu_torch.motion.odometry import GroundOdometry
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.types import InputError, Traverse, expect
 
 log = logging.getLogger("dejavu_torch")
 
@@ -51,8 +51,7 @@ class ResampledTraverse(Part):
         if -distance.min() > distance.max():  # a camera that looks backwards
             distance = -distance
         moved, frames = distance.diff(), len(distance)
-        if not moved.any():
-            raise InputError(f"{traverse.name} does not move in its {frames} frames; expected motion")
+        expect(moved.any(), "motion", f"{traverse.name} does not move in its {frames} frames")
         forward, back = int((moved > 0).sum()), int((moved < 0).sum())
         if back > MAX_BACKWARD * forward:
             log.warning(

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.text import settings_of
-from dejavu_torch.types import FrequencyLayer, InputError, Plan
+from dejavu_torch.types import FrequencyLayer, InputError, Plan, expect
 
 torchaudio: Any
 try:  # its compiled library fails to load with another build of torch
@@ -154,8 +154,7 @@ class SpectrogramAnalysis(PeriodFinder):
             (short in ("shrink", "refuse"), f"{short=}", "'shrink' or 'refuse'"),
             (false_alarm is None or 0 < false_alarm < 1, f"{false_alarm=}", "None or a number in (0, 1)"),
         ):
-            if not fits:
-                raise InputError(f"spectrogram got {seen}; expected {expected}")
+            expect(fits, expected, f"spectrogram got {seen}")
         self.window, self.hop, self.min_period, self.strongest = window, hop, min_period, strongest
         self.peaks, self.false_alarm, self.short = peaks, false_alarm, short
         self._logged: set[str] = set()
@@ -163,8 +162,7 @@ class SpectrogramAnalysis(PeriodFinder):
     def chunks(self, places: int) -> list[tuple[int, int]]:
         """The chunks [start, stop) of a route."""
         shortest, seen = 2 * self.min_period, f"the route has {places} place{'s' * (places != 1)}"
-        if places < shortest:
-            raise InputError(f"{seen}; expected at least {shortest}, two periods of {self.min_period}")
+        expect(places >= shortest, f"at least {shortest}, two periods of {self.min_period}", seen)
         if places < self.window and self.short == "refuse":
             cure = "the window, or a shorter window, or --mapper.periods.short shrink"
             raise InputError(f"{seen}; expected at least {self.window}, {cure}")
@@ -206,8 +204,7 @@ class SpectrogramAnalysis(PeriodFinder):
 
     def _strongest(self, chunk: Tensor) -> tuple[Tensor, Tensor]:
         """The strongest bins of each feature (count,D), and the largest share of its power in one (D,)."""
-        if not chunk.isfinite().all():
-            raise InputError("spectrogram got features that are not finite; expected finite numbers")
+        expect(chunk.isfinite().all(), "finite numbers", "spectrogram got features that are not finite")
         power, last = chunk_power(chunk), len(chunk) // self.min_period
         bins = strongest_bins(power, min(self.strongest, len(power)), last, self.peaks)
         share = power.gather(0, bins.clamp(min=0)) / power[1:].sum(0)

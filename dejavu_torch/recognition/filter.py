@@ -14,7 +14,7 @@ from dejavu_torch.memory import is_plain, without_autocast
 from dejavu_torch.recognition.motion import MIN_PROBABILITY, Layout, Motion, Rates, checked_rates, logits
 from dejavu_torch.recognition.online import Learned
 from dejavu_torch.recognition.sequence import each
-from dejavu_torch.types import InputError, SequenceModel
+from dejavu_torch.types import InputError, SequenceModel, expect
 
 
 class Moments(NamedTuple):
@@ -102,12 +102,9 @@ class PlaceFilter(SequenceModel):
         if not 0 < sharpness < math.inf or not math.isfinite(off_map):
             seen = f"sharpness {sharpness}, off_map {off_map}"
             raise InputError(f"{seen}; expected finite numbers, the sharpness above 0")
-        if not isinstance(within, int) or within < 0:
-            raise InputError(f"within is {within}; expected a whole number, at least 0")
-        if threshold is not None and math.isnan(threshold):
-            raise InputError("the threshold is NaN; expected a number, or None")
-        if not isinstance(lag, int) or lag < 0:
-            raise InputError(f"the lag is {lag}; expected a whole number of queries, at least 0")
+        expect(isinstance(within, int) and within >= 0, "a whole number, at least 0", within=within)
+        expect(threshold is None or not math.isnan(threshold), "a number, or None", "the threshold is NaN")
+        expect(isinstance(lag, int) and lag >= 0, "a whole number of queries, at least 0", lag=lag)
         self.move_logits = nn.Parameter(logits(*moves))
         self.rate_logits = nn.Parameter(logits(1 - jump - leave, jump, leave))
         self.enter_logit = nn.Parameter(logits(enter)[0] - logits(1 - enter)[0])
@@ -267,8 +264,7 @@ class PlaceFilter(SequenceModel):
             seen = f"a lag of {self.lag} where all queries are known"
             raise InputError(f"{seen}; expected a PlaceSmoother, or a LiveLocalizer")
         furthest = len(self.move_logits) - 1
-        if furthest >= places:
-            raise InputError(f"moves of up to {furthest} places on a map of {places}; expected fewer")
+        expect(furthest < places, "fewer", f"moves of up to {furthest} places on a map of {places}")
 
     def threshold_of(self, threshold: float | None) -> float | None:
         """The filter's own threshold: its scores are probabilities, not distances."""

@@ -25,7 +25,7 @@ from dejavu_torch.memory import check_room, concatenate
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, resampled
 from dejavu_torch.resize import resize_frames
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.types import InputError, Traverse, expect
 
 READ_BATCH = 64  # frames
 MIN_FRAMES = 300  # with fewer, a trained network is usually worse than an untrained map
@@ -170,8 +170,7 @@ class RouteData(LightningDataModule):
         held_out: float = 0.05,
     ) -> None:
         super().__init__()
-        if not 0 <= held_out <= 0.5:
-            raise InputError(f"held_out is {held_out}; expected a share of the frames, from 0 to 0.5")
+        expect(0 <= held_out <= 0.5, "a share of the frames, from 0 to 0.5", held_out=held_out)
         if tolerance < 0 or clip < 1 or not 2 <= batch_size < LARGEST or batch_size % clip:
             seen = f"tolerance is {tolerance}, batch_size {batch_size}, clip {clip}"
             raise InputError(f"{seen}; expected 0 or more, and batches of at least 2 frames in whole clips")
@@ -179,8 +178,7 @@ class RouteData(LightningDataModule):
             raise InputError(f"resize is {resize}; expected (height, width), at least 1 pixel each")
         routes = routes_of(source) if isinstance(source, (str, Path)) else source
         self.listed = {"source": [*routes] if isinstance(routes, (list, tuple)) else [routes]}
-        if not self.listed["source"]:
-            raise InputError("source is an empty list; expected at least one traverse")
+        expect(self.listed["source"], "at least one traverse", "source is an empty list")
         for name, given in (("second", second), ("validation", validation), ("query", query)):
             self.listed[name] = self._one_each(name, given)
         self.truths = {
@@ -424,8 +422,7 @@ def store(traverse: Traverse, resize: tuple[int, int] | None = None) -> Tensor:
                 seen = f"{traverse.name} holds frames of {shape} and of {tuple(batch.shape[1:])}"
                 raise InputError(f"{seen}; expected one size, as with data.resize")
             shape = tuple(batch.shape[1:])
-            if not batch.isfinite().all():
-                raise InputError(f"{traverse.name} holds NaN or infinite values; expected finite numbers")
+            expect(batch.isfinite().all(), "finite numbers", f"{traverse.name} holds NaN or infinite values")
             yield (batch if batch.ndim == 2 else (batch * 255).round().clamp(0, 255).byte().flatten(1)).cpu()
 
     values = concatenate(rows())

@@ -43,7 +43,7 @@ from dejavu_torch.training.task import (
     coded,
     trainable,
 )
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, expect
 
 log = logging.getLogger("dejavu_torch")
 
@@ -126,8 +126,7 @@ class DescriptorTask(RouteTask):
     def prepare(self) -> None:
         data, name = self.data, self.data.route_name
         frames = data.sets["reference"]
-        if frames.values.ndim == 2:
-            raise InputError(f"{name} holds ready features; expected frames, or `dejavu learn`")
+        expect(frames.values.ndim != 2, "frames, or `dejavu learn`", f"{name} holds ready features")
         if not trainable(self.features):
             seen = f"{type(self.features).__name__} has nothing to train"
             raise InputError(f"{seen}; expected parameters that are not frozen, or `dejavu learn`")

@@ -14,7 +14,7 @@ from torch import Tensor
 from dejavu_torch.maps.quantisation import quantise
 from dejavu_torch.maps.spectrum import Transform, from_spectrum
 from dejavu_torch.maps.template_map import TemplateMap, weight_per_feature
-from dejavu_torch.types import InputError, Plan
+from dejavu_torch.types import InputError, Plan, expect
 
 STEP = 0.5  # of the lines' RMS, at the start
 PER_OCTAVE = 2  # frequency bands with a width each
@@ -82,8 +82,7 @@ def _check_places(places: Tensor, scores: Tensor) -> None:
 def _surprise(scores: Tensor, right: Tensor, temperature: Tensor | float) -> Tensor:
     """-log of the probability of the right columns, for rows with any. (Q,K), (Q,K) bool -> (rows,)."""
     smallest = torch.as_tensor(temperature).min().item()
-    if not smallest > 0:
-        raise InputError(f"the temperature is {smallest}; expected a number above 0")
+    expect(smallest > 0, "a number above 0", temperature=smallest)
     covered = ~scores.isposinf()
     right = right & covered
     kept = right.any(1)

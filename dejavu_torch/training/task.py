@@ -34,7 +34,7 @@ from dejavu_torch.training.checkpoint import CheckpointFiles, read_checkpoint, t
 from dejavu_torch.training.datamodule import MIN_FRAMES, Batch, RouteData, StoredFrames
 from dejavu_torch.training.losses import LastLosses, Losses
 from dejavu_torch.training.metrics import PlaceRecognition
-from dejavu_torch.types import InputError, Training
+from dejavu_torch.types import InputError, Training, expect
 
 log = logging.getLogger("dejavu_torch")
 
@@ -385,8 +385,7 @@ def load_weights(task: RouteTask, path: str | Path) -> None:
 def check_settings(*settings: tuple[str, object, bool, str]) -> None:
     """Refuse the first setting (name, value, whether it fits, what was expected) that does not fit."""
     for name, value, fits, expected in settings:
-        if not fits:
-            raise InputError(f"{name} is {value!r}; expected {expected}")
+        expect(fits, expected, f"{name} is {value!r}")
 
 
 def check_preprocess(preprocess: Preprocess | None) -> None:
