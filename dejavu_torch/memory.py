@@ -150,9 +150,7 @@ def _blocks(batches: Iterable[Tensor], most: int) -> Iterator[Tensor]:
     for batch in batches:
         dimension, dtype = seen = batch.shape[1], batch.dtype
         kind = kind or seen
-        if seen != kind:
-            before = f"{kind[0]} of {kind[1]} as before"
-            raise InputError(f"features {rows}.. are {dimension} of {dtype}; expected {before}")
+        expect(seen == kind, f"{kind[0]} {kind[1]} as before", f"batch of {dimension} {dtype}")
         rows, held = rows + len(batch), held + batch.nbytes
         loose.append(batch)
         if held > most:

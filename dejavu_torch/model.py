@@ -123,13 +123,11 @@ class DejaVu(nn.Module):
         if whitening not in (None, "none") and not isinstance(whitening, Whitening):
             raise InputError(f"the whitening is {whitening!r}; expected a Whitening, 'none' or None")
         expect(mapper is None or isinstance(mapper, Mapper), "a Mapper or None", mapper=type(mapper))
-        if not isinstance(batch_size, int) or batch_size < 1:
-            raise InputError(f"batch_size is {batch_size}; expected a whole number of at least 1")
+        expect(isinstance(batch_size, int) and batch_size > 0, "an integer above 0", batch_size=batch_size)
         expect(threshold is None or threshold > -math.inf, "a number, or None", threshold=threshold)
         expect(weight_bits in BITS, f"one of {', '.join(map(str, BITS))}", weight_bits=weight_bits)
         check_precision(precision)
-        if precision is not None and threshold is not None:
-            raise InputError(f"threshold is {threshold} and precision is {precision}; expected one of them")
+        expect(None in (precision, threshold), "one of them", threshold=threshold, precision=precision)
         self.mapper = SpectralMapper() if mapper is None else mapper
         if whitening is None and self.mapper.whitens:
             whitening = Whitening()
@@ -669,5 +667,4 @@ def check_queries(model: DejaVu, shape: tuple[int, ...], dimension: int, name: s
 
 def check_precision(precision: float | None) -> None:
     """Refuse a precision outside (0, 1)."""
-    if precision is not None and not 0 < precision < 1:
-        raise InputError(f"the precision is {precision}; expected a share above 0 and below 1, such as .99")
+    expect(precision is None or 0 < precision < 1, "a share above 0 and below 1", precision=precision)

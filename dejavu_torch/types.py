@@ -45,20 +45,23 @@ def expect(fits: object, to_be: object, seen: object = "", /, **given: object) -
         >>> expect(2 > 1, "at least 1", k=2)
     """
     if not fits:
-        shown = {
-            name: value.__name__ if isinstance(value, type) else repr(value) for name, value in given.items()
-        }
-        raise InputError(f"{seen or ' and '.join(map(' is '.join, shown.items()))}; expected {to_be}")
+        pairs = ((name, x.__name__ if isinstance(x, type) else repr(x)) for name, x in given.items())
+        raise InputError(f"{seen or ' and '.join(map(' is '.join, pairs))}; expected {to_be}")
 
 
 def check_shape(x: Tensor, dims: str, name: str) -> None:
-    """Refuse a tensor of another shape than `dims`, such as "Q 16": a word is any size, a number that one."""
-    sizes = dims.split()
-    fits = x.ndim == len(sizes) and all(
-        w.isalpha() or n == int(w) for w, n in zip(sizes, x.shape, strict=True)
-    )
-    if not fits:
-        raise InputError(f"{name} {tuple(x.shape)}; expected ({','.join(sizes)})")
+    """Refuse a tensor of another shape than `dims`, such as "Q N>=1 16": any size, at least 1, and 16.
+
+    Example:
+        >>> check_shape(torch.zeros(5, 3), "Q N>=1", "the scores are")
+    """
+    if x.ndim != len(sizes := dims.split()) or not all(map(_fits, x.shape, sizes)):
+        raise InputError(f"{name} {tuple(x.shape)}; expected ({', '.join(sizes)}{',' * (len(sizes) == 1)})")
+
+
+def _fits(size: int, wanted: str) -> bool:
+    word, _, least = wanted.partition(">=")
+    return size >= int(least) if least else word.isalpha() or size == int(word)
 
 
 class Traverse(Dataset[Tensor], ABC):

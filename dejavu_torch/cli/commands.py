@@ -67,8 +67,7 @@ def run_learn(
             address of a cluster. They read the sources by the same paths
     """
     append = growing.append
-    if not sources and not (append and growing.average):
-        raise InputError("there is no source; expected one, or --append MAP with --average SOURCE")
+    expect(sources or (append and growing.average), "one, or --append and --average", "there is no source")
     assert map is not None  # the parser checks it
     where = device_of(learning.device, learns=True)
     model = growing.model(model).to(where)

@@ -136,8 +136,7 @@ def _check_written(out: Path, pairs: Path | None, *read: str | Path) -> None:
     for written in filter(None, (out, pairs)):
         check_output_file(written)
         check_not_read(written, *read)
-    if pairs is not None and pairs.resolve() == out.resolve():
-        raise InputError(f"--pairs {pairs} is --out as well; expected another name")
+    expect(pairs is None or pairs.resolve() != out.resolve(), "another name", f"--pairs {pairs} is --out")
 
 
 def _open_query(model: DejaVu, source: str, paired: Path | None, damaged: dict[int, str] | None) -> Traverse:

@@ -71,7 +71,7 @@ class Sequences:
         way, length = self.way, None
         if way is not None and way.startswith("sequence:"):
             length = as_number(way.removeprefix("sequence:"))
-            expect(length is not None and not (length % 1), WAYS, f"--match {way}")
+            expect(length is not None and length % 1 == 0, WAYS, f"--match {way}")
         elif way not in (None, "drive", "filter", "single"):
             raise InputError(f"--match {way}; expected {WAYS}")
         if self.speeds is not None and length in (None, 1):

@@ -156,8 +156,7 @@ class TrainCLI(LightningCLI):
         super().parse_arguments(parser, args)
         chosen = self.config[self.config["subcommand"]]
         for part in ("trainer", "model", "data"):
-            if not isinstance(chosen[part], Namespace):
-                raise InputError(f"{part} is {chosen[part]!r:.40}; expected options, as KEY: VALUE")
+            expect(isinstance(chosen[part], Namespace), "KEY: VALUE", f"{part} is {chosen[part]!r:.40}")
         trainer, seed = chosen["trainer"], chosen["seed_everything"]
         interval, steps = trainer["val_check_interval"], "a number of at least 1, or -1 for no end"
         for name, value, fits, expected in (

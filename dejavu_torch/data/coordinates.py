@@ -66,8 +66,7 @@ def coordinates_of(traverses: Sequence[Traverse], kind: Kind) -> list[Tensor]:
             seen = f"{other} has coordinates and {traverse.name} none"
             raise InputError(f"{seen}; expected 'SOURCE?coordinates=FILE' for both")
     known = [own for own in carried if own is not None]
-    if len({own.degrees for own in known}) > 1:
-        raise InputError("coordinates in metres and in degrees; expected one kind for all sources")
+    expect(len({own.degrees for own in known}) < 2, "one kind", "coordinates in metres and in degrees")
     if known[0].degrees:
         return in_metres([own.values for own in known])
     shared = min(own.values.shape[1] for own in known)
@@ -95,10 +94,8 @@ def read_coordinates(path: Path, traverse: Traverse) -> Coordinates:
     expect(rows, EXPECTED, f"{path} has no rows")
     key, degrees, columns = _columns(path, rows)
     for line, cells in rows:
-        if len(cells) < max(columns) + 1:
-            raise InputError(
-                f"{path}, line {line}: {len(cells)} columns; expected {max(columns) + 1} or more"
-            )
+        seen = f"{path}, line {line}: {len(cells)} columns"
+        expect(len(cells) > max(columns), f"{max(columns) + 1} or more", seen)
     values = np.array([[_value(cells[column]) for column in columns] for _, cells in rows])
     if degrees and not (np.abs(np.nan_to_num(values)) <= (90, 180)).all():
         raise InputError(f"{path} has latitudes beyond 90 or longitudes beyond 180; expected degrees")

@@ -239,8 +239,7 @@ def check_ground_truth(truth: Truth, interpolate: bool = False) -> int | Near | 
     truth = str(truth)  # YAML gives an offset as a number
     path = Path(truth)
     suffix = path.suffix.lower()
-    if interpolate and suffix != ".csv":
-        raise InputError(f"truth {truth} cannot be interpolated; expected a .csv of query,place")
+    expect(not interpolate or suffix == ".csv", "a .csv of query,place to be interpolated", truth=truth)
     if suffix in (".csv", ".json", ".npz"):
         check_regular(path, EXPECTED)
         return path

@@ -28,8 +28,7 @@ def encode_names(names: Sequence[str]) -> str:
         (True, True)
     """
     longest = max(map(len, names), default=0)
-    if longest > MAX_NAME_LENGTH:
-        raise InputError(f"a frame's name has {longest} characters; expected at most {MAX_NAME_LENGTH}")
+    expect(longest <= MAX_NAME_LENGTH, f"at most {MAX_NAME_LENGTH}", f"a name has {longest} characters")
     value: Any = _numbered(names)
     if value is None or _names(value) != list(names):
         value = list(names)

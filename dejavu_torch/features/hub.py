@@ -96,7 +96,7 @@ def made(function: str, **arguments: Any) -> nn.Module:
     expect(callable(maker), "one, or a class", f"{function} is no function that can be imported")
     try:
         with redirect_stdout(sys.stderr):  # keeps stdout to lines of JSON
-            network = maker(**arguments)
+            network: nn.Module = maker(**arguments)
     except SystemExit as stop:  # it would end the command silently
         raise InputError(f"{function} ends the program ({stop}); expected one that makes a network") from stop
     expect(isinstance(network, nn.Module), "an nn.Module", f"{function} made a {type(network).__name__}")

@@ -135,8 +135,7 @@ def equalise(frames: Tensor, clip_limit: float = 2.0, grid: tuple[int, int] = (8
     The table of 256 grey levels has no gradient, so the gradient is that of the identity. Kornia's
     differentiable form gives other values (up to 0.3 away).
     """
-    if torch.compiler.is_exporting():
-        raise InputError("clahe, by kornia, would fix the number of frames; expected another contrast")
+    expect(not torch.compiler.is_exporting(), "another contrast", "clahe would fix the number of frames")
     from kornia.enhance import equalize_clahe
 
     (height, width), (rows, columns) = frames.shape[-2:], grid
@@ -197,15 +196,12 @@ class Preprocess(nn.Module):
         super().__init__()
         sized = size is None or (isinstance(size, int) and size >= 1)
         tiled = len(grid) == 2 and all(tiles >= 1 and tiles == int(tiles) for tiles in grid)
-        for fits, seen, expected in (
-            (sized, f"{size=}", "pixels of the longer side, at least 1, or null"),
-            (contrast in (None, *get_args(Contrast)), f"{contrast=}", "'patch', 'clahe' or None"),
-            (patch >= 3 and patch % 2 == 1, f"{patch=}", "an odd number of pixels, at least 3"),
-            (0 <= clip_limit <= MOST_CLIP, f"{clip_limit=}", f"0 (no limit) to {MOST_CLIP:g}"),
-            (0 <= blank < 1, f"{blank=}", "a standard deviation of at least 0, below 1"),
-            (tiled, f"grid={tuple(grid)}", "(rows, columns), integers of at least 1"),
-        ):
-            expect(fits, expected, f"preprocess got {seen}")
+        expect(sized, "pixels of the longer side, at least 1, or null", f"{size=}")
+        expect(contrast in (None, *get_args(Contrast)), "'patch', 'clahe' or None", f"{contrast=}")
+        expect(patch >= 3 and patch % 2 == 1, "an odd number of pixels, at least 3", f"{patch=}")
+        expect(0 <= clip_limit <= MOST_CLIP, f"0 (no limit) to {MOST_CLIP:g}", f"{clip_limit=}")
+        expect(0 <= blank < 1, "a standard deviation of at least 0, below 1", f"{blank=}")
+        expect(tiled, "(rows, columns), integers of at least 1", f"grid={tuple(grid)}")
         self.channel = None if channel is None else channel_name(channel)
         self.contrast: Contrast | None = contrast
         self.patch, self.clip_limit, self.size = patch, float(clip_limit), size

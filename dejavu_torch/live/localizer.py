@@ -15,7 +15,7 @@ from dejavu_torch.features.extract import features_of, in_mode
 from dejavu_torch.model import DejaVu, check_queries
 from dejavu_torch.recognition.centring import running_mean
 from dejavu_torch.recognition.filter import PlaceFilter
-from dejavu_torch.types import InputError, Match, SequenceModel, expect
+from dejavu_torch.types import InputError, Match, SequenceModel, check_shape, expect
 
 EXPECTED = "uint8 (H,W), (H,W,3) or (3,H,W), or float in [0, 1], or float (D,) for a map of ready features"
 DTYPES = ("uint8", "float16", "bfloat16", "float32", "float64")
@@ -163,8 +163,7 @@ class LiveLocalizer:
             self._shape = batch.shape[1:]
         features = features.to(torch.promote_types(features.dtype, torch.float32))
         descriptor = features if whitening is None else whitening(features, self._projection)
-        if descriptor.shape[1] != dimension:
-            raise InputError(f"the frame gives {descriptor.shape[1]} features; the map expects {dimension}")
+        check_shape(descriptor, f"1 {dimension}", "the frame gives features")
         expect(descriptor.isfinite().all(), "finite numbers", "the frame gives NaN or infinite features")
         return descriptor
 
@@ -192,6 +191,5 @@ def as_batch(frame: Tensor | np.ndarray, device: torch.device | str = "cpu") -> 
         return values[None].float().div_(255)
     values = values if values.dtype == torch.float64 else values.float()
     low, high = (float(end) for end in values.aminmax())
-    if not (low >= -ROUNDING and high <= 1 + ROUNDING):
-        raise InputError(f"the frame has values from {low:.4g} to {high:.4g}; expected 0 to 1")
+    expect(low >= -ROUNDING and high <= 1 + ROUNDING, "0 to 1", f"the frame has {low:.4g} to {high:.4g}")
     return values[None].clamp(0, 1)

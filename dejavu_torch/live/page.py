@@ -172,9 +172,8 @@ class ReferencePictures:
     """Pictures of the frames of the map's reference, for `Page`, read as they are asked for."""
 
     def __init__(self, reference: Traverse, frames: int) -> None:
-        if len(reference) != frames:
-            seen = f"{reference.name} has {len(reference)} frames"
-            raise InputError(f"{seen}; the map's reference has {frames}")
+        seen = f"{reference.name} has {len(reference)} frames"
+        expect(len(reference) == frames, f"{frames}, as the map's reference", seen)
         expect(len(reference.frame_shape) == 3, "frames to show", f"{reference.name} holds features")
         self.reference, self._one_at_a_time = reference, threading.Lock()  # requests come in threads
 

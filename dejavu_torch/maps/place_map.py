@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from dejavu_torch.data.positions import count_places
 from dejavu_torch.maps.frame_table import FrameTable, Link, Route
 from dejavu_torch.maps.summary import MapSummary
-from dejavu_torch.types import InputError, expect
+from dejavu_torch.types import InputError, check_shape, expect
 
 log = logging.getLogger("dejavu_torch")
 
@@ -95,8 +95,7 @@ class PlaceMap(nn.Module, ABC):
 
     def check_queries(self, queries: Tensor) -> None:
         """Refuse queries that are not (Q,D)."""
-        if queries.ndim != 2 or queries.shape[1] != self.dimension:
-            raise InputError(f"the queries are {tuple(queries.shape)}; the map expects (Q, {self.dimension})")
+        check_shape(queries, f"Q {self.dimension}", "the map got queries")
 
     def score_blocks(self, queries: Tensor) -> ScoreBlocks:
         """The columns of `scores`, block by block."""
@@ -179,7 +178,7 @@ class PlaceMap(nn.Module, ABC):
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore the result of `get_extra_state`; another kind or other settings are an InputError."""
         for name, value in {"kind": self.kind, **self.settings()}.items():
-            expect(state.get(name) == value, f"{value!r}", f"the map's {name} is {state.get(name)!r}")
+            expect(state.get(name) == value, repr(value), f"the map's {name} is {state.get(name)!r}")
         self.places, self.dimension = state["places"], state["dimension"]
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:

@@ -133,8 +133,7 @@ class SpectralMap(PlaceMap):
         resolution: float = 0.0,
         step: float = 0.0,
     ) -> None:
-        if type(chunk) is not int or chunk < 2:
-            raise InputError(f"chunk is {chunk!r}; expected a number of places, at least 2, such as 10000")
+        expect(type(chunk) is int and chunk >= 2, "a number of places, at least 2, as 10000", chunk=chunk)
         expect(0 <= resolution < math.inf, "a number of places, 0 or more", resolution=resolution)
         super().__init__(0, 0 if means is None else means.shape[1])
         self.metric: SpectralMetric = one_of(metric, SpectralMetric, "metric")

@@ -20,7 +20,7 @@ from dejavu_torch.maps.templates import PhaseTemplates, check_plan
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.text import settings_of
-from dejavu_torch.types import FrequencyLayer, InputError, Plan, expect
+from dejavu_torch.types import FrequencyLayer, InputError, Plan, check_shape, expect
 
 Reduction = Literal["mean", "sum"]
 MAX_PLACES = 2**26  # in all layers, since a file of a few bytes can claim any number
@@ -230,8 +230,7 @@ class TemplateMap(PlaceMap):
         if weights and not len(self.weights):
             initial = self.templates.new_ones(self.dimension)
             if start is not None and len(start):
-                if start.shape != initial.shape:
-                    raise InputError(f"the weights start as {tuple(start.shape)}; expected ({len(initial)},)")
+                check_shape(start, str(len(initial)), "the weights start as")
                 initial = start.detach().clone()
             self.templates, self.weights = self._times(initial), initial
         for name, wanted in (("templates", templates), ("weights", weights)):

@@ -12,7 +12,7 @@ from dejavu_torch.memory import check_room
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.support import supportive_periods
 from dejavu_torch.text import settings_of
-from dejavu_torch.types import FrequencyLayer, InputError, Plan
+from dejavu_torch.types import FrequencyLayer, InputError, Plan, check_shape
 
 LONGEST = 2**24  # bins in a period, and places in a bin, so that products fit into int64
 
@@ -55,8 +55,7 @@ class ImposedPeriods(PeriodFinder):
         self.bin, self.stagger = bin, stagger
 
     def plan(self, features: Tensor) -> Plan:
-        if features.ndim != 2 or len(features) < 2 or features.shape[1] < 1:
-            raise InputError(f"imposed periods got {tuple(features.shape)}; expected (N,D), N >= 2, D >= 1")
+        check_shape(features, "N>=2 D>=1", "imposed periods got")
         places, dimension = features.shape
         bins = -(-places // self.bin)
         periods = self.periods or supportive_periods(bins)

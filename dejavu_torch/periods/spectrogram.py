@@ -144,17 +144,13 @@ class SpectrogramAnalysis(PeriodFinder):
         short: Literal["shrink", "refuse"] = "shrink",
     ) -> None:
         super().__init__()
-        sizes = f"window={window}, min_period={min_period}"
-        for fits, seen, expected in (
-            (min_period >= 2, sizes, "min_period >= 2"),
-            (window >= 2 * min_period, sizes, "window >= 2 * min_period"),
-            (strongest >= 1, f"{strongest=}", "strongest >= 1"),
-            (hop is None or 1 <= hop <= window, f"{hop=}", f"1..{window} (the window)"),
-            (peaks in ("local", "bins"), f"{peaks=}", "'local' or 'bins'"),
-            (short in ("shrink", "refuse"), f"{short=}", "'shrink' or 'refuse'"),
-            (false_alarm is None or 0 < false_alarm < 1, f"{false_alarm=}", "None or a number in (0, 1)"),
-        ):
-            expect(fits, expected, f"spectrogram got {seen}")
+        expect(min_period >= 2, "min_period >= 2", f"{window=}, {min_period=}")
+        expect(window >= 2 * min_period, "window >= 2 * min_period", f"{window=}, {min_period=}")
+        expect(strongest >= 1, "strongest >= 1", f"{strongest=}")
+        expect(hop is None or 1 <= hop <= window, f"1..{window} (the window)", f"{hop=}")
+        expect(peaks in ("local", "bins"), "'local' or 'bins'", f"{peaks=}")
+        expect(short in ("shrink", "refuse"), "'shrink' or 'refuse'", f"{short=}")
+        expect(false_alarm is None or 0 < false_alarm < 1, "None or a number in (0, 1)", f"{false_alarm=}")
         self.window, self.hop, self.min_period, self.strongest = window, hop, min_period, strongest
         self.peaks, self.false_alarm, self.short = peaks, false_alarm, short
         self._logged: set[str] = set()

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.types import InputError, Match, expect
+from dejavu_torch.types import Match, check_shape, expect
 
 HIGHEST = torch.finfo(torch.float64).max  # threshold that accepts every finite score; JSON has no infinity
 PROBABLE = 0.5  # minimum probability that a calibrated map accepts by default
@@ -68,8 +68,7 @@ def best_candidates(scores: Tensor, k: int, radius: int, places: Tensor | None =
         +inf; all others are accepted.
     """
     expect(isinstance(scores, Tensor), "a tensor (Q,N)", f"scores are a {type(scores).__name__}")
-    if scores.ndim != 2 or scores.shape[1] < 1:
-        raise InputError(f"scores are {tuple(scores.shape)}; expected (Q,N) with N >= 1")
+    check_shape(scores, "Q N>=1", "scores are")
     columns = scores.shape[1]
     check_candidates(k, radius, columns)
     found = []

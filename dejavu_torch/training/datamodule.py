@@ -93,9 +93,8 @@ class Clips(DistributedSampler[list[int]]):
         self.generator = torch.Generator().manual_seed(torch.initial_seed() % 2**63)
         self.total = sum(len(run) // clip for run in runs)
         self.clips = min(batch_size // clip, self.total) // processes  # of a process's part of a batch
-        if not self.clips:
-            seen = f"there are {self.total} clips of {clip} frames and {processes} processes"
-            raise InputError(f"{seen}; expected one for each")
+        seen = f"there are {self.total} clips of {clip} frames and {processes} processes"
+        expect(self.clips, "one for each", seen)
 
     def __len__(self) -> int:
         return self.total // (self.clips * self.num_replicas)
@@ -277,8 +276,7 @@ class RouteData(LightningDataModule):
             self._read(name)
         if stage == "fit":
             self.unseen()  # so that its errors come before the training
-        if stage == "test" and "query" not in self.sets:
-            raise InputError("there is nothing to test on; expected data.query, a second traverse")
+        expect(stage != "test" or "query" in self.sets, "data.query, to test on", "there is no query")
 
     @property
     def _size(self) -> tuple[int, int] | None:

@@ -39,7 +39,6 @@ from dejavu_torch.training.task import (
     WHITENING,
     RouteTask,
     check_preprocess,
-    check_settings,
     coded,
     trainable,
 )
@@ -103,10 +102,8 @@ class DescriptorTask(RouteTask):
         if isinstance(mapper, TemplateMapper):
             expected = "expected another one, or --model TemplateTask to train templates"
             raise InputError(f"the mapper is a TemplateMapper; {expected}")
-        check_settings(
-            ("rate", rate, 0 <= rate < math.inf, "0 or more, such as 1"),
-            ("whitening.strengths", strengths, strengths == STRENGTHS, "those of data.augmentation alone"),
-        )
+        expect(0 <= rate < math.inf, "0 or more, such as 1", rate=rate)
+        expect(strengths == STRENGTHS, "those of data.augmentation alone", f"whitening.strengths {strengths}")
         check_preprocess(preprocess)
         if embedding := coded(backbone):
             backbone = embedding.without_code()

@@ -75,11 +75,9 @@ class RouteTask(pl.LightningModule):
         weight_bits: Literal[8, 32],
     ) -> None:
         super().__init__()
-        check_settings(
-            ("lr", lr, lr > 0, "a number above 0"),
-            ("weight_decay", weight_decay, weight_decay >= 0, "0 or more"),
-            ("weight_bits", weight_bits, weight_bits in BITS, f"one of {', '.join(map(str, BITS))}"),
-        )
+        expect(lr > 0, "a number above 0", lr=lr)
+        expect(weight_decay >= 0, "0 or more", weight_decay=weight_decay)
+        expect(weight_bits in BITS, f"one of {', '.join(map(str, BITS))}", weight_bits=weight_bits)
         self.dejavu, self.lr, self.weight_decay, self.weight_bits = dejavu, lr, weight_decay, weight_bits
         if start is not None:
             start_from(dejavu.features, start)
@@ -380,12 +378,6 @@ def load_weights(task: RouteTask, path: str | Path) -> None:
         task.on_load_checkpoint(checkpoint)
         task.load_state_dict(checkpoint["state_dict"])
     task.resumed = False
-
-
-def check_settings(*settings: tuple[str, object, bool, str]) -> None:
-    """Refuse the first setting (name, value, whether it fits, what was expected) that does not fit."""
-    for name, value, fits, expected in settings:
-        expect(fits, expected, f"{name} is {value!r}")
 
 
 def check_preprocess(preprocess: Preprocess | None) -> None:
