@@ -238,9 +238,8 @@ def second_traverse(
     model.descriptor.require_learning(" + ".join(traverse.name for traverse in visits))
     truths = [truth] if isinstance(truth, str | None) else [*truth]
     truths *= len(visits) if len(truths) == 1 else 1
-    if len(truths) != len(visits):
-        seen = f"{len(visits)} further traverses and {len(truths)} truths"
-        raise InputError(f"{seen}; expected one for each, or one for all")
+    seen = f"{len(visits)} further traverses and {len(truths)} truths"
+    expect(len(truths) == len(visits), "one for each, or one for all", seen)
     views = [_known_places(model, reference, *pair) for pair in zip(visits, truths, strict=True)]
     drives = [(drive, places) for drive, places, _ in views]
     known = [places for places in (places for _, places in drives) if places is not None]
@@ -309,9 +308,8 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
         >>> merge(models, ["out", "back"]).map.routes
         (Route(name='out', places=200, frames=200), Route(name='back', places=200, frames=200))
     """
-    if len(models) < 2 or len(names) != len(models):
-        seen = f"{len(models)} maps and {len(names)} names to merge"
-        raise InputError(f"{seen}; expected at least two maps, and a name for each")
+    seen = f"{len(models)} maps and {len(names)} names to merge"
+    expect(len(models) >= 2 and len(names) == len(models), "at least two maps, and a name for each", seen)
     first, parts = models[0], dict[str, SpectralMap]()
     for name, model in zip(names, models, strict=True):
         place_map = model.map
@@ -399,9 +397,8 @@ def joined_names(parts: list[list[str]], frames: list[int]) -> list[str]:
 
 def _check_count(places: int, resampled: bool) -> None:
     limit = EXACT if resampled else LARGEST
-    if places > limit:
-        steps = " at even steps" if resampled else ""
-        raise InputError(f"{places} places{steps} in one map; expected at most {limit}, or several maps")
+    steps = " at even steps" if resampled else ""
+    expect(places <= limit, f"at most {limit}, or several maps", f"{places} places{steps} in one map")
 
 
 def _check_compatible(model: DejaVu, added: Traverse) -> None:

@@ -428,9 +428,8 @@ class DejaVu(nn.Module):
         traverse = self.at_map_size(as_traverse(traverse), self.frame_shape or ())
         if self.step is not None:
             traverse = self.resample(traverse, self.step, progress, self.frame_shape)
-        if len(traverse) != self.map.places:
-            seen = f"{traverse.name} has {len(traverse)} places, the map {self.map.places}"
-            raise InputError(f"{seen}; expected the traverse that the map was learned from")
+        seen = f"{traverse.name} has {len(traverse)} places, the map {self.map.places}"
+        expect(len(traverse) == self.map.places, "the traverse that the map was learned from", seen)
         check_apart(apart, len(traverse))
         descriptors = self.descriptor.all_of(traverse, progress)
         matching = self.loop_matching(apart, PlaceSmoother() if drive else None)
@@ -654,13 +653,11 @@ def check_queries(model: DejaVu, shape: tuple[int, ...], dimension: int, name: s
         raise InputError(f"{seen}{learned * (len(reference or ()) == 3)}")
     if reference is None or len(shape) != 3:
         return
-    if len(reference) == 1:
-        seen = f"{name} has frames, but the map was learned from ready features"
-        raise InputError(f"{seen}; expected features (Q, {expected})")
+    seen = f"{name} has frames, but the map was learned from ready features"
+    expect(len(reference) != 1, f"features (Q, {expected})", seen)
     own, other = (" x ".join(map(str, size)) for size in (shape, reference))
-    if dimension != expected:
-        seen = f"{name}: frames of {own} give {dimension} features"
-        raise InputError(f"{seen}; the map expects {expected}, as frames of {other} give")
+    seen = f"{name}: frames of {own} give {dimension} features"
+    expect(dimension == expected, f"{expected}, as frames of {other} give", seen)
     if shape[1:] != reference[1:] and getattr(model.descriptor.features, "resize", None) is None:
         log.warning("%s has frames of %s, the map was learned from %s", name, own, other)
 

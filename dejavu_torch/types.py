@@ -163,9 +163,8 @@ class Traverse(Dataset[Tensor], ABC):
         """How many frames to read at a time: `most`, or fewer if they are large; refuses too large ones."""
         expect(most >= 1, "at least 1", f"a batch holds {most} frames")
         values = math.prod(self.frame_shape)
-        if values > FRAME_NUMBERS:
-            seen = f"{self.name} has frames of {' x '.join(map(str, self.frame_shape))} numbers"
-            raise InputError(f"{seen}; expected at most {FRAME_NUMBERS}, for images by ?width=640")
+        seen = f"{self.name} has frames of {' x '.join(map(str, self.frame_shape))} numbers"
+        expect(values <= FRAME_NUMBERS, f"at most {FRAME_NUMBERS}, for images by ?width=640", seen)
         return max(1, min(most, BATCH_NUMBERS // max(1, values)))
 
     def changed(self, **attributes: Any) -> Self:

@@ -150,9 +150,8 @@ def run_export(
     matcher = None if isinstance(matcher, str) else matcher
     model = options.load_map(map, features)
     options.Acceptance(threshold).of(model)
-    if matcher is not None and model.precision is not None:
-        seen = f"the map's precision, {model.precision}, only holds for single frames in an ONNX file"
-        raise InputError(f"{seen}; expected --threshold with a sequence or a filter")
+    seen = f"the map's precision, {model.precision}, only holds for single frames in an ONNX file"
+    expect(matcher is None or model.precision is None, "--threshold with a sequence or a filter", seen)
     written = export_onnx(model, onnx, matcher, centre == "mean")
     for kind in ("inputs", "outputs"):
         shapes = (f"{name} {tuple(shape)}" for name, shape in written.facts[kind].items())
@@ -296,16 +295,14 @@ def check_cluster(cluster: str, device: str, mapper: Mapper | None = None) -> No
 
     options.refuse_with(f"--cluster {cluster}", device=device != "cpu" and device)
     check_installed()
-    if not isinstance(mapper, SpectralMapper | None):
-        seen = f"--cluster {cluster} encodes chunks, and {type(mapper).__name__} has none"
-        raise InputError(f"{seen}; expected a spectral map")
+    seen = f"--cluster {cluster} encodes chunks, and {type(mapper).__name__} has none"
+    expect(isinstance(mapper, SpectralMapper | None), "a spectral map", seen)
 
 
 def _check_map_file(path: Path, *read: str | Path | None, option: str = "--map") -> None:
     """Refuse early a map file that cannot be written or is also read."""
-    if path.suffix != ".safetensors":
-        expected = path.with_suffix(".safetensors") if path.name else "such as route.safetensors"
-        raise InputError(f"{option} {path} is not the name of a map; expected {expected}")
+    expected = path.with_suffix(".safetensors") if path.name else "such as route.safetensors"
+    expect(path.suffix == ".safetensors", expected, f"{option} {path} is not the name of a map")
     check_output_file(path)
     check_not_read(path, *read)
 

@@ -58,9 +58,8 @@ def follow(
         if port is not None:
             pictures = None
             if reference is not None:
-                if model.map.routes:
-                    seen = f"--reference {reference}: the map has {len(model.map.routes)} routes"
-                    raise InputError(f"{seen}; expected the map of one route, or no --reference")
+                seen = f"--reference {reference}: the map has {len(model.map.routes)} routes"
+                expect(not model.map.routes, "the map of one route, or no --reference", seen)
                 shown = len(model.map.positions) or model.map.places
                 pictures = ReferencePictures(open_source(reference), shown)
             page = stack.enter_context(Page(port, title, pictures))

@@ -115,9 +115,8 @@ class LiveSequences(Sequences):
         matcher = super().matcher(within, threshold)
         if isinstance(matcher, PlaceFilter):
             return PlaceFilter(within=within, threshold=threshold, lag=self.lag, learns=self.learns)
-        if self.lag or self.learns:
-            seen = f"--lag {self.lag}" if self.lag else "--learns"
-            raise InputError(f"{seen} with --match {self.way}; expected --match filter with it")
+        seen = f"--lag {self.lag}" if self.lag else "--learns"
+        expect(not self.lag and not self.learns, "--match filter with it", f"{seen} with --match {self.way}")
         return matcher
 
 
@@ -327,9 +326,8 @@ class LearningOptions:
         elif self.calibration is None and len(traverse.frame_shape) != 3:
             why = f"{traverse.name}, which has no frames to calibrate by"
         for given, name in ((model.precision, "a precision,"), (distractors, "--distractors")):
-            if why and given:
-                instead = ", or --threshold instead" if given is model.precision else ""
-                raise InputError(f"{name} {given}, and {why}; expected --calibration SOURCE{instead}")
+            instead = ", or --threshold instead" if given is model.precision else ""
+            expect(not why or not given, f"--calibration SOURCE{instead}", f"{name} {given}, and {why}")
 
 
 @dataclass
@@ -401,9 +399,8 @@ class EvaluationOptions:
 def refuse_with(option: str, **others: object) -> None:
     """Refuse an option if one of the others, which exclude it, is given."""
     for name, value in others.items():
-        if value:
-            other = f"--{name}" if value is True else f"--{name} {value}"
-            raise InputError(f"{option} and {other}; expected one of them")
+        other = f"--{name}" if value is True else f"--{name} {value}"
+        expect(not value, "one of them", f"{option} and {other}")
 
 
 def check_no_truth(option: str, truth: object) -> None:

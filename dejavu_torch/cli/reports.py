@@ -101,9 +101,8 @@ def run_compare(
     acceptance.check(matcher, judging.distractors)
     if map is not None:
         model = options.load_map(map, options.named_features(model))
-        if model.map.routes:
-            names = ", ".join(route.name for route in model.map.routes)
-            raise InputError(f"--map {map} has the routes {names}; expected a map of {reference} alone")
+        names = ", ".join(route.name for route in model.map.routes)
+        expect(not model.map.routes, f"a map of {reference} alone", f"--map {map} has the routes {names}")
         acceptance.of(model)
     searching.of(model.to(where))
     first = open_source(reference)

@@ -281,9 +281,8 @@ class TrainCLI(LightningCLI):
             if path in ("best", "hpc") or not Path(path).exists():
                 raise InputError(f"{path} is not there; {EXPECTED}")
             return
-        if last is None:
-            seen = f"there is no checkpoint in {Path(self.trainer.default_root_dir) / 'checkpoints'}"
-            raise InputError(f"{seen}; expected --ckpt_path, or the trainer.default_root_dir of a training")
+        seen = f"there is no checkpoint in {Path(self.trainer.default_root_dir) / 'checkpoints'}"
+        expect(last is not None, "--ckpt_path, or the trainer.default_root_dir of a training", seen)
         chosen["ckpt_path"] = str(last)
 
     before_test = before_export = before_validate

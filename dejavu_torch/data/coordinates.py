@@ -100,9 +100,8 @@ def read_coordinates(path: Path, traverse: Traverse) -> Coordinates:
     if degrees and not (np.abs(np.nan_to_num(values)) <= (90, 180)).all():
         raise InputError(f"{path} has latitudes beyond 90 or longitudes beyond 180; expected degrees")
     if key is None:
-        if len(values) != len(traverse):
-            seen = f"{path} has {len(values)} rows, {traverse.name} {len(traverse)} frames"
-            raise InputError(f"{seen}; expected as many, or a column name or time")
+        seen = f"{path} has {len(values)} rows, {traverse.name} {len(traverse)} frames"
+        expect(len(values) == len(traverse), "as many, or a column name or time", seen)
     elif key[1] == "name":
         known = dict(zip((cells[key[0]] for _, cells in rows), values, strict=True))
         values = np.array([known.get(name, np.full(len(columns), math.nan)) for name in traverse.names])

@@ -83,9 +83,8 @@ def as_ground_truth(truth: Truth, queries: int | None = None) -> GroundTruth:
     shapes = [tuple(part.shape) for part in truth]
     rows = len(truth.judged) if queries is None else queries
     fits = shapes[1] == (rows,) and all(len(shape) == 2 and shape[0] == rows for shape in shapes[::2])
-    if not fits:
-        seen = f"the truth is {shapes[0]}, with judged {shapes[1]} and ignored {shapes[2]}"
-        raise InputError(f"{seen}; expected ({rows}, R), ({rows},) and ({rows}, S), one row per query")
+    seen = f"the truth is {shapes[0]}, with judged {shapes[1]} and ignored {shapes[2]}"
+    expect(fits, f"({rows}, R), ({rows},) and ({rows}, S), one row per query", seen)
     return truth
 
 
@@ -106,9 +105,8 @@ def _table_of(truth: Any) -> Tensor:
         raise InputError(f"{seen}; expected {FORMS}") from error
     odd = [row for row in rows if row.ndim != 1 or row.is_floating_point() or row.is_complex()]
     kinds = {row.dtype == torch.bool for row in rows}
-    if odd or len(kinds) > 1:
-        seen = f"{tuple(odd[0].shape)} {odd[0].dtype}" if odd else "truth values and places"
-        raise InputError(f"a query of the truth has {seen}; expected {FORMS}")
+    seen = f"{tuple(odd[0].shape)} {odd[0].dtype}" if odd else "truth values and places"
+    expect(not odd and len(kinds) <= 1, FORMS, f"a query of the truth has {seen}")
     if kinds == {True}:
         return padded(row.nonzero()[:, 0] for row in rows)
     return _checked(padded(row.long() for row in rows))
@@ -414,9 +412,8 @@ def _from_table(
     elif resampled:
         places = _to_queries(places, numbers)
     judged = torch.tensor([query in places for query in queries])
-    if not judged.any():
-        wanted = f"{int(numbers.min())} to {int(numbers.max())}"
-        raise InputError(f"{path} lists queries from {first} to {last}; expected some of {wanted}")
+    wanted = f"{int(numbers.min())} to {int(numbers.max())}"
+    expect(judged.any(), f"some of {wanted}", f"{path} lists queries from {first} to {last}")
     rows = [[_rounded(place) for place in places.get(query, ())] for query in queries]
     positives = padded(torch.tensor(row, dtype=torch.int64) for row in rows)
     return _every(positives)._replace(judged=judged)

@@ -32,9 +32,8 @@ def check_output_file(path: Path) -> None:
 def check_output_folder(path: Path) -> None:
     """Refuse a folder that could not be created or written to, before long work starts."""
     parent = _existing(path)
-    if not parent.is_dir():
-        kind = "a file" if parent.is_file() else "not a folder"
-        raise InputError(f"{path} cannot be made a folder: {parent} is {kind}; expected a new path")
+    kind = "a file" if parent.is_file() else "not a folder"
+    expect(parent.is_dir(), "a new path", f"{path} cannot be made a folder: {parent} is {kind}")
     if not os.access(parent, os.W_OK):
         raise InputError(f"no permission to write in the folder {parent}")
 

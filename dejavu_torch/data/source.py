@@ -178,9 +178,8 @@ def _arguments(text: str, query: str, reader: Callable[..., Traverse]) -> dict[s
     defaults = {name: option.default for name, option in inspect.signature(reader).parameters.items()} | EVERY
     arguments: dict[str, Any] = {}
     for name, value in parse_qsl(query, keep_blank_values=True):
-        if name not in defaults or name in arguments:
-            what = "a second" if name in arguments else "unknown"
-            raise InputError(f"{text}: {what} {name!r}; expected {', '.join(defaults)}")
+        what = "a second" if name in arguments else "unknown"
+        expect(name in defaults and name not in arguments, ", ".join(defaults), f"{text}: {what} {name!r}")
         default = defaults[name]
         kind = int if default is empty or isinstance(default, bool) else type(default)
         try:

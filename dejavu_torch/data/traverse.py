@@ -166,9 +166,8 @@ class Cropped(Part):
         super().__init__(traverse, range(len(traverse)))
         shape, (top, bottom, left, right) = traverse.frame_shape, crop
         fits = len(shape) == 3 and min(crop) >= 0 and top + bottom < shape[1] and left + right < shape[2]
-        if not fits:
-            seen = f"{traverse.name}: crop={','.join(map(str, crop))} of {' x '.join(map(str, shape))}"
-            raise InputError(f"{seen}; expected frames, of which some pixels are left")
+        seen = f"{traverse.name}: crop={','.join(map(str, crop))} of {' x '.join(map(str, shape))}"
+        expect(fits, "frames, of which some pixels are left", seen)
         self.box = slice(top, shape[1] - bottom), slice(left, shape[2] - right)
         size = shape[1], shape[2]
         self.mask = None if mask is None else (resize_frames(mask[None], size) >= 0.5).float()
@@ -327,9 +326,8 @@ class Frames(Traverse):
             raise InputError(
                 f"item {i} of {self.name} is {kind}; expected a frame (C,H,W), features (D,) or an image"
             )
-        if expected not in (None, tuple(item.shape)):
-            seen = f"item {i} of {self.name} has shape {tuple(item.shape)}"
-            raise InputError(f"{seen}; expected {expected} as item 0")
+        seen = f"item {i} of {self.name} has shape {tuple(item.shape)}"
+        expect(expected in (None, tuple(item.shape)), f"{expected} as item 0", seen)
         return item
 
 

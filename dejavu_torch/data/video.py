@@ -258,9 +258,8 @@ def stream_of(container: InputContainer, name: str, expected: str, threads: str)
 
 def check_same_size(name: str, number: int, frame: VideoFrame, first: tuple[int, int]) -> None:
     """Refuse a frame of another size than the first, (height, width)."""
-    if (frame.height, frame.width) != first:
-        seen = f"frame {number} of {name} is {frame.height} x {frame.width} pixels"
-        raise InputError(f"{seen}; expected {first[0]} x {first[1]} as in frame 0")
+    seen = f"frame {number} of {name} is {frame.height} x {frame.width} pixels"
+    expect((frame.height, frame.width) == first, f"{first[0]} x {first[1]} as in frame 0", seen)
 
 
 def pixels_of(frame: VideoFrame, path: Path, width: int = 0, height: int = 0) -> np.ndarray:

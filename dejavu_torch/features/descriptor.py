@@ -148,9 +148,8 @@ class Descriptor(nn.Module):
         """
         for features in self.features_in(traverse, progress, verb, on_first):
             descriptors = self.whitened(features)
-            if not descriptors.isfinite().all():
-                seen = f"the whitening makes NaN or infinity of the features of {traverse.name}"
-                raise InputError(f"{seen}; expected a map of such frames")
+            seen = f"the whitening makes NaN or infinity of the features of {traverse.name}"
+            expect(descriptors.isfinite().all(), "a map of such frames", seen)
             yield descriptors
 
     def all_of(self, traverse: Traverse, progress: bool = False, on_first: OnFirst | None = None) -> Tensor:

@@ -44,9 +44,8 @@ def in_parts(work: Callable[[Tensor], Tensor], frames: Tensor) -> Tensor:
 def channel_name(channel: str) -> str:
     """The normal form of a channel's name: "grey", "R", "R-B"."""
     name = str(channel).strip().upper().replace("GREY", "grey")
-    if name not in CHANNELS:
-        expected = "'grey', 'R', 'G', 'B' or a difference such as 'R-B'"
-        raise InputError(f"channel {channel!r} is unknown; expected {expected}")
+    expected = "'grey', 'R', 'G', 'B' or a difference such as 'R-B'"
+    expect(name in CHANNELS, expected, f"channel {channel!r} is unknown")
     return name
 
 
@@ -74,9 +73,8 @@ def range_of(given: Sequence[float] | str | None) -> tuple[float, float] | Liter
     except (TypeError, ValueError):
         low = high = math.nan
     low, high = (low / DEEP, high / DEEP) if high > 1 else (low, high)
-    if not 0 <= low < high <= 1:
-        expected = "LOW,HIGH in [0, 1], or up to 65535 as of 16 bits, or auto"
-        raise InputError(f"preprocess got range={given!r}; expected {expected}")
+    expected = "LOW,HIGH in [0, 1], or up to 65535 as of 16 bits, or auto"
+    expect(0 <= low < high <= 1, expected, f"preprocess got range={given!r}")
     return low, high
 
 

@@ -50,10 +50,9 @@ def up_to(network: nn.Module, layer: str, frames: Tensor) -> nn.Module:
     The copy omits modules that have not started by then, unless that changes its output for `frames`.
     """
     name, names = type(network).__name__, [path for path, _ in network.named_modules() if path]
-    if layer not in names:
-        some = [path for path in names if path.count(".") < 2]
-        examples = ", ".join([*some[:SHOWN], ".."][: len(some)]) or "none, it has none"
-        raise InputError(f"{name} has no layer {layer!r:.80}; expected one such as {examples}")
+    some = [path for path in names if path.count(".") < 2]
+    examples = ", ".join([*some[:SHOWN], ".."][: len(some)]) or "none, it has none"
+    expect(layer in names, f"one such as {examples}", f"{name} has no layer {layer!r:.80}")
     try:
         ended = copy.deepcopy(network)
     except RuntimeError as error:

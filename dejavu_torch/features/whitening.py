@@ -281,9 +281,8 @@ class Whitening(nn.Module):
         """
         groups = groups if self.groups is None else self.groups
         sizes = [places.shape[1]] if groups is None else [*groups]
-        if sum(sizes) != places.shape[1]:
-            seen = f"groups of {' + '.join(map(str, sizes))} dimensions, descriptors {tuple(places.shape)}"
-            raise InputError(f"{seen}; expected (N, {sum(sizes)})")
+        seen = f"groups of {' + '.join(map(str, sizes))} dimensions, descriptors {tuple(places.shape)}"
+        expect(sum(sizes) == places.shape[1], f"(N, {sum(sizes)})", seen)
         compared = views is not None or visits is not None
         bits = self.bits_of(len(places), compared)
         members = [self] if groups is None else [self._member() for _ in sizes]

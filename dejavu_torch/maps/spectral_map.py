@@ -179,9 +179,8 @@ class SpectralMap(PlaceMap):
         else:
             parts = [_nonzero(level) for level in levels]
         sizes = self.places + sum(places), self._bounds[-1] + sum(len(level) for *_, level in parts)
-        if max(sizes) > LARGEST:
-            seen = f"the map has {sizes[0]} places and {sizes[1]} coefficients"
-            raise InputError(f"{seen}; expected at most {LARGEST} of each: make several maps")
+        seen = f"the map has {sizes[0]} places and {sizes[1]} coefficients"
+        expect(max(sizes) <= LARGEST, f"at most {LARGEST} of each: make several maps", seen)
 
         def append(name: str, *more: Tensor) -> None:
             setattr(self, name, torch.cat([getattr(self, name), *(tensor.to(device) for tensor in more)]))

@@ -138,9 +138,8 @@ class TemplateMap(PlaceMap):
         )
         check_plan(self.plan, self.places, self.dimension)
         covered = sum(layer.stop - layer.start for layer in self.plan)
-        if max(self.places, covered) > MAX_PLACES:
-            seen = f"a map of {self.places} places, {covered} in all layers"
-            raise InputError(f"{seen}; expected at most {MAX_PLACES}")
+        seen = f"a map of {self.places} places, {covered} in all layers"
+        expect(max(self.places, covered) <= MAX_PLACES, f"at most {MAX_PLACES}", seen)
         # the numerator of the period is the number of places after which phases repeat
         self.laps = [min(layer.period.numerator, layer.stop - layer.start) for layer in self.plan]
         pairs = zip(self.plan, self.laps, strict=True)

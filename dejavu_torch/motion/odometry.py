@@ -152,9 +152,8 @@ def interpolated(shift: Tensor, valid: Tensor, name: str) -> Tensor:
     bad, good = (~valid).nonzero()[:, 0], valid.nonzero()[:, 0]
     if not len(bad):
         return shift
-    if not len(good):
-        seen = f"{name}: none of {len(shift)} steps shows the same ground twice"
-        raise InputError(f"{seen}; expected corners on the ground in front of the camera")
+    seen = f"{name}: none of {len(shift)} steps shows the same ground twice"
+    expect(len(good), "corners on the ground in front of the camera", seen)
     segments = [f"{run.start} to {run.stop}" for run in runs(bad)]
     more = f" and {len(segments) - MAX_LISTED} more" if len(segments) > MAX_LISTED else ""
     log.warning(

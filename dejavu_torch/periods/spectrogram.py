@@ -159,9 +159,8 @@ class SpectrogramAnalysis(PeriodFinder):
         """The chunks [start, stop) of a route."""
         shortest, seen = 2 * self.min_period, f"the route has {places} place{'s' * (places != 1)}"
         expect(places >= shortest, f"at least {shortest}, two periods of {self.min_period}", seen)
-        if places < self.window and self.short == "refuse":
-            cure = "the window, or a shorter window, or --mapper.periods.short shrink"
-            raise InputError(f"{seen}; expected at least {self.window}, {cure}")
+        cure = "the window, or a shorter window, or --mapper.periods.short shrink"
+        expect(places >= self.window or self.short != "refuse", f"at least {self.window}, {cure}", seen)
         window = min(self.window, places)
         hop = min(self.hop or window, window)
         chunks = [(start, start + window) for start in range(0, places - window + 1, hop)]

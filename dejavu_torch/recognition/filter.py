@@ -260,9 +260,8 @@ class PlaceFilter(SequenceModel):
         return Motion(Layout(like.shape[-1], route_starts=tuple(route_starts)), rates)
 
     def check(self, queries: int | None, places: int) -> None:
-        if self.lag and queries is not None:
-            seen = f"a lag of {self.lag} where all queries are known"
-            raise InputError(f"{seen}; expected a PlaceSmoother, or a LiveLocalizer")
+        seen = f"a lag of {self.lag} where all queries are known"
+        expect(not self.lag or queries is None, "a PlaceSmoother, or a LiveLocalizer", seen)
         furthest = len(self.move_logits) - 1
         expect(furthest < places, "fewer", f"moves of up to {furthest} places on a map of {places}")
 

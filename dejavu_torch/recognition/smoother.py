@@ -537,9 +537,8 @@ def check_descriptors(descriptors: Tensor | None) -> Tensor:
     """Descriptors (Q,K), or an InputError that tells why not."""
     if descriptors is None:
         raise InputError("a function of scores without descriptors; expected those of the queries")
-    if descriptors.ndim != 2 or not bool(descriptors.isfinite().all()):
-        seen = f"descriptors are {tuple(descriptors.shape)} {descriptors.dtype}"
-        raise InputError(f"{seen}; expected finite ones (Q,K)")
+    seen = f"descriptors are {tuple(descriptors.shape)} {descriptors.dtype}"
+    expect(descriptors.ndim == 2 and bool(descriptors.isfinite().all()), "finite ones (Q,K)", seen)
     return descriptors
 
 

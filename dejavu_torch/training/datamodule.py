@@ -213,9 +213,8 @@ class RouteData(LightningDataModule):
         if count > 1 and name in ("validation", "query") and any(one is not None for one in each):
             seen = f"{name} is given, but there are {count} routes, for which no map is made"
             raise InputError(f"{seen}; expected none, and `dejavu compare A B --descriptor FILE` for a route")
-        if len(each) != count:
-            seen = f"{name} lists {len(each)}, and there are {count} routes"
-            raise InputError(f"{seen}; expected one for each route, null for routes without")
+        seen = f"{name} lists {len(each)}, and there are {count} routes"
+        expect(len(each) == count, "one for each route, null for routes without", seen)
         return each
 
     @property
@@ -369,9 +368,8 @@ class RouteData(LightningDataModule):
         each = torch.arange(len(frames)).split([len(part) for part in parts])
         runs = [run for part in each for run in runs_of(part[kept[part]])]
         longest = max(map(len, runs))
-        if longest < self.clip:
-            seen = f"clip is {self.clip} and the longest segment to train on has {longest} frames"
-            raise InputError(f"{seen} (data.held_out is {self.held_out:g}); expected a shorter clip")
+        seen = f"clip is {self.clip} and the longest segment to train on has {longest} frames"
+        expect(longest >= self.clip, "a shorter clip", f"{seen} (data.held_out is {self.held_out:g})")
         batch_size = self.batch_size * self._processes[1]
         return _loader(frames, Clips(runs, batch_size, self.clip, process, processes))
 
@@ -416,9 +414,8 @@ def store(traverse: Traverse, resize: tuple[int, int] | None = None) -> Tensor:
                 needed = 4 * len(batch) * batch.shape[1] * math.prod(resize)
                 check_room(needed, f"{traverse.name} in frames of {resize[0]} x {resize[1]}")
                 batch = resize_frames(batch, resize)
-            if shape and tuple(batch.shape[1:]) != shape:
-                seen = f"{traverse.name} holds frames of {shape} and of {tuple(batch.shape[1:])}"
-                raise InputError(f"{seen}; expected one size, as with data.resize")
+            seen = f"{traverse.name} holds frames of {shape} and of {tuple(batch.shape[1:])}"
+            expect(not shape or tuple(batch.shape[1:]) == shape, "one size, as with data.resize", seen)
             shape = tuple(batch.shape[1:])
             expect(batch.isfinite().all(), "finite numbers", f"{traverse.name} holds NaN or infinite values")
             yield (batch if batch.ndim == 2 else (batch * 255).round().clamp(0, 255).byte().flatten(1)).cpu()

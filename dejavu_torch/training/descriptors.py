@@ -124,14 +124,10 @@ class DescriptorTask(RouteTask):
         data, name = self.data, self.data.route_name
         frames = data.sets["reference"]
         expect(frames.values.ndim != 2, "frames, or `dejavu learn`", f"{name} holds ready features")
-        if not trainable(self.features):
-            seen = f"{type(self.features).__name__} has nothing to train"
-            raise InputError(f"{seen}; expected parameters that are not frozen, or `dejavu learn`")
-        if self.rate and len(data.routes) > 1:
-            seen = (
-                f"model.rate is {self.rate}, for the bits of one map, and there are {len(data.routes)} routes"
-            )
-            raise InputError(f"{seen}; expected model.rate 0, or one route")
+        seen = f"{type(self.features).__name__} has nothing to train"
+        expect(trainable(self.features), "parameters that are not frozen, or `dejavu learn`", seen)
+        seen = f"model.rate is {self.rate}, for the bits of one map, and there are {len(data.routes)} routes"
+        expect(not self.rate or len(data.routes) <= 1, "model.rate 0, or one route", seen)
         if (
             self.dejavu.whitening is not None
             and not data.augmentation.acts

@@ -61,9 +61,8 @@ def place_cross_entropy(
     _check_places(places, scores)
     queries, n = scores.shape
     outside = places[(places < -1) | (places >= n)].tolist()
-    if tolerance < 0 or outside:
-        seen = f"the tolerance is {tolerance} and places outside the route are {outside[:3]}"
-        raise InputError(f"{seen}; expected at least 0, and places in 0..{n - 1} or -1")
+    seen = f"the tolerance is {tolerance} and places outside the route are {outside[:3]}"
+    expect(tolerance >= 0 and not outside, f"at least 0, and places in 0..{n - 1} or -1", seen)
     # +1 at the start of each range of right places, -1 after its end: avoids Q x N x R
     known = (places >= 0).int()
     steps = known.new_zeros(queries, n + 1)

@@ -164,9 +164,8 @@ class RouteTask(pl.LightningModule):
     def _check_places(self) -> None:
         """Refuse the map of another route, which a checkpoint may hold."""
         places, count = self.map.places, len(self.data.sets["reference"])
-        if places not in (0, count):
-            seen = f"the map has {places} places, {self.data.reference.name} has {count}"
-            raise InputError(f"{seen}; expected the route that the map was made of")
+        seen = f"the map has {places} places, {self.data.reference.name} has {count}"
+        expect(places in (0, count), "the route that the map was made of", seen)
 
     def _say_few(self) -> None:
         data = self.data
@@ -205,9 +204,8 @@ class RouteTask(pl.LightningModule):
                 made.append(make(values))
         features = torch.cat(made)
         features = features[order.argsort().to(features.device)]
-        if not features.isfinite().all():
-            seen = f"{type(self.features).__name__} gives NaN or infinite features for {self.data.route_name}"
-            raise InputError(f"{seen}; expected finite numbers")
+        seen = f"{type(self.features).__name__} gives NaN or infinite features for {self.data.route_name}"
+        expect(features.isfinite().all(), "finite numbers", seen)
         return features
 
     @torch.no_grad()
@@ -347,9 +345,8 @@ class RouteTask(pl.LightningModule):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuse a checkpoint of another model or other routes."""
-        if checkpoint["task"] != type(self).__name__:
-            seen = f"the checkpoint is of a {checkpoint['task']}"
-            raise InputError(f"{seen}; expected one of a {type(self).__name__}")
+        seen = f"the checkpoint is of a {checkpoint['task']}"
+        expect(checkpoint["task"] == type(self).__name__, f"one of a {type(self).__name__}", seen)
         if self._trainer is not None:
             self.resumed = True
             if checkpoint["routes"] != self._routes():
@@ -425,10 +422,9 @@ def freeze_parts(
     named = dict(backbone.named_parameters())
     for prefix in prefixes:
         chosen = [p for name, p in named.items() if name.startswith(prefix)]
-        if not chosen:
-            known = ", ".join(sorted({name.partition(".")[0] for name in named}))
-            seen = f"freeze has {prefix!r}, but no parameter of {type(backbone).__name__} begins with it"
-            raise InputError(f"{seen}; expected one of {known or 'none, it has none'}")
+        known = ", ".join(sorted({name.partition(".")[0] for name in named}))
+        seen = f"freeze has {prefix!r}, but no parameter of {type(backbone).__name__} begins with it"
+        expect(chosen, f"one of {known or 'none, it has none'}", seen)
         for parameter in chosen:
             parameter.requires_grad_(False)
     return {
