@@ -246,9 +246,8 @@ def second_traverse(
     if len(known) == len(drives):
         return LabelledFrames(chained([drive for drive, _ in drives]), torch.cat(known))
     for drive, places, seen in views:
-        if places is None and len(drive) < LEAST:
-            expected = f"a truth for its places, or at least {LEAST} frames in order"
-            raise InputError(f"{seen}; expected the same number, frame i at place i, {expected}")
+        expected = f"the same number, frame i at place i, a truth, or at least {LEAST} frames in order"
+        expect(places is not None or len(drive) >= LEAST, expected, seen)
     model.descriptor.check_sizes(reference, *(drive for drive, _ in drives))
     return place_drives(model, reference, drives, progress)
 
@@ -274,9 +273,8 @@ def one_route(model: DejaVu, verb: str) -> SpectralMap:
     """The spectral map of a model; InputError if it has none, another kind, or one of several routes."""
     require_map(model, f" to {verb}")
     place_map = model.map
-    if place_map.routes:
-        names = ", ".join(route.name for route in place_map.routes)
-        raise InputError(f"the map has the routes {names}; expected to {verb} the map of a route, then merge")
+    seen = f"the map has the routes {', '.join(route.name for route in place_map.routes)}"
+    expect(not place_map.routes, f"to {verb} the map of a route, then merge", seen)
     if not isinstance(place_map, SpectralMap):
         seen = (
             f"there is a map of kind {place_map.kind!r}; expected one of kind {SpectralMap.kind!r} to {verb}"

@@ -361,10 +361,9 @@ def check_types(tensors: Mapping[str, Tensor], features: nn.Module) -> None:
 
 def check_rounded(descriptor: Descriptor) -> None:
     """Refuse a descriptor of 8-bit weights that are not rounded."""
-    if descriptor.weight_bits == 8 and not is_rounded(descriptor.features):
-        name = type(descriptor.features).__name__
-        seen = f"weights of {name} are not rounded to 8 bits, or changed since then"
-        raise InputError(f"{seen}; expected a DejaVu constructed from them with weight_bits=8")
+    seen = f"weights of {type(descriptor.features).__name__} are not rounded to 8 bits, or changed since then"
+    fits = descriptor.weight_bits != 8 or is_rounded(descriptor.features)
+    expect(fits, "a DejaVu constructed from them with weight_bits=8", seen)
 
 
 def run_key(

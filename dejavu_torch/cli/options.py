@@ -74,10 +74,8 @@ class Sequences:
             expect(length is not None and length % 1 == 0, WAYS, f"--match {way}")
         elif way not in (None, "drive", "filter", "single"):
             raise InputError(f"--match {way}; expected {WAYS}")
-        if self.speeds is not None and length in (None, 1):
-            raise InputError(
-                f"--speeds {self.speeds} without a sequence; expected --match sequence:T with them"
-            )
+        fits = self.speeds is None or length not in (None, 1)
+        expect(fits, "--match sequence:T with them", f"--speeds {self.speeds} without a sequence")
         if length is not None:
             matcher = SequenceMatcher(int(length), (1.0,) if self.speeds is None else self.speeds)
             return None if length == 1 else matcher

@@ -78,9 +78,8 @@ class LiveLocalizer:
         if model.step is not None and model.velocity is not None:
             seen = "the map's places are even steps along the ground, which only a whole traverse shows"
             raise InputError(f"{seen}; expected a map without --velocity, or unchanged frames (--as_is)")
-        if not (sequence is None or sequence == "filter" or isinstance(sequence, SequenceModel)):
-            seen = f"the sequence is {sequence!r}"
-            raise InputError(f"{seen}; expected a SequenceModel such as PlaceFilter, 'filter' or None")
+        fits = sequence in (None, "filter") or isinstance(sequence, SequenceModel)
+        expect(fits, "a SequenceModel such as PlaceFilter, 'filter' or None", f"the sequence is {sequence!r}")
         self.keep_scores, self.centring = keep_scores, running_mean(model.map) if centre else None
         self.model, self.sequence = model, PlaceFilter() if isinstance(sequence, str) else sequence
         self._shape: tuple[int, ...] | None = None  # of the latest valid frame

@@ -79,9 +79,8 @@ def read_map(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     check_regular(path, EXPECTED)
     try:
         with path.open("rb") as file:
-            if file.read(len(ZIP)) == ZIP:
-                cure = "or `dejavu train export` of the checkpoint"
-                raise InputError(f"{path} is a checkpoint or another archive; expected {EXPECTED}, {cure}")
+            cure = "or `dejavu train export` of the checkpoint"
+            expect(file.read(len(ZIP)) != ZIP, f"{EXPECTED}, {cure}", f"{path} is a checkpoint or archive")
         with safe_open(path, framework="pt") as archive:
             metadata = archive.metadata() or {}
             expect(NAME in metadata, EXPECTED, f"{path} is not a map of dejavu_torch")

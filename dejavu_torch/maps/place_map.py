@@ -210,9 +210,8 @@ class PlaceMap(nn.Module, ABC):
     def load_packed(self, tensors: dict[str, Tensor], extra: dict[str, Any]) -> None:
         """Load the results of `packed` and `get_extra_state`; other tensors are an InputError."""
         names = self.state_dict().keys() - {EXTRA}
-        if not names - {*self.optional} <= tensors.keys() <= names:
-            seen = f"it holds {', '.join(sorted(tensors)) or 'nothing'}"
-            raise InputError(f"{seen} of a map; expected {', '.join(sorted(names))}")
+        fits, seen = names - {*self.optional} <= tensors.keys() <= names, ", ".join(sorted(tensors))
+        expect(fits, ", ".join(sorted(names)), f"it holds {seen or 'nothing'} of a map")
         default = {
             name: getattr(self, name).new_zeros(shape)
             for name, shape in self.optional.items()

@@ -99,9 +99,8 @@ class PlaceFilter(SequenceModel):
     ) -> None:
         super().__init__()
         moves = checked_rates(moves, jump, leave, enter)
-        if not 0 < sharpness < math.inf or not math.isfinite(off_map):
-            seen = f"sharpness {sharpness}, off_map {off_map}"
-            raise InputError(f"{seen}; expected finite numbers, the sharpness above 0")
+        fits = 0 < sharpness < math.inf and math.isfinite(off_map)
+        expect(fits, "finite numbers, the sharpness above 0", f"sharpness {sharpness}, off_map {off_map}")
         expect(isinstance(within, int) and within >= 0, "a whole number, at least 0", within=within)
         expect(threshold is None or not math.isnan(threshold), "a number, or None", "the threshold is NaN")
         expect(isinstance(lag, int) and lag >= 0, "a whole number of queries, at least 0", lag=lag)

@@ -167,9 +167,8 @@ class PlaceSmoother(SequenceModel):
         super().__init__()
         moves = checked_rates(moves, jump, leave, enter)
         expect(0 <= turn <= 1, "a probability", turn=turn)
-        if not 0 < separation < math.inf or not 1 <= tempering < math.inf:
-            seen = f"separation {separation}, tempering {tempering}"
-            raise InputError(f"{seen}; expected finite numbers, above 0 and at least 1")
+        fits = 0 < separation < math.inf and 1 <= tempering < math.inf
+        expect(fits, "finite, above 0 and at least 1", f"separation {separation}, tempering {tempering}")
         expect(isinstance(within, int) and within >= 0, "a whole number, at least 0", within=within)
         expect(threshold is None or not math.isnan(threshold), "a number, or None", "the threshold is NaN")
         for link in links:

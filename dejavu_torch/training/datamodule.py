@@ -187,9 +187,8 @@ class RouteData(LightningDataModule):
         }
         for name, one in ((name, one) for name, every in self.listed.items() for one in every):
             fits = isinstance(one, (str, Path, Traverse, Tensor, np.ndarray))
-            if not fits and (one is not None or name == "source"):
-                expected = "a path, a Traverse, or a tensor or array of frames or features"
-                raise InputError(f"{name} is of type {type(one).__name__}; expected {expected}")
+            expected = "a path, a Traverse, or a tensor or array of frames or features"
+            expect(fits or (one is None and name != "source"), expected, f"{name} is a {type(one).__name__}")
         paths = [str(one) for one in self.listed["source"] if isinstance(one, (str, Path))]
         for one in (one for one in paths if paths.count(one) > 1):
             raise InputError(f"{one} is given twice; expected each route once, other traverses as second")

@@ -99,9 +99,8 @@ class DescriptorTask(RouteTask):
         backbone = SmallCNN() if backbone is None else backbone
         mapper = SpectralMapper() if mapper is None else mapper
         strengths = whitening.strengths if isinstance(whitening, Whitening) else STRENGTHS
-        if isinstance(mapper, TemplateMapper):
-            expected = "expected another one, or --model TemplateTask to train templates"
-            raise InputError(f"the mapper is a TemplateMapper; {expected}")
+        fits = not isinstance(mapper, TemplateMapper)
+        expect(fits, "another one, or --model TemplateTask to train templates", mapper=type(mapper))
         expect(0 <= rate < math.inf, "0 or more, such as 1", rate=rate)
         expect(strengths == STRENGTHS, "those of data.augmentation alone", f"whitening.strengths {strengths}")
         check_preprocess(preprocess)
@@ -128,13 +127,9 @@ class DescriptorTask(RouteTask):
         expect(trainable(self.features), "parameters that are not frozen, or `dejavu learn`", seen)
         seen = f"model.rate is {self.rate}, for the bits of one map, and there are {len(data.routes)} routes"
         expect(not self.rate or len(data.routes) <= 1, "model.rate 0, or one route", seen)
-        if (
-            self.dejavu.whitening is not None
-            and not data.augmentation.acts
-            and data.sources["second"] is None
-        ):
-            seen = "data.augmentation changes nothing, so the whitening has nothing to learn from"
-            raise InputError(f"{seen}; expected an augmentation, data.second, or model.whitening none")
+        seen = "data.augmentation changes nothing, so the whitening has nothing to learn from"
+        fits = self.dejavu.whitening is None or data.augmentation.acts or data.sources["second"] is not None
+        expect(fits, "an augmentation, data.second, or model.whitening none", seen)
         self.every = every = similar_span(frames, data.lengths, data.tolerance)
         if every < SPARSE <= data.tolerance:
             log.warning(
