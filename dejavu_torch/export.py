@@ -29,7 +29,7 @@ from dejavu_torch.recognition.centring import running_mean
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.text import one_line
-from dejavu_torch.types import InputError, SequenceModel
+from dejavu_torch.types import InputError, SequenceModel, expect
 from dejavu_torch.version import __version__
 
 OPSET = 18
@@ -168,9 +168,8 @@ def export_onnx(
             seen = f"an export needs {name}, which cannot be imported ({one_line(error)})"
             raise InputError(f"{seen}; expected it: pip install 'dejavu_torch[export]'") from error
     require_map(model)
-    if model.map.routes:
-        routes = ", ".join(route.name for route in model.map.routes)
-        raise InputError(f"the map has the routes {routes}; expected to export the map of each")
+    routes = ", ".join(route.name for route in model.map.routes)
+    expect(not model.map.routes, "to export the map of each", f"the map has the routes {routes}")
     if model.frame_shape is None:
         raise InputError("the map does not know its frames; expected a map learned from a source")
     if sequence is not None:
@@ -179,9 +178,8 @@ def export_onnx(
         seen = f"a filter with a lag of {sequence.lag}"
         raise InputError(f"{seen}; expected one without: an ONNX file answers each frame at once")
     size = 4 * model.map.places * model.map.dimension if isinstance(model.map, SpectralMap) else 0
-    if size > MAX_BYTES:
-        seen = f"{model.map.places} places of {model.map.dimension} dimensions need {size / 1e9:.1f} GB"
-        raise InputError(f"{seen}; expected at most {MAX_BYTES / 1e9:.1f} GB in an ONNX file")
+    seen = f"{model.map.places} places of {model.map.dimension} dimensions need {size / 1e9:.1f} GB"
+    expect(size <= MAX_BYTES, f"at most {MAX_BYTES / 1e9:.1f} GB in an ONNX file", seen)
     device = model.map.device
     graph = Graph(model, sequence, centre)
     shape, generator = (TRIED, *model.frame_shape), torch.Generator().manual_seed(0)
@@ -199,9 +197,8 @@ def export_onnx(
             difference = _difference(written, graph, noise, facts)
         except Exception as error:  # of any type, from torch, onnx or onnxruntime
             raise _refusal(graph, noise, error) from error
-    if not difference <= TOLERANCE:
-        seen = f"the exported scores differ from torch's by {difference:.2g} on noise"
-        raise InputError(f"{seen}; expected at most {TOLERANCE:g}: a part behaves differently in ONNX")
+    seen = f"the exported scores differ from torch's by {difference:.2g} on noise"
+    expect(difference <= TOLERANCE, f"at most {TOLERANCE:g}: a part behaves differently in ONNX", seen)
     with whole_file(path) as temporary:
         temporary.write_bytes(written)
     return Exported(facts, len(written), difference)

@@ -25,7 +25,7 @@ from dejavu_torch.model import DejaVu, features_per_frame, require_map
 from dejavu_torch.model_file import ModelState, Recipe, difference, recipe_of, run_key, weights_of
 from dejavu_torch.motion.resampling import ResampledTraverse, source_of
 from dejavu_torch.teaching import LEAST, place_drives
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.types import InputError, Traverse, expect
 
 log = logging.getLogger("dejavu_torch")
 
@@ -214,8 +214,7 @@ def _known_places(
     else:
         seen = f"{second.name} has {frames} frames and {name} {table.frames}"
         return second, None, seen + (" at even steps" if step is not None else "")
-    if not (places >= 0).any():
-        raise InputError(f"no frame of {second.name} shows a place of {name}; expected some")
+    expect((places >= 0).any(), "some", f"no frame of {second.name} shows a place of {name}")
     return second, places, ""
 
 
@@ -239,18 +238,16 @@ def second_traverse(
     model.descriptor.require_learning(" + ".join(traverse.name for traverse in visits))
     truths = [truth] if isinstance(truth, str | None) else [*truth]
     truths *= len(visits) if len(truths) == 1 else 1
-    if len(truths) != len(visits):
-        seen = f"{len(visits)} further traverses and {len(truths)} truths"
-        raise InputError(f"{seen}; expected one for each, or one for all")
+    seen = f"{len(visits)} further traverses and {len(truths)} truths"
+    expect(len(truths) == len(visits), "one for each, or one for all", seen)
     views = [_known_places(model, reference, *pair) for pair in zip(visits, truths, strict=True)]
     drives = [(drive, places) for drive, places, _ in views]
     known = [places for places in (places for _, places in drives) if places is not None]
     if len(known) == len(drives):
         return LabelledFrames(chained([drive for drive, _ in drives]), torch.cat(known))
     for drive, places, seen in views:
-        if places is None and len(drive) < LEAST:
-            expected = f"a truth for its places, or at least {LEAST} frames in order"
-            raise InputError(f"{seen}; expected the same number, frame i at place i, {expected}")
+        expected = f"the same number, frame i at place i, a truth, or at least {LEAST} frames in order"
+        expect(places is not None or len(drive) >= LEAST, expected, seen)
     model.descriptor.check_sizes(reference, *(drive for drive, _ in drives))
     return place_drives(model, reference, drives, progress)
 
@@ -276,9 +273,8 @@ def one_route(model: DejaVu, verb: str) -> SpectralMap:
     """The spectral map of a model; InputError if it has none, another kind, or one of several routes."""
     require_map(model, f" to {verb}")
     place_map = model.map
-    if place_map.routes:
-        names = ", ".join(route.name for route in place_map.routes)
-        raise InputError(f"the map has the routes {names}; expected to {verb} the map of a route, then merge")
+    seen = f"the map has the routes {', '.join(route.name for route in place_map.routes)}"
+    expect(not place_map.routes, f"to {verb} the map of a route, then merge", seen)
     if not isinstance(place_map, SpectralMap):
         seen = (
             f"there is a map of kind {place_map.kind!r}; expected one of kind {SpectralMap.kind!r} to {verb}"
@@ -310,9 +306,8 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
         >>> merge(models, ["out", "back"]).map.routes
         (Route(name='out', places=200, frames=200), Route(name='back', places=200, frames=200))
     """
-    if len(models) < 2 or len(names) != len(models):
-        seen = f"{len(models)} maps and {len(names)} names to merge"
-        raise InputError(f"{seen}; expected at least two maps, and a name for each")
+    seen = f"{len(models)} maps and {len(names)} names to merge"
+    expect(len(models) >= 2 and len(names) == len(models), "at least two maps, and a name for each", seen)
     first, parts = models[0], dict[str, SpectralMap]()
     for name, model in zip(names, models, strict=True):
         place_map = model.map
@@ -400,9 +395,8 @@ def joined_names(parts: list[list[str]], frames: list[int]) -> list[str]:
 
 def _check_count(places: int, resampled: bool) -> None:
     limit = EXACT if resampled else LARGEST
-    if places > limit:
-        steps = " at even steps" if resampled else ""
-        raise InputError(f"{places} places{steps} in one map; expected at most {limit}, or several maps")
+    steps = " at even steps" if resampled else ""
+    expect(places <= limit, f"at most {limit}, or several maps", f"{places} places{steps} in one map")
 
 
 def _check_compatible(model: DejaVu, added: Traverse) -> None:
@@ -419,8 +413,7 @@ def _check_compatible(model: DejaVu, added: Traverse) -> None:
         )
         raise InputError(f"{added.name} has {seen}, the map was learned from {learned}; expected the same")
     count, expected = model.descriptor.count_features(added), features_per_frame(model)
-    if count != expected:
-        raise InputError(f"{added.name} gives {count} features per frame; expected {expected}, as in the map")
+    expect(count == expected, f"{expected}, as in the map", f"{added.name} gives {count} features per frame")
 
 
 def _compatible(model: DejaVu, stored: tuple[int, ...], shape: tuple[int, ...]) -> bool:

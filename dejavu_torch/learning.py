@@ -35,7 +35,7 @@ from dejavu_torch.memory import concatenate
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.recognition.calibration import Calibration, calibrated
 from dejavu_torch.text import progress_of
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.types import InputError, Traverse, expect
 
 MAX_SEGMENT = 512  # consecutive queries in a calibration
 SEGMENT_SCORES = 2**22  # maximum, queries of a segment x places
@@ -282,9 +282,8 @@ def observation_counts(visits: LabelledFrames, places: int) -> Tensor:
     """The number of frames that show each of N places, (N,); a place beyond them is refused, and frames whose
     places are not given."""
     name, frames = visits.traverse.name, len(visits.traverse)
-    if frames != len(visits.places):
-        seen = f"{name} has {frames} frames and {len(visits.places)} places"
-        raise InputError(f"{seen}; expected the same number")
+    seen = f"{name} has {frames} frames and {len(visits.places)} places"
+    expect(frames == len(visits.places), "the same number", seen)
     shown = visits.places[visits.places >= 0].cpu()
     if len(shown) and int(shown.max()) >= places:
         raise InputError(f"{name} shows place {int(shown.max())}; expected one of {places}")

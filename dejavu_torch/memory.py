@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch._C._functorch import is_functorch_wrapped_tensor
 from torch.autograd import forward_ad
 
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, expect
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -81,8 +81,7 @@ def check_room(needed: float, what: str) -> None:
         >>> check_room(10**6, "a strip of 1000 x 1000 pixels")
     """
     free = free_memory()
-    if needed > free:
-        raise InputError(f"{what} takes {_size(needed)}; expected at most the {_size(free)} free")
+    expect(needed <= free, f"at most the {_size(free)} free", f"{what} takes {_size(needed)}")
 
 
 def _size(number: float) -> str:
@@ -130,8 +129,7 @@ def concatenate(batches: Iterable[Tensor], in_memory: int = IN_MEMORY, half: boo
         if held > in_memory:
             file = _spilled(parts, file, half)
             parts, held = [], 0
-    if not parts and file is None:
-        raise InputError("there are no features; expected at least one batch")
+    expect(parts or file is not None, "at least one batch", "there are no features")
     if file is None:
         if len(parts) == 1:
             return parts[0]
@@ -152,9 +150,7 @@ def _blocks(batches: Iterable[Tensor], most: int) -> Iterator[Tensor]:
     for batch in batches:
         dimension, dtype = seen = batch.shape[1], batch.dtype
         kind = kind or seen
-        if seen != kind:
-            before = f"{kind[0]} of {kind[1]} as before"
-            raise InputError(f"features {rows}.. are {dimension} of {dtype}; expected {before}")
+        expect(seen == kind, f"{kind[0]} {kind[1]} as before", f"batch of {dimension} {dtype}")
         rows, held = rows + len(batch), held + batch.nbytes
         loose.append(batch)
         if held > most:

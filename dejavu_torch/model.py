@@ -38,7 +38,7 @@ from dejavu_torch.recognition.select import HIGHEST, PROBABLE, Acceptance, check
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.resize import reduced_size
 from dejavu_torch.text import with_progress
-from dejavu_torch.types import InputError, Match, SequenceModel, Traverse
+from dejavu_torch.types import InputError, Match, SequenceModel, Traverse, expect
 
 if TYPE_CHECKING:
     from dejavu_torch.recognition.calibration import Calibration
@@ -122,17 +122,12 @@ class DejaVu(nn.Module):
         super().__init__()
         if whitening not in (None, "none") and not isinstance(whitening, Whitening):
             raise InputError(f"the whitening is {whitening!r}; expected a Whitening, 'none' or None")
-        if mapper is not None and not isinstance(mapper, Mapper):
-            raise InputError(f"the mapper is a {type(mapper).__name__}; expected a Mapper or None")
-        if not isinstance(batch_size, int) or batch_size < 1:
-            raise InputError(f"batch_size is {batch_size}; expected a whole number of at least 1")
-        if threshold is not None and not threshold > -math.inf:
-            raise InputError(f"the threshold is {threshold}; expected a number, or None")
-        if weight_bits not in BITS:
-            raise InputError(f"weight_bits is {weight_bits!r}; expected one of {', '.join(map(str, BITS))}")
+        expect(mapper is None or isinstance(mapper, Mapper), "a Mapper or None", mapper=type(mapper))
+        expect(isinstance(batch_size, int) and batch_size > 0, "an integer above 0", batch_size=batch_size)
+        expect(threshold is None or threshold > -math.inf, "a number, or None", threshold=threshold)
+        expect(weight_bits in BITS, f"one of {', '.join(map(str, BITS))}", weight_bits=weight_bits)
         check_precision(precision)
-        if precision is not None and threshold is not None:
-            raise InputError(f"threshold is {threshold} and precision is {precision}; expected one of them")
+        expect(None in (precision, threshold), "one of them", threshold=threshold, precision=precision)
         self.mapper = SpectralMapper() if mapper is None else mapper
         if whitening is None and self.mapper.whitens:
             whitening = Whitening()
@@ -433,9 +428,8 @@ class DejaVu(nn.Module):
         traverse = self.at_map_size(as_traverse(traverse), self.frame_shape or ())
         if self.step is not None:
             traverse = self.resample(traverse, self.step, progress, self.frame_shape)
-        if len(traverse) != self.map.places:
-            seen = f"{traverse.name} has {len(traverse)} places, the map {self.map.places}"
-            raise InputError(f"{seen}; expected the traverse that the map was learned from")
+        seen = f"{traverse.name} has {len(traverse)} places, the map {self.map.places}"
+        expect(len(traverse) == self.map.places, "the traverse that the map was learned from", seen)
         check_apart(apart, len(traverse))
         descriptors = self.descriptor.all_of(traverse, progress)
         matching = self.loop_matching(apart, PlaceSmoother() if drive else None)
@@ -630,8 +624,7 @@ def _state_of(model: DejaVu, place_map: PlaceMap, traverse: Traverse | None) -> 
 def require_map(model: DejaVu, purpose: str = "") -> None:
     """Refuse a model without a map; `purpose` is for the message, such as " to append to"."""
     if not model.map.places:
-        if model.trained is None:
-            raise InputError(f"there is no map yet{purpose}; expected learn(...) or load(...) first")
+        expect(model.trained is not None, "learn(...) or load(...) first", f"there is no map yet{purpose}")
         seen = f"this is a descriptor without a map{purpose}"
         raise InputError(f"{seen}; expected learn(...) with it first")
 
@@ -644,8 +637,7 @@ def features_per_frame(model: DejaVu) -> int:
 
 def check_apart(apart: int, places: int) -> None:
     """Refuse loops closer than a place, or none."""
-    if not 1 <= apart < places:
-        raise InputError(f"loops: {apart}; expected a number of places from 1 to {places - 1}")
+    expect(1 <= apart < places, f"a number of places from 1 to {places - 1}", f"loops: {apart}")
 
 
 def check_queries(model: DejaVu, shape: tuple[int, ...], dimension: int, name: str) -> None:
@@ -661,18 +653,15 @@ def check_queries(model: DejaVu, shape: tuple[int, ...], dimension: int, name: s
         raise InputError(f"{seen}{learned * (len(reference or ()) == 3)}")
     if reference is None or len(shape) != 3:
         return
-    if len(reference) == 1:
-        seen = f"{name} has frames, but the map was learned from ready features"
-        raise InputError(f"{seen}; expected features (Q, {expected})")
+    seen = f"{name} has frames, but the map was learned from ready features"
+    expect(len(reference) != 1, f"features (Q, {expected})", seen)
     own, other = (" x ".join(map(str, size)) for size in (shape, reference))
-    if dimension != expected:
-        seen = f"{name}: frames of {own} give {dimension} features"
-        raise InputError(f"{seen}; the map expects {expected}, as frames of {other} give")
+    seen = f"{name}: frames of {own} give {dimension} features"
+    expect(dimension == expected, f"{expected}, as frames of {other} give", seen)
     if shape[1:] != reference[1:] and getattr(model.descriptor.features, "resize", None) is None:
         log.warning("%s has frames of %s, the map was learned from %s", name, own, other)
 
 
 def check_precision(precision: float | None) -> None:
     """Refuse a precision outside (0, 1)."""
-    if precision is not None and not 0 < precision < 1:
-        raise InputError(f"the precision is {precision}; expected a share above 0 and below 1, such as .99")
+    expect(precision is None or 0 < precision < 1, "a share above 0 and below 1", precision=precision)

@@ -42,7 +42,7 @@ from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.recognition.calibration import Calibration, Platt
 from dejavu_torch.text import one_line
-from dejavu_torch.types import InputError, Training, Traverse
+from dejavu_torch.types import InputError, Training, Traverse, expect
 from dejavu_torch.version import __version__
 
 R = TypeVar("R", bound="Model")
@@ -195,9 +195,8 @@ def build(recipe: Recipe, given: nn.Module | None = None) -> Any:
     name = recipe.class_path
     if given is not None and recipe_of(given) == recipe:
         return given
-    if name not in REGISTRY:
-        seen = f"the map's features are of class {name}, which only the caller can load"
-        raise InputError(f"{seen}; expected it as `features`, with its original arguments")
+    seen = f"the map's features are of class {name}, which only the caller can load"
+    expect(name in REGISTRY, "it as `features`, with its original arguments", seen)
     arguments = dict(recipe.init_args)
     for key, parts in _parts(recipe).items():
         # only learning needs the period finder: a foreign one is omitted
@@ -362,10 +361,9 @@ def check_types(tensors: Mapping[str, Tensor], features: nn.Module) -> None:
 
 def check_rounded(descriptor: Descriptor) -> None:
     """Refuse a descriptor of 8-bit weights that are not rounded."""
-    if descriptor.weight_bits == 8 and not is_rounded(descriptor.features):
-        name = type(descriptor.features).__name__
-        seen = f"weights of {name} are not rounded to 8 bits, or changed since then"
-        raise InputError(f"{seen}; expected a DejaVu constructed from them with weight_bits=8")
+    seen = f"weights of {type(descriptor.features).__name__} are not rounded to 8 bits, or changed since then"
+    fits = descriptor.weight_bits != 8 or is_rounded(descriptor.features)
+    expect(fits, "a DejaVu constructed from them with weight_bits=8", seen)
 
 
 def run_key(

@@ -23,7 +23,7 @@ from dejavu_torch.recognition.calibration import TOLERANCE, Calibration, calibra
 from dejavu_torch.recognition.centring import centred
 from dejavu_torch.recognition.evidence import spacing_of
 from dejavu_torch.recognition.smoother import PlaceSmoother
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.types import InputError, Traverse, expect
 
 SURE = 0.9  # probability of a frame that teaches
 FEWEST, SHARE = 60, 0.1  # frames of a drive that teaches, and their share of it, at least
@@ -142,8 +142,7 @@ def described(model: DejaVu, drive: Source, verb: str, progress: bool = False) -
     if not isinstance(place_map, SpectralMap):
         raise InputError(f"the map is of kind {place_map.kind!r}; expected one of kind 'spectral' to {verb}")
     traverse = model.resample(as_traverse(drive), model.step, progress, model.frame_shape)
-    if len(traverse) < LEAST:
-        raise InputError(f"{traverse.name} has {len(traverse)} frames; expected at least {LEAST}")
+    expect(len(traverse) >= LEAST, f"at least {LEAST}", f"{traverse.name} has {len(traverse)} frames")
     features = model.descriptor.count_features(traverse)
     check_queries(model, traverse.frame_shape, features, traverse.name)
     return traverse, model.descriptor.all_of(traverse, progress).float().to(place_map.device)

@@ -38,6 +38,32 @@ class InputError(ValueError):
         super().__init__(text)
 
 
+def expect(fits: object, to_be: object, seen: object = "", /, **given: object) -> None:
+    """Refuse bad input unless it `fits`: "`seen`; expected `to_be`", where `given` reads "name is value".
+
+    Example:
+        >>> expect(2 > 1, "at least 1", k=2)
+    """
+    if not fits:
+        pairs = ((name, x.__name__ if isinstance(x, type) else repr(x)) for name, x in given.items())
+        raise InputError(f"{seen or ' and '.join(map(' is '.join, pairs))}; expected {to_be}")
+
+
+def check_shape(x: Tensor, dims: str, name: str) -> None:
+    """Refuse a tensor of another shape than `dims`, such as "Q N>=1 16": any size, at least 1, and 16.
+
+    Example:
+        >>> check_shape(torch.zeros(5, 3), "Q N>=1", "the scores are")
+    """
+    if x.ndim != len(sizes := dims.split()) or not all(map(_fits, x.shape, sizes)):
+        raise InputError(f"{name} {tuple(x.shape)}; expected ({', '.join(sizes)}{',' * (len(sizes) == 1)})")
+
+
+def _fits(size: int, wanted: str) -> bool:
+    word, _, least = wanted.partition(">=")
+    return size >= int(least) if least else word.isalpha() or size == int(word)
+
+
 class Traverse(Dataset[Tensor], ABC):
     """Frames along a route, indexed from 0: a sequence that is read as needed, never all of it in memory.
 
@@ -130,18 +156,15 @@ class Traverse(Dataset[Tensor], ABC):
     @cached_property
     def frame_shape(self) -> tuple[int, ...]:
         """Shape of a frame: (C,H,W), or (D,) of ready features."""
-        if not len(self):
-            raise InputError(f"{self.name} holds no frames; expected at least one")
+        expect(len(self), "at least one", f"{self.name} holds no frames")
         return tuple(self.read(range(1)).shape[1:])
 
     def at_once(self, most: int = BATCH_SIZE) -> int:
         """How many frames to read at a time: `most`, or fewer if they are large; refuses too large ones."""
-        if most < 1:
-            raise InputError(f"a batch holds {most} frames; expected at least 1")
+        expect(most >= 1, "at least 1", f"a batch holds {most} frames")
         values = math.prod(self.frame_shape)
-        if values > FRAME_NUMBERS:
-            seen = f"{self.name} has frames of {' x '.join(map(str, self.frame_shape))} numbers"
-            raise InputError(f"{seen}; expected at most {FRAME_NUMBERS}, for images by ?width=640")
+        seen = f"{self.name} has frames of {' x '.join(map(str, self.frame_shape))} numbers"
+        expect(values <= FRAME_NUMBERS, f"at most {FRAME_NUMBERS}, for images by ?width=640", seen)
         return max(1, min(most, BATCH_NUMBERS // max(1, values)))
 
     def changed(self, **attributes: Any) -> Self:
@@ -192,8 +215,7 @@ class FrequencyLayer:
         object.__setattr__(self, "period", Fraction(self.period))
         a, b = self.period.as_integer_ratio()
         seen = f"a layer has period {self.period} and {self.phases} phases"
-        if a <= 0 or self.phases < 1:
-            raise InputError(f"{seen}; expected period > 0, phases >= 1")
+        expect(a > 0 and self.phases >= 1, "period > 0, phases >= 1", seen)
         if not 0 <= self.start < self.stop:
             raise InputError(f"a layer covers [{self.start}, {self.stop}); expected 0 <= start < stop")
         if max(self.stop * b, a * self.phases) >= 2**63:

@@ -376,7 +376,7 @@ def on_waves(query):
         (lambda: wave_model().learn(waves())(torch.rand(3, 1)), ("the query gives 1 features", "expects 2")),
         (
             lambda: wave_model().learn(pictures()).localize(torch.rand(3, 1, 32, 32)),
-            ("32 x 32", "324 features", "expects 108"),
+            ("32 x 32", "324 features", "expected 108"),
         ),
         (
             lambda: DejaVu().learn(pictures()).localize(torch.rand(3, 5)),

@@ -37,7 +37,7 @@ from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.recognition.calibration import Calibration
 from dejavu_torch.recognition.coarse import plan
 from dejavu_torch.text import printable
-from dejavu_torch.types import InputError, Match, Traverse
+from dejavu_torch.types import InputError, Match, Traverse, expect
 
 if TYPE_CHECKING:
     from dejavu_torch.teaching import Refinement
@@ -67,8 +67,7 @@ def run_learn(
             address of a cluster. They read the sources by the same paths
     """
     append = growing.append
-    if not sources and not (append and growing.average):
-        raise InputError("there is no source; expected one, or --append MAP with --average SOURCE")
+    expect(sources or (append and growing.average), "one, or --append and --average", "there is no source")
     assert map is not None  # the parser checks it
     where = device_of(learning.device, learns=True)
     model = growing.model(model).to(where)
@@ -144,17 +143,15 @@ def run_export(
     """
     from dejavu_torch.export import OPSET, export_onnx
 
-    if onnx.suffix != ".onnx":
-        raise InputError(f"--onnx {onnx} is no name of an ONNX file; expected one such as route.onnx")
+    expect(onnx.suffix == ".onnx", "one such as route.onnx", f"--onnx {onnx} is no name of an ONNX file")
     check_output_file(onnx)
     check_not_read(onnx, map)
     matcher = sequences.matcher(SUPPRESSION, threshold)
     matcher = None if isinstance(matcher, str) else matcher
     model = options.load_map(map, features)
     options.Acceptance(threshold).of(model)
-    if matcher is not None and model.precision is not None:
-        seen = f"the map's precision, {model.precision}, only holds for single frames in an ONNX file"
-        raise InputError(f"{seen}; expected --threshold with a sequence or a filter")
+    seen = f"the map's precision, {model.precision}, only holds for single frames in an ONNX file"
+    expect(matcher is None or model.precision is None, "--threshold with a sequence or a filter", seen)
     written = export_onnx(model, onnx, matcher, centre == "mean")
     for kind in ("inputs", "outputs"):
         shapes = (f"{name} {tuple(shape)}" for name, shape in written.facts[kind].items())
@@ -240,8 +237,7 @@ def run_merge(maps: Sequence[Path], *, map: Path, features: nn.Module | None = N
     for one, other in combinations(maps, 2):
         if one.exists() and other.exists() and one.samefile(other):
             raise InputError(f"{other} and {one} are the same file; expected each map once")
-    if len(maps) < 2:
-        raise InputError(f"{maps[0]} alone; expected at least two maps to merge")
+    expect(len(maps) >= 2, "at least two maps to merge", f"{maps[0]} alone")
     models = [options.load_map(path, copy.deepcopy(features)) for path in maps]
     model = growth.merge(models, [path.stem for path in maps])
     model.save(map)
@@ -299,16 +295,14 @@ def check_cluster(cluster: str, device: str, mapper: Mapper | None = None) -> No
 
     options.refuse_with(f"--cluster {cluster}", device=device != "cpu" and device)
     check_installed()
-    if not isinstance(mapper, SpectralMapper | None):
-        seen = f"--cluster {cluster} encodes chunks, and {type(mapper).__name__} has none"
-        raise InputError(f"{seen}; expected a spectral map")
+    seen = f"--cluster {cluster} encodes chunks, and {type(mapper).__name__} has none"
+    expect(isinstance(mapper, SpectralMapper | None), "a spectral map", seen)
 
 
 def _check_map_file(path: Path, *read: str | Path | None, option: str = "--map") -> None:
     """Refuse early a map file that cannot be written or is also read."""
-    if path.suffix != ".safetensors":
-        expected = path.with_suffix(".safetensors") if path.name else "such as route.safetensors"
-        raise InputError(f"{option} {path} is not the name of a map; expected {expected}")
+    expected = path.with_suffix(".safetensors") if path.name else "such as route.safetensors"
+    expect(path.suffix == ".safetensors", expected, f"{option} {path} is not the name of a map")
     check_output_file(path)
     check_not_read(path, *read)
 

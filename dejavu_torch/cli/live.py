@@ -20,7 +20,7 @@ from dejavu_torch.live.localizer import LiveLocalizer, LiveMatch
 from dejavu_torch.live.page import Page, ReferencePictures, Snapshot, without_nan
 from dejavu_torch.model import DejaVu
 from dejavu_torch.text import printable
-from dejavu_torch.types import InputError, SequenceModel
+from dejavu_torch.types import InputError, SequenceModel, expect
 
 RECENT = 10_000  # answers whose times are kept
 RATE = 10  # frames per second on the page, for a source without times
@@ -58,9 +58,8 @@ def follow(
         if port is not None:
             pictures = None
             if reference is not None:
-                if model.map.routes:
-                    seen = f"--reference {reference}: the map has {len(model.map.routes)} routes"
-                    raise InputError(f"{seen}; expected the map of one route, or no --reference")
+                seen = f"--reference {reference}: the map has {len(model.map.routes)} routes"
+                expect(not model.map.routes, "the map of one route, or no --reference", seen)
                 shown = len(model.map.positions) or model.map.places
                 pictures = ReferencePictures(open_source(reference), shown)
             page = stack.enter_context(Page(port, title, pictures))
@@ -126,8 +125,7 @@ def frames_from(
     size = (shape[1], shape[2]) if shape is not None and len(shape) == 3 else None
     if is_stream(source):
         camera = Camera(source, size)
-        if realtime:
-            raise InputError(f"--realtime: {camera.name} is live already; expected a video file with it")
+        expect(not realtime, "a video file with it", f"--realtime: {camera.name} is live already")
         return _with_warning(camera), True, camera.name
     own, traverse = open_source(source).frame_shape, open_source(source, size)
     if traverse.frame_shape != own and size is not None:

@@ -29,7 +29,7 @@ from dejavu_torch.motion.ground_plane import check_corners
 from dejavu_torch.motion.resampling import source_of
 from dejavu_torch.recognition.select import check_candidates
 from dejavu_torch.recognition.smoother import PlaceSmoother
-from dejavu_torch.types import InputError, Match, Traverse
+from dejavu_torch.types import InputError, Match, Traverse, expect
 
 NO_DRIVE = "the queries are no drive of this map, as far as they show: each is matched by itself"
 
@@ -136,8 +136,7 @@ def _check_written(out: Path, pairs: Path | None, *read: str | Path) -> None:
     for written in filter(None, (out, pairs)):
         check_output_file(written)
         check_not_read(written, *read)
-    if pairs is not None and pairs.resolve() == out.resolve():
-        raise InputError(f"--pairs {pairs} is --out as well; expected another name")
+    expect(pairs is None or pairs.resolve() != out.resolve(), "another name", f"--pairs {pairs} is --out")
 
 
 def _open_query(model: DejaVu, source: str, paired: Path | None, damaged: dict[int, str] | None) -> Traverse:
@@ -201,10 +200,8 @@ def run_live(
     from dejavu_torch.data.camera import without_password
 
     device_of(loading.device)
-    if reference is not None and page is None:
-        raise InputError(f"--reference {reference} without --page; expected both")
-    if not 0 < timeout <= threading.TIMEOUT_MAX:
-        raise InputError(f"--timeout {timeout:g}; expected seconds, above 0")
+    expect(reference is None or page is not None, "both", f"--reference {reference} without --page")
+    expect(0 < timeout <= threading.TIMEOUT_MAX, "seconds, above 0", f"--timeout {timeout:g}")
     matcher = sequences.matcher(SUPPRESSION, acceptance.threshold)
     assert not isinstance(matcher, str)  # the default is the filter
     acceptance.check(matcher)

@@ -25,7 +25,7 @@ from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.search import Search, check_search
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.recognition.smoother import PlaceSmoother
-from dejavu_torch.types import InputError, SequenceModel, Traverse
+from dejavu_torch.types import InputError, SequenceModel, Traverse, expect
 
 NO_CALIBRATION = "none"
 UNREAD = (None, NO_CALIBRATION)  # values of --calibration that name no source
@@ -71,14 +71,11 @@ class Sequences:
         way, length = self.way, None
         if way is not None and way.startswith("sequence:"):
             length = as_number(way.removeprefix("sequence:"))
-            if length is None or length % 1:
-                raise InputError(f"--match {way}; expected {WAYS}")
+            expect(length is not None and length % 1 == 0, WAYS, f"--match {way}")
         elif way not in (None, "drive", "filter", "single"):
             raise InputError(f"--match {way}; expected {WAYS}")
-        if self.speeds is not None and length in (None, 1):
-            raise InputError(
-                f"--speeds {self.speeds} without a sequence; expected --match sequence:T with them"
-            )
+        fits = self.speeds is None or length not in (None, 1)
+        expect(fits, "--match sequence:T with them", f"--speeds {self.speeds} without a sequence")
         if length is not None:
             matcher = SequenceMatcher(int(length), (1.0,) if self.speeds is None else self.speeds)
             return None if length == 1 else matcher
@@ -116,9 +113,8 @@ class LiveSequences(Sequences):
         matcher = super().matcher(within, threshold)
         if isinstance(matcher, PlaceFilter):
             return PlaceFilter(within=within, threshold=threshold, lag=self.lag, learns=self.learns)
-        if self.lag or self.learns:
-            seen = f"--lag {self.lag}" if self.lag else "--learns"
-            raise InputError(f"{seen} with --match {self.way}; expected --match filter with it")
+        seen = f"--lag {self.lag}" if self.lag else "--learns"
+        expect(not self.lag and not self.learns, "--match filter with it", f"{seen} with --match {self.way}")
         return matcher
 
 
@@ -328,9 +324,8 @@ class LearningOptions:
         elif self.calibration is None and len(traverse.frame_shape) != 3:
             why = f"{traverse.name}, which has no frames to calibrate by"
         for given, name in ((model.precision, "a precision,"), (distractors, "--distractors")):
-            if why and given:
-                instead = ", or --threshold instead" if given is model.precision else ""
-                raise InputError(f"{name} {given}, and {why}; expected --calibration SOURCE{instead}")
+            instead = ", or --threshold instead" if given is model.precision else ""
+            expect(not why or not given, f"--calibration SOURCE{instead}", f"{name} {given}, and {why}")
 
 
 @dataclass
@@ -402,15 +397,13 @@ class EvaluationOptions:
 def refuse_with(option: str, **others: object) -> None:
     """Refuse an option if one of the others, which exclude it, is given."""
     for name, value in others.items():
-        if value:
-            other = f"--{name}" if value is True else f"--{name} {value}"
-            raise InputError(f"{option} and {other}; expected one of them")
+        other = f"--{name}" if value is True else f"--{name} {value}"
+        expect(not value, "one of them", f"{option} and {other}")
 
 
 def check_no_truth(option: str, truth: object) -> None:
     """Refuse the truth of a traverse that is not given."""
-    if truth is not None:
-        raise InputError(f"--{option}_truth {truth} without --{option}; expected --{option} SOURCE with it")
+    expect(truth is None, f"--{option} SOURCE with it", f"--{option}_truth {truth} without --{option}")
 
 
 def several(given: Any) -> list[Any]:

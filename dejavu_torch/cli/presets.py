@@ -9,7 +9,7 @@ from typing import Any
 import yaml
 
 from dejavu_torch.data.files import check_regular, read_text, reading
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, expect
 
 PACKAGE = Path(__file__).parents[1]
 # inside the installed package; in a clone next to it
@@ -62,11 +62,9 @@ def read_config(path: Path) -> dict[str, Any]:
     Raises:
         InputError: not a regular file, text, YAML, or a mapping with keys; or too large.
     """
-    if check_regular(path, EXPECTED) > LARGEST:
-        raise InputError(f"{path} is larger than {LARGEST} bytes; expected {EXPECTED}")
+    expect(check_regular(path, EXPECTED) <= LARGEST, EXPECTED, f"{path} is larger than {LARGEST} bytes")
     text = read_text(path, EXPECTED)
     with reading(path, "is no YAML", EXPECTED):
-        given = yaml.load(text, Loader)
-    if not isinstance(given, dict):
-        raise InputError(f"{path} holds no options; expected {EXPECTED}, as KEY: VALUE")
+        given: dict[str, Any] = yaml.load(text, Loader)
+    expect(isinstance(given, dict), f"{EXPECTED}, as KEY: VALUE", f"{path} holds no options")
     return given

@@ -22,7 +22,7 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import recipe_of
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.smoother import PlaceSmoother
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, expect
 
 if TYPE_CHECKING:
     from dejavu_torch.evaluation.compare import Comparison
@@ -101,9 +101,8 @@ def run_compare(
     acceptance.check(matcher, judging.distractors)
     if map is not None:
         model = options.load_map(map, options.named_features(model))
-        if model.map.routes:
-            names = ", ".join(route.name for route in model.map.routes)
-            raise InputError(f"--map {map} has the routes {names}; expected a map of {reference} alone")
+        names = ", ".join(route.name for route in model.map.routes)
+        expect(not model.map.routes, f"a map of {reference} alone", f"--map {map} has the routes {names}")
         acceptance.of(model)
     searching.of(model.to(where))
     first = open_source(reference)
@@ -155,11 +154,9 @@ def _check_loops(
 ) -> None:
     """Refuse a comparison without a query, and loops with what needs one."""
     if loops is None:
-        if query is None:
-            raise InputError("compare without QUERY; expected a second traverse, or --loops within the first")
+        expect(query is not None, "a second traverse, or --loops within the first", "compare without QUERY")
         return
-    if query is not None:
-        raise InputError(f"--loops {loops} and the query {query}; expected the reference alone")
+    expect(query is None, "the reference alone", f"--loops {loops} and the query {query}")
     of_routes = {
         name: getattr(judging, name) for name in ("top", "distractors", "storage_curve", "leave_out")
     }

@@ -34,7 +34,7 @@ from dejavu_torch.training.descriptors import DescriptorTask
 from dejavu_torch.training.export import DESCRIPTOR, MapExport, has_bf16
 from dejavu_torch.training.task import RouteTask, load_weights
 from dejavu_torch.training.templates import TemplateTask
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, expect
 
 TASKS = DescriptorTask, TemplateTask  # which --model names
 BF16 = ("bf16-mixed", "bf16")
@@ -156,8 +156,7 @@ class TrainCLI(LightningCLI):
         super().parse_arguments(parser, args)
         chosen = self.config[self.config["subcommand"]]
         for part in ("trainer", "model", "data"):
-            if not isinstance(chosen[part], Namespace):
-                raise InputError(f"{part} is {chosen[part]!r:.40}; expected options, as KEY: VALUE")
+            expect(isinstance(chosen[part], Namespace), "KEY: VALUE", f"{part} is {chosen[part]!r:.40}")
         trainer, seed = chosen["trainer"], chosen["seed_everything"]
         interval, steps = trainer["val_check_interval"], "a number of at least 1, or -1 for no end"
         for name, value, fits, expected in (
@@ -167,8 +166,7 @@ class TrainCLI(LightningCLI):
             ("trainer.overfit_batches", trainer["overfit_batches"], not trainer["overfit_batches"], "0"),
             ("seed_everything", seed, seed is None or 0 <= seed < 2**32, "a number from 0 to 2^32 - 1"),
         ):
-            if not fits:
-                raise InputError(f"{name} is {value!s:.40}; expected {expected}")
+            expect(fits, expected, f"{name} is {value!s:.40}")
         if trainer["num_nodes"] != 1 and not {"MASTER_ADDR", "SLURM_JOB_ID"} & os.environ.keys():
             raise InputError(  # the machines would wait for each other forever
                 f"trainer.num_nodes is {trainer['num_nodes']}, but no address of the first is set; expected "
@@ -283,9 +281,8 @@ class TrainCLI(LightningCLI):
             if path in ("best", "hpc") or not Path(path).exists():
                 raise InputError(f"{path} is not there; {EXPECTED}")
             return
-        if last is None:
-            seen = f"there is no checkpoint in {Path(self.trainer.default_root_dir) / 'checkpoints'}"
-            raise InputError(f"{seen}; expected --ckpt_path, or the trainer.default_root_dir of a training")
+        seen = f"there is no checkpoint in {Path(self.trainer.default_root_dir) / 'checkpoints'}"
+        expect(last is not None, "--ckpt_path, or the trainer.default_root_dir of a training", seen)
         chosen["ckpt_path"] = str(last)
 
     before_test = before_export = before_validate

@@ -12,7 +12,7 @@ from torch import Tensor
 from dejavu_torch.data.files import read_text, reading
 from dejavu_torch.data.folder import ROUNDING, numbers_increase
 from dejavu_torch.text import printable
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.types import InputError, Traverse, expect
 
 UNNAMED = "the array"
 EXPECTED = (
@@ -44,10 +44,8 @@ class ArrayTraverse(Traverse):
         pixels = kind == "uint8" and (len(shape) == 3 or any(colours))
         floats = kind in ("float16", "bfloat16", "float32", "float64") and len(shape) in (2, 4)
         colours_last = floats and colours == [False, True]
-        if not (pixels or floats) or colours_last:
-            raise InputError(f"{name} is {shape} {kind}; expected {EXPECTED}")
-        if 0 in shape:
-            raise InputError(f"{name} is {shape}, which is empty; expected {EXPECTED}")
+        expect((pixels or floats) and not colours_last, EXPECTED, f"{name} is {shape} {kind}")
+        expect(0 not in shape, EXPECTED, f"{name} is {shape}, which is empty")
         self.name = name
         self.values = values
 
@@ -101,7 +99,6 @@ def read_array(path: Path) -> ArrayTraverse:
     if values.ndim == 2 and text.exists():
         expected = f"{len(values)} names, one line for each row of {path}, or no such file"
         names = [line.strip() for line in read_text(text, expected).splitlines() if line.strip()]
-        if len(names) != len(values):
-            raise InputError(f"{text} has {len(names)} names; expected {expected}")
+        expect(len(names) == len(values), expected, f"{text} has {len(names)} names")
         traverse.names, traverse.ordered = names, numbers_increase(names)
     return traverse

@@ -17,7 +17,7 @@ from dejavu_torch.data.files import why
 from dejavu_torch.data.video import FORMATS, check_same_size, pixels_of, seconds_of, stream_of
 from dejavu_torch.resize import is_stretched
 from dejavu_torch.text import printable
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.types import InputError, Traverse, expect
 
 PIPE = "-"  # standard input
 PROTOCOLS = "rtsp,rtsps,rtp,srtp,udp,tcp,tls,http,https,httpproxy,rtmp,rtmps,rtmpt,srt,crypto,data"
@@ -88,10 +88,8 @@ class Camera:
             seen = f"broke off after {number} frames" if number else "cannot be read"
             expected = "more frames" if number else self._expected
             raise InputError(f"{self.name} {seen}: {why(error)}; expected {expected}") from error
-        if not number:
-            raise InputError(f"{self.name} gave no frames; expected {self._expected}")
-        if not self.ends:
-            raise InputError(f"{self.name} ended after {number} frames; expected more frames")
+        expect(number, self._expected, f"{self.name} gave no frames")
+        expect(self.ends, "more frames", f"{self.name} ended after {number} frames")
 
     def _open(self) -> Any:
         import av
@@ -100,8 +98,7 @@ class Camera:
         settings: dict[str, Any] = {"metadata_errors": "replace"}
         address: Any = self.source
         if self.device:
-            if not os.path.exists(self.source):
-                raise InputError(f"{self.name} is not there; expected {self._expected}")
+            expect(os.path.exists(self.source), self._expected, f"{self.name} is not there")
             settings["format"] = "v4l2"
             options = {}
         elif self.ends:  # unbuffered: a thread would hold the buffer's lock until the process ends

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.files import as_number, read_rows
-from dejavu_torch.types import Coordinates, InputError, Traverse
+from dejavu_torch.types import Coordinates, InputError, Traverse, expect
 
 log = logging.getLogger("dejavu_torch")
 
@@ -66,8 +66,7 @@ def coordinates_of(traverses: Sequence[Traverse], kind: Kind) -> list[Tensor]:
             seen = f"{other} has coordinates and {traverse.name} none"
             raise InputError(f"{seen}; expected 'SOURCE?coordinates=FILE' for both")
     known = [own for own in carried if own is not None]
-    if len({own.degrees for own in known}) > 1:
-        raise InputError("coordinates in metres and in degrees; expected one kind for all sources")
+    expect(len({own.degrees for own in known}) < 2, "one kind", "coordinates in metres and in degrees")
     if known[0].degrees:
         return in_metres([own.values for own in known])
     shared = min(own.values.shape[1] for own in known)
@@ -92,29 +91,24 @@ def read_coordinates(path: Path, traverse: Traverse) -> Coordinates:
         for line, cells in read_rows(path, EXPECTED)
         if not cells[0].startswith("#")
     ]
-    if not rows:
-        raise InputError(f"{path} has no rows; expected {EXPECTED}")
+    expect(rows, EXPECTED, f"{path} has no rows")
     key, degrees, columns = _columns(path, rows)
     for line, cells in rows:
-        if len(cells) < max(columns) + 1:
-            raise InputError(
-                f"{path}, line {line}: {len(cells)} columns; expected {max(columns) + 1} or more"
-            )
+        seen = f"{path}, line {line}: {len(cells)} columns"
+        expect(len(cells) > max(columns), f"{max(columns) + 1} or more", seen)
     values = np.array([[_value(cells[column]) for column in columns] for _, cells in rows])
     if degrees and not (np.abs(np.nan_to_num(values)) <= (90, 180)).all():
         raise InputError(f"{path} has latitudes beyond 90 or longitudes beyond 180; expected degrees")
     if key is None:
-        if len(values) != len(traverse):
-            seen = f"{path} has {len(values)} rows, {traverse.name} {len(traverse)} frames"
-            raise InputError(f"{seen}; expected as many, or a column name or time")
+        seen = f"{path} has {len(values)} rows, {traverse.name} {len(traverse)} frames"
+        expect(len(values) == len(traverse), "as many, or a column name or time", seen)
     elif key[1] == "name":
         known = dict(zip((cells[key[0]] for _, cells in rows), values, strict=True))
         values = np.array([known.get(name, np.full(len(columns), math.nan)) for name in traverse.names])
     else:
         values = _at_times(path, np.array([_value(cells[key[0]]) for _, cells in rows]), values, traverse)
     missing = int(np.isnan(values).any(1).sum()) if len(values) else len(traverse)
-    if missing == len(traverse):
-        raise InputError(f"{path} tells of no frame of {traverse.name}; expected its names or times")
+    expect(missing != len(traverse), "its names or times", f"{path} tells of no frame of {traverse.name}")
     if missing:
         log.warning("%s: %d of %d frames have no coordinates", traverse.name, missing, len(traverse))
     return Coordinates(torch.from_numpy(values), degrees)
@@ -235,9 +229,7 @@ def in_metres(tables: Sequence[Tensor]) -> list[Tensor]:
 
 def _fixes(traverse: Traverse, kind: Kind) -> list[Fix]:
     names = traverse.names
-    if not names:
-        seen = f"{traverse.name} has no image names"
-        raise InputError(f"{seen}; expected a folder of images for truth {kind}")
+    expect(names, f"a folder of images for truth {kind}", f"{traverse.name} has no image names")
     fixes = [_fix(name) for name in names]
     missing = [name for name, fix in zip(names, fixes, strict=True) if math.isnan(fix.first)]
     if len(missing) == len(names):

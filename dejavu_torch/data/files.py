@@ -11,7 +11,7 @@ from pathlib import Path
 
 from dejavu_torch.memory import check_room
 from dejavu_torch.text import one_line
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, expect
 
 LARGEST = 2**53  # a float64 holds every whole number up to here
 BYTES_PER_CHARACTER = 64  # of memory that a table takes once it is parsed
@@ -25,9 +25,8 @@ def check_regular(path: Path, expected: str) -> int:
         raise InputError(f"{path} is not there; expected {expected}") from error
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         raise InputError(f"{path} cannot be read: {why(error)}; expected {expected}") from error
-    if not stat.S_ISREG(status.st_mode):
-        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "not a regular file"
-        raise InputError(f"{path} is {kind}; expected {expected}")
+    kind = "a folder" if stat.S_ISDIR(status.st_mode) else "not a regular file"
+    expect(stat.S_ISREG(status.st_mode), expected, f"{path} is {kind}")
     return status.st_size
 
 

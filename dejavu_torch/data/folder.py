@@ -23,7 +23,7 @@ from dejavu_torch.data.files import reading
 from dejavu_torch.memory import check_room
 from dejavu_torch.resize import MOST_PIXELS, is_stretched, resize_frames
 from dejavu_torch.text import printable
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.types import InputError, Traverse, expect
 
 log = logging.getLogger("dejavu_torch")
 
@@ -73,8 +73,7 @@ class ImageFolder(Traverse):
     ) -> None:
         folder = Path(path)
         check_size(folder, width, height)
-        if not folder.is_dir():
-            raise InputError(f"{folder} is not there; expected a folder of images")
+        expect(folder.is_dir(), "a folder of images", f"{folder} is not there")
         inside = list(folder.rglob("*") if recursive else folder.iterdir())
         names = {file: file.relative_to(folder).as_posix() for file in inside}
         seen = [file for file in inside if "/." not in f"/{names[file]}"]
@@ -132,8 +131,7 @@ class ImageFolder(Traverse):
         shape = f"{height} x {width} pixels of {channels} channel{'s' * (channels > 1)}"
         self._first = self._first or (file.name, shape, original)
         name, expected, first = self._first
-        if shape != expected:
-            raise InputError(f"{file} is {shape}; expected {expected} like {name}")
+        expect(shape == expected, f"{expected} like {name}", f"{file} is {shape}")
         if self.same_aspect and is_stretched(original, first):
             ratio = f"the aspect ratio of {name}, {first[0]} x {first[1]}"
             raise InputError(f"{file} is {original[0]} x {original[1]} pixels; expected {ratio}")
@@ -245,8 +243,7 @@ def check_size(path: Path, width: int, height: int) -> None:
 def check_pixels(path: Path, rows: int, columns: int, most: int) -> None:
     """Refuse more pixels than `most` or than fit in memory, before allocating them."""
     seen = f"{path} has {rows} x {columns} pixels"
-    if rows * columns > most:
-        raise InputError(f"{seen}; expected at most {most}")
+    expect(rows * columns <= most, f"at most {most}", seen)
     check_room(BYTES_PER_PIXEL * rows * columns, f"{seen}, which")
 
 

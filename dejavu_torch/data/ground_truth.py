@@ -24,7 +24,7 @@ from dejavu_torch.data.coordinates import Near, coordinates_of
 from dejavu_torch.data.files import LARGEST, as_number, check_regular, read_rows, read_text, reading
 from dejavu_torch.memory import check_room
 from dejavu_torch.text import one_line
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.types import InputError, Traverse, expect
 
 log = logging.getLogger("dejavu_torch")
 
@@ -83,9 +83,8 @@ def as_ground_truth(truth: Truth, queries: int | None = None) -> GroundTruth:
     shapes = [tuple(part.shape) for part in truth]
     rows = len(truth.judged) if queries is None else queries
     fits = shapes[1] == (rows,) and all(len(shape) == 2 and shape[0] == rows for shape in shapes[::2])
-    if not fits:
-        seen = f"the truth is {shapes[0]}, with judged {shapes[1]} and ignored {shapes[2]}"
-        raise InputError(f"{seen}; expected ({rows}, R), ({rows},) and ({rows}, S), one row per query")
+    seen = f"the truth is {shapes[0]}, with judged {shapes[1]} and ignored {shapes[2]}"
+    expect(fits, f"({rows}, R), ({rows},) and ({rows}, S), one row per query", seen)
     return truth
 
 
@@ -106,9 +105,8 @@ def _table_of(truth: Any) -> Tensor:
         raise InputError(f"{seen}; expected {FORMS}") from error
     odd = [row for row in rows if row.ndim != 1 or row.is_floating_point() or row.is_complex()]
     kinds = {row.dtype == torch.bool for row in rows}
-    if odd or len(kinds) > 1:
-        seen = f"{tuple(odd[0].shape)} {odd[0].dtype}" if odd else "truth values and places"
-        raise InputError(f"a query of the truth has {seen}; expected {FORMS}")
+    seen = f"{tuple(odd[0].shape)} {odd[0].dtype}" if odd else "truth values and places"
+    expect(not odd and len(kinds) <= 1, FORMS, f"a query of the truth has {seen}")
     if kinds == {True}:
         return padded(row.nonzero()[:, 0] for row in rows)
     return _checked(padded(row.long() for row in rows))
@@ -190,8 +188,7 @@ def near_truth(reference: Tensor, query: Tensor, radius: float) -> Tensor:
 def of_loops(truth: GroundTruth, queries: Tensor, apart: int) -> GroundTruth:
     """A ground truth (Q,R) of which only places over `apart` frames before the query (Q,) are right."""
     positives = torch.where(truth.positives < queries[:, None] - apart, truth.positives, -1)
-    if not (positives >= 0).any():
-        raise InputError(f"no query comes back to a place over {apart} frames before; expected loops")
+    expect((positives >= 0).any(), "loops", f"no query comes back to a place over {apart} frames before")
     return truth._replace(positives=positives)
 
 
@@ -235,14 +232,12 @@ def is_given(truth: Truth | None) -> TypeGuard[Tensor | NDArray[Any] | Sequence[
 def check_ground_truth(truth: Truth, interpolate: bool = False) -> int | Near | Path | GroundTruth:
     """Parse a ground truth as an offset, a radius in metres, or an existing file, before long work starts."""
     if is_given(truth):
-        if interpolate:
-            raise InputError("the truth is given, not listed; expected a .csv of query,place to interpolate")
+        expect(not interpolate, "a .csv of query,place to interpolate", "the truth is given, not listed")
         return as_ground_truth(truth)
     truth = str(truth)  # YAML gives an offset as a number
     path = Path(truth)
     suffix = path.suffix.lower()
-    if interpolate and suffix != ".csv":
-        raise InputError(f"truth {truth} cannot be interpolated; expected a .csv of query,place")
+    expect(not interpolate or suffix == ".csv", "a .csv of query,place to be interpolated", truth=truth)
     if suffix in (".csv", ".json", ".npz"):
         check_regular(path, EXPECTED)
         return path
@@ -417,9 +412,8 @@ def _from_table(
     elif resampled:
         places = _to_queries(places, numbers)
     judged = torch.tensor([query in places for query in queries])
-    if not judged.any():
-        wanted = f"{int(numbers.min())} to {int(numbers.max())}"
-        raise InputError(f"{path} lists queries from {first} to {last}; expected some of {wanted}")
+    wanted = f"{int(numbers.min())} to {int(numbers.max())}"
+    expect(judged.any(), f"some of {wanted}", f"{path} lists queries from {first} to {last}")
     rows = [[_rounded(place) for place in places.get(query, ())] for query in queries]
     positives = padded(torch.tensor(row, dtype=torch.int64) for row in rows)
     return _every(positives)._replace(judged=judged)
@@ -472,8 +466,7 @@ def _read_csv(path: Path, frames: int | None, interpolate: bool) -> Listed:
         if problem:
             raise InputError(f"{path}, line {line}: {problem}")
         listed[int(query)] = places
-    if not listed:
-        raise InputError(f"{path} lists no query; expected lines of query,place")
+    expect(listed, "lines of query,place", f"{path} lists no query")
     return listed
 
 
@@ -519,10 +512,8 @@ def _read_matrices(path: Path, numbers: Tensor, frames: int | None, every: bool)
             if len(data) != size:
                 raise ValueError(f"{name} has {len(data)} bytes or more instead of {size}")
             matrices.append(np.frombuffer(data, dtype).reshape(shape, order="F" if by_columns else "C"))
-    if not matrices:
-        raise InputError(f"{path} contains {', '.join(stored) or 'nothing'}; expected {expected}")
-    if matrices[0].shape != matrices[-1].shape:
-        raise InputError(f"{path}: GThard and GTsoft differ in shape; expected the same")
+    expect(matrices, expected, f"{path} contains {', '.join(stored) or 'nothing'}")
+    expect(matrices[0].shape == matrices[-1].shape, "the same", f"{path}: GThard and GTsoft differ in shape")
     if not all(np.isfinite(matrix).all() for matrix in matrices):
         raise InputError(f"{path} contains values that are not finite; expected {expected}")
     hard, *soft = (torch.from_numpy(matrix[:, numbers.numpy()] != 0).T for matrix in matrices)

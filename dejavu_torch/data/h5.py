@@ -16,7 +16,7 @@ from dejavu_torch.data.files import reading
 from dejavu_torch.data.folder import numbers_increase, sort_names
 from dejavu_torch.memory import check_room
 from dejavu_torch.text import one_line, printable
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.types import InputError, Traverse, expect
 
 H5_SUFFIXES = {".h5", ".hdf5"}
 KEY = "global_descriptor"
@@ -57,15 +57,13 @@ class DescriptorFile(Traverse):
             file.visititems(visit)
             shared = KEY in file
             self.names = sort_names(shapes, order, self.name)
-        if not shapes:
-            seen = f"has one {KEY} for all images" if shared else f"contains no {KEY}"
-            raise InputError(f"{self.name} {seen}; expected {EXPECTED}")
+        seen = f"has one {KEY} for all images" if shared else f"contains no {KEY}"
+        expect(shapes, EXPECTED, f"{self.name} {seen}")
         (width,) = shapes[self.names[0]]
         for image in self.names:
-            if shapes[image] != (width,) or not width:
-                seen = f"{KEY} of {image} has {shapes[image][0]} dimensions"
-                expected = f"{width} like {self.names[0]}" if width else "at least 1"
-                raise InputError(f"{self.name}: {seen}; expected {expected}")
+            seen = f"{KEY} of {image} has {shapes[image][0]} dimensions"
+            expected = f"{width} like {self.names[0]}" if width else "at least 1"
+            expect(shapes[image] == (width,) and width, expected, f"{self.name}: {seen}")
         check_room(24.0 * width, f"a descriptor of {self.name}")
         self.ordered = numbers_increase(self.names)
 

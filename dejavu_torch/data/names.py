@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from itertools import accumulate, pairwise
 from typing import Any
 
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, expect
 
 MAX_NAME_LENGTH = 4096  # characters, as of a path
 MAX_DIGITS = 18  # of a number in a name
@@ -28,8 +28,7 @@ def encode_names(names: Sequence[str]) -> str:
         (True, True)
     """
     longest = max(map(len, names), default=0)
-    if longest > MAX_NAME_LENGTH:
-        raise InputError(f"a frame's name has {longest} characters; expected at most {MAX_NAME_LENGTH}")
+    expect(longest <= MAX_NAME_LENGTH, f"at most {MAX_NAME_LENGTH}", f"a name has {longest} characters")
     value: Any = _numbered(names)
     if value is None or _names(value) != list(names):
         value = list(names)
@@ -41,8 +40,7 @@ def decode_names(code: str, count: int | None = None) -> list[str]:
     value = json.loads(zlib.decompress(base64.b64decode(code)))
     columns = value["columns"] if isinstance(value, dict) else None
     seen = len(value) if columns is None else len(columns[0]) - 1
-    if count not in (None, seen):
-        raise InputError(f"there are names of {seen} frames; expected {count}")
+    expect(count in (None, seen), count, f"there are names of {seen} frames")
     return value if columns is None else _names(value)
 
 

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, expect
 
 PREFIX = ".dejavu-"  # of the temporary folders for incomplete files
 _temporary: set[Path] = set()  # this process's temporary folders
@@ -19,8 +19,7 @@ def check_output_file(path: Path) -> None:
     """Refuse a file that could not be written, before long work starts. Links are followed."""
     with _refusing(path, "cannot be written"):
         target = _target(path)
-        if target.is_dir():
-            raise InputError(f"{path} is a folder; expected a file to write")
+        expect(not target.is_dir(), "a file to write", f"{path} is a folder")
         if path.exists() and not path.is_file():  # not target: /dev/stdout resolves to no path
             raise InputError(f"{path} is not a regular file; expected a file to write")
         if not target.parent.is_dir():
@@ -33,9 +32,8 @@ def check_output_file(path: Path) -> None:
 def check_output_folder(path: Path) -> None:
     """Refuse a folder that could not be created or written to, before long work starts."""
     parent = _existing(path)
-    if not parent.is_dir():
-        kind = "a file" if parent.is_file() else "not a folder"
-        raise InputError(f"{path} cannot be made a folder: {parent} is {kind}; expected a new path")
+    kind = "a file" if parent.is_file() else "not a folder"
+    expect(parent.is_dir(), "a new path", f"{path} cannot be made a folder: {parent} is {kind}")
     if not os.access(parent, os.W_OK):
         raise InputError(f"no permission to write in the folder {parent}")
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dejavu_torch.types import InputError
+from dejavu_torch.types import expect
 
 MAX_PLACES = 2**24  # a float32 holds every whole number up to here
 NEAR = 1e-4  # steps: a frame this close to a place has reached it
@@ -48,9 +48,8 @@ def positions_behind(positions: Tensor, places: int) -> Tensor:
     """
     double = positions.double().clamp(min=0)
     total = places + count_places(double)
-    if total > MAX_PLACES:
-        expected = f"at most {MAX_PLACES}, as float32 cannot number more: learn several maps and merge them"
-        raise InputError(f"{total} places at even steps on one route; expected {expected}")
+    expected = f"at most {MAX_PLACES}, as float32 cannot number more: learn several maps and merge them"
+    expect(total <= MAX_PLACES, expected, f"{total} places at even steps on one route")
     moved = (double + places).float()
     reached = (double + NEAR).floor() + places  # float32 may round large positions up to the next place
     below = torch.nextafter((reached + 1 - NEAR).float(), torch.zeros_like(moved))

@@ -25,7 +25,7 @@ from dejavu_torch.data.simulate import SIMULATORS
 from dejavu_torch.data.strip import read_strip
 from dejavu_torch.data.traverse import Cropped, Frames, frame_range
 from dejavu_torch.data.video import VIDEO_SUFFIXES, Video
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.types import InputError, Traverse, expect
 
 # of frames or features: see `as_traverse`
 Source: TypeAlias = Traverse | Tensor | NDArray[Any] | str | Path | Sequence[Any] | Dataset[Any]
@@ -139,8 +139,7 @@ def check_not_read(out: Path, *sources: str | Path | None) -> None:
                 path
             )
             read = read or (out.suffix.lower() in IMAGE_SUFFIXES and out.parent.samefile(path))
-        if read:
-            raise InputError(f"{out} is an input; expected another name for the output")
+        expect(not read, "another name for the output", f"{out} is an input")
 
 
 def _split(text: str) -> tuple[str, str]:
@@ -156,14 +155,12 @@ def _reader(text: str, address: str) -> Callable[..., Traverse]:
     """The function that opens an address with the options as arguments."""
     kind, colon, name = address.partition(":")
     if kind + colon == "sim:":
-        if name not in SIMULATORS:
-            raise InputError(f"there is no simulator {name!r}; expected {', '.join(sorted(SIMULATORS))}")
+        expect(name in SIMULATORS, ", ".join(sorted(SIMULATORS)), f"there is no simulator {name!r}")
         return SIMULATORS[name]
     if kind + colon == "strip:":
         return partial(read_strip, Path(name))
     path = Path(address)
-    if not address or not os.path.exists(path):
-        raise InputError(f"{text or 'a source without a name'} is not there; expected {EXPECTED}")
+    expect(address and os.path.exists(path), EXPECTED, f"{text or 'a source without a name'} is not there")
     if path.is_dir():
         return partial(ImageFolder, path)
     suffix = path.suffix.lower()
@@ -181,9 +178,8 @@ def _arguments(text: str, query: str, reader: Callable[..., Traverse]) -> dict[s
     defaults = {name: option.default for name, option in inspect.signature(reader).parameters.items()} | EVERY
     arguments: dict[str, Any] = {}
     for name, value in parse_qsl(query, keep_blank_values=True):
-        if name not in defaults or name in arguments:
-            what = "a second" if name in arguments else "unknown"
-            raise InputError(f"{text}: {what} {name!r}; expected {', '.join(defaults)}")
+        what = "a second" if name in arguments else "unknown"
+        expect(name in defaults and name not in arguments, ", ".join(defaults), f"{text}: {what} {name!r}")
         default = defaults[name]
         kind = int if default is empty or isinstance(default, bool) else type(default)
         try:
@@ -191,6 +187,5 @@ def _arguments(text: str, query: str, reader: Callable[..., Traverse]) -> dict[s
         except ValueError as error:
             raise InputError(f"{text}: {name} is {value!r}; expected {KINDS[kind]}") from error
     for name, default in defaults.items():
-        if default is empty and name not in arguments:
-            raise InputError(f"{text}: {name} is missing; expected {name}=...")
+        expect(default is not empty or name in arguments, f"{name}=...", f"{text}: {name} is missing")
     return arguments

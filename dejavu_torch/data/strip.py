@@ -10,7 +10,7 @@ from torch import Tensor
 from dejavu_torch.data.files import as_number
 from dejavu_torch.data.folder import read_image
 from dejavu_torch.text import printable
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.types import InputError, Traverse, expect
 
 
 class SlidingWindow(Traverse):
@@ -60,9 +60,8 @@ def read_strip(path: Path, width: int, rows: str = "", halve: int = 0, grey: boo
     strip = read_image(path)
     if grey and strip.shape[0] == 3:
         strip = (strip * strip.new_tensor([0.299, 0.587, 0.114])[:, None, None]).sum(0, keepdim=True)
-    if halve < 0 or min(strip.shape[1:]) >> halve < 1:
-        seen = f"{path} is {strip.shape[1]} x {strip.shape[2]} pixels, to be halved {halve} times"
-        raise InputError(f"{seen}; expected at least 0 times, leaving at least one pixel")
+    seen = f"{path} is {strip.shape[1]} x {strip.shape[2]} pixels, to be halved {halve} times"
+    expect(halve >= 0 and min(strip.shape[1:]) >> halve > 0, "at least 0 times, leaving a pixel", seen)
     for _ in range(halve):
         strip = torch.nn.functional.avg_pool2d(strip, 2)
     if rows:

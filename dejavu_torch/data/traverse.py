@@ -17,7 +17,7 @@ from torch import Tensor
 
 from dejavu_torch.data.files import LARGEST
 from dejavu_torch.resize import is_stretched, resize_frames
-from dejavu_torch.types import Coordinates, InputError, Traverse
+from dejavu_torch.types import Coordinates, InputError, Traverse, expect
 
 log = logging.getLogger("dejavu_torch")
 
@@ -98,8 +98,7 @@ class Chain(Traverse):
 
     def __init__(self, traverses: Sequence[Traverse]) -> None:
         self.traverses = list(traverses)
-        if not self.traverses:
-            raise InputError("a chain of no traverses; expected at least one")
+        expect(self.traverses, "at least one", "a chain of no traverses")
         first = self.traverses[0]
         for other in self.traverses:
             if other.frame_shape != first.frame_shape:
@@ -167,9 +166,8 @@ class Cropped(Part):
         super().__init__(traverse, range(len(traverse)))
         shape, (top, bottom, left, right) = traverse.frame_shape, crop
         fits = len(shape) == 3 and min(crop) >= 0 and top + bottom < shape[1] and left + right < shape[2]
-        if not fits:
-            seen = f"{traverse.name}: crop={','.join(map(str, crop))} of {' x '.join(map(str, shape))}"
-            raise InputError(f"{seen}; expected frames, of which some pixels are left")
+        seen = f"{traverse.name}: crop={','.join(map(str, crop))} of {' x '.join(map(str, shape))}"
+        expect(fits, "frames, of which some pixels are left", seen)
         self.box = slice(top, shape[1] - bottom), slice(left, shape[2] - right)
         size = shape[1], shape[2]
         self.mask = None if mask is None else (resize_frames(mask[None], size) >= 0.5).float()
@@ -296,8 +294,7 @@ class Frames(Traverse):
 
     def __init__(self, dataset: Any, name: str = "the dataset") -> None:
         self.dataset, self.name = dataset, name
-        if not len(dataset):
-            raise InputError(f"{name} is empty; expected at least one frame")
+        expect(len(dataset), "at least one frame", f"{name} is empty")
         first = self._item(0)
         self.shape, how = tuple(first.shape), []
         if isinstance(dataset[0], tuple | list):
@@ -329,9 +326,8 @@ class Frames(Traverse):
             raise InputError(
                 f"item {i} of {self.name} is {kind}; expected a frame (C,H,W), features (D,) or an image"
             )
-        if expected not in (None, tuple(item.shape)):
-            seen = f"item {i} of {self.name} has shape {tuple(item.shape)}"
-            raise InputError(f"{seen}; expected {expected} as item 0")
+        seen = f"item {i} of {self.name} has shape {tuple(item.shape)}"
+        expect(expected in (None, tuple(item.shape)), f"{expected} as item 0", seen)
         return item
 
 

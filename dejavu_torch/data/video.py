@@ -24,7 +24,7 @@ from dejavu_torch.data.folder import check_pixels, check_size, fitted_size
 from dejavu_torch.data.names import clock_time
 from dejavu_torch.resize import MOST_PIXELS
 from dejavu_torch.text import printable
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.types import InputError, Traverse, expect
 
 if TYPE_CHECKING:
     from av import VideoFrame
@@ -86,8 +86,7 @@ class Video(Traverse):
                 whole = whole and all(entry.pos + entry.size <= container.size for entry in entries)
             self._sought = kind != "avi" or not stream.codec_context.has_b_frames
             listed = kind.startswith(("mov", "matroska", "avi")) and self._sought
-        if not whole:
-            raise InputError(f"{path} is cut off or damaged; expected a complete video file")
+        expect(whole, "a complete video file", f"{path} is cut off or damaged")
         began = monotonic()
         self._stamps, self._keys, base = self._listed() if listed else self._decoded()
         if (took := monotonic() - began) > LONG:
@@ -186,8 +185,7 @@ class Video(Traverse):
             return self._index(stamps, keys, stream)
 
     def _index(self, stamps: list[Any], keys: list[bool], stream: VideoStream) -> Index:
-        if not stamps:
-            raise InputError(f"{self.name} has no frames; expected a video")
+        expect(stamps, "a video", f"{self.name} has no frames")
         known = None not in stamps
         self._sought = self._sought and known and stamps == sorted({*stamps})
         starts = [i for i, key in enumerate(keys) if key and i and self._sought]
@@ -260,9 +258,8 @@ def stream_of(container: InputContainer, name: str, expected: str, threads: str)
 
 def check_same_size(name: str, number: int, frame: VideoFrame, first: tuple[int, int]) -> None:
     """Refuse a frame of another size than the first, (height, width)."""
-    if (frame.height, frame.width) != first:
-        seen = f"frame {number} of {name} is {frame.height} x {frame.width} pixels"
-        raise InputError(f"{seen}; expected {first[0]} x {first[1]} as in frame 0")
+    seen = f"frame {number} of {name} is {frame.height} x {frame.width} pixels"
+    expect((frame.height, frame.width) == first, f"{first[0]} x {first[1]} as in frame 0", seen)
 
 
 def pixels_of(frame: VideoFrame, path: Path, width: int = 0, height: int = 0) -> np.ndarray:

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from dejavu_torch.resize import check_size, resize_frames
 from dejavu_torch.text import settings_of
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, check_shape
 
 FLAT = 2 / 255  # contrast below which nothing is amplified
 
@@ -94,8 +94,7 @@ class SmallCNN(nn.Module):
         super()._load_from_state_dict(state, prefix, *args)
 
     def forward(self, frames: Tensor) -> Tensor:
-        if frames.ndim != 4 or frames.shape[1] != self.channels:
-            raise InputError(f"SmallCNN got {tuple(frames.shape)}; expected frames (B,{self.channels},H,W)")
+        check_shape(frames, f"B {self.channels} H W", "SmallCNN got frames")
         frames = resize_frames(frames, self.resize).to(self.linear.weight.dtype)
         if self.cell:
             frames = local_contrast(frames, self.cell)

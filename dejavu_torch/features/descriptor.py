@@ -25,7 +25,7 @@ from dejavu_torch.features.preprocess import BLANK, DEEP, Preprocess, measured_r
 from dejavu_torch.features.views import SAMPLE, AugmentedFrames, LabelledFrames, Sample, augmented_route
 from dejavu_torch.features.whitening import INDEPENDENT, MOST_VIEWS, WIDEST, Visits, Whitening
 from dejavu_torch.memory import IN_MEMORY, concatenate
-from dejavu_torch.types import BATCH_NUMBERS, BATCH_SIZE, InputError, Traverse
+from dejavu_torch.types import BATCH_NUMBERS, BATCH_SIZE, InputError, Traverse, expect
 
 log = logging.getLogger("dejavu_torch")
 
@@ -148,9 +148,8 @@ class Descriptor(nn.Module):
         """
         for features in self.features_in(traverse, progress, verb, on_first):
             descriptors = self.whitened(features)
-            if not descriptors.isfinite().all():
-                seen = f"the whitening makes NaN or infinity of the features of {traverse.name}"
-                raise InputError(f"{seen}; expected a map of such frames")
+            seen = f"the whitening makes NaN or infinity of the features of {traverse.name}"
+            expect(descriptors.isfinite().all(), "a map of such frames", seen)
             yield descriptors
 
     def all_of(self, traverse: Traverse, progress: bool = False, on_first: OnFirst | None = None) -> Tensor:
@@ -250,8 +249,7 @@ class Descriptor(nn.Module):
         second: LabelledFrames | None,
         progress: bool,
     ) -> None:
-        if len(features) < 2:
-            raise InputError(f"{traverse.name} has 1 frame; expected at least 2")
+        expect(len(features) >= 2, "at least 2", f"{traverse.name} has 1 frame")
         visits = second if second is not None and second.placed is not None else None
         second = None if visits is not None else second
         source = "" if second is None else f"by {second.traverse.name}"

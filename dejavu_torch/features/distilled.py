@@ -14,7 +14,7 @@ from torch.nn.functional import adaptive_avg_pool2d, conv2d
 from dejavu_torch.features.preprocess import check_frames
 from dejavu_torch.resize import resize_frames
 from dejavu_torch.text import settings_of
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, expect
 
 SIZE = (96, 96)  # pixels of its training frames
 STRIDES = (2, 2, 2, 1, 1)  # of its convolutions
@@ -51,9 +51,8 @@ class Distilled(nn.Module):
     def __init__(self, grid: int = 6, weights: str = "lite0") -> None:
         super().__init__()
         self.grid, self.weights = grid, weights
-        if not 1 <= grid <= WIDEST or weights not in WEIGHTS:
-            seen = f"Distilled got {settings_of(self)}; expected a grid of 1 to {WIDEST}"
-            raise InputError(f"{seen}, and weights {' or '.join(WEIGHTS)}")
+        expected = f"a grid of 1 to {WIDEST}, and weights {' or '.join(WEIGHTS)}"
+        expect(1 <= grid <= WIDEST and weights in WEIGHTS, expected, f"Distilled got {settings_of(self)}")
         for name, tensor in loaded(WEIGHTS[weights]).items():
             self.register_buffer(name, tensor, persistent=name == "checksum")
 

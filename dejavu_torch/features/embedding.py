@@ -14,7 +14,7 @@ from dejavu_torch.features.truncate import members_of, run, tensors_in, up_to
 from dejavu_torch.features.whitening import learned_whitening
 from dejavu_torch.resize import check_size, resize_frames
 from dejavu_torch.text import one_line, settings_of
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, expect
 
 WIDEST = 256  # cells along a side of a grid
 SHOWN = 4  # shapes in a message
@@ -133,8 +133,7 @@ class Embedding(nn.Module):
         output: int | None = None,
     ) -> None:
         super().__init__()
-        if not isinstance(network, nn.Module):
-            raise InputError(f"the network is a {type(network).__name__}; expected an nn.Module")
+        expect(isinstance(network, nn.Module), "an nn.Module", network=type(network))
         fits = hidden == 0 if dimension is None else dimension >= 1
         self.resize = check_size(resize, 1, "Embedding got resize")
         self.dimension, self.channels, self.grid, self.cell = dimension, channels, grid, cell

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from dejavu_torch.features.preprocess import check_frames, in_parts
 from dejavu_torch.resize import check_size, resize_frames
 from dejavu_torch.text import settings_of
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, expect
 
 MOST_ORIENTATIONS = 360
 Bins = Literal["hard", "linear"]
@@ -93,10 +93,9 @@ def _checked(
 ) -> tuple[int, int] | None:
     """The size to resize to, if all settings of `HOG` are in range."""
     least, most = min(orientations, cell, block), MOST_ORIENTATIONS
-    if least < 1 or orientations > most or bins not in ("hard", "linear"):
-        seen = f"orientations={orientations}, cell={cell}, block={block}, bins={bins!r}"
-        expected = f"at least 1 each, at most {most} orientations, bins 'hard' or 'linear'"
-        raise InputError(f"HOG got {seen}; expected {expected}")
+    seen = f"orientations={orientations}, cell={cell}, block={block}, bins={bins!r}"
+    expected = f"at least 1 each, at most {most} orientations, bins 'hard' or 'linear'"
+    expect(least >= 1 and orientations <= most and bins in ("hard", "linear"), expected, f"HOG got {seen}")
     return None if resize is None else check_size(resize, cell * block, "HOG got resize")
 
 

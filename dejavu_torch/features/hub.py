@@ -11,7 +11,7 @@ from torch import nn
 
 from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.text import one_line
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, expect
 
 PREFIX = "hub:"
 MEAN, STD = [0.485, 0.456, 0.406], [0.229, 0.224, 0.225]  # of ImageNet
@@ -93,14 +93,12 @@ def made(function: str, **arguments: Any) -> nn.Module:
         maker: Any = pydoc.locate(function)
     except pydoc.ErrorDuringImport as error:
         raise InputError(f"{function} cannot be imported: {one_line(error.value)}") from error
-    if not callable(maker):
-        raise InputError(f"{function} is no function that can be imported; expected one, or a class")
+    expect(callable(maker), "one, or a class", f"{function} is no function that can be imported")
     try:
         with redirect_stdout(sys.stderr):  # keeps stdout to lines of JSON
-            network = maker(**arguments)
+            network: nn.Module = maker(**arguments)
     except SystemExit as stop:  # it would end the command silently
         raise InputError(f"{function} ends the program ({stop}); expected one that makes a network") from stop
-    if not isinstance(network, nn.Module):
-        raise InputError(f"{function} made a {type(network).__name__}; expected an nn.Module")
+    expect(isinstance(network, nn.Module), "an nn.Module", f"{function} made a {type(network).__name__}")
     # DataParallel would use the first GPU, wherever the model is
     return network.module.cpu() if isinstance(network, nn.DataParallel) else network

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from dejavu_torch.features.preprocess import FLAT, channel_name, check_frames, select_channel
 from dejavu_torch.resize import check_size, resize_frames
 from dejavu_torch.text import settings_of
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, expect
 
 
 class PatchPixels(nn.Module):
@@ -27,8 +27,7 @@ class PatchPixels(nn.Module):
 
     def __init__(self, size: tuple[int, int] = (32, 64), patch: int = 8, channel: str | None = None) -> None:
         super().__init__()
-        if patch < 2:
-            raise InputError(f"PatchPixels got patches of {patch} pixels; expected at least 2")
+        expect(patch >= 2, "at least 2", f"PatchPixels got patches of {patch} pixels")
         self.size, self.patch = check_size(size, patch, "PatchPixels got size"), patch
         self.channel = None if channel is None else channel_name(channel)
 

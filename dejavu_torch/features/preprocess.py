@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from dejavu_torch.text import settings_of
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, expect
 
 MOST_CLIP = 1e6
 Contrast = Literal["patch", "clahe"]
@@ -44,9 +44,8 @@ def in_parts(work: Callable[[Tensor], Tensor], frames: Tensor) -> Tensor:
 def channel_name(channel: str) -> str:
     """The normal form of a channel's name: "grey", "R", "R-B"."""
     name = str(channel).strip().upper().replace("GREY", "grey")
-    if name not in CHANNELS:
-        expected = "'grey', 'R', 'G', 'B' or a difference such as 'R-B'"
-        raise InputError(f"channel {channel!r} is unknown; expected {expected}")
+    expected = "'grey', 'R', 'G', 'B' or a difference such as 'R-B'"
+    expect(name in CHANNELS, expected, f"channel {channel!r} is unknown")
     return name
 
 
@@ -55,8 +54,7 @@ def select_channel(frames: Tensor, channel: str) -> Tensor:
     name, count = channel_name(channel), frames.shape[1]
     if name == "grey" and count == 1:
         return frames
-    if count != 3:
-        raise InputError(f"channel {name!r} of frames with {count} channels; expected the 3 of RGB")
+    expect(count == 3, "the 3 of RGB", f"channel {name!r} of frames with {count} channels")
     if name == "grey":
         from kornia.color import rgb_to_grayscale  # loading kornia takes a third of a second
 
@@ -75,9 +73,8 @@ def range_of(given: Sequence[float] | str | None) -> tuple[float, float] | Liter
     except (TypeError, ValueError):
         low = high = math.nan
     low, high = (low / DEEP, high / DEEP) if high > 1 else (low, high)
-    if not 0 <= low < high <= 1:
-        expected = "LOW,HIGH in [0, 1], or up to 65535 as of 16 bits, or auto"
-        raise InputError(f"preprocess got range={given!r}; expected {expected}")
+    expected = "LOW,HIGH in [0, 1], or up to 65535 as of 16 bits, or auto"
+    expect(0 <= low < high <= 1, expected, f"preprocess got range={given!r}")
     return low, high
 
 
@@ -136,8 +133,7 @@ def equalise(frames: Tensor, clip_limit: float = 2.0, grid: tuple[int, int] = (8
     The table of 256 grey levels has no gradient, so the gradient is that of the identity. Kornia's
     differentiable form gives other values (up to 0.3 away).
     """
-    if torch.compiler.is_exporting():
-        raise InputError("clahe, by kornia, would fix the number of frames; expected another contrast")
+    expect(not torch.compiler.is_exporting(), "another contrast", "clahe would fix the number of frames")
     from kornia.enhance import equalize_clahe
 
     (height, width), (rows, columns) = frames.shape[-2:], grid
@@ -148,8 +144,7 @@ def equalise(frames: Tensor, clip_limit: float = 2.0, grid: tuple[int, int] = (8
         return frames
     detached = frames.detach()
     low, high = (bound.item() for bound in detached.aminmax())
-    if not (low >= 0 and high <= 1):
-        raise InputError(f"clahe got values from {low:g} to {high:g}; expected values in [0, 1]")
+    expect(low >= 0 and high <= 1, "values in [0, 1]", f"clahe got values from {low:g} to {high:g}")
     equalised = in_parts(lambda part: equalize_clahe(part, clip_limit, grid), detached)
     return frames + (equalised - detached) if frames.requires_grad else equalised
 
@@ -199,16 +194,12 @@ class Preprocess(nn.Module):
         super().__init__()
         sized = size is None or (isinstance(size, int) and size >= 1)
         tiled = len(grid) == 2 and all(tiles >= 1 and tiles == int(tiles) for tiles in grid)
-        for fits, seen, expected in (
-            (sized, f"{size=}", "pixels of the longer side, at least 1, or null"),
-            (contrast in (None, *get_args(Contrast)), f"{contrast=}", "'patch', 'clahe' or None"),
-            (patch >= 3 and patch % 2 == 1, f"{patch=}", "an odd number of pixels, at least 3"),
-            (0 <= clip_limit <= MOST_CLIP, f"{clip_limit=}", f"0 (no limit) to {MOST_CLIP:g}"),
-            (0 <= blank < 1, f"{blank=}", "a standard deviation of at least 0, below 1"),
-            (tiled, f"grid={tuple(grid)}", "(rows, columns), integers of at least 1"),
-        ):
-            if not fits:
-                raise InputError(f"preprocess got {seen}; expected {expected}")
+        expect(sized, "pixels of the longer side, at least 1, or null", f"{size=}")
+        expect(contrast in (None, *get_args(Contrast)), "'patch', 'clahe' or None", f"{contrast=}")
+        expect(patch >= 3 and patch % 2 == 1, "an odd number of pixels, at least 3", f"{patch=}")
+        expect(0 <= clip_limit <= MOST_CLIP, f"0 (no limit) to {MOST_CLIP:g}", f"{clip_limit=}")
+        expect(0 <= blank < 1, "a standard deviation of at least 0, below 1", f"{blank=}")
+        expect(tiled, "(rows, columns), integers of at least 1", f"grid={tuple(grid)}")
         self.channel = None if channel is None else channel_name(channel)
         self.contrast: Contrast | None = contrast
         self.patch, self.clip_limit, self.size = patch, float(clip_limit), size

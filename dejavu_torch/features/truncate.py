@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.modules.module import register_module_forward_hook, register_module_forward_pre_hook
 
 from dejavu_torch.features.extract import in_mode
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, expect
 
 SHOWN = 12  # names of layers in a message
 
@@ -50,10 +50,9 @@ def up_to(network: nn.Module, layer: str, frames: Tensor) -> nn.Module:
     The copy omits modules that have not started by then, unless that changes its output for `frames`.
     """
     name, names = type(network).__name__, [path for path, _ in network.named_modules() if path]
-    if layer not in names:
-        some = [path for path in names if path.count(".") < 2]
-        examples = ", ".join([*some[:SHOWN], ".."][: len(some)]) or "none, it has none"
-        raise InputError(f"{name} has no layer {layer!r:.80}; expected one such as {examples}")
+    some = [path for path in names if path.count(".") < 2]
+    examples = ", ".join([*some[:SHOWN], ".."][: len(some)]) or "none, it has none"
+    expect(layer in names, f"one such as {examples}", f"{name} has no layer {layer!r:.80}")
     try:
         ended = copy.deepcopy(network)
     except RuntimeError as error:
@@ -67,8 +66,7 @@ def up_to(network: nn.Module, layer: str, frames: Tensor) -> nn.Module:
         register_module_forward_hook(lambda module, *_: finished.add(module)),  # runs before `_end`
     ):
         expected = _outputs(ended, frames)
-    if last not in started:
-        raise InputError(f"{name} does not run its layer {layer} as a module; expected another layer")
+    expect(last in started, "another layer", f"{name} does not run its layer {layer} as a module")
     smaller = copy.deepcopy(ended)
     _omit(ended, smaller, started, finished)
     try:

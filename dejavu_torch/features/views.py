@@ -12,7 +12,7 @@ from torch import Tensor
 from dejavu_torch.data.traverse import Part, as_shape
 from dejavu_torch.features.augmentation import LARGEST, Augmentation
 from dejavu_torch.features.preprocess import spread
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.types import InputError, Traverse, expect
 
 SAMPLE = 10_000  # frames that a longer route is fitted on
 MIN_SEGMENTS = 4  # of a sample
@@ -139,8 +139,7 @@ class AugmentedFrames:
         factor: float = 1.0,
         span: tuple[float, float] = (0.0, 1.0),
     ) -> None:
-        if len(traverse.frame_shape) != 3:
-            raise InputError(f"{traverse.name} holds ready features; expected frames to augment")
+        expect(len(traverse.frame_shape) == 3, "frames to augment", f"{traverse.name} holds ready features")
         try:
             self.augmentation = Augmentation(**strengths).stronger(factor)
         except TypeError as error:

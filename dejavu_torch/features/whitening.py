@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.memory import without_autocast
 from dejavu_torch.text import settings_of
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, check_shape, expect
 
 log = logging.getLogger("dejavu_torch")
 
@@ -165,8 +165,7 @@ class Whitening(nn.Module):
         lengths: bool | None = None,
     ) -> None:
         super().__init__()
-        if not isinstance(strengths, Mapping | None):
-            raise InputError(f"the strengths are {strengths!r}; expected arguments of Augmentation by name")
+        expect(isinstance(strengths, Mapping | None), "arguments of Augmentation", strengths=strengths)
         self.numbers, self.components, self.shrinkage, self.views = numbers, components, shrinkage, views
         self.seed, self.bits, self.groups = seed, bits, None if groups is None else [*groups]
         self.lengths, self.decides = lengths, lengths is None
@@ -221,9 +220,8 @@ class Whitening(nn.Module):
         """Descriptors (B,D) -> (B,K); `projections`: stored `all_unpacked`."""
         if not self.learned:
             return descriptors
-        shape, sizes = tuple(descriptors.shape), self.sizes
-        if shape[1:] != (sum(sizes),):
-            raise InputError(f"the whitening got descriptors {shape}; expected (B, {sum(sizes)})")
+        sizes = self.sizes
+        check_shape(descriptors, f"B {sum(sizes)}", "the whitening got descriptors")
         # bf16 is too coarse for the small differences that whitening amplifies
         with torch.autocast(descriptors.device.type, enabled=False):
             exact = descriptors.to(torch.promote_types(descriptors.dtype, torch.float32))
@@ -283,9 +281,8 @@ class Whitening(nn.Module):
         """
         groups = groups if self.groups is None else self.groups
         sizes = [places.shape[1]] if groups is None else [*groups]
-        if sum(sizes) != places.shape[1]:
-            seen = f"groups of {' + '.join(map(str, sizes))} dimensions, descriptors {tuple(places.shape)}"
-            raise InputError(f"{seen}; expected (N, {sum(sizes)})")
+        seen = f"groups of {' + '.join(map(str, sizes))} dimensions, descriptors {tuple(places.shape)}"
+        expect(sum(sizes) == places.shape[1], f"(N, {sum(sizes)})", seen)
         compared = views is not None or visits is not None
         bits = self.bits_of(len(places), compared)
         members = [self] if groups is None else [self._member() for _ in sizes]
@@ -381,13 +378,11 @@ def _projected_views(
     """Components (2,n,C) of views, which are read batch by batch, and of their places, for each group."""
     sizes, pairs = [len(mean) for mean, *_ in bases], [list[Tensor]() for _ in bases]
     for view, place in views:
-        if view.shape[1] != places.shape[1]:
-            raise InputError(f"views have {view.shape[1]} features; expected {places.shape[1]}, the route's")
+        check_shape(view, f"V {places.shape[1]}", "the views are")
         both = (rows.split(sizes, 1) for rows in (view, places[place.to(places.device)]))
         for held, (mean, basis, *_), *parts in zip(pairs, bases, *both, strict=True):
             held.append(torch.stack([_projected(part, mean, basis) for part in parts]))
-    if not pairs[0]:
-        raise InputError("there are no views for whitening; expected at least one batch, or None")
+    expect(pairs[0], "at least one batch, or None", "there are no views for whitening")
     return [torch.cat(held, 1) for held in pairs]
 
 
@@ -444,8 +439,7 @@ def principal_components(
 
     Shape: (N,D) -> mean (D,), basis (D,C), variances (C,), the largest first; C is at most `count`.
     """
-    if rows.ndim != 2 or len(rows) < 2:
-        raise InputError(f"the descriptors are {tuple(rows.shape)}; expected (N,D), N at least 2")
+    check_shape(rows, "N>=2 D", "the descriptors are")
     sample = rows[:: max(1, len(rows) // SAMPLED)].float()
     mean = sample.mean(0) if centre else sample.new_zeros(sample.shape[1])
     centred = sample - mean

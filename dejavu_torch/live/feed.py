@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import suppress
 
 from dejavu_torch.data.camera import Frame
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, expect
 
 WAITING = 2  # frames read ahead, if none is dropped
 
@@ -89,8 +89,7 @@ def in_real_time(frames: Iterable[Frame], name: str, rate: float | None = None) 
     start: float | None = None
     for frame in frames:
         seconds = frame.number / rate if rate and math.isnan(frame.seconds) else frame.seconds
-        if math.isnan(seconds):
-            raise InputError(f"{name} has no timestamps; expected a video for --realtime")
+        expect(not math.isnan(seconds), "a video for --realtime", f"{name} has no timestamps")
         start = time.monotonic() - seconds if start is None else start
         time.sleep(max(0.0, start + seconds - time.monotonic()))
         yield frame

@@ -15,7 +15,7 @@ from dejavu_torch.features.extract import features_of, in_mode
 from dejavu_torch.model import DejaVu, check_queries
 from dejavu_torch.recognition.centring import running_mean
 from dejavu_torch.recognition.filter import PlaceFilter
-from dejavu_torch.types import InputError, Match, SequenceModel
+from dejavu_torch.types import InputError, Match, SequenceModel, check_shape, expect
 
 EXPECTED = "uint8 (H,W), (H,W,3) or (3,H,W), or float in [0, 1], or float (D,) for a map of ready features"
 DTYPES = ("uint8", "float16", "bfloat16", "float32", "float64")
@@ -78,9 +78,8 @@ class LiveLocalizer:
         if model.step is not None and model.velocity is not None:
             seen = "the map's places are even steps along the ground, which only a whole traverse shows"
             raise InputError(f"{seen}; expected a map without --velocity, or unchanged frames (--as_is)")
-        if not (sequence is None or sequence == "filter" or isinstance(sequence, SequenceModel)):
-            seen = f"the sequence is {sequence!r}"
-            raise InputError(f"{seen}; expected a SequenceModel such as PlaceFilter, 'filter' or None")
+        fits = sequence in (None, "filter") or isinstance(sequence, SequenceModel)
+        expect(fits, "a SequenceModel such as PlaceFilter, 'filter' or None", f"the sequence is {sequence!r}")
         self.keep_scores, self.centring = keep_scores, running_mean(model.map) if centre else None
         self.model, self.sequence = model, PlaceFilter() if isinstance(sequence, str) else sequence
         self._shape: tuple[int, ...] | None = None  # of the latest valid frame
@@ -101,8 +100,7 @@ class LiveLocalizer:
         self.scores = scores[-1] if len(scores) else self.scores
 
     def __call__(self, frame: Tensor | np.ndarray, left_out: int = 0) -> LiveMatch:
-        if self.lag:
-            raise InputError(f"an answer for each frame with a lag of {self.lag}; expected due(frame)")
+        expect(not self.lag, "due(frame)", f"an answer for each frame with a lag of {self.lag}")
         return self.due(frame, left_out)[0]
 
     @torch.no_grad()
@@ -164,10 +162,8 @@ class LiveLocalizer:
             self._shape = batch.shape[1:]
         features = features.to(torch.promote_types(features.dtype, torch.float32))
         descriptor = features if whitening is None else whitening(features, self._projection)
-        if descriptor.shape[1] != dimension:
-            raise InputError(f"the frame gives {descriptor.shape[1]} features; the map expects {dimension}")
-        if not descriptor.isfinite().all():
-            raise InputError("the frame gives NaN or infinite features; expected finite numbers")
+        check_shape(descriptor, f"1 {dimension}", "the frame gives features")
+        expect(descriptor.isfinite().all(), "finite numbers", "the frame gives NaN or infinite features")
         return descriptor
 
 
@@ -194,6 +190,5 @@ def as_batch(frame: Tensor | np.ndarray, device: torch.device | str = "cpu") -> 
         return values[None].float().div_(255)
     values = values if values.dtype == torch.float64 else values.float()
     low, high = (float(end) for end in values.aminmax())
-    if not (low >= -ROUNDING and high <= 1 + ROUNDING):
-        raise InputError(f"the frame has values from {low:.4g} to {high:.4g}; expected 0 to 1")
+    expect(low >= -ROUNDING and high <= 1 + ROUNDING, "0 to 1", f"the frame has {low:.4g} to {high:.4g}")
     return values[None].clamp(0, 1)

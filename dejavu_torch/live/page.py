@@ -22,7 +22,7 @@ from torch import Tensor
 
 from dejavu_torch.data.camera import Frame
 from dejavu_torch.live.localizer import LiveMatch
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.types import InputError, Traverse, expect
 
 HOST = "127.0.0.1"
 PORT = 8765  # default
@@ -59,8 +59,7 @@ class Page:
     def __init__(
         self, port: int = PORT, title: str = "", reference: Callable[[int], str | None] | None = None
     ) -> None:
-        if not 0 <= port < 2**16:
-            raise InputError(f"port {port}; expected one from 0 to 65535, 0 for any free one")
+        expect(0 <= port < 2**16, "one from 0 to 65535, 0 for any free one", f"port {port}")
         self.title, self.reference = title, reference
         self.snapshot: Snapshot | None = None
         page = self
@@ -173,11 +172,9 @@ class ReferencePictures:
     """Pictures of the frames of the map's reference, for `Page`, read as they are asked for."""
 
     def __init__(self, reference: Traverse, frames: int) -> None:
-        if len(reference) != frames:
-            seen = f"{reference.name} has {len(reference)} frames"
-            raise InputError(f"{seen}; the map's reference has {frames}")
-        if len(reference.frame_shape) != 3:
-            raise InputError(f"{reference.name} holds features; expected frames to show")
+        seen = f"{reference.name} has {len(reference)} frames"
+        expect(len(reference) == frames, f"{frames}, as the map's reference", seen)
+        expect(len(reference.frame_shape) == 3, "frames to show", f"{reference.name} holds features")
         self.reference, self._one_at_a_time = reference, threading.Lock()  # requests come in threads
 
     def __call__(self, frame: int) -> str | None:

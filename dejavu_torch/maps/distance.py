@@ -16,7 +16,7 @@ from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 
 from dejavu_torch.maps.compiling import compiled
 from dejavu_torch.memory import is_readable
-from dejavu_torch.types import InputError
+from dejavu_torch.types import check_shape, expect
 
 Metric = Literal["l1", "l2", "cosine"]
 Floats = NDArray[np.float32]
@@ -45,11 +45,9 @@ def phase_distances(query: Tensor, templates: Tensor, metric: Metric = "l1") -> 
         >>> phase_distances(torch.tensor([[1.0, 2.0]]), torch.tensor([[1.0, 2.0], [0.0, 4.0]]))
         tensor([[0., 3.]])
     """
-    if metric not in get_args(Metric):
-        raise InputError(f"metric {metric!r} is unknown; expected {', '.join(get_args(Metric))}")
-    if query.ndim != 2 or templates.ndim != 2 or query.shape[1] != templates.shape[1]:
-        seen = f"phase_distances got {tuple(query.shape)} and {tuple(templates.shape)}"
-        raise InputError(f"{seen}; expected (Q,F) and (P,F)")
+    expect(metric in get_args(Metric), ", ".join(get_args(Metric)), f"metric {metric!r} is unknown")
+    check_shape(templates, "P F", "phase_distances got templates")
+    check_shape(query, f"Q {templates.shape[1]}", "phase_distances got queries")
     dtype = torch.promote_types(torch.promote_types(query.dtype, templates.dtype), torch.float32)
     query, templates = query.to(dtype), templates.to(dtype)
     with torch.autocast(query.device.type, enabled=False):

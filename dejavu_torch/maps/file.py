@@ -15,7 +15,7 @@ from torch import Tensor
 
 from dejavu_torch.data.files import check_regular
 from dejavu_torch.data.output import whole_file
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, expect
 
 FORMAT = 11
 NAME = "dejavu_torch-map"
@@ -79,13 +79,11 @@ def read_map(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     check_regular(path, EXPECTED)
     try:
         with path.open("rb") as file:
-            if file.read(len(ZIP)) == ZIP:
-                cure = "or `dejavu train export` of the checkpoint"
-                raise InputError(f"{path} is a checkpoint or another archive; expected {EXPECTED}, {cure}")
+            cure = "or `dejavu train export` of the checkpoint"
+            expect(file.read(len(ZIP)) != ZIP, f"{EXPECTED}, {cure}", f"{path} is a checkpoint or archive")
         with safe_open(path, framework="pt") as archive:
             metadata = archive.metadata() or {}
-            if NAME not in metadata:
-                raise InputError(f"{path} is not a map of dejavu_torch; expected {EXPECTED}")
+            expect(NAME in metadata, EXPECTED, f"{path} is not a map of dejavu_torch")
             sealed = json.loads(metadata[NAME])
             if (version := sealed["version"]) != FORMAT:
                 seen = f"{path} has map format {version!r:.40}, of another dejavu_torch"
@@ -98,8 +96,7 @@ def read_map(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         raise
     except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path} is truncated or not a map file ({error}); expected a whole one") from error
-    if damaged:
-        raise InputError(f"{path} is damaged: its {' and '.join(damaged)}; expected it as it was written")
+    expect(not damaged, "it as it was written", f"{path} is damaged: its {' and '.join(damaged)}")
     return tensors, header
 
 

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from dejavu_torch.data.positions import count_places
 from dejavu_torch.maps.frame_table import FrameTable, Link, Route
 from dejavu_torch.maps.summary import MapSummary
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, check_shape, expect
 
 log = logging.getLogger("dejavu_torch")
 
@@ -32,8 +32,7 @@ def require(fits: bool, seen: str) -> None:
 
 def one_of(value: L, kind: Any, name: str) -> L:
     """A value that a Literal names, else an InputError; `name`: of the value in the message."""
-    if value not in get_args(kind):
-        raise InputError(f"{name} is {value!r:.60}; expected {str(kind).removeprefix('typing.')}")
+    expect(value in get_args(kind), str(kind).removeprefix("typing."), f"{name} is {value!r:.60}")
     return value
 
 
@@ -96,8 +95,7 @@ class PlaceMap(nn.Module, ABC):
 
     def check_queries(self, queries: Tensor) -> None:
         """Refuse queries that are not (Q,D)."""
-        if queries.ndim != 2 or queries.shape[1] != self.dimension:
-            raise InputError(f"the queries are {tuple(queries.shape)}; the map expects (Q, {self.dimension})")
+        check_shape(queries, f"Q {self.dimension}", "the map got queries")
 
     def score_blocks(self, queries: Tensor) -> ScoreBlocks:
         """The columns of `scores`, block by block."""
@@ -180,8 +178,7 @@ class PlaceMap(nn.Module, ABC):
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore the result of `get_extra_state`; another kind or other settings are an InputError."""
         for name, value in {"kind": self.kind, **self.settings()}.items():
-            if state.get(name) != value:
-                raise InputError(f"the map's {name} is {state.get(name)!r}; expected {value!r}")
+            expect(state.get(name) == value, repr(value), f"the map's {name} is {state.get(name)!r}")
         self.places, self.dimension = state["places"], state["dimension"]
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
@@ -213,9 +210,8 @@ class PlaceMap(nn.Module, ABC):
     def load_packed(self, tensors: dict[str, Tensor], extra: dict[str, Any]) -> None:
         """Load the results of `packed` and `get_extra_state`; other tensors are an InputError."""
         names = self.state_dict().keys() - {EXTRA}
-        if not names - {*self.optional} <= tensors.keys() <= names:
-            seen = f"it holds {', '.join(sorted(tensors)) or 'nothing'}"
-            raise InputError(f"{seen} of a map; expected {', '.join(sorted(names))}")
+        fits, seen = names - {*self.optional} <= tensors.keys() <= names, ", ".join(sorted(tensors))
+        expect(fits, ", ".join(sorted(names)), f"it holds {seen or 'nothing'} of a map")
         default = {
             name: getattr(self, name).new_zeros(shape)
             for name, shape in self.optional.items()

@@ -13,7 +13,7 @@ from dejavu_torch.maps.quantisation import RouteLines
 from dejavu_torch.maps.spectral_map import CHUNK_BYTES, Chunk, SpectralMap, SpectralMetric
 from dejavu_torch.maps.spectrum import Transform
 from dejavu_torch.text import settings_of
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, expect
 
 ROWS = 2**14  # descriptors checked at a time
 HELD = 0.85  # default share of the variance: such maps are nearly as accurate as their descriptors
@@ -67,9 +67,7 @@ class SpectralMapper(Mapper):
         super().__init__()
         every = {"route_bytes_per_place": route_bytes_per_place, "step": step, "hold": hold}
         given = {name: value for name, value in every.items() if value is not None}
-        if len(given) > 1:
-            seen = " and ".join(f"{name} is {value}" for name, value in given.items())
-            raise InputError(f"{seen}; expected one of them, None for the others")
+        expect(len(given) <= 1, "one of them, None for the others", **given)
         for name, value in given.items():
             if not 0 < value < (1 if name == "hold" else math.inf):
                 share = " and below 1, such as 0.85" if name == "hold" else ""

@@ -22,7 +22,7 @@ from dejavu_torch.maps.place_map import PlaceMap, ScoreBlocks, one_of, require
 from dejavu_torch.maps.spectrum import Transform, from_slots, half_cycles, slots
 from dejavu_torch.maps.summary import ChunkSummary, MapSummary
 from dejavu_torch.memory import is_readable
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, expect
 
 SpectralMetric = Literal["cosine", "l2"]
 MIN_NORM = 1e-6  # of the RMS norm in a chunk, or of the mean's norm: shorter descriptors count as 0
@@ -133,10 +133,8 @@ class SpectralMap(PlaceMap):
         resolution: float = 0.0,
         step: float = 0.0,
     ) -> None:
-        if type(chunk) is not int or chunk < 2:
-            raise InputError(f"chunk is {chunk!r}; expected a number of places, at least 2, such as 10000")
-        if not 0 <= resolution < math.inf:
-            raise InputError(f"resolution is {resolution}; expected a number of places, 0 or more")
+        expect(type(chunk) is int and chunk >= 2, "a number of places, at least 2, as 10000", chunk=chunk)
+        expect(0 <= resolution < math.inf, "a number of places, 0 or more", resolution=resolution)
         super().__init__(0, 0 if means is None else means.shape[1])
         self.metric: SpectralMetric = one_of(metric, SpectralMetric, "metric")
         self.transform: Transform = one_of(transform, Transform, "transform")
@@ -181,9 +179,8 @@ class SpectralMap(PlaceMap):
         else:
             parts = [_nonzero(level) for level in levels]
         sizes = self.places + sum(places), self._bounds[-1] + sum(len(level) for *_, level in parts)
-        if max(sizes) > LARGEST:
-            seen = f"the map has {sizes[0]} places and {sizes[1]} coefficients"
-            raise InputError(f"{seen}; expected at most {LARGEST} of each: make several maps")
+        seen = f"the map has {sizes[0]} places and {sizes[1]} coefficients"
+        expect(max(sizes) <= LARGEST, f"at most {LARGEST} of each: make several maps", seen)
 
         def append(name: str, *more: Tensor) -> None:
             setattr(self, name, torch.cat([getattr(self, name), *(tensor.to(device) for tensor in more)]))
@@ -326,8 +323,7 @@ class SpectralMap(PlaceMap):
     def part(self, name: str) -> SpectralMap:
         """The map of one route alone; an InputError if there is no such route."""
         names = [route.name for route in self.routes]
-        if name not in names:
-            raise InputError(f"there is no route {name!r}; expected one of {', '.join(names)}")
+        expect(name in names, f"one of {', '.join(names)}", f"there is no route {name!r}")
         r = names.index(name)
         start, frame = (sum(route[i] for route in self.routes[:r]) for i in (1, 2))  # type: ignore[misc]
         _, places, frames = self.routes[r]

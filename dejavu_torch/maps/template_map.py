@@ -20,7 +20,7 @@ from dejavu_torch.maps.templates import PhaseTemplates, check_plan
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.text import settings_of
-from dejavu_torch.types import FrequencyLayer, InputError, Plan
+from dejavu_torch.types import FrequencyLayer, InputError, Plan, check_shape, expect
 
 Reduction = Literal["mean", "sum"]
 MAX_PLACES = 2**26  # in all layers, since a file of a few bytes can claim any number
@@ -114,8 +114,7 @@ class TemplateMap(PlaceMap):
         self.temperature = temperature
         for layer, block in zip(plan, templates, strict=True):
             shape = layer.phases, len(layer.features)
-            if block.shape != shape:
-                raise InputError(f"templates of a layer are {tuple(block.shape)}; expected (P,F) = {shape}")
+            expect(block.shape == shape, f"(P,F) = {shape}", f"templates of a layer are {tuple(block.shape)}")
         rows = [(*layer.period.as_integer_ratio(), layer.phases, layer.start, layer.stop) for layer in plan]
         index = [feature for layer in plan for feature in layer.features]
         pointer = [0, *accumulate(len(layer.features) for layer in plan)]
@@ -139,9 +138,8 @@ class TemplateMap(PlaceMap):
         )
         check_plan(self.plan, self.places, self.dimension)
         covered = sum(layer.stop - layer.start for layer in self.plan)
-        if max(self.places, covered) > MAX_PLACES:
-            seen = f"a map of {self.places} places, {covered} in all layers"
-            raise InputError(f"{seen}; expected at most {MAX_PLACES}")
+        seen = f"a map of {self.places} places, {covered} in all layers"
+        expect(max(self.places, covered) <= MAX_PLACES, f"at most {MAX_PLACES}", seen)
         # the numerator of the period is the number of places after which phases repeat
         self.laps = [min(layer.period.numerator, layer.stop - layer.start) for layer in self.plan]
         pairs = zip(self.plan, self.laps, strict=True)
@@ -231,8 +229,7 @@ class TemplateMap(PlaceMap):
         if weights and not len(self.weights):
             initial = self.templates.new_ones(self.dimension)
             if start is not None and len(start):
-                if start.shape != initial.shape:
-                    raise InputError(f"the weights start as {tuple(start.shape)}; expected ({len(initial)},)")
+                check_shape(start, str(len(initial)), "the weights start as")
                 initial = start.detach().clone()
             self.templates, self.weights = self._times(initial), initial
         for name, wanted in (("templates", templates), ("weights", weights)):
@@ -311,8 +308,7 @@ class TemplateMapper(Mapper):
         trainable: bool = False,
     ) -> None:
         super().__init__()
-        if not isinstance(periods, PeriodFinder | None):
-            raise InputError(f"periods is a {type(periods).__name__}; expected a PeriodFinder")
+        expect(isinstance(periods, PeriodFinder | None), "a PeriodFinder", periods=type(periods))
         self.trainable = trainable
         self.periods: PeriodFinder | None = SpectrogramAnalysis() if periods is None else periods
         self.metric, self.reduction, self.temperature = metric, reduction, temperature

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from dejavu_torch.memory import without_autocast
-from dejavu_torch.types import FrequencyLayer, InputError
+from dejavu_torch.types import FrequencyLayer, InputError, check_shape
 
 MASK_NUMBERS = 2**22  # values of a mask that are held at a time
 
@@ -72,8 +72,7 @@ class PhaseTemplates(nn.Module):
     """
 
     def forward(self, features: Tensor, plan: Sequence[FrequencyLayer]) -> tuple[Tensor, ...]:
-        if features.ndim != 2:
-            raise InputError(f"the features are {tuple(features.shape)}; expected (N,D)")
+        check_shape(features, "N D", "the features are")
         check_plan(plan, *features.shape)
         return tuple(_means(features, layer) for layer in plan)
 

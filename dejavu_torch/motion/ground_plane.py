@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d, pad
 
 from dejavu_torch.memory import check_room
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, expect
 
 Corners = Sequence[Sequence[float]]
 TRAPEZIUM: Corners = ((0.32, 0.72), (0.68, 0.72), (0.95, 0.98), (0.05, 0.98))
@@ -25,11 +25,9 @@ def check_corners(corners: Corners) -> None:
         raise InputError(f"{seen}; expected four (x, y): {order}")
     text = "ground corners " + " ".join(f"({x:g}, {y:g})" for x, y in corners)
     points = torch.tensor(corners, dtype=torch.float64)
-    if not ((points >= 0) & (points <= 1)).all():
-        raise InputError(f"{text} lie outside the frame; expected fractions of it, 0 to 1")
+    expect(((points >= 0) & (points <= 1)).all(), "fractions of it, 0 to 1", f"{text} lie outside the frame")
     edges = points.roll(-1, 0) - points
-    if not (torch.stack([edges, edges.roll(-1, 0)], 1).det() > 1e-6).all():
-        raise InputError(f"{text} are not convex; expected {order}")
+    expect((torch.stack([edges, edges.roll(-1, 0)], 1).det() > 1e-6).all(), order, f"{text} are not convex")
 
 
 def ground_patch(frames: Tensor, corners: Corners = TRAPEZIUM, size: tuple[int, int] = (96, 96)) -> Tensor:
@@ -46,8 +44,7 @@ def ground_patch(frames: Tensor, corners: Corners = TRAPEZIUM, size: tuple[int, 
         seen = f"frames {tuple(frames.shape)} {frames.dtype}"
         raise InputError(f"{seen}; expected (B,C,H,W) float, grey or RGB: features do not show the ground")
     (count, _, height, width), (rows, columns) = frames.shape, size
-    if min(height, width) < 2:
-        raise InputError(f"frames of {height} x {width} pixels; expected at least 2 x 2")
+    expect(min(height, width) >= 2, "at least 2 x 2", f"frames of {height} x {width} pixels")
     # two sampling grids and the patches
     check_room(32.0 * count * rows * columns, f"the ground in {count} x {rows} x {columns} pixels")
     from kornia.color import rgb_to_grayscale  # slow to import

@@ -15,7 +15,7 @@ from dejavu_torch.motion.flow import flow_shift
 from dejavu_torch.motion.ground_plane import TRAPEZIUM, Corners, check_corners, ground_patch
 from dejavu_torch.motion.phase_correlation import MIN_CONFIDENCE, phase_shifts, viterbi_path
 from dejavu_torch.text import progress_of, settings_of
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.types import InputError, Traverse, expect
 
 log = logging.getLogger("dejavu_torch")
 
@@ -73,14 +73,10 @@ class GroundOdometry(nn.Module):
         check_corners(corners)
         if len(size) != 2 or min(size) < 32 or max(size) > MAX_SIZE:
             raise InputError(f"size is {tuple(size)}; expected (rows, columns) of 32 to {MAX_SIZE} each")
-        if step is not None and not 0 < step < math.inf:
-            raise InputError(f"step is {step}; expected pixels of ground above 0, or None")
-        if not 0 <= least <= 1:
-            raise InputError(f"least is {least}; expected a confidence from 0 to 1")
-        if not 0 <= still < math.inf:
-            raise InputError(f"still is {still}; expected pixels of ground, at least 0")
-        if flow not in ("phase", "lk"):
-            raise InputError(f"flow is {flow!r}; expected phase or lk")
+        expect(step is None or 0 < step < math.inf, "pixels of ground above 0, or None", step=step)
+        expect(0 <= least <= 1, "a confidence from 0 to 1", least=least)
+        expect(0 <= still < math.inf, "pixels of ground, at least 0", still=still)
+        expect(flow in ("phase", "lk"), "phase or lk", flow=flow)
         self.corners = tuple((float(x), float(y)) for x, y in corners)
         self.size = (int(size[0]), int(size[1]))
         self.step = None if step is None else float(step)
@@ -100,8 +96,7 @@ class GroundOdometry(nn.Module):
 
     def _path(self, parts: list[tuple[Tensor, Tensor]], name: str) -> tuple[Tensor, Tensor]:
         """The shifts (n,) chosen by `viterbi_path` from all parts, and their confidences (n,)."""
-        if not parts:
-            raise InputError(f"{name} has 1 frame; expected at least 2 to measure motion")
+        expect(parts, "at least 2 to measure motion", f"{name} has 1 frame")
         shifts, confidences = (torch.cat(part) for part in zip(*parts, strict=True))
         path = viterbi_path(shifts, confidences, self.size[0]).to(shifts.device)[:, None]
         return shifts.gather(1, path)[:, 0], confidences.gather(1, path)[:, 0]
@@ -157,9 +152,8 @@ def interpolated(shift: Tensor, valid: Tensor, name: str) -> Tensor:
     bad, good = (~valid).nonzero()[:, 0], valid.nonzero()[:, 0]
     if not len(bad):
         return shift
-    if not len(good):
-        seen = f"{name}: none of {len(shift)} steps shows the same ground twice"
-        raise InputError(f"{seen}; expected corners on the ground in front of the camera")
+    seen = f"{name}: none of {len(shift)} steps shows the same ground twice"
+    expect(len(good), "corners on the ground in front of the camera", seen)
     segments = [f"{run.start} to {run.stop}" for run in runs(bad)]
     more = f" and {len(segments) - MAX_LISTED} more" if len(segments) > MAX_LISTED else ""
     log.warning(

@@ -10,7 +10,7 @@ from dejavu_torch.data.ground_truth import GroundTruth, Truth, find_ground_truth
 from dejavu_torch.data.positions import NEAR, shown_frames
 from dejavu_torch.data.traverse import Part
 from dejavu_torch.motion.odometry import GroundOdometry
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.types import Traverse, expect
 
 log = logging.getLogger("dejavu_torch")
 
@@ -51,8 +51,7 @@ class ResampledTraverse(Part):
         if -distance.min() > distance.max():  # a camera that looks backwards
             distance = -distance
         moved, frames = distance.diff(), len(distance)
-        if not moved.any():
-            raise InputError(f"{traverse.name} does not move in its {frames} frames; expected motion")
+        expect(moved.any(), "motion", f"{traverse.name} does not move in its {frames} frames")
         forward, back = int((moved > 0).sum()), int((moved < 0).sum())
         if back > MAX_BACKWARD * forward:
             log.warning(
@@ -62,10 +61,9 @@ class ResampledTraverse(Part):
         step = odometry.step if step is None else step
         self.step = float(moved.abs()[moved != 0].median()) if step is None else float(step)
         self.positions = (distance / self.step).float()
-        if not 1 <= float(self.positions.max()) + NEAR < MAX_STEPS_PER_FRAME * frames:
-            seen = f"{traverse.name} moves by {float(distance.max()):.3g} pixels of ground in {frames} frames"
-            expected = f"at least one step of {self.step:g}, and at most {MAX_STEPS_PER_FRAME} per frame"
-            raise InputError(f"{seen}; expected {expected}")
+        seen = f"{traverse.name} moves by {float(distance.max()):.3g} pixels of ground in {frames} frames"
+        expected = f"at least one step of {self.step:g}, and at most {MAX_STEPS_PER_FRAME} per frame"
+        expect(1 <= float(self.positions.max()) + NEAR < MAX_STEPS_PER_FRAME * frames, expected, seen)
         super().__init__(traverse, shown_frames(self.positions))
 
 

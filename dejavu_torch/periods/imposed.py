@@ -12,7 +12,7 @@ from dejavu_torch.memory import check_room
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.support import supportive_periods
 from dejavu_torch.text import settings_of
-from dejavu_torch.types import FrequencyLayer, InputError, Plan
+from dejavu_torch.types import FrequencyLayer, InputError, Plan, check_shape, expect
 
 LONGEST = 2**24  # bins in a period, and places in a bin, so that products fit into int64
 
@@ -43,9 +43,8 @@ class ImposedPeriods(PeriodFinder):
 
     def __init__(self, periods: list[int] | None = None, bin: int = 5, stagger: bool = False) -> None:
         super().__init__()
-        if not 1 + stagger <= bin <= LONGEST:
-            least = "2 places to stagger" if stagger else "1 place"
-            raise InputError(f"imposed periods got bin={bin}; expected at least {least}, at most {LONGEST}")
+        expected = f"at least {'2 places to stagger' if stagger else '1 place'}, at most {LONGEST}"
+        expect(1 + stagger <= bin <= LONGEST, expected, f"imposed periods got bin={bin}")
         if periods is not None:
             fits = all(isinstance(period, int) and 2 <= period <= LONGEST for period in periods)
             if not fits or not periods or len(periods) > len(set(periods)):
@@ -55,8 +54,7 @@ class ImposedPeriods(PeriodFinder):
         self.bin, self.stagger = bin, stagger
 
     def plan(self, features: Tensor) -> Plan:
-        if features.ndim != 2 or len(features) < 2 or features.shape[1] < 1:
-            raise InputError(f"imposed periods got {tuple(features.shape)}; expected (N,D), N >= 2, D >= 1")
+        check_shape(features, "N>=2 D>=1", "imposed periods got")
         places, dimension = features.shape
         bins = -(-places // self.bin)
         periods = self.periods or supportive_periods(bins)

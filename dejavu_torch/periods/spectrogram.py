@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.text import settings_of
-from dejavu_torch.types import FrequencyLayer, InputError, Plan
+from dejavu_torch.types import FrequencyLayer, InputError, Plan, expect
 
 torchaudio: Any
 try:  # its compiled library fails to load with another build of torch
@@ -144,18 +144,13 @@ class SpectrogramAnalysis(PeriodFinder):
         short: Literal["shrink", "refuse"] = "shrink",
     ) -> None:
         super().__init__()
-        sizes = f"window={window}, min_period={min_period}"
-        for fits, seen, expected in (
-            (min_period >= 2, sizes, "min_period >= 2"),
-            (window >= 2 * min_period, sizes, "window >= 2 * min_period"),
-            (strongest >= 1, f"{strongest=}", "strongest >= 1"),
-            (hop is None or 1 <= hop <= window, f"{hop=}", f"1..{window} (the window)"),
-            (peaks in ("local", "bins"), f"{peaks=}", "'local' or 'bins'"),
-            (short in ("shrink", "refuse"), f"{short=}", "'shrink' or 'refuse'"),
-            (false_alarm is None or 0 < false_alarm < 1, f"{false_alarm=}", "None or a number in (0, 1)"),
-        ):
-            if not fits:
-                raise InputError(f"spectrogram got {seen}; expected {expected}")
+        expect(min_period >= 2, "min_period >= 2", f"{window=}, {min_period=}")
+        expect(window >= 2 * min_period, "window >= 2 * min_period", f"{window=}, {min_period=}")
+        expect(strongest >= 1, "strongest >= 1", f"{strongest=}")
+        expect(hop is None or 1 <= hop <= window, f"1..{window} (the window)", f"{hop=}")
+        expect(peaks in ("local", "bins"), "'local' or 'bins'", f"{peaks=}")
+        expect(short in ("shrink", "refuse"), "'shrink' or 'refuse'", f"{short=}")
+        expect(false_alarm is None or 0 < false_alarm < 1, "None or a number in (0, 1)", f"{false_alarm=}")
         self.window, self.hop, self.min_period, self.strongest = window, hop, min_period, strongest
         self.peaks, self.false_alarm, self.short = peaks, false_alarm, short
         self._logged: set[str] = set()
@@ -163,11 +158,9 @@ class SpectrogramAnalysis(PeriodFinder):
     def chunks(self, places: int) -> list[tuple[int, int]]:
         """The chunks [start, stop) of a route."""
         shortest, seen = 2 * self.min_period, f"the route has {places} place{'s' * (places != 1)}"
-        if places < shortest:
-            raise InputError(f"{seen}; expected at least {shortest}, two periods of {self.min_period}")
-        if places < self.window and self.short == "refuse":
-            cure = "the window, or a shorter window, or --mapper.periods.short shrink"
-            raise InputError(f"{seen}; expected at least {self.window}, {cure}")
+        expect(places >= shortest, f"at least {shortest}, two periods of {self.min_period}", seen)
+        cure = "the window, or a shorter window, or --mapper.periods.short shrink"
+        expect(places >= self.window or self.short != "refuse", f"at least {self.window}, {cure}", seen)
         window = min(self.window, places)
         hop = min(self.hop or window, window)
         chunks = [(start, start + window) for start in range(0, places - window + 1, hop)]
@@ -206,8 +199,7 @@ class SpectrogramAnalysis(PeriodFinder):
 
     def _strongest(self, chunk: Tensor) -> tuple[Tensor, Tensor]:
         """The strongest bins of each feature (count,D), and the largest share of its power in one (D,)."""
-        if not chunk.isfinite().all():
-            raise InputError("spectrogram got features that are not finite; expected finite numbers")
+        expect(chunk.isfinite().all(), "finite numbers", "spectrogram got features that are not finite")
         power, last = chunk_power(chunk), len(chunk) // self.min_period
         bins = strongest_bins(power, min(self.strongest, len(power)), last, self.peaks)
         share = power.gather(0, bins.clamp(min=0)) / power[1:].sum(0)

@@ -14,7 +14,7 @@ from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.recognition.filter import PlaceFilter, moments_of
 from dejavu_torch.recognition.select import best_candidates, best_match
 from dejavu_torch.recognition.smoother import Drive, PlaceSmoother
-from dejavu_torch.types import InputError, Match, SequenceModel
+from dejavu_torch.types import InputError, Match, SequenceModel, expect
 
 TOLERANCE = 5  # places within which an answer is right
 MARGIN = 2.0  # weight of the margin beside the score itself
@@ -197,8 +197,7 @@ def calibrated(
                 right = ((index - places).abs() <= TOLERANCE) & (index >= 0) & on_map
                 columns = confidences, right, torch.full_like(right, on_map)
                 rows.append(tuple(column.cpu()[places.cpu() >= 0] for column in columns))
-    if not answers[0]:
-        raise InputError("there are no queries to calibrate by; expected some")
+    expect(answers[0], "some", "there are no queries to calibrate by")
     platts: list[Platt | None] = []
     for rows in answers:
         confidences, right, on_the_map = map(torch.cat, zip(*rows, strict=True))

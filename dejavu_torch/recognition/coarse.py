@@ -20,7 +20,7 @@ from dejavu_torch.maps.spectral_map import SpectralMap, scores_of
 from dejavu_torch.maps.spectrum import half_cycles
 from dejavu_torch.recognition.search import NmsSpec, Scan, Search, TopK, check_search, empty_topk
 from dejavu_torch.recognition.select import best_candidates
-from dejavu_torch.types import InputError
+from dejavu_torch.types import expect
 
 MIN_PLACES = 20_000  # a shorter map is scanned, which is as fast
 OVERHEAD = 16  # bytes of a sample besides its descriptor
@@ -77,8 +77,7 @@ def plan(place_map: PlaceMap, limit: int | None = None) -> SamplingPlan | None:
     if place_map.places < max(MIN_PLACES, 2 * longest):
         return None
     minimum = size(longest, SPACINGS[0], SPACINGS[1])
-    if limit < minimum:
-        raise InputError(f"search_memory is {limit} bytes; expected at least {minimum}, for a chunk")
+    expect(limit >= minimum, f"at least {minimum}, for a chunk", f"search_memory is {limit} bytes")
     held = explained_variance(place_map)
     widest_coarse = next((d for d in SPACINGS if held[d] >= COARSE), 0)
     widest_fine = next((d for d in SPACINGS if held[d] >= FINE), 2)

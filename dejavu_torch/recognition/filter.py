@@ -14,7 +14,7 @@ from dejavu_torch.memory import is_plain, without_autocast
 from dejavu_torch.recognition.motion import MIN_PROBABILITY, Layout, Motion, Rates, checked_rates, logits
 from dejavu_torch.recognition.online import Learned
 from dejavu_torch.recognition.sequence import each
-from dejavu_torch.types import InputError, SequenceModel
+from dejavu_torch.types import InputError, SequenceModel, expect
 
 
 class Moments(NamedTuple):
@@ -99,15 +99,11 @@ class PlaceFilter(SequenceModel):
     ) -> None:
         super().__init__()
         moves = checked_rates(moves, jump, leave, enter)
-        if not 0 < sharpness < math.inf or not math.isfinite(off_map):
-            seen = f"sharpness {sharpness}, off_map {off_map}"
-            raise InputError(f"{seen}; expected finite numbers, the sharpness above 0")
-        if not isinstance(within, int) or within < 0:
-            raise InputError(f"within is {within}; expected a whole number, at least 0")
-        if threshold is not None and math.isnan(threshold):
-            raise InputError("the threshold is NaN; expected a number, or None")
-        if not isinstance(lag, int) or lag < 0:
-            raise InputError(f"the lag is {lag}; expected a whole number of queries, at least 0")
+        fits = 0 < sharpness < math.inf and math.isfinite(off_map)
+        expect(fits, "finite numbers, the sharpness above 0", f"sharpness {sharpness}, off_map {off_map}")
+        expect(isinstance(within, int) and within >= 0, "a whole number, at least 0", within=within)
+        expect(threshold is None or not math.isnan(threshold), "a number, or None", "the threshold is NaN")
+        expect(isinstance(lag, int) and lag >= 0, "a whole number of queries, at least 0", lag=lag)
         self.move_logits = nn.Parameter(logits(*moves))
         self.rate_logits = nn.Parameter(logits(1 - jump - leave, jump, leave))
         self.enter_logit = nn.Parameter(logits(enter)[0] - logits(1 - enter)[0])
@@ -263,12 +259,10 @@ class PlaceFilter(SequenceModel):
         return Motion(Layout(like.shape[-1], route_starts=tuple(route_starts)), rates)
 
     def check(self, queries: int | None, places: int) -> None:
-        if self.lag and queries is not None:
-            seen = f"a lag of {self.lag} where all queries are known"
-            raise InputError(f"{seen}; expected a PlaceSmoother, or a LiveLocalizer")
+        seen = f"a lag of {self.lag} where all queries are known"
+        expect(not self.lag or queries is None, "a PlaceSmoother, or a LiveLocalizer", seen)
         furthest = len(self.move_logits) - 1
-        if furthest >= places:
-            raise InputError(f"moves of up to {furthest} places on a map of {places}; expected fewer")
+        expect(furthest < places, "fewer", f"moves of up to {furthest} places on a map of {places}")
 
     def threshold_of(self, threshold: float | None) -> float | None:
         """The filter's own threshold: its scores are probabilities, not distances."""

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.maps.place_map import PlaceMap
-from dejavu_torch.types import InputError
+from dejavu_torch.types import expect
 
 Search = Literal["auto", "coarse", "exact", "scan"]
 NmsSpec = tuple[int, int]  # (k, radius): k candidates with this suppression radius in places
@@ -23,8 +23,7 @@ SCORES_AT_ONCE = 2**24  # numbers of Q x n in memory
 
 def check_search(method: str) -> None:
     """Refuse an unknown search method."""
-    if method not in get_args(Search):
-        raise InputError(f"search {method!r}; expected auto, coarse, exact or scan")
+    expect(method in get_args(Search), "auto, coarse, exact or scan", f"search {method!r}")
 
 
 def num_needed(wanted: list[NmsSpec], places: int) -> int:

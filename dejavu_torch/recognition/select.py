@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.types import InputError, Match
+from dejavu_torch.types import Match, check_shape, expect
 
 HIGHEST = torch.finfo(torch.float64).max  # threshold that accepts every finite score; JSON has no infinity
 PROBABLE = 0.5  # minimum probability that a calibrated map accepts by default
@@ -67,10 +67,8 @@ def best_candidates(scores: Tensor, k: int, radius: int, places: Tensor | None =
     Convention: the first wins among equal scores. A candidate without a finite score is place -1 with score
         +inf; all others are accepted.
     """
-    if not isinstance(scores, Tensor):
-        raise InputError(f"scores are a {type(scores).__name__}; expected a tensor (Q,N)")
-    if scores.ndim != 2 or scores.shape[1] < 1:
-        raise InputError(f"scores are {tuple(scores.shape)}; expected (Q,N) with N >= 1")
+    expect(isinstance(scores, Tensor), "a tensor (Q,N)", f"scores are a {type(scores).__name__}")
+    check_shape(scores, "Q N>=1", "scores are")
     columns = scores.shape[1]
     check_candidates(k, radius, columns)
     found = []
@@ -96,12 +94,9 @@ def best_candidates(scores: Tensor, k: int, radius: int, places: Tensor | None =
 
 def check_candidates(k: int, radius: int, places: int | None = None) -> None:
     """Refuse k or a radius out of range; `places` is None if unknown."""
-    if k < 1:
-        raise InputError(f"{k} candidates per query; expected at least 1")
-    if places is not None and k > places:
-        raise InputError(f"{k} candidates per query on {places} places; expected at most {places}")
-    if radius < 0:
-        raise InputError(f"the suppression radius is {radius} places; expected at least 0")
+    expect(k >= 1, "at least 1", f"{k} candidates per query")
+    expect(places is None or k <= places, f"at most {places}", f"{k} candidates per query on {places} places")
+    expect(radius >= 0, "at least 0", f"the suppression radius is {radius} places")
 
 
 def accept(score: Tensor, threshold: float | None) -> Tensor:

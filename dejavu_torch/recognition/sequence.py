@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dejavu_torch.memory import is_readable
-from dejavu_torch.types import InputError, SequenceModel
+from dejavu_torch.types import InputError, SequenceModel, expect
 
 MAX_LENGTH = 2**16  # queries of a sequence
 
@@ -55,9 +55,8 @@ class SequenceMatcher(SequenceModel):
             raise InputError(f"a sequence of {length} queries; expected a whole number, 1 to {MAX_LENGTH}")
         self.length = length
         self.speeds = tuple(float(speed) for speed in speeds) if isinstance(speeds, Iterable) else ()
-        if not self.speeds or not all(map(math.isfinite, self.speeds)):
-            seen = f"the speeds are {speeds}"
-            raise InputError(f"{seen}; expected at least one finite number of places per query")
+        fits = self.speeds and all(map(math.isfinite, self.speeds))
+        expect(fits, "at least one finite number of places per query", f"the speeds are {speeds}")
 
     def _shifts(self, speed: float) -> list[int]:
         """Places from a trajectory's end back to it, 0, 1, .., T - 1 queries before the latest."""
@@ -123,9 +122,8 @@ class SequenceMatcher(SequenceModel):
 
     def check(self, queries: int | None, places: int) -> None:
         for speed in self.speeds:
-            if abs(self._shifts(speed)[-1]) >= places:
-                seen = f"a sequence of {self.length} queries at {speed:g} places per query on {places} places"
-                raise InputError(f"{seen}; expected a shorter one, or speeds that do not leave the map")
+            seen = f"a sequence of {self.length} queries at {speed:g} places per query on {places} places"
+            expect(abs(self._shifts(speed)[-1]) < places, "a shorter one, or other speeds", seen)
         if queries is not None and self.length > queries:
             log.warning("a sequence of %d queries, but there are %d: all are used", self.length, queries)
 

@@ -30,7 +30,7 @@ from dejavu_torch.recognition.motion import (
     checked_rates,
     logits,
 )
-from dejavu_torch.types import InputError, SequenceModel
+from dejavu_torch.types import InputError, SequenceModel, expect
 
 MOVES = (0.2, 0.5, 0.2, 0.05, 0.02, 0.015, 0.015)
 SLOW = (0.67, 0.25, 0.05, 0.01, 0.01, 0.005, 0.005)  # of which EM starts if that at one place a query fails
@@ -166,15 +166,11 @@ class PlaceSmoother(SequenceModel):
     ) -> None:
         super().__init__()
         moves = checked_rates(moves, jump, leave, enter)
-        if not 0 <= turn <= 1:
-            raise InputError(f"turn is {turn}; expected a probability")
-        if not 0 < separation < math.inf or not 1 <= tempering < math.inf:
-            seen = f"separation {separation}, tempering {tempering}"
-            raise InputError(f"{seen}; expected finite numbers, above 0 and at least 1")
-        if not isinstance(within, int) or within < 0:
-            raise InputError(f"within is {within}; expected a whole number, at least 0")
-        if threshold is not None and math.isnan(threshold):
-            raise InputError("the threshold is NaN; expected a number, or None")
+        expect(0 <= turn <= 1, "a probability", turn=turn)
+        fits = 0 < separation < math.inf and 1 <= tempering < math.inf
+        expect(fits, "finite, above 0 and at least 1", f"separation {separation}, tempering {tempering}")
+        expect(isinstance(within, int) and within >= 0, "a whole number, at least 0", within=within)
+        expect(threshold is None or not math.isnan(threshold), "a number, or None", "the threshold is NaN")
         for link in links:
             if len(link) != 3 or not all(isinstance(place, int) for place in link[:2]):
                 raise InputError(f"a link is {link}; expected a place, another one, and a probability")
@@ -540,9 +536,8 @@ def check_descriptors(descriptors: Tensor | None) -> Tensor:
     """Descriptors (Q,K), or an InputError that tells why not."""
     if descriptors is None:
         raise InputError("a function of scores without descriptors; expected those of the queries")
-    if descriptors.ndim != 2 or not bool(descriptors.isfinite().all()):
-        seen = f"descriptors are {tuple(descriptors.shape)} {descriptors.dtype}"
-        raise InputError(f"{seen}; expected finite ones (Q,K)")
+    seen = f"descriptors are {tuple(descriptors.shape)} {descriptors.dtype}"
+    expect(descriptors.ndim == 2 and bool(descriptors.isfinite().all()), "finite ones (Q,K)", seen)
     return descriptors
 
 

@@ -25,7 +25,7 @@ from dejavu_torch.memory import check_room, concatenate
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, resampled
 from dejavu_torch.resize import resize_frames
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.types import InputError, Traverse, expect
 
 READ_BATCH = 64  # frames
 MIN_FRAMES = 300  # with fewer, a trained network is usually worse than an untrained map
@@ -93,9 +93,8 @@ class Clips(DistributedSampler[list[int]]):
         self.generator = torch.Generator().manual_seed(torch.initial_seed() % 2**63)
         self.total = sum(len(run) // clip for run in runs)
         self.clips = min(batch_size // clip, self.total) // processes  # of a process's part of a batch
-        if not self.clips:
-            seen = f"there are {self.total} clips of {clip} frames and {processes} processes"
-            raise InputError(f"{seen}; expected one for each")
+        seen = f"there are {self.total} clips of {clip} frames and {processes} processes"
+        expect(self.clips, "one for each", seen)
 
     def __len__(self) -> int:
         return self.total // (self.clips * self.num_replicas)
@@ -170,8 +169,7 @@ class RouteData(LightningDataModule):
         held_out: float = 0.05,
     ) -> None:
         super().__init__()
-        if not 0 <= held_out <= 0.5:
-            raise InputError(f"held_out is {held_out}; expected a share of the frames, from 0 to 0.5")
+        expect(0 <= held_out <= 0.5, "a share of the frames, from 0 to 0.5", held_out=held_out)
         if tolerance < 0 or clip < 1 or not 2 <= batch_size < LARGEST or batch_size % clip:
             seen = f"tolerance is {tolerance}, batch_size {batch_size}, clip {clip}"
             raise InputError(f"{seen}; expected 0 or more, and batches of at least 2 frames in whole clips")
@@ -179,8 +177,7 @@ class RouteData(LightningDataModule):
             raise InputError(f"resize is {resize}; expected (height, width), at least 1 pixel each")
         routes = routes_of(source) if isinstance(source, (str, Path)) else source
         self.listed = {"source": [*routes] if isinstance(routes, (list, tuple)) else [routes]}
-        if not self.listed["source"]:
-            raise InputError("source is an empty list; expected at least one traverse")
+        expect(self.listed["source"], "at least one traverse", "source is an empty list")
         for name, given in (("second", second), ("validation", validation), ("query", query)):
             self.listed[name] = self._one_each(name, given)
         self.truths = {
@@ -190,9 +187,8 @@ class RouteData(LightningDataModule):
         }
         for name, one in ((name, one) for name, every in self.listed.items() for one in every):
             fits = isinstance(one, (str, Path, Traverse, Tensor, np.ndarray))
-            if not fits and (one is not None or name == "source"):
-                expected = "a path, a Traverse, or a tensor or array of frames or features"
-                raise InputError(f"{name} is of type {type(one).__name__}; expected {expected}")
+            expected = "a path, a Traverse, or a tensor or array of frames or features"
+            expect(fits or (one is None and name != "source"), expected, f"{name} is a {type(one).__name__}")
         paths = [str(one) for one in self.listed["source"] if isinstance(one, (str, Path))]
         for one in (one for one in paths if paths.count(one) > 1):
             raise InputError(f"{one} is given twice; expected each route once, other traverses as second")
@@ -216,9 +212,8 @@ class RouteData(LightningDataModule):
         if count > 1 and name in ("validation", "query") and any(one is not None for one in each):
             seen = f"{name} is given, but there are {count} routes, for which no map is made"
             raise InputError(f"{seen}; expected none, and `dejavu compare A B --descriptor FILE` for a route")
-        if len(each) != count:
-            seen = f"{name} lists {len(each)}, and there are {count} routes"
-            raise InputError(f"{seen}; expected one for each route, null for routes without")
+        seen = f"{name} lists {len(each)}, and there are {count} routes"
+        expect(len(each) == count, "one for each route, null for routes without", seen)
         return each
 
     @property
@@ -279,8 +274,7 @@ class RouteData(LightningDataModule):
             self._read(name)
         if stage == "fit":
             self.unseen()  # so that its errors come before the training
-        if stage == "test" and "query" not in self.sets:
-            raise InputError("there is nothing to test on; expected data.query, a second traverse")
+        expect(stage != "test" or "query" in self.sets, "data.query, to test on", "there is no query")
 
     @property
     def _size(self) -> tuple[int, int] | None:
@@ -373,9 +367,8 @@ class RouteData(LightningDataModule):
         each = torch.arange(len(frames)).split([len(part) for part in parts])
         runs = [run for part in each for run in runs_of(part[kept[part]])]
         longest = max(map(len, runs))
-        if longest < self.clip:
-            seen = f"clip is {self.clip} and the longest segment to train on has {longest} frames"
-            raise InputError(f"{seen} (data.held_out is {self.held_out:g}); expected a shorter clip")
+        seen = f"clip is {self.clip} and the longest segment to train on has {longest} frames"
+        expect(longest >= self.clip, "a shorter clip", f"{seen} (data.held_out is {self.held_out:g})")
         batch_size = self.batch_size * self._processes[1]
         return _loader(frames, Clips(runs, batch_size, self.clip, process, processes))
 
@@ -420,12 +413,10 @@ def store(traverse: Traverse, resize: tuple[int, int] | None = None) -> Tensor:
                 needed = 4 * len(batch) * batch.shape[1] * math.prod(resize)
                 check_room(needed, f"{traverse.name} in frames of {resize[0]} x {resize[1]}")
                 batch = resize_frames(batch, resize)
-            if shape and tuple(batch.shape[1:]) != shape:
-                seen = f"{traverse.name} holds frames of {shape} and of {tuple(batch.shape[1:])}"
-                raise InputError(f"{seen}; expected one size, as with data.resize")
+            seen = f"{traverse.name} holds frames of {shape} and of {tuple(batch.shape[1:])}"
+            expect(not shape or tuple(batch.shape[1:]) == shape, "one size, as with data.resize", seen)
             shape = tuple(batch.shape[1:])
-            if not batch.isfinite().all():
-                raise InputError(f"{traverse.name} holds NaN or infinite values; expected finite numbers")
+            expect(batch.isfinite().all(), "finite numbers", f"{traverse.name} holds NaN or infinite values")
             yield (batch if batch.ndim == 2 else (batch * 255).round().clamp(0, 255).byte().flatten(1)).cpu()
 
     values = concatenate(rows())

@@ -39,11 +39,10 @@ from dejavu_torch.training.task import (
     WHITENING,
     RouteTask,
     check_preprocess,
-    check_settings,
     coded,
     trainable,
 )
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, expect
 
 log = logging.getLogger("dejavu_torch")
 
@@ -100,13 +99,10 @@ class DescriptorTask(RouteTask):
         backbone = SmallCNN() if backbone is None else backbone
         mapper = SpectralMapper() if mapper is None else mapper
         strengths = whitening.strengths if isinstance(whitening, Whitening) else STRENGTHS
-        if isinstance(mapper, TemplateMapper):
-            expected = "expected another one, or --model TemplateTask to train templates"
-            raise InputError(f"the mapper is a TemplateMapper; {expected}")
-        check_settings(
-            ("rate", rate, 0 <= rate < math.inf, "0 or more, such as 1"),
-            ("whitening.strengths", strengths, strengths == STRENGTHS, "those of data.augmentation alone"),
-        )
+        fits = not isinstance(mapper, TemplateMapper)
+        expect(fits, "another one, or --model TemplateTask to train templates", mapper=type(mapper))
+        expect(0 <= rate < math.inf, "0 or more, such as 1", rate=rate)
+        expect(strengths == STRENGTHS, "those of data.augmentation alone", f"whitening.strengths {strengths}")
         check_preprocess(preprocess)
         if embedding := coded(backbone):
             backbone = embedding.without_code()
@@ -126,23 +122,14 @@ class DescriptorTask(RouteTask):
     def prepare(self) -> None:
         data, name = self.data, self.data.route_name
         frames = data.sets["reference"]
-        if frames.values.ndim == 2:
-            raise InputError(f"{name} holds ready features; expected frames, or `dejavu learn`")
-        if not trainable(self.features):
-            seen = f"{type(self.features).__name__} has nothing to train"
-            raise InputError(f"{seen}; expected parameters that are not frozen, or `dejavu learn`")
-        if self.rate and len(data.routes) > 1:
-            seen = (
-                f"model.rate is {self.rate}, for the bits of one map, and there are {len(data.routes)} routes"
-            )
-            raise InputError(f"{seen}; expected model.rate 0, or one route")
-        if (
-            self.dejavu.whitening is not None
-            and not data.augmentation.acts
-            and data.sources["second"] is None
-        ):
-            seen = "data.augmentation changes nothing, so the whitening has nothing to learn from"
-            raise InputError(f"{seen}; expected an augmentation, data.second, or model.whitening none")
+        expect(frames.values.ndim != 2, "frames, or `dejavu learn`", f"{name} holds ready features")
+        seen = f"{type(self.features).__name__} has nothing to train"
+        expect(trainable(self.features), "parameters that are not frozen, or `dejavu learn`", seen)
+        seen = f"model.rate is {self.rate}, for the bits of one map, and there are {len(data.routes)} routes"
+        expect(not self.rate or len(data.routes) <= 1, "model.rate 0, or one route", seen)
+        seen = "data.augmentation changes nothing, so the whitening has nothing to learn from"
+        fits = self.dejavu.whitening is None or data.augmentation.acts or data.sources["second"] is not None
+        expect(fits, "an augmentation, data.second, or model.whitening none", seen)
         self.every = every = similar_span(frames, data.lengths, data.tolerance)
         if every < SPARSE <= data.tolerance:
             log.warning(

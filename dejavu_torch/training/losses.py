@@ -14,7 +14,7 @@ from torch import Tensor
 from dejavu_torch.maps.quantisation import quantise
 from dejavu_torch.maps.spectrum import Transform, from_spectrum
 from dejavu_torch.maps.template_map import TemplateMap, weight_per_feature
-from dejavu_torch.types import InputError, Plan
+from dejavu_torch.types import InputError, Plan, check_shape, expect
 
 STEP = 0.5  # of the lines' RMS, at the start
 PER_OCTAVE = 2  # frequency bands with a width each
@@ -61,9 +61,8 @@ def place_cross_entropy(
     _check_places(places, scores)
     queries, n = scores.shape
     outside = places[(places < -1) | (places >= n)].tolist()
-    if tolerance < 0 or outside:
-        seen = f"the tolerance is {tolerance} and places outside the route are {outside[:3]}"
-        raise InputError(f"{seen}; expected at least 0, and places in 0..{n - 1} or -1")
+    seen = f"the tolerance is {tolerance} and places outside the route are {outside[:3]}"
+    expect(tolerance >= 0 and not outside, f"at least 0, and places in 0..{n - 1} or -1", seen)
     # +1 at the start of each range of right places, -1 after its end: avoids Q x N x R
     known = (places >= 0).int()
     steps = known.new_zeros(queries, n + 1)
@@ -82,8 +81,7 @@ def _check_places(places: Tensor, scores: Tensor) -> None:
 def _surprise(scores: Tensor, right: Tensor, temperature: Tensor | float) -> Tensor:
     """-log of the probability of the right columns, for rows with any. (Q,K), (Q,K) bool -> (rows,)."""
     smallest = torch.as_tensor(temperature).min().item()
-    if not smallest > 0:
-        raise InputError(f"the temperature is {smallest}; expected a number above 0")
+    expect(smallest > 0, "a number above 0", temperature=smallest)
     covered = ~scores.isposinf()
     right = right & covered
     kept = right.any(1)
@@ -116,8 +114,7 @@ def phase_cross_entropy(
         tensor(0.6931)
     """
     shapes, expected = [tuple(d.shape) for d in distances], [(len(places), layer.phases) for layer in plan]
-    if not shapes or shapes != expected:
-        raise InputError(f"the distances are {shapes}; expected at least one, the plan's {expected}")
+    expect(shapes and shapes == expected, f"the plan's {expected}, 1 or more", f"the distances are {shapes}")
     surprise = []
     for block, layer in zip(distances, plan, strict=True):
         _check_places(places, block)
@@ -252,12 +249,10 @@ def coded_proxies(
         >>> coded.proxies.shape, bool(coded.bits > 0)
         (torch.Size([40, 8]), True)
     """
-    if lines.ndim != 2 or len(lines) < 2 or not lines.shape[1]:
-        raise InputError(f"the lines are {tuple(lines.shape)}; expected (W,K), at least 2 segments")
+    check_shape(lines, "W>=2 K>=1", "the lines are")
     band = bands_of(len(lines), transform).to(lines.device)
     expected = (int(band.max()) + 1) * lines.shape[1]
-    if tuple(log_widths.shape) != (expected,):
-        raise InputError(f"the widths are {tuple(log_widths.shape)}; expected ({expected},)")
+    check_shape(log_widths, str(expected), "the widths are")
     scaled = lines / lines.square().mean().clamp(min=MIN_ENERGY).sqrt() / log_step.exp()
     levels = scaled + (quantise(scaled.detach(), 1.0) - scaled).detach()
     noisy = scaled + torch.rand(scaled.shape, dtype=scaled.dtype).to(scaled) - 0.5 if noise else scaled

@@ -11,7 +11,7 @@ from torchmetrics.utilities.data import dim_zero_cat
 
 from dejavu_torch.data.ground_truth import GroundTruth, Truth, scored_and_right
 from dejavu_torch.evaluation.curves import Scores, check_truth, evaluate
-from dejavu_torch.types import InputError, Match
+from dejavu_torch.types import Match, expect
 
 
 class PlaceRecognition(Metric):
@@ -59,8 +59,7 @@ class PlaceRecognition(Metric):
         truth = check_truth(match, truth, self.tolerance)
         if match.index.ndim == 2:
             match = match.map(lambda column: column[:, 0])
-        if match.score.isnan().any():
-            raise InputError("a score is NaN; expected numbers or +inf")
+        expect(not match.score.isnan().any(), "numbers or +inf", "a score is NaN")
         index, score = match.index.cpu(), match.score.detach().cpu()
         truth = GroundTruth(*(part.cpu() for part in truth))
         kept, good = scored_and_right(index, truth, self.tolerance)

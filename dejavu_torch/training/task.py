@@ -34,7 +34,7 @@ from dejavu_torch.training.checkpoint import CheckpointFiles, read_checkpoint, t
 from dejavu_torch.training.datamodule import MIN_FRAMES, Batch, RouteData, StoredFrames
 from dejavu_torch.training.losses import LastLosses, Losses
 from dejavu_torch.training.metrics import PlaceRecognition
-from dejavu_torch.types import InputError, Training
+from dejavu_torch.types import InputError, Training, expect
 
 log = logging.getLogger("dejavu_torch")
 
@@ -75,11 +75,9 @@ class RouteTask(pl.LightningModule):
         weight_bits: Literal[8, 32],
     ) -> None:
         super().__init__()
-        check_settings(
-            ("lr", lr, lr > 0, "a number above 0"),
-            ("weight_decay", weight_decay, weight_decay >= 0, "0 or more"),
-            ("weight_bits", weight_bits, weight_bits in BITS, f"one of {', '.join(map(str, BITS))}"),
-        )
+        expect(lr > 0, "a number above 0", lr=lr)
+        expect(weight_decay >= 0, "0 or more", weight_decay=weight_decay)
+        expect(weight_bits in BITS, f"one of {', '.join(map(str, BITS))}", weight_bits=weight_bits)
         self.dejavu, self.lr, self.weight_decay, self.weight_bits = dejavu, lr, weight_decay, weight_bits
         if start is not None:
             start_from(dejavu.features, start)
@@ -166,9 +164,8 @@ class RouteTask(pl.LightningModule):
     def _check_places(self) -> None:
         """Refuse the map of another route, which a checkpoint may hold."""
         places, count = self.map.places, len(self.data.sets["reference"])
-        if places not in (0, count):
-            seen = f"the map has {places} places, {self.data.reference.name} has {count}"
-            raise InputError(f"{seen}; expected the route that the map was made of")
+        seen = f"the map has {places} places, {self.data.reference.name} has {count}"
+        expect(places in (0, count), "the route that the map was made of", seen)
 
     def _say_few(self) -> None:
         data = self.data
@@ -207,9 +204,8 @@ class RouteTask(pl.LightningModule):
                 made.append(make(values))
         features = torch.cat(made)
         features = features[order.argsort().to(features.device)]
-        if not features.isfinite().all():
-            seen = f"{type(self.features).__name__} gives NaN or infinite features for {self.data.route_name}"
-            raise InputError(f"{seen}; expected finite numbers")
+        seen = f"{type(self.features).__name__} gives NaN or infinite features for {self.data.route_name}"
+        expect(features.isfinite().all(), "finite numbers", seen)
         return features
 
     @torch.no_grad()
@@ -349,9 +345,8 @@ class RouteTask(pl.LightningModule):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuse a checkpoint of another model or other routes."""
-        if checkpoint["task"] != type(self).__name__:
-            seen = f"the checkpoint is of a {checkpoint['task']}"
-            raise InputError(f"{seen}; expected one of a {type(self).__name__}")
+        seen = f"the checkpoint is of a {checkpoint['task']}"
+        expect(checkpoint["task"] == type(self).__name__, f"one of a {type(self).__name__}", seen)
         if self._trainer is not None:
             self.resumed = True
             if checkpoint["routes"] != self._routes():
@@ -380,13 +375,6 @@ def load_weights(task: RouteTask, path: str | Path) -> None:
         task.on_load_checkpoint(checkpoint)
         task.load_state_dict(checkpoint["state_dict"])
     task.resumed = False
-
-
-def check_settings(*settings: tuple[str, object, bool, str]) -> None:
-    """Refuse the first setting (name, value, whether it fits, what was expected) that does not fit."""
-    for name, value, fits, expected in settings:
-        if not fits:
-            raise InputError(f"{name} is {value!r}; expected {expected}")
 
 
 def check_preprocess(preprocess: Preprocess | None) -> None:
@@ -434,10 +422,9 @@ def freeze_parts(
     named = dict(backbone.named_parameters())
     for prefix in prefixes:
         chosen = [p for name, p in named.items() if name.startswith(prefix)]
-        if not chosen:
-            known = ", ".join(sorted({name.partition(".")[0] for name in named}))
-            seen = f"freeze has {prefix!r}, but no parameter of {type(backbone).__name__} begins with it"
-            raise InputError(f"{seen}; expected one of {known or 'none, it has none'}")
+        known = ", ".join(sorted({name.partition(".")[0] for name in named}))
+        seen = f"freeze has {prefix!r}, but no parameter of {type(backbone).__name__} begins with it"
+        expect(chosen, f"one of {known or 'none, it has none'}", seen)
         for parameter in chosen:
             parameter.requires_grad_(False)
     return {

@@ -29,7 +29,7 @@ from dejavu_torch.training.losses import (
     place_chance,
 )
 from dejavu_torch.training.task import RouteTask, check_preprocess, coded, trainable
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, expect
 
 log = logging.getLogger("dejavu_torch")
 
@@ -182,9 +182,8 @@ class TemplateTask(RouteTask):
             else:
                 features = self.of_reference(embedding.code, self.descriptors(), shuffled=True)
             self.dejavu.learn_features(features, self.data.reference)
-        if not self.route.plan:
-            name = self.data.reference.name
-            raise InputError(f"nothing repeats in the features of {name}; expected imposed periods")
+        name = self.data.reference.name
+        expect(self.route.plan, "imposed periods", f"nothing repeats in the features of {name}")
         self.route.trainable(True)
         self.map.train(self.training)
         if self.data.resize is not None:

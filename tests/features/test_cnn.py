@@ -127,8 +127,8 @@ def test_state_dict_round_trip():
         (lambda: small(widths=(4, 0)), ("widths=(4, 0)", "at least 1 each")),
         (lambda: small(squeeze=0), ("squeeze=0", "at least 1 each")),
         (lambda: small(cell=-1), ("cell=-1", "cell 0 or more")),
-        (lambda: small()(torch.rand(2, 1, 16, 24)), ("(2, 1, 16, 24)", "(B,3,H,W)")),
-        (lambda: small()(torch.rand(3, 16, 24)), ("(3, 16, 24)", "(B,3,H,W)")),
+        (lambda: small()(torch.rand(2, 1, 16, 24)), ("(2, 1, 16, 24)", "(B, 3, H, W)")),
+        (lambda: small()(torch.rand(3, 16, 24)), ("(3, 16, 24)", "(B, 3, H, W)")),
     ],
 )
 def test_what_is_refused(call, facts):

@@ -267,11 +267,11 @@ def test_principal_components_are_those_of_the_covariance(features):
         (lambda: Whitening(bits=6), ("bits=6", "4, 8 or 16")),
         (lambda: Whitening(strengths="all"), ("strengths", "'all'")),
         (lambda: learned(torch.ones(600, 4), None), ("600 descriptors", "all the same")),
-        (lambda: learned(PLACES[:1], None), ("(1, 40)", "N at least 2")),
+        (lambda: learned(PLACES[:1], None), ("(1, 40)", "N>=2")),
         (lambda: Whitening().learn(PLACES, []), ("no views", "or None")),
         (lambda: learned(views=PLACES), ("views", "augmentation")),
         (lambda: learned(numbers=20), ("numbers is 20", "rank 12")),
-        (lambda: learned(views=VIEWS[:, :7]), ("7 features", "expected 40")),
+        (lambda: learned(views=VIEWS[:, :7]), ("(600, 7)", "(V, 40)")),
         (lambda: learned()(VIEWS[:, :7]), ("(600, 7)", "(B, 40)")),
     ],
 )

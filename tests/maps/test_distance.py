@@ -66,7 +66,7 @@ def test_cosine_of_nothing_is_1():
 def test_what_has_no_distance_is_refused():
     with refused("'manhattan' is unknown; expected l1, l2, cosine"):
         phase_distances(torch.rand(3, 4), torch.rand(5, 4), "manhattan")  # type: ignore[arg-type]
-    with refused("(3, 4) and (5, 3); expected (Q,F) and (P,F)"):
+    with refused("queries (3, 4); expected (Q, 3)"):
         phase_distances(torch.rand(3, 4), torch.rand(5, 3))
 
 

@@ -229,8 +229,8 @@ def test_convention_10_memory_does_not_grow_with_the_queries(largest_tensor):
 @pytest.mark.parametrize(
     ("make_scores", "words"),
     [
-        (lambda route: route.scores(torch.rand(3, 5)), ["queries are (3, 5)", "expects (Q, 4)"]),
-        (lambda route: route.scores(torch.rand(4)), ["queries are (4,)", "expects (Q, 4)"]),
+        (lambda route: route.scores(torch.rand(3, 5)), ["queries (3, 5)", "expected (Q, 4)"]),
+        (lambda route: route.scores(torch.rand(4)), ["queries (4,)", "expected (Q, 4)"]),
         (
             lambda _: TemplateMap(metric="manhattan"),
             ["metric is 'manhattan'; expected Literal['l1', 'l2', 'cosine']"],

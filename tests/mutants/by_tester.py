@@ -281,8 +281,8 @@ MUTANTS = [
     Mutant(
         "A frame that is not in [0, 1] is refused live.",
         "dejavu_torch/live/localizer.py",
-        "if not (low >= -ROUNDING and high <= 1 + ROUNDING):",
-        "if not (low >= -ROUNDING):",
+        "expect(low >= -ROUNDING and high <= 1 + ROUNDING,",
+        "expect(low >= -ROUNDING,",
         ("tests/live/test_localizer.py::test_what_is_no_frame_of_the_map_is_refused_and_changes_nothing",),
     ),
     Mutant(

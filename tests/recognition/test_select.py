@@ -84,9 +84,9 @@ def test_what_cannot_be_is_refused():
         ((scores, 0, 5), ["0 candidates", "at least 1"]),
         ((scores, 5, 5), ["5 candidates", "on 4 places", "at most 4"]),
         ((scores, 2, -1), ["radius is -1 places", "at least 0"]),
-        ((scores[0], 2, 5), ["(4,)", "(Q,N)"]),
-        ((scores[:, :0], 1, 5), ["(2, 0)", "(Q,N) with N >= 1"]),
-        ((scores[None], 1, 5), ["(1, 2, 4)", "(Q,N)"]),
+        ((scores[0], 2, 5), ["(4,)", "(Q, N>=1)"]),
+        ((scores[:, :0], 1, 5), ["(2, 0)", "(Q, N>=1)"]),
+        ((scores[None], 1, 5), ["(1, 2, 4)", "(Q, N>=1)"]),
     ):
         with refused(*words):
             best_candidates(*arguments)

@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dejavu_torch.data.simulate.route import Random, SimulatedRoute, choice, option, rgb
-from dejavu_torch.types import InputError
+from dejavu_torch.types import expect
 
 DASH_PERIOD = 93
 CHEVRON_PERIOD = 171
@@ -280,9 +280,8 @@ class AerialRoad(SimulatedRoute):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.frames > LONGEST[self.ground]:
-            expected = f"1 <= frames <= {LONGEST[self.ground]}, with ground=repeat {LONGEST['repeat']}"
-            raise InputError(f"{self.name} has frames={self.frames}; expected {expected}")
+        expected = f"1 <= frames <= {LONGEST[self.ground]}, with ground=repeat {LONGEST['repeat']}"
+        expect(self.frames <= LONGEST[self.ground], expected, f"{self.name} has frames={self.frames}")
         self.length, self.places = self.frames, torch.arange(self.frames, dtype=torch.float64)
         random, swing = Random("flight", self.seed, self.traverse), 1.0 if self.traverse else 0.4
         looks = [random.pick(values) for values in ((0.78, 0.84, 1.16), (0.86, 1.16), (-0.06, 0.06))]

@@ -18,7 +18,7 @@ from torch import Tensor
 from dejavu_torch.data.simulate.route import Random, SimulatedRoute, option
 from dejavu_torch.data.simulate.scenery import FOOT, Structure, World
 from dejavu_torch.data.simulate.sheets import FAR, Light, Painter, Thing, View
-from dejavu_torch.types import InputError
+from dejavu_torch.types import expect
 
 FPS = 25.0
 ACCELERATION = 0.9  # metres per second squared, the same for braking
@@ -70,14 +70,12 @@ class Railway(SimulatedRoute):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0.5 <= self.width / self.height <= 4:
-            seen = f"sim:{self.kind} has height={self.height} and width={self.width}"
-            raise InputError(f"{seen}; expected a width of 0.5 to 4 times the height")
+        seen = f"sim:{self.kind} has height={self.height} and width={self.width}"
+        expect(0.5 <= self.width / self.height <= 4, "a width of 0.5 to 4 times the height", seen)
         reference = self._ride(0)
         distance = self._ride(self.traverse) if self.traverse else reference
-        if self.frames > len(distance):
-            expected = f"at most the {len(distance)} of its route"
-            raise InputError(f"sim:{self.kind} has frames={self.frames}; expected {expected}")
+        expected = f"at most the {len(distance)} of its route"
+        expect(self.frames <= len(distance), expected, f"sim:{self.kind} has frames={self.frames}")
         self.size = self.height, self.width
         self.length = self.frames or len(distance)
         self.distance = distance[: self.length]
