@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import logging
-import math
-import re
-import zipfile
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from numbers import Real
@@ -21,7 +17,8 @@ from torch.nn.utils.rnn import pad_sequence
 
 from dejavu_torch.data.coordinates import FORMS as COORDINATES
 from dejavu_torch.data.coordinates import Near, coordinates_of
-from dejavu_torch.data.files import LARGEST, as_number, check_regular, read_rows, read_text, reading
+from dejavu_torch.data.files import LARGEST, as_number, check_regular
+from dejavu_torch.data.truth_files import places_of_queries, read_csv, read_json, read_matrices
 from dejavu_torch.memory import check_room
 from dejavu_torch.text import one_line
 from dejavu_torch.types import InputError, Traverse, expect
@@ -29,7 +26,7 @@ from dejavu_torch.types import InputError, Traverse, expect
 log = logging.getLogger("dejavu_torch")
 
 PAIRS_PER_BLOCK = 2**20
-OFTEN, FEW = 0.2, 20  # share of right pairs that a warning is due for, and places from which on
+OFTEN, FEW = 0.2, 20  # share of right pairs from which a warning is given, and places below which it is not
 EXPECTED = (
     "an integer offset such as 0, a .csv of query,place, a .json with a list of places for each query, an "
     ".npz with GThard, metres:25 for sources with coordinates, or utm:25, degrees:25 or metres:25 for those "
@@ -37,7 +34,6 @@ EXPECTED = (
 )
 FORMS = "integer places (Q,) or (Q,R), or a boolean matrix (Q,N)"
 BYTES_PER_PLACE = 32  # of a table of right places, including temporaries
-Listed = dict[int, list[float]]  # the places of each query in a file
 
 
 class GroundTruth(NamedTuple):
@@ -72,6 +68,7 @@ def as_ground_truth(truth: Truth, queries: int | None = None) -> GroundTruth:
         >>> as_ground_truth([[3, 4], [], [0]]).positives.tolist()
         [[3, 4], [-1, -1], [0, -1]]
     """
+    expect(truth is not None, FORMS, "there is no truth")
     if not is_given(truth):
         if queries is None:
             raise InputError(f"the truth is {truth} for an unknown number of queries; expected the number")
@@ -79,7 +76,7 @@ def as_ground_truth(truth: Truth, queries: int | None = None) -> GroundTruth:
         assert ground_truth is not None
         return ground_truth
     if not isinstance(truth, GroundTruth):
-        truth = _every(_table_of(truth))
+        truth = all_judged(_table_of(truth))
     shapes = [tuple(part.shape) for part in truth]
     rows = len(truth.judged) if queries is None else queries
     fits = shapes[1] == (rows,) and all(len(shape) == 2 and shape[0] == rows for shape in shapes[::2])
@@ -88,7 +85,7 @@ def as_ground_truth(truth: Truth, queries: int | None = None) -> GroundTruth:
     return truth
 
 
-def _every(places: Tensor) -> GroundTruth:
+def all_judged(places: Tensor) -> GroundTruth:
     """The places (Q,R) of queries that are all judged."""
     judged = torch.ones(len(places), dtype=torch.bool, device=places.device)
     return GroundTruth(places, judged, places.new_zeros(len(places), 0))
@@ -97,7 +94,7 @@ def _every(places: Tensor) -> GroundTruth:
 def _table_of(truth: Any) -> Tensor:
     """Places in any form as a table (Q,R) int64, -1 as padding."""
     if isinstance(truth, Tensor) and truth.dtype in (torch.int32, torch.int64) and truth.ndim == 2:
-        return _checked(truth.long())
+        return refuse_zero_one_matrix(truth.long())
     try:
         rows = _rows(truth)
     except (TypeError, ValueError, RuntimeError) as error:
@@ -109,10 +106,10 @@ def _table_of(truth: Any) -> Tensor:
     expect(not odd and len(kinds) <= 1, FORMS, f"a query of the truth has {seen}")
     if kinds == {True}:
         return padded(row.nonzero()[:, 0] for row in rows)
-    return _checked(padded(row.long() for row in rows))
+    return refuse_zero_one_matrix(padded(row.long() for row in rows))
 
 
-def _checked(table: Tensor) -> Tensor:
+def refuse_zero_one_matrix(table: Tensor) -> Tensor:
     """Refuse what is a matrix of queries and places rather than a table of places."""
     matrix = len(table) > 1 and table.shape[1] > 3
     if matrix and bool(((table == 0) | (table == 1)).all()):
@@ -297,39 +294,45 @@ def find_ground_truth(
         >>> find_ground_truth("-1", None, None, frames=3, queries=3).positives.tolist()
         [[-1], [0], [1]]
     """
-    numbers, every = (torch.arange(queries), True) if isinstance(queries, int) else (queries, False)
+    numbers, all_frames = (torch.arange(queries), True) if isinstance(queries, int) else (queries, False)
     if truth is None:
         if reference is None or query is None:
             return None
         if reference.places is not None and query.places is not None:
-            return _every(position_truth(reference.places, _rows_of(query.places, numbers)))
+            return all_judged(position_truth(reference.places, _rows_of(query.places, numbers)))
         same_length = not resampled and len(query) == frames
         if same_length and (aligned or are_aligned(reference, query)):
-            return _every(offset_truth(numbers, frames))
+            return all_judged(offset_truth(numbers, frames))
         return None
     parsed = check_ground_truth(truth, interpolate)
     if isinstance(parsed, GroundTruth):
-        count = len(numbers) if every else None if query is None else len(query)
+        count = len(numbers) if all_frames else None if query is None else len(query)
         rows = (_rows_of(part, numbers) for part in as_ground_truth(parsed, count))
         ground_truth = GroundTruth(*rows)
     elif isinstance(parsed, int):
-        ground_truth = _every(offset_truth(numbers, frames, parsed))
+        ground_truth = all_judged(offset_truth(numbers, frames, parsed))
     elif isinstance(parsed, Near):
         if reference is None or query is None:
             raise InputError(f"truth {truth} reads the names of images; expected reference and query")
         stored, asked = coordinates_of([reference, query], parsed.kind)
         asked = _rows_of(asked, numbers)
-        ground_truth = _every(near_truth(stored, asked, parsed.radius))
+        ground_truth = all_judged(near_truth(stored, asked, parsed.radius))
         ground_truth = ground_truth._replace(judged=~asked.isnan().any(1))
     elif parsed.suffix.lower() == ".npz":
-        ground_truth = _read_matrices(parsed, numbers, frames, every)
+        hard, *soft = read_matrices(parsed, numbers, frames, all_frames)
+        ground_truth = all_judged(padded(row.nonzero()[:, 0] for row in hard))
+        if soft:
+            ignored = padded(row.nonzero()[:, 0] for row in soft[0] & ~hard)
+            ground_truth = ground_truth._replace(ignored=ignored)
     else:
         length = len(query) if query is not None and resampled else None
         if parsed.suffix.lower() == ".csv":
-            places = _read_csv(parsed, frames, interpolate)
+            listed = read_csv(parsed, frames, interpolate)
         else:
-            places = _read_json(parsed, frames, len(numbers) if every else length, int(numbers.max()) + 1)
-        ground_truth = _from_table(parsed, places, numbers, length, interpolate, resampled)
+            count = len(numbers) if all_frames else length
+            listed = read_json(parsed, frames, count, int(numbers.max()) + 1)
+        places, judged = places_of_queries(parsed, listed, numbers, length, interpolate, resampled)
+        ground_truth = all_judged(padded(places))._replace(judged=judged)
     if (ground_truth.positives >= 0).any():
         _warn_of_many(ground_truth, frames)
         return ground_truth
@@ -395,146 +398,3 @@ def offset_of(truth: Truth | None, positions: bool = False) -> int | None:
     with suppress(ValueError):
         return offset if abs(offset := int(str(truth))) < LARGEST else None
     return None
-
-
-def _from_table(
-    path: Path, places: Listed, numbers: Tensor, length: int | None, interpolate: bool, resampled: bool
-) -> GroundTruth:
-    """The places that a file lists for queries; `length`: of a resampled query traverse."""
-    first, last = min(places), max(places)
-    queries = numbers.tolist()
-    if interpolate:
-        knots = sorted(places)
-        between = np.interp(numbers.numpy(), knots, [places[query][0] for query in knots]).tolist()
-        places = {query: [at] for query, at in zip(queries, between, strict=True) if first <= query <= last}
-    elif length is not None and last >= length:
-        raise InputError(f"{path} lists query {last}; expected frames from 0 to {length - 1}")
-    elif resampled:
-        places = _to_queries(places, numbers)
-    judged = torch.tensor([query in places for query in queries])
-    wanted = f"{int(numbers.min())} to {int(numbers.max())}"
-    expect(judged.any(), f"some of {wanted}", f"{path} lists queries from {first} to {last}")
-    rows = [[_rounded(place) for place in places.get(query, ())] for query in queries]
-    positives = padded(torch.tensor(row, dtype=torch.int64) for row in rows)
-    return _every(positives)._replace(judged=judged)
-
-
-def _to_queries(listed: Listed, frames: Tensor) -> Listed:
-    """Add the places of each listed frame to the nearest of the queries' `frames`, unless it is listed."""
-    ordered = frames.sort().values
-    moved = {frame: list(places) for frame, places in listed.items()}
-    for frame in listed:
-        after = int(torch.searchsorted(ordered, frame))
-        near = ordered[max(0, after - 1) : after + 1].tolist()
-        nearest = min(near, key=lambda other: abs(other - frame))
-        if nearest not in listed:
-            moved.setdefault(nearest, []).extend(listed[frame])
-    return moved
-
-
-def _read_csv(path: Path, frames: int | None, interpolate: bool) -> Listed:
-    rows = read_rows(path, "lines of query,place")
-    if rows and all(as_number(cell) is None for cell in rows[0][1] if cell):
-        number, names = rows.pop(0)
-        # any other column, such as a distance, would be read as a right place
-        if names[0].lower() != "query" or not all(re.match("place|$", name.lower()) for name in names[1:]):
-            expected = "query,place[,place...]"
-            raise InputError(f"{path}, line {number}: columns {','.join(names)}; expected {expected}")
-    end, valid = (LARGEST, "0") if frames is None else (frames, f"0 to {frames - 1}")
-    listed: Listed = {}
-    for line, cells in rows:
-        while not cells[-1]:
-            del cells[-1]
-        numbers = [value for value in map(as_number, cells) if value is not None]
-        query, places = (numbers or [-1.0])[0], [place for place in numbers[1:] if place != -1]
-        outside = [place for place in places if place < 0 or _rounded(place) >= end]
-        fractions = [place for place in places if place % 1 and not interpolate]
-        problem = ""
-        if len(numbers) < len(cells):
-            bad = next(cell for cell in cells if as_number(cell) is None)
-            problem = f"{bad!r} is not a frame number; expected query,place"
-        elif query < 0 or query % 1:
-            problem = f"query {cells[0]}; expected a whole number of at least 0"
-        elif query in listed:
-            problem = f"query {cells[0]} is listed twice; expected each once"
-        elif outside:
-            problem = f"place {outside[0]:.12g}; expected a reference frame from {valid}, or -1 for none"
-        elif fractions:
-            problem = f"place {fractions[0]:.12g}; expected a whole number, or interpolation"
-        elif interpolate and len(places) != 1:
-            problem = f"{len(places)} places; expected one per line to interpolate"
-        if problem:
-            raise InputError(f"{path}, line {line}: {problem}")
-        listed[int(query)] = places
-    expect(listed, "lines of query,place", f"{path} lists no query")
-    return listed
-
-
-def _read_json(path: Path, frames: int | None, count: int | None, minimum: int) -> Listed:
-    """The places of `count` queries, None if unknown, at least `minimum`."""
-    expected = "a list of whole numbers, its right places, for each query"
-    with reading(path, "is not JSON", expected):
-        rows = json.loads(read_text(path, expected))
-    if not isinstance(rows, list) or len(rows) < minimum or count not in (None, len(rows)):
-        seen = f"a list of {len(rows)}" if isinstance(rows, list) else f"a {type(rows).__name__}"
-        queries = f"{minimum} queries or more" if count is None else f"{count} queries"
-        raise InputError(f"{path} contains {seen}; expected {expected}, {queries}")
-    end, valid = (LARGEST, "0") if frames is None else (frames, f"0 to {frames - 1}")
-    for query, row in enumerate(rows):
-        listed = isinstance(row, list)
-        wrong = [item for item in (row if listed else [row]) if type(item) is not int or not 0 <= item < end]
-        if wrong or not listed:
-            seen = f"{path}, query {query}: {json.dumps(wrong[0] if listed else row)[:40]}"
-            raise InputError(f"{seen}; expected a list of reference frames from {valid}")
-    return dict(enumerate(rows))
-
-
-def _rounded(place: float) -> int:
-    return math.floor(place) + (place % 1 >= 0.5)  # floor(place + 0.5) is wrong for large numbers
-
-
-def _read_matrices(path: Path, numbers: Tensor, frames: int | None, every: bool) -> GroundTruth:
-    """An npz with the matrices (reference frames, query frames) GThard and/or GTsoft."""
-    expected = "boolean matrices GThard and/or GTsoft"
-    matrices: list[np.ndarray] = []
-    with reading(path, "is not a complete .npz file of arrays", expected), zipfile.ZipFile(path) as archive:
-        stored = [name.removesuffix(".npy") for name in archive.namelist()]
-        for name in ("GThard", "GTsoft"):
-            if name not in stored:
-                continue
-            with archive.open(f"{name}.npy") as file:
-                np.lib.format.read_magic(file)
-                shape, by_columns, dtype = np.lib.format.read_array_header_1_0(file)  # of a plain matrix
-                _check_shape(f"{path}: {name} is {shape} {dtype}", shape, dtype, numbers, frames, every)
-                size = math.prod(shape) * dtype.itemsize
-                check_room(2.0 * size + 16.0 * math.prod(shape), f"{path}: {name} {shape}")
-                data = file.read(size + 1)
-            if len(data) != size:
-                raise ValueError(f"{name} has {len(data)} bytes or more instead of {size}")
-            matrices.append(np.frombuffer(data, dtype).reshape(shape, order="F" if by_columns else "C"))
-    expect(matrices, expected, f"{path} contains {', '.join(stored) or 'nothing'}")
-    expect(matrices[0].shape == matrices[-1].shape, "the same", f"{path}: GThard and GTsoft differ in shape")
-    if not all(np.isfinite(matrix).all() for matrix in matrices):
-        raise InputError(f"{path} contains values that are not finite; expected {expected}")
-    hard, *soft = (torch.from_numpy(matrix[:, numbers.numpy()] != 0).T for matrix in matrices)
-    truth = _every(padded(row.nonzero()[:, 0] for row in hard))
-    return truth._replace(ignored=padded(row.nonzero()[:, 0] for row in soft[0] & ~hard)) if soft else truth
-
-
-def _check_shape(
-    seen: str, shape: tuple[int, ...], dtype: np.dtype[Any], numbers: Tensor, frames: int | None, every: bool
-) -> None:
-    """Refuse anything but a matrix (reference frames, query frames), with a hint if it is transposed."""
-    count = int(numbers.max()) + 1
-
-    def fits(rows: int, columns: int) -> bool:
-        # queries given by number may be a subset of the columns
-        return frames in (None, rows) and (columns == count or (columns > count and not every))
-
-    plain = len(shape) == 2 and dtype.kind in "biuf"
-    # without a known reference, a row for each query suggests that the matrix is transposed
-    transposed = plain and frames is None and shape[1] != count == shape[0]
-    if not plain or transposed or not fits(*shape):
-        rows = "reference frames" if frames is None else frames
-        hint = "; its transpose fits" if plain and fits(*shape[::-1]) else ""
-        raise InputError(f"{seen}; expected a matrix of ({rows}, {count}), one column per query frame{hint}")

@@ -159,8 +159,8 @@ class Preprocess(nn.Module):
         patch: side of the square patch for "patch", pixels, odd, at least 3.
         clip_limit: for "clahe": limit of histogram bins, relative to a flat one, at least 1 pixel; 0 is none.
         grid: (rows, columns) of tiles for "clahe"; they need not divide the frame.
-        size: pixels of the longer side to which `DejaVu.fit` reduces frames, but not below the features' own
-            `resize`; None keeps their size.
+        size: pixels of the longer side to which `DejaVu.at_map_size` reduces frames, but not below the
+            features' own `resize`; None keeps their size.
         range: (low, high), or "low,high", which become 0 and 1, with what lies outside: for frames that use
             few of 16 bits, as of a thermal or depth camera. In [0, 1], or up to 65535 as of 16 bits. "auto"
             is measured when a route is learned, see `measured_range`, and then kept, for queries too.

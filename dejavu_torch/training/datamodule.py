@@ -298,7 +298,7 @@ class RouteData(LightningDataModule):
         return None
 
     def _open(self, source: Any, shape: tuple[int, ...] | None = None) -> Traverse:
-        """A traverse, at the size of `DejaVu.fit` of the task's model unless `resize` is given."""
+        """A traverse, at the size of `DejaVu.at_map_size` of the task's model unless `resize` is given."""
         traverse = as_traverse(source)
         model = self._of_task("dejavu")
         return traverse if model is None or self.resize is not None else model.at_map_size(traverse, shape)

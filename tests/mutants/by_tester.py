@@ -496,7 +496,7 @@ MUTANTS = [
     ),
     Mutant(
         "A list of right places has one for each query.",
-        "dejavu_torch/data/ground_truth.py",
+        "dejavu_torch/data/truth_files.py",
         "or count not in (None, len(rows))",
         "",
         ("tests/data/test_ground_truth.py::-k json_of_another_shape",),

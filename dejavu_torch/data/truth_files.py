@@ -1,0 +1,171 @@
+"""Files of a ground truth: lines of query,place, lists in JSON, matrices in .npz."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dejavu_torch.data.files import LARGEST, as_number, read_rows, read_text, reading
+from dejavu_torch.memory import check_room
+from dejavu_torch.types import InputError, expect
+
+Listed = dict[int, list[float]]  # the places of each query in a file
+
+
+def places_of_queries(
+    path: Path, listed: Listed, numbers: Tensor, length: int | None, interpolate: bool, resampled: bool
+) -> tuple[list[Tensor], Tensor]:
+    """The places (n,) int64 that a file lists for each query, and which queries it lists, (Q,) bool.
+
+    Args:
+        listed: the content of the file. numbers: (Q,) the frame of each query in its source.
+        length: of the query's source, if it is resampled.
+    """
+    first, last = min(listed), max(listed)
+    queries = numbers.tolist()
+    if interpolate:
+        knots = sorted(listed)
+        between = np.interp(numbers.numpy(), knots, [listed[query][0] for query in knots]).tolist()
+        listed = {query: [at] for query, at in zip(queries, between, strict=True) if first <= query <= last}
+    elif length is not None and last >= length:
+        raise InputError(f"{path} lists query {last}; expected frames from 0 to {length - 1}")
+    elif resampled:
+        listed = _to_queries(listed, numbers)
+    judged = torch.tensor([query in listed for query in queries])
+    wanted = f"{int(numbers.min())} to {int(numbers.max())}"
+    expect(judged.any(), f"some of {wanted}", f"{path} lists queries from {first} to {last}")
+    rows = [[_rounded(place) for place in listed.get(query, ())] for query in queries]
+    return [torch.tensor(row, dtype=torch.int64) for row in rows], judged
+
+
+def _to_queries(listed: Listed, frames: Tensor) -> Listed:
+    """Add the places of each listed frame to the nearest of the queries' `frames`, unless it is listed."""
+    ordered = frames.sort().values
+    moved = {frame: list(places) for frame, places in listed.items()}
+    for frame in listed:
+        after = int(torch.searchsorted(ordered, frame))
+        near = ordered[max(0, after - 1) : after + 1].tolist()
+        nearest = min(near, key=lambda other: abs(other - frame))
+        if nearest not in listed:
+            moved.setdefault(nearest, []).extend(listed[frame])
+    return moved
+
+
+def read_csv(path: Path, frames: int | None, interpolate: bool) -> Listed:
+    """The places of lines of query,place[,place...]."""
+    rows = read_rows(path, "lines of query,place")
+    if rows and all(as_number(cell) is None for cell in rows[0][1] if cell):
+        number, names = rows.pop(0)
+        # any other column, such as a distance, would be read as a right place
+        if names[0].lower() != "query" or not all(re.match("place|$", name.lower()) for name in names[1:]):
+            expected = "query,place[,place...]"
+            raise InputError(f"{path}, line {number}: columns {','.join(names)}; expected {expected}")
+    end, valid = (LARGEST, "0") if frames is None else (frames, f"0 to {frames - 1}")
+    listed: Listed = {}
+    for line, cells in rows:
+        while not cells[-1]:
+            del cells[-1]
+        numbers = [value for value in map(as_number, cells) if value is not None]
+        query, places = (numbers or [-1.0])[0], [place for place in numbers[1:] if place != -1]
+        outside = [place for place in places if place < 0 or _rounded(place) >= end]
+        fractions = [place for place in places if place % 1 and not interpolate]
+        problem = ""
+        if len(numbers) < len(cells):
+            bad = next(cell for cell in cells if as_number(cell) is None)
+            problem = f"{bad!r} is not a frame number; expected query,place"
+        elif query < 0 or query % 1:
+            problem = f"query {cells[0]}; expected a whole number of at least 0"
+        elif query in listed:
+            problem = f"query {cells[0]} is listed twice; expected each once"
+        elif outside:
+            problem = f"place {outside[0]:.12g}; expected a reference frame from {valid}, or -1 for none"
+        elif fractions:
+            problem = f"place {fractions[0]:.12g}; expected a whole number, or interpolation"
+        elif interpolate and len(places) != 1:
+            problem = f"{len(places)} places; expected one per line to interpolate"
+        if problem:
+            raise InputError(f"{path}, line {line}: {problem}")
+        listed[int(query)] = places
+    expect(listed, "lines of query,place", f"{path} lists no query")
+    return listed
+
+
+def read_json(path: Path, frames: int | None, count: int | None, minimum: int) -> Listed:
+    """The places of `count` queries, None if unknown, at least `minimum`."""
+    expected = "a list of whole numbers, its right places, for each query"
+    with reading(path, "is not JSON", expected):
+        rows = json.loads(read_text(path, expected))
+    if not isinstance(rows, list) or len(rows) < minimum or count not in (None, len(rows)):
+        seen = f"a list of {len(rows)}" if isinstance(rows, list) else f"a {type(rows).__name__}"
+        queries = f"{minimum} queries or more" if count is None else f"{count} queries"
+        raise InputError(f"{path} contains {seen}; expected {expected}, {queries}")
+    end, valid = (LARGEST, "0") if frames is None else (frames, f"0 to {frames - 1}")
+    for query, row in enumerate(rows):
+        listed = isinstance(row, list)
+        wrong = [item for item in (row if listed else [row]) if type(item) is not int or not 0 <= item < end]
+        if wrong or not listed:
+            seen = f"{path}, query {query}: {json.dumps(wrong[0] if listed else row)[:40]}"
+            raise InputError(f"{seen}; expected a list of reference frames from {valid}")
+    return dict(enumerate(rows))
+
+
+def _rounded(place: float) -> int:
+    return math.floor(place) + (place % 1 >= 0.5)  # floor(place + 0.5) is wrong for large numbers
+
+
+def read_matrices(path: Path, numbers: Tensor, frames: int | None, all_frames: bool) -> list[Tensor]:
+    """The matrices GThard and/or GTsoft of an npz, (reference frames, query frames), each as (Q,N) bool."""
+    expected = "boolean matrices GThard and/or GTsoft"
+    matrices: list[np.ndarray] = []
+    with reading(path, "is not a complete .npz file of arrays", expected), zipfile.ZipFile(path) as archive:
+        stored = [name.removesuffix(".npy") for name in archive.namelist()]
+        for name in ("GThard", "GTsoft"):
+            if name not in stored:
+                continue
+            with archive.open(f"{name}.npy") as file:
+                np.lib.format.read_magic(file)
+                shape, by_columns, dtype = np.lib.format.read_array_header_1_0(file)  # of a plain matrix
+                _check_shape(f"{path}: {name} is {shape} {dtype}", shape, dtype, numbers, frames, all_frames)
+                size = math.prod(shape) * dtype.itemsize
+                check_room(2.0 * size + 16.0 * math.prod(shape), f"{path}: {name} {shape}")
+                data = file.read(size + 1)
+            if len(data) != size:
+                raise ValueError(f"{name} has {len(data)} bytes or more instead of {size}")
+            matrices.append(np.frombuffer(data, dtype).reshape(shape, order="F" if by_columns else "C"))
+    expect(matrices, expected, f"{path} contains {', '.join(stored) or 'nothing'}")
+    expect(matrices[0].shape == matrices[-1].shape, "the same", f"{path}: GThard and GTsoft differ in shape")
+    if not all(np.isfinite(matrix).all() for matrix in matrices):
+        raise InputError(f"{path} contains values that are not finite; expected {expected}")
+    return [torch.from_numpy(matrix[:, numbers.numpy()] != 0).T for matrix in matrices]
+
+
+def _check_shape(
+    seen: str,
+    shape: tuple[int, ...],
+    dtype: np.dtype[Any],
+    numbers: Tensor,
+    frames: int | None,
+    all_frames: bool,
+) -> None:
+    """Refuse anything but a matrix (reference frames, query frames), with a hint if it is transposed."""
+    count = int(numbers.max()) + 1
+
+    def fits(rows: int, columns: int) -> bool:
+        # queries given by number may be a subset of the columns
+        return frames in (None, rows) and (columns == count or (columns > count and not all_frames))
+
+    plain = len(shape) == 2 and dtype.kind in "biuf"
+    # without a known reference, a row for each query suggests that the matrix is transposed
+    transposed = plain and frames is None and shape[1] != count == shape[0]
+    if not plain or transposed or not fits(*shape):
+        rows = "reference frames" if frames is None else frames
+        hint = "; its transpose fits" if plain and fits(*shape[::-1]) else ""
+        raise InputError(f"{seen}; expected a matrix of ({rows}, {count}), one column per query frame{hint}")

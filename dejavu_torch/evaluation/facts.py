@@ -1,0 +1,144 @@
+"""The entries of report.json of a comparison."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dejavu_torch.data.coordinates import Near, coordinates_of
+from dejavu_torch.data.ground_truth import Truth, check_ground_truth, describe_ground_truth, offset_of
+from dejavu_torch.evaluation.answers import answer_facts
+from dejavu_torch.evaluation.curves import auc_error
+from dejavu_torch.evaluation.evaluate import evaluation_facts
+from dejavu_torch.evaluation.localization import Localization
+from dejavu_torch.maps.distance import l1_backend
+from dejavu_torch.maps.summary import MapSummary
+from dejavu_torch.motion.resampling import ResampledTraverse, source_of
+from dejavu_torch.periods.spectrogram import BACKEND
+from dejavu_torch.recognition.filter import PlaceFilter
+from dejavu_torch.recognition.sequence import SequenceMatcher
+from dejavu_torch.types import Match
+
+QUANTILES = 0.5, 0.9, 0.99  # of errors in metres
+STANDING, FAR = 0.01, 256  # of the distance between places drawn at random: a camera that stands still
+
+
+def facts_of(run: Localization, seconds: Mapping[str, float]) -> dict[str, Any]:
+    """The entries about the map, the run and places where the camera stands."""
+    return {
+        **_map_facts(run.model.summary(), run.reference_features),
+        **_run_facts(run, seconds),
+        **_standing_facts(run),
+    }
+
+
+def _map_facts(summary: MapSummary, features: Tensor) -> dict[str, Any]:
+    """The entries of report.json about the map, whose places have these features (N,D)."""
+    chunks = [chunk._asdict() | {"periods": [*map(plain_number, chunk.periods)]} for chunk in summary.chunks]
+    names = ("kind", "map_bytes", "fixed_bytes", "route_bytes", "bytes_per_place", "lines")
+    return {
+        **{name: getattr(summary, name) for name in (*names, "templates", "template_numbers")},
+        "frames": len(features),
+        "backbone_bytes": summary.fixed.get("backbone", 0),
+        "route_bytes_per_place": summary.route_bytes / len(features),
+        "full_bytes": features.nbytes,
+        "periods": sorted({period for chunk in chunks for period in chunk["periods"]}),
+        "chunks": chunks,
+    }
+
+
+def _run_facts(run: Localization, seconds: Mapping[str, float]) -> dict[str, Any]:
+    """The entries of report.json about the run; no seconds to learn if the map is given."""
+    model, reference, query = run.model, run.reference, run.query
+    acceptance = model.acceptance(run.smoother or run.sequence)
+    facts = {
+        "answers": run.answers,
+        "seconds_learn": seconds["learn"],
+        "seconds_localize": seconds["localize"],
+        "l1_backend": l1_backend(),
+        "spectrogram_backend": BACKEND,
+        "threshold": acceptance.threshold,
+        "least_probability": acceptance.precision,
+        "sequence": run.sequence.length if isinstance(run.sequence, SequenceMatcher) else 1,
+        "speeds": list(run.sequence.speeds) if isinstance(run.sequence, SequenceMatcher) else None,
+        "filter": isinstance(run.sequence, PlaceFilter),
+        "trained": model.trained and model.trained._asdict(),
+        "reference": reference.name,
+        "query": query.name,
+    }
+    if run.smoother is not None:
+        facts["drive"] = drive = run.smoother.settled()
+        if run.truth is not None:
+            block = math.ceil(run.smoother.correlation)
+            drive["auc_error"] = auc_error(run.scored, run.truth, run.tolerance, block)
+    if run.matching.apart is not None:
+        facts["loops"] = run.matching.apart
+    if isinstance(reference, ResampledTraverse):
+        facts["resampling"] = {
+            "step": reference.step,
+            "reference_frames": len(reference.positions),
+            "query_frames": len(query.positions) if isinstance(query, ResampledTraverse) else None,
+        }
+    return facts
+
+
+def match_facts(
+    run: Localization, candidates: Match, truth: Truth | None, interpolate: bool, off: Mapping[str, Tensor]
+) -> dict[str, Any]:
+    """The entries of report.json about the answers; `off`: see `rejection_facts`."""
+    place_map, tolerance = run.model.map, run.tolerance
+    carried = all(source_of(traverse).places is not None for traverse in (run.reference, run.query))
+    words, offset = describe_ground_truth(truth, interpolate, carried), offset_of(truth, carried)
+    ranked, shown = place_map.table.scored(candidates.index), run.match.renumbered(place_map.frame_of)
+    facts = evaluation_facts(run.scored, ranked, run.truth, tolerance, place_map.positions, words, off)
+    alone = answer_facts(shown, run.query_frames, tolerance, run.truth is not None, offset)
+    if run.matching.apart is not None:
+        alone.pop("line", None)  # a second lap lies on one
+    return facts | alone
+
+
+def metric_facts(run: Localization, truth: Truth | None) -> dict[str, Any]:
+    """The entry `error_metres` of report.json: quantiles of the distances between queries and the places
+    reported for them, where the truth is by coordinates."""
+    parsed = None if truth is None else check_ground_truth(truth)
+    if not isinstance(parsed, Near):
+        return {}
+    stored, asked = coordinates_of([source_of(run.reference), source_of(run.query)], parsed.kind)
+    index = run.match.index
+    distance = (asked[run.query_frames] - stored[run.model.map.frame_of(index)]).norm(dim=1)
+    known = distance.isfinite() & (index >= 0)
+    if run.truth is not None and run.matching.apart is not None:
+        known &= (run.truth.positives >= 0).any(1)  # most places are no loop
+    facts: dict[str, Any] = {}
+    for name, chosen in (("all", known), ("accepted", known & run.match.accepted)):
+        if chosen.any():
+            quantiles = distance[chosen].quantile(torch.tensor(QUANTILES, dtype=torch.float64)).tolist()
+            facts[name] = {f"{share:g}": round(at, 3) for share, at in zip(QUANTILES, quantiles, strict=True)}
+    return {"error_metres": facts}
+
+
+def _standing_facts(run: Localization) -> dict[str, int]:
+    """The entry `standing` of report.json: places where the camera stands, if there are some."""
+    if isinstance(run.reference, ResampledTraverse):
+        return {}
+    count = count_standing(run.reference_features)
+    return {"standing": count} if count else {}
+
+
+def count_standing(descriptors: Tensor) -> int:
+    """How many of the places (N,K) look like the one before, as where the camera stands."""
+    drawn = torch.linspace(0, len(descriptors) - 1, min(FAR, len(descriptors))).round().long()
+    some = descriptors[drawn].float()
+    far = float((some - some.flip(0)).square().sum(1).median())
+    steps = descriptors.float().diff(dim=0).square().sum(1)
+    return int((steps < STANDING * far).sum())
+
+
+def plain_number(period: object) -> int | float:
+    """An exact period as a JSON number."""
+    value = float(period)  # type: ignore[arg-type]
+    return int(value) if value.is_integer() else value
