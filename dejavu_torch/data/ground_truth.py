@@ -15,7 +15,6 @@ from typing import Any, NamedTuple, TypeAlias, TypeGuard
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
@@ -53,7 +52,7 @@ class GroundTruth(NamedTuple):
     ignored: Tensor
 
 
-Truth: TypeAlias = str | Path | Tensor | NDArray[Any] | Sequence[int] | Sequence[Sequence[int]] | GroundTruth
+Truth: TypeAlias = str | Path | Tensor | np.ndarray | Sequence[int] | Sequence[Sequence[int]] | GroundTruth
 
 
 def as_ground_truth(truth: Truth, queries: int | None = None) -> GroundTruth:
@@ -224,7 +223,7 @@ def ground_truth_in_places(truth: GroundTruth, place_of: Callable[[Tensor], Tens
     return truth._replace(positives=place_of(truth.positives), ignored=place_of(truth.ignored))
 
 
-def is_given(truth: Truth | None) -> TypeGuard[Tensor | NDArray[Any] | Sequence[Any] | GroundTruth]:
+def is_given(truth: Truth | None) -> TypeGuard[Tensor | np.ndarray | Sequence[Any] | GroundTruth]:
     """Whether a ground truth is places themselves, not words or a file that tell of them."""
     return truth is not None and not isinstance(truth, str | Path | Real)
 

@@ -840,9 +840,8 @@ MUTANTS = [
     Mutant(
         "A class on the command line may stand behind its settings.",
         "dejavu_torch/cli/parser.py",
-        "for name in first for value in vars(found)[name]), *others]",
-        "for name in first[:1] for value in vars(found)[name]), *others, *(f'{name}={value}' "
-        "for name in first[1:] for value in vars(found)[name])]",
+        "*spelled[configs:], *others]",
+        "*others, *spelled[configs:]]",
         ("tests/test_cli_hub.py::-k overrule_it", "tests/test_cli_networks.py::-k functions_methods"),
     ),
     Mutant(
