@@ -93,7 +93,7 @@ def _every(places: Tensor) -> GroundTruth:
     return GroundTruth(places, judged, places.new_zeros(len(places), 0))
 
 
-def _table_of(truth: Any) -> Tensor:
+def _table_of(truth: Iterable[object]) -> Tensor:
     """Places in any form as a table (Q,R) int64, -1 as padding."""
     if isinstance(truth, Tensor) and truth.dtype in (torch.int32, torch.int64) and truth.ndim == 2:
         return _checked(truth.long())
@@ -120,7 +120,7 @@ def _checked(table: Tensor) -> Tensor:
     return table
 
 
-def _rows(truth: Any) -> list[Tensor]:
+def _rows(truth: Iterable[object]) -> list[Tensor]:
     """What a truth says of each query, (R,)."""
     if isinstance(truth, Sequence) and any(isinstance(row, Sequence | Tensor | np.ndarray) for row in truth):
         rows = [torch.as_tensor(row) for row in truth]

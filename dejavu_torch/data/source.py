@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 from urllib.parse import parse_qsl
 
 import numpy as np
@@ -27,7 +27,7 @@ from dejavu_torch.data.video import VIDEO_SUFFIXES, Video
 from dejavu_torch.types import Facts, InputError, Traverse, expect
 
 # of frames or features: see `as_traverse`
-Source: TypeAlias = Traverse | Tensor | np.ndarray | str | Path | Sequence[Any] | Dataset[Any]
+Source: TypeAlias = Traverse | Tensor | np.ndarray | str | Path | Sequence[object] | Dataset[object]
 CONVERTED = {  # kinds of files that other programs turn into images
     ".gif": "an animation; expected it converted, as by `ffmpeg -i FILE FOLDER/%06d.png`",
     ".zip": "an archive; expected it unpacked, as by `unzip FILE -d FOLDER`",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor, nn
@@ -158,7 +158,7 @@ class Whitening(nn.Module):
         components: int = COMPONENTS,
         shrinkage: float | None = None,
         views: int | None = None,
-        strengths: Facts | None = None,
+        strengths: Mapping[str, Any] | None = None,
         seed: int = 0,
         bits: Literal[4, 8, 16] | None = None,
         groups: list[int] | None = None,
