@@ -28,7 +28,7 @@ from dejavu_torch.features.hub import made as made  # config files name it here
 from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import REGISTRY
 from dejavu_torch.text import one_line
-from dejavu_torch.types import InputError
+from dejavu_torch.types import Facts, InputError
 
 MODEL = "model"  # the parameter of a command that is a DejaVu: each of its arguments is an option
 COMMAND = "command"  # the parameter that is the command line itself
@@ -80,7 +80,7 @@ def whole_numbers(value: object) -> Iterator[int]:
 class HelpFormatter(jsonargparse.DefaultHelpFormatter):
     """Help without lists of all installed classes, and without defaults of null."""
 
-    def _expand_help(self, action: Any) -> str:
+    def _expand_help(self, action: argparse.Action) -> str:
         text, cut, _ = super()._expand_help(action).partition(", known subclasses: ")
         text = text.replace("<class '", "").replace("'>", "").replace(" | null, default: null", "")
         return text + (")" if cut else "")
@@ -92,7 +92,7 @@ class HelpAll(argparse.Action):
     def __init__(self, option_strings: Sequence[str], dest: str, **settings: Any) -> None:
         super().__init__(option_strings, argparse.SUPPRESS, 0, default=argparse.SUPPRESS, **settings)
 
-    def __call__(self, parser: Any, *_: Any) -> None:
+    def __call__(self, parser: Any, *_: object) -> None:
         parser.whole = True
         parser.print_help()
         parser.exit()
@@ -101,7 +101,7 @@ class HelpAll(argparse.Action):
 class Preset(jsonargparse.ActionConfigFile):  # type: ignore[name-defined, misc]
     """--config: the name of a preset, or a YAML file of options."""
 
-    def __call__(self, parser: Any, cfg: Any, values: Any, option_string: str | None = None) -> None:
+    def __call__(self, parser: Parser, cfg: object, values: str, option_string: str | None = None) -> None:
         path = find_config(values)
         read_config(path)
         super().__call__(parser, cfg, str(path), option_string)
@@ -150,11 +150,11 @@ class Parser(jsonargparse.ArgumentParser):
             for one, text in zip(hidden, texts, strict=True):
                 one.help = text
 
-    def parse_object(self, *args: Any, **settings: Any) -> Any:
+    def parse_object(self, *args: object, **settings: object) -> Any:
         accept_networks(self)
         return super().parse_object(*args, **settings)
 
-    def _parsed(self, args: Any, *rest: Any, **settings: Any) -> Any:
+    def _parsed(self, args: Sequence[str] | None, *rest: Any, **settings: Any) -> Any:
         accept_networks(self)
         for word in args or ():
             if not word or (word.startswith("--") and word.endswith("=")):
@@ -267,7 +267,7 @@ def command_parser(name: str, function: Callable[..., None], program: str = "dej
     return parser
 
 
-def described(thing: Callable[..., Any]) -> tuple[str | None, dict[str, str | None]]:
+def described(thing: Callable[..., object]) -> tuple[str | None, dict[str, str | None]]:
     """The description and the help of each argument, of a function or of a dataclass with its bases."""
     helps: dict[str, str | None] = {}
     for one in reversed(thing.__mro__ if isinstance(thing, type) else [thing]):
@@ -279,7 +279,7 @@ def described(thing: Callable[..., Any]) -> tuple[str | None, dict[str, str | No
 def add_option(parser: Any, parameter: inspect.Parameter, helps: Mapping[str, str | None]) -> None:
     """Add an option or a positional argument to a parser or a group of it, see `command_parser`."""
     keyword, default = parameter.kind is parameter.KEYWORD_ONLY, parameter.default
-    settings: dict[str, Any] = {"help": helps.get(parameter.name, argparse.SUPPRESS)}  # hidden
+    settings: Facts = {"help": helps.get(parameter.name, argparse.SUPPRESS)}  # hidden
     if parameter.annotation is bool:
         settings["action"] = "store_true"
     elif get_origin(parameter.annotation) is Sequence:
@@ -297,7 +297,7 @@ def add_option(parser: Any, parameter: inspect.Parameter, helps: Mapping[str, st
         action.const = BARE[parameter.name]
 
 
-def grouped(function: Callable[..., None], arguments: dict[str, Any]) -> dict[str, Any]:
+def grouped(function: Callable[..., None], arguments: Facts) -> Facts:
     """The arguments, with those of each dataclass of the function gathered in it."""
     for key, parameter in inspect.signature(function, eval_str=True).parameters.items():
         if is_dataclass(parameter.annotation):
@@ -324,7 +324,7 @@ def add_model(parser: Parser) -> None:
     parser.set_defaults(DEFAULT_PARTS)
 
 
-def parse(name: str, function: Callable[..., None], words: Sequence[str]) -> dict[str, Any]:
+def parse(name: str, function: Callable[..., None], words: Sequence[str]) -> Facts:
     """The arguments of a command's function, from the words after its name.
 
     Raises:
@@ -334,7 +334,7 @@ def parse(name: str, function: Callable[..., None], words: Sequence[str]) -> dic
     parser = command_parser(name, function)
     parsed = parser.parse_args(list(words))
     try:
-        arguments: dict[str, Any] = parser.instantiate(parsed).as_dict()
+        arguments: Facts = parser.instantiate(parsed).as_dict()
     except Exception as error:
         raise refusal(error) from error
     if MODEL in function.__annotations__:
@@ -342,7 +342,7 @@ def parse(name: str, function: Callable[..., None], words: Sequence[str]) -> dic
     return grouped(function, arguments)
 
 
-def _model_of(name: str, arguments: dict[str, Any], words: Sequence[str]) -> DejaVu:
+def _model_of(name: str, arguments: Facts, words: Sequence[str]) -> DejaVu:
     """The model that the arguments describe, which are removed from them.
 
     Args:
@@ -373,7 +373,7 @@ def _model_of(name: str, arguments: dict[str, Any], words: Sequence[str]) -> Dej
     return model
 
 
-def _check_settings(name: str, arguments: dict[str, Any], words: Sequence[str]) -> None:
+def _check_settings(name: str, arguments: Facts, words: Sequence[str]) -> None:
     """Refuse settings that a given map has already, and `learn` without a file to write."""
     if name == "learn":
         arguments["map"] = arguments["map"] or arguments["append"]

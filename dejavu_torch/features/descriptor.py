@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -74,7 +73,7 @@ class Descriptor(nn.Module):
         self.batch_size, self.weight_bits = batch_size, weight_bits
         self.reduces = False  # whether the whitening was added for ready features that are too wide for a map
         self.warned: set[tuple[str, str]] = set()  # (traverse, line) of warnings that were logged
-        self.known: dict[Any, tuple[object, Tensor]] | None = None  # features, see `remembering`
+        self.known: dict[object, tuple[object, Tensor]] | None = None  # features, see `remembering`
         self.register_buffer("_where", torch.zeros(0), persistent=False)
 
     @property

@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 from functools import cache
 from itertools import accumulate
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -22,7 +22,7 @@ from dejavu_torch.maps.place_map import PlaceMap, ScoreBlocks, one_of, require
 from dejavu_torch.maps.spectrum import Transform, from_slots, half_cycles, slots
 from dejavu_torch.maps.summary import ChunkSummary, MapSummary
 from dejavu_torch.memory import is_readable
-from dejavu_torch.types import InputError, expect
+from dejavu_torch.types import Facts, InputError, expect
 
 SpectralMetric = Literal["cosine", "l2"]
 MIN_NORM = 1e-6  # of the RMS norm in a chunk, or of the mean's norm: shorter descriptors count as 0
@@ -472,13 +472,13 @@ class SpectralMap(PlaceMap):
         longest = max((stop - start for start, stop in self.chunks), default=1)
         return max(COPIES * longest, BLOCK // max(1, self.dimension))
 
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> Facts:
         return {name: getattr(self, name) for name in ("metric", "transform", "chunk", "resolution")}
 
-    def get_extra_state(self) -> dict[str, Any]:
+    def get_extra_state(self) -> Facts:
         return {**super().get_extra_state(), "routes": [route._asdict() for route in self.routes]}
 
-    def set_extra_state(self, state: dict[str, Any]) -> None:
+    def set_extra_state(self, state: Facts) -> None:
         super().set_extra_state(state)
         self.routes = tuple(Route(**route) for route in state["routes"])
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import torch
 import torch.nn.functional as F
@@ -30,7 +30,7 @@ from dejavu_torch.recognition.motion import (
     checked_rates,
     logits,
 )
-from dejavu_torch.types import InputError, SequenceModel, expect
+from dejavu_torch.types import Facts, InputError, SequenceModel, expect
 
 MOVES = (0.2, 0.5, 0.2, 0.05, 0.02, 0.015, 0.015)
 SLOW = (0.67, 0.25, 0.05, 0.01, 0.01, 0.005, 0.005)  # of which EM starts if that at one place a query fails
@@ -192,7 +192,7 @@ class PlaceSmoother(SequenceModel):
     def start(self, places: int, fixed: bool = False) -> Tensor:
         raise InputError(WHOLE)
 
-    def step(self, *_: Any) -> tuple[Tensor, Tensor]:
+    def step(self, *_: object) -> tuple[Tensor, Tensor]:
         raise InputError(WHOLE)
 
     def check(self, queries: int | None, places: int) -> None:
@@ -455,7 +455,7 @@ class PlaceSmoother(SequenceModel):
         return likelihood
 
     @torch.no_grad()
-    def settled(self) -> dict[str, Any]:
+    def settled(self) -> Facts:
         """What the smoother settled on, for a report."""
         _, jump, leave = self.rate_logits.softmax(0).tolist()
         return {
