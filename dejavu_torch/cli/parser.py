@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import inspect
 import os
-import re
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import is_dataclass
@@ -17,16 +16,15 @@ import docstring_parser
 import jsonargparse
 from jsonargparse.typing import restricted_string_type
 
+from dejavu_torch.cli.messages import LONGEST, UsageError, by_options, causes, refusal
 from dejavu_torch.cli.names import FIRST_OPTIONS
 from dejavu_torch.cli.networks import accept_networks, is_made, names_network
-from dejavu_torch.cli.networks import with_hub as with_hub
 from dejavu_torch.cli.options import named_features, refuse_with
 from dejavu_torch.cli.presets import find_config, read_config
 from dejavu_torch.data.files import LARGEST
 from dejavu_torch.data.source import check_not_read
 from dejavu_torch.features.hub import made as made  # config files name it here
 from dejavu_torch.model import DejaVu
-from dejavu_torch.model_file import REGISTRY
 from dejavu_torch.text import one_line
 from dejavu_torch.types import Facts, InputError
 
@@ -45,27 +43,6 @@ HINT = (
 )
 BARE = {"velocity": "GroundOdometry", "page": 8765}  # values of options given without one
 MapFile = restricted_string_type("MapFile", r".*\.safetensors")
-LONGEST = 300  # characters of a message; longer ones are cut
-
-
-class UsageError(InputError):
-    """A command line or config file that the commands do not understand."""
-
-
-def causes(error: BaseException | None) -> Iterator[BaseException]:
-    """An exception and its causes; jsonargparse wraps each in one that says more."""
-    while error is not None:
-        yield error
-        error = error.__cause__ or error.__context__
-
-
-def refusal(error: Exception) -> InputError:
-    """The error of a part's constructor, as an InputError."""
-    chain = list(causes(error))
-    own = [one for one in chain if isinstance(one, InputError)]
-    if own:  # Python's None is YAML's null
-        return type(own[-1])(re.sub(r"\bNone\b", "null", str(own[-1])))
-    return InputError(f"a part cannot be built: {one_line(chain[-1])[:LONGEST] or type(chain[-1]).__name__}")
 
 
 def whole_numbers(value: object) -> Iterator[int]:
@@ -200,42 +177,8 @@ class Parser(jsonargparse.ArgumentParser):
                 for name in names.split(", ")
             ]
             message = f"{head}{required}{', '.join(words)}"
-        text = one_line(_by_options(message, ex, positional))
+        text = one_line(by_options(message, ex, positional))
         raise UsageError(text if len(text) < LONGEST else f"{text[:LONGEST]} ...") from ex
-
-
-def _by_options(message: str, error: Exception | None, positional: Collection[str]) -> str:
-    """The message of jsonargparse, or for an option's value that of the innermost parser or type."""
-    key = re.match(r'Parser key "([^"]+)"', message)
-    if key is None:
-        stages = re.match(r'expected "subcommand" to be one of {(.*)}', message)
-        if stages:
-            return f"no stage given; expected one of {stages[1].replace(',', ', ')}"
-        return re.sub(r"^Option '([\w.]+)'", r"--\1", message)
-    option = "--" * (key[1] not in positional) + key[1].replace(".init_args", "")
-    chain = list(causes(error))
-    part = next((one for one in chain if isinstance(one, UsageError)), None)
-    if part is not None:
-        inner = re.sub(r"(?<![\w-])--(?=\w)", f"{option}.", str(part))  # of the part's own parser
-        return inner if inner.startswith(option) else f"{option}: {inner}"
-    own = [one for one in chain if isinstance(one, InputError)]
-    setting = re.search(r"NestedArg\(key='([\w.]+)'", message)
-    if setting:
-        return f"{option}.{setting[1]}: the value of {option} has no settings; expected one or the other"
-    text = str((own or chain)[-1]).replace("typing.Literal", "one of ")
-    text = re.sub(r"<class '(?:\w+\.)*(\w+)'>", r"\1", text)
-    others = ", none or a map file" * ("MapFile" in message)
-    wanted = f"expected the import path of a class{others}, not"
-    text = text.replace("Expected a dot import path string:", wanted)
-    if text.startswith(wanted) and not others:
-        word = text.removeprefix(wanted).strip().lower()
-        meant = "null" if word == "none" else next((name for name in REGISTRY if name.lower() == word), None)
-        text += f"; did you mean {meant}?" if meant else ""
-    value = re.match(r"Expected an? (.*)\. Got value: (.*)", text, re.DOTALL)
-    none = "null, or " if value and value[2].lower() == "none" else ""
-    if value:
-        return f"{option} is {value[2]}; expected {none}{value[1]}"
-    return f"{option} {text}" if text.startswith("is ") else f"{option}: {text}"
 
 
 @cache
