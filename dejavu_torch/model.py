@@ -436,7 +436,7 @@ class DejaVu(nn.Module):
         return self.localize_descriptors(descriptors, matching, progress=progress)
 
     def loop_matching(self, apart: int, smoother: PlaceSmoother | None) -> Matching:
-        """How `loops` matches. Accepted as of single queries, else those that a drive finds likely."""
+        """How `loops` matches. Answers are accepted as of single queries, or if a drive finds them likely."""
         single = self.matching(None)
         likely = smoother is not None and not single.acceptance.given
         acceptance = self.acceptance(smoother) if likely else single.acceptance

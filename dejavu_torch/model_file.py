@@ -67,7 +67,7 @@ CLASSES: tuple[type[nn.Module], ...] = (
 )
 REGISTRY = {cls.__name__: cls for cls in CLASSES}
 # arguments that older files name and no class takes; the one that changes a descriptor, with its only value
-GONE: Mapping[str, Facts] = {
+REMOVED_ARGUMENTS: Mapping[str, Facts] = {
     "Joined": {"shares": ...},
     "Whitening": {"most_views": ..., "power": 1.0, "group_numbers": ...},
 }
@@ -115,7 +115,7 @@ class Model(Protocol):
 PARTS = ("preprocess", "features", "whitening", "mapper", "velocity")
 SETTINGS = ("threshold", "precision", "batch_size")
 # arguments that files lack at their defaults
-LATER: Mapping[str, Facts] = {
+ADDED_ARGUMENTS: Mapping[str, Facts] = {
     "Preprocess": {"range": None, "blank": BLANK},
     "Whitening": {"lengths": None},
 }
@@ -132,7 +132,7 @@ def recipe_of(module: nn.Module) -> Recipe:
             arguments[name] = [recipe_of(member)._asdict() for member in value]
         elif isinstance(value, nn.Module):
             arguments[name] = recipe_of(value)._asdict()
-    for name, default in LATER.get(cls.__name__, {}).items():
+    for name, default in ADDED_ARGUMENTS.get(cls.__name__, {}).items():
         if arguments[name] == default:
             del arguments[name]
     return Recipe(cls.__name__, json.loads(json.dumps(arguments)))  # compares equal to one from a file
@@ -168,8 +168,8 @@ def _parts(recipe: Recipe) -> dict[str, list[Recipe]]:
 
 
 def without_gone(recipe: Recipe) -> Recipe:
-    """The recipe, and those nested in it, without the arguments in `GONE`."""
-    gone = GONE.get(recipe.class_path, {})
+    """The recipe, and those nested in it, without the arguments in `REMOVED_ARGUMENTS`."""
+    gone = REMOVED_ARGUMENTS.get(recipe.class_path, {})
     arguments = {
         key: value
         for key, value in recipe.init_args.items()

@@ -41,7 +41,7 @@ from dejavu_torch.types import Facts, InputError, Match, Traverse
 from dejavu_torch.version import __version__
 
 RANKS = (5, 10)  # the N of recall@N
-TOLD = 10  # right and wrong answers, from which on their scores are compared
+TOLD = 10  # least number of right and of wrong answers whose scores are compared
 
 log = logging.getLogger("dejavu_torch")
 

@@ -29,7 +29,7 @@ from dejavu_torch.types import BATCH_NUMBERS, BATCH_SIZE, InputError, Traverse, 
 log = logging.getLogger("dejavu_torch")
 
 DRAWN = 32  # frames that the preprocessing adapts to
-NARROW = 0.1  # share of the values of 16 bits below which it is told that frames use few of them
+NARROW = 0.1  # share of the values of 16 bits; a warning is given if the frames use less
 ROWS = 4096  # descriptors on the device at a time
 DESCRIPTOR_MEMORY = IN_MEMORY // 4  # bytes of descriptors kept in memory
 

@@ -271,7 +271,7 @@ class SpectralMap(PlaceMap):
         place_map = self._sharing()
         place_map.stage_scale = (both.abs().amax(0) / 127).float()
         place_map.stage = (both / place_map.stage_scale).round().to(torch.int8)
-        place_map.drives = torch.cat([self.drives, self.drives.new_ones(1)]).sum(0, True, dtype=torch.int32)
+        place_map.drives = self.drives + 1 if len(self.drives) else self.drives.new_ones(1)
         place_map.norms = torch.cat([*map(place_map._norms_of, range(len(self.chunks)))])
         place_map._hide()
         place_map.check()
@@ -325,8 +325,8 @@ class SpectralMap(PlaceMap):
         names = [route.name for route in self.routes]
         expect(name in names, f"one of {', '.join(names)}", f"there is no route {name!r}")
         r = names.index(name)
-        start, frame = (sum(route[i] for route in self.routes[:r]) for i in (1, 2))  # type: ignore[misc]
-        _, places, frames = self.routes[r]
+        before, (_, places, frames) = self.routes[:r], self.routes[r]
+        start, frame = sum(route.places for route in before), sum(route.frames for route in before)
         starts = [first for first, _ in self.chunks]
         part = self.between(bisect.bisect_left(starts, start), bisect.bisect_left(starts, start + places))
         part.routes = ()
