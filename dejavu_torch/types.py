@@ -46,7 +46,7 @@ def expect(fits: object, to_be: object, seen: object = "", /, **given: object) -
         >>> expect(2 > 1, "at least 1", k=2)
     """
     if not fits:
-        pairs = ((name, x.__name__ if isinstance(x, type) else repr(x)) for name, x in given.items())
+        pairs = ((name, f"a {x.__name__}" if isinstance(x, type) else repr(x)) for name, x in given.items())
         raise InputError(f"{seen or ' and '.join(map(' is '.join, pairs))}; expected {to_be}")
 
 

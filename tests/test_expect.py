@@ -16,10 +16,10 @@ def test_what_fits_passes() -> None:
 
 
 def test_messages_tell_what_was_seen_and_expected() -> None:
-    for fits, told in ((False, "k is 0 and name is 'x'; expected 1 or more"), (0, "mapper is int; expected")):
-        given = {"k": 0, "name": "x"} if fits is False else {"mapper": int}
-        with refused(told):
-            expect(fits, "1 or more", **given)
+    with refused("k is 0 and name is 'x'; expected 1 or more"):
+        expect(False, "1 or more", k=0, name="x")
+    with refused("mapper is a dict; expected a Mapper"):
+        expect(0, "a Mapper", mapper=dict)
     with pytest.raises(InputError, match=r"^a route without frames; expected some$"):
         expect([], "some", "a route without frames")
 

@@ -93,7 +93,7 @@ class SmallCNN(nn.Module):
         super()._load_from_state_dict(state, prefix, *args)
 
     def forward(self, frames: Tensor) -> Tensor:
-        check_shape(frames, f"B {self.channels} H W", "SmallCNN got frames")
+        check_shape(frames, f"B {self.channels} H W", "SmallCNN got")
         frames = resize_frames(frames, self.resize).to(self.linear.weight.dtype)
         if self.cell:
             frames = local_contrast(frames, self.cell)

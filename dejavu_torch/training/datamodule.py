@@ -188,8 +188,9 @@ class RouteData(LightningDataModule):
         }
         for name, one in ((name, one) for name, every in self.listed.items() for one in every):
             fits = isinstance(one, (str, Path, Traverse, Tensor, np.ndarray))
-            expected = "a path, a Traverse, or a tensor or array of frames or features"
-            expect(fits or (one is None and name != "source"), expected, f"{name} is a {type(one).__name__}")
+            if not fits and (one is not None or name == "source"):
+                expected = "a path, a Traverse, or a tensor or array of frames or features"
+                raise InputError(f"{name} is of type {type(one).__name__}; expected {expected}")
         paths = [str(one) for one in self.listed["source"] if isinstance(one, (str, Path))]
         for one in (one for one in paths if paths.count(one) > 1):
             raise InputError(f"{one} is given twice; expected each route once, other traverses as second")
@@ -275,7 +276,7 @@ class RouteData(LightningDataModule):
             self._read(name)
         if stage == "fit":
             self.unseen()  # so that its errors come before the training
-        expect(stage != "test" or "query" in self.sets, "data.query, to test on", "there is no query")
+        expect(stage != "test" or "query" in self.sets, "data.query, a second traverse", "nothing to test on")
 
     @property
     def _size(self) -> tuple[int, int] | None:
