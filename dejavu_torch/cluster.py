@@ -11,7 +11,7 @@ import sys
 import sysconfig
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Hashable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from functools import lru_cache
 from itertools import pairwise
@@ -19,6 +19,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -53,7 +54,7 @@ class Cluster:
 
     def __init__(self, address: str = AUTO) -> None:
         os.environ.update({name: value for name, value in QUIET.items() if name not in os.environ})
-        self.ray: Any = check_installed()
+        self.ray: ModuleType = check_installed()
         logging.getLogger("ray").setLevel(logging.ERROR)
         quiet = {"log_to_driver": False, "logging_level": logging.ERROR, "configure_logging": False}
         handlers = {number: signal.getsignal(number) for number in SIGNALS}
@@ -86,7 +87,7 @@ class Cluster:
         with _by_value(self.ray, vars(encode).values()):
             sent = [self.ray.put(encode)]
         waiting = deque(tasks[i : i + together] for i in range(0, len(tasks), together))
-        running: deque[tuple[list[range], Any]] = deque()
+        running: deque[tuple[list[range], object]] = deque()
         try:
             while waiting or running:
                 while waiting and len(running) < AHEAD * self.workers:
@@ -103,7 +104,7 @@ class Cluster:
                 with suppress(Exception):
                     self.ray.cancel(reference, force=True)
 
-    def _result(self, reference: Any) -> tuple[list[Chunk], str]:
+    def _result(self, reference: object) -> tuple[list[Chunk], str]:
         try:
             return self.ray.get(reference)  # type: ignore[no-any-return]
         except self.ray.exceptions.RayTaskError:  # raised by our code
@@ -133,7 +134,7 @@ class ClusterSearch:
             raise InputError(f"a map of kind {place_map.kind!r} cannot be divided; expected a spectral one")
         actor = cluster.ray.remote(num_cpus=1, max_restarts=RETRIES, max_task_retries=RETRIES)(_Searcher)
         self.cluster, self.actors = cluster, []
-        self.parts: list[Any] = []  # kept for restarted actors
+        self.parts: list[object] = []  # kept for restarted actors
         starts, workers = [start for start, _ in place_map.chunks], cluster.workers
         bounds = [bisect_left(starts, worker * place_map.places / workers) for worker in range(workers)]
         for first, stop in pairwise([*bounds, len(starts)]):
@@ -165,13 +166,13 @@ class _Searcher:
         self.first = first
         self.searcher = searcher(part, method, memory)
 
-    def search(self, queries: Any, wanted: list[NmsSpec]) -> tuple[Any, Any]:
+    def search(self, queries: np.ndarray, wanted: list[NmsSpec]) -> tuple[np.ndarray, np.ndarray]:
         """Scores and places that include the wanted candidates of the part, as arrays."""
         score, place = self.searcher(torch.from_numpy(queries.copy()), wanted)
         return score.numpy(), torch.where(score.isfinite(), place + self.first, place).numpy()
 
 
-def check_installed() -> Any:
+def check_installed() -> ModuleType:
     """The module `ray`; InputError if it is not installed."""
     try:
         return importlib.import_module("ray")
@@ -186,12 +187,12 @@ def _processors() -> int:
 
 
 @lru_cache(1)
-def _received(reference: Any) -> Any:
+def _received(reference: Hashable) -> Any:
     """The encoder, unpacked once by each worker process instead of for each task."""
     return check_installed().get(reference)
 
 
-def _encode(sent: list[Any], tasks: list[range], folder: str) -> tuple[list[Chunk], str]:
+def _encode(sent: list[Hashable], tasks: list[range], folder: str) -> tuple[list[Chunk], str]:
     """In a worker: the chunks of some tasks, and the error that ended them early, or ""."""
     with suppress(OSError):
         os.chdir(folder)
@@ -206,7 +207,7 @@ def _encode(sent: list[Any], tasks: list[range], folder: str) -> tuple[list[Chun
 
 
 @contextmanager
-def _by_value(ray: Any, values: Iterable[object]) -> Iterator[None]:
+def _by_value(ray: ModuleType, values: Iterable[object]) -> Iterator[None]:
     """Sends classes from the user's own files as code, since workers do not have these files."""
     modules = {module.__name__: module for value in values for module in _modules_of(value)}
     for module in modules.values():

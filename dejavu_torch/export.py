@@ -29,7 +29,7 @@ from dejavu_torch.recognition.centring import running_mean
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.text import one_line
-from dejavu_torch.types import InputError, SequenceModel, expect
+from dejavu_torch.types import Facts, InputError, SequenceModel, expect
 from dejavu_torch.version import __version__
 
 OPSET = 18
@@ -48,7 +48,7 @@ class Exported(NamedTuple):
     1, on frames of noise.
     """
 
-    facts: dict[str, Any]
+    facts: Facts
     bytes: int
     difference: float
 
@@ -225,17 +225,17 @@ def run_session(session: Any, frames: Tensor) -> Tensor:
     return torch.cat(rows)
 
 
-def _first_states(facts: dict[str, Any]) -> list[Tensor]:
+def _first_states(facts: Facts) -> list[Tensor]:
     """The states before the first frame, from the metadata."""
     first = {"state": float(facts.get("first_state", 0)), "mean": 0.0}
     return [torch.full(shape, first[name]) for name, shape in facts["inputs"].items() if name in first]
 
 
-def _facts(model: DejaVu, sequence: SequenceModel | None, centre: bool) -> dict[str, Any]:
+def _facts(model: DejaVu, sequence: SequenceModel | None, centre: bool) -> Facts:
     """The metadata; free dimensions have a name."""
     shape, places = list(model.frame_shape or ()), model.map.places
     name, sizes = ("frames", [*shape[:1], "height", "width"]) if len(shape) == 3 else ("features", shape)
-    facts: dict[str, Any] = {"version": __version__, "opset": OPSET, "places": places, "frame_shape": shape}
+    facts: Facts = {"version": __version__, "opset": OPSET, "places": places, "frame_shape": shape}
     if sequence is None:
         facts |= {"inputs": {name: ["batch", *sizes]}, "outputs": {"scores": ["batch", places]}}
         threshold, platt = model.threshold, model.matching(None).platt
@@ -259,7 +259,7 @@ def _facts(model: DejaVu, sequence: SequenceModel | None, centre: bool) -> dict[
 
 def _program(
     graph: nn.Module, inputs: tuple[Tensor, ...], names: tuple[list[str], list[str]], free: dict[int, str]
-) -> Any:
+) -> torch.onnx.ONNXProgram:
     """The ONNX program of a module; `free` names the variable dimensions of the first input."""
     # exported here, since torch.onnx.export would fall back to ways that fix the batch size
     sizes = {axis: torch.export.Dim(name, min=1, max=MAX_SIZE) for axis, name in free.items()}
@@ -279,7 +279,7 @@ def _program(
     )
 
 
-def _translations() -> dict[Callable[..., Any], Callable[..., Any]]:
+def _translations() -> dict[Callable[..., object], Callable[..., object]]:
     """ONNX for operations that torch cannot translate."""
     import onnx_ir as ir
     from onnxscript import opset18
@@ -307,7 +307,7 @@ def _translations() -> dict[Callable[..., Any], Callable[..., Any]]:
     return {aten.hypot.default: hypot, aten.cdist.default: cdist, aten._cdist_forward.default: cdist}
 
 
-def _serialised(program: Any, facts: dict[str, Any]) -> bytes:
+def _serialised(program: torch.onnx.ONNXProgram, facts: Facts) -> bytes:
     """The file's contents, without the source locations that torch adds to every node."""
     import onnx_ir as ir
     from onnxscript import optimizer
@@ -325,7 +325,7 @@ def _serialised(program: Any, facts: dict[str, Any]) -> bytes:
     return written
 
 
-def _difference(written: bytes, graph: Graph, frames: Tensor, facts: dict[str, Any]) -> float:
+def _difference(written: bytes, graph: Graph, frames: Tensor, facts: Facts) -> float:
     """The largest difference of onnxruntime's scores to torch's, relative above 1."""
     states, rows = [state.to(frames.device) for state in _first_states(facts)], []
     for part in frames.split(len(frames) if graph.sequence is None else 1):

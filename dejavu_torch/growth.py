@@ -246,7 +246,7 @@ def second_traverse(
     if len(known) == len(drives):
         return LabelledFrames(chained([drive for drive, _ in drives]), torch.cat(known))
     for drive, places, seen in views:
-        expected = f"the same number, frame i at place i, a truth, or at least {LEAST} frames in order"
+        expected = f"as many, frame i at place i, a truth for its places, or at least {LEAST} frames in order"
         expect(places is not None or len(drive) >= LEAST, expected, seen)
     model.descriptor.check_sizes(reference, *(drive for drive, _ in drives))
     return place_drives(model, reference, drives, progress)

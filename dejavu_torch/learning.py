@@ -7,7 +7,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
-from typing import Any, NoReturn, cast
+from typing import NoReturn, cast
 
 import torch
 from torch import Tensor
@@ -35,7 +35,7 @@ from dejavu_torch.memory import concatenate
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.recognition.calibration import Calibration, calibrated
 from dejavu_torch.text import progress_of
-from dejavu_torch.types import InputError, Traverse, expect
+from dejavu_torch.types import Facts, InputError, Traverse, expect
 
 MAX_SEGMENT = 512  # consecutive queries in a calibration
 SEGMENT_SCORES = 2**22  # maximum, queries of a segment x places
@@ -141,7 +141,7 @@ class Checkpoint:
         """Write the partial map, with the first `places` places of a traverse. InputError if this fails; an
         earlier file then stays."""
         tensors = {f"map.{name}": tensor for name, tensor in place_map.packed().items()}
-        header: dict[str, Any] = {"run": dict(self.key), "map": place_map.get_extra_state()}
+        header: Facts = {"run": dict(self.key), "map": place_map.get_extra_state()}
         if descriptor.whitening is not None:
             learned = descriptor.whitening.state_dict()
             tensors |= {f"whitening.{name}": tensor for name, tensor in learned.items()}

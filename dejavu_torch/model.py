@@ -38,7 +38,7 @@ from dejavu_torch.recognition.select import HIGHEST, PROBABLE, Acceptance, check
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.resize import reduced_size
 from dejavu_torch.text import with_progress
-from dejavu_torch.types import InputError, Match, SequenceModel, Traverse, expect
+from dejavu_torch.types import Facts, InputError, Match, SequenceModel, Traverse, expect
 
 if TYPE_CHECKING:
     from dejavu_torch.recognition.calibration import Calibration
@@ -162,7 +162,7 @@ class DejaVu(nn.Module):
         else:
             super().__setattr__(name, value)
 
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> Facts:
         """The constructor's arguments now: `DejaVu(**model.settings())` is the same model without a map.
 
         A whitening that is learned with each map is a copy, so that another model can learn; all other parts,
@@ -436,7 +436,7 @@ class DejaVu(nn.Module):
         return self.localize_descriptors(descriptors, matching, progress=progress)
 
     def loop_matching(self, apart: int, smoother: PlaceSmoother | None) -> Matching:
-        """How `loops` matches. Accepted as of single queries, else those that a drive finds likely."""
+        """How `loops` matches. Answers are accepted as of single queries, or if a drive finds them likely."""
         single = self.matching(None)
         likely = smoother is not None and not single.acceptance.given
         acceptance = self.acceptance(smoother) if likely else single.acceptance
@@ -591,11 +591,11 @@ class DejaVu(nn.Module):
         """The resolution of the map, and the bytes of its file by part."""
         return model_file.summary_of(self)
 
-    def get_extra_state(self) -> dict[str, Any]:
+    def get_extra_state(self) -> Facts:
         """The state apart from tensors and the map's own state."""
         return model_file.state_to_json(self.state)
 
-    def set_extra_state(self, state: dict[str, Any]) -> None:
+    def set_extra_state(self, state: Facts) -> None:
         """Restore the result of `get_extra_state`; InputError if it lacks an entry."""
         try:
             self.state = model_file.state_from_json(state)

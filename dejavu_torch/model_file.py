@@ -42,7 +42,7 @@ from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.recognition.calibration import Calibration, Platt
 from dejavu_torch.text import one_line
-from dejavu_torch.types import InputError, Training, Traverse, expect
+from dejavu_torch.types import Facts, InputError, Training, Traverse, expect
 from dejavu_torch.version import __version__
 
 R = TypeVar("R", bound="Model")
@@ -67,7 +67,7 @@ CLASSES: tuple[type[nn.Module], ...] = (
 )
 REGISTRY = {cls.__name__: cls for cls in CLASSES}
 # arguments that older files name and no class takes; the one that changes a descriptor, with its only value
-GONE: Mapping[str, Mapping[str, Any]] = {
+REMOVED_ARGUMENTS: Mapping[str, Facts] = {
     "Joined": {"shares": ...},
     "Whitening": {"most_views": ..., "power": 1.0, "group_numbers": ...},
 }
@@ -77,7 +77,7 @@ class Recipe(NamedTuple):
     """The name of a module's class and its constructor arguments."""
 
     class_path: str
-    init_args: dict[str, Any]
+    init_args: Facts
 
 
 @dataclass
@@ -115,7 +115,7 @@ class Model(Protocol):
 PARTS = ("preprocess", "features", "whitening", "mapper", "velocity")
 SETTINGS = ("threshold", "precision", "batch_size")
 # arguments that files lack at their defaults
-LATER: Mapping[str, Mapping[str, Any]] = {
+ADDED_ARGUMENTS: Mapping[str, Facts] = {
     "Preprocess": {"range": None, "blank": BLANK},
     "Whitening": {"lengths": None},
 }
@@ -132,7 +132,7 @@ def recipe_of(module: nn.Module) -> Recipe:
             arguments[name] = [recipe_of(member)._asdict() for member in value]
         elif isinstance(value, nn.Module):
             arguments[name] = recipe_of(value)._asdict()
-    for name, default in LATER.get(cls.__name__, {}).items():
+    for name, default in ADDED_ARGUMENTS.get(cls.__name__, {}).items():
         if arguments[name] == default:
             del arguments[name]
     return Recipe(cls.__name__, json.loads(json.dumps(arguments)))  # compares equal to one from a file
@@ -145,7 +145,7 @@ def parts_of(model: Model) -> dict[str, nn.Module | None]:
     return described | {"mapper": model.mapper, "velocity": model.velocity}
 
 
-def recipes_of(model: Model) -> dict[str, Any]:
+def recipes_of(model: Model) -> Facts:
     """The recipe of each part of a model, as JSON values."""
     parts = parts_of(model).items()
     return {name: None if part is None else recipe_of(part)._asdict() for name, part in parts}
@@ -168,8 +168,8 @@ def _parts(recipe: Recipe) -> dict[str, list[Recipe]]:
 
 
 def without_gone(recipe: Recipe) -> Recipe:
-    """The recipe, and those nested in it, without the arguments in `GONE`."""
-    gone = GONE.get(recipe.class_path, {})
+    """The recipe, and those nested in it, without the arguments in `REMOVED_ARGUMENTS`."""
+    gone = REMOVED_ARGUMENTS.get(recipe.class_path, {})
     arguments = {
         key: value
         for key, value in recipe.init_args.items()
@@ -228,7 +228,7 @@ def weights_of(model: Model, part: str) -> dict[str, Tensor]:
     }
 
 
-def state_to_json(state: ModelState) -> dict[str, Any]:
+def state_to_json(state: ModelState) -> Facts:
     """A model's state as JSON values."""
     names = encode_names(state.frame_names) if state.frame_names else None
     calibration = state.calibration and {
@@ -240,7 +240,7 @@ def state_to_json(state: ModelState) -> dict[str, Any]:
     return values | {"calibration": calibration}
 
 
-def state_from_json(values: Mapping[str, Any], frames: int | None = None) -> ModelState:
+def state_from_json(values: Facts, frames: int | None = None) -> ModelState:
     """The state from the result of `state_to_json`; `frames`: the number of names, None for any."""
     shape, trained, calibration = values["frame_shape"], values["trained"], values["calibration"]
     if calibration is not None:
@@ -258,7 +258,7 @@ def _platt(slope: float, offset: float, most: Sequence[Sequence[float]] = ()) ->
     return Platt(slope, offset, tuple((upper, limit) for upper, limit in most))
 
 
-def contents(model: Model) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def contents(model: Model) -> tuple[dict[str, Tensor], Facts]:
     """The tensors and the header of a model's map file."""
     settings = {"threshold": model.threshold, "precision": model.precision}
     header = recipes_of(model) | settings | {"batch_size": model.descriptor.batch_size}
@@ -323,7 +323,7 @@ def read_place_map(path: Path) -> PlaceMap:
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[tuple[dict[str, Tensor], dict[str, Any]]]:
+def opened(path: Path) -> Iterator[tuple[dict[str, Tensor], Facts]]:
     """Tensors and header of a map file; errors within the block are raised with the file's name."""
     tensors, values = read_map(path)
     try:
@@ -340,7 +340,7 @@ def opened(path: Path) -> Iterator[tuple[dict[str, Tensor], dict[str, Any]]]:
         raise InputError(f"{path} does not fit its modules: {one_line(error)}") from error
 
 
-def _fill(place_map: PlaceMap, tensors: Mapping[str, Tensor], state: dict[str, Any]) -> None:
+def _fill(place_map: PlaceMap, tensors: Mapping[str, Tensor], state: Facts) -> None:
     """Fill an empty map from a file; it stays empty if the file has only a descriptor."""
     stored = part_of(tensors, "map")
     if stored or state.get("places"):
@@ -388,7 +388,7 @@ def run_key(
     return digests(source=_source(traverse), **sources) | {"settings": sums.pop(FILE_HEADER), **sums}
 
 
-def _source(traverse: Traverse | AugmentedFrames) -> list[Any]:
+def _source(traverse: Traverse | AugmentedFrames) -> list[object]:
     """What identifies the source of a traverse, without its frames."""
     names = [*traverse.names] if isinstance(traverse, Traverse) else []
     return [traverse.name, len(traverse), [*traverse.frame_shape], names]

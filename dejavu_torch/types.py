@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, Literal, NamedTuple, Self, SupportsIndex, TypeAlias
 
 import torch
 from torch import Tensor, nn
@@ -24,6 +24,7 @@ BATCH_SIZE = 64  # frames read at a time by default
 FRAME_NUMBERS = 2**28  # values in one frame: 1 GB
 LONGEST_MESSAGE = 2000  # characters
 
+Facts: TypeAlias = dict[str, Any]  # what JSON holds, settings and other values of many types, by name
 # T queries in a sequence, all so far in a filter, or all of the drive in a smoother
 Together = int | Literal["filter", "smoother"]
 
@@ -45,7 +46,7 @@ def expect(fits: object, to_be: object, seen: object = "", /, **given: object) -
         >>> expect(2 > 1, "at least 1", k=2)
     """
     if not fits:
-        pairs = ((name, x.__name__ if isinstance(x, type) else repr(x)) for name, x in given.items())
+        pairs = ((name, f"a {x.__name__}" if isinstance(x, type) else repr(x)) for name, x in given.items())
         raise InputError(f"{seen or ' and '.join(map(' is '.join, pairs))}; expected {to_be}")
 
 
@@ -125,7 +126,7 @@ class Traverse(Dataset[Tensor], ABC):
                     raise IndexError(f"a mask {tuple(given.shape)} for the {len(self)} frames of {self.name}")
                 given = given.nonzero()[:, 0]
             if given.ndim == 0:
-                return self.read(self._existing([given.item()]))[0]
+                return self.read(self._existing(given[None].tolist()))[0]
             index = given.tolist()
         numbers = self._existing(index)
         return self.read(numbers) if len(numbers) else torch.zeros(0, *self.frame_shape)
@@ -138,7 +139,7 @@ class Traverse(Dataset[Tensor], ABC):
         for batch in self.batches():
             yield from batch
 
-    def _existing(self, index: Iterable[Any]) -> range | list[int]:
+    def _existing(self, index: Iterable[SupportsIndex]) -> range | list[int]:
         """Numbers from 0, as a range where they are one."""
         count = len(self)
         numbers = [operator.index(i) for i in index]  # refuses floats
@@ -167,7 +168,7 @@ class Traverse(Dataset[Tensor], ABC):
         expect(values <= FRAME_NUMBERS, f"at most {FRAME_NUMBERS}, for images by ?width=640", seen)
         return max(1, min(most, BATCH_NUMBERS // max(1, values)))
 
-    def changed(self, **attributes: Any) -> Self:
+    def changed(self, **attributes: object) -> Self:
         """A copy with other attributes."""
         other = copy.copy(self)
         other.__dict__.pop("frame_shape", None)
@@ -275,7 +276,7 @@ class Match:
     def __len__(self) -> int:
         return len(self.index)
 
-    def __getitem__(self, queries: Any) -> Match:
+    def __getitem__(self, queries: int | slice | Sequence[int] | Tensor) -> Match:
         sequences = {T: match[queries] for T, match in self.sequences.items()}
         return replace(self.map(lambda column: column[queries]), sequences=sequences)
 

@@ -70,7 +70,7 @@ def errors_of_one_line(given: Sequence[str]) -> Iterator[None]:
         os.getcwd()
     except FileNotFoundError:  # which would crash some libraries
         fail("the current folder no longer exists; expected one that does")
-    from dejavu_torch.cli.parser import UsageError
+    from dejavu_torch.cli.messages import UsageError
     from dejavu_torch.data.output import remove_temporaries
     from dejavu_torch.types import InputError
 

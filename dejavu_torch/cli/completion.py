@@ -83,7 +83,7 @@ def _copy(parser: ArgumentParser, plain: argparse.ArgumentParser) -> None:
                 _copy(part, plain)
 
 
-def _leaves(kind: Any) -> Iterator[Any]:
+def _leaves(kind: object) -> Iterator[object]:
     """The types and the values of literals in an annotation."""
     parts = get_args(kind)
     for part in parts:

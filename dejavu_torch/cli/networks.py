@@ -15,7 +15,7 @@ from jsonargparse._typehints import ActionTypeHint  # whose values no public hoo
 from dejavu_torch.features import hub
 from dejavu_torch.features.joined import Joined
 from dejavu_torch.model_file import REGISTRY
-from dejavu_torch.types import InputError
+from dejavu_torch.types import Facts, InputError
 
 OPTIONS = ("features", "backbone", "network")  # last parts of the names of such options
 MADE = "dejavu_torch.cli.parser.made"  # as config files name it
@@ -66,7 +66,7 @@ class NetworkAction(ActionTypeHint):
                 cfg[self.dest] = None  # settings of another class are not kept
         super().__call__(parser, cfg, value, option)  # type: ignore[no-untyped-call]
 
-    def _check_type(self, value: Any, append: bool = False, cfg: Any = None, mode: Any = None) -> Any:
+    def _check_type(self, value: Any, append: bool = False, cfg: Any = None, mode: object = None) -> Any:
         if isinstance(value, Namespace):
             value = value.as_dict()
         value = spelt(value)
@@ -90,7 +90,7 @@ def accept_networks(parser: ArgumentParser) -> None:
             action.__class__ = NetworkAction  # and no mapping, as of hub
 
 
-def spelt(value: Any) -> Any:
+def spelt(value: object) -> Any:
     """A value with import paths in place of short names, and with the call that makes each network."""
     if isinstance(value, str):
         if value.lstrip().startswith(("[", "{")):
@@ -124,7 +124,7 @@ def spelt(value: Any) -> Any:
     return {"class_path": HUB, "init_args": {"name": path.removeprefix(hub.PREFIX), **given}}
 
 
-def _inside(key: str, value: Any) -> Any:
+def _inside(key: str, value: object) -> object:
     """The value of a class's argument, in which there may be networks."""
     if isinstance(value, list):
         return [spelt(one) if isinstance(one, dict) or key == "members" else one for one in value]
@@ -141,7 +141,7 @@ def path_of(name: str) -> str:
     return f"{REGISTRY[name].__module__}.{name}" if name in REGISTRY else name
 
 
-def _function_at(path: str) -> Callable[..., Any] | None:
+def _function_at(path: str) -> Callable[..., object] | None:
     """The function or method of that name, or None."""
     try:
         found = pydoc.locate(path) if "." in path else None
@@ -150,7 +150,7 @@ def _function_at(path: str) -> Callable[..., Any] | None:
     return found if inspect.isroutine(found) else None
 
 
-def _of_one_class(before: Any, value: dict[str, Any]) -> bool:
+def _of_one_class(before: Facts, value: Facts) -> bool:
     """Whether two values name the same class, by any path."""
     names = (str(one.get("class_path")).rpartition(".")[2] for one in (before, value))
     return len({*names}) == 1

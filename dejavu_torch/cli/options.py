@@ -271,7 +271,7 @@ class LearningOptions:
     device: str = "cpu"
 
     @property
-    def files(self) -> list[Any]:
+    def files(self) -> list[str | Path | None]:
         """What these options read."""
         given = [*several(self.second), *map(str, several(self.second_truth))]
         return [*given, self.descriptor, self.calibration, self.calibration_truth]
@@ -406,7 +406,7 @@ def check_no_truth(option: str, truth: object) -> None:
     expect(truth is None, f"--{option} SOURCE with it", f"--{option}_truth {truth} without --{option}")
 
 
-def several(given: Any) -> list[Any]:
+def several(given: object) -> list[Any]:
     """The values of an option that takes one or several."""
     return [] if given is None else [*given] if isinstance(given, list) else [given]
 

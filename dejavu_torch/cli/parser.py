@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import inspect
 import os
-import re
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import is_dataclass
@@ -17,18 +16,17 @@ import docstring_parser
 import jsonargparse
 from jsonargparse.typing import restricted_string_type
 
+from dejavu_torch.cli.messages import LONGEST, UsageError, by_options, causes, refusal
 from dejavu_torch.cli.names import FIRST_OPTIONS
 from dejavu_torch.cli.networks import accept_networks, is_made, names_network
-from dejavu_torch.cli.networks import with_hub as with_hub
 from dejavu_torch.cli.options import named_features, refuse_with
 from dejavu_torch.cli.presets import find_config, read_config
 from dejavu_torch.data.files import LARGEST
 from dejavu_torch.data.source import check_not_read
 from dejavu_torch.features.hub import made as made  # config files name it here
 from dejavu_torch.model import DejaVu
-from dejavu_torch.model_file import REGISTRY
 from dejavu_torch.text import one_line
-from dejavu_torch.types import InputError
+from dejavu_torch.types import Facts, InputError
 
 MODEL = "model"  # the parameter of a command that is a DejaVu: each of its arguments is an option
 COMMAND = "command"  # the parameter that is the command line itself
@@ -45,27 +43,6 @@ HINT = (
 )
 BARE = {"velocity": "GroundOdometry", "page": 8765}  # values of options given without one
 MapFile = restricted_string_type("MapFile", r".*\.safetensors")
-LONGEST = 300  # characters of a message; longer ones are cut
-
-
-class UsageError(InputError):
-    """A command line or config file that the commands do not understand."""
-
-
-def causes(error: BaseException | None) -> Iterator[BaseException]:
-    """An exception and its causes; jsonargparse wraps each in one that says more."""
-    while error is not None:
-        yield error
-        error = error.__cause__ or error.__context__
-
-
-def refusal(error: Exception) -> InputError:
-    """The error of a part's constructor, as an InputError."""
-    chain = list(causes(error))
-    own = [one for one in chain if isinstance(one, InputError)]
-    if own:  # Python's None is YAML's null
-        return type(own[-1])(re.sub(r"\bNone\b", "null", str(own[-1])))
-    return InputError(f"a part cannot be built: {one_line(chain[-1])[:LONGEST] or type(chain[-1]).__name__}")
 
 
 def whole_numbers(value: object) -> Iterator[int]:
@@ -80,7 +57,7 @@ def whole_numbers(value: object) -> Iterator[int]:
 class HelpFormatter(jsonargparse.DefaultHelpFormatter):
     """Help without lists of all installed classes, and without defaults of null."""
 
-    def _expand_help(self, action: Any) -> str:
+    def _expand_help(self, action: argparse.Action) -> str:
         text, cut, _ = super()._expand_help(action).partition(", known subclasses: ")
         text = text.replace("<class '", "").replace("'>", "").replace(" | null, default: null", "")
         return text + (")" if cut else "")
@@ -92,7 +69,7 @@ class HelpAll(argparse.Action):
     def __init__(self, option_strings: Sequence[str], dest: str, **settings: Any) -> None:
         super().__init__(option_strings, argparse.SUPPRESS, 0, default=argparse.SUPPRESS, **settings)
 
-    def __call__(self, parser: Any, *_: Any) -> None:
+    def __call__(self, parser: Any, *_: object) -> None:
         parser.whole = True
         parser.print_help()
         parser.exit()
@@ -101,7 +78,7 @@ class HelpAll(argparse.Action):
 class Preset(jsonargparse.ActionConfigFile):  # type: ignore[name-defined, misc]
     """--config: the name of a preset, or a YAML file of options."""
 
-    def __call__(self, parser: Any, cfg: Any, values: Any, option_string: str | None = None) -> None:
+    def __call__(self, parser: Parser, cfg: object, values: str, option_string: str | None = None) -> None:
         path = find_config(values)
         read_config(path)
         super().__call__(parser, cfg, str(path), option_string)
@@ -150,11 +127,11 @@ class Parser(jsonargparse.ArgumentParser):
             for one, text in zip(hidden, texts, strict=True):
                 one.help = text
 
-    def parse_object(self, *args: Any, **settings: Any) -> Any:
+    def parse_object(self, *args: object, **settings: object) -> Any:
         accept_networks(self)
         return super().parse_object(*args, **settings)
 
-    def _parsed(self, args: Any, *rest: Any, **settings: Any) -> Any:
+    def _parsed(self, args: Sequence[str] | None, *rest: Any, **settings: Any) -> Any:
         accept_networks(self)
         for word in args or ():
             if not word or (word.startswith("--") and word.endswith("=")):
@@ -200,42 +177,8 @@ class Parser(jsonargparse.ArgumentParser):
                 for name in names.split(", ")
             ]
             message = f"{head}{required}{', '.join(words)}"
-        text = one_line(_by_options(message, ex, positional))
+        text = one_line(by_options(message, ex, positional))
         raise UsageError(text if len(text) < LONGEST else f"{text[:LONGEST]} ...") from ex
-
-
-def _by_options(message: str, error: Exception | None, positional: Collection[str]) -> str:
-    """The message of jsonargparse, or for an option's value that of the innermost parser or type."""
-    key = re.match(r'Parser key "([^"]+)"', message)
-    if key is None:
-        stages = re.match(r'expected "subcommand" to be one of {(.*)}', message)
-        if stages:
-            return f"no stage given; expected one of {stages[1].replace(',', ', ')}"
-        return re.sub(r"^Option '([\w.]+)'", r"--\1", message)
-    option = "--" * (key[1] not in positional) + key[1].replace(".init_args", "")
-    chain = list(causes(error))
-    part = next((one for one in chain if isinstance(one, UsageError)), None)
-    if part is not None:
-        inner = re.sub(r"(?<![\w-])--(?=\w)", f"{option}.", str(part))  # of the part's own parser
-        return inner if inner.startswith(option) else f"{option}: {inner}"
-    own = [one for one in chain if isinstance(one, InputError)]
-    setting = re.search(r"NestedArg\(key='([\w.]+)'", message)
-    if setting:
-        return f"{option}.{setting[1]}: the value of {option} has no settings; expected one or the other"
-    text = str((own or chain)[-1]).replace("typing.Literal", "one of ")
-    text = re.sub(r"<class '(?:\w+\.)*(\w+)'>", r"\1", text)
-    others = ", none or a map file" * ("MapFile" in message)
-    wanted = f"expected the import path of a class{others}, not"
-    text = text.replace("Expected a dot import path string:", wanted)
-    if text.startswith(wanted) and not others:
-        word = text.removeprefix(wanted).strip().lower()
-        meant = "null" if word == "none" else next((name for name in REGISTRY if name.lower() == word), None)
-        text += f"; did you mean {meant}?" if meant else ""
-    value = re.match(r"Expected an? (.*)\. Got value: (.*)", text, re.DOTALL)
-    none = "null, or " if value and value[2].lower() == "none" else ""
-    if value:
-        return f"{option} is {value[2]}; expected {none}{value[1]}"
-    return f"{option} {text}" if text.startswith("is ") else f"{option}: {text}"
 
 
 @cache
@@ -267,7 +210,7 @@ def command_parser(name: str, function: Callable[..., None], program: str = "dej
     return parser
 
 
-def described(thing: Callable[..., Any]) -> tuple[str | None, dict[str, str | None]]:
+def described(thing: Callable[..., object]) -> tuple[str | None, dict[str, str | None]]:
     """The description and the help of each argument, of a function or of a dataclass with its bases."""
     helps: dict[str, str | None] = {}
     for one in reversed(thing.__mro__ if isinstance(thing, type) else [thing]):
@@ -279,7 +222,7 @@ def described(thing: Callable[..., Any]) -> tuple[str | None, dict[str, str | No
 def add_option(parser: Any, parameter: inspect.Parameter, helps: Mapping[str, str | None]) -> None:
     """Add an option or a positional argument to a parser or a group of it, see `command_parser`."""
     keyword, default = parameter.kind is parameter.KEYWORD_ONLY, parameter.default
-    settings: dict[str, Any] = {"help": helps.get(parameter.name, argparse.SUPPRESS)}  # hidden
+    settings: Facts = {"help": helps.get(parameter.name, argparse.SUPPRESS)}  # hidden
     if parameter.annotation is bool:
         settings["action"] = "store_true"
     elif get_origin(parameter.annotation) is Sequence:
@@ -297,7 +240,7 @@ def add_option(parser: Any, parameter: inspect.Parameter, helps: Mapping[str, st
         action.const = BARE[parameter.name]
 
 
-def grouped(function: Callable[..., None], arguments: dict[str, Any]) -> dict[str, Any]:
+def grouped(function: Callable[..., None], arguments: Facts) -> Facts:
     """The arguments, with those of each dataclass of the function gathered in it."""
     for key, parameter in inspect.signature(function, eval_str=True).parameters.items():
         if is_dataclass(parameter.annotation):
@@ -324,7 +267,7 @@ def add_model(parser: Parser) -> None:
     parser.set_defaults(DEFAULT_PARTS)
 
 
-def parse(name: str, function: Callable[..., None], words: Sequence[str]) -> dict[str, Any]:
+def parse(name: str, function: Callable[..., None], words: Sequence[str]) -> Facts:
     """The arguments of a command's function, from the words after its name.
 
     Raises:
@@ -334,7 +277,7 @@ def parse(name: str, function: Callable[..., None], words: Sequence[str]) -> dic
     parser = command_parser(name, function)
     parsed = parser.parse_args(list(words))
     try:
-        arguments: dict[str, Any] = parser.instantiate(parsed).as_dict()
+        arguments: Facts = parser.instantiate(parsed).as_dict()
     except Exception as error:
         raise refusal(error) from error
     if MODEL in function.__annotations__:
@@ -342,7 +285,7 @@ def parse(name: str, function: Callable[..., None], words: Sequence[str]) -> dic
     return grouped(function, arguments)
 
 
-def _model_of(name: str, arguments: dict[str, Any], words: Sequence[str]) -> DejaVu:
+def _model_of(name: str, arguments: Facts, words: Sequence[str]) -> DejaVu:
     """The model that the arguments describe, which are removed from them.
 
     Args:
@@ -373,7 +316,7 @@ def _model_of(name: str, arguments: dict[str, Any], words: Sequence[str]) -> Dej
     return model
 
 
-def _check_settings(name: str, arguments: dict[str, Any], words: Sequence[str]) -> None:
+def _check_settings(name: str, arguments: Facts, words: Sequence[str]) -> None:
     """Refuse settings that a given map has already, and `learn` without a file to write."""
     if name == "learn":
         arguments["map"] = arguments["map"] or arguments["append"]

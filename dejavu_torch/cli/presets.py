@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
 
 import yaml
 
 from dejavu_torch.data.files import check_regular, read_text, reading
-from dejavu_torch.types import InputError, expect
+from dejavu_torch.types import Facts, InputError, expect
 
 PACKAGE = Path(__file__).parents[1]
 # inside the installed package; in a clone next to it
@@ -22,7 +21,7 @@ LARGEST = 2**18  # bytes of a config
 class Loader(yaml.SafeLoader):  # type: ignore[misc]
     """A loader that refuses a key that appears twice, of which others take the last value."""
 
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> Any:
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> object:
         """The mapping of a node."""
         seen: set[str] = set()
         for key, _ in node.value:
@@ -56,7 +55,7 @@ def find_config(name: str) -> Path:
     raise InputError(f"--config {name} is not there; expected a YAML file, or one of {known}")
 
 
-def read_config(path: Path) -> dict[str, Any]:
+def read_config(path: Path) -> Facts:
     """The options in a YAML file.
 
     Raises:
@@ -65,6 +64,6 @@ def read_config(path: Path) -> dict[str, Any]:
     expect(check_regular(path, EXPECTED) <= LARGEST, EXPECTED, f"{path} is larger than {LARGEST} bytes")
     text = read_text(path, EXPECTED)
     with reading(path, "is no YAML", EXPECTED):
-        given: dict[str, Any] = yaml.load(text, Loader)
+        given: Facts = yaml.load(text, Loader)
     expect(isinstance(given, dict), f"{EXPECTED}, as KEY: VALUE", f"{path} holds no options")
     return given

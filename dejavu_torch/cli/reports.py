@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from dejavu_torch.cli import options
 from dejavu_torch.cli.commands import (
@@ -22,7 +22,7 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import recipe_of
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.smoother import PlaceSmoother
-from dejavu_torch.types import InputError, expect
+from dejavu_torch.types import Facts, InputError, expect
 
 if TYPE_CHECKING:
     from dejavu_torch.evaluation.compare import Comparison
@@ -59,7 +59,7 @@ def run_demo(
     paper = paper_model()
     same = recipe_of(model.mapper) == recipe_of(paper.mapper)
     others = {} if same else {"paper": ("the paper to the letter", paper)}
-    settings: dict[str, Any] = {"seed": seed, "second": views, "others": others, "progress": True}
+    settings: Facts = {"seed": seed, "second": views, "others": others, "progress": True}
     result = compare(reference, query, model=model, storage_curve=True, **settings)
     _publish(result, out, "dejavu demo: the built-in route", command)
     print_localize(out / "map.safetensors", model, command, localized, "or try")

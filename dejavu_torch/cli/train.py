@@ -21,8 +21,10 @@ from pytorch_lightning.callbacks import Checkpoint, ModelCheckpoint, ProgressBar
 from pytorch_lightning.cli import LightningArgumentParser, LightningCLI
 
 from dejavu_torch.cli.commands import features_words, print_map, print_next
+from dejavu_torch.cli.messages import refusal
+from dejavu_torch.cli.networks import with_hub
 from dejavu_torch.cli.options import several
-from dejavu_torch.cli.parser import Parser, Preset, refusal, with_hub
+from dejavu_torch.cli.parser import Parser, Preset
 from dejavu_torch.cli.process import interrupts_raise
 from dejavu_torch.data.output import check_output_folder, make_output_folder, remove_empty_folders
 from dejavu_torch.features.embedding import Embedding
@@ -34,7 +36,7 @@ from dejavu_torch.training.descriptors import DescriptorTask
 from dejavu_torch.training.export import DESCRIPTOR, MapExport, has_bf16
 from dejavu_torch.training.task import RouteTask, load_weights
 from dejavu_torch.training.templates import TemplateTask
-from dejavu_torch.types import InputError, expect
+from dejavu_torch.types import Facts, InputError, expect
 
 TASKS = DescriptorTask, TemplateTask  # which --model names
 BF16 = ("bf16-mixed", "bf16")
@@ -51,7 +53,7 @@ TRAINER = {
     "log_every_n_steps": 10,
 }
 # default classes, whose options can be given without the class
-PARTS: dict[str, dict[str, Any]] = {
+PARTS: dict[str, Facts] = {
     "model": {
         "class_path": f"{DescriptorTask.__module__}.{DescriptorTask.__name__}",
         "init_args": {"backbone": {"class_path": "dejavu_torch.features.cnn.SmallCNN"}},
@@ -236,7 +238,7 @@ class TrainCLI(LightningCLI):
         if not asked["fast_dev_run"] and (root / self._written).exists() and not resumed:
             log.warning("%s holds an earlier run, which this one replaces", root)
 
-    def fit(self, **arguments: Any) -> None:
+    def fit(self, **arguments: object) -> None:
         """Train, and print what was written, even if the user interrupts."""
         root, failed = self.trainer.default_root_dir, False
         try:
@@ -256,7 +258,7 @@ class TrainCLI(LightningCLI):
             if self.trainer.interrupted and last is not None and not failed:
                 print_next("train", *self.words, "--ckpt_path", last, lead="to go on")
 
-    def _run(self, stage: str, **arguments: Any) -> None:
+    def _run(self, stage: str, **arguments: object) -> None:
         """Run a stage; after a failure remove new folders with nothing but Lightning's config."""
         root = Path(self.trainer.default_root_dir)
         new = [folder for folder in (root, *root.parents) if not folder.exists()]
@@ -331,7 +333,7 @@ def print_written(export: MapExport, data: RouteData, words: Sequence[str]) -> N
     print_what_next(path, data, model, words)
 
 
-def unseen_of(data: RouteData) -> Any:
+def unseen_of(data: RouteData) -> object:
     """The traverse to validate on, else the one to test on, else None."""
     return data.sources["validation"] or data.sources["query"]
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -78,7 +77,7 @@ class ArrayTraverse(Traverse):
             return part
         return torch.from_numpy(np.array(part, dtype=part.dtype.newbyteorder("=")))  # a writable copy
 
-    def __reduce__(self) -> Any:
+    def __reduce__(self) -> str | tuple[object, ...]:
         # a file is pickled as its path: the other process opens it
         return super().__reduce__() if self.path is None else (read_array, (self.path,))
 

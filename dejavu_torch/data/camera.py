@@ -6,7 +6,7 @@ import math
 import os
 import re
 import stat
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +17,7 @@ from dejavu_torch.data.files import why
 from dejavu_torch.data.video import FORMATS, check_same_size, pixels_of, seconds_of, stream_of
 from dejavu_torch.resize import is_stretched
 from dejavu_torch.text import printable
-from dejavu_torch.types import InputError, Traverse, expect
+from dejavu_torch.types import Facts, InputError, Traverse, expect
 
 PIPE = "-"  # standard input
 PROTOCOLS = "rtsp,rtsps,rtp,srtp,udp,tcp,tls,http,https,httpproxy,rtmp,rtmps,rtmpt,srt,crypto,data"
@@ -95,8 +95,8 @@ class Camera:
         import av
 
         options = {"protocol_whitelist": "pipe", "format_whitelist": f"{FORMATS},nut,yuv4mpegpipe"}
-        settings: dict[str, Any] = {"metadata_errors": "replace"}
-        address: Any = self.source
+        settings: Facts = {"metadata_errors": "replace"}
+        address: object = self.source
         if self.device:
             expect(os.path.exists(self.source), self._expected, f"{self.name} is not there")
             settings["format"] = "v4l2"
@@ -112,7 +112,7 @@ class Camera:
         return av.open(address, "r", container_options=options, **settings)
 
 
-def _mode_is(path: str, test: Any) -> bool:
+def _mode_is(path: str, test: Callable[[int], bool]) -> bool:
     try:
         return bool(test(os.stat(path).st_mode))
     except (OSError, ValueError):

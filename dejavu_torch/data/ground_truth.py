@@ -11,7 +11,6 @@ from typing import Any, NamedTuple, TypeAlias, TypeGuard
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
@@ -49,7 +48,7 @@ class GroundTruth(NamedTuple):
     ignored: Tensor
 
 
-Truth: TypeAlias = str | Path | Tensor | NDArray[Any] | Sequence[int] | Sequence[Sequence[int]] | GroundTruth
+Truth: TypeAlias = str | Path | Tensor | np.ndarray | Sequence[int] | Sequence[Sequence[int]] | GroundTruth
 
 
 def as_ground_truth(truth: Truth, queries: int | None = None) -> GroundTruth:
@@ -91,7 +90,7 @@ def all_judged(places: Tensor) -> GroundTruth:
     return GroundTruth(places, judged, places.new_zeros(len(places), 0))
 
 
-def _table_of(truth: Any) -> Tensor:
+def _table_of(truth: Iterable[object]) -> Tensor:
     """Places in any form as a table (Q,R) int64, -1 as padding."""
     if isinstance(truth, Tensor) and truth.dtype in (torch.int32, torch.int64) and truth.ndim == 2:
         return refuse_zero_one_matrix(truth.long())
@@ -118,7 +117,7 @@ def refuse_zero_one_matrix(table: Tensor) -> Tensor:
     return table
 
 
-def _rows(truth: Any) -> list[Tensor]:
+def _rows(truth: Iterable[object]) -> list[Tensor]:
     """What a truth says of each query, (R,)."""
     if isinstance(truth, Sequence) and any(isinstance(row, Sequence | Tensor | np.ndarray) for row in truth):
         rows = [torch.as_tensor(row) for row in truth]
@@ -221,7 +220,7 @@ def ground_truth_in_places(truth: GroundTruth, place_of: Callable[[Tensor], Tens
     return truth._replace(positives=place_of(truth.positives), ignored=place_of(truth.ignored))
 
 
-def is_given(truth: Truth | None) -> TypeGuard[Tensor | NDArray[Any] | Sequence[Any] | GroundTruth]:
+def is_given(truth: Truth | None) -> TypeGuard[Tensor | np.ndarray | Sequence[Any] | GroundTruth]:
     """Whether a ground truth is places themselves, not words or a file that tell of them."""
     return truth is not None and not isinstance(truth, str | Path | Real)
 

@@ -42,7 +42,7 @@ class DescriptorFile(Traverse):
         self.path, self.name = Path(path), printable(path)
         shapes: dict[str, tuple[int, ...]] = {}
 
-        def visit(name: str, item: Any) -> None:
+        def visit(name: str, item: object) -> None:
             image, _, leaf = name.rpartition("/")
             if leaf != KEY or not image:
                 return

@@ -8,9 +8,8 @@ import re
 import zlib
 from collections.abc import Sequence
 from itertools import accumulate, pairwise
-from typing import Any
 
-from dejavu_torch.types import InputError, expect
+from dejavu_torch.types import Facts, InputError, expect
 
 MAX_NAME_LENGTH = 4096  # characters, as of a path
 MAX_DIGITS = 18  # of a number in a name
@@ -29,9 +28,8 @@ def encode_names(names: Sequence[str]) -> str:
     """
     longest = max(map(len, names), default=0)
     expect(longest <= MAX_NAME_LENGTH, f"at most {MAX_NAME_LENGTH}", f"a name has {longest} characters")
-    value: Any = _numbered(names)
-    if value is None or _names(value) != list(names):
-        value = list(names)
+    numbered = _numbered(names)
+    value = list(names) if numbered is None or _names(numbered) != list(names) else numbered
     return base64.b64encode(zlib.compress(json.dumps(value, separators=(",", ":")).encode(), 9)).decode()
 
 
@@ -44,7 +42,7 @@ def decode_names(code: str, count: int | None = None) -> list[str]:
     return value if columns is None else _names(value)
 
 
-def _numbered(names: Sequence[str]) -> dict[str, Any] | None:
+def _numbered(names: Sequence[str]) -> Facts | None:
     """Names that differ only in their numbers: the text between them, and the changes of each; else None."""
     parts = [re.split("([0-9]+)", name) for name in names]
     if any(part[::2] != parts[0][::2] or max(map(len, part[1::2]), default=0) > MAX_DIGITS for part in parts):
@@ -57,7 +55,7 @@ def _numbered(names: Sequence[str]) -> dict[str, Any] | None:
     return {"texts": parts[0][::2], "columns": columns} if columns else None
 
 
-def _names(numbered: dict[str, Any]) -> list[str]:
+def _names(numbered: Facts) -> list[str]:
     first, *rest = numbered["texts"]
     if max(width for width, *_ in numbered["columns"]) > MAX_DIGITS:
         raise InputError(f"the numbers in names are too wide; expected at most {MAX_DIGITS} digits")

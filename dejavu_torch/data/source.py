@@ -8,11 +8,10 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 from urllib.parse import parse_qsl
 
 import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset
 
@@ -25,10 +24,10 @@ from dejavu_torch.data.simulate import SIMULATORS
 from dejavu_torch.data.strip import read_strip
 from dejavu_torch.data.traverse import Cropped, Frames, frame_range
 from dejavu_torch.data.video import VIDEO_SUFFIXES, Video
-from dejavu_torch.types import InputError, Traverse, expect
+from dejavu_torch.types import Facts, InputError, Traverse, expect
 
 # of frames or features: see `as_traverse`
-Source: TypeAlias = Traverse | Tensor | NDArray[Any] | str | Path | Sequence[Any] | Dataset[Any]
+Source: TypeAlias = Traverse | Tensor | np.ndarray | str | Path | Sequence[object] | Dataset[object]
 CONVERTED = {  # kinds of files that other programs turn into images
     ".gif": "an animation; expected it converted, as by `ffmpeg -i FILE FOLDER/%06d.png`",
     ".zip": "an archive; expected it unpacked, as by `unzip FILE -d FOLDER`",
@@ -172,11 +171,11 @@ def _reader(text: str, address: str) -> Callable[..., Traverse]:
     raise InputError(f"{path} is {seen}; expected {EXPECTED}")
 
 
-def _arguments(text: str, query: str, reader: Callable[..., Traverse]) -> dict[str, Any]:
+def _arguments(text: str, query: str, reader: Callable[..., Traverse]) -> Facts:
     """`a=1&b=2` as arguments of the reader, and options in `EVERY`, each of the type of its default."""
     empty = inspect.Parameter.empty
     defaults = {name: option.default for name, option in inspect.signature(reader).parameters.items()} | EVERY
-    arguments: dict[str, Any] = {}
+    arguments: Facts = {}
     for name, value in parse_qsl(query, keep_blank_values=True):
         what = "a second" if name in arguments else "unknown"
         expect(name in defaults and name not in arguments, ", ".join(defaults), f"{text}: {what} {name!r}")

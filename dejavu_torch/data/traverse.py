@@ -331,7 +331,7 @@ class Frames(Traverse):
         return item
 
 
-def _first_of(item: Any) -> Any:
+def _first_of(item: object) -> Any:
     return item[0] if isinstance(item, tuple | list) and item else item
 
 

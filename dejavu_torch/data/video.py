@@ -24,7 +24,7 @@ from dejavu_torch.data.folder import check_pixels, check_size, fitted_size
 from dejavu_torch.data.names import clock_time
 from dejavu_torch.resize import MOST_PIXELS
 from dejavu_torch.text import printable
-from dejavu_torch.types import InputError, Traverse, expect
+from dejavu_torch.types import Facts, InputError, Traverse, expect
 
 if TYPE_CHECKING:
     from av import VideoFrame
@@ -100,7 +100,7 @@ class Video(Traverse):
     def __len__(self) -> int:
         return len(self._stamps)
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> Facts:
         return self.__dict__ | {"_decoder": None}
 
     def decoded_at(self, height: int, width: int) -> Video:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.recognition.select import PROBABLE
-from dejavu_torch.types import Match
+from dejavu_torch.types import Facts, Match
 
 LEVELS = (0.9, PROBABLE)  # probabilities of being right at which answers are counted
 CONFIDENT = 3  # without probabilities, one answer in three is confident, by its score
@@ -105,10 +105,10 @@ def line_of(places: Tensor, queries: Tensor, within: int, min_answers: float = M
 
 def answer_facts(
     match: Match, queries: Tensor, tolerance: int, scored: bool, offset: int | None = None
-) -> dict[str, Any]:
+) -> Facts:
     """The entries of report.json about the answers by themselves."""
     counts = probable_counts(match)
-    facts: dict[str, Any] = {"probably_right": counts} if counts else {}
+    facts: Facts = {"probably_right": counts} if counts else {}
     if scored and offset is None:
         return facts
     within, sure = max(tolerance, MIN_WIDTH), confident(match) & (match.index >= 0)

@@ -22,7 +22,7 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import recipe_of
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.recognition.drive import DriveQuery, localize_drives
-from dejavu_torch.recognition.localizer import SINGLE, Localizer, Matching, Scoring, asked_of
+from dejavu_torch.recognition.localizer import SINGLE, Localizer, Matching, Scoring, drive_query
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.text import with_progress
 from dejavu_torch.types import InputError, Match, Traverse
@@ -140,7 +140,7 @@ def baselines_of(
 
     def nearest(name: str, stored: Tensor, k: int, bytes: int, stride: int = 1) -> Baseline:
         match = run.match_by(lambda *how: nearest_frames(stored, how[0], stride, metric, progress, how[1]))
-        asked = run.asked(scores_of_stored(stored, stride, metric))
+        asked = run.drive_query(scores_of_stored(stored, stride, metric))
         return Baseline(name, match, bytes + fixed, k, fixed, asked)
 
     size, own = partial(stride_bytes, frames, dimension), reference.element_size()
@@ -199,7 +199,7 @@ def _null_controls(run: Localization, seed: int, one: str, progress: bool) -> di
     def null(name: str, same_plan: bool = False) -> Baseline:
         shuffled, order = null_map(model, run.reference_features, seed, same_plan)
         match = run.match_by(lambda query, how: shuffled.localize_descriptors(query, how, order, progress))
-        return Baseline(f"null: {name}", match, asked=run.asked(shuffled.scores_in(order)))
+        return Baseline(f"null: {name}", match, asked=run.drive_query(shuffled.scores_in(order)))
 
     foreign = isinstance(model.mapper, TemplateMapper) and model.mapper.periods is None
     if foreign:
@@ -299,7 +299,7 @@ def _described_baselines(
 
     def baseline(name: str, k: int) -> Baseline:
         match = nearest_frames(stored, queries, k, "l1", progress, matching)
-        asked = None if smoother is None else asked_of(queries, smoother, scores_of_stored(stored, k))
+        asked = None if smoother is None else drive_query(queries, smoother, scores_of_stored(stored, k))
         return Baseline(name, match, size(k), k, asked=asked)
 
     return {key: baseline(name, k) for key, (name, k) in names.items()}

@@ -354,7 +354,7 @@ def _other_contenders(
         queries, size = other.descriptor.all_of(run.query, progress), other.summary()
         match = other.localize_descriptors(queries, run.matching, progress=progress)
         beside = copy.deepcopy(run.beside)
-        asked = None if beside is None else other.localizer(SINGLE).asked(queries, beside)
+        asked = None if beside is None else other.localizer(SINGLE).drive_query(queries, beside)
         found[key] = Baseline(name, match, size.map_bytes, None, size.fixed_bytes, asked)
     contenders = {}
     for key, (name, match, bytes, k, fixed, _) in with_drives(found, progress).items():

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from torch import Tensor
 
@@ -14,7 +14,7 @@ from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth, counted
 from dejavu_torch.evaluation.curves import PRCurve, Scores, curve_of, evaluate
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.sequence import SequenceMatcher
-from dejavu_torch.types import Match, SequenceModel, Together
+from dejavu_torch.types import Facts, Match, SequenceModel, Together
 
 LENGTHS = (1, 5, 11, 21)  # queries of the sequences that a report compares
 
@@ -78,10 +78,10 @@ class Contender(NamedTuple):
         """Recall at which the curve starts, that of the queries that share the best score."""
         return float(self.curve.recall[0]) if self.curve and len(self.curve.recall) else None
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> Facts:
         """The nested entry of report.json."""
         scores = self.scores._asdict() if self.scores else dict.fromkeys(Scores._fields)
-        extra: dict[str, Any] = {"bytes": self.bytes, "route_bytes": self.route_bytes, "k": self.k}
+        extra: Facts = {"bytes": self.bytes, "route_bytes": self.route_bytes, "k": self.k}
         extra |= {"curve_starts_at_recall": self.starts, "auc_by_confidence": self.auc_by_confidence}
         if self.sequences:
             extra["sequences"] = sequences_as_json(self.sequences)

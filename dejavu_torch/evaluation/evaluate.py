@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -37,11 +37,11 @@ from dejavu_torch.evaluation.score_plots import draw_curves
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.model_file import read_place_map
 from dejavu_torch.text import printable
-from dejavu_torch.types import InputError, Match, Traverse
+from dejavu_torch.types import Facts, InputError, Match, Traverse
 from dejavu_torch.version import __version__
 
 RANKS = (5, 10)  # the N of recall@N
-TOLD = 10  # right and wrong answers, from which on their scores are compared
+TOLD = 10  # least number of right and of wrong answers whose scores are compared
 
 log = logging.getLogger("dejavu_torch")
 
@@ -163,7 +163,7 @@ def evaluation_facts(
     positions: Tensor,
     described: str,
     off_map: Mapping[str, Tensor] = MappingProxyType({}),
-) -> dict[str, Any]:
+) -> Facts:
     """The entries of every report.json besides the scores.
 
     Args:
@@ -172,7 +172,7 @@ def evaluation_facts(
         positions: of the map's places, empty if places are frames; see `PlaceMap`.
         off_map: see `rejection_facts`.
     """
-    facts: dict[str, Any] = {
+    facts: Facts = {
         "queries": len(match.index),
         "accepted": int(match.accepted.sum()),
         "tolerance": tolerance,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,13 +20,13 @@ from dejavu_torch.motion.resampling import ResampledTraverse, source_of
 from dejavu_torch.periods.spectrogram import BACKEND
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.sequence import SequenceMatcher
-from dejavu_torch.types import Match
+from dejavu_torch.types import Facts, Match
 
 QUANTILES = 0.5, 0.9, 0.99  # of errors in metres
 STANDING, FAR = 0.01, 256  # of the distance between places drawn at random: a camera that stands still
 
 
-def facts_of(run: Localization, seconds: Mapping[str, float]) -> dict[str, Any]:
+def facts_of(run: Localization, seconds: Mapping[str, float]) -> Facts:
     """The entries about the map, the run and places where the camera stands."""
     return {
         **_map_facts(run.model.summary(), run.reference_features),
@@ -36,7 +35,7 @@ def facts_of(run: Localization, seconds: Mapping[str, float]) -> dict[str, Any]:
     }
 
 
-def _map_facts(summary: MapSummary, features: Tensor) -> dict[str, Any]:
+def _map_facts(summary: MapSummary, features: Tensor) -> Facts:
     """The entries of report.json about the map, whose places have these features (N,D)."""
     chunks = [chunk._asdict() | {"periods": [*map(plain_number, chunk.periods)]} for chunk in summary.chunks]
     names = ("kind", "map_bytes", "fixed_bytes", "route_bytes", "bytes_per_place", "lines")
@@ -51,7 +50,7 @@ def _map_facts(summary: MapSummary, features: Tensor) -> dict[str, Any]:
     }
 
 
-def _run_facts(run: Localization, seconds: Mapping[str, float]) -> dict[str, Any]:
+def _run_facts(run: Localization, seconds: Mapping[str, float]) -> Facts:
     """The entries of report.json about the run; no seconds to learn if the map is given."""
     model, reference, query = run.model, run.reference, run.query
     acceptance = model.acceptance(run.smoother or run.sequence)
@@ -88,7 +87,7 @@ def _run_facts(run: Localization, seconds: Mapping[str, float]) -> dict[str, Any
 
 def match_facts(
     run: Localization, candidates: Match, truth: Truth | None, interpolate: bool, off: Mapping[str, Tensor]
-) -> dict[str, Any]:
+) -> Facts:
     """The entries of report.json about the answers; `off`: see `rejection_facts`."""
     place_map, tolerance = run.model.map, run.tolerance
     carried = all(source_of(traverse).places is not None for traverse in (run.reference, run.query))
@@ -101,7 +100,7 @@ def match_facts(
     return facts | alone
 
 
-def metric_facts(run: Localization, truth: Truth | None) -> dict[str, Any]:
+def metric_facts(run: Localization, truth: Truth | None) -> Facts:
     """The entry `error_metres` of report.json: quantiles of the distances between queries and the places
     reported for them, where the truth is by coordinates."""
     parsed = None if truth is None else check_ground_truth(truth)
@@ -113,7 +112,7 @@ def metric_facts(run: Localization, truth: Truth | None) -> dict[str, Any]:
     known = distance.isfinite() & (index >= 0)
     if run.truth is not None and run.matching.apart is not None:
         known &= (run.truth.positives >= 0).any(1)  # most places are no loop
-    facts: dict[str, Any] = {}
+    facts: Facts = {}
     for name, chosen in (("all", known), ("accepted", known & run.match.accepted)):
         if chosen.any():
             quantiles = distance[chosen].quantile(torch.tensor(QUANTILES, dtype=torch.float64)).tolist()

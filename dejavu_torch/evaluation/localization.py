@@ -16,7 +16,7 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.recognition.drive import DriveQuery
 from dejavu_torch.recognition.filter import PlaceFilter
-from dejavu_torch.recognition.localizer import SINGLE, Matching, Scoring, asked_of, earlier
+from dejavu_torch.recognition.localizer import SINGLE, Matching, Scoring, drive_query, earlier
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.types import Match, SequenceModel, Traverse
 
@@ -67,11 +67,11 @@ class Localization(NamedTuple):
             return found
         return replace(match(self.query_features, matching._replace(also={})), sequences=found.sequences)
 
-    def asked(self, score: Scoring) -> DriveQuery | None:
+    def drive_query(self, score: Scoring) -> DriveQuery | None:
         """The queries as a drive with the scores of another map, if a smoother is compared."""
         if self.beside is None:
             return None
-        return asked_of(self.query_features, self.beside, score, self.causal_features)
+        return drive_query(self.query_features, self.beside, score, self.causal_features)
 
     @property
     def answers(self) -> str:

@@ -19,7 +19,7 @@ from dejavu_torch.evaluation.contenders import COLOURS
 from dejavu_torch.evaluation.localization import Localization, frame_at, nearest_query
 from dejavu_torch.motion.resampling import source_of
 from dejavu_torch.recognition.filter import PlaceFilter
-from dejavu_torch.types import Match, Traverse
+from dejavu_torch.types import Facts, Match, Traverse
 
 CELLS = 400  # rows and columns of a score matrix, at most
 PIXELS = 1000  # rows and columns of a posterior, at most
@@ -145,7 +145,7 @@ def draw_coverage(
     elif probability is not None:
         order = probability.argsort()  # the surest drawn last
         order = order[reported[order]]
-        style: dict[str, Any] = {"cmap": "viridis_r", "vmin": 0, "vmax": 1, "linewidths": 0}
+        style: Facts = {"cmap": "viridis_r", "vmin": 0, "vmax": 1, "linewidths": 0}
         points = axis.scatter(queries[order], shown[order], s=9, c=probability[order], **style)
         figure.colorbar(points, ax=axis, pad=0.01, aspect=30, label="probability of being right")
     else:
@@ -183,7 +183,7 @@ def draw_scores(run: Localization, cells: int = CELLS) -> plots.Pictures:
     bar = figure.colorbar(image, ax=axis, pad=0.01, aspect=30, ticks=[0, 1], label="score of the query")
     bar.ax.set_yticklabels(["best", "median"])
     handles, names = axis.get_legend_handles_labels()
-    style: dict[str, Any] = {"markerscale": 4, "handlelength": 1.5, "columnspacing": 1}
+    style: Facts = {"markerscale": 4, "handlelength": 1.5, "columnspacing": 1}
     plots.legend(figure, handles, names, ncols=len(names), **style)
     shown = []
     if len(chosen) < len(queries):
@@ -215,7 +215,7 @@ def _show_scores(axis: Any, run: Localization, x: Tensor, y: Tensor, values: Ten
     image = axis.pcolorfast(x.numpy(), y.numpy(), values.T.numpy(), cmap="gray", vmin=0, vmax=1)
     index, queries = run.scored.index, run.query_frames
     found = index >= 0
-    style: dict[str, Any] = {"color": COLOURS["map"], "markersize": 2, "label": "reported place"}
+    style: Facts = {"color": COLOURS["map"], "markersize": 2, "label": "reported place"}
     axis.plot(queries[found], run.borders[index[found]], ".", **style)
     if run.truth is not None:
         style = {"color": plots.RIGHT, "linewidth": 1, "dashes": (4, 4)}

@@ -15,7 +15,7 @@ from dejavu_torch.evaluation.activation import share
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.plots import DARK, GREY, RIGHT, Pictures, canvas, picture
 from dejavu_torch.memory import in_float32
-from dejavu_torch.types import Match
+from dejavu_torch.types import Facts, Match
 
 ASKED = (0.5, 0.8, 0.9, 0.95, 0.99)  # precisions in a report
 BINS = 10
@@ -23,11 +23,11 @@ BINS = 10
 
 def rejection_facts(
     match: Match, truth: GroundTruth | None, tolerance: int, off_map: Mapping[str, Tensor]
-) -> dict[str, Any]:
+) -> Facts:
     """The entry `rejection` of report.json; empty if matches have no probabilities."""
     if match.probability is None:
         return {}
-    facts: dict[str, Any] = {"off_map": {}}
+    facts: Facts = {"off_map": {}}
     for name, probability in off_map.items():
         accepted = {f"{asked:g}": float((probability >= asked).double().mean()) for asked in ASKED}
         facts["off_map"][name] = {"frames": len(probability), "accepted": accepted}

@@ -22,7 +22,7 @@ from dejavu_torch.evaluation.prose import sentences, templates
 from dejavu_torch.evaluation.rejection import rejection_table
 from dejavu_torch.recognition.select import PROBABLE
 from dejavu_torch.text import printable
-from dejavu_torch.types import Together
+from dejavu_torch.types import Facts, Together
 
 PICTURES = (
     *("frames", "pairs", "coverage", "scores", "pr", "storage", "sequences"),
@@ -55,7 +55,7 @@ class Report(NamedTuple):
     contenders: Mapping[str, Contender]
     facts: Mapping[str, Any]
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> Facts:
         """report.json as a mapping."""
         scores = self.ours._replace(bytes=None).as_json()
         nested = {key: contender.as_json() for key, contender in self.contenders.items()}

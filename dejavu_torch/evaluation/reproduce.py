@@ -22,10 +22,10 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
-from dejavu_torch.types import InputError, Match, Traverse
+from dejavu_torch.types import Facts, InputError, Match, Traverse
 
 PATCH = (32, 32)  # pixels: slightly more rows than the region of ground has in a frame
-PAPER: dict[str, Any] = {"min_period": 8, "peaks": "bins", "false_alarm": None, "short": "refuse"}
+PAPER: Facts = {"min_period": 8, "peaks": "bins", "false_alarm": None, "short": "refuse"}
 SETTINGS = ("min_period", "strongest", "peaks", "false_alarm", "short")  # of the analysis, except its chunks
 
 
@@ -85,7 +85,7 @@ def reproduce(
         "ideal": contend("ideal: the database itself", model.localize(places), itself, tolerance),
         "ideal_leave_out": contend(left_out, leave_out_match(model, places, tolerance), itself, tolerance),
     }
-    facts: dict[str, Any] = {
+    facts: Facts = {
         **result.report.facts,
         "published": PUBLISHED[dataset]._asdict(),
     }
@@ -204,7 +204,7 @@ def _mapper(model: DejaVu) -> TemplateMapper | None:
     return None
 
 
-def _settings(mapper: TemplateMapper) -> dict[str, Any]:
+def _settings(mapper: TemplateMapper) -> Facts:
     """The settings of a spectrogram analysis, except its chunks."""
     return {name: getattr(mapper.periods, name) for name in SETTINGS}
 

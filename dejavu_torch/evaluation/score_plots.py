@@ -20,7 +20,7 @@ from dejavu_torch.evaluation.plots import (
     picture,
     set_title,
 )
-from dejavu_torch.types import Together
+from dejavu_torch.types import Facts, Together
 
 _SHADES = (COLOURS["map"], "#00406b", "#5aa9d6")  # one map on several datasets
 MIN_GAIN = 0.001  # of an area
@@ -38,13 +38,13 @@ class Stored(NamedTuple):
     recall_at_1: float
     sequences: Mapping[Together, Scores] = MappingProxyType({})
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> Facts:
         """The entry of report.json."""
         entry = self._asdict() | {"sequences": sequences_as_json(self.sequences)}
         return {name: value for name, value in entry.items() if value != {}}
 
 
-def _style(key: str) -> dict[str, Any]:
+def _style(key: str) -> Facts:
     """The colour and line of a contender, by its key."""
     line = _LINES.get(key.partition("_")[0], "-")
     return {"color": colour_of(key), "linestyle": line, "linewidth": 2.4 if key == "map" else 1.6}
@@ -104,7 +104,7 @@ def draw_storage(
     axis.grid(alpha=0.25)
     legend(figure)
     factors = [null / ours for ours, null in equally_good(*(storage.get(key, ()) for key in ("map", "null")))]
-    numbers: dict[str, Any] = {key: [one.as_json() for one in points] for key, points in storage.items()}
+    numbers: Facts = {key: [one.as_json() for one in points] for key, points in storage.items()}
     numbers["null_over_map"] = factors
     return picture("storage", (figure, axis), numbers, factors=factors)
 

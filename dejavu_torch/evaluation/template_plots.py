@@ -24,7 +24,7 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.resampling import source_of
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.resize import resize_frames
-from dejavu_torch.types import FrequencyLayer, Plan, Traverse
+from dejavu_torch.types import Facts, FrequencyLayer, Plan, Traverse
 
 CANDIDATES = 16  # features of a layer from which one is chosen to be shown
 SHOWN = 12  # layers of a chunk, at most
@@ -315,7 +315,7 @@ def draw_activations(run: Localization, place_map: TemplateMap, chunk: list[int]
     scores.append(run.scores(torch.tensor([query]))[0, start:stop])
     titles = [f"period {float(layer.period):.4g}, {len(layer.features)} features" for layer in layers]
     titles.append("all layers fused")
-    numbers: dict[str, Any] = {}
+    numbers: Facts = {}
     if run.truth is not None:
         found = run.query_features, run.scored.index
         rates = activation_rates(place_map, chosen, *found, run.truth, run.tolerance)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 from torch import Tensor, nn
 
@@ -86,7 +85,7 @@ class SmallCNN(nn.Module):
             trained = next(self.convolutions[0].parameters()).requires_grad  # unless it is frozen
             self.convolutions[0] = first.to(self.linear.weight).requires_grad_(trained)
 
-    def _load_from_state_dict(self, state: dict[str, Tensor], prefix: str, *args: Any) -> None:
+    def _load_from_state_dict(self, state: dict[str, Tensor], prefix: str, *args: object) -> None:
         stored = state.get(f"{prefix}convolutions.0.weight")
         if stored is not None and stored.ndim == 4 and stored.shape[1]:
             self.follow(stored.shape[1])
@@ -94,7 +93,7 @@ class SmallCNN(nn.Module):
         super()._load_from_state_dict(state, prefix, *args)
 
     def forward(self, frames: Tensor) -> Tensor:
-        check_shape(frames, f"B {self.channels} H W", "SmallCNN got frames")
+        check_shape(frames, f"B {self.channels} H W", "SmallCNN got")
         frames = resize_frames(frames, self.resize).to(self.linear.weight.dtype)
         if self.cell:
             frames = local_contrast(frames, self.cell)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -30,7 +29,7 @@ from dejavu_torch.types import BATCH_NUMBERS, BATCH_SIZE, InputError, Traverse, 
 log = logging.getLogger("dejavu_torch")
 
 DRAWN = 32  # frames that the preprocessing adapts to
-NARROW = 0.1  # share of the values of 16 bits below which it is told that frames use few of them
+NARROW = 0.1  # share of the values of 16 bits; a warning is given if the frames use less
 ROWS = 4096  # descriptors on the device at a time
 DESCRIPTOR_MEMORY = IN_MEMORY // 4  # bytes of descriptors kept in memory
 
@@ -74,7 +73,7 @@ class Descriptor(nn.Module):
         self.batch_size, self.weight_bits = batch_size, weight_bits
         self.reduces = False  # whether the whitening was added for ready features that are too wide for a map
         self.warned: set[tuple[str, str]] = set()  # (traverse, line) of warnings that were logged
-        self.known: dict[Any, tuple[object, Tensor]] | None = None  # features, see `remembering`
+        self.known: dict[object, tuple[object, Tensor]] | None = None  # features, see `remembering`
         self.register_buffer("_where", torch.zeros(0), persistent=False)
 
     @property

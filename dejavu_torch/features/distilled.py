@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import torch
 from safetensors.torch import load_file
@@ -63,7 +62,7 @@ class Distilled(nn.Module):
         maps = distilled_maps(resize_frames(frames, SIZE), dict(self.named_buffers()))
         return adaptive_avg_pool2d(maps, self.grid).flatten(1)
 
-    def _load_from_state_dict(self, state: dict[str, Any], prefix: str, *args: Any) -> None:
+    def _load_from_state_dict(self, state: dict[str, Tensor], prefix: str, *args: object) -> None:
         stored = state.get(f"{prefix}checksum")
         if stored is not None and not torch.equal(stored.cpu(), self.checksum.cpu()):
             seen = f"it was learned with other weights {self.weights} of Distilled than this version has"

@@ -11,7 +11,7 @@ from torch import nn
 
 from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.text import one_line
-from dejavu_torch.types import InputError, expect
+from dejavu_torch.types import Facts, InputError, expect
 
 PREFIX = "hub:"
 MEAN, STD = [0.485, 0.456, 0.406], [0.229, 0.224, 0.225]  # of ImageNet
@@ -22,12 +22,12 @@ class Network(NamedTuple):
 
     repository: str
     entry: str
-    settings: dict[str, Any]
+    settings: Facts
     size: tuple[int, int] = (322, 322)
     output: int | None = None
 
     @property
-    def call(self) -> dict[str, Any]:
+    def call(self) -> Facts:
         """The arguments of torch.hub.load."""
         return {"repo_or_dir": self.repository, "model": self.entry, "trust_repo": True, **self.settings}
 
@@ -59,7 +59,7 @@ def known(name: str) -> Network:
 
 def hub(
     name: str,
-    network: dict[str, Any] | None = None,
+    network: Facts | None = None,
     dimension: int | None = None,
     resize: tuple[int, int] | None = None,
     mean: float | list[float] | None = MEAN,
@@ -81,7 +81,7 @@ def hub(
     return Embedding(net, dimension=dimension, resize=size, mean=mean, std=std, output=chosen, **settings)
 
 
-def made(function: str, **arguments: Any) -> nn.Module:
+def made(function: str, **arguments: object) -> nn.Module:
     """The network that a function of any signature makes, such as torch.hub.load.
 
     jsonargparse itself only accepts functions with annotated arguments and return value.

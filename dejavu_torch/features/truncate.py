@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections import OrderedDict
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -33,7 +32,7 @@ def run(network: nn.Module, frames: Tensor) -> object:
     return output
 
 
-def _traced_calls() -> OrderedDict[str, Any]:
+def _traced_calls() -> OrderedDict[str, object]:
     """The stack of module calls of torch.export, which its tracer does not unwind after an exception."""
     if torch.compiler.is_exporting() and not torch.compiler.is_dynamo_compiling():
         from torch.fx.experimental.proxy_tensor import get_proxy_mode
@@ -78,7 +77,7 @@ def up_to(network: nn.Module, layer: str, frames: Tensor) -> nn.Module:
     return smaller if same else ended
 
 
-def _end(layer: nn.Module, inputs: Any, output: object) -> None:
+def _end(layer: nn.Module, inputs: object, output: object) -> None:
     raise Reached(output)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -12,7 +12,7 @@ from torch import Tensor
 from dejavu_torch.data.traverse import Part, as_shape
 from dejavu_torch.features.augmentation import LARGEST, Augmentation
 from dejavu_torch.features.preprocess import spread
-from dejavu_torch.types import InputError, Traverse, expect
+from dejavu_torch.types import Facts, InputError, Traverse, expect
 
 SAMPLE = 10_000  # frames that a longer route is fitted on
 MIN_SEGMENTS = 4  # of a sample
@@ -91,7 +91,7 @@ class LabelledFrames(NamedTuple):
         drive, names, *_ = self.placed or (self.places, {})
         return sum(bool((self.places[drive == i] >= 0).any()) for i in names)
 
-    def placed_facts(self) -> dict[str, Any] | None:
+    def placed_facts(self) -> Facts | None:
         """The entry `second` of report.json; None if no smoother placed the frames."""
         if self.placed is None:
             return None
@@ -134,7 +134,7 @@ class AugmentedFrames:
         runs: Sequence[range],
         block: int,
         copies: int,
-        strengths: Mapping[str, Any],
+        strengths: Facts,
         seed: int = 0,
         factor: float = 1.0,
         span: tuple[float, float] = (0.0, 1.0),
@@ -181,7 +181,7 @@ def augmented_route(
     frames: int,
     copies: int,
     most: int,
-    strengths: Mapping[str, Any],
+    strengths: Facts,
     seed: int = 0,
     span: tuple[float, float] = (0.0, 1.0),
 ) -> tuple[LabelledFrames, str]:
@@ -195,7 +195,7 @@ def augmented_route(
 def augmented_segments(
     traverse: Traverse,
     frames: int,
-    strengths: Mapping[str, Any],
+    strengths: Facts,
     places: int | None = None,
     starts: Sequence[int] | None = None,
     span: tuple[float, float] = (0.0, 1.0),

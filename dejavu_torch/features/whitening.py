@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.memory import without_autocast
 from dejavu_torch.text import settings_of
-from dejavu_torch.types import InputError, check_shape, expect
+from dejavu_torch.types import Facts, InputError, check_shape, expect
 
 log = logging.getLogger("dejavu_torch")
 
@@ -36,7 +36,7 @@ VISIT = 16.0  # how many augmented copies a frame of a drive counts as
 LIGHT = 50  # frames of a drive that its mean change is shrunk by
 SPARE = 32  # further directions of the randomised subspace, for accuracy
 ROUNDS = 3  # of its iteration
-STRENGTHS: Mapping[str, Any] = {  # defaults of `Augmentation`
+STRENGTHS: Facts = {  # defaults of `Augmentation`
     name: [*strength] if len(strength) > 1 else strength[0]
     for name, strength in Augmentation().strengths.items()
     if max(strength)
@@ -359,7 +359,7 @@ class Whitening(nn.Module):
         self.offset = (mean @ whole) * self.scale
         self.length = self.scale.new_zeros(0) if length is None else length.to(self.scale).view(1)
 
-    def _load_from_state_dict(self, state: dict[str, Any], prefix: str, *args: Any) -> None:
+    def _load_from_state_dict(self, state: dict[str, Tensor], prefix: str, *args: object) -> None:
         inner = f"{prefix}members."
         groups = {name.removeprefix(inner).partition(".")[0] for name in state if name.startswith(inner)}
         self.members = nn.ModuleList(self._member() for _ in groups)  # torch loads them next

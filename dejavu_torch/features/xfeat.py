@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -60,7 +59,7 @@ class XFeat(nn.Module):
         maps = normalize(dense_features(grey, dict(self.named_buffers())), dim=1)
         return normalize(adaptive_avg_pool2d(maps, self.grid).flatten(1), dim=1)
 
-    def _load_from_state_dict(self, state: dict[str, Any], prefix: str, *args: Any) -> None:
+    def _load_from_state_dict(self, state: dict[str, Tensor], prefix: str, *args: object) -> None:
         stored = state.get(f"{prefix}checksum")
         if stored is not None and not torch.equal(stored.cpu(), self.checksum.cpu()):
             seen = f"it was learned with other weights of XFeat than this {PACKAGE} has"

@@ -12,7 +12,7 @@ from contextlib import suppress
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
@@ -22,7 +22,7 @@ from torch import Tensor
 
 from dejavu_torch.data.camera import Frame
 from dejavu_torch.live.localizer import LiveMatch
-from dejavu_torch.types import InputError, Traverse, expect
+from dejavu_torch.types import Facts, InputError, Traverse, expect
 
 HOST = "127.0.0.1"
 PORT = 8765  # default
@@ -68,7 +68,7 @@ class Page:
             def do_GET(self) -> None:
                 page.answer(self)
 
-            def log_message(self, *_: Any) -> None:
+            def log_message(self, *_: object) -> None:
                 pass
 
         try:
@@ -113,12 +113,12 @@ class Page:
             request.end_headers()
             request.wfile.write(body)
 
-    def state(self, seen: str = "") -> dict[str, Any]:
+    def state(self, seen: str = "") -> Facts:
         """What the page polls; only the number of the frame if the page has `seen` it."""
         if self.snapshot is None:
             return {"title": self.title, "number": -1}
         frame, match, scores, posterior, *counts = self.snapshot
-        facts: dict[str, Any] = {"title": self.title, "number": frame.number}
+        facts: Facts = {"title": self.title, "number": frame.number}
         if seen == str(frame.number):
             return facts
         facts |= match._asdict() | {"time": frame.seconds}
@@ -133,7 +133,7 @@ class Page:
         }
 
 
-def without_nan(facts: dict[str, Any]) -> dict[str, Any]:
+def without_nan(facts: Facts) -> Facts:
     """The facts with None for NaN and infinity, which JSON does not have."""
     missing = [key for key, value in facts.items() if isinstance(value, float) and not math.isfinite(value)]
     return facts | dict.fromkeys(missing)

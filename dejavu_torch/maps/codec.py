@@ -130,7 +130,7 @@ def _filled(levels: Ints) -> int:
     return 1 + int(np.flatnonzero(levels.any(1)).max(initial=-1))
 
 
-def _count(counts: Any, size: Ints, sign: Ints, before: Ints, near: Ints) -> None:
+def _count(counts: np.ndarray, size: Ints, sign: Ints, before: Ints, near: Ints) -> None:
     """Add the bits of levels (R,K) to counts (CONTEXTS,2); before: the sign two rows before each."""
     length = np.frexp(size)[1].astype(np.int64)
     ends = np.bincount((length * NEAR + near).ravel(), minlength=32 * NEAR).reshape(32, NEAR)
@@ -217,7 +217,7 @@ def _code(block: Any, start: int, filled: int, packed: Any, coding: Any) -> int:
 
 
 def _bit(
-    context: int, bit: int, reads: bool, low: int, span: int, at: int, counts: Any, packed: Any
+    context: int, bit: int, reads: bool, low: int, span: int, at: int, counts: Ints, packed: bytearray | Ints
 ) -> tuple[int, int, int, int]:
     """Code a bit in its context -> the bit, and the interval and position after it."""
     zero, one = counts[2 * context], counts[2 * context + 1]
@@ -237,7 +237,7 @@ def _bit(
     return bit, low, span, at
 
 
-def _put(low: int, at: int, packed: Any) -> int:
+def _put(low: int, at: int, packed: bytearray | Ints) -> int:
     """Write the first byte of the interval's lower end, with a carry into the bytes before it."""
     byte = low >> MIN_SPAN
     if byte > 255:
@@ -250,7 +250,7 @@ def _put(low: int, at: int, packed: Any) -> int:
     return (low & LEAST - 1) << 8
 
 
-def _near(sums: Any, rows: Any, logarithms: Any) -> Any:
+def _near(sums: Ints, rows: Ints, logarithms: Ints) -> Any:
     """The contexts (R,K), 0 to `NEAR`, by the recent growth of `sums` (.., K+1) over all earlier rows."""
     now, columns = sums[rows % len(sums)], sums.shape[1] - 1
     far = np.minimum(np.minimum(np.maximum(rows // 2, 16), REACH), rows)

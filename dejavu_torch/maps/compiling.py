@@ -5,18 +5,19 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from threading import Timer
-from typing import Any
+from typing import Any, TypeAlias
 
 from dejavu_torch.text import one_line
 
 log = logging.getLogger("dejavu_torch")
 
+Kernel: TypeAlias = Callable[..., Any]
 SILENCE = 2.0  # seconds, longer than a load from the cache takes
 
 
 def compiled(
-    function: Callable[..., Any], signature: str, what: str, calls: Sequence[Any] = (), **options: Any
-) -> Callable[..., Any] | None:
+    function: Kernel, signature: str, what: str, calls: Sequence[object] = (), **options: object
+) -> Kernel | None:
     """The function, and its `calls`, compiled for one signature, or loaded from numba's cache; a long
     compilation is logged.
 
@@ -32,7 +33,7 @@ def compiled(
             register_jitable(call)
         notice.start()
         try:
-            kernel: Callable[..., Any] = numba.njit(signature, cache=True, **options)(function)
+            kernel: Kernel = numba.njit(signature, cache=True, **options)(function)
         except Exception:  # the cache may have no folder
             kernel = numba.njit(signature, cache=False, **options)(function)
         if kernel is function:

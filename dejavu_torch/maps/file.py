@@ -6,7 +6,6 @@ import json
 from collections.abc import Mapping
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any
 
 import safetensors.torch
 import torch
@@ -15,7 +14,7 @@ from torch import Tensor
 
 from dejavu_torch.data.files import check_regular
 from dejavu_torch.data.output import whole_file
-from dejavu_torch.types import InputError, expect
+from dejavu_torch.types import Facts, InputError, expect
 
 FORMAT = 11
 NAME = "dejavu_torch-map"
@@ -25,7 +24,7 @@ HEADER = "header"  # key of the header and of its digest
 DIGEST = 8  # bytes
 
 
-def checksums(tensors: Mapping[str, Tensor], header: Any) -> dict[str, str]:
+def checksums(tensors: Mapping[str, Tensor], header: object) -> dict[str, str]:
     """A digest of the header, and of each part's names, types, shapes and bytes."""
     sums = {HEADER: blake2b(json.dumps(header).encode(), digest_size=DIGEST)}
     for name, tensor in sorted(tensors.items()):
@@ -35,12 +34,12 @@ def checksums(tensors: Mapping[str, Tensor], header: Any) -> dict[str, str]:
     return {part: digest.hexdigest() for part, digest in sums.items()}
 
 
-def digests(**values: Any) -> dict[str, str]:
+def digests(**values: object) -> dict[str, str]:
     """A digest of each of these JSON values."""
     return {name: checksums({}, {name: value})[HEADER] for name, value in values.items()}
 
 
-def map_size(tensors: Mapping[str, Tensor], header: dict[str, Any]) -> int:
+def map_size(tensors: Mapping[str, Tensor], header: Facts) -> int:
     """Bytes of the file that `write_map` writes, from names, types and shapes alone."""
     sums = dict.fromkeys((HEADER, *(name.partition(".")[0] for name in tensors)), "0" * 2 * DIGEST)
     empty = {name: torch.empty(0, dtype=tensor.dtype) for name, tensor in tensors.items()}
@@ -54,7 +53,7 @@ def map_size(tensors: Mapping[str, Tensor], header: dict[str, Any]) -> int:
     return 8 + -(-len(text.encode()) // 8) * 8 + end
 
 
-def write_map(path: Path, tensors: Mapping[str, Tensor], header: dict[str, Any]) -> None:
+def write_map(path: Path, tensors: Mapping[str, Tensor], header: Facts) -> None:
     """Write the file completely or, with an InputError, not at all; equal contents give equal bytes. Names of
     tensors begin with a part of the model and a dot; the header is JSON."""
     with whole_file(path) as temporary:
@@ -66,7 +65,7 @@ def write_map(path: Path, tensors: Mapping[str, Tensor], header: dict[str, Any])
             raise InputError(f"{path} was not written: {error}") from error
 
 
-def _metadata(sums: dict[str, str], header: dict[str, Any]) -> dict[str, str]:
+def _metadata(sums: dict[str, str], header: Facts) -> dict[str, str]:
     """The metadata of the archive: one entry, for a fixed order."""
     try:
         return {NAME: json.dumps({"version": FORMAT, "checksums": sums, HEADER: header}, allow_nan=False)}
@@ -74,7 +73,7 @@ def _metadata(sums: dict[str, str], header: dict[str, Any]) -> dict[str, str]:
         raise InputError(f"the model cannot be written: {error}; expected finite numbers") from error
 
 
-def read_map(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def read_map(path: Path) -> tuple[dict[str, Tensor], Facts]:
     """What `write_map` wrote; an InputError if it is missing, truncated, damaged or not of this format."""
     check_regular(path, EXPECTED)
     try:

@@ -6,7 +6,7 @@ import logging
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from itertools import accumulate
-from typing import Any, ClassVar, Self, TypeVar, get_args
+from typing import ClassVar, Self, TypeVar, get_args
 
 import torch
 from torch import Tensor, nn
@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from dejavu_torch.data.positions import count_places
 from dejavu_torch.maps.frame_table import FrameTable, Link, Route
 from dejavu_torch.maps.summary import MapSummary
-from dejavu_torch.types import InputError, check_shape, expect
+from dejavu_torch.types import Facts, InputError, check_shape, expect
 
 log = logging.getLogger("dejavu_torch")
 
@@ -30,7 +30,7 @@ def require(fits: bool, seen: str) -> None:
         raise InputError(f"the map does not fit together: {seen}")
 
 
-def one_of(value: L, kind: Any, name: str) -> L:
+def one_of(value: L, kind: object, name: str) -> L:
     """A value that a Literal names, else an InputError; `name`: of the value in the message."""
     expect(value in get_args(kind), str(kind).removeprefix("typing."), f"{name} is {value!r:.60}")
     return value
@@ -71,7 +71,7 @@ class PlaceMap(nn.Module, ABC):
         """Scores of all places, differentiable."""
 
     @abstractmethod
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> Facts:
         """Settings that a loaded state must have too, such as the metric, as JSON values."""
 
     @abstractmethod
@@ -84,7 +84,7 @@ class PlaceMap(nn.Module, ABC):
     def forward(self, queries: Tensor) -> Tensor:
         return self.scores(queries)
 
-    def _apply(self, *args: Any, **kwargs: Any) -> Self:
+    def _apply(self, *args: object, **kwargs: object) -> Self:
         """As in nn.Module, but what `double()` and the like would change for files keeps its type."""
         before: dict[str, Tensor] = {name: getattr(self, name) for name in self.kept}
         super()._apply(*args, **kwargs)  # type: ignore[no-untyped-call]
@@ -171,17 +171,17 @@ class PlaceMap(nn.Module, ABC):
             seen = count_places(self.table.steps)
             require(seen == self.places, f"positions of {seen} places; expected {self.places}")
 
-    def get_extra_state(self) -> dict[str, Any]:
+    def get_extra_state(self) -> Facts:
         """The state besides the tensors."""
         return {"kind": self.kind, "places": self.places, "dimension": self.dimension, **self.settings()}
 
-    def set_extra_state(self, state: dict[str, Any]) -> None:
+    def set_extra_state(self, state: Facts) -> None:
         """Restore the result of `get_extra_state`; another kind or other settings are an InputError."""
         for name, value in {"kind": self.kind, **self.settings()}.items():
             expect(state.get(name) == value, repr(value), f"the map's {name} is {state.get(name)!r}")
         self.places, self.dimension = state["places"], state["dimension"]
 
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+    def _load_from_state_dict(self, state_dict: Facts, prefix: str, *args: object) -> None:
         if not any(name.startswith(prefix) for name in state_dict):  # the state of other parts of a model
             super()._load_from_state_dict(state_dict, prefix, *args)
             return
@@ -207,7 +207,7 @@ class PlaceMap(nn.Module, ABC):
         omitted = {EXTRA} if len(self.visits) else {EXTRA, "visits"}
         return {name: value for name, value in self.state_dict().items() if name not in omitted}
 
-    def load_packed(self, tensors: dict[str, Tensor], extra: dict[str, Any]) -> None:
+    def load_packed(self, tensors: dict[str, Tensor], extra: Facts) -> None:
         """Load the results of `packed` and `get_extra_state`; other tensors are an InputError."""
         names = self.state_dict().keys() - {EXTRA}
         fits, seen = names - {*self.optional} <= tensors.keys() <= names, ", ".join(sorted(tensors))

@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 from functools import cache
 from itertools import accumulate
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -22,7 +22,7 @@ from dejavu_torch.maps.place_map import PlaceMap, ScoreBlocks, one_of, require
 from dejavu_torch.maps.spectrum import Transform, from_slots, half_cycles, slots
 from dejavu_torch.maps.summary import ChunkSummary, MapSummary
 from dejavu_torch.memory import is_readable
-from dejavu_torch.types import InputError, expect
+from dejavu_torch.types import Facts, InputError, expect
 
 SpectralMetric = Literal["cosine", "l2"]
 MIN_NORM = 1e-6  # of the RMS norm in a chunk, or of the mean's norm: shorter descriptors count as 0
@@ -271,7 +271,7 @@ class SpectralMap(PlaceMap):
         place_map = self._sharing()
         place_map.stage_scale = (both.abs().amax(0) / 127).float()
         place_map.stage = (both / place_map.stage_scale).round().to(torch.int8)
-        place_map.drives = torch.cat([self.drives, self.drives.new_ones(1)]).sum(0, True, dtype=torch.int32)
+        place_map.drives = self.drives + 1 if len(self.drives) else self.drives.new_ones(1)
         place_map.norms = torch.cat([*map(place_map._norms_of, range(len(self.chunks)))])
         place_map._hide()
         place_map.check()
@@ -325,8 +325,8 @@ class SpectralMap(PlaceMap):
         names = [route.name for route in self.routes]
         expect(name in names, f"one of {', '.join(names)}", f"there is no route {name!r}")
         r = names.index(name)
-        start, frame = (sum(route[i] for route in self.routes[:r]) for i in (1, 2))  # type: ignore[misc]
-        _, places, frames = self.routes[r]
+        before, (_, places, frames) = self.routes[:r], self.routes[r]
+        start, frame = sum(route.places for route in before), sum(route.frames for route in before)
         starts = [first for first, _ in self.chunks]
         part = self.between(bisect.bisect_left(starts, start), bisect.bisect_left(starts, start + places))
         part.routes = ()
@@ -472,13 +472,13 @@ class SpectralMap(PlaceMap):
         longest = max((stop - start for start, stop in self.chunks), default=1)
         return max(COPIES * longest, BLOCK // max(1, self.dimension))
 
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> Facts:
         return {name: getattr(self, name) for name in ("metric", "transform", "chunk", "resolution")}
 
-    def get_extra_state(self) -> dict[str, Any]:
+    def get_extra_state(self) -> Facts:
         return {**super().get_extra_state(), "routes": [route._asdict() for route in self.routes]}
 
-    def set_extra_state(self, state: dict[str, Any]) -> None:
+    def set_extra_state(self, state: Facts) -> None:
         super().set_extra_state(state)
         self.routes = tuple(Route(**route) for route in state["routes"])
 

@@ -8,7 +8,7 @@ from fractions import Fraction
 from functools import reduce
 from itertools import accumulate, groupby, pairwise
 from operator import attrgetter
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -20,7 +20,7 @@ from dejavu_torch.maps.templates import PhaseTemplates, check_plan
 from dejavu_torch.periods.finder import PeriodFinder
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.text import settings_of
-from dejavu_torch.types import FrequencyLayer, InputError, Plan, check_shape, expect
+from dejavu_torch.types import Facts, FrequencyLayer, InputError, Plan, check_shape, expect
 
 Reduction = Literal["mean", "sum"]
 MAX_PLACES = 2**26  # in all layers, since a file of a few bytes can claim any number
@@ -158,13 +158,13 @@ class TemplateMap(PlaceMap):
         require(fits, f"the temperature is {T!r}; expected a number above 0")
         super().check()
 
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> Facts:
         return {"metric": self.metric, "reduction": self.reduction}
 
-    def get_extra_state(self) -> dict[str, Any]:
+    def get_extra_state(self) -> Facts:
         return super().get_extra_state() | {"temperature": self.temperature}
 
-    def set_extra_state(self, state: dict[str, Any]) -> None:
+    def set_extra_state(self, state: Facts) -> None:
         super().set_extra_state(state)
         self.temperature = state.get("temperature")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from types import ModuleType
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from torch import Tensor
 from dejavu_torch.motion.ground_plane import FLAT
 from dejavu_torch.types import InputError
 
-Array = np.ndarray[Any, Any]
+Array = np.ndarray
 Tracker = Callable[[Array, Array, float], tuple[Array, Array, Array]]
 
 TOLERANCE = 0.7  # pixels within which displacements agree
@@ -76,7 +76,7 @@ def _shift(track: Tracker, first: Array, second: Array) -> tuple[float, float]:
     return best
 
 
-def _track_corners(cv2: Any, first: Array, second: Array, start: float) -> tuple[Array, Array, Array]:
+def _track_corners(cv2: ModuleType, first: Array, second: Array, start: float) -> tuple[Array, Array, Array]:
     """Points (P,2) as (x, y), their displacements (P,2), and whether tracking back returns to them (P,)."""
     points = cv2.goodFeaturesToTrack(first, 200, 0.01, 3)
     if points is None:

@@ -31,10 +31,10 @@ from dejavu_torch.recognition.smoother import (
 )
 from dejavu_torch.text import progress_of
 
-LARGE, LARGE_MAP = 2**25, 2**13  # queries x places, and places, from which on a drive goes coarse to fine
+LARGE, LARGE_MAP = 2**25, 2**13  # queries x places, and places, above which a drive is matched coarse to fine
 GROUP = 16  # consecutive places that are one in the coarse pass; more if more than `HELD` scores were held
 HELD = 2**27
-LIKELY = 1e-4  # coarse mass from which on the places of a group are looked at
+LIKELY = 1e-4  # least coarse probability of a group whose places are looked at
 LOOKED = 2**12  # places of a window that are looked at, at most, and those beside them
 WINDOW, MARGIN = 400, 100  # queries that are smoothed at a time, and those on both sides that they depend on
 MEANS = 256  # queries whose mean score of a place is taken

@@ -120,7 +120,7 @@ class Localizer:
             scores = earlier(scores, numbers, self.matching.apart)
             self.matched += len(scores)
         if not self.models:
-            return self._answer(self._candidates(scores), pair_of(scores))
+            return self._answer(self._candidates(scores), best_pair(scores))
         return Match.joined(map(self._in_sequence, scores.split(max(1, CACHED // scores.shape[1]))))
 
     def drive(
@@ -135,7 +135,7 @@ class Localizer:
         Args:
             score: scores of queries, (B,K) -> (B,N); None are those of the map.
         """
-        asked = self.asked(descriptors, smoother, score)
+        asked = self.drive_query(descriptors, smoother, score)
         match = localize_drive(asked, progress)
         acceptance = self.matching.acceptance
         # whose scores are distances
@@ -143,7 +143,9 @@ class Localizer:
             acceptance = Acceptance(precision=math.exp(-acceptance.threshold))
         return self._accepted(match, acceptance)
 
-    def asked(self, descriptors: Tensor, smoother: PlaceSmoother, score: Scoring | None = None) -> DriveQuery:
+    def drive_query(
+        self, descriptors: Tensor, smoother: PlaceSmoother, score: Scoring | None = None
+    ) -> DriveQuery:
         """What `drive` matches."""
         matching, place_map, tiles = self.matching, self.place_map, None
         if score is None:
@@ -203,7 +205,7 @@ class Localizer:
             answered = torch.cat([filter.waiting(states[self.own]), scores])
             scores = answered[: len(steps[self.own][0])]
         final = scores if single else steps[self.own][0]
-        pair, confidence = pair_of(final), None
+        pair, confidence = best_pair(final), None
         if self.matching.platt is not None and not single:
             confidence = self.track(final, scores)
         match = self._answer(self._candidates(final), pair, confidence)
@@ -220,7 +222,7 @@ class Localizer:
         """Candidates (B,k) with all that is known of them.
 
         Args:
-            pair: the two best places of each query, see `pair_of`.
+            pair: the two best places of each query, see `best_pair`.
             confidence: for the calibration; None is that of single queries.
         """
         platt, k = self.matching.platt, match.index.shape[1]
@@ -252,12 +254,12 @@ class Localizer:
         return self._answer(match, pair)
 
 
-def asked_of(
+def drive_query(
     queries: Tensor, smoother: PlaceSmoother, score: Scoring, plain: Tensor | None = None
 ) -> DriveQuery:
     """Queries (Q,K) as a drive with scores of any kind, for a smoother like this one; see `Matching`."""
     matching = Matching(plain=plain, removed=smoother.removed)
-    return Localizer(None, matching).asked(queries, copy.deepcopy(smoother), score)
+    return Localizer(None, matching).drive_query(queries, copy.deepcopy(smoother), score)
 
 
 def earlier(scores: Tensor, numbers: Tensor, apart: int) -> Tensor:
@@ -266,6 +268,6 @@ def earlier(scores: Tensor, numbers: Tensor, apart: int) -> Tensor:
     return scores.masked_fill(place >= (numbers[:, None] - apart).to(scores.device), math.inf)
 
 
-def pair_of(scores: Tensor) -> Match:
+def best_pair(scores: Tensor) -> Match:
     """The two best places of each query that are more than `TOLERANCE` apart, (B,N) -> (B,2)."""
     return best_candidates(scores, min(2, scores.shape[1]), TOLERANCE)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import torch
 import torch.nn.functional as F
@@ -30,7 +30,7 @@ from dejavu_torch.recognition.motion import (
     checked_rates,
     logits,
 )
-from dejavu_torch.types import InputError, SequenceModel, expect
+from dejavu_torch.types import Facts, InputError, SequenceModel, expect
 
 MOVES = (0.2, 0.5, 0.2, 0.05, 0.02, 0.015, 0.015)
 SLOW = (0.67, 0.25, 0.05, 0.01, 0.01, 0.005, 0.005)  # of which EM starts if that at one place a query fails
@@ -42,8 +42,9 @@ MOVE_SHARE = 0.1  # of the queries: the weight of the prior of the moves
 RATE_COUNTS, ENTER_COUNTS = 200.0, 50.0  # steps that the priors of jump and leave, and of enter, count as
 SHARPENED = 0.6  # tau' = SHARPENED tau
 MIN_SEPARATION = 0.3
-SURE, SLOW_CHANGES = 2.5, 7.0  # separation, and tau over tau of detrended queries, from which on changes so
-# slow, as of trains that wait, make no query say less
+# separation, and tau over tau of detrended queries, above which slow changes, as of a train that waits,
+# do not make a query count less
+SURE, SLOW_CHANGES = 2.5, 7.0
 FITTED, STRETCH, STRETCHES = 1000, 100, 10  # queries that are fitted to at most, in a stretch, and stretches
 LEAST, SAMPLED = 20, 2**21  # queries that are fitted to at least, and their scores at most otherwise
 CORRELATED = 4  # correlation times in a stretch, at least
@@ -180,7 +181,7 @@ class PlaceSmoother(SequenceModel):
         self.turn, self.separation, self.tempering = turn, float(separation), float(tempering)
         self.within, self.threshold = within, threshold
         self.links, self.loop = tuple(links), loop
-        self.map_links: tuple[Link, ...] = ()  # likewise, of the map that a `Localizer` matches to
+        self.map_links: tuple[Link, ...] = ()  # those of the map that a `Localizer` matches to
         self.removed = 1.0  # share of each place's mean score that is removed
         self.log_likelihood: float | None = None  # nats above being off the map throughout, as fitted
         self.correlation = 1.0  # tau of these queries
@@ -192,7 +193,7 @@ class PlaceSmoother(SequenceModel):
     def start(self, places: int, fixed: bool = False) -> Tensor:
         raise InputError(WHOLE)
 
-    def step(self, *_: Any) -> tuple[Tensor, Tensor]:
+    def step(self, *_: object) -> tuple[Tensor, Tensor]:
         raise InputError(WHOLE)
 
     def check(self, queries: int | None, places: int) -> None:
@@ -455,7 +456,7 @@ class PlaceSmoother(SequenceModel):
         return likelihood
 
     @torch.no_grad()
-    def settled(self) -> dict[str, Any]:
+    def settled(self) -> Facts:
         """What the smoother settled on, for a report."""
         _, jump, leave = self.rate_logits.softmax(0).tolist()
         return {

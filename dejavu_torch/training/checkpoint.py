@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from pickle import UnpicklingError
-from typing import Any
 from zipfile import ZipFile
 
 import torch
@@ -16,7 +15,7 @@ from lightning_fabric.plugins.io.torch_io import TorchCheckpointIO
 from dejavu_torch.data.files import check_regular
 from dejavu_torch.data.output import make_output_folder, whole_file
 from dejavu_torch.text import one_line
-from dejavu_torch.types import InputError
+from dejavu_torch.types import Facts, InputError
 
 EXPECTED = "expected a checkpoint that `dejavu train fit` wrote"
 KEYS = {"epoch": int, "global_step": int, "state_dict": dict, "task": str, "routes": list, "held": list}
@@ -26,9 +25,7 @@ class CheckpointFiles(TorchCheckpointIO):
     """Lightning's plugin that writes and reads checkpoints. A full disk or a kill leaves the previous file in
     place, a damaged file is refused, and code in a file is never run: `weights_only` is always true."""
 
-    def save_checkpoint(
-        self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any | None = None
-    ) -> None:
+    def save_checkpoint(self, checkpoint: Facts, path: str | Path, storage_options: object = None) -> None:
         """Write a checkpoint; URLs are left to Lightning."""
         if storage_options is not None or "://" in str(path):
             super().save_checkpoint(checkpoint, path, storage_options)
@@ -40,20 +37,20 @@ class CheckpointFiles(TorchCheckpointIO):
             temporary.write_bytes(buffer.getbuffer())
 
     def load_checkpoint(
-        self, path: str | Path, map_location: Any = None, weights_only: bool | None = None
-    ) -> dict[str, Any]:
+        self, path: str | Path, map_location: object = None, weights_only: bool | None = None
+    ) -> Facts:
         """See `read_checkpoint`; the other arguments are ignored."""
         return read_checkpoint(path)
 
 
-def read_checkpoint(path: str | Path) -> dict[str, Any]:
+def read_checkpoint(path: str | Path) -> Facts:
     """The content of a checkpoint, on the CPU; a missing, damaged or foreign file is refused."""
     check_regular(Path(path), EXPECTED.removeprefix("expected "))
     try:
         with ZipFile(path) as archive:  # torch does not look at checksums
             if damaged := archive.testzip():
                 raise InputError(f"{path} is damaged: {damaged} has a wrong checksum; {EXPECTED}")
-        checkpoint: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+        checkpoint: Facts = torch.load(path, map_location="cpu", weights_only=True)
         missing = [key for key, kind in KEYS.items() if not isinstance(checkpoint.get(key), kind)]
     except InputError:
         raise

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple, TypeAlias, cast
 
 import numpy as np
 import torch
@@ -27,6 +27,7 @@ from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, r
 from dejavu_torch.resize import resize_frames
 from dejavu_torch.types import InputError, Traverse, expect
 
+Given: TypeAlias = str | Any  # a path, on the command line; or what `as_traverse` takes, or several
 READ_BATCH = 64  # frames
 MIN_FRAMES = 300  # with fewer, a trained network is usually worse than an untrained map
 MIN_SEGMENTS = 2  # that are held out
@@ -153,12 +154,12 @@ class RouteData(LightningDataModule):
 
     def __init__(
         self,
-        source: str | Any,
-        second: str | Any = None,
-        second_truth: str | Any = None,
-        validation: str | Any = None,
+        source: Given,
+        second: Given = None,
+        second_truth: Given = None,
+        validation: Given = None,
         validation_truth: str | None = None,
-        query: str | Any = None,
+        query: Given = None,
         truth: str | None = None,
         tolerance: int = 5,
         batch_size: int = 64,
@@ -187,8 +188,9 @@ class RouteData(LightningDataModule):
         }
         for name, one in ((name, one) for name, every in self.listed.items() for one in every):
             fits = isinstance(one, (str, Path, Traverse, Tensor, np.ndarray))
-            expected = "a path, a Traverse, or a tensor or array of frames or features"
-            expect(fits or (one is None and name != "source"), expected, f"{name} is a {type(one).__name__}")
+            if not fits and (one is not None or name == "source"):
+                expected = "a path, a Traverse, or a tensor or array of frames or features"
+                raise InputError(f"{name} is of type {type(one).__name__}; expected {expected}")
         paths = [str(one) for one in self.listed["source"] if isinstance(one, (str, Path))]
         for one in (one for one in paths if paths.count(one) > 1):
             raise InputError(f"{one} is given twice; expected each route once, other traverses as second")
@@ -205,7 +207,7 @@ class RouteData(LightningDataModule):
         self.sets: dict[str, StoredFrames] = {}
         self._smaller: tuple[int, int] | None = None  # size of the stored frames, if smaller than their own
 
-    def _one_each(self, name: str, given: Any) -> list[Any]:
+    def _one_each(self, name: str, given: object) -> list[Any]:
         """The given value for each of the routes."""
         count = len(self.listed["source"])
         each = list(given) if isinstance(given, (list, tuple)) else [given] * (count if given is None else 1)
@@ -248,7 +250,7 @@ class RouteData(LightningDataModule):
         count = max(MIN_SEGMENTS, round(self.held_out * len(frames) / SEGMENT))
         return [(2 * i + 1) * len(frames) // (2 * count) - SEGMENT // 2 for i in range(count)]
 
-    def _of_task(self, name: str, default: Any = None) -> Any:
+    def _of_task(self, name: str, default: object = None) -> Any:
         """An attribute of the task in training; the default without one."""
         return default if self.trainer is None else getattr(self.trainer.lightning_module, name, default)
 
@@ -274,7 +276,7 @@ class RouteData(LightningDataModule):
             self._read(name)
         if stage == "fit":
             self.unseen()  # so that its errors come before the training
-        expect(stage != "test" or "query" in self.sets, "data.query, to test on", "there is no query")
+        expect(stage != "test" or "query" in self.sets, "data.query, a second traverse", "nothing to test on")
 
     @property
     def _size(self) -> tuple[int, int] | None:
@@ -297,7 +299,7 @@ class RouteData(LightningDataModule):
                 return self._opened(name), self.sets[name].truth
         return None
 
-    def _open(self, source: Any, shape: tuple[int, ...] | None = None) -> Traverse:
+    def _open(self, source: Given, shape: tuple[int, ...] | None = None) -> Traverse:
         """A traverse, at the size of `DejaVu.at_map_size` of the task's model unless `resize` is given."""
         traverse = as_traverse(source)
         model = self._of_task("dejavu")

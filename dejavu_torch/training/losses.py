@@ -114,7 +114,7 @@ def phase_cross_entropy(
         tensor(0.6931)
     """
     shapes, expected = [tuple(d.shape) for d in distances], [(len(places), layer.phases) for layer in plan]
-    expect(shapes and shapes == expected, f"the plan's {expected}, 1 or more", f"the distances are {shapes}")
+    expect(shapes and shapes == expected, f"at least one, {expected}", f"the distances are {shapes}")
     surprise = []
     for block, layer in zip(distances, plan, strict=True):
         _check_places(places, block)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 from torchmetrics import Metric
@@ -46,7 +44,7 @@ class PlaceRecognition(Metric):
 
     rows: list[Tensor]
 
-    def __init__(self, tolerance: int, **kwargs: Any) -> None:
+    def __init__(self, tolerance: int, **kwargs: object) -> None:
         super().__init__(**kwargs)
         self.tolerance = tolerance
         # one-dimensional, so that batches and processes can be joined for any R; float64, so that a process

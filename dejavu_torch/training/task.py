@@ -34,7 +34,7 @@ from dejavu_torch.training.checkpoint import CheckpointFiles, read_checkpoint, t
 from dejavu_torch.training.datamodule import MIN_FRAMES, Batch, RouteData, StoredFrames
 from dejavu_torch.training.losses import LastLosses, Losses
 from dejavu_torch.training.metrics import PlaceRecognition
-from dejavu_torch.types import InputError, Training, expect
+from dejavu_torch.types import Facts, InputError, Training, expect
 
 log = logging.getLogger("dejavu_torch")
 
@@ -284,7 +284,7 @@ class RouteTask(pl.LightningModule):
         self.log("train/loss", total.detach(), prog_bar=True, sync_dist=several)
         return total
 
-    def on_train_batch_end(self, *_: Any) -> None:
+    def on_train_batch_end(self, *_: object) -> None:
         """Stop a training that learns nothing, as soon as that is known."""
         self.resumed = False  # the optimizer accepted the checkpoint's state
         if not self.last.learned and self.trainer.world_size == 1:
@@ -332,18 +332,18 @@ class RouteTask(pl.LightningModule):
 
     # checkpoints
 
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+    def on_save_checkpoint(self, checkpoint: Facts) -> None:
         """Add what was trained on; a map in closed form is not stored."""
         state = checkpoint["state_dict"]
         checkpoint["state_dict"] = {n: one for n, one in state.items() if not n.startswith(self.derived)}
         checkpoint |= {"task": type(self).__name__, "routes": self._routes(), "held": self.held}
 
-    def _routes(self) -> list[Any]:
+    def _routes(self) -> Sequence[object]:
         """Names and lengths of several routes; empty for one, whose path may change."""
         named = [[route.name, n] for route, n in zip(self.data.routes, self.data.lengths, strict=True)]
         return named if len(named) > 1 else []
 
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+    def on_load_checkpoint(self, checkpoint: Facts) -> None:
         """Refuse a checkpoint of another model or other routes."""
         seen = f"the checkpoint is of a {checkpoint['task']}"
         expect(checkpoint["task"] == type(self).__name__, f"one of a {type(self).__name__}", seen)
@@ -362,7 +362,7 @@ class RouteTask(pl.LightningModule):
             raise InputError(f"the checkpoint is of another model than the config's: {', '.join(other[:3])}")
 
 
-def PlaceRecognitionTask(*_: Any, **__: Any) -> NoReturn:
+def PlaceRecognitionTask(*_: object, **__: object) -> NoReturn:
     """Raises an InputError that names what took its place."""
     one, other = "DescriptorTask for a spectral map", "TemplateTask for templates"
     raise InputError(f"PlaceRecognitionTask was divided; expected {one}, or {other}")

@@ -851,4 +851,11 @@ MUTANTS = [
         "if True:",
         ("tests/test_cli.py::-k reads_well",),
     ),
+    Mutant(
+        "A number in a shape is exact.",
+        "dejavu_torch/types.py",
+        "word.isalpha() or size == int(word)",
+        "word.isalpha() or size >= int(word)",
+        ("tests/test_expect.py",),
+    ),
 ]

@@ -120,8 +120,8 @@ def test_gradients_of_the_code():
 @pytest.mark.parametrize(
     ("lines", "widths", "facts"),
     [
-        (torch.ones(1, 4), torch.zeros(4), ("(1, 4)", "at least 2 segments")),
-        (torch.ones(5, 0), torch.zeros(0), ("(5, 0)", "at least 2 segments")),
+        (torch.ones(1, 4), torch.zeros(4), ("(1, 4)", "W>=2")),
+        (torch.ones(5, 0), torch.zeros(0), ("(5, 0)", "W>=2")),
         (torch.ones(5, 4), torch.zeros(3), ("the widths are (3,)", "expected (24,)")),
     ],
     ids=["short", "empty", "widths"],

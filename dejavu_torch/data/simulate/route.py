@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import field, fields
 from hashlib import blake2b
 from numbers import Integral, Real
@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dejavu_torch.memory import in_float32
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.types import Facts, InputError, Traverse
 
 _T = TypeVar("_T")
 
@@ -48,7 +48,7 @@ class SimulatedRoute(Traverse):
         for entry in fields(self):  # type: ignore[arg-type]  # a subclass is a dataclass
             key, default = entry.name, getattr(type(self), entry.name)
             value = getattr(self, key)
-            if expected := _expected(key, value, default, entry.metadata):
+            if expected := _expected(key, value, default, dict(entry.metadata)):
                 raise InputError(f"sim:{self.kind} has {key}={value}; expected {expected}")
             value = type(default)(value)
             setattr(self, key, value)
@@ -61,7 +61,7 @@ class SimulatedRoute(Traverse):
     def _frames(self, at: Tensor) -> Tensor:
         """Draw the frames with these numbers. Shape: (B,) int64 -> (B,3,H,W) float32 in [0,1]."""
 
-    def __reduce__(self) -> Any:
+    def __reduce__(self) -> tuple[object, ...]:
         # without the scenery drawn so far
         return type(self), tuple(getattr(self, entry.name) for entry in fields(self))  # type: ignore[arg-type]
 
@@ -73,7 +73,7 @@ class SimulatedRoute(Traverse):
         return self._frames(torch.as_tensor(frames))
 
 
-def _expected(key: str, value: object, default: object, allowed: Mapping[str, Any]) -> str:
+def _expected(key: str, value: object, default: object, allowed: Facts) -> str:
     """The valid values of an option; "" if its value is one of them."""
     if "names" in allowed:
         return "" if value in allowed["names"] else " or ".join(allowed["names"])
