@@ -132,11 +132,6 @@ def test_clahe_passes_gradients_straight_through_without_other_values():
 # --- the module
 
 
-def test_without_choices_the_input_itself_comes_back():
-    for frames in (torch.rand(2, 3, 8, 8), torch.rand(5, 7)):  # images, and ready-made features
-        assert Preprocess()(frames) is frames
-
-
 def test_module_equals_functions():
     frames = torch.rand(2, 3, 24, 30)
     module = Preprocess(channel="g", contrast="patch", patch=5)
