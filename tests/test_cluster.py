@@ -161,14 +161,6 @@ def test_what_cannot_be_made_is_named_and_what_precedes_it_is_kept(cluster, watc
     assert began == [0, 100, 400]
 
 
-def test_chunks_made_together_before_a_bad_frame_are_kept(cluster, tmp_path):
-    bad = route()
-    bad[544] = torch.nan
-    assert 544 not in Sample.of(PLACES, CHUNK).frame
-    with refused("frames 500 to 599", "read on", "frame 544", "500 of 620"):
-        learned(bad, checkpoint=Checkpoint(tmp_path / "m"), map_tasks=cluster.map)
-
-
 def found_by(model, queries, search=None):
     if search is not None:
         model.searcher = search

@@ -11,8 +11,6 @@ from helpers import Fixed, refused, template_model
 
 from dejavu_torch import DejaVu, FrequencyLayer
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.evaluation.compare import compare
-from dejavu_torch.evaluation.evaluate import evaluate_file
 from dejavu_torch.evaluation.matches import read_matches, write_matches
 from dejavu_torch.motion.resampling import ResampledTraverse
 
@@ -123,32 +121,6 @@ def test_compare_and_evaluate_agree(route, pair, tmp_path):
         for folder in ("c", "e"):
             assert report_of(tmp_path / folder)[f"recall_at_{first}"] == pytest.approx(expected)
     assert report_of(tmp_path / "c")["recall_at_1"] < report_of(tmp_path / "c")["recall_at_10"]
-
-
-def test_without_top_compare_counts_and_writes_matches_only(route, pair, tmp_path, capsys):
-    run("compare", *pair, "--map", route, "--truth", "0", "--tolerance", "1", "--out", tmp_path / "c")
-    assert "among the first 5 candidates" in capsys.readouterr().out
-    assert report_of(tmp_path / "c")["recall_at_10"] > 0
-    assert len(rows_of(tmp_path / "c" / "matches.csv")) == 96
-    assert "rank" not in rows_of(tmp_path / "c" / "matches.csv")[0]
-    run("evaluate", tmp_path / "c" / "matches.csv", "--truth", "0", "--out", tmp_path / "e")
-    report = report_of(tmp_path / "e")
-    assert (report["recall_at_5"], report["recall_at_10"]) == (None, None)
-
-
-def test_as_many_ranks_as_the_file_has(tmp_path):
-    rows = "".join(f"3,{10 * rank},0.{rank},1,{rank}\n" for rank in range(1, 8))
-    (tmp_path / "m.csv").write_text("query,place,score,accepted,rank\n" + rows)
-    facts = evaluate_file(tmp_path / "m.csv", "47").report.facts  # place 50: rank 5
-    assert (facts["queries"], facts["recall_at_5"], facts["recall_at_10"]) == (1, 1.0, None)
-
-
-def test_a_route_of_fewer_places_than_candidates():
-    waves = torch.rand(8, 3, generator=torch.Generator().manual_seed(3))
-    model = template_model(periods=Fixed(FrequencyLayer(8, 8, 0, 8, (0, 1, 2))))
-    result = compare(ArrayTraverse(waves), ArrayTraverse(waves + 0.01), "0", model=model, tolerance=0)
-    report = result.report.as_json()
-    assert (report["recall_at_5"], report["recall_at_10"]) == (1.0, None)
 
 
 def test_convention_11_candidates_are_even_steps_apart_and_written_as_frames(tmp_path):

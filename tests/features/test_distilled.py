@@ -39,13 +39,6 @@ def test_it_is_the_layers_of_the_file_pooled():
     torch.testing.assert_close(Distilled(4)(frames).view_as(expected), expected, rtol=1e-4, atol=1e-4)
 
 
-def test_grey_frames_are_colours_alike_and_other_channels_their_mean():
-    net, frames = Distilled(), torch.rand(2, 2, 40, 70)
-    grey = frames.mean(1, keepdim=True)
-    torch.testing.assert_close(net(grey), net(grey.expand(-1, 3, -1, -1)), rtol=1e-4, atol=1e-4)
-    torch.testing.assert_close(net(frames), net(grey))
-
-
 def test_settings_out_of_range_are_refused():
     for settings, seen in (({"grid": 0}, "grid=0"), ({"grid": 13}, "1 to 12"), ({"weights": "vgg"}, "lite0")):
         with refused(seen):

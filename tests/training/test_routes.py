@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 
 import numpy as np
@@ -230,21 +229,6 @@ def test_a_folder_of_folders_is_a_route_each(tmp_path):
     assert len(open_source(routes_of("photos?width=8")[1])) == LENGTHS[1]
     for whole in ("photos/day9", ".", "third.npy", "gone", "", "sim:aerial", str(tmp_path)):
         assert routes_of(whole) == [whole]
-
-
-def test_what_is_printed_leads_to_a_map(capsys, tmp_path):
-    out = str(tmp_path / "run")
-    run(*FIT, "[photos/day9,third.npy]", "--trainer.default_root_dir", out)
-    line = capsys.readouterr().out.splitlines()[-1]
-    made = f"dejavu learn ROUTE --descriptor {out}/descriptor.safetensors --map route.safetensors"
-    assert line == f"next: {made}"
-    given = {"ROUTE": "photos/day10", "route.safetensors": str(tmp_path / "m.safetensors")}
-    words = [given.get(word, word) for word in shlex.split(line.removeprefix("next: dejavu "))]
-    run(*words, "--mapper.route_bytes_per_place", "20")
-    model = DejaVu.load(tmp_path / "m.safetensors")
-    own, base = model.features.state_dict(), DejaVu.load(Path(out) / "descriptor.safetensors").features
-    assert all(torch.equal(own[name], value) for name, value in base.state_dict().items())
-    assert model.map.places == LENGTHS[1]
 
 
 def test_info_says_what_it_is(capsys):

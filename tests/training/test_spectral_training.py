@@ -30,7 +30,6 @@ from dejavu_torch import HOG, DejaVu, SpectralMapper, TemplateMap, Whitening
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.features.embedding import Embedding
-from dejavu_torch.features.joined import Joined
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.training.task import start_from
 
@@ -72,16 +71,6 @@ def test_a_training_ends_in_a_map_that_finds_its_own_places(tmp_path, settings):
     assert model.trained.steps == 4
 
 
-def test_members_of_joined_features_are_whitened_by_themselves(tmp_path):
-    task = spectral(backbone=Joined([HOG(cell=4), backbone()]))
-    trainer(tmp_path).fit(task, data_of())
-    model = DejaVu.load(tmp_path / "map.safetensors")
-    assert_same_scores(task, model)
-    assert model.whitening is not None
-    assert model.whitening.sizes == [324, 8]
-    assert recall(model, footage()) > 0.9
-
-
 def test_the_file_holds_the_network_alone(tmp_path):
     model = fit(tmp_path, spectral(weight_bits=32), data_of())
     assert isinstance(model.features, Embedding)
@@ -91,26 +80,6 @@ def test_the_file_holds_the_network_alone(tmp_path):
     assert model.map.dimension == 8  # of the network, not the 12 of the code
     assert model.whitening is not None
     assert model.whitening.learned
-
-
-def test_the_map_is_of_the_last_features_not_of_those_validated_before(tmp_path):
-    every = {"val_check_interval": 2, "check_val_every_n_epoch": None}
-    model = fit(tmp_path, spectral(), data_of(), max_steps=3, **every)
-    features = model.descriptor.all_of(ArrayTraverse(footage()))
-    assert torch.equal(levels(model), SpectralMapper(20.0)(features).level)
-
-
-def test_making_a_map_changes_nothing_and_gives_the_same_again(tmp_path):
-    task = spectral()
-    trainer(tmp_path).fit(task, data_of())
-    task.train()
-    first, state = levels(task.deployed()), torch.get_rng_state()
-    weights = {name: value.clone() for name, value in task.features.state_dict().items()}
-    task.relearn()
-    assert torch.equal(levels(task.deployed()), first)
-    assert torch.equal(torch.get_rng_state(), state)
-    assert task.features.training
-    assert all(torch.equal(weights[n], value) for n, value in task.features.state_dict().items())
 
 
 @pytest.mark.parametrize("alone", [False, True], ids=["augmented", "second alone"])
