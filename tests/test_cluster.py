@@ -6,8 +6,6 @@ import importlib
 import os
 import signal
 import sys
-import threading
-import time
 
 import numpy as np
 import pytest
@@ -102,33 +100,6 @@ def test_workers_write_the_file_of_one_process(cluster, tmp_path):
         model = DejaVu(mapper=SpectralMapper(6.0, chunk=CHUNK))
         files.append(file_of(learn_mean(model, route(), visits, map_tasks=map_tasks), tmp_path))
     assert files[0] == files[1]
-
-
-def test_a_worker_that_is_killed_is_made_up_for(cluster, watched, tmp_path):
-    images = write_images(tmp_path / "route", frames(PLACES, size=16))
-    whole = file_of(learned(open_source(images), watched), tmp_path)
-    killed = []
-
-    def kill():
-        stop = time.monotonic() + 60
-        while not killed and time.monotonic() < stop:
-            for file in tmp_path.glob("*.worker"):
-                killed.append(int(file.stem))
-                os.kill(killed[0], signal.SIGKILL)
-                break
-            time.sleep(0.01)
-        (tmp_path / "go").touch()
-
-    thread = threading.Thread(target=kill)
-    thread.start()
-    model = learned(
-        open_source(images), watched, checkpoint=Checkpoint(tmp_path / "m"), map_tasks=cluster.map
-    )
-    thread.join()
-    assert killed
-    assert killed[0] != os.getpid()
-    assert len(list(tmp_path.glob("*.worker"))) >= 2
-    assert file_of(model, tmp_path) == whole
 
 
 def test_what_cannot_be_made_is_named_and_what_precedes_it_is_kept(cluster, watched, tmp_path, monkeypatch):

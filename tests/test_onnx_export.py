@@ -233,11 +233,7 @@ def test_the_command(tmp_path, capsys):
     assert "expected one of them" in fails(
         capsys, *words, tmp_path / "map.onnx", "--filter", "--sequence", "3"
     )
-    assert "has no mean" in fails(capsys, *words, tmp_path / "map.onnx", "--centre", "mean")
     assert "the whole drive" in fails(capsys, *words, tmp_path / "map.onnx", "--match", "drive")
-    assert "none.safetensors" in fails(
-        capsys, "export", tmp_path / "none.safetensors", "--onnx", tmp_path / "map.onnx"
-    )
     with refused("a lag of 3", "expected one without"):
         export_onnx(model, tmp_path / "map.onnx", PlaceFilter(lag=3))
     assert (tmp_path / "map.onnx").read_bytes() == before

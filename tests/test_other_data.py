@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from command_line import fails, report_of, rows_of, run
 from PIL import Image
 from test_readme import understand
@@ -170,18 +169,6 @@ def test_pairs_need_names_and_a_file_of_their_own(extracted, tmp_path, monkeypat
         error = fails(capsys, "localize", map, source, "--out", out, "--pairs", pairs)
         assert [word for word in words if word not in error] == []
     assert {file.name for file in tmp_path.iterdir()} == {"unnamed.npy", "unnamed.safetensors"}
-
-
-def test_equal_names_say_that_frames_show_the_same_places(tmp_path):
-    for name in ("a", "b"):
-        np.save(tmp_path / f"{name}.npy", descriptors(60, len(name)))
-        (tmp_path / f"{name}.txt").write_text("".join(f"{i}.jpg\n" for i in range(60)))
-    from dejavu_torch.data.ground_truth import find_ground_truth
-    from dejavu_torch.data.source import open_source
-
-    truth = find_ground_truth(None, *(open_source(tmp_path / f"{name}.npy") for name in "ab"), 60, 60)
-    assert truth is not None
-    assert torch.equal(truth.positives[:, 0], torch.arange(60))
 
 
 def test_the_page_is_short_and_its_commands_are_understood():

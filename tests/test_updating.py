@@ -7,7 +7,7 @@ import copy
 import numpy as np
 import pytest
 import torch
-from command_line import fails, run
+from command_line import run
 from helpers import refused
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -215,4 +215,3 @@ def test_the_command_updates_a_map(tmp_path, capsys):
     assert "route monday: places 240-" in out
     run("localize", path, tmp_path / "monday.npy", "--ordered", "--out", tmp_path / "m.csv")
     assert ",monday," in (tmp_path / "m.csv").read_text()
-    assert "none.npy" in fails(capsys, "update", path, tmp_path / "none.npy")

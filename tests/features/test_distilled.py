@@ -13,12 +13,9 @@ from torch import nn
 from torch.nn.functional import adaptive_avg_pool2d
 
 from benchmarks import distil
-from dejavu_torch import HOG, DejaVu, SpectralMapper, evaluate, open_source
+from dejavu_torch import DejaVu, open_source
 from dejavu_torch.features import distilled
 from dejavu_torch.features.distilled import STRIDES, WEIGHTS, Distilled
-from dejavu_torch.features.joined import Joined
-from dejavu_torch.features.pixels import PatchPixels
-from dejavu_torch.motion.resampling import ground_truth_of
 
 
 def layers():
@@ -74,16 +71,3 @@ def test_the_bench_makes_weights_that_the_class_reads(tmp_path, monkeypatch, cap
     assert not torch.equal(Distilled(1)(frames), before(frames))
     assert (tmp_path / "out" / "bench.png").is_file()
     assert "at least 30" in benchmark_fails(capsys, "distil", "--out", tmp_path / "no", "--steps", "20")
-
-
-def test_beside_hog_it_is_worth_more_than_pixels_in_the_city(data_dir):
-    city = data_dir / "robotcar" / "t5"
-    reference, query = (open_source(city / f"{name}.npy") for name in ("reference", "query"))
-    truth = ground_truth_of(str(city / "truth.csv"), reference, query)
-    assert truth is not None
-    pixels = Joined([HOG(), PatchPixels((24, 48), channel="grey")])
-    areas = []
-    for features in (pixels, None):  # with it is the default
-        model = DejaVu(features, mapper=SpectralMapper(5.0)).learn(reference)
-        areas.append(evaluate(model.localize(query), truth, 2).auc)
-    assert areas[1] > areas[0] + 0.04

@@ -21,7 +21,7 @@ from dejavu_torch import (
 from dejavu_torch.cli.commands import run_learn
 from dejavu_torch.cli.parser import parse
 from dejavu_torch.features.descriptor import default_features
-from dejavu_torch.features.joined import Joined, groups_of
+from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.model import features_per_frame
 from dejavu_torch.model_file import recipe_of
@@ -61,17 +61,6 @@ def flights():
     """120 frames of a road and of another flight over it."""
     sources = (open_source(f"sim:aerial?frames=120&traverse={i}") for i in range(2))
     return [torch.cat([*source.batches(120)])[..., ::2, ::2].contiguous() for source in sources]
-
-
-def test_features_lie_side_by_side_and_tell_their_groups():
-    features, frames = Joined([HOG(), network(), Means()]).eval(), torch.rand(3, 3, 32, 40)
-    assert features.groups is None
-    made = features(frames)
-    parts = [member(frames) for member in features.members]
-    assert torch.equal(made, torch.cat(parts, 1))
-    assert features.groups == tuple(part.shape[1] for part in parts) == (432, 24, 12)
-    assert groups_of(features) == features.groups
-    assert groups_of(HOG()) is None
 
 
 def test_gradients_reach_the_members_weights_and_the_frames():
@@ -230,12 +219,9 @@ def test_a_network_of_a_function_beside_hog(folder, capsys):
 @pytest.mark.parametrize(
     ("words", "seen"),
     [
-        (("[]",), "the members of the features are none; expected modules, at least one"),
         (("[HOG, zoo.nothing]",), "--features.members: module 'zoo' has no attribute 'nothing'"),
         (("[HOG, {",), "--features is '[HOG, {'; expected a list of classes"),
         (("[2020-13-45]",), "--features is '[2020-13-45]'; expected a list of classes"),
-        (("[HOG, PatchPixels]", "--whitening.groups", "[1764, 10]"), "groups of 1764 + 10 dimensions"),
-        (("HOG", "--whitening.groups", "[]"), "the groups are []"),
     ],
 )
 def test_mistakes_are_one_line(words, seen, folder, capsys):

@@ -9,8 +9,6 @@ from small_training import CONFIG, MINE, footage, train
 from dejavu_torch import DejaVu
 from dejavu_torch.training.task import RouteTask
 
-CALIBRATED = ("test_export", "test_train_command")
-
 
 @pytest.fixture(scope="session")
 def made(tmp_path_factory):
@@ -30,7 +28,7 @@ def made(tmp_path_factory):
 @pytest.fixture(autouse=True)
 def _without_calibration(request, monkeypatch):
     """Of many small trainings, of which it takes a third; those of the command are calibrated."""
-    if request.path.stem not in CALIBRATED:
+    if request.path.stem != "test_train_command":
         monkeypatch.setattr(DejaVu, "calibrate", lambda self, *_, **__: self)
 
 

@@ -10,7 +10,7 @@ import torch
 from command_line import fails, run, write_images
 from helpers import refused
 from small_training import CONFIG, Stop, backbone, data_of, footage, recall, trainer
-from torch import Tensor, nn
+from torch import nn
 
 from dejavu_torch import DejaVu, RouteData, SpectralMapper, open_source
 from dejavu_torch.data.arrays import ArrayTraverse
@@ -238,15 +238,6 @@ def test_info_says_what_it_is(capsys):
     assert [
         one for one in ("without a map", "SmallCNN", "trained for 4 steps", hint) if one not in told
     ] == []
-
-
-def test_compare_learns_with_a_descriptor_of_a_map_as_well(tmp_path):
-    bytes_ = ("--mapper.route_bytes_per_place", "20")
-    run("learn", "third.npy", "--map", tmp_path / "m.safetensors", "--descriptor", WEIGHTS, *bytes_)
-    for name, given in (("base", WEIGHTS), ("map", tmp_path / "m.safetensors")):
-        run("compare", "third.npy", "third.npy", "--descriptor", given, *bytes_, "--out", tmp_path / name)
-    states = [DejaVu.load(tmp_path / name / "map.safetensors").state_dict() for name in ("base", "map")]
-    assert all(torch.equal(v, states[1][n]) for n, v in states[0].items() if isinstance(v, Tensor))
 
 
 LEARN = ["learn", "third.npy", "--map", "new.safetensors", "--descriptor", WEIGHTS]

@@ -71,6 +71,23 @@ def test_a_training_ends_in_a_map_that_finds_its_own_places(tmp_path, settings):
     assert model.trained.steps == 4
 
 
+def ordinary():
+    """Convolutions, batch norm and ReLU, then a linear layer: features of any scale."""
+    layers = []
+    for before, after, stride in ((1, 8, 2), (8, 16, 2), (16, 16, 2), (16, 16, 1)):
+        layers += [nn.Conv2d(before, after, 3, stride, 1), nn.BatchNorm2d(after), nn.ReLU()]
+    return nn.Sequential(*layers, nn.Flatten(), nn.Linear(64, 32))
+
+
+def test_an_ordinary_network_learns(tmp_path):
+    torch.manual_seed(0)
+    task = spectral(backbone=ordinary(), mapper=SpectralMapper(8.0), rate=0.3)
+    trainer(tmp_path, max_steps=200, limit_val_batches=0).fit(task, data_of(tolerance=5))
+    torch.manual_seed(0)
+    untrained = DejaVu(ordinary(), "none", mapper=SpectralMapper(8.0)).learn(ArrayTraverse(footage()))
+    assert recall(task.deployed(), footage(0.3)) > recall(untrained, footage(0.3)) + 0.05
+
+
 def test_the_file_holds_the_network_alone(tmp_path):
     model = fit(tmp_path, spectral(weight_bits=32), data_of())
     assert isinstance(model.features, Embedding)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import shlex
 import signal
-import sys
 from functools import wraps
 from importlib import import_module
 
@@ -15,13 +14,12 @@ import torch
 import yaml
 from command_line import fails, run
 from pytorch_lightning import Trainer
-from small_training import CONFIG, DESCRIPTOR, FRAMES, MINE, footage, train, warned
+from small_training import CONFIG, DESCRIPTOR, FRAMES, footage, train, warned
 
 from dejavu_torch import DejaVu, TemplateMap
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.features.cnn import SmallCNN
-from dejavu_torch.maps.file import read_map
 from dejavu_torch.maps.spectral_map import SpectralMap
 
 
@@ -111,19 +109,6 @@ def test_options_of_our_own_parts_need_no_class_name(folder, tmp_path):
     np.testing.assert_allclose(seen["train/loss"], expected, rtol=1e-4)
 
 
-def test_a_class_in_the_current_folder_is_found(tmp_path, monkeypatch):
-    """As by the console command, whose first path is that of its script."""
-    np.save(tmp_path / "one.npy", footage().numpy())
-    (tmp_path / "own_classes.py").write_text(MINE)
-    (tmp_path / "train.yaml").write_text(CONFIG)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", [path for path in sys.path if path not in ("", str(tmp_path))])
-    train("fit", "--model.backbone", "own_classes.Plain", "--trainer.enable_checkpointing", "false")
-    assert "own_classes.Plain" in str(read_map(tmp_path / "run" / "map.safetensors")[1]["features"])
-    assert not list(tmp_path.rglob("*.ckpt"))  # which can be switched off
-    del sys.modules["own_classes"]
-
-
 def test_a_users_own_checkpoints_decide_which_is_the_map(folder, tmp_path):
     text = CONFIG.partition("trainer:")[0]
     text += """
@@ -163,17 +148,6 @@ def test_a_spectral_map_whatever_mapper_a_preset_has(folder, tmp_path, capfd, ca
     assert [model.calibration is not None for model in maps] == [False, True, True]
     assert torch.equal(maps[0].map.streams, maps[1].map.streams)  # type: ignore[arg-type]
     assert len(maps[2].map.level) < len(maps[1].map.level)  # type: ignore[arg-type]
-
-
-def test_help_has_our_options_first(capsys):
-    with pytest.raises(SystemExit) as stop:
-        run("train", "fit", "--help")
-    assert stop.value.code == 0
-    usage, _, options = capsys.readouterr().out.partition("options:")
-    assert usage.startswith("usage: dejavu train ")
-    expected = ("--model.help", "--data.second_truth", "--trainer.max_steps")
-    places = [options.index(word) for word in expected]
-    assert places == sorted(places)
 
 
 # what it says --------------------------------------------------------------------------------------------
