@@ -87,6 +87,16 @@ def test_grey_is_repeated_and_colour_becomes_luminance():
     torch.testing.assert_close(one(red), one(torch.full((1, 1, 12, 16), 0.299)), rtol=0, atol=1e-5)
 
 
+def test_making_one_changes_nothing_of_the_network():
+    """Neither running statistics nor the mode of any part."""
+    network = nn.Sequential(nn.BatchNorm2d(3), nn.Conv2d(3, 4, 3), nn.Dropout())
+    network[0].eval()
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    Embedding(network)
+    assert [module.training for module in network.modules()] == [True, False, True, True]
+    assert all(torch.equal(value, before[name]) for name, value in network.state_dict().items())
+
+
 MEAN = lambda frames: frames.mean((2, 3))  # noqa: E731
 TOKENS = lambda frames: frames.flatten(2).mT  # noqa: E731
 

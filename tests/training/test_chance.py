@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+
 import pytest
 import torch
 from helpers import refused
@@ -10,9 +12,12 @@ from small_training import FRAMES, backbone, data_of, new_descriptor, new_task, 
 from dejavu_torch.training.losses import (
     LAST,
     LastLosses,
+    phase_chance,
+    phase_cross_entropy,
     place_chance,
     place_cross_entropy,
 )
+from dejavu_torch.types import FrequencyLayer
 
 FEW, STEPS = 20, 30  # steps that tell, and of a training
 ALIKE = torch.full((FRAMES, 16, 16), 128, dtype=torch.uint8)
@@ -37,6 +42,17 @@ def test_no_blind_guess_of_the_place_is_better(tolerance):
     assert place_chance(60, tolerance) <= min(losses) + 1e-6
     assert losses[0] == pytest.approx(place_chance(60, tolerance), abs=0.05)  # but for the ends of the route
     assert place_chance(2 * tolerance + 1, tolerance) == 0
+
+
+def test_no_blind_guess_of_the_phase_is_better():
+    torch.manual_seed(0)
+    plan = (FrequencyLayer(Fraction(7), 7, 0, 10, (0,)), FrequencyLayer(Fraction(20), 4, 0, 10, (0,)))
+    places = torch.arange(10)[:, None]
+    blind = [[3 * torch.randn(1, layer.phases).expand(10, -1) for layer in plan] for _ in range(20)]
+    assert all(float(phase_cross_entropy(one, plan, places, 1.0)) >= phase_chance(plan) for one in blind)
+    share = torch.tensor([0.2] * 3 + [0.1] * 4), torch.tensor([0.5, 0.5, 1e-9, 1e-9])
+    best = [-part.log().expand(10, -1) for part in share]
+    assert float(phase_cross_entropy(best, plan, places, 1.0)) == pytest.approx(phase_chance(plan), abs=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.ground_truth import GroundTruth
-from dejavu_torch.training.datamodule import Clips, RouteData, as_frames, store
+from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth
+from dejavu_torch.features.augmentation import Augmentation
+from dejavu_torch.training.datamodule import Batch, Clips, RouteData, as_frames, store
 
 
 def numbered(frames, first=0, side=8):
@@ -128,6 +129,18 @@ def test_clips(lengths, clip, clips, seed):
 
 
 # augmentation --------------------------------------------------------------------------------------------
+
+
+def test_a_clip_gets_one_change_and_a_validation_the_same_each_time():
+    data, frames = route(augmentation=Augmentation(noise=0.0)), torch.rand(1, 1, 8, 8).expand(8, 1, 8, 8)
+    clips = data.augmented(frames, 4).unflatten(0, (2, 4))
+    torch.testing.assert_close(clips, clips[:, :1].expand_as(clips))
+    assert not torch.allclose(clips[0], clips[1], atol=1e-3)
+    batches = [Batch(frames, as_ground_truth(torch.arange(first, first + 8)[:, None])) for first in (0, 8)]
+    first = data.validated(batches[0])
+    assert torch.equal(data.validated(batches[0]), first)
+    for other in (data.validated(batches[1]), frames):
+        assert not torch.allclose(other, first, atol=1e-3)
 
 
 # what is kept, and what is refused -----------------------------------------------------------------------

@@ -79,6 +79,13 @@ def test_gradients_of_the_place_loss_reach_scores_and_temperature():
     assert torch.autograd.gradcheck(loss, (scores, temperature))
 
 
+def test_half_scores_are_summed_in_single_precision():
+    scores = torch.rand(4, 3000).half()
+    loss = place_cross_entropy(scores, torch.arange(4)[:, None], 0, 0.01).loss
+    assert loss.dtype == torch.float32
+    close(loss, place_cross_entropy(scores.double(), torch.arange(4)[:, None], 0, 0.01).loss.float(), 1e-3)
+
+
 def test_the_place_loss_builds_nothing_of_queries_times_places_times_answers(largest_tensor):
     with largest_tensor() as seen:
         place_cross_entropy(torch.rand(16, 500), torch.randint(0, 500, (16, 40)), 5, 0.1)

@@ -9,7 +9,8 @@ import torch
 from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
-from small_training import data_of, fit, footage, new_descriptor, recall
+from pytorch_lightning import Callback
+from small_training import data_of, fit, footage, new_descriptor, recall, trainer
 
 from dejavu_torch.maps.quantisation import quantise
 from dejavu_torch.maps.spectrum import from_spectrum
@@ -119,6 +120,19 @@ def test_shapes_that_do_not_fit(lines, widths, facts):
 
 
 # -------------------------------------------------------------------- training
+
+
+def test_bits_count_for_more_and_more(tmp_path):
+    """Nothing at the first step, so that the descriptor learns places first."""
+    seen = []
+
+    class Losses(Callback):
+        def on_train_batch_end(self, trainer, *_):
+            now = {name: float(value) for name, value in trainer.callback_metrics.items()}
+            seen.append((now["train/loss"] - now["train/descriptor"]) / now["train/bits"])
+
+    trainer(tmp_path, Losses(), max_steps=4).fit(rated(2.0), data_of())
+    assert seen == pytest.approx([0.0, 0.5, 1.0, 1.5], abs=1e-3)
 
 
 def test_bits_are_saved_where_they_count(tmp_path):

@@ -99,6 +99,13 @@ def test_the_file_holds_the_network_alone(tmp_path):
     assert model.whitening.learned
 
 
+def test_the_map_is_of_the_last_features_not_of_those_validated_before(tmp_path):
+    every = {"val_check_interval": 2, "check_val_every_n_epoch": None}
+    model = fit(tmp_path, spectral(), data_of(), max_steps=3, **every)
+    features = model.descriptor.all_of(ArrayTraverse(footage()))
+    assert torch.equal(levels(model), SpectralMapper(20.0)(features).level)
+
+
 @pytest.mark.parametrize("alone", [False, True], ids=["augmented", "second alone"])
 def test_a_second_traverse_tells_what_a_visit_changes(tmp_path, caplog, alone):
     """Of a checkpoint as in the training: what is tested is the map of the file."""

@@ -13,6 +13,7 @@ from small_training import (
     data_of,
     fit,
     footage,
+    heights,
     mapper,
     new_task,
     recall,
@@ -146,12 +147,13 @@ def test_frames_are_resized_when_they_are_stored(tmp_path, settings, resize, sto
 # figures -------------------------------------------------------------------------------------------------
 
 
-def test_the_figures_are_those_of_evaluate_on_the_map(tmp_path):
+@pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
+def test_the_figures_are_those_of_evaluate_on_the_map(tmp_path, precision):
     """Also of queries without a right place, or of which nothing is known."""
     rows = [f"{i},{i},{i // 2}" if i % 3 else f"{i}" for i in range(30)]
     truth = tmp_path / "truth.csv"
     truth.write_text("\n".join(rows) + "\n")
-    running, task, noisy = trainer(tmp_path), new_task(), ArrayTraverse(footage(0.2))
+    running, task, noisy = trainer(tmp_path, precision=precision), new_task(), ArrayTraverse(footage(0.2))
     running.fit(task, data_of())
     (figures,) = running.test(task, data_of(query=noisy, truth=str(truth)), verbose=False)
     match = DejaVu.load(tmp_path / "map.safetensors").localize(noisy)
@@ -159,3 +161,17 @@ def test_the_figures_are_those_of_evaluate_on_the_map(tmp_path):
     assert known is not None
     expected = evaluate(match, known, tolerance=2)._asdict()
     assert figures == pytest.approx({f"test/{name}": value for name, value in expected.items()}, abs=1e-6)
+
+
+def test_the_rate_rises_over_a_tenth_and_falls_to_0(tmp_path):
+    """And only what is multiplied decays."""
+    task, seen = new_task(weight_decay=0.3), []
+
+    def noted(optimizer):
+        seen.append(optimizer.param_groups[0]["lr"] / task.lr)
+        decays = {id(p): group["weight_decay"] for group in optimizer.param_groups for p in group["params"]}
+        assert decays == {id(p): 0.3 if p.ndim > 1 else 0 for p in task.parameters()}
+
+    task.on_before_optimizer_step = noted  # type: ignore[method-assign]
+    trainer(tmp_path, max_steps=20, limit_val_batches=0).fit(task, data_of())
+    assert seen == pytest.approx(heights(20))
