@@ -6,6 +6,8 @@ import importlib
 import os
 import signal
 import sys
+import threading
+import time
 
 import numpy as np
 import pytest
@@ -27,20 +29,24 @@ from dejavu_torch.types import FrequencyLayer
 
 CHUNK, PLACES = 50, 620
 FEATURES = """
-import os
+import os, time
 from pathlib import Path
 import torch
 
 class Watched(torch.nn.Module):
-    '''Means of blocks. A white frame ends a worker.'''
+    '''Means of blocks. A worker says its number and waits until it may go on; a white frame ends it.'''
 
     def __init__(self, folder):
         super().__init__()
         self.folder, self.home = str(folder), os.getpid()
 
     def forward(self, frames):
-        if os.getpid() != self.home and (Path(self.folder) / "deadly").exists():
-            if (frames.flatten(1).amin(1) > 0.95).any():
+        if os.getpid() != self.home:
+            here = Path(self.folder)
+            (here / f"{os.getpid()}.worker").touch()
+            while not (here / "go").exists():
+                time.sleep(0.01)
+            if (here / "deadly").exists() and (frames.flatten(1).amin(1) > 0.95).any():
                 os._exit(1)
         return torch.nn.functional.avg_pool2d(frames, 4).flatten(1)
 """
@@ -98,6 +104,33 @@ def test_workers_write_the_file_of_one_process(cluster, tmp_path):
     assert files[0] == files[1]
 
 
+def test_a_worker_that_is_killed_is_made_up_for(cluster, watched, tmp_path):
+    images = write_images(tmp_path / "route", frames(PLACES, size=16))
+    whole = file_of(learned(open_source(images), watched), tmp_path)
+    killed = []
+
+    def kill():
+        stop = time.monotonic() + 60
+        while not killed and time.monotonic() < stop:
+            for file in tmp_path.glob("*.worker"):
+                killed.append(int(file.stem))
+                os.kill(killed[0], signal.SIGKILL)
+                break
+            time.sleep(0.01)
+        (tmp_path / "go").touch()
+
+    thread = threading.Thread(target=kill)
+    thread.start()
+    model = learned(
+        open_source(images), watched, checkpoint=Checkpoint(tmp_path / "m"), map_tasks=cluster.map
+    )
+    thread.join()
+    assert killed
+    assert killed[0] != os.getpid()
+    assert len(list(tmp_path.glob("*.worker"))) >= 2
+    assert file_of(model, tmp_path) == whole
+
+
 def test_what_cannot_be_made_is_named_and_what_precedes_it_is_kept(cluster, watched, tmp_path, monkeypatch):
     monkeypatch.setattr(clustering, "RETRIES", 0)
     bright = frames(PLACES, size=16)
@@ -107,6 +140,7 @@ def test_what_cannot_be_made_is_named_and_what_precedes_it_is_kept(cluster, watc
     good = (images / "110.png").read_bytes()
     whole = file_of(learned(open_source(images), watched), tmp_path)
     (images / "110.png").write_bytes(b"no image")
+    (tmp_path / "go").touch()
     (tmp_path / "deadly").touch()
     began = []
 
@@ -125,6 +159,14 @@ def test_what_cannot_be_made_is_named_and_what_precedes_it_is_kept(cluster, watc
     (tmp_path / "deadly").unlink()
     assert file_of(learn(), tmp_path) == whole
     assert began == [0, 100, 400]
+
+
+def test_chunks_made_together_before_a_bad_frame_are_kept(cluster, tmp_path):
+    bad = route()
+    bad[544] = torch.nan
+    assert 544 not in Sample.of(PLACES, CHUNK).frame
+    with refused("frames 500 to 599", "read on", "frame 544", "500 of 620"):
+        learned(bad, checkpoint=Checkpoint(tmp_path / "m"), map_tasks=cluster.map)
 
 
 def found_by(model, queries, search=None):
