@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 
 import numpy as np
@@ -204,14 +203,6 @@ def test_frames_left_out_move_the_filter_on(route):
         )
 
     assert posteriors(True)[10:].mean() > posteriors(False)[10:].mean() + 0.2
-
-
-def test_a_copy_goes_on_by_itself(spectral, drive):
-    localizer = LiveLocalizer(spectral)
-    answers(localizer, drive[:5])
-    other = copy.deepcopy(localizer)
-    expected = answers(localizer, drive[5:9])
-    assert [one.place for one in answers(other, drive[5:9])] == [one.place for one in expected]
 
 
 def test_names_and_interruption(spectral, drive, monkeypatch):
