@@ -123,51 +123,6 @@ def test_a_file_that_is_half_written_goes_and_the_old_one_stays(folder, number, 
     assert (folder / "m.csv").read_text() == "old"
 
 
-def test_a_training_that_is_interrupted_leaves_a_map(folder):
-    (folder / "train.yaml").write_text(
-        "model:\n"
-        "  class_path: dejavu_torch.TemplateTask\n"
-        "  init_args:\n"
-        "    backbone:\n"
-        "      class_path: dejavu_torch.features.cnn.SmallCNN\n"
-        "      init_args: {dimension: 8, channels: 1, resize: [16, 16], widths: [4, 8], squeeze: 4}\n"
-        "data: {source: a.npy, batch_size: 20, tolerance: 2}\n"
-        "trainer: {max_steps: 1000000, accelerator: cpu, enable_progress_bar: false, default_root_dir: run,\n"
-        "  log_every_n_steps: 1}\n"
-    )
-    process = start(folder, "train", "fit", "--config", "train.yaml")
-    wait_for(process, lambda: list((folder / "run").rglob("metrics.csv")))
-    process.send_signal(signal.SIGINT)
-    out, said = process.communicate(timeout=60)
-    lines = said.splitlines(keepends=True)
-    assert (process.returncode, lines.count(INTERRUPTED)) == (130, 1)
-    assert [line for line in lines if not line.startswith(b"dejavu: ")] == []
-    assert b"to go on: dejavu train fit" in out
-    assert DejaVu.load(folder / "run" / "map.safetensors").trained is not None
-
-
-# standard streams
-
-
-@pytest.mark.parametrize(
-    ("words", "status", "said"),
-    [
-        ("| grep -q usage:", 0, ""),
-        ("> /dev/full", 2, "dejavu: the printed output is incomplete: No space left on device\n"),
-        ("dance 2>&-", 2, ""),
-        ("''", 2, "dejavu: '' is no command; expected one of"),
-    ],
-)
-def test_the_overview_whatever_becomes_of_what_is_printed(words, status, said):
-    command = f"set -o pipefail; {' '.join(DEJAVU)} {words}"
-    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True)
-    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (status, "", bool(said))
-    assert done.stderr.startswith(said)
-
-
-# names
-
-
 def test_what_a_writer_could_not_take_is_refused_ahead_of_the_work(folder, capsys):
     os.mkfifo(folder / "fifo.safetensors")
     (folder / "link").symlink_to("nowhere")

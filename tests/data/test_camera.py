@@ -65,15 +65,6 @@ def test_frames_are_brought_to_a_size_as_those_of_a_file(tmp_path, stream):
     assert torch.equal(torch.from_numpy(first.pixels.copy()).permute(2, 0, 1) / 255, expected)
 
 
-def test_a_stream_that_changes_size_keeps_what_came_before(tmp_path, stream):
-    other = clip(tmp_path / "other.ts", pictures(4, 48, 64), **H264).read_bytes()  # type: ignore[arg-type]
-    count = 0
-    with piped(tmp_path, stream + other) as pipe, refused("48 x 64", "32 x 48", "frame 12"):
-        for _ in Camera(pipe):
-            count += 1
-    assert count == 12
-
-
 def test_the_end_of_an_address_is_told(tmp_path, stream):
     (tmp_path / "clip.ts").write_bytes(stream)
     with served(tmp_path) as address, refused("clip.ts ended after 12 frames", "expected more frames"):

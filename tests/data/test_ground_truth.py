@@ -598,18 +598,6 @@ def test_a_frame_that_no_query_shows_speaks_for_the_nearest_one_that_is_shown(tm
         read(written(tmp_path, "1,0\n10,4\n"), 12, SHOWN)
 
 
-def test_positions_and_coordinates_are_of_frames():
-    reference = images(*((10 * i, 0) for i in range(12)))
-    query = images(*((10 * i, 0) for i in range(1, 12)))
-    found = known("utm:1", reference, query, 12, SHOWN, resampled=True)
-    assert sets(found.positives) == [{4}, {10}]
-    part = known("utm:1", frame_range(reference, start=2), query, 10, SHOWN)
-    assert sets(part.positives) == [{2}, {8}]
-    carried = route(12, list(range(12))), route(10, list(range(1, 11)))
-    found = known(None, *carried, 12, SHOWN, resampled=True)
-    assert sets(found.positives) == [{4}, {10}]
-
-
 # sizes, which are checked before anything is read
 
 

@@ -102,25 +102,6 @@ def test_what_cannot_be_written_is_refused_at_once(tmp_path, check, name, words)
     assert list(tmp_path.iterdir()) == [tmp_path / "file"]
 
 
-# what is there already
-
-
-def test_a_file_keeps_its_mode_and_a_new_one_follows_the_umask(tmp_path):
-    private, new = tmp_path / "private", tmp_path / "new"
-    private.touch()
-    private.chmod(0o600)
-    before = os.umask(0o027)
-    try:
-        write(private)
-        write(new)
-        with whole_folder(tmp_path / "folder") as temporary:
-            (temporary / "a").touch(0o600)  # as some writers do
-    finally:
-        os.umask(before)
-    assert (mode_of(private), mode_of(new)) == (0o600, 0o640)
-    assert (mode_of(tmp_path / "folder"), mode_of(tmp_path / "folder" / "a")) == (0o750, 0o640)
-
-
 def test_no_permission_is_told_at_once(tmp_path, monkeypatch):
     (tmp_path / "a").touch()
     monkeypatch.setattr(os, "access", lambda place, mode: Path(place) != tmp_path / "a")
@@ -135,9 +116,6 @@ def test_the_folder_vanishes_meanwhile(tmp_path):
         temporary.write_text("new")
         (tmp_path / "folder").rename(tmp_path / "moved")
     assert list(tmp_path.glob("moved/a.txt")) == []
-
-
-# folders
 
 
 def test_a_folder_keeps_its_other_files(tmp_path):

@@ -60,11 +60,6 @@ def test_markings_repeat_exactly_and_no_sooner(scale):
     assert (DASH_PERIOD, CHEVRON_PERIOD) == (93, 171)
 
 
-def test_the_camera_moves_one_column_per_frame():
-    frames = all_of(AerialRoad(frames=40, noise=0, drift=0, yaw=0))
-    assert torch.allclose(frames[1:, :, :, :-1], frames[:-1, :, :, 1:], atol=0.02)
-
-
 def test_two_flights_see_the_same_route(flights):
     first, second = (looks(frames) for frames in flights)
     same = (first * second).sum(1)

@@ -213,16 +213,6 @@ def test_cover_is_the_hidden_part_of_an_interval(gap, length, depth, slope, half
     assert np.abs(seen.numpy() - hidden).max() < 0.01
 
 
-def test_railways_open_by_name():
-    train = open_source("sim:underground?seed=2&frames=7&height=32&width=40&speed=20")
-    assert isinstance(train, Underground)
-    assert train.name == "sim:underground?seed=2&traverse=0&frames=7&height=32&width=40&speed=20.0"
-    assert repr(train) == repr(Underground(2, 0, 7, 32, 40, 20.0))
-    assert repr(open_source(train.name)) == repr(train)
-    assert len(open_source("sim:outdoor?frames=0")) == len(Outdoor())
-    assert len(open_source(f"sim:outdoor?seed={10**25}")) in range(3000, 8000)
-
-
 def has(given, *expected):
     """What the simulator itself refuses, with what it says."""
     return given, [f"has {given}; expected", *expected]

@@ -5,23 +5,12 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from helpers import all_of, refused
 
-from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.source import open_source
 from dejavu_torch.data.traverse import Chain
-
-
-@pytest.mark.parametrize("name", ["a.npy", "a.NPY", "with space?.npy"])
-def test_an_array(tmp_path, name):
-    with (tmp_path / name).open("wb") as file:
-        np.save(file, np.ones((3, 2)))
-    source = open_source(tmp_path / name)
-    assert isinstance(source, ArrayTraverse)
-    assert (len(source), source.name) == (3, str(tmp_path / name))
 
 
 @pytest.mark.parametrize(

@@ -259,17 +259,6 @@ def test_frames_of_other_sizes_are_refused():
         Chain([])
 
 
-def test_an_array_goes_elsewhere_as_its_file(tmp_path):
-    np.save(tmp_path / "route.npy", np.random.default_rng(0).random((5000, 8), np.float32))
-    route = open_source(tmp_path / "route.npy")
-    packed = pickle.dumps(route)
-    assert len(packed) < 1000
-    assert torch.equal(pickle.loads(packed)[:], route[:])
-    # a part of what is mapped goes as its values
-    part = ArrayTraverse(np.load(tmp_path / "route.npy", mmap_mode="r")[100:140])
-    assert torch.equal(pickle.loads(pickle.dumps(part))[:], route[100:140])
-
-
 # other sizes
 
 

@@ -10,28 +10,13 @@ import numpy as np
 from helpers import refused
 
 from dejavu_torch.data.camera import Frame
-from dejavu_torch.live.feed import WAITING, FrameReader, in_real_time
+from dejavu_torch.live.feed import FrameReader, in_real_time
 
 PIXELS = np.zeros((2, 2, 3), np.uint8)
 
 
 def shots(count, rate=25.0):
     return (Frame(i, i / rate, PIXELS) for i in range(count))
-
-
-def test_no_frame_of_a_file_is_dropped_nor_read_far_ahead():
-    read = []
-
-    def counted():
-        for shot in shots(30):
-            read.append(shot.number)
-            yield shot
-
-    with FrameReader(counted()) as feed:
-        for i, shot in enumerate(feed):
-            assert shot.number == i
-            assert len(read) <= i + WAITING + 2
-    assert (i, feed.dropped) == (29, 0)
 
 
 def test_of_a_live_source_the_newest_frame_is_taken_and_the_others_are_counted():

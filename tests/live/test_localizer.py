@@ -133,16 +133,6 @@ def test_every_kind_of_array(given, spectral, drive):
     assert LiveLocalizer(spectral, None)(given(drive[5])).place == 15
 
 
-def test_ready_features():
-    wave = torch.randn(40, 6)
-    model = DejaVu().learn(wave)
-    assert LiveLocalizer(model, None)(wave[7]).place == 7
-    searching = LiveLocalizer(model, None, keep_scores=False)
-    assert (searching(wave[7]).place, searching.scores) == (7, None)
-    with refused("5 features", "6"):
-        LiveLocalizer(DejaVu(whitening="none").learn(wave))(wave[7, :5])
-
-
 @pytest.mark.parametrize(
     ("frame", "words"),
     [

@@ -100,17 +100,6 @@ def test_curve_keeps_the_highest_of_many_places():
     assert curve(torch.tensor([3.0, 1.0, 2.0, math.inf]), posterior=False) == [0.0, 1.0, 0.5, 0.0]
 
 
-@pytest.mark.parametrize("places", [1, 7, 512, 700, 100_000])
-def test_columns_of_a_posterior_and_being_off_the_map_add_up_to_1(places):
-    posterior = torch.rand(places + 1, generator=torch.Generator().manual_seed(0))
-    posterior /= posterior.sum()
-    heights = curve(posterior, posterior=True)
-    assert len(heights) == min(512, places)
-    assert sum(heights) == pytest.approx(1 - float(posterior[-1]), abs=1e-3)
-    middle = torch.arange(places) * len(heights) // places == len(heights) // 2
-    assert heights[len(heights) // 2] == pytest.approx(float(posterior[:-1][middle].sum()), abs=1e-5)
-
-
 def test_reference_pictures_of_any_source(tmp_path):
     frames = pictures(5)
     np.save(tmp_path / "frames.npy", frames)

@@ -299,15 +299,6 @@ def test_a_camera_that_looks_back():
     assert even.frame[0] == 0
 
 
-def test_few_frames_are_in_memory(largest_tensor):
-    traverse = journey()
-    with largest_tensor() as seen:
-        even = ResampledTraverse(traverse, GroundOdometry(step=8.0), batch_size=4)
-        for _ in even.batches(4):
-            pass
-    assert seen.numel < traverse.values.numel() / 8
-
-
 # --- what is refused
 
 
