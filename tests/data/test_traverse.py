@@ -193,12 +193,6 @@ def test_a_part_is_a_slice_however_the_frames_are_read(part, size):
         assert torch.equal(some[1:4], expected[1:4])
 
 
-def test_parts_of_parts_name_both():
-    part = frame_range(frame_range(ArrayTraverse(VALUES, "walk"), start=10), stop=8, step=2)
-    assert part.name == "walk[10:][0:8:2]"
-    assert part[:].flatten().tolist() == [10, 12, 14, 16]
-
-
 def parts(cuts):
     bounds = [0, *sorted(cuts), len(VALUES)]
     return [ArrayTraverse(VALUES[a:b]) for a, b in pairwise(bounds) if b > a]

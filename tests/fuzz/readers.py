@@ -394,7 +394,7 @@ def truth_text(case):
         names[at] = mutate_text(random, names[at]).decode(errors="replace")
         text = random.choice(("utm", "utm:25", "utm:1e300", "utm:0"))
     traverse = ArrayTraverse(pictures(12))
-    traverse.frame_name = names.__getitem__  # type: ignore[method-assign]
+    traverse.names = names
     judge(case, text, traverse)
 
 
