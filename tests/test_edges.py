@@ -25,7 +25,6 @@ from dejavu_torch import (
     SpectralMapper,
     TemplateMapper,
     Whitening,
-    best_match,
     compare,
     evaluate,
     open_source,
@@ -34,9 +33,6 @@ from dejavu_torch.data import GroundTruth
 from dejavu_torch.data.source import as_traverse
 from dejavu_torch.evaluation import judge
 from dejavu_torch.features.cnn import SmallCNN
-from dejavu_torch.features.joined import Joined
-from dejavu_torch.maps import log_posterior
-from dejavu_torch.resize import resize_frames
 from dejavu_torch.training.metrics import PlaceRecognition
 from dejavu_torch.types import FrequencyLayer
 
@@ -73,13 +69,6 @@ def test_learning_a_second_model_leaves_the_first_alone(learned):
     assert torch.equal(other.whitening.projection, learned.whitening.projection)
     other.learn(1 - FRAMES.flip(0))
     assert torch.equal(learned(FRAMES[SOME]), before)
-
-
-def test_a_fixed_whitening_is_shared():
-    model = spectral().learn(FRAMES)
-    other = DejaVu(mapper=SpectralMapper(16.0))
-    other.descriptor.take(model.descriptor, whitening=True)
-    assert other.settings()["whitening"] is other.whitening
 
 
 def test_an_optimiser_goes_on_with_the_templates_of_a_map_made_anew(caplog):
@@ -130,48 +119,6 @@ def test_frames_have_the_type_of_the_network(make):
     finds_itself(spectral(make()).learn(FRAMES))
 
 
-def test_joined_networks_have_types_of_their_own():
-    model = spectral(Joined([network().bfloat16(), network()])).learn(FRAMES)
-    finds_itself(model)
-    assert model(FRAMES[:2]).dtype == torch.float32
-
-
-def test_frames_in_double_precision_are_learned():
-    finds_itself(spectral().learn(FRAMES.numpy() / 1.0), FRAMES.double())
-    finds_itself(spectral().learn(FRAMES.double()), FRAMES.double())
-
-
-def test_a_default_type_of_double_precision():
-    torch.set_default_dtype(torch.float64)
-    try:
-        finds_itself(spectral(SmallCNN(8, 3, (16, 16))).learn(FRAMES))
-        finds_itself(spectral().learn(FRAMES.double()), FRAMES.double())
-    finally:
-        torch.set_default_dtype(torch.float32)
-
-
-class Ensemble(nn.Module):
-    """With parts of a common name, and weights that are no parameters."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.members = nn.ModuleList([nn.Flatten()])
-        self.register_buffer("mixing", torch.rand(3 * 32 * 24, 8, dtype=torch.float64))
-
-    def forward(self, frames):
-        return self.members[0](frames) @ self.mixing
-
-
-def test_a_network_of_buffers_gets_frames_of_their_type():
-    finds_itself(spectral(Ensemble()).learn(FRAMES))
-
-
-def test_bytes_are_resized_as_torch_does():
-    frames = (255 * FRAMES).byte()
-    expected = nn.functional.interpolate(frames, (20, 20), mode="bilinear", antialias=True)
-    assert torch.equal(resize_frames(frames, (20, 20)), expected)
-
-
 @pytest.mark.parametrize("to", ["double", "half", "bfloat16"])
 def test_frame_positions_keep_their_type(to):
     route = SpectralMapper(16.0)(torch.rand(60, 8))
@@ -185,14 +132,6 @@ def test_a_converted_model_is_saved_as_maps_are(to, tmp_path):
     model = spectral().learn(FRAMES)
     getattr(model, to)().save(tmp_path / "map.safetensors")
     finds_itself(DejaVu.load(tmp_path / "map.safetensors"))
-
-
-def test_templates_in_double_precision_are_saved_and_searched(tmp_path):
-    model = templates().learn(FRAMES)
-    expected = model.localize(FRAMES).index
-    model.double().save(tmp_path / "map.safetensors")
-    assert torch.equal(model.localize(FRAMES).index, expected)
-    assert torch.equal(DejaVu.load(tmp_path / "map.safetensors").localize(FRAMES).index, expected)
 
 
 # forms of input
@@ -250,13 +189,6 @@ def test_states_have_to_fit_several_sequences():
             model(scores, state)
     with refused("adds up to 21", "probabilities"):
         PlaceFilter()(scores, torch.ones(3, 21))
-
-
-def test_leading_dimensions_of_scores():
-    scores = torch.rand(2, 3, 7, 20)
-    match = best_match(scores)
-    assert torch.equal(match.index, scores.argmin(-1))
-    torch.testing.assert_close(log_posterior(scores, 0.5)[1, 2], log_posterior(scores[1, 2], 0.5))
 
 
 # truth in any form

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import os
 import random
-import resource
 import shlex
 import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from pathlib import Path
 
@@ -21,9 +19,8 @@ from command_line import fails, frames, run, write_images
 from processes import PACKAGE, Forked
 
 from dejavu_torch import DejaVu
-from dejavu_torch.cli import main
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="limits, mounts and signals of Linux")
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="mounts and signals of Linux")
 DEJAVU = (sys.executable, "-m", "dejavu_torch.cli")
 PIPES = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
 INTERRUPTED = b"dejavu: interrupted\n"
@@ -86,11 +83,6 @@ def forked(work):
     os._exit(0)
 
 
-def ended(work):
-    """The status of a process that has done this."""
-    return os.waitstatus_to_exitcode(os.waitpid(forked(work), 0)[1])
-
-
 def names_in(folder):
     return {file.name for file in folder.iterdir()} if folder.exists() else set()
 
@@ -130,192 +122,6 @@ def test_a_file_that_is_half_written_goes_and_the_old_one_stays(folder, number, 
     assert process.communicate(timeout=60)[1] == said
     assert (process.returncode, names_in(folder)) == (status, before)
     assert (folder / "m.csv").read_text() == "old"
-
-
-def test_a_training_that_is_interrupted_leaves_a_map(folder):
-    (folder / "train.yaml").write_text(
-        "model:\n"
-        "  class_path: dejavu_torch.TemplateTask\n"
-        "  init_args:\n"
-        "    backbone:\n"
-        "      class_path: dejavu_torch.features.cnn.SmallCNN\n"
-        "      init_args: {dimension: 8, channels: 1, resize: [16, 16], widths: [4, 8], squeeze: 4}\n"
-        "data: {source: a.npy, batch_size: 20, tolerance: 2}\n"
-        "trainer: {max_steps: 1000000, accelerator: cpu, enable_progress_bar: false, default_root_dir: run,\n"
-        "  log_every_n_steps: 1}\n"
-    )
-    process = start(folder, "train", "fit", "--config", "train.yaml")
-    wait_for(process, lambda: list((folder / "run").rglob("metrics.csv")))
-    process.send_signal(signal.SIGINT)
-    out, said = process.communicate(timeout=60)
-    lines = said.splitlines(keepends=True)
-    assert (process.returncode, lines.count(INTERRUPTED)) == (130, 1)
-    assert [line for line in lines if not line.startswith(b"dejavu: ")] == []
-    assert b"to go on: dejavu train fit" in out
-    assert DejaVu.load(folder / "run" / "map.safetensors").trained is not None
-
-
-def test_a_benchmark_of_memory_that_is_interrupted_leaves_neither_files_nor_a_process(tmp_path, monkeypatch):
-    from benchmarks import memory
-    from dejavu_torch.cli import process
-    from dejavu_torch.data.output import remove_temporaries
-
-    (tmp_path / "tmp").mkdir()
-    script = "#!/bin/sh", 'cd "${0%/*}"', "echo $$ > new", "mv new pid", "exec sleep 60"
-    (tmp_path / "python").write_text("\n".join(script))
-    (tmp_path / "python").chmod(0o700)
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
-    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
-
-    def bench():
-        process.take_over()
-        process.cleanup[:] = [remove_temporaries]
-        list(memory.bench_memory([64]))
-
-    child = forked(bench)
-    pid = tmp_path / "pid"
-    late = time.monotonic() + 60
-    while not pid.exists() and time.monotonic() < late:
-        time.sleep(0.01)
-    assert list(tmp_path.glob("tmp/.dejavu-*/*.npy"))
-    os.kill(child, signal.SIGINT)
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 130
-    assert names_in(tmp_path / "tmp") == set()
-    status = Path(f"/proc/{int(pid.read_text())}/status")
-    while status.exists() and "State:\tZ" not in status.read_text() and time.monotonic() < late:
-        time.sleep(0.01)
-    assert time.monotonic() < late
-
-
-def python(code, *words, **settings):
-    """Status and output of code run by another interpreter; torch is not needed for most."""
-    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, **settings)  # type: ignore[call-overload]
-    return done.returncode, done.stdout, done.stderr
-
-
-def test_ctrl_c_when_all_is_done_changes_nothing():
-    late = "import atexit, signal; atexit.register(signal.raise_signal, signal.SIGINT)"
-    code = f"{late}\nfrom dejavu_torch.cli import main; main()"
-    assert python(code, "--version")[::2] == (0, "")
-
-
-def test_a_signal_that_is_ignored_stays_so():
-    ignore = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"  # as nohup, or a shell's &, does
-    code = f"{ignore}\nfrom dejavu_torch.cli import process; process.take_over(); signal.raise_signal(2)"
-    assert python(code) == (0, "", "")
-
-
-def test_where_interrupts_are_raised_the_second_one_ends():
-    code = (
-        "import signal; from dejavu_torch.cli import process; process.take_over()\n"
-        "with process.interrupts_raise():\n"
-        "    try: signal.raise_signal(2)\n"
-        "    except KeyboardInterrupt: print('kept')\n"
-        "    signal.raise_signal(2)\n"
-        "print('not reached')"
-    )
-    assert python(code) == (130, "kept\n", "dejavu: interrupted\n")
-
-
-def test_an_interrupt_that_was_turned_into_another_exception_is_one():
-    code = (
-        "import signal; from dejavu_torch import cli\n"
-        "def run(given):\n"
-        "    with cli.process.interrupts_raise():\n"
-        "        try: signal.raise_signal(2)\n"
-        "        except KeyboardInterrupt: raise RuntimeError('of an extension')\n"
-        "cli.main(program=run)"
-    )
-    assert python(code) == (130, "", "dejavu: interrupted\n")
-
-
-# standard streams
-
-
-def opened(number):
-    """A standard stream as Python opens it."""
-    try:
-        os.fstat(number)
-    except OSError:
-        return None
-    return open(number, "w" if number else "r", closefd=False)
-
-
-@pytest.mark.parametrize(("redirected", "status"), [("left", 0), ("closed", 0), ("full", 2)])
-def test_files_are_written_whatever_becomes_of_what_is_printed(redirected, status, folder, capfd):
-    """Where who reads has left, as `head` does, where streams are closed, and where a disk is full."""
-
-    def command():
-        os.chdir(folder)
-        read, write = os.pipe()
-        os.close(read)
-        if redirected == "closed":
-            os.closerange(0, 3)
-        else:
-            os.dup2(os.open("/dev/full", os.O_WRONLY) if redirected == "full" else write, 1)
-        os.close(write)
-        for number, name in enumerate(("stdin", "stdout", "stderr")):
-            stream = opened(number)
-            setattr(sys, name, stream)
-            setattr(sys, f"__{name}__", stream)
-        sys.argv[1:] = ["localize", "map.safetensors", "b.npy", "--out", "m.csv"]
-        main()
-
-    assert ended(command) == status
-    said = "dejavu: the printed output is incomplete: No space left on device\n"
-    assert capfd.readouterr().err == said * (redirected == "full")
-    text = (folder / "m.csv").read_text()  # and nothing that was printed
-    assert (text[:12], text.count("\n")) == ("query,place,", 65)
-
-
-@pytest.mark.parametrize(
-    ("words", "status", "said"),
-    [
-        ("| grep -q usage:", 0, ""),
-        ("> /dev/full", 2, "dejavu: the printed output is incomplete: No space left on device\n"),
-        ("dance 2>&-", 2, ""),
-        ("''", 2, "dejavu: '' is no command; expected one of"),
-    ],
-)
-def test_the_overview_whatever_becomes_of_what_is_printed(words, status, said):
-    command = f"set -o pipefail; {' '.join(DEJAVU)} {words}"
-    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True)
-    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (status, "", bool(said))
-    assert done.stderr.startswith(said)
-
-
-def test_a_folder_that_is_gone_is_no_traceback(tmp_path):
-    code = "import os; os.rmdir(os.getcwd()); from dejavu_torch.cli import main; main()"
-    (tmp_path / "gone").mkdir()
-    path = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
-    words = ("learn", "a.npy", "--map", "a.safetensors")
-    status, _, said = python(code, *words, cwd=tmp_path / "gone", env=path)
-    assert (status, said.count("\n")) == (2, 1)
-    assert "current folder" in said
-
-
-# names
-
-
-def test_names_that_are_no_text_do_not_fail_a_report(tmp_path):
-    for name, seed in ((b"caf\xe9\n\x1b[31m", 1), ("\xe9$_{$".encode(), 2)):
-        plain = write_images(tmp_path / f"{seed}", frames(32, seed=seed))
-        for image in plain.iterdir():
-            os.rename(image, os.fsencode(plain) + b"/\xff\n$_{$" + os.fsencode(image.name))
-        plain.rename(Path(os.fsdecode(os.fsencode(tmp_path) + b"/" + name)))
-    words = [b"compare", b"caf\xe9\n\x1b[31m", "\xe9$_{$".encode(), b"--truth", b"0", b"--out", b"out"]
-    words += map(os.fsencode, (*PLAIN, "--calibration", "none"))
-    (tmp_path / "matplotlibrc").write_text("savefig.dpi: 20")  # names are drawn, in few pixels
-    plain_c = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
-    plain_c["MATPLOTLIBRC"] = str(tmp_path)
-    done = subprocess.run([*map(os.fsencode, DEJAVU), *words], cwd=tmp_path, env=plain_c, capture_output=True)
-    assert (done.returncode, done.stderr.count(b"\n")) == (0, done.stderr.count(b"dejavu: "))
-    assert b"\x1b" not in done.stdout
-    assert names_in(tmp_path / "out") >= REPORT
-    page = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
-    assert page.count(r"caf\udce9\n\x1b[31m") >= 3
-    rows = (tmp_path / "out" / "matches.csv").read_text(encoding="utf-8").splitlines()
-    assert (len(rows), rows[1].count(r"\udcff\n$_{$")) == (33, 2)
 
 
 def test_what_a_writer_could_not_take_is_refused_ahead_of_the_work(folder, capsys):
@@ -363,17 +169,7 @@ def test_an_output_that_is_what_is_read_is_refused_and_stays(folder, words, caps
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
 
-def test_a_report_may_lie_beside_what_it_is_of(folder, monkeypatch):
-    monkeypatch.chdir(folder)
-    run("localize", "map.safetensors", "b.npy", "--out", "m.csv")
-    (folder / "0").mkdir()
-    run("evaluate", "m.csv", "--truth", "0", "--out", ".")
-    run("evaluate", "m.csv", "--truth", "0", "--map", "map.safetensors", "--out", "0")
-    assert {"index.html", "m.csv", "map.safetensors"} <= names_in(folder)
-    assert "index.html" in names_in(folder / "0")
-
-
-# no room
+# kills
 
 
 def mounted(folder, options, *commands):
@@ -434,22 +230,6 @@ def test_a_disk_that_is_full_or_sealed_is_one_line_and_leaves_what_was_there(fol
     ]
 
 
-def test_a_limit_on_files_is_one_line(folder, capfd):
-    (folder / "m.csv").write_text("old")
-    before = names_in(folder)
-
-    def limited():
-        os.chdir(folder)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (500, 500))
-        run("localize", "map.safetensors", "b.npy", "--out", "m.csv")
-
-    assert (ended(limited), capfd.readouterr().err) == (2, "dejavu: m.csv was not written: File too large\n")
-    assert (names_in(folder), (folder / "m.csv").read_text()) == (before, "old")
-
-
-# kills
-
-
 def test_a_kill_leaves_a_whole_map_and_a_whole_report(folder):
     model, target, moment = DejaVu.load(folder / "map.safetensors"), folder / "out", random.Random(0)
     whole = (folder / "map.safetensors").read_bytes()
@@ -472,23 +252,3 @@ def test_a_kill_leaves_a_whole_map_and_a_whole_report(folder):
         DejaVu.load(folder / "map.safetensors")
         # fewer are there where the removal was killed, never a part of one
         assert {file.read_bytes() for file in target.glob("*")} <= {whole}
-
-
-def test_two_writers_of_a_map_and_a_folder_both_end_well(folder):
-    from dejavu_torch.data.output import whole_file, whole_folder
-
-    def write(text):
-        for _ in range(100):
-            with whole_file(folder / "one") as temporary:
-                temporary.write_text(text)
-            with whole_folder(folder / "new") as temporary:
-                (temporary / "a").write_text(text)
-                (temporary / "b").write_text(text)
-
-    before = names_in(folder)
-    children = [forked(lambda text=text: write(text * 10_000)) for text in "xyz"]
-    assert [os.waitpid(child, 0)[1] for child in children] == [0, 0, 0]
-    texts = {text * 10_000 for text in "xyz"}
-    assert {(folder / "one").read_text(), (folder / "new" / "a").read_text()} <= texts
-    assert names_in(folder) == before | {"one", "new"}
-    assert names_in(folder / "new") == {"a", "b"}

@@ -96,28 +96,6 @@ def test_the_file_is_that_of_all_places_learned_at_once(chunk, parts, settings, 
     assert DejaVu.load(tmp_path / "appended").map.places == len(route)
 
 
-def test_the_old_places_stay_and_the_new_ones_are_found():
-    route = walk(500)
-    model = learned(route[:200])  # 200 is no multiple of 64: the last chunk stays short
-    model.threshold = 0.25
-    query = walk(1, seed=3)
-    old = model.map.scores(query)
-    assert append(model, route[200:]) is model
-    assert [stop - start for start, stop in spectral(model).chunks] == [*[64] * 3, 8, *[64] * 4, 44]
-    assert torch.equal(model.map.scores(query)[:, :200], old)
-    assert (model.localize(route[::7]).index - torch.arange(0, 500, 7)).abs().max() <= 2
-    assert (model.threshold, model.summary().places) == (0.25, 500)
-
-
-def test_names_follow_and_parts_without_names_stay_without():
-    route = walk(192)
-    model = learned(route[:64])
-    append(append(model, Named(route[64:128], "b")), route[128:])
-    names = [model.frame_names[i] for i in (63, 64, 127, 128)]
-    assert names == ["", "b_0000.png", "b_0063.png", ""]
-    assert append(learned(route[:64]), route[64:128]).frame_names == []
-
-
 def test_a_calibration_goes_and_comes_again_from_the_new_places():
     coarse = torch.rand(120, 1, 8, 8, generator=torch.Generator().manual_seed(0))
     frames = torch.nn.functional.interpolate(coarse, (32, 32), mode="bilinear")
@@ -227,13 +205,6 @@ def test_what_cannot_be_appended():
             append(model, added)
         assert model.map is before
         assert model.get_extra_state() == state
-
-
-def test_frames_of_another_size_go_where_features_resize_them():
-    model = image_model(features=HOG(resize=(32, 32)))
-    assert append(model, torch.rand(20, 3, 64, 48)).map.places == 60
-    grey = image_model(preprocess=Preprocess(channel="grey"))
-    assert append(grey, torch.rand(20, 1, 32, 32)).map.places == 60
 
 
 def test_more_places_than_lines_can_be_numbered(monkeypatch):
@@ -454,13 +425,10 @@ def test_a_map_of_means_is_that_of_the_means_by_hand(tmp_path):
     fresh = DejaVu(whitening="none", mapper=SpectralMapper(6.0, chunk=50))
     fresh.load_state_dict(loaded.state_dict())
     assert fresh.map.visit_counts.tolist() == counts
+    both = merge([loaded, learned(route)], ["a", "b"])
+    assert both.map.visits.tolist() == [*model.map.visits.tolist(), [120, 1]]
     fresh.load_state_dict(learned(route, 50).state_dict())  # of one visit
     assert fresh.map.visit_counts.tolist() == [1] * 120
-
-
-def test_places_of_one_visit_take_no_bytes(tmp_path):
-    learned(walk(100)).save(tmp_path / "m")
-    assert "map.visits" not in read_map(tmp_path / "m")[0]
 
 
 def test_a_visit_is_averaged_into_a_map():
@@ -481,24 +449,6 @@ def test_a_visit_is_averaged_into_a_map():
     assert model.map.visits.tolist() == [[5, 1], [10, 5], [30, 3], [105, 1]]
     means = by_hand(means, [1] * 5 + [3] * 10 + [2] * 30 + [1] * 105, more, shown)
     assert (spectral(model).decode(0)[:45] - means[:45]).abs().mean() < 2 * coded[0].step
-
-
-def test_counts_follow_where_a_map_grows(tmp_path):
-    route = walk(200)
-    model = learned(route[:100], 50)
-    rest = ArrayTraverse(noisy(route[100:], 2), "rest")
-    append(model, route[100:], visits=LabelledFrames(rest, torch.arange(100)))
-    assert model.map.visits.tolist() == [[100, 1], [100, 2]]
-    first = spectral(model)
-    means = (route[100:] + noisy(route[100:], 2)) / 2
-    expected = first.of_chunks(encode_chunk(part, *coding_of(first)) for part in means.split(50))
-    query = walk(3, seed=4)
-    assert torch.allclose(model.map.scores(query)[:, 100:], expected.scores(query), atol=1e-5)
-    append(model, route)
-    both = merge([model, learned(route, 50)], ["a", "b"])
-    assert both.map.visits.tolist() == [[100, 1], [100, 2], [400, 1]]
-    both.save(tmp_path / "m")
-    assert DejaVu.load(tmp_path / "m").map.visits.tolist() == both.map.visits.tolist()
 
 
 def test_which_places_a_visit_shows(tmp_path):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import importlib
 import math
-import multiprocessing
 from contextlib import contextmanager
 
 import pytest
@@ -82,14 +81,6 @@ def test_chunks_are_those_of_their_own_descriptors():
         assert torch.equal(own.stream.bytes, expected.stream.bytes)
         assert own.places == len(part)
     assert found_share(model, route()) > 0.95
-
-
-def test_a_short_route_is_learned_from_all_of_it(tmp_path, monkeypatch):
-    long_from(monkeypatch, PLACES)
-    model = DejaVu(mapper=SpectralMapper(3.0, chunk=CHUNK))
-    whole = model.learn_features(model.descriptor.learn(ArrayTraverse(route())), ArrayTraverse(route()))
-    assert resumed(tmp_path) == file_of(whole, tmp_path)
-    assert not (tmp_path / "m.part").exists()
 
 
 @contextmanager
@@ -355,12 +346,6 @@ def visits_of(places):
     return LabelledFrames(ArrayTraverse(route()[places] + noise), places)
 
 
-def test_processes_write_the_file_of_one(tmp_path):
-    whole = file_of(learned(route()), tmp_path)
-    with multiprocessing.get_context("spawn").Pool(2) as pool:
-        assert file_of(learned(route(), map_tasks=pool.imap), tmp_path) == whole
-
-
 def test_visits_are_averaged_in_chunk_by_chunk(tmp_path, made):
     # all places but some, one of them twice, some frames that show none, and against the direction
     places = torch.cat([torch.arange(0, 400), torch.tensor([7, -1, -1]), torch.arange(480, PLACES).flip(0)])
@@ -389,22 +374,3 @@ def test_visits_are_averaged_in_chunk_by_chunk(tmp_path, made):
     assert sum(made) == PLACES - 8 * CHUNK
     with refused("953 frames", "1030 places"):
         growth.learn_mean(model(), route(), visits_of(places)._replace(places=torch.arange(PLACES)))
-
-
-def test_a_long_route_of_ready_features_holds_their_variance(tmp_path, caplog):
-    """Wide ones that change from place to place: reduced, though nothing whitens, and resumed alike."""
-    random = torch.Generator().manual_seed(0)
-    basis = torch.randn(60, 300, generator=random)
-    places = torch.randn(PLACES, 60, generator=random) @ basis
-    wide = ArrayTraverse(places)
-
-    def learn():
-        model = DejaVu(whitening="none", mapper=SpectralMapper(chunk=CHUNK))
-        return model.learn(wide, checkpoint=Checkpoint(tmp_path / "m"))
-
-    first, again = learn(), learn()
-    assert first.map.dimension == 61
-    assert first.summary().route_bytes > 8 * PLACES
-    assert "route_bytes_per_place" not in caplog.text
-    assert torch.equal(again(places[:9]), first(places[:9]))
-    assert torch.equal(first.localize(places[::50]).index, torch.arange(0, PLACES, 50))

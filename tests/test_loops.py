@@ -36,14 +36,6 @@ def test_a_second_lap_finds_the_first(drive):
         assert not match.accepted[:120].any()
 
 
-def test_a_blank_frame_comes_back_to_nothing():
-    rows = twice()
-    rows[[50, 170]] = 0
-    match = DejaVu(whitening="none").learn(rows).loops(rows, 30, drive=False)
-    assert not match.accepted[170]
-    assert not (match.index == 50).any()
-
-
 def test_what_is_refused(tmp_path, capsys):
     rows = twice()
     model = DejaVu(whitening="none").learn(rows)
@@ -54,15 +46,8 @@ def test_what_is_refused(tmp_path, capsys):
             model.loops(rows, apart)
     model.save(tmp_path / "m.safetensors")
     np.save(tmp_path / "d.npy", rows.numpy())
-    words = (
-        "localize",
-        tmp_path / "m.safetensors",
-        tmp_path / "d.npy",
-        "--loops",
-        30,
-        "--out",
-        tmp_path / "m.csv",
-    )
+    files = tmp_path / "m.safetensors", tmp_path / "d.npy"
+    words = "localize", *files, "--loops", 30, "--out", tmp_path / "m.csv"
     for option in ("--top 3", "--match filter", "--centre mean"):
         assert f"--loops 30 and {option}" in fails(capsys, *words, *option.split())
 

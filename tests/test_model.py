@@ -21,8 +21,7 @@ from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.growth import associate
 from dejavu_torch.model import DejaVu
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
-from dejavu_torch.recognition.select import best_match
-from dejavu_torch.types import FrequencyLayer, Match, Training, Traverse
+from dejavu_torch.types import FrequencyLayer, Match, Traverse
 
 SIZE = 16
 
@@ -135,25 +134,6 @@ def test_so_many_features_are_told_of(monkeypatch, caplog):
 # training and deployment give equal scores
 
 
-def test_training_and_deployed_path_give_equal_scores():
-    model = template_model(Tiny(), layers(8, 9)).learn(pictures())
-    model.train()
-    query = pictures(6)
-    match = model.localize(query)
-    model.eval()
-    expected = best_match(model(query.requires_grad_()))
-    assert torch.equal(match.index, expected.index)
-    assert torch.equal(match.score, expected.score)
-
-
-def test_a_batch_of_frames_finds_what_each_frame_finds():
-    """As in the README: `model(frames)` after `learn`, of a network with BatchNorm."""
-    model = template_model(Tiny(), layers(8, 9)).learn(pictures())
-    frames = pictures(6)
-    torch.testing.assert_close(model(frames), torch.cat([model(frame[None]) for frame in frames]))
-    assert int(model.features.norm.num_batches_tracked) == 0
-
-
 @pytest.mark.parametrize("most", [1.4, 255.0])
 def test_frames_that_are_not_in_0_to_1_are_warned_of_once(most, caplog):
     frames = pictures(40)
@@ -221,32 +201,6 @@ def test_gradcheck_from_frames_to_scores():
     assert torch.autograd.gradcheck(model, frames)
 
 
-def test_gradients_reach_the_weights_of_the_backbone():
-    model = template_model(Tiny(), layers(8, 9)).learn(pictures()).eval()
-    model(pictures(4) + 0.1).logsumexp(1).sum().backward()
-    for gradient in (model.features.conv.weight.grad, model.features.conv.bias.grad):
-        assert gradient.isfinite().all()
-        assert gradient.abs().max() > 0
-
-
-# a module like any other
-
-
-def test_state_dict_goes_into_a_fresh_model():
-    torch.manual_seed(0)
-    model = template_model(Tiny(), layers(8, 9)).learn(pictures()).eval()
-    fresh = template_model(Tiny()).eval()
-    fresh.load_state_dict(model.state_dict())
-    assert fresh.map.plan == model.map.plan
-    assert torch.equal(fresh(pictures(5)), model(pictures(5)))
-    smaller = template_model(Tiny(), layers(5, features=2)).learn(pictures(80))
-    smaller.load_state_dict(model.state_dict())
-    assert smaller.map.plan == model.map.plan
-
-
-# memory
-
-
 # a route in which nothing repeats, and bad input
 
 
@@ -291,6 +245,7 @@ def test_large_frames_are_reduced_and_queries_follow(tmp_path, caplog):
         model.localize(frames[None])
     assert len(caplog.messages) <= 1  # told once
     large.requires_grad_()
+    assert not model.localize(large[:1]).score.requires_grad
     model(large[:1]).sum().backward()
     assert large.grad is not None
     assert large.grad.isfinite().all()
@@ -303,11 +258,7 @@ def test_frames_keep_their_size_where_it_was_asked_for(tmp_path):
         Image.new("L", (400, 200), 40 * i).save(images / f"{i}.png")
     model = DejaVu()
     assert model.at_map_size(open_source(images)).frame_shape == (1, 80, 160)
-    assert model.at_map_size(open_source(f"{images}?start=1")).frame_shape == (1, 80, 160)
     assert model.at_map_size(open_source(f"{images}?width=300&start=1")).frame_shape == (1, 150, 300)
-    assert DejaVu(HOG()).at_map_size(open_source(images)).frame_shape == (1, 80, 160)
-    block = DejaVu(HOG()).at_map_size(ArrayTraverse(torch.rand(1, 1, 20, 500)))
-    assert block.frame_shape == (1, 16, 400)
     assert DejaVu(HOG(resize=(100, 100))).at_map_size(open_source(images)).frame_shape == (1, 100, 200)
     for size, shape in ((None, (1, 200, 400)), (50, (1, 25, 50))):
         small = DejaVu(preprocess=Preprocess(size=size)).at_map_size(open_source(images))
@@ -331,17 +282,6 @@ def test_learning_ends_in_eval_mode_and_matching_restores_the_mode(training):
     modes = [part.training for part in (model.features, model.features.conv, model.features.norm)]
     assert modes == [training, training, False]
     assert all(torch.equal(before[name], value) for name, value in model.features.state_dict().items())
-
-
-def test_what_is_known_of_a_map_is_part_of_its_state():
-    model, again = wave_model().learn(waves()), wave_model()
-    model.trained, model.frame_names = Training(7, None), [f"{i:04}.png" for i in range(72)]
-    again.load_state_dict(model.state_dict())
-    assert (again.frame_shape, again.trained, again.frame_names[7]) == ((2,), Training(7, None), "0007.png")
-    again.learn(waves())  # anew
-    assert (again.trained, again.frame_names) == (None, [])
-    model.load_state_dict(again.state_dict())
-    assert (model.trained, model.frame_names) == (None, [])
 
 
 class Paired(nn.Module):
@@ -423,17 +363,3 @@ def test_queries_are_read_as_they_are_matched_in_constant_memory(largest_tensor)
         numbers.add(seen.numel)
     assert len(numbers) == 1
     assert numbers.pop() <= READY * 72
-
-
-def test_a_flat_image_has_finite_gradients_and_no_graph_is_left():
-    model = wave_model().learn(pictures().requires_grad_())
-    frames = torch.full((2, 1, SIZE, 2 * SIZE), 0.5, requires_grad=True)
-    features = model.descriptor.describe(frames).detach()
-    with torch.autocast("cpu", torch.bfloat16):
-        scores = model(features)
-    assert torch.equal(scores, model(features))  # which ignore it
-    model(frames).sum().backward()
-    assert frames.grad is not None
-    assert frames.grad.isfinite().all()
-    assert not model.map.templates.requires_grad
-    assert not model.localize(frames).score.requires_grad

@@ -29,7 +29,6 @@ from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.distilled import Distilled
 from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.pixels import PatchPixels
-from dejavu_torch.features.preprocess import VALUES_AT_ONCE
 from dejavu_torch.types import FrequencyLayer
 
 CHUNKS = (  # overlapping, with gaps, and a rational period
@@ -38,7 +37,6 @@ CHUNKS = (  # overlapping, with gaps, and a rational period
     FrequencyLayer(7, 7, 10, 25, (3,)),
     FrequencyLayer(7, 7, 30, 50, (1, 2, 3)),
 )
-UNCOVERED = [*range(25, 30), *range(50, 60)]
 
 
 def embedding():
@@ -121,18 +119,6 @@ def test_the_exported_model_scores_as_the_model_does(kind):
     assert_scores_alike(program.module() if kind == "no layers" else saved(program), model, 1, 8, 100)
 
 
-@pytest.mark.parametrize("kind", ["no layers", "l1, temperature"])
-def test_the_compiled_model_scores_as_the_model_does(kind):
-    model = MODELS[kind]()
-    torch.compiler.reset()
-    assert_scores_alike(torch.compile(model, fullgraph=True, backend="eager"), model, 8, 100)
-
-
-def test_places_that_nothing_covers_and_frames_that_run_in_parts_are_among_them():
-    assert of_chunks()(torch.rand(3, 4))[:, UNCOVERED].isposinf().all()
-    assert VALUES_AT_ONCE < 100 * 3 * 64 * 64
-
-
 @pytest.mark.figures
 @pytest.mark.skipif(not (shutil.which("g++") or shutil.which("c++")), reason="no C++ compiler")
 def test_the_model_compiled_by_inductor_scores_frames_as_the_model_does():
@@ -142,20 +128,6 @@ def test_the_model_compiled_by_inductor_scores_frames_as_the_model_does():
     for batch in (8, 100):
         queries = queries_of(model, batch)
         torch.testing.assert_close(run(queries), model(queries), rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize("training", [True, False])
-def test_the_weights_of_the_features_count(training, monkeypatch):
-    model, queries = of_chunks(), torch.rand(5, 4)
-    before = model(queries)
-    model.map.trainable(weights=True, start=torch.tensor([0.5, 1.0, 2.0, 0.0]))
-    if not training:
-        model.map.freeze()
-    with host_synchronisations(monkeypatch) as found:
-        expected = model(queries)
-    assert found == []
-    assert not torch.allclose(expected[:, :20], before[:, :20])
-    torch.testing.assert_close(exported(model, queries[:2]).module()(queries), expected, rtol=0, atol=1e-6)
 
 
 # what the host reads

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import pytest
 import torch
-from command_line import report_of, run
-from torch import nn
 
 from dejavu_torch import DejaVu, open_source
 from dejavu_torch.features.embedding import Embedding
@@ -24,42 +22,6 @@ def path():
 def network():
     made = lite.EfficientNet.from_pretrained("efficientnet-lite0", weights_path=path())
     return made.eval()
-
-
-def test_its_early_blocks_are_a_fortieth_of_it(network):
-    net = Embedding(network, None, resize=(64, 128), grid=4, layer="_blocks.3", mean=0.5, std=0.5).eval()
-    frames = torch.rand(3, 3, 64, 128)
-    with torch.no_grad():
-        maps = network._swish(network._bn0(network._conv_stem((frames - 0.5) / 0.5)))  # type: ignore[operator]
-        for block in list(network._blocks)[:4]:  # type: ignore[call-overload]
-            maps = block(maps)
-        expected = nn.functional.adaptive_avg_pool2d(maps, 4).flatten(1)
-        torch.testing.assert_close(net(frames), expected, rtol=1e-4, atol=1e-4)
-    count, own = (sum(p.numel() for p in one.parameters()) for one in (network, net))
-    assert own < count / 100
-    batch = {"frames": {0: torch.export.Dim("batch")}}
-    program = torch.export.export(net, (frames,), dynamic_shapes=batch)
-    torch.testing.assert_close(program.module()(frames[:2]), net(frames[:2]))
-
-
-def test_on_the_command_line(tmp_path):
-    words = [
-        "--features",
-        "dejavu_torch.Embedding",
-        "--features.dimension=null",
-        "--features.layer=_blocks.3",
-    ]
-    words += ["--features.network", "efficientnet_lite_pytorch.EfficientNet.from_pretrained"]
-    words += ["--features.network.model_name=efficientnet-lite0", f"--features.network.weights_path={path()}"]
-    words += ["--features.mean=.5", "--features.std=.5", "--features.resize=[64,64]", "--features.grid=4"]
-    learned, query, out = (
-        "sim:aerial?frames=100",
-        "sim:aerial?frames=100&traverse=1",
-        tmp_path / "map.safetensors",
-    )
-    run("learn", learned, "--map", out, *words)
-    run("compare", learned, query, "--map", out, *words, "--out", tmp_path / "report")
-    assert report_of(tmp_path / "report")["auc"] > 0.9
 
 
 @pytest.mark.figures

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from helpers import refused, template_model
+from helpers import refused
 from torch import Tensor, nn
 
 from dejavu_torch import HOG, best_match, evaluate, model_file
@@ -113,16 +113,6 @@ def test_what_is_of_templates_alone_is_refused_in_one_line():
             use()
 
 
-def test_a_state_of_another_kind_or_of_other_settings_is_refused():
-    state = DejaVu(mapper=StoredMapper()).learn(torch.rand(9, 2)).state_dict()
-    with refused("kind is 'stored'", "'templates'"):
-        template_model().load_state_dict(state)
-    other = DejaVu(mapper=StoredMapper(power=2.0))
-    with refused("power is 1.0", "2.0"):
-        other.load_state_dict(state)
-    assert other.map.places == 0
-
-
 def test_the_one_table_between_frames_and_places():
     """A camera that stands over frames 2 to 4: all of them are place 2."""
     route = TemplateMap((), (), 4, 2)
@@ -148,20 +138,6 @@ def test_a_mapper_that_does_not_fit_is_refused():
         DejaVu(mapper=nn.Linear(2, 2))  # type: ignore[arg-type]
     with refused("Linear", "PeriodFinder"):
         TemplateMapper(nn.Linear(2, 2))  # type: ignore[arg-type]
-
-
-def test_a_state_that_is_refused_leaves_the_map_as_it_was():
-    wave = torch.arange(128)[:, None] % torch.tensor([8.0, 9.0])
-    model, other = template_model().learn(wave), template_model().learn(wave[:64] + 1)
-    expected, state = model(wave), other.map.state_dict()
-    for change in (
-        {"templates": state["templates"][:-1]},
-        {"layers": state["layers"] + torch.tensor([0, 0, 1, 0, 0])},
-        {"_extra_state": {**state["_extra_state"], "metric": "l2"}},
-    ):
-        with refused("map"):
-            model.map.load_state_dict(state | change)
-        assert torch.equal(model(wave), expected)
 
 
 class Foreign(PeriodFinder):

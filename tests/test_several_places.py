@@ -9,28 +9,10 @@ from command_line import frames, report_of, rows_of, run
 from footage import QUERY, REFERENCE, camera, everything, footage
 from helpers import Fixed, refused, template_model
 
-from dejavu_torch import DejaVu, FrequencyLayer
+from dejavu_torch import FrequencyLayer
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.evaluation.compare import compare
-from dejavu_torch.evaluation.evaluate import evaluate_file
 from dejavu_torch.evaluation.matches import read_matches, write_matches
 from dejavu_torch.motion.resampling import ResampledTraverse
-
-
-@pytest.fixture(scope="module")
-def pair(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("pair")
-    for name, seed in (("first", 1), ("second", 2)):
-        np.save(folder / f"{name}.npy", frames(96, seed))
-    return folder / "first.npy", folder / "second.npy"
-
-
-@pytest.fixture(scope="module")
-def route(pair):
-    path = pair[0].parent / "map.safetensors"
-    run("learn", pair[0], "--map", path)
-    return path
-
 
 # in Python
 
@@ -64,21 +46,6 @@ def test_the_first_candidate_is_what_localize_finds(monkeypatch, model):
 # in matches.csv
 
 
-def test_localize_writes_a_row_for_each_candidate(route, pair, tmp_path):
-    run("localize", route, pair[1], "--out", tmp_path / "best.csv")
-    run("localize", route, pair[1], "--out", tmp_path / "top.csv", "--top", "10")
-    best, rows = rows_of(tmp_path / "best.csv"), rows_of(tmp_path / "top.csv")
-    columns = ["query", "place", "score", "accepted", "probability", "confidence", "rank"]
-    assert list(rows[0]) == [*columns, "query_name", "place_name"]
-    assert {row["probability"] for row in rows if row["rank"] != "1"} == {""}
-    assert [int(row["rank"]) for row in rows] == [*range(1, 11)] * 96
-    assert [row | {"rank": "1"} for row in rows[::10]] == rows[::10]
-    both = rows[0].keys() & best[0].keys()
-    assert [{k: row[k] for k in both} for row in rows[::10]] == [{k: row[k] for k in both} for row in best]
-    expected = DejaVu.load(route).candidates(torch.from_numpy(frames(96, 2))[:, None] / 255, 10)
-    assert [int(row["place"]) for row in rows] == expected.index.flatten().tolist()
-
-
 @pytest.fixture(scope="module")
 def flights(tmp_path_factory):
     """A calibrated map, whose queries are another flight."""
@@ -96,6 +63,9 @@ def test_the_first_of_several_places_has_the_probability(flights, tmp_path, word
     run("localize", flights, AGAIN, *words, "--out", best)
     run("localize", flights, AGAIN, *words, "--top", "4", "--out", top)
     alone, rows = rows_of(best), rows_of(top)
+    columns = ["query", "place", "score", "accepted", "probability", "confidence", "rank"]
+    assert list(rows[0]) == [*columns, "query_name", "place_name"]
+    assert [int(row["rank"]) for row in rows] == [1, 2, 3, 4] * 96
     assert [{**row, "rank": "1"} for row in alone] == rows[::4]
     others = [row for row in rows if row["rank"] != "1"]
     assert len(others) == 3 * 96
@@ -108,7 +78,11 @@ def test_the_first_of_several_places_has_the_probability(flights, tmp_path, word
     assert reports[0]["accepted"] == reports[1]["accepted"] == sum(row["accepted"] == "1" for row in alone)
 
 
-def test_compare_and_evaluate_agree(route, pair, tmp_path):
+def test_compare_and_evaluate_agree(tmp_path):
+    pair, route = (tmp_path / "first.npy", tmp_path / "second.npy"), tmp_path / "map.safetensors"
+    for seed, path in enumerate(pair, 1):
+        np.save(path, frames(96, seed))
+    run("learn", pair[0], "--map", route)
     options = "--truth", "0", "--tolerance", "1", "--map", route
     run("compare", *pair, *options, "--top", "12", "--out", tmp_path / "c")
     rows = rows_of(tmp_path / "c" / "matches.csv")
@@ -123,32 +97,6 @@ def test_compare_and_evaluate_agree(route, pair, tmp_path):
         for folder in ("c", "e"):
             assert report_of(tmp_path / folder)[f"recall_at_{first}"] == pytest.approx(expected)
     assert report_of(tmp_path / "c")["recall_at_1"] < report_of(tmp_path / "c")["recall_at_10"]
-
-
-def test_without_top_compare_counts_and_writes_matches_only(route, pair, tmp_path, capsys):
-    run("compare", *pair, "--map", route, "--truth", "0", "--tolerance", "1", "--out", tmp_path / "c")
-    assert "among the first 5 candidates" in capsys.readouterr().out
-    assert report_of(tmp_path / "c")["recall_at_10"] > 0
-    assert len(rows_of(tmp_path / "c" / "matches.csv")) == 96
-    assert "rank" not in rows_of(tmp_path / "c" / "matches.csv")[0]
-    run("evaluate", tmp_path / "c" / "matches.csv", "--truth", "0", "--out", tmp_path / "e")
-    report = report_of(tmp_path / "e")
-    assert (report["recall_at_5"], report["recall_at_10"]) == (None, None)
-
-
-def test_as_many_ranks_as_the_file_has(tmp_path):
-    rows = "".join(f"3,{10 * rank},0.{rank},1,{rank}\n" for rank in range(1, 8))
-    (tmp_path / "m.csv").write_text("query,place,score,accepted,rank\n" + rows)
-    facts = evaluate_file(tmp_path / "m.csv", "47").report.facts  # place 50: rank 5
-    assert (facts["queries"], facts["recall_at_5"], facts["recall_at_10"]) == (1, 1.0, None)
-
-
-def test_a_route_of_fewer_places_than_candidates():
-    waves = torch.rand(8, 3, generator=torch.Generator().manual_seed(3))
-    model = template_model(periods=Fixed(FrequencyLayer(8, 8, 0, 8, (0, 1, 2))))
-    result = compare(ArrayTraverse(waves), ArrayTraverse(waves + 0.01), "0", model=model, tolerance=0)
-    report = result.report.as_json()
-    assert (report["recall_at_5"], report["recall_at_10"]) == (1.0, None)
 
 
 def test_convention_11_candidates_are_even_steps_apart_and_written_as_frames(tmp_path):

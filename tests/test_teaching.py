@@ -21,8 +21,8 @@ from dejavu_torch import (
 )
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.export import export_onnx, run_session, session_of
-from dejavu_torch.features.views import LabelledFrames, Placed, Sample, views_of
-from dejavu_torch.features.whitening import LIGHT, VISIT, Visits, learned_whitening
+from dejavu_torch.features.views import LabelledFrames
+from dejavu_torch.features.whitening import LIGHT, VISIT, Visits
 from dejavu_torch.growth import append, merge, second_traverse
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.recognition.coarse import CoarseSearch, SamplingPlan
@@ -122,29 +122,6 @@ def test_drives_with_and_without_truth_teach_together(road, drive, placed):
     assert len(list(views.placed_lines())) == 1
 
 
-def test_features_are_computed_once(road, drive, monkeypatch):
-    model, seen = fresh(), []
-    describe = type(model.descriptor).describe
-    monkeypatch.setattr(
-        type(model.descriptor),
-        "describe",
-        lambda own, frames: (seen.append(len(frames)), describe(own, frames))[1],
-    )
-    second_traverse(model, road, drive)
-    once = FRAMES + 2 * FRAMES + len(drive)  # with two copies of each
-    assert once <= sum(seen) < once + FRAMES  # and a few to compare sizes
-
-
-def test_a_weight_counts_as_so_many_pairs():
-    views, places = torch.randn(40, 6), torch.randn(40, 6)
-    weight = torch.ones(40)
-    weight[25:] = 3.0
-    number = torch.arange(40).repeat_interleave(weight.long())
-    expected = learned_whitening(views[number], places[number], 4, 0.1)
-    for found, known in zip(learned_whitening(views, places, 4, 0.1, weight=weight), expected, strict=True):
-        torch.testing.assert_close(found.abs(), known.abs(), rtol=1e-4, atol=1e-5)
-
-
 def test_a_frame_of_a_drive_counts_as_so_many_copies():
     places = waves(100)
     copies = (noisy(places), torch.arange(100))
@@ -191,17 +168,6 @@ def test_the_light_of_a_drive_is_no_change(monkeypatch):
     torch.testing.assert_close(products(views + light), products(views), rtol=0, atol=1e-3)
 
 
-def test_a_sample_keeps_the_drive_of_each_frame():
-    which, places = torch.tensor([0, 0, 1, 1, 1]), torch.tensor([3, -1, 0, 4, 9])
-    views = LabelledFrames(ArrayTraverse(torch.rand(5, 4)), places, Placed(which, {1: "b"}, 0.9, 1))
-    some = views_of(views, torch.tensor([0, 3, 9]))
-    assert some.places.tolist() == [1, 0, 2]
-    assert some.placed is not None
-    assert some.placed.drive.tolist() == [0, 1, 1]
-    nothing = views._replace(places=torch.full((5,), -1))
-    assert not len(Sample(torch.arange(3), 3).views(nothing).places)  # not refused: copies are left
-
-
 def test_what_cannot_be_placed_is_refused(road):
     few = ArrayTraverse(frames_of(1)[:29], "few")
     with refused("few has 29 frames and road 160", "a truth for its places", "at least 30 frames in order"):
@@ -218,16 +184,8 @@ def test_a_report_and_the_command_tell_how_many_frames_teach(road, drive, tmp_pa
         pixels = frames.mul(255).round().byte().permute(0, 2, 3, 1).numpy()
         np.save(tmp_path / f"{name}.npy", pixels)
     pair = (tmp_path / "road.npy", tmp_path / "query.npy")
-    run(
-        "compare",
-        *pair,
-        "--second",
-        tmp_path / "drive.npy",
-        "--out",
-        tmp_path / "report",
-        "--calibration",
-        "none",
-    )
+    words = "--second", tmp_path / "drive.npy", "--calibration", "none"
+    run("compare", *pair, *words, "--out", tmp_path / "report")
     second, out = report_of(tmp_path / "report")["second"], capsys.readouterr().out
     assert f"{second['placed']} of 120 frames of {tmp_path / 'drive.npy'} placed; " in out
     assert second["of"] == 120
@@ -235,9 +193,6 @@ def test_a_report_and_the_command_tell_how_many_frames_teach(road, drive, tmp_pa
     assert second["probability"] == SURE
     run("learn", pair[0], "--second", tmp_path / "drive.npy", "--map", tmp_path / "m.safetensors")
     assert "frames of" in capsys.readouterr().out
-    np.save(tmp_path / "few.npy", np.load(tmp_path / "drive.npy")[:20])
-    words = ("learn", pair[0], "--second", tmp_path / "few.npy", "--map", tmp_path / "n.safetensors")
-    assert "few.npy has 20 frames" in fails(capsys, *words)
     plain = compare(road, ArrayTraverse(frames_of(2), "query"), "0", fresh(), calibration="none").report
     assert "second" not in plain.facts
 

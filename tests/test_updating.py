@@ -7,18 +7,17 @@ import copy
 import numpy as np
 import pytest
 import torch
-from command_line import fails, run
+from command_line import run
 from helpers import refused
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch import Tensor
 
 from dejavu_torch import DejaVu, PlaceSmoother, SpectralMapper
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.growth import merge
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.recognition.centring import centred
-from dejavu_torch.updating import PIECE, Update, update
+from dejavu_torch.updating import PIECE, update
 
 END = 240  # places that the map has; the route goes on
 
@@ -113,16 +112,6 @@ def test_new_ground_is_stored_without_the_light_of_the_day():
     expected = centred(place_map, drive)[slice(*stretch)]
     plain = torch.nn.functional.cosine_similarity(stored, drive[slice(*stretch)], dim=1).mean()
     assert torch.nn.functional.cosine_similarity(stored, expected, dim=1).mean() > max(0.9, float(plain))
-
-
-def test_a_drive_of_another_route_changes_nothing():
-    model = model_of(ROUTE)
-    before = {name: value.clone() for name, value in model.state_dict().items() if isinstance(value, Tensor)}
-    found = update(model, waves(200, seed=5))
-    assert (found.is_drive, found.changed) == (False, False)
-    assert "no drive of this map" in str(found)
-    assert all(torch.equal(model.state_dict()[name], value) for name, value in before.items())
-    assert update(model, seen(ROUTE[20:300])).stretches == ()
 
 
 def test_short_gaps_stay_out_and_short_drives_do_not_refine():
@@ -226,12 +215,3 @@ def test_the_command_updates_a_map(tmp_path, capsys):
     assert "route monday: places 240-" in out
     run("localize", path, tmp_path / "monday.npy", "--ordered", "--out", tmp_path / "m.csv")
     assert ",monday," in (tmp_path / "m.csv").read_text()
-    assert "none.npy" in fails(capsys, "update", path, tmp_path / "none.npy")
-
-
-def test_an_update_in_words():
-    assert str(Update(None, True)) == "too few frames to learn from; nothing new"
-    told = str(Update(None, True, ((3, 40),), ("monday",), ((60, 90),)))
-    assert told.endswith(
-        "frames 3-39 are new, the route monday; frames 60-89 may be new, or hard to recognise"
-    )

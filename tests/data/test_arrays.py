@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from pathlib import Path
 
 import numpy as np
@@ -46,22 +45,12 @@ def test_values(values, expected, kind, tmp_path):
     assert len(traverse) == 7
 
 
-@pytest.mark.parametrize(
-    ("text", "ordered"),
-    [
-        ("".join(f"db/{i}.jpg\n" for i in range(5, 12)), True),
-        ("\ufeff" + "\r\n".join(f" {i % 3} é.jpg " for i in range(7)) + "\n\n", False),
-        ("".join(f"{'9' * 5000}{i}\n" for i in range(7)), True),
-    ],
-)
-def test_a_file_beside_features_names_their_images(tmp_path, text, ordered):
+@pytest.mark.parametrize(("names", "ordered"), [("5 6 7 8 9 10 11", True), ("é 1 2 0 1 2 0", False)])
+def test_a_file_beside_features_names_their_images(tmp_path, names, ordered):
     np.save(tmp_path / "a.npy", FEATURES)
-    (tmp_path / "a.txt").write_bytes(text.encode())
+    (tmp_path / "a.txt").write_bytes(("\ufeff" + "\r\n".join(names.split()) + "\n\n").encode())
     traverse = read_array(tmp_path / "a.npy")
-    names = [line.strip("\ufeff ") for line in text.splitlines() if line]
-    for one in (traverse, pickle.loads(pickle.dumps(traverse))):
-        assert one.names == names
-    assert traverse.ordered is ordered
+    assert (traverse.names, traverse.ordered) == (names.split(), ordered)
     assert torch.equal(all_of(traverse), torch.tensor(FEATURES))
 
 
@@ -81,11 +70,6 @@ def test_names_that_are_no_text_are_refused_and_frames_have_none(tmp_path):
     with refused("a.txt", "UTF-8"):
         read_array(tmp_path / "a.npy")
     assert read_array(tmp_path / "b.npy").names == ()
-
-
-def test_another_byte_order_is_read(tmp_path):
-    np.save(tmp_path / "a.npy", FEATURES.astype(">f8"))
-    assert torch.equal(all_of(read_array(tmp_path / "a.npy")), torch.tensor(FEATURES))
 
 
 @pytest.mark.parametrize(
@@ -134,32 +118,6 @@ def test_pickled_objects_are_refused_and_not_run(tmp_path):
     with refused(str(path), "not a complete .npy array"):
         read_array(path)
     assert not (tmp_path / "ran").exists()
-
-
-def written(path, kind, shape):
-    """A file that says that it is of any type and shape."""
-    text = f"{{'descr': {kind}, 'fortran_order': False, 'shape': {shape}}}".encode().ljust(118) + b"\n"
-    path.write_bytes(b"\x93NUMPY\1\0" + len(text).to_bytes(2, "little") + text + bytes(256))
-    return path
-
-
-@pytest.mark.parametrize(
-    ("kind", "shape"),
-    [
-        ("'<f4'", f"({2**62}, 4)"),
-        ("'<f4'", f"({10**40}, 1)"),
-        ("'<f4'", "(9, 9)"),
-        ("('<f4', (1000000000000,))", "(4, 4)"),
-    ],
-)
-def test_a_size_that_a_file_does_not_have_is_refused(tmp_path, kind, shape):
-    with refused("a.npy", "expected frames (N,H,W)"):
-        read_array(written(tmp_path / "a.npy", kind, shape))
-
-
-def test_a_file_of_no_frames_is_said_to_hold_nothing(tmp_path):
-    with refused("a.npy", "(0, 9999999999), which is empty"):
-        read_array(written(tmp_path / "a.npy", "'<f4'", "(0, 9999999999)"))
 
 
 @pytest.mark.parametrize("bad", [-0.01, 1.01, np.nan, np.inf])

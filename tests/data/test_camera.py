@@ -15,8 +15,7 @@ import torch
 from helpers import refused
 from videos import H264, clip, numbers, pictures, piped
 
-from dejavu_torch import open_source
-from dejavu_torch.data.camera import Camera, is_stream, shots_of, stretched
+from dejavu_torch.data.camera import Camera, is_stream, stretched
 from dejavu_torch.data.video import Video
 from dejavu_torch.types import InputError
 
@@ -66,33 +65,10 @@ def test_frames_are_brought_to_a_size_as_those_of_a_file(tmp_path, stream):
     assert torch.equal(torch.from_numpy(first.pixels.copy()).permute(2, 0, 1) / 255, expected)
 
 
-def test_a_stream_that_changes_size_keeps_what_came_before(tmp_path, stream):
-    other = clip(tmp_path / "other.ts", pictures(4, 48, 64), **H264).read_bytes()  # type: ignore[arg-type]
-    count = 0
-    with piped(tmp_path, stream + other) as pipe, refused("48 x 64", "32 x 48", "frame 12"):
-        for _ in Camera(pipe):
-            count += 1
-    assert count == 12
-
-
 def test_the_end_of_an_address_is_told(tmp_path, stream):
     (tmp_path / "clip.ts").write_bytes(stream)
     with served(tmp_path) as address, refused("clip.ts ended after 12 frames", "expected more frames"):
         list(Camera(f"{address}/clip.ts"))
-
-
-def test_an_answer_names_no_file_of_this_machine(tmp_path, stream):
-    (tmp_path / "clip.ts").write_bytes(stream)
-    for where in (f"file:{tmp_path}/clip.ts", "file:clip.ts"):
-        (tmp_path / "list.m3u8").write_text(
-            f"#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:1,\n{where}\n#EXT-X-ENDLIST\n"
-        )
-        with served(tmp_path) as address, refused("list.m3u8"):
-            list(Camera(f"{address}/list.m3u8"))
-        os.rename(tmp_path / "list.m3u8", tmp_path / "list")
-        with piped(tmp_path, (tmp_path / "list").read_bytes()) as pipe, refused("pipe"):
-            list(Camera(pipe))
-        (tmp_path / "pipe").unlink()
 
 
 def test_an_open_pipe_is_one_by_whatever_name(stream):
@@ -131,17 +107,3 @@ def test_what_is_no_stream_is_one_line(source, words):
     assert is_stream(source)
     with refused(*words):
         list(Camera(source))
-
-
-@pytest.mark.parametrize("data", [b"", b"no video at all" * 100])
-def test_a_pipe_without_video_is_one_line(data, tmp_path):
-    with piped(tmp_path, data) as pipe, refused("pipe", "a video stream"):
-        list(Camera(pipe))
-
-
-def test_files_are_no_streams(tmp_path):
-    path = clip(tmp_path / "clip.mkv", FRAMES[:3])
-    assert not any(map(is_stream, (str(path), str(tmp_path), "sim:aerial", "missing.mp4", "nul\0")))
-    shots = list(shots_of(open_source(path)))
-    assert [shot.seconds for shot in shots] == pytest.approx([0, 0.04, 0.08])
-    assert [shot.pixels.shape for shot in shots] == [(3, 32, 48)] * 3

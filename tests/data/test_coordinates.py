@@ -16,7 +16,6 @@ from dejavu_torch.data.coordinates import coordinates_of, read_coordinates
 from dejavu_torch.data.ground_truth import find_ground_truth
 from dejavu_torch.data.source import check_not_read
 from dejavu_torch.data.traverse import Chain, Part
-from dejavu_torch.evaluation.facts import count_standing
 
 NAN = math.nan
 
@@ -141,9 +140,3 @@ def test_a_report_tells_errors_in_metres(tmp_path):
         traverse.coordinates = read_coordinates(tmp_path / "w.csv", traverse)
     facts = compare(reference, query, "metres:2", tolerance=0).report.facts
     assert facts["error_metres"]["all"] == {"0.5": 1.0, "0.9": 1.0, "0.99": 1.0}
-
-
-def test_places_where_the_camera_stands_are_counted():
-    moving = torch.nn.functional.normalize(torch.randn(40, 16), dim=1)
-    assert count_standing(moving) == 0
-    assert count_standing(torch.cat([moving, moving[-1:].repeat(29, 1)])) == 29

@@ -22,7 +22,6 @@ from dejavu_torch.data.ground_truth import (
     GroundTruth,
     check_ground_truth,
     counted,
-    describe_ground_truth,
     find_ground_truth,
     ground_truth_in_places,
     is_right,
@@ -108,14 +107,6 @@ def test_near_is_every_frame_within_the_radius_inclusive(reference, query, radiu
         for x, y in query
     ]
     assert [[place for place in row if place >= 0] for row in found.tolist()] == expected
-
-
-def test_near_needs_no_table_of_all_pairs(largest_tensor):
-    line = torch.stack([torch.arange(2500.0), torch.zeros(2500)], 1)
-    with largest_tensor() as seen:
-        found = near_truth(line, line, 0.0)
-    assert found.flatten().tolist() == list(range(2500))
-    assert seen.numel < 2500 * 2500 / 3
 
 
 def test_a_soft_place_counts_neither_way_and_an_unknown_query_never():
@@ -344,12 +335,6 @@ def test_a_csv_that_is_none_is_refused(tmp_path, text, words):
         read(written(tmp_path, text), 8, 7, interpolate=interpolate)
 
 
-def test_places_are_not_bounded_where_the_map_is_not_known(tmp_path):
-    assert read(written(tmp_path, "0,100000"), None, 1).positives.tolist() == [[100000]]
-    with refused("place -3", "from 0,"):
-        read(written(tmp_path, "0,-3"), None, 1)
-
-
 @given(st.dictionaries(st.integers(0, 30), st.integers(0, 60), min_size=1, max_size=6))
 def test_interpolation_is_a_straight_line_between_neighbours_and_nothing_beyond(scratch, listed):
     path = written(scratch, "".join(f"{query},{place}\n" for query, place in listed.items()))
@@ -362,12 +347,6 @@ def test_interpolation_is_a_straight_line_between_neighbours_and_nothing_beyond(
         assert len(found) == (query in expected)
         assert all(abs(place - expected[query]) <= 0.5 + 1e-9 for place in found)
     assert all(sets(truth.positives)[query] == {place} for query, place in listed.items())
-
-
-def test_interpolation_by_hand(tmp_path):
-    path = written(tmp_path, "1,10\n5,12.4\n6,0\n")
-    some = read(path, 20, torch.tensor([5, 2, 0]), interpolate=True)
-    assert some.positives[:, 0].tolist() == [12, 11, -1]
 
 
 # npz
@@ -508,15 +487,6 @@ def test_a_json_of_another_shape_is_refused(tmp_path, rows, queries, words):
         read(listed(tmp_path, rows), 10, queries)
 
 
-def test_a_list_counts_frames_of_queries_that_are_resampled(tmp_path):
-    path, query = listed(tmp_path, [[4], [5], [6], [7]]), ArrayTraverse(torch.rand(4, 2))
-    shown = torch.tensor([0, 2, 2])
-    truth = known(path, None, query, 10, shown, resampled=True)
-    assert sets(truth.positives) == [{4}, {6}, {6}]
-    with refused("list of 4", "5 queries"):
-        known(path, None, ArrayTraverse(torch.rand(5, 2)), 10, shown, resampled=True)
-
-
 def test_utm_makes_every_reference_frame_near_by_right():
     reference = images(*((500_000 + 10 * i, 4_000_000) for i in range(8)))
     query = images((500_030, 4_000_000), (500_000, 4_000_025), (500_000, 4_000_026))
@@ -593,18 +563,6 @@ def test_a_truth_that_calls_nearly_all_right_is_told(caplog):
     assert "46 % of all pairs of a query and a place count as right" in caplog.text
 
 
-# real data
-
-
-def test_the_corridor_truth(data_dir):
-    truth = read(str(data_dir / "corridor" / "truth.csv"), 111, 111)
-    assert truth.judged.all()
-    found = sets(truth.positives)
-    assert (found[0], found[110]) == ({0, 1, 2}, {108, 109, 110})
-    # a slow camera: right places follow each other without gaps
-    assert all(max(places) - min(places) == len(places) - 1 for places in found)
-
-
 # resampled by distance: two queries show frames 3 and 9 of 11; three places show frames 0, 4 and 9 of 12
 
 SHOWN = torch.tensor([3, 9])
@@ -640,56 +598,6 @@ def test_a_frame_that_no_query_shows_speaks_for_the_nearest_one_that_is_shown(tm
         read(written(tmp_path, "1,0\n10,4\n"), 12, SHOWN)
 
 
-def test_a_frame_may_be_shown_by_several_queries(tmp_path):
-    path = written(tmp_path, "0,2\n1,5\n")
-    found = known(path, None, None, 12, torch.tensor([0, 0, 1, 1, 1]), resampled=True)
-    assert sets(found.positives) == [{2}, {2}, {5}, {5}, {5}]
-
-
-def test_matrices_are_of_frames(tmp_path):
-    hard, soft = np.zeros((12, 11), bool), np.zeros((12, 11), bool)
-    hard[11, 3] = hard[0, 9] = hard[5, 0] = soft[4, 3] = True
-    places = ground_truth_in_places(
-        resampled(saved(tmp_path, GThard=hard, GTsoft=soft)), lambda frames: look_up(PLACE_OF, frames)
-    )
-    assert (sets(places.positives), sets(places.ignored)) == ([set(), {0}], [{1}, set()])
-
-
-def test_positions_and_coordinates_are_of_frames():
-    reference = images(*((10 * i, 0) for i in range(12)))
-    query = images(*((10 * i, 0) for i in range(1, 12)))
-    found = known("utm:1", reference, query, 12, SHOWN, resampled=True)
-    assert sets(found.positives) == [{4}, {10}]
-    part = known("utm:1", frame_range(reference, start=2), query, 10, SHOWN)
-    assert sets(part.positives) == [{2}, {8}]
-    carried = route(12, list(range(12))), route(10, list(range(1, 11)))
-    found = known(None, *carried, 12, SHOWN, resampled=True)
-    assert sets(found.positives) == [{4}, {10}]
-
-
-def test_as_many_resampled_frames_are_no_ground_truth():
-    pair = route(12), route(12)
-    assert find_ground_truth(None, *pair, 12, SHOWN, resampled=True, aligned=True) is None
-    assert find_ground_truth(None, *pair, 12, SHOWN, aligned=True) is not None
-
-
-@pytest.mark.parametrize(
-    ("truth", "options", "words"),
-    [
-        ("-3", {}, "place = query - 3"),
-        ("utm", {}, "within 25 m by the coordinates in image names"),
-        ("utm:7.5", {}, "within 7.5 m"),
-        (None, {}, "both sources are aligned"),
-        (None, {"positions": True}, "positions that both traverses carry"),
-    ],
-)
-def test_a_ground_truth_in_words(truth, options, words, tmp_path):
-    assert words in describe_ground_truth(truth, **options)
-    path = written(tmp_path, "0,1")
-    assert describe_ground_truth(path) == path
-    assert describe_ground_truth(path, interpolate=True) == f"{path}, interpolated"
-
-
 # sizes, which are checked before anything is read
 
 
@@ -714,14 +622,6 @@ def packed(folder, kind, shape, body):
 def test_a_size_that_a_matrix_claims_is_not_believed(tmp_path, kind, shape, words):
     with refused("truth.npz", words):
         read(packed(tmp_path, kind, shape, bytes(9)), None, torch.tensor([0]))
-
-
-def test_a_matrix_larger_than_the_memory_is_not_unpacked(tmp_path, monkeypatch):
-    path = packed(tmp_path, "'|b1'", "(3000, 3000)", b"\1" * 3000**2)
-    assert Path(path).stat().st_size < 10**5
-    monkeypatch.setattr(memory, "free_memory", lambda: 10e6)
-    with refused("GThard (3000, 3000) takes 162 MB", "10 MB free"):
-        read(path, 3000, 3000)
 
 
 def test_a_table_wider_than_the_memory_is_refused(tmp_path, monkeypatch):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import pickle
 import sys
 from pathlib import Path
@@ -56,12 +55,6 @@ def test_the_lexicographic_order_is_another_traverse(tmp_path):
         open_source(f"{path}?order=size")
 
 
-def test_names_that_end_in_rising_numbers_are_in_order(tmp_path):
-    path = written(tmp_path / "a.h5", {f"db/{i}.jpg": ROWS[0] for i in (9, 10, 11)})
-    assert open_source(f"{path}?order=natural").ordered
-    assert not open_source(f"{path}?order=lexicographic").ordered
-
-
 BAD = ROWS[0].copy()
 BAD[2] = np.nan
 
@@ -84,12 +77,6 @@ def test_other_contents_are_refused(tmp_path, rows, words):
     path = written(tmp_path / "a.h5", rows)
     with refused(str(path), *words):
         all_of(open_source(path))
-
-
-def test_local_features_alone_are_refused(tmp_path):
-    path = written(tmp_path / "feats.h5", {"a.jpg": np.zeros((4, 2), np.float32)}, "keypoints")
-    with refused("feats.h5 contains no global_descriptor"):
-        open_source(path)
 
 
 def in_another_file(group):
@@ -124,19 +111,6 @@ def test_numbers_that_the_file_does_not_hold_are_refused(tmp_path, make):
         make(file.create_group("a.jpg"))
     with refused("a.h5", "global_descriptor of a.jpg is", "expected a group for each image"):
         all_of(open_source(tmp_path / "a.h5"))
-
-
-def test_a_file_that_is_no_whole_hdf5_is_refused(tmp_path):
-    path = written(tmp_path / "a.h5", {"a.jpg": ROWS[0]})
-    whole = path.read_bytes()
-    for content in (b"", b"no hdf5\n" * 99, whole[: len(whole) // 2], whole[:-20]):
-        path.write_bytes(content)
-        with refused(str(path), "cannot be read as an HDF5 file", "expected a group for each image"):
-            open_source(path)
-    path.unlink()
-    os.mkfifo(path)
-    with refused("a.h5 is not a regular file"):
-        open_source(path)
 
 
 def test_without_h5py_a_line_says_what_to_install(tmp_path, monkeypatch):

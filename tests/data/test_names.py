@@ -7,16 +7,11 @@ import json
 import zlib
 
 import pytest
-import torch
 from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
-from PIL import Image
 
-from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.folder import ImageFolder
 from dejavu_torch.data.names import MAX_NAME_LENGTH, clock_time, decode_names, encode_names
-from dejavu_torch.data.traverse import frame_range
 
 
 def packed(names):
@@ -59,15 +54,6 @@ def test_times_of_a_video_take_less_than_a_tenth_of_a_byte_a_frame():
 def test_other_names_are_compressed():
     names = [f"@{500_000 + (i * i) % 97}@{4_000_000 + 7 * i}@.jpg" for i in range(1000)]
     assert len(packed(names)) < len(json.dumps(names)) / 3
-
-
-def test_the_names_of_a_traverse(tmp_path):
-    for i in range(8, 12):
-        Image.new("L", (2, 2)).save(tmp_path / f"{i}.png")
-    folder = ImageFolder(tmp_path)
-    assert folder.names == ["8.png", "9.png", "10.png", "11.png"]
-    assert frame_range(folder, start=1, step=2).names == ["9.png", "11.png"]
-    assert ArrayTraverse(torch.rand(5, 2)).names == ()
 
 
 def test_a_name_beyond_reason_is_refused():

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import os
 import stat
-import tempfile
 from pathlib import Path
 
 import pytest
@@ -13,10 +12,7 @@ from helpers import refused
 
 from dejavu_torch.data.output import (
     check_output_file,
-    check_output_folder,
     make_output_folder,
-    remove_empty_folders,
-    temporary_folder,
     whole_file,
     whole_folder,
 )
@@ -106,59 +102,6 @@ def test_what_cannot_be_written_is_refused_at_once(tmp_path, check, name, words)
     assert list(tmp_path.iterdir()) == [tmp_path / "file"]
 
 
-def test_a_folder_is_made_with_its_parents():
-    with temporary_folder(Path(tempfile.gettempdir())) as folder:
-        for _ in range(2):
-            make_output_folder(folder / "a" / "b")
-        (folder / "a" / "file").touch()
-        remove_empty_folders(folder / "a")
-        assert [path.name for path in sorted(folder.rglob("*"))] == ["a", "file"]
-    assert not folder.exists()
-
-
-# what is there already
-
-
-def test_through_a_link_its_target_is_written(tmp_path):
-    (tmp_path / "there").mkdir()
-    for name, first in (("a.txt", "link.txt"), ("new.txt", "dangling.txt")):
-        (tmp_path / first).symlink_to(tmp_path / "there" / name)
-        (tmp_path / f"second_{first}").symlink_to(first)
-    (tmp_path / "there" / "a.txt").write_text("old")
-    write(tmp_path / "second_link.txt")
-    write(tmp_path / "second_dangling.txt")
-    assert held(tmp_path / "there") == {"a.txt": "new", "new.txt": "new"}
-    assert len([file for file in tmp_path.iterdir() if file.is_symlink()]) == 4
-
-
-def test_a_file_keeps_its_mode_and_a_new_one_follows_the_umask(tmp_path):
-    private, new = tmp_path / "private", tmp_path / "new"
-    private.touch()
-    private.chmod(0o600)
-    before = os.umask(0o027)
-    try:
-        write(private)
-        write(new)
-        with whole_folder(tmp_path / "folder") as temporary:
-            (temporary / "a").touch(0o600)  # as some writers do
-    finally:
-        os.umask(before)
-    assert (mode_of(private), mode_of(new)) == (0o600, 0o640)
-    assert (mode_of(tmp_path / "folder"), mode_of(tmp_path / "folder" / "a")) == (0o750, 0o640)
-
-
-def test_what_is_no_regular_file_is_refused_and_stays(tmp_path):
-    os.mkfifo(tmp_path / "fifo")
-    (tmp_path / "link").symlink_to("/dev/null")
-    before = {file.name: file.lstat().st_mode for file in tmp_path.iterdir()}
-    for path in ("fifo", "link", "/dev/null"):
-        with refused(path, "regular file"):
-            check_output_file(tmp_path / path)
-        with refused(path):
-            check_output_folder(tmp_path / path)
-    assert {file.name: file.lstat().st_mode for file in tmp_path.iterdir()} == before
-
-
 def test_no_permission_is_told_at_once(tmp_path, monkeypatch):
     (tmp_path / "a").touch()
     monkeypatch.setattr(os, "access", lambda place, mode: Path(place) != tmp_path / "a")
@@ -173,9 +116,6 @@ def test_the_folder_vanishes_meanwhile(tmp_path):
         temporary.write_text("new")
         (tmp_path / "folder").rename(tmp_path / "moved")
     assert list(tmp_path.glob("moved/a.txt")) == []
-
-
-# folders
 
 
 def test_a_folder_keeps_its_other_files(tmp_path):
@@ -202,13 +142,3 @@ def test_a_full_disk_or_a_folder_in_the_way_leaves_what_was_there(tmp_path, monk
         (temporary / "b").write_text("new")
     assert sorted(file.name for file in tmp_path.iterdir()) == ["a", "b"]
     assert (tmp_path / "a").read_text() == "old"
-
-
-def test_of_two_writers_of_a_new_folder_the_last_wins(tmp_path):
-    target = tmp_path / "target"
-    with whole_folder(target) as one, whole_folder(target) as other:
-        (one / "a").write_text("one")
-        (one / "b").write_text("one")
-        (other / "a").write_text("other")
-    assert held(target) == {"a": "one", "b": "one"}
-    assert list(tmp_path.iterdir()) == [target]

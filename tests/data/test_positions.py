@@ -6,7 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dejavu_torch.data.positions import NEAR, borders, look_up, place_of, shown_frames
+from dejavu_torch.data.positions import NEAR, borders, place_of, shown_frames
 
 WAYS = st.lists(st.floats(-1.5, 2.5, width=32), min_size=1, max_size=25).map(
     lambda steps: torch.tensor([0.0, *steps]).cumsum(0)
@@ -43,9 +43,3 @@ def test_convention_11_standing_and_going_back_add_no_places():
     assert place_of(positions, torch.arange(10)).tolist() == [0, 1, 2, 2, 2, 1, 0, 1, 2, 3]
     assert borders(positions).tolist() == [0, 1, 2, 9, 10]
     assert place_of(positions, torch.tensor([[8, -1]])).tolist() == [[2, -1]]
-
-
-def test_minus_one_stays():
-    table = torch.tensor([5, 7, -1])
-    assert look_up(table, torch.tensor([[0, -1], [2, 1]])).tolist() == [[5, -1], [-1, 7]]
-    assert look_up(table, torch.zeros(2, 0, dtype=torch.int64)).shape == (2, 0)

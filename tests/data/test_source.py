@@ -3,53 +3,14 @@
 from __future__ import annotations
 
 import os
-from contextlib import chdir
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from helpers import all_of, refused
-from PIL import Image
-from videos import clip, pictures
 
-from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.folder import ImageFolder
-from dejavu_torch.data.ground_truth import position_truth
-from dejavu_torch.data.simulate.aerial import AerialRoad
 from dejavu_torch.data.source import open_source
 from dejavu_torch.data.traverse import Chain
-from dejavu_torch.data.video import Video
-
-
-@pytest.mark.parametrize("name", ["a.npy", "a.NPY", "with space?.npy"])
-def test_an_array(tmp_path, name):
-    with (tmp_path / name).open("wb") as file:
-        np.save(file, np.ones((3, 2)))
-    source = open_source(tmp_path / name)
-    assert isinstance(source, ArrayTraverse)
-    assert (len(source), source.name) == (3, str(tmp_path / name))
-
-
-@pytest.mark.parametrize("name", ["A.MKV", "what?.mkv", "clip.mp4?width=16.mkv"])
-@pytest.mark.parametrize(
-    ("options", "shape"),
-    [("", (5, 3, 32, 48)), ("?width=16&height=8", (5, 3, 8, 16)), ("?width=24", (5, 3, 16, 24))],
-)
-def test_a_video(tmp_path, name, options, shape):
-    path = clip(tmp_path / name, pictures(5))
-    for kind in (str, Path):
-        source = open_source(kind(f"{path}{options}"))
-        assert isinstance(source, Video)
-        assert source.name == str(path)
-        assert next(source.batches(8)).shape == shape
-
-
-def test_a_simulator():
-    source = open_source("sim:aerial?seed=3&traverse=1&frames=40&noise=0.1")
-    assert isinstance(source, AerialRoad)
-    assert (source.seed, source.traverse, len(source), source.noise) == (3, 1, 40, 0.1)
-    assert torch.equal(source.places, torch.arange(40.0, dtype=torch.float64))
 
 
 @pytest.mark.parametrize(
@@ -88,17 +49,6 @@ def test_how_to_convert_what_is_no_source(tmp_path, name, words):
     (tmp_path / name).touch()
     with refused(name, "into a folder of images", *words):
         open_source(tmp_path / name)
-
-
-def test_a_folder_takes_the_options_of_a_video(tmp_path):
-    for i in range(4):
-        Image.new("RGB", (60, 40), (i, i, i)).save(tmp_path / f"{i}.png")
-    source = open_source(f"{tmp_path}?width=30&step=2")
-    assert (len(source), source.frame_shape, source.name) == (2, (3, 20, 30), f"{tmp_path}[0::2]")
-    assert isinstance(open_source(tmp_path), ImageFolder)
-    tmp_path.rename(tmp_path.with_name("sim"))
-    with chdir(tmp_path.parent):  # no simulator, as no colon follows
-        assert isinstance(open_source("sim"), ImageFolder)
 
 
 # part of a source
@@ -144,25 +94,6 @@ HUGE = "1" + "0" * 30
 def test_a_part_that_is_not_there_is_refused(sources, kind, part, words):
     with refused(words):
         part_of(sources[kind], part)
-
-
-@pytest.mark.parametrize("step", [HUGE, 2**63 - 1, 12])
-@pytest.mark.parametrize("kind", ["frames.npy", "clip.mkv", "aerial"])
-def test_a_step_beyond_the_end_takes_one_frame(sources, kind, step):
-    source = part_of(sources[kind], f"step={step}")
-    torch.testing.assert_close(all_of(source), all_of(open_source(sources[kind]))[:1])
-    assert source.places is None or len(source.places) == 1
-
-
-def test_a_part_of_a_reference_keeps_its_positions():
-    reference = open_source("sim:outdoor?frames=60&start=20&stop=50")
-    query = open_source("sim:outdoor?frames=60&traverse=1&start=30&step=3")
-    assert reference.places is not None
-    assert query.places is not None
-    found = position_truth(reference.places, query.places)[:, 0]
-    known = found >= 0
-    assert known.any()
-    assert ((reference.places[found] - query.places).abs()[known] <= 1).all()
 
 
 @pytest.mark.parametrize("name", ["a.npy", "a.mp4", "a.png"])

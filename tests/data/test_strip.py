@@ -48,12 +48,6 @@ def test_a_file_is_cut_as_asked(image):
         assert len(traverse) == 14
 
 
-def test_a_file_as_it_is(image):
-    frames = all_of(open_source(f"strip:{image}?width=40"))
-    torch.testing.assert_close(frames, pixels_of(image).float()[None], atol=1e-6, rtol=0)
-    assert all_of(open_source(f"strip:{image}?width=2&halve=2&step=3")).shape == (3, 3, 5, 2)
-
-
 @pytest.mark.parametrize(
     "strip", [torch.rand(5, 9), torch.rand(1, 1, 5, 9), torch.zeros(1, 5, 9, dtype=torch.uint8)]
 )

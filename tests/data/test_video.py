@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pickle
 from fractions import Fraction
-from pathlib import Path
 
 import av
 import numpy as np
@@ -12,7 +11,6 @@ import pytest
 import torch
 from helpers import all_of, refused
 from torch.nn.functional import avg_pool2d
-from torch.utils.data import DataLoader
 from videos import H264, clip, numbers, pictures
 
 from dejavu_torch.data import video as video_module
@@ -62,15 +60,6 @@ def test_frames_their_times_and_names_are_in_order(tmp_path, name, caplog):
     assert caplog.messages == []  # the rate is steady
 
 
-@pytest.mark.parametrize("name", ["h264.mp4", "h264.mkv", "mjpeg.avi"])
-def test_the_batch_size_changes_nothing(tmp_path, name):
-    video = Video(clip(tmp_path / name, pictures(11), **KINDS[name]), width=20)
-    whole = all_of(video)
-    for batch in (1, 2, 5, 100):
-        assert {len(part) for part in list(video.batches(batch))[:-1]} <= {batch}
-        assert torch.equal(all_of(video, batch), whole)
-
-
 @pytest.mark.parametrize("group", [8, None], ids=["short groups", "one group"])
 @pytest.mark.parametrize("name", KINDS)
 def test_any_frame_is_exact_in_any_order(tmp_path, name, group):
@@ -83,37 +72,6 @@ def test_any_frame_is_exact_in_any_order(tmp_path, name, group):
     assert torch.equal(video[mixed], whole[mixed])
     assert torch.equal(Video(path)[20:26], whole[20:26])
     assert torch.equal(pickle.loads(pickle.dumps(video))[[12, 4]], whole[[12, 4]])
-
-
-@pytest.mark.parametrize(("name", "key"), [("h264.mp4", 14), ("ffv1.mkv", 16)])
-def test_only_the_groups_asked_for_are_decoded(tmp_path, name, key, monkeypatch):
-    path = clip(tmp_path / name, pictures(30), group=8, **KINDS[name])
-    video, decode, decoded = Video(path), video_module._decode, list[int]()
-
-    def noted(*opened):
-        for frame in decode(*opened):
-            decoded.append(round(25 * frame.time))
-            yield frame
-
-    monkeypatch.setattr(video_module, "_decode", noted)
-    assert numbers(video[[18, 20]]) == [18, 20]
-    assert video[21].shape == (3, 32, 48)
-    assert decoded == list(range(key, 22))  # from a key frame on, each once
-
-
-def test_a_forked_process_reads_its_own_frames(tmp_path):
-    video = Video(clip(tmp_path / "a.mp4", pictures(30), group=8, **H264))
-    assert numbers(video[9:12]) == [9, 10, 11]  # its file stays open
-    loader = DataLoader(video, batch_size=7, num_workers=2, multiprocessing_context="fork")
-    for _ in range(2):
-        assert numbers(torch.cat([*loader])) == list(range(30))
-    assert numbers(video[12:15]) == [12, 13, 14]
-
-
-def test_opening_reads_all_names_and_times(tmp_path, monkeypatch):
-    video = Video(clip(tmp_path / "a.mkv", pictures(30)))
-    monkeypatch.setattr(video, "_open", lambda: pytest.fail("it is read again"))
-    assert (len(video), video.names[3], video.names[29]) == (30, "0:00:00.120", "0:00:01.160")
 
 
 @pytest.mark.parametrize("kind", ["h264.mp4", "h264.mkv", "mjpeg.avi"])
@@ -190,25 +148,6 @@ def test_frames_are_streamed(tmp_path, largest_tensor):
     assert seen.numel == 4 * 3 * 16 * 24
 
 
-@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="needs /proc")
-def test_the_file_is_closed(tmp_path):
-    path = clip(tmp_path / "a.mkv", pictures(5))
-    video = Video(path)
-
-    def is_open():
-        return str(path) in [str(link.resolve()) for link in Path("/proc/self/fd").iterdir()]
-
-    assert not is_open()
-    assert len(video[:2]) == 2
-    assert is_open()  # for the next frames
-    assert len(video[2:]) == 3
-    assert not is_open()
-    assert len(video[:1]) == 1
-    assert is_open()
-    del video
-    assert not is_open()
-
-
 @pytest.mark.parametrize("name", ["a.mp4", "a.mkv", "a.avi", "a.mjpeg", "a.ts"])
 def test_a_file_that_is_no_video_is_refused(tmp_path, name):
     for content in (b"", b"no video\n" * 99, bytes(5000), b"\x1a\x45\xdf\xa3", b"RIFF"):
@@ -234,15 +173,6 @@ def test_sound_alone_is_refused(tmp_path):
         container.mux(stream.encode())
     with refused("a.mp4", "no video stream"):
         Video(tmp_path / "a.mp4")
-
-
-def test_a_video_without_frames_is_refused(tmp_path):
-    with av.open(str(tmp_path / "a.avi"), "w") as container:
-        stream = container.add_stream("mjpeg", rate=25)
-        stream.height, stream.width, stream.pix_fmt = 32, 48, "yuvj420p"
-        container.start_encoding()
-    with refused("a.avi", "no frames"):
-        all_of(Video(tmp_path / "a.avi"))
 
 
 @pytest.mark.parametrize("kind", ["mjpeg.mjpeg", "h264.ts"])
@@ -295,15 +225,6 @@ def test_a_hole_in_the_middle_is_refused_in_one_line(tmp_path, name, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-def test_any_cut_of_a_small_video_is_refused(tmp_path):
-    path = clip(tmp_path / "a.mkv", pictures(3, 4, 6))
-    whole = path.read_bytes()
-    for stop in range(8, len(whole), 5):
-        path.write_bytes(whole[:stop])
-        with refused(str(path)):
-            Video(path)
-
-
 def test_a_video_recorded_live_is_read(tmp_path):
     path = clip(tmp_path / "a.mkv", pictures(5), options={"live": "1"})
     assert numbers(all_of(Video(path))) == [0, 1, 2, 3, 4]
@@ -312,30 +233,6 @@ def test_a_video_recorded_live_is_read(tmp_path):
     for length in (bytes(4), b"\xff" * 4):  # as where it could not be filled in
         path.write_bytes(whole[:4] + length + whole[8:])
         assert numbers(all_of(Video(path))) == [0, 1, 2, 3, 4]
-
-
-def test_what_follows_a_video_does_not_matter(tmp_path):
-    for name in ("h264.mp4", "h264.mkv", "mjpeg.avi"):
-        path = clip(tmp_path / name, pictures(5), **KINDS[name])
-        path.write_bytes(path.read_bytes() + b"something else")
-        assert numbers(all_of(Video(path))) == [0, 1, 2, 3, 4]
-
-
-def test_a_drive(data_dir):
-    video = Video(data_dir / "highway" / "solidWhiteRight.mp4", width=160)
-    assert len(video) == 221
-    assert torch.equal(video.times, torch.arange(221).double() / 25)
-    whole = all_of(video)
-    assert whole.shape == (221, 3, 90, 160)
-    assert torch.equal(video[[200, 7, 120]], whole[[200, 7, 120]])
-    assert next(Video(video.path).batches(1)).shape == (1, 3, 540, 960)
-
-
-def test_a_list_of_other_files_is_no_video(tmp_path):
-    clip(tmp_path / "a.mkv", pictures(3))
-    (tmp_path / "list.mp4").write_text("ffconcat version 1.0\nfile a.mkv\n")
-    with refused("list.mp4", "cannot be read as a video"):
-        Video(tmp_path / "list.mp4")
 
 
 def test_a_stream_that_claims_too_many_pixels_is_refused(tmp_path, monkeypatch):

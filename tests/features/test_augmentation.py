@@ -63,23 +63,6 @@ def test_each_alone_acts_on_some_or_all_clips_and_alike_on_the_frames_of_one(nam
     assert torch.allclose(after, after[:, :1].expand_as(after), atol=1e-6) == (name != "noise")
 
 
-def test_noise_is_of_the_frame_and_whether_there_is_any_is_of_the_clip():
-    clips = torch.full((100, 6, 1, 16, 16), 0.5)
-    spread = (only(noise=0.03)(clips) - clips).flatten(2).std(2)
-    noisy = spread[:, 0] > 0
-    assert (spread[~noisy] == 0).all()
-    assert spread[noisy].sub(0.03).abs().max() < 0.01
-    assert spread.std(1)[noisy].min() > 0
-
-
-def test_range_and_type_at_the_largest_strengths():
-    wild = Augmentation(**{name: most if len(most) > 1 else most[0] for name, most in LARGEST.items()})
-    after = wild(torch.rand(40, 3, 24, 28))
-    assert after.dtype == torch.float32
-    assert after.isfinite().all()
-    assert 0 <= after.min() < after.max() <= 1
-
-
 def test_the_seed_repeats_it():
     for shape in ((6, 3, 16, 20), (2, 3, 3, 16, 20)):
         frames, augmentation = torch.rand(shape), Augmentation()
@@ -90,20 +73,7 @@ def test_the_seed_repeats_it():
         assert torch.allclose(Augmentation()(channels_last), first, atol=1e-5)
         assert not torch.allclose(second, first, atol=1e-2)
         assert first.shape == shape
-
-
-@pytest.mark.parametrize("occlusion", [0.0, 0.3])
-def test_entries_see_none_but_what_covers_them(occlusion):
-    frames, other = torch.rand(8, 3, 16, 16).expand(2, 8, 3, 16, 16).clone()
-    other[3] = torch.rand(3, 16, 16)
-    seen = set()
-    for seed in range(8):
-        torch.manual_seed(seed)
-        first = Augmentation(occlusion=occlusion)(frames)
-        torch.manual_seed(seed)
-        second = Augmentation(occlusion=occlusion)(other)
-        seen |= set(changed(first, second).nonzero().flatten().tolist())
-    assert seen == ({3, 4} if occlusion else {3})
+        assert 0 <= first.min() < first.max() <= 1
 
 
 def test_colour_is_of_the_channel_and_exposure_of_all():
@@ -124,21 +94,7 @@ def test_gamma_is_a_power():
     assert torch.allclose(only(gamma=0.5)(ends), ends)
 
 
-def test_illumination_falls_evenly_from_one_side():
-    change = only(illumination=0.25)(flat(0.5))[:, 0] - 0.5
-    change = change[changed(torch.zeros_like(change), change)]
-    assert 0.15 < change.abs().amax((1, 2)).max() <= 0.251
-    assert change.abs().amin((1, 2)).max() < 1e-6
-    for axis in (1, 2):
-        assert change.diff(n=2, dim=axis).abs().max() < 1e-6
-
-
-def test_blur_takes_variance_keeps_the_mean_and_reaches_as_far_as_sigma():
-    frames = torch.rand(60, 1, 32, 32)
-    blurred = only(blur=3.0)(frames)
-    assert (blurred.var((1, 2, 3)) < 1.001 * frames.var((1, 2, 3))).all()  # a tiny sigma leaves it as it is
-    assert blurred.var((1, 2, 3)).min() < 0.2 * frames.var((1, 2, 3)).min()
-    assert (blurred - frames).mean((1, 2, 3)).abs().max() < 0.02
+def test_blur_reaches_as_far_as_sigma():
     dots = torch.zeros(60, 1, 15, 15)
     dots[:, :, 7, 7] = 1
     for sigma, reach in ((0.3, 1), (1.2, 1), (2.0, 2), (2.6, 3)):
@@ -165,11 +121,6 @@ def test_occlusion_covers_one_rectangle_of_at_most_its_fraction(most):
         assert other[covered > 0, 0].float().mean(0)[5:-5, 5:-5].min() > 0  # anywhere
 
 
-def test_a_clip_alone_is_covered_with_black():
-    after = torch.cat([only(occlusion=0.5)(torch.full((1, 3, 1, 20, 20), 0.5)) for _ in range(20)])
-    assert set(after.unique().tolist()) == {0.0, 0.5}
-
-
 @pytest.mark.parametrize("drawn", [1e-6, 1 - 1e-6])
 def test_warps_are_those_of_kornia(drawn, monkeypatch):
     """Drawn to either end: kornia turns, scales and moves the frame by as much."""
@@ -185,21 +136,6 @@ def test_warps_are_those_of_kornia(drawn, monkeypatch):
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-4)
 
 
-def test_perspective_keeps_the_middle_and_makes_one_side_larger():
-    frames = torch.zeros(200, 1, 61, 61)
-    frames[:, :, 30, 30] = 1
-    after = only(perspective=20.0)(frames)[:, 0]
-    for axis in (1, 2):
-        light = after.sum(axis) / after.sum((1, 2))[:, None]
-        assert (light @ torch.arange(61.0) - 30).abs().max() < 0.1
-    frames = torch.zeros(200, 1, 61, 61)
-    frames[:, :, 20:41, 15] = frames[:, :, 20:41, 45] = 1
-    after = only(perspective=20.0)(frames)[:, 0]
-    ratio = (after[..., :30].sum((1, 2)) / after[..., 31:].sum((1, 2))).log()
-    assert 0.15 < ratio.max() < 0.6
-    assert -0.6 < ratio.min() < -0.15
-
-
 def test_it_is_plain_numbers_with_nothing_to_save():
     frames, augmentation = torch.rand(3, 3, 16, 16), Augmentation(**json.loads(json.dumps(DEFAULTS)))
     augmentation(frames)
@@ -208,31 +144,21 @@ def test_it_is_plain_numbers_with_nothing_to_save():
     assert "shift=(0.02, 0.04), scale=0.05" in repr(augmentation)
 
 
-@pytest.mark.parametrize("name", DEFAULTS)
-def test_a_wrong_strength_is_refused(name):
-    pair = isinstance(DEFAULTS[name], tuple)
-    for wrong in (-0.01, float("nan"), 181.0, "much"):
-        with refused(f"{name} is", "expected a number from 0 to"):
-            only(**{name: (wrong, 0.0) if pair else wrong})
-    with refused(f"{name} is"):
-        only(**{name: 0.1 if pair else (0.1, 0.1)})
-
-
-def test_frames_by_name_and_none_at_all():
-    assert Augmentation()(frames=torch.rand(0, 3, 16, 16)).shape == (0, 3, 16, 16)
-    with refused("float64"):
-        Augmentation()(frames=torch.rand(0, 3, 16, 16).double())
-
-
 @pytest.mark.parametrize(
-    ("frames", "facts"),
+    ("call", "facts"),
     [
-        (torch.rand(3, 16, 16), ("(3, 16, 16) torch.float32", "(B,C,H,W)", "(B,T,C,H,W)")),
-        (torch.rand(2, 3, 16, 16, dtype=torch.float64), ("torch.float64", "float32 (B,C,H,W)")),
-        (torch.rand(2, 3, 4, 16), ("(2, 3, 4, 16)", "more than 4 pixels")),
-        (torch.rand(2, 0, 16, 16), ("(2, 0, 16, 16)", "float32 (B,C,H,W)")),
+        (lambda: only(rotation=-0.01), ("rotation is", "expected a number from 0 to")),
+        (lambda: only(scale=float("nan")), ("scale is", "expected a number from 0 to")),
+        (lambda: only(shift=("much", 0.0)), ("shift is", "expected a number from 0 to")),
+        (lambda: only(perspective=181.0), ("perspective is", "expected a number from 0 to")),
+        (lambda: only(colour=0.1), ("colour is",)),
+        (lambda: only(noise=(0.1, 0.1)), ("noise is",)),
+        (lambda: only()(torch.rand(3, 16, 16)), ("(3, 16, 16) torch.float32", "(B,C,H,W)", "(B,T,C,H,W)")),
+        (lambda: only()(torch.rand(2, 3, 16, 16).double()), ("torch.float64", "float32 (B,C,H,W)")),
+        (lambda: only(blur=4.0)(torch.rand(2, 3, 4, 16)), ("(2, 3, 4, 16)", "more than 4 pixels")),
+        (lambda: only()(torch.rand(2, 0, 16, 16)), ("(2, 0, 16, 16)", "float32 (B,C,H,W)")),
     ],
 )
-def test_wrong_frames_are_refused(frames, facts):
+def test_what_is_refused(call, facts):
     with refused(*facts):
-        only(blur=4.0)(frames)
+        call()

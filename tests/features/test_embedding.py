@@ -13,7 +13,7 @@ from kornia.contrib import TinyViT
 from kornia.feature import HardNet
 from torch import Tensor, nn
 
-from dejavu_torch import DejaVu, ImposedPeriods, TemplateMapper
+from dejavu_torch import DejaVu
 from dejavu_torch.features.cnn import SmallCNN, local_contrast
 from dejavu_torch.features.embedding import Coder, Embedding
 from dejavu_torch.features.whitening import learned_whitening
@@ -52,9 +52,8 @@ def plain(**settings):
         (lambda: HardNet(pretrained=False), {"channels": 1, "resize": (32, 32)}),
         (tiny_vit, {"resize": (32, 32)}),
         (lambda: nn.Conv2d(3, 4, 3), {"grid": 2}),
-        (lambda: SmallCNN(dimension=7, resize=(16, 16), widths=(4,)), {"cell": 8}),
     ],
-    ids=["HardNet", "TinyViT", "Conv2d", "SmallCNN"],
+    ids=["HardNet", "TinyViT", "Conv2d"],
 )
 def test_networks_of_all_kinds(make, settings):
     net = Embedding(make(), dimension=12, **settings)
@@ -76,14 +75,6 @@ def test_the_features_are_the_pooled_maps_projected_and_standardised():
     projected = net.linear(torch.stack(cells, 2).flatten(1))
     expected = (projected - projected.mean(0)) / (projected.var(0, correction=0) + 1e-5).sqrt()
     torch.testing.assert_close(net(frames), expected, rtol=0, atol=1e-4)
-
-
-def test_without_a_dimension_the_descriptor_is_what_it_gives():
-    full = Embedding(SmallCNN(dimension=7, resize=(16, 16), widths=(4,)), 5, resize=(16, 16), hidden=6).eval()
-    own, frames = full.without_code(), torch.rand(20, 3, 24, 24)
-    assert torch.equal(own(frames), full.describe(frames))
-    assert own.network is full.network
-    assert all(name.startswith("network.") for name in own.state_dict())
 
 
 def test_grey_is_repeated_and_colour_becomes_luminance():
@@ -181,7 +172,6 @@ def test_networks_that_do_not_fit_are_refused(make, output, facts):
         (lambda: plain(dimension=0), ("dimension=0", "at least 1")),
         (lambda: plain(dimension=None, hidden=6), ("hidden=6", "or none and hidden 0")),
         (lambda: plain(channels=2), ("channels=2", "1 or 3")),
-        (lambda: plain(resize=(0, 8)), ("resize=(0, 8)", "expected")),
         (lambda: plain(resize=(8, 8, 8)), ("resize=(8, 8, 8)", "expected")),
         (lambda: plain(grid=0), ("grid=0", "1 to 256")),
         (lambda: plain(cell=-1), ("cell=-1", "0 or more")),
@@ -223,34 +213,7 @@ def test_components_are_whitened_and_of_one_length():
     torch.testing.assert_close(coder(mean + 7 * (views - mean)), coder(views), rtol=1e-4, atol=1e-4)
 
 
-def test_noise_is_for_training_alone():
-    views = torch.randn(200, 6)
-    coder = Coder(6, 3, hidden=5, noise=0.5)
-    coder.layers[1].momentum = 0.0  # its statistics stay
-    assert not torch.equal(coder(views), coder(views))
-    coder.noise = 0.0
-    assert torch.equal(coder(views), coder(views))
-    coder.noise = 0.5
-    coder.eval()
-    assert torch.equal(coder(views), coder(views))
-
-
 def test_gradients_reach_the_descriptor():
     coder = Coder(4, 2, hidden=3, noise=0.0).double().eval()
     views = torch.randn(3, 4, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(coder, (views,))
-
-
-def test_a_map_brings_the_whitening_back(tmp_path):
-    frames = torch.rand(12, 3, 16, 16)
-    settings = {"resize": (16, 16), "grid": 2, "hidden": 6, "noise": 0.3, "kept": 7}
-    net, empty = plain(**settings), plain(**settings)
-    assert net.coder is not None
-    net.coder.whiten(*net.describe(torch.rand(40, 3, 16, 16)).detach().split(20))
-    net.eval()
-    model = DejaVu(net, mapper=TemplateMapper(ImposedPeriods([3], bin=1))).learn(frames)
-    model.save(tmp_path / "map.safetensors")
-    again = DejaVu.load(tmp_path / "map.safetensors", features=empty)
-    assert torch.equal(again(frames), model(frames))
-    assert empty.coder is not None
-    assert empty.coder.whitened

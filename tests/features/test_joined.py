@@ -14,17 +14,14 @@ from dejavu_torch import (
     HOG,
     DejaVu,
     Embedding,
-    Preprocess,
     SpectralMapper,
-    TemplateMapper,
     Whitening,
     open_source,
 )
 from dejavu_torch.cli.commands import run_learn
 from dejavu_torch.cli.parser import parse
-from dejavu_torch.features.descriptor import default_features, own_size
-from dejavu_torch.features.distilled import Distilled
-from dejavu_torch.features.joined import Joined, groups_of
+from dejavu_torch.features.descriptor import default_features
+from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.model import features_per_frame
 from dejavu_torch.model_file import recipe_of
@@ -66,17 +63,6 @@ def flights():
     return [torch.cat([*source.batches(120)])[..., ::2, ::2].contiguous() for source in sources]
 
 
-def test_features_lie_side_by_side_and_tell_their_groups():
-    features, frames = Joined([HOG(), network(), Means()]).eval(), torch.rand(3, 3, 32, 40)
-    assert features.groups is None
-    made = features(frames)
-    parts = [member(frames) for member in features.members]
-    assert torch.equal(made, torch.cat(parts, 1))
-    assert features.groups == tuple(part.shape[1] for part in parts) == (432, 24, 12)
-    assert groups_of(features) == features.groups
-    assert groups_of(HOG()) is None
-
-
 def test_gradients_reach_the_members_weights_and_the_frames():
     features, frames = Joined([Means(), PatchPixels((8, 8))]).double(), torch.rand(2, 1, 8, 8).double()
     assert torch.autograd.gradcheck(features, (frames.requires_grad_(),))
@@ -91,12 +77,6 @@ def test_frames_of_any_number_of_channels_are_described(channels):
     grey = frames.mean(1, keepdim=True) if channels in (2, 4) else frames
     pixels = PatchPixels(channel="grey")
     assert torch.equal(pixels(frames), pixels(grey))
-
-
-def test_grey_pixels_are_those_of_grey_frames():
-    frames = torch.rand(2, 3, 16, 24)
-    grey = PatchPixels(channel="grey")(frames)
-    torch.testing.assert_close(grey, PatchPixels()(Preprocess("grey")(frames)))
 
 
 @pytest.mark.parametrize(
@@ -115,13 +95,6 @@ def test_what_is_refused(call, facts):
         call()
 
 
-def test_the_size_of_joined_features_is_that_of_the_largest():
-    tall, wide = HOG(resize=(64, 32)), Embedding(nn.Conv2d(3, 6, 3), None, resize=(32, 48))
-    assert own_size(Joined([tall, PatchPixels(), wide])) == (64, 48)
-    assert own_size(both()) is None
-    assert own_size(both(), block=True) == own_size(HOG(), block=True) == (16, 16)
-
-
 def test_a_whitening_takes_the_groups_of_the_features(flights, tmp_path):
     model = DejaVu(both(), mapper=SpectralMapper(12.0)).learn(flights[0])
     assert model.whitening is not None
@@ -138,15 +111,6 @@ def test_a_whitening_takes_the_groups_of_the_features(flights, tmp_path):
     other = DejaVu()
     other.descriptor.take(again.descriptor, whitening=True)
     assert other.learn(flights[1]).whitening is again.whitening
-
-
-def test_the_default_features_are_joined_where_something_whitens_them():
-    joined = Joined([HOG(), Distilled()])
-    templates = TemplateMapper()
-    for model in (DejaVu(), DejaVu(whitening=Whitening()), DejaVu(whitening=Whitening(), mapper=templates)):
-        assert recipe_of(model.features) == recipe_of(joined)
-    for model in (DejaVu(whitening="none"), DejaVu(mapper=templates)):
-        assert recipe_of(model.features) == recipe_of(HOG())
 
 
 def test_ready_features_have_no_groups_but_those_that_are_asked_for():
@@ -242,34 +206,6 @@ def test_settings_of_hog_alone_mean_hog(folder, words):
     assert recipe_of(other) == recipe_of(PatchPixels(patch=4))
 
 
-def test_a_map_of_the_default_is_compared_with_its_own_features(folder, capsys):
-    run("learn", ROUTE, "--map", "map.safetensors")
-    words = "compare", ROUTE, f"{ROUTE}&traverse=1", "--map", "map.safetensors", "--out", "out"
-    assert "it was learned with Joined; got HOG" in fails(capsys, *words, "--features.cell", "4")
-    assert "it was learned with Joined; got HOG" in fails(capsys, *words, "--features", "HOG")  # of a member
-    run(*words)
-    assert (folder / "out" / "report.json").exists()
-
-
-def test_a_list_in_a_config_file(folder):
-    path = "dejavu_torch.features.joined.Joined"
-    (folder / "own.yaml").write_text(f"features: {{class_path: {path}, init_args: {{members: {LIST}}}}}\n")
-    assert repr(features_of("--config", "own.yaml")) == repr(features_of("--features", LIST))
-    assert repr(features_of("--config", "own.yaml", "--features", "[HOG]")) == repr(Joined([HOG()]))
-
-
-def test_learn_and_localize(folder, capsys):
-    run(*LEARN, LIST)
-    assert "Whitening, 1764 + 2048 to 30 dimensions" in capsys.readouterr().out
-    run("info", "map.safetensors")
-    told = capsys.readouterr().out
-    assert "HOG: orientations=9" in told
-    assert "PatchPixels: size=(32, 64), patch=8, channel='grey'" in told
-    run("localize", "map.safetensors", f"{ROUTE}&traverse=1", "--out", "matches.csv")
-    rows = [line.split(",") for line in (folder / "matches.csv").read_text().splitlines()[1:]]
-    assert sum(abs(int(query) - int(place)) <= 5 for query, place, *_ in rows) > 50
-
-
 def test_a_network_of_a_function_beside_hog(folder, capsys):
     run(*LEARN, HUB)
     sys.modules.pop("zoo")
@@ -283,12 +219,9 @@ def test_a_network_of_a_function_beside_hog(folder, capsys):
 @pytest.mark.parametrize(
     ("words", "seen"),
     [
-        (("[]",), "the members of the features are none; expected modules, at least one"),
         (("[HOG, zoo.nothing]",), "--features.members: module 'zoo' has no attribute 'nothing'"),
         (("[HOG, {",), "--features is '[HOG, {'; expected a list of classes"),
         (("[2020-13-45]",), "--features is '[2020-13-45]'; expected a list of classes"),
-        (("[HOG, PatchPixels]", "--whitening.groups", "[1764, 10]"), "groups of 1764 + 10 dimensions"),
-        (("HOG", "--whitening.groups", "[]"), "the groups are []"),
     ],
 )
 def test_mistakes_are_one_line(words, seen, folder, capsys):

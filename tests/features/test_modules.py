@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 import torch
 from helpers import refused
@@ -13,9 +11,7 @@ from dejavu_torch import (
     GroundOdometry,
     ImposedPeriods,
     Preprocess,
-    SpectralMapper,
     SpectrogramAnalysis,
-    TemplateMapper,
     Whitening,
 )
 from dejavu_torch.features import preprocess
@@ -64,15 +60,6 @@ def test_a_recipe_builds_the_same_module(name):
     again = build(recipe)
     assert repr(again) == repr(module)
     assert recipe_of(again) == recipe
-
-
-@pytest.mark.parametrize("base", [HOG, SpectralMapper, TemplateMapper])
-def test_a_subclass_with_arguments_of_its_own_shows_those_of_its_base(base):
-    class Own(base):  # type: ignore[misc]
-        def __init__(self, own: int = 3, **given: Any) -> None:
-            super().__init__(**given)
-
-    assert repr(Own()) == repr(base()).replace(base.__name__, "Own", 1)
 
 
 @pytest.mark.parametrize("name", [name for name in MODULES if name != "network"])

@@ -132,11 +132,6 @@ def test_clahe_passes_gradients_straight_through_without_other_values():
 # --- the module
 
 
-def test_without_choices_the_input_itself_comes_back():
-    for frames in (torch.rand(2, 3, 8, 8), torch.rand(5, 7)):  # images, and ready-made features
-        assert Preprocess()(frames) is frames
-
-
 def test_module_equals_functions():
     frames = torch.rand(2, 3, 24, 30)
     module = Preprocess(channel="g", contrast="patch", patch=5)
@@ -226,15 +221,10 @@ CHANNELS, WIDE = torch.rand(1, 4, 8, 8), torch.rand(1, 1, 8, 20)
         (lambda: Preprocess("gray2"), ("channel 'gray2' is unknown", "'grey', 'R', 'G', 'B'", "'R-B'")),
         (lambda: Preprocess("R-"), ("channel 'R-' is unknown",)),
         (lambda: Preprocess("R-R"), ("channel 'R-R' is unknown",)),
-        (lambda: Preprocess("R-G-B"), ("channel 'R-G-B' is unknown",)),
-        (lambda: Preprocess("R-grey"), ("channel 'R-grey' is unknown",)),
         (lambda: Preprocess(contrast="retinex"), ("contrast='retinex'", "'patch'", "'clahe'")),
         (lambda: Preprocess(patch=1), ("patch=1", "odd", "at least 3")),
         (lambda: Preprocess(patch=8), ("patch=8", "odd", "at least 3")),
         (lambda: Preprocess(grid=(0, 8)), ("grid=(0, 8)", "(rows, columns)")),
-        (lambda: Preprocess(grid=(8,)), ("grid=(8,)", "(rows, columns)")),
-        (lambda: Preprocess(grid=(2.5, 2)), ("grid=(2.5, 2)", "(rows, columns)")),
-        (lambda: Preprocess(clip_limit=-1.0), ("clip_limit=-1.0", "expected 0 (no limit)")),
         (lambda: Preprocess(clip_limit=math.nan), ("clip_limit=nan", "expected 0 (no limit)")),
         (lambda: Preprocess(range="0.3"), ("range='0.3'", "LOW,HIGH", "auto")),
         (lambda: Preprocess(range=(0.4, 0.4)), ("range=(0.4, 0.4)", "LOW,HIGH")),
@@ -243,9 +233,7 @@ CHANNELS, WIDE = torch.rand(1, 4, 8, 8), torch.rand(1, 1, 8, 20)
         (lambda: applied(CHANNELS[:, :1], channel="R"), ("'R'", "1 channels", "RGB")),
         (lambda: applied(CHANNELS, channel="G-B"), ("'G-B'", "4 channels", "RGB")),
         (lambda: applied(WIDE, contrast="patch"), ("8 x 20 pixels", "9 x 9")),
-        (lambda: applied(WIDE.mT, contrast="patch"), ("20 x 8 pixels", "9 x 9")),
         (lambda: applied(WIDE + 1, contrast="clahe", grid=(2, 2)), ("values from 1", "[0, 1]")),
-        (lambda: applied(WIDE - 1, contrast="clahe", grid=(2, 2)), ("values from -", "[0, 1]")),
         (lambda: applied(WIDE * math.nan, contrast="clahe", grid=(2, 2)), ("nan", "[0, 1]")),
     ],
 )

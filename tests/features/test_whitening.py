@@ -319,36 +319,6 @@ def test_one_group_has_the_numbers_of_a_whitening_without_levelled():
     assert torch.equal(again(SIDE[1]), plain(SIDE[1]))
 
 
-def test_the_order_of_members_changes_no_cosine():
-    whitening, swapped = joined(), Whitening(bits=16)
-    turned = [torch.cat([rows[:, 40:], rows[:, :40]], 1) for rows in SIDE]
-    swapped.learn(turned[0], [(turned[1], torch.arange(600))], (25, 40))  # as features tell it
-    assert (swapped.groups, swapped.sizes, whitening.sizes) == (None, [25, 40], GROUPS)
-    cosines = [one(views) @ one(places).T for one, (places, views) in ((whitening, SIDE), (swapped, turned))]
-    torch.testing.assert_close(*cosines, rtol=0, atol=1e-3)
-
-
-def test_own_groups_are_ahead_of_those_of_the_features():
-    whitening = Whitening(groups=[65])
-    whitening.learn(SIDE[0], [(SIDE[1], torch.arange(600))], GROUPS)
-    assert whitening.sizes == [65]
-
-
-def test_views_of_members_are_made_once_in_any_batches():
-    batches = ((SIDE[1][part], part) for part in torch.arange(600).split(250))
-    whitening = Whitening(groups=GROUPS, bits=16)
-    whitening.learn(SIDE[0], batches)
-    torch.testing.assert_close(whitening(SIDE[1]), joined()(SIDE[1]), rtol=0, atol=1e-4)
-
-
-def test_a_member_that_is_scaled_weighs_as_before():
-    whitening, scaled = joined(), Whitening(groups=GROUPS, bits=16)
-    larger = [torch.cat([rows[:, :40], 100 * rows[:, 40:]], 1) for rows in SIDE]
-    scaled.learn(larger[0], [(larger[1], torch.arange(600))])
-    cosines = [one(views) @ one(places).T for one, (places, views) in ((whitening, SIDE), (scaled, larger))]
-    torch.testing.assert_close(*cosines, rtol=0, atol=1e-3)
-
-
 @pytest.mark.parametrize("bits", [4, 8, 16])
 @pytest.mark.parametrize("views", [True, False])
 def test_a_state_of_groups_is_loaded(bits, views):
@@ -382,11 +352,3 @@ def test_gradients_reach_the_members():
 def test_groups_that_do_not_fit(call, facts):
     with refused(*facts):
         call()
-
-
-def test_a_refused_group_leaves_the_whitening_as_it_was():
-    whitening = joined()
-    before, constant = whitening(SIDE[1]), torch.cat([PLACES, torch.ones(600, 25)], 1)
-    with refused("600 descriptors", "all the same"):
-        whitening.learn(constant, [(SIDE[1], torch.arange(600))])
-    assert torch.equal(whitening(SIDE[1]), before)

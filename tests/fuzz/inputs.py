@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
-import shutil
-
 import numpy as np
 import torch
 from PIL import Image
 from pytorch_lightning import Trainer
 from videos import clip
 
-from dejavu_torch.cli.presets import FOLDER
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.source import open_source
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import DejaVu
-from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.training.datamodule import RouteData
 from dejavu_torch.training.templates import TemplateTask
-from dejavu_torch.types import Training
 
 
 def pictures(count, side=16, noise=0.0):
@@ -33,41 +27,21 @@ def pictures(count, side=16, noise=0.0):
     return np.clip(frames + noise * drawn.normal(size=frames.shape), 0, 255).astype(np.uint8)
 
 
-def frames_of(array):
-    """(N,1,H,W) in [0, 1]."""
-    return torch.from_numpy(array)[:, None].float() / 255
-
-
 def maps(folder):
-    """Map files of every kind, and beside each frames that it localizes."""
-    frames, queries = frames_of(pictures(40)), pictures(12, noise=5.0)
+    """Map files of every kind."""
+    frames = torch.from_numpy(pictures(40))[:, None].float() / 255
     features = torch.from_numpy(np.random.default_rng(1).normal(size=(40, 12))).float()
     periods = ImposedPeriods([3, 4, 5], bin=2)
-    write_images(folder / "photos", pictures(40))
-    ground = pictures(40, 48)[::-1].swapaxes(1, 2).copy()  # comes nearer, down the frame
-    small = {"channels": 1, "resize": (16, 16), "widths": (4, 8), "squeeze": 4}
-    odometry = GroundOdometry(((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)), (48, 48), step=6.0)
-    templates = TemplateMapper(periods)
-    network, rounded = (SmallCNN(8, **small) for _ in range(2))  # type: ignore[arg-type]
-    plan = TemplateMapper(periods, reduction="sum", metric="l2")
+    network = SmallCNN(8, channels=1, resize=(16, 16), widths=(4, 8), squeeze=4)
     models = {
-        "templates": (DejaVu(mapper=templates), frames, queries),
-        "plan": (DejaVu(mapper=plan), features, features[:9].numpy()),
-        "spectral": (DejaVu(), frames, queries),
-        "plain": (DejaVu(whitening="none"), features, features[:9].numpy()),
-        "chunked": (DejaVu(mapper=SpectralMapper(chunk=16)), frames, queries),
-        "named": (DejaVu(threshold=0.5), open_source(folder / "photos"), queries),
-        "learned": (DejaVu(network, mapper=templates), frames, queries),
-        "rounded": (DejaVu(rounded, mapper=SpectralMapper(20.0), weight_bits=8), frames, queries),
-        "resampled": (DejaVu(velocity=odometry), frames_of(ground), ground[:20]),
+        "templates": (DejaVu(network, mapper=TemplateMapper(periods)), frames),
+        "plan": (DejaVu(mapper=TemplateMapper(periods, reduction="sum", metric="l2")), features),
+        "spectral": (DejaVu(), frames),
+        "chunked": (DejaVu(mapper=SpectralMapper(chunk=16), whitening="none"), features),
+        "rounded": (DejaVu(network, mapper=SpectralMapper(20.0), weight_bits=8), frames),
     }
-    for name, (model, reference, query) in models.items():
-        model.learn(reference)
-        if name == "learned":
-            model.trained = Training(4, 0)
-        model.save(folder / f"{name}.safetensors")
-        np.save(folder / f"{name}.npy", query)
-    shutil.rmtree(folder / "photos")
+    for name, (model, reference) in models.items():
+        model.learn(reference).save(folder / f"{name}.safetensors")
 
 
 def write_images(folder, images):
@@ -93,9 +67,6 @@ def images(folder):
     turned = Image.Exif()
     turned[0x0112] = 6
     colour.save(folder / "turned.jpg", exif=turned)
-    (folder / "vector.png").write_bytes(
-        b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n(out/ran) (w) file closefile\n"
-    )
 
 
 def videos(folder):
@@ -105,24 +76,6 @@ def videos(folder):
     frames = np.stack([pictures(12, 48)[:, :32]] * 3, 3)
     for name, (codec, pixels) in kinds.items():
         clip(folder / name, frames, codec, pixels)
-
-
-TRAIN = """
-model:
-  class_path: dejavu_torch.TemplateTask
-  init_args:
-    backbone:
-      class_path: dejavu_torch.features.cnn.SmallCNN
-      init_args: {dimension: 8, channels: 1, resize: [16, 16], widths: [4, 8], squeeze: 4}
-    mapper:
-      class_path: dejavu_torch.TemplateMapper
-      init_args:
-        periods:
-          class_path: dejavu_torch.ImposedPeriods
-          init_args: {periods: [3, 4, 5], bin: 2}
-data: {source: in/frames.npy, batch_size: 20, tolerance: 2}
-trainer: {max_steps: 2, accelerator: cpu, logger: false, default_root_dir: out/run}
-"""
 
 
 def new_task():
@@ -141,24 +94,14 @@ def checkpoints(folder):
 
 
 def inputs(folder):
-    """What command lines name: `in` of their folder."""
-    maps(folder)
-    for path in folder.glob("*.npy"):
-        path.unlink()
+    """A source of every kind: `in` of the folder of a case."""
     np.save(folder / "frames.npy", pictures(40))
-    np.save(folder / "query.npy", pictures(12, noise=5.0))
     np.save(folder / "features.npy", np.random.default_rng(1).normal(size=(40, 12)).astype(np.float32))
     write_images(folder / "photos", pictures(30))
     clip(folder / "clip.mp4", np.stack([pictures(12, 48)[:, :32]] * 3, 3), "libx264", "yuv420p")
     Image.fromarray(pictures(1, 40)[0]).save(folder / "strip.png")
-    (folder / "matches.csv").write_text(matches_text())
-    (folder / "truth.csv").write_text("query,place\n" + "".join(f"{i},{i}\n" for i in range(12)))
-    np.savez(folder / "truth.npz", GThard=np.eye(40, 12, dtype=bool))
-    (folder / "config.yaml").write_text((FOLDER / "local_maxima.yaml").read_text())
-    (folder / "train.yaml").write_text(TRAIN)
     (folder / "empty").mkdir()
     (folder / "a_file").write_text("a file")
-    checkpoints(folder)
 
 
 def matches_text():

@@ -6,12 +6,11 @@ of the case it died of, and another goes on behind it.
 
 What counts as a finding:
 
-- any exception but InputError of the library, and SystemExit 0 or 2 of the commands;
-- a message, a warning or an error of a command, that is more than one line;
+- any exception but InputError;
+- a message of more than one line, a warning or a traceback that is printed;
 - more time or memory than that; the end of the process;
-- files that a refused input leaves, temporary files that anything leaves;
-- files that were there and are changed: inputs, the user's own, all but what a command line names as output;
-- an import of the canary, a module that only files name;
+- files that are left, temporary ones among them;
+- files that were there and are changed: inputs, and the user's own;
 - what a reader itself finds: damage that changes what is read, values out of range.
 """
 
@@ -23,7 +22,6 @@ import logging
 import multiprocessing
 import os
 import resource
-import shlex
 import shutil
 import signal
 import stat
@@ -34,7 +32,6 @@ import traceback
 import warnings
 from collections import Counter, defaultdict
 from contextlib import ExitStack, suppress
-from itertools import pairwise
 from pathlib import Path
 from random import Random
 from typing import NamedTuple
@@ -47,7 +44,6 @@ from dejavu_torch.data.output import PREFIX
 from dejavu_torch.maps import codec
 from dejavu_torch.types import InputError
 
-from .mutations import CANARY
 from .readers import READERS, Case, Wrong
 
 CPU, WALL = 20, 90  # seconds of a case
@@ -57,8 +53,6 @@ GROWN = 2**29  # bytes by which a process may have grown when it goes on to anot
 MOST = 300  # characters of a message
 PACKAGE = Path(dejavu_torch.__file__).parent
 BYSTANDER = f"{PREFIX}notes"  # a folder of the user's own
-OUTPUTS = ("--out", "--trainer.default_root_dir")
-CANARY_CODE = "class Module: pass\ndef run(*args, **more): return 0\n"
 
 
 class Finding(NamedTuple):
@@ -113,10 +107,6 @@ def _run_case(reader, seed, number, root):
         outcome = "refused"
         if len(str(error).splitlines()) != 1:
             findings.append(_finding(error, "message of several lines"))
-    except SystemExit as error:
-        outcome = {0: "accepted", None: "accepted", 2: "refused"}.get(error.code, "broken")  # type: ignore[arg-type]
-        if outcome == "broken":
-            findings.append(_finding(error, f"exit status {error.code}"))
     except Wrong as error:
         findings.append(Finding("wrong", str(error).partition(":")[0], str(error)[:MOST]))
     except BaseException as error:
@@ -126,14 +116,8 @@ def _run_case(reader, seed, number, root):
         signal.setitimer(signal.ITIMER_REAL, 0)
     sys.stdout.flush()
     sys.stderr.flush()
-    findings += _told(root, case, outcome) if not findings else []
-    findings += _left(root, case, outcome, before, temporary) if before else []
-    if CANARY in sys.modules:
-        del sys.modules[CANARY]
-        findings.append(Finding("code executed", "", "the canary was imported"))
-    if case.words:
-        line = shlex.join(case.words)
-        findings = [one._replace(message=f"{one.message} of dejavu {line:.{MOST}}") for one in findings]
+    findings += _told(root) if not findings else []
+    findings += _left(root, outcome, before, temporary) if before else []
     return Result(number, "broken" if findings else outcome, findings)
 
 
@@ -145,22 +129,14 @@ def _finding(error, kind):
     return Finding(kind, where, str(error)[:MOST])
 
 
-def _told(root, case, outcome):
-    """What is wrong with what a case wrote to stderr: each line is one message of ours.
-
-    Beside a call of the library lines of C code are let pass, such as libtiff's, which nothing can turn off.
-    """
+def _told(root):
+    """What is wrong with what a case wrote to stderr; lines of C code, as libtiff's, cannot be turned off."""
     text = (root / "stderr").read_text(errors="replace")
-    lines = text.split("\n")[:-1]
-    foreign = [line for line in lines if not line.startswith("dejavu: ")]
-    if foreign and (case.words or any(word in text for word in ("Warning: ", "Traceback"))):
-        return [Finding("stderr", foreign[0][:100], text[: 2 * MOST])]
-    if case.words and outcome == "refused" and not lines:
-        return [Finding("stderr", "", "exit status 2 without a word")]
-    return []
+    said = [line for line in text.splitlines() if any(word in line for word in ("Warning: ", "Traceback"))]
+    return [Finding("stderr", said[0][:100], text[: 2 * MOST])] if said else []
 
 
-def _left(root, case, outcome, before, temporary):
+def _left(root, outcome, before, temporary):
     """What is wrong with the files after a case."""
     if any(temporary.iterdir()):
         gc.collect()  # a tensor that is kept in a temporary file
@@ -169,27 +145,11 @@ def _left(root, case, outcome, before, temporary):
     after = _files(root / "work")
     new = sorted(name for name in after if name not in before)
     changed = [name for name in before if after.get(name, "gone") != before[name]]
-    if outcome == "accepted":
-        new = [name for name in new if PREFIX in name]
-        named = _named(case.words, case.folder.relative_to(root / "work"))
-        changed = [name for name in changed if not named(name)]
     if new:
         findings.append(Finding(f"file left where {outcome}", "", str(new)[:MOST]))
     if changed:
         findings.append(Finding("input changed", "", str(changed)[:MOST]))
     return findings
-
-
-def _named(words, folder):
-    """Whether a command line, run in `folder`, names a file, or its folder, as output and not as input."""
-    outputs, inputs = set(), set()
-    for before, word in pairwise(["", *words]):
-        option, equals, value = word.partition("=") if word.startswith("--") else (before, "=", word)
-        written = option in OUTPUTS or (option == "--map" and words[0] == "learn")
-        address = value.removeprefix("strip:").partition("?")[0]
-        if equals:  # else its value is the next word
-            (outputs if written else inputs).add(os.path.normpath(folder / address))
-    return lambda name: name not in inputs and any(Path(name).is_relative_to(place) for place in outputs)
 
 
 def _files(folder):
@@ -223,9 +183,6 @@ def _prepare(root):
     cli._log_to_stderr()
     os.environ["TMPDIR"] = tempfile.tempdir = str(root / "tmp")
     os.environ["MPLCONFIGDIR"] = str(root / "matplotlib")
-    (root / "canary").mkdir(exist_ok=True)
-    (root / "canary" / f"{CANARY}.py").write_text(CANARY_CODE)
-    sys.path.append(str(root / "canary"))
     torch.set_num_threads(1)
 
 

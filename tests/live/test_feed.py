@@ -7,33 +7,16 @@ import threading
 import time
 
 import numpy as np
-import pytest
 from helpers import refused
 
 from dejavu_torch.data.camera import Frame
-from dejavu_torch.live.feed import WAITING, FrameReader, in_real_time
-from dejavu_torch.types import InputError
+from dejavu_torch.live.feed import FrameReader, in_real_time
 
 PIXELS = np.zeros((2, 2, 3), np.uint8)
 
 
 def shots(count, rate=25.0):
     return (Frame(i, i / rate, PIXELS) for i in range(count))
-
-
-def test_no_frame_of_a_file_is_dropped_nor_read_far_ahead():
-    read = []
-
-    def counted():
-        for shot in shots(30):
-            read.append(shot.number)
-            yield shot
-
-    with FrameReader(counted()) as feed:
-        for i, shot in enumerate(feed):
-            assert shot.number == i
-            assert len(read) <= i + WAITING + 2
-    assert (i, feed.dropped) == (29, 0)
 
 
 def test_of_a_live_source_the_newest_frame_is_taken_and_the_others_are_counted():
@@ -54,37 +37,6 @@ def test_of_a_live_source_the_newest_frame_is_taken_and_the_others_are_counted()
         seen = [first, *(shot.number for shot in frames)]
     assert seen[-1] == 8
     assert feed.dropped == 9 - len(seen)
-
-
-def test_a_source_that_stalls_is_told_behind_what_came():
-    never = threading.Event()
-
-    def stalls():
-        yield from shots(3)
-        never.wait(10)
-
-    seen = []
-    with (
-        refused("/dev/video0", "stalled", "0.05"),
-        FrameReader(stalls(), timeout=0.05, name="/dev/video0") as feed,
-    ):
-        for shot in feed:
-            seen.append(shot.number)
-    never.set()
-    assert seen == [0, 1, 2]
-
-
-@pytest.mark.parametrize("newest", [False, True])
-def test_what_reading_raises_comes_behind_the_frames(newest):
-    def breaks():
-        yield from shots(1)
-        raise InputError("it broke off")
-
-    seen = []
-    with refused("broke off"), FrameReader(breaks(), newest) as feed:
-        for shot in feed:
-            seen.append(shot.number)
-    assert seen == [0]
 
 
 def test_the_thread_ends_with_the_feed():

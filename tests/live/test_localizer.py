@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 
 import numpy as np
@@ -134,16 +133,6 @@ def test_every_kind_of_array(given, spectral, drive):
     assert LiveLocalizer(spectral, None)(given(drive[5])).place == 15
 
 
-def test_ready_features():
-    wave = torch.randn(40, 6)
-    model = DejaVu().learn(wave)
-    assert LiveLocalizer(model, None)(wave[7]).place == 7
-    searching = LiveLocalizer(model, None, keep_scores=False)
-    assert (searching(wave[7]).place, searching.scores) == (7, None)
-    with refused("5 features", "6"):
-        LiveLocalizer(DejaVu(whitening="none").learn(wave))(wave[7, :5])
-
-
 @pytest.mark.parametrize(
     ("frame", "words"),
     [
@@ -204,14 +193,6 @@ def test_frames_left_out_move_the_filter_on(route):
         )
 
     assert posteriors(True)[10:].mean() > posteriors(False)[10:].mean() + 0.2
-
-
-def test_a_copy_goes_on_by_itself(spectral, drive):
-    localizer = LiveLocalizer(spectral)
-    answers(localizer, drive[:5])
-    other = copy.deepcopy(localizer)
-    expected = answers(localizer, drive[5:9])
-    assert [one.place for one in answers(other, drive[5:9])] == [one.place for one in expected]
 
 
 def test_names_and_interruption(spectral, drive, monkeypatch):

@@ -6,8 +6,6 @@ import http.client
 import json
 import math
 import re
-import shutil
-import subprocess
 from concurrent.futures import ThreadPoolExecutor
 from urllib.request import urlopen
 
@@ -22,8 +20,6 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.camera import Frame
 from dejavu_torch.live.localizer import LiveMatch
 from dejavu_torch.live.page import PAGE, Page, ReferencePictures, Snapshot, as_picture, curve
-
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
 
 def moment(number=7, name="left<b>.png", accepted=True, time=0.28):
@@ -104,17 +100,6 @@ def test_curve_keeps_the_highest_of_many_places():
     assert curve(torch.tensor([3.0, 1.0, 2.0, math.inf]), posterior=False) == [0.0, 1.0, 0.5, 0.0]
 
 
-@pytest.mark.parametrize("places", [1, 7, 512, 700, 100_000])
-def test_columns_of_a_posterior_and_being_off_the_map_add_up_to_1(places):
-    posterior = torch.rand(places + 1, generator=torch.Generator().manual_seed(0))
-    posterior /= posterior.sum()
-    heights = curve(posterior, posterior=True)
-    assert len(heights) == min(512, places)
-    assert sum(heights) == pytest.approx(1 - float(posterior[-1]), abs=1e-3)
-    middle = torch.arange(places) * len(heights) // places == len(heights) // 2
-    assert heights[len(heights) // 2] == pytest.approx(float(posterior[:-1][middle].sum()), abs=1e-5)
-
-
 def test_reference_pictures_of_any_source(tmp_path):
     frames = pictures(5)
     np.save(tmp_path / "frames.npy", frames)
@@ -131,20 +116,3 @@ def test_reference_pictures_of_any_source(tmp_path):
     with refused("the array holds features", "frames to show"):
         ReferencePictures(ArrayTraverse(torch.rand(5, 8)), 5)
     assert as_picture(torch.rand(6)) is None  # ready features
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
-def test_a_browser_shows_it(page, tmp_path):
-    page.reference = lambda frame: as_picture(np.full((24, 32, 3), frame % 256, np.uint8))
-    page.show(moment())
-    options = "--headless --no-sandbox --disable-gpu --no-first-run --disable-sync --window-size=1000,800"
-    options += " --disable-background-networking --disable-component-update --virtual-time-budget=2000"
-    command = [str(CHROMIUM), *options.split(), f"--user-data-dir={tmp_path}", "--dump-dom", page.url]
-    ran = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
-    shown = re.sub(r"<script>.*?</script>", "", ran.stdout, flags=re.DOTALL)
-    assert 'class="yes"' in shown
-    words = "frame 7", "0.28 s", "accepted:", "place 1204", "left&lt;b&gt;.png", "0.905", "12.5", "19.0"
-    assert [one for one in words if one not in shown] == []
-    assert shown.count("data:image/jpeg") == 2
-    assert len(re.findall(r"<path", shown)) >= 4

@@ -18,7 +18,7 @@ from torch.nn.functional import avg_pool2d, conv2d, grid_sample
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.source import open_source
 from dejavu_torch.motion.ground_plane import TRAPEZIUM, ground_patch
-from dejavu_torch.motion.odometry import GroundOdometry, interpolated
+from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse
 
 PATCH, AHEAD = 96, 200  # pixels of ground: the patch, and where the drive begins
@@ -134,23 +134,6 @@ def test_a_region_of_ground_becomes_even():
         torch.testing.assert_close(patch[1:-1, 1:-1], even[1:-1, 1:-1], rtol=0, atol=0.003)
 
 
-def test_the_corner_of_the_frame_may_lie_on_the_horizon():
-    """A straight line across the frame stays one, in the row where the region has it."""
-    for far in (0.4, 0.45):
-        frames = torch.zeros(1, 1, 101, 101)
-        frames[..., int(100 * (far + 0.4)) - 2 :, :] = 1
-        patch = ground_patch(frames, ((0.25, far), (0.75, far), (1, far + 0.4), (0, far + 0.4)), (48, 48))
-        assert patch.isfinite().all()
-        assert patch[..., -1, 4:-4].min() > 0.9
-        assert patch[..., :40, :].max() < 0.1
-
-
-def test_colours_become_grey():
-    frames = torch.rand(2, 3, 60, 80)
-    grey = (frames * torch.tensor([0.299, 0.587, 0.114]).view(1, 3, 1, 1)).sum(1, keepdim=True)
-    torch.testing.assert_close(ground_patch(frames), ground_patch(grey))
-
-
 # --- the shift between two patches
 
 
@@ -173,21 +156,6 @@ def test_a_known_shift(shift, sway, gain, offset, seed):
     found, confidence = shift_between(*noisy)
     assert found.item() == pytest.approx(tenths / 10, abs=0.1)
     assert confidence.item() > 0.6
-
-
-def test_patches_of_any_size():
-    for height, width in ((33, 32), (97, 71), (64, 128)):
-        world = torch.rand(3, 1, height + 9, width)
-        shift, confidence = shift_between(world[:, :, 9:], world[:, :, :-9])
-        torch.testing.assert_close(shift, torch.full((3,), 9.0), rtol=0, atol=0.1)
-        assert confidence.min() > 0.7
-
-
-def test_the_way_back_is_the_negative():
-    patches = ground_patch(journey().values)
-    there, back = shift_between(patches[:-1], patches[1:]), shift_between(patches[1:], patches[:-1])
-    torch.testing.assert_close(there[0], -back[0], rtol=0, atol=0.1)
-    torch.testing.assert_close(there[1], back[1], rtol=0, atol=0.02)
 
 
 def test_confidence_tells_the_same_ground_from_another():
@@ -263,26 +231,6 @@ def test_a_drop_out_gets_its_neighbours_velocity(caplog):
     assert path_error(measured.distance, position) < 0.01
 
 
-@pytest.mark.parametrize(
-    ("lost", "told"),
-    [
-        ([0, 40, 41, 98, 99], "frames 0 to 1, 40 to 42, 98 to 100 (5 of 100 steps)"),
-        ([*range(0, 28, 4)], "0 to 1, 4 to 5, 8 to 9, 12 to 13, 16 to 17, 20 to 21 and 1 more (7 of 100"),
-    ],
-)
-def test_segments_without_ground_are_named(lost, told, caplog):
-    valid = torch.ones(100, dtype=torch.bool)
-    valid[lost] = False
-    speed = torch.linspace(3, 4, 100, dtype=torch.float64)
-    shift = interpolated(torch.where(valid, speed, 77.0), valid, "clip.mp4")
-    ends = int(valid.nonzero()[0]), int(valid.nonzero()[-1])
-    torch.testing.assert_close(shift, speed.clamp(speed[ends[0]], speed[ends[1]]))
-    (message,) = caplog.messages
-    assert message.startswith("clip.mp4: ")
-    assert told in message
-    assert "\n" not in message
-
-
 SIDEWAYS = ((0.1, 0.9), (0.1, 0.2), (0.9, 0.2), (0.9, 0.9))  # its rows run along the frame
 
 
@@ -351,28 +299,6 @@ def test_a_camera_that_looks_back():
     assert even.frame[0] == 0
 
 
-@pytest.mark.parametrize("step", [1.5, 14.0])
-def test_any_batch_size_any_number_of_times(step):
-    even = ResampledTraverse(short(), GroundOdometry(step=step))
-    frames = all_of(even, 100)
-    for size in (1, 2, 5, 12):
-        batches = list(even.batches(size))
-        assert max(len(batch) for batch in batches) <= size
-        assert torch.equal(torch.cat(batches), frames)
-    for start, stop in ((0, 1), (3, 9), (len(frames) - 2, len(frames) + 9)):
-        assert torch.equal(even[start:stop], frames[start:stop])
-    assert len(even[len(frames) : len(frames) + 5]) == 0
-
-
-def test_few_frames_are_in_memory(largest_tensor):
-    traverse = journey()
-    with largest_tensor() as seen:
-        even = ResampledTraverse(traverse, GroundOdometry(step=8.0), batch_size=4)
-        for _ in even.batches(4):
-            pass
-    assert seen.numel < traverse.values.numel() / 8
-
-
 # --- what is refused
 
 
@@ -426,13 +352,3 @@ def test_a_car_on_a_motorway(data_dir):
     assert speed.std() < 0.1 * speed.mean()
     over_a_second = speed.unfold(0, 25, 1).mean(1)
     assert over_a_second.max() < 1.1 * over_a_second.min()
-
-
-def test_a_small_car_that_sways(data_dir):
-    """Coarse frames of a road almost without texture: a wide region sees it drive on, lap after lap."""
-    car = open_source(f"{data_dir}/rc_car_laps/frames?start=194&stop=983")
-    wide = ((0.2, 0.5), (0.8, 0.5), (1.0, 0.95), (0.0, 0.95))
-    measured = GroundOdometry(wide, (48, 48)).distances(car)
-    assert (measured.confidence > 0.4).double().mean() > 0.95
-    laps = measured.distance[[0, 396, 788]].diff()
-    assert laps.min() > 0.75 * laps.max()

@@ -64,13 +64,6 @@ def test_a_single_frame_and_ready_features_are_queries_as_they_are(model):
     assert model.localize(features).index.tolist() == [50, 50]
 
 
-def test_a_resampled_traverse_stays_as_it_is(model):
-    even = model.resample(ArrayTraverse(footage(QUERY)), model.step)
-    assert model.resample(even, model.step) is even
-    traverse = ArrayTraverse(footage(QUERY))
-    assert DejaVu().resample(traverse) is traverse
-
-
 def test_the_file_keeps_the_step_and_the_table(model, tmp_path):
     model.save(tmp_path / "map.safetensors")
     again = DejaVu.load(tmp_path / "map.safetensors")
@@ -101,26 +94,6 @@ def test_positions_come_on_top_of_the_budget_of_a_map():
 
 
 # frames and places
-
-
-def test_the_map_has_the_table_of_the_traverse(model):
-    even = ResampledTraverse(ArrayTraverse(footage(REFERENCE)), camera())
-    frames = torch.arange(len(REFERENCE))
-    assert torch.equal(model.map.positions, even.positions)
-    assert torch.equal(model.map.frame_of(torch.arange(101)), even.frame)
-    assert torch.equal(model.map.table.borders[:-1], even.frame)
-    assert int(model.map.table.borders[-1]) == len(REFERENCE)
-    assert torch.equal(model.map.place_of(frames), place_of(even.positions, frames))
-
-
-def test_places_that_show_the_same_frame_are_one():
-    """16 pixels a frame at a pixel a step: each frame is shown at 16 places."""
-    even = resampled((16, 12), step=1.0)
-    for frame in (5, 0):
-        shows = (even.frame == frame).nonzero()[:, 0]
-        assert 7 <= len(shows) <= 18
-        assert len(place_of(even.positions, even.frame[shows]).unique()) == 1
-        assert shows.min() <= int(place_of(even.positions, torch.tensor(frame))) <= shows.max()
 
 
 def test_the_way_back_belongs_to_the_places_it_passes():
@@ -168,12 +141,3 @@ def test_ground_that_moves_to_and_fro_is_told(caplog):
     with caplog.at_level("WARNING", "dejavu_torch"):
         resampled(*[(4, 2), (-4, 1)] * 10, begin=100)
     assert any("20 of 30 steps go forward and 10 backwards" in line for line in caplog.messages)
-
-
-def test_nan_is_told_by_the_frame_of_the_source():
-    frames = footage(REFERENCE)
-    even = ResampledTraverse(ArrayTraverse(frames), camera())
-    frames[30, :, :3, :3] = torch.nan
-    even.traverse = ArrayTraverse(frames)
-    with refused("frame 30", "NaN"):
-        template_model(velocity=camera()).learn(even)

@@ -119,17 +119,15 @@ def assert_same_scores(task, model):
 
 
 class Stop(Callback):
-    """Saves a checkpoint after some steps, and ends the training, by an exception where one is given."""
+    """Saves a checkpoint after some steps, and ends the training."""
 
-    def __init__(self, steps: int, path: Path | None = None, exception: BaseException | None = None) -> None:
-        self.steps, self.path, self.exception = steps, path, exception
+    def __init__(self, steps: int, path: Path | None = None) -> None:
+        self.steps, self.path = steps, path
 
     def on_train_batch_end(self, trainer, *_):
         if trainer.global_step == self.steps:
             if self.path is not None:
                 trainer.save_checkpoint(self.path)
-            if self.exception is not None:
-                raise self.exception
             trainer.should_stop = True
 
 
@@ -150,7 +148,6 @@ data: {source: one.npy, batch_size: 20, tolerance: 2}
 trainer: {max_steps: 4, accelerator: cpu, enable_progress_bar: false, default_root_dir: run}
 """
 MINE = """
-import torch
 from torch import nn
 
 class Plain(nn.Module):
@@ -171,17 +168,6 @@ class Hungry(Plain):
         if self.calls > 2:
             raise MemoryError
         return super().forward(frames)
-
-class Masked(Plain):
-    def __init__(self) -> None:
-        super().__init__()
-        self.linear = nn.Sequential(nn.LazyBatchNorm1d(), nn.LazyLinear(8))
-        self.register_buffer("mask", torch.full((4, 4), -torch.inf).triu(1))
-        self.register_buffer("wide", torch.ones(1, 4).expand(4, 4))
-    def get_extra_state(self):
-        return {"best": -torch.inf, "seen": torch.ones(2)}
-    def set_extra_state(self, state):
-        assert state["best"] == -torch.inf
 
 class Interrupted(Plain):
     def forward(self, frames):

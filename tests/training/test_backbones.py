@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 import torch
 from helpers import refused
-from kornia.feature import TFeat
 from small_training import (
     FRAMES,
     backbone,
@@ -14,7 +13,6 @@ from small_training import (
     footage,
     new_task,
     recall,
-    still,
     trainer,
     warned,
 )
@@ -22,8 +20,7 @@ from torch import nn
 
 from dejavu_torch import HOG, DejaVu
 from dejavu_torch.features.cnn import SmallCNN
-from dejavu_torch.features.embedding import Embedding
-from dejavu_torch.training.task import freeze_parts, start_from
+from dejavu_torch.training.task import freeze_parts
 
 RUNNING = ("running_mean", "running_var", "num_batches_tracked")
 
@@ -39,14 +36,6 @@ def changed(tmp_path, module, **settings):
 
 def trained(task):
     return {name for name, parameter in task.named_parameters() if parameter.requires_grad}
-
-
-def test_frozen_wholly_it_stays_as_it_was(tmp_path):
-    start = fit(tmp_path, new_task(backbone=(module := backbone()), freeze=[""], lr=1e-12), data_of())
-    names, task = changed(tmp_path, module, freeze=[""])
-    assert names == set()
-    assert not torch.allclose(task.dejavu.map.templates, start.map.templates, atol=1e-3)
-    assert trained(task) == {"log_temperature", "dejavu.map.templates"}
 
 
 def normed():
@@ -81,34 +70,6 @@ def test_a_prefix_of_nothing_is_refused():
         new_task(freeze=["linear", "nix"])
     with refused("''", "HOG", "it has none"):
         freeze_parts(HOG(), [""], "train")
-
-
-def test_a_map_gives_a_backbone_to_start_from(tmp_path):
-    first, path = new_task(weight_bits=32), tmp_path / "map.safetensors"
-    fit(tmp_path, first, data_of())
-    start_from(module := backbone(), path)
-    own = first.dejavu.features.state_dict()
-    assert all(torch.equal(value, own[name]) for name, value in module.state_dict().items())
-    with refused("map.safetensors holds weights of", "SmallCNN", "expected those of the same"):
-        start_from(backbone(9), path)
-    with refused("gone is not there"):
-        start_from(module, tmp_path / "gone")
-
-
-def test_a_foreign_network_learns(tmp_path):
-    """Two trainings of a step and of many, whose maps take its weights along."""
-    noisy, found = footage(0.1), []
-    for lr, steps in ((1e-9, 1), (3e-3, 60)):
-        torch.manual_seed(0)
-        module, own = (Embedding(TFeat(pretrained=False), 8, channels=1, resize=(32, 32)) for _ in range(2))
-        task = new_task(backbone=module, lr=lr)
-        trainer(tmp_path, max_steps=steps).fit(task, data_of(augmentation=still(noise=0.2)))
-        model = DejaVu.load(tmp_path / "map.safetensors", own)
-        torch.testing.assert_close(model.eval()(noisy[:4, None] / 255), task.eval()(noisy[:4, None] / 255))
-        found.append(recall(model, noisy))
-    assert found[1] > max(0.4, found[0] + 0.15), found
-    with refused("only the caller can load", "`features`"):
-        DejaVu.load(tmp_path / "map.safetensors")
 
 
 def test_hog_has_nothing_to_train_but_the_map_is(tmp_path):

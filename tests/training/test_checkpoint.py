@@ -1,14 +1,15 @@
-"""Checkpoints: what a run goes on from, what is refused, and files that run no code and are written whole."""
+"""Checkpoints: what a run goes on from, what is refused, files that run no code, and maps without one."""
 
 from __future__ import annotations
 
-import resource
 from pathlib import Path
 
 import pytest
 import torch
 from command_line import fails
 from helpers import refused
+from pytorch_lightning import Callback
+from pytorch_lightning.callbacks import ModelCheckpoint
 from small_training import (
     FRAMES,
     Stop,
@@ -22,10 +23,10 @@ from small_training import (
     new_descriptor,
     new_task,
     trainer,
+    warned,
 )
-from torch import Tensor
 
-from dejavu_torch import DejaVu, ImposedPeriods, SpectralMapper
+from dejavu_torch import DejaVu, ImposedPeriods
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.training.checkpoint import read_checkpoint
 
@@ -63,27 +64,6 @@ def test_a_resumed_run_takes_the_steps_that_are_left(tmp_path, parts, kind):
     model = DejaVu.load(tmp_path / "map.safetensors")
     assert model.trained is not None
     assert (model.trained.steps, model.map.places) == (STEPS, FRAMES)
-
-
-def test_what_a_checkpoint_holds_is_taken_over(tmp_path, parts):
-    for kind in ("templates", "code"):
-        task = KINDS[kind]()
-        trainer(tmp_path).validate(task, data_of(), ckpt_path=parts[kind], verbose=False)
-        state, own = torch.load(parts[kind], weights_only=True)["state_dict"], task.state_dict()
-        assert all(torch.equal(own[n], value) for n, value in state.items() if isinstance(value, Tensor))
-
-
-def test_a_spectral_checkpoint_has_no_map_and_validating_it_makes_one(tmp_path, parts):
-    state = torch.load(parts["spectral"], weights_only=True)["state_dict"]
-    assert not [name for name in state if "dejavu.map" in name or "whitening" in name]
-    task = new_descriptor(mapper=SpectralMapper(6.0))  # this run's budget
-    noisy = data_of(validation=ArrayTraverse(footage(0.05)), validation_truth="0")
-    (figures,) = trainer(tmp_path).validate(task, noisy, ckpt_path=parts["spectral"], verbose=False)
-    assert figures["val/recall_at_1"] > 0.5
-    route = task.deployed()
-    assert route.trained is not None
-    assert route.trained.steps == 4
-    assert 5.8 < route.summary().route_bytes / FRAMES <= 6
 
 
 # refusals ------------------------------------------------------------------------------------------------
@@ -154,8 +134,6 @@ def test_a_pickle_runs_nothing_whatever_the_config_says(folder, parts, tmp_path,
     ("make", "facts"),
     [
         (lambda path, _: None, ["is not there"]),
-        (lambda path, _: path.mkdir(), ["is a folder"]),
-        (lambda path, _: path.write_text("no checkpoint"), ["cannot be read"]),
         (lambda path, good: path.write_bytes(good[: len(good) // 2]), ["cannot be read"]),
         (lambda path, _: torch.save([1, 2], path), ["cannot be read"]),
         (lambda path, _: torch.save({"epoch": 1}, path), ["has no global_step"]),
@@ -167,14 +145,23 @@ def test_what_is_no_checkpoint(tmp_path, parts, make, facts):
         read_checkpoint(tmp_path / "bad.ckpt")
 
 
-def test_a_full_disk_leaves_the_checkpoint_of_before(tmp_path):
-    trainer(tmp_path, last(tmp_path)).fit(new_task(), data_of())
-    path = tmp_path / "checkpoints" / "last.ckpt"
-    before, limits = path.read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
-    try:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) // 2, limits[1]))
-        with refused("checkpoints"):
-            trainer(tmp_path, last(tmp_path), max_steps=6).fit(new_task(), data_of())
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert path.read_bytes() == before
+class Tidy(Callback):
+    """Deletes the best checkpoint."""
+
+    def on_train_end(self, trainer, pl_module):
+        Path(trainer.checkpoint_callbacks[0].best_model_path).unlink()  # type: ignore[attr-defined]
+
+
+def test_what_leaves_no_map_or_another_than_expected_warns(tmp_path, caplog):
+    trainer(tmp_path, limit_train_batches=0).fit(new_task(), data_of())
+    assert warned(caplog) == ["no training step was made: no map is written"]
+    assert not (tmp_path / "map.safetensors").exists()
+    caplog.clear()
+    best, task = ModelCheckpoint(tmp_path, monitor="val/auc_augmented", mode="max"), new_task()
+    trainer(tmp_path, best, Tidy(), last(tmp_path)).fit(task, data_of())
+    assert warned(caplog) == [f"{best.best_model_path} is gone: the map is from the last step"]
+    caplog.clear()
+    trainer(tmp_path).fit(new_task(), data_of(), ckpt_path=tmp_path / "checkpoints" / "last.ckpt")
+    (line,) = warned(caplog)
+    assert line.startswith("nothing was trained: step 4 is already reached")
+    assert torch.equal(DejaVu.load(tmp_path / "map.safetensors").map.templates, task.route.templates)

@@ -53,21 +53,6 @@ def test_a_stretch_is_as_long_as_frames_stay_alike(step, noise, expected):
     assert similar_span(stored(stop), [260], 5) == expected
 
 
-def test_what_a_route_always_shows_is_no_likeness():
-    below, other = torch.rand(2, 1, 32, 64, generator=torch.Generator().manual_seed(1))
-    routes = [slid(80, 60, seed=seed) for seed in (2, 3)]
-    routes[0][:, :, 32:], routes[1][:, :, 32:] = below, other
-    assert similar_span(stored(*routes), [60, 60], 5) == 1
-    assert similar_span(stored(slid(1)[:60], *routes), [60, 60, 60], 5) == 1  # not the first route alone
-
-
-def test_frames_too_small_for_hog_have_stretches_of_the_tolerance():
-    small = StoredFrames(
-        [torch.zeros(9, 1, 4, 4, dtype=torch.uint8)], as_ground_truth(torch.arange(9)[:, None])
-    )
-    assert similar_span(small, [9], 5) == 5
-
-
 def test_places_are_right_within_a_stretch(tmp_path, caplog):
     task = new_descriptor(backbone=backbone(), mapper=SpectralMapper(6.0))
     fit(tmp_path, task, data_of(slid(80), tolerance=5), max_steps=1)

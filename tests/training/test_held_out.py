@@ -2,37 +2,30 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-
-import numpy as np
 import pytest
 import torch
-from command_line import fails
 from small_training import (
-    DESCRIPTOR,
     backbone,
     data_of,
     footage,
     last,
     new_descriptor,
     new_task,
-    train,
     trainer,
     warned,
 )
 
-from dejavu_torch import DejaVu, Preprocess, RouteData, SpectralMapper
+from dejavu_torch import DejaVu, RouteData, SpectralMapper
 from dejavu_torch.cli.train import MapTrainer
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.features.views import SEGMENT
 from dejavu_torch.training import export
-from dejavu_torch.training.export import UNTRAINED, compare_with_untrained
+from dejavu_torch.training.export import compare_with_untrained
 
 FRAMES = 320
 MADE = {"mapper": SpectralMapper(6.0), "whitening": "none"}  # a descriptor and its map
 SHORT = {"max_steps": 2, "limit_val_batches": 0}
-CALIBRATE = DejaVu.calibrate  # which conftest.py patches away
 
 
 def long(**settings):
@@ -123,26 +116,6 @@ def test_what_the_checkpoint_s_training_saw_does_not_calibrate(tmp_path, caplog,
     assert len([line for line in warned(caplog) if "not calibrated" in line]) == len(first)
 
 
-def test_at_the_end_the_map_is_calibrated_and_set_beside_the_untrained_one(
-    folder, tmp_path, capsys, monkeypatch
-):
-    """At another size than the reference's, with a backbone that takes no other."""
-    monkeypatch.setattr(DejaVu, "calibrate", CALIBRATE)
-    monkeypatch.setattr("dejavu_torch.features.views.FEWEST", 40)
-    np.save(tmp_path / "long.npy", footage(frames=FRAMES, side=32).numpy())
-    words = ["--data.source", tmp_path / "long.npy", "--trainer.max_steps=2", "--trainer.limit_val_batches=0"]
-    words += ["--data.resize", "[16,16]", *DESCRIPTOR, "--model.backbone", "mine.Plain"]
-    words += ["--model.whitening", "none", "--model.mapper.route_bytes_per_place", 8]
-    train("fit", *words, "--trainer.default_root_dir", tmp_path / "run")
-    said = capsys.readouterr().out
-    assert "segments that training never saw" in said
-    rows = [line.split("AUC")[0].strip() for line in said.splitlines() if "recall@1" in line]
-    assert rows == ["the trained map", "HOG of all frames", "the untrained map"]
-    model = DejaVu.load(tmp_path / "run" / "map.safetensors", import_module("mine").Plain())
-    assert model.frame_shape == (1, 16, 16)
-    assert model.calibration is not None
-
-
 def test_a_calibration_that_fails_loses_no_training(tmp_path, monkeypatch):
     def failing(*_):
         raise RuntimeError("shapes cannot be multiplied")
@@ -151,17 +124,6 @@ def test_a_calibration_that_fails_loses_no_training(tmp_path, monkeypatch):
     with pytest.raises(RuntimeError, match="shapes"):
         trainer(tmp_path, **SHORT).fit(new_descriptor(backbone=backbone(), **MADE), long())
     assert DejaVu.load(tmp_path / "map.safetensors").map.places == FRAMES
-
-
-@pytest.mark.parametrize("size", [None, 160])
-def test_the_untrained_map_is_of_frames_of_the_queries_size(caplog, size):
-    """Of raw frames as `data.resize` leaves them, above what a map reduces them to by default."""
-    reference, query = (ArrayTraverse(footage(noise, 24, 176)) for noise in (0.0, 0.1))
-    model = DejaVu(backbone(), mapper=SpectralMapper(6.0), preprocess=Preprocess(size=size))
-    model.learn(ArrayTraverse(footage(0.0, 24, 32)))
-    scores = compare_with_untrained(model, reference, query, as_ground_truth(torch.arange(24)[:, None]), 2)
-    assert UNTRAINED in scores
-    assert len([line for line in warned(caplog) if "resized to" in line]) == (size is not None)
 
 
 @pytest.mark.parametrize("settings", [{"hold": 0.9}, {"step": 1.0}])
@@ -188,13 +150,6 @@ def test_a_short_route_is_told_before_the_training(tmp_path, caplog):
     (line,) = warned(caplog)
     assert all(fact in line for fact in ("40 frames, fewer than 300", "dejavu learn", "data.validation"))
     assert DejaVu.load(tmp_path / "map.safetensors").calibration is None
-
-
-def test_too_few_bytes_are_told_before_the_training(folder, tmp_path, capfd):
-    words = ["--config", "train.yaml", *DESCRIPTOR, "--model.mapper.route_bytes_per_place", "0.3"]
-    words += ["--trainer.default_root_dir", tmp_path / "run"]
-    assert "route_bytes_per_place is 0.3; expected more than" in fails(capfd, "train", "fit", *words)
-    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("channels", [1, 3])

@@ -79,19 +79,6 @@ def test_gradients_of_the_place_loss_reach_scores_and_temperature():
     assert torch.autograd.gradcheck(loss, (scores, temperature))
 
 
-@pytest.mark.parametrize("scores", [torch.full((2, 5), INF), torch.rand(2, 5), torch.rand(0, 5)])
-def test_where_no_place_counts_the_loss_and_its_gradients_are_0(scores):
-    places = torch.full((len(scores), 3), 0 if scores.isinf().any() else -1)
-    temperature = torch.tensor(0.5, requires_grad=True)
-    scores = scores.clone().requires_grad_()
-    loss, left_out = place_cross_entropy(scores, places, 1, temperature)
-    loss.backward()
-    assert (loss.item(), left_out) == (0, len(scores))
-    for leaf in (scores, temperature):
-        assert leaf.grad is not None
-        assert (leaf.grad == 0).all()
-
-
 def test_half_scores_are_summed_in_single_precision():
     scores = torch.rand(4, 3000).half()
     loss = place_cross_entropy(scores, torch.arange(4)[:, None], 0, 0.01).loss

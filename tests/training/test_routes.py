@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ import torch
 from command_line import fails, run, write_images
 from helpers import refused
 from small_training import CONFIG, Stop, backbone, data_of, footage, recall, trainer
-from torch import Tensor, nn
+from torch import nn
 
 from dejavu_torch import DejaVu, RouteData, SpectralMapper, open_source
 from dejavu_torch.data.arrays import ArrayTraverse
@@ -232,21 +231,6 @@ def test_a_folder_of_folders_is_a_route_each(tmp_path):
         assert routes_of(whole) == [whole]
 
 
-def test_what_is_printed_leads_to_a_map(capsys, tmp_path):
-    out = str(tmp_path / "run")
-    run(*FIT, "[photos/day9,third.npy]", "--trainer.default_root_dir", out)
-    line = capsys.readouterr().out.splitlines()[-1]
-    made = f"dejavu learn ROUTE --descriptor {out}/descriptor.safetensors --map route.safetensors"
-    assert line == f"next: {made}"
-    given = {"ROUTE": "photos/day10", "route.safetensors": str(tmp_path / "m.safetensors")}
-    words = [given.get(word, word) for word in shlex.split(line.removeprefix("next: dejavu "))]
-    run(*words, "--mapper.route_bytes_per_place", "20")
-    model = DejaVu.load(tmp_path / "m.safetensors")
-    own, base = model.features.state_dict(), DejaVu.load(Path(out) / "descriptor.safetensors").features
-    assert all(torch.equal(own[name], value) for name, value in base.state_dict().items())
-    assert model.map.places == LENGTHS[1]
-
-
 def test_info_says_what_it_is(capsys):
     run("info", WEIGHTS)
     told = capsys.readouterr().out
@@ -254,15 +238,6 @@ def test_info_says_what_it_is(capsys):
     assert [
         one for one in ("without a map", "SmallCNN", "trained for 4 steps", hint) if one not in told
     ] == []
-
-
-def test_compare_learns_with_a_descriptor_of_a_map_as_well(tmp_path):
-    bytes_ = ("--mapper.route_bytes_per_place", "20")
-    run("learn", "third.npy", "--map", tmp_path / "m.safetensors", "--descriptor", WEIGHTS, *bytes_)
-    for name, given in (("base", WEIGHTS), ("map", tmp_path / "m.safetensors")):
-        run("compare", "third.npy", "third.npy", "--descriptor", given, *bytes_, "--out", tmp_path / name)
-    states = [DejaVu.load(tmp_path / name / "map.safetensors").state_dict() for name in ("base", "map")]
-    assert all(torch.equal(v, states[1][n]) for n, v in states[0].items() if isinstance(v, Tensor))
 
 
 LEARN = ["learn", "third.npy", "--map", "new.safetensors", "--descriptor", WEIGHTS]

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 import torch
 from footage import QUERY, REFERENCE, STEP, camera
 from footage import footage as ground
 from helpers import Fixed, refused
-from pytorch_lightning import Callback
 from small_training import (
     FRAMES,
     assert_same_scores,
@@ -150,62 +147,31 @@ def test_frames_are_resized_when_they_are_stored(tmp_path, settings, resize, sto
 # figures -------------------------------------------------------------------------------------------------
 
 
-def assert_figures(running, task, noisy, truth="0"):
-    """The figures of a test are those of `evaluate` on the map in the trainer's folder."""
-    data = data_of(query=ArrayTraverse(noisy), truth=truth)
-    (figures,) = running.test(task, data, verbose=False)
-    match = DejaVu.load(Path(running.default_root_dir) / "map.safetensors").localize(ArrayTraverse(noisy))
-    known = find_ground_truth(truth, None, None, FRAMES, FRAMES)
+@pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
+def test_the_figures_are_those_of_evaluate_on_the_map(tmp_path, precision):
+    """Also of queries without a right place, or of which nothing is known."""
+    rows = [f"{i},{i},{i // 2}" if i % 3 else f"{i}" for i in range(30)]
+    truth = tmp_path / "truth.csv"
+    truth.write_text("\n".join(rows) + "\n")
+    running, task, noisy = trainer(tmp_path, precision=precision), new_task(), ArrayTraverse(footage(0.2))
+    running.fit(task, data_of())
+    (figures,) = running.test(task, data_of(query=noisy, truth=str(truth)), verbose=False)
+    match = DejaVu.load(tmp_path / "map.safetensors").localize(noisy)
+    known = find_ground_truth(str(truth), None, None, FRAMES, FRAMES)
     assert known is not None
     expected = evaluate(match, known, tolerance=2)._asdict()
     assert figures == pytest.approx({f"test/{name}": value for name, value in expected.items()}, abs=1e-6)
 
 
-def test_the_figures_are_those_of_evaluate_on_the_map(tmp_path):
-    """Also of queries without a right place, or of which nothing is known."""
-    rows = [f"{i},{i},{i // 2}" if i % 3 else f"{i}" for i in range(30)]
-    (tmp_path / "truth.csv").write_text("\n".join(rows) + "\n")
-    running, task = trainer(tmp_path), new_task()
-    running.fit(task, data_of())
-    assert_figures(running, task, footage(0.2), str(tmp_path / "truth.csv"))
-
-
-def test_figures_are_made_in_32_bits(tmp_path):
-    running, task = trainer(tmp_path, precision="bf16-mixed", max_steps=30), new_task()
-    running.fit(task, data_of())
-    assert_figures(running, task, footage(0.2))
-
-
-def test_without_training_the_phase_means_are_evaluated(tmp_path):
-    """Of the augmented reference the figures are called so."""
-    running, task = trainer(tmp_path), new_task()
-    given = {"validation": ArrayTraverse(footage(0.2)), "validation_truth": "0"}
-    (figures,) = running.validate(task, data_of(**given), verbose=False)
-    assert {"val/auc", "val/recall_at_1"} < set(figures)
-    (figures,) = running.validate(task, data_of(), verbose=False)
-    assert {"val/auc_augmented", "val/recall_at_1_augmented"} < set(figures)
-    assert all(name.endswith("_augmented") for name in figures)
-    task.deployed().save(tmp_path / "map.safetensors")
-    assert_figures(running, task, footage(0.2))
-    trainer(tmp_path).fit(task, data_of())  # and it can be trained all the same
-
-
-class Rates(Callback):
-    """The learning rate of each step, beside that of the task."""
-
-    def __init__(self) -> None:
-        self.seen = []
-
-    def on_before_optimizer_step(self, trainer, pl_module, optimizer):
-        self.seen.append(optimizer.param_groups[0]["lr"] / pl_module.lr)
-        decays = {id(p): group["weight_decay"] for group in optimizer.param_groups for p in group["params"]}
-        assert decays == {id(p): 0.3 if p.ndim > 1 else 0 for p in pl_module.parameters()}
-
-
-@pytest.mark.parametrize("steps", [20, 1])
-def test_the_rate_rises_over_a_tenth_and_falls_to_0(tmp_path, steps):
+def test_the_rate_rises_over_a_tenth_and_falls_to_0(tmp_path):
     """And only what is multiplied decays."""
-    rates, task = Rates(), new_task(weight_decay=0.3)
-    running = trainer(tmp_path, rates, max_steps=steps, enable_checkpointing=False, limit_val_batches=0)
-    running.fit(task, data_of())
-    assert rates.seen == pytest.approx(heights(steps))
+    task, seen = new_task(weight_decay=0.3), []
+
+    def noted(optimizer):
+        seen.append(optimizer.param_groups[0]["lr"] / task.lr)
+        decays = {id(p): group["weight_decay"] for group in optimizer.param_groups for p in group["params"]}
+        assert decays == {id(p): 0.3 if p.ndim > 1 else 0 for p in task.parameters()}
+
+    task.on_before_optimizer_step = noted  # type: ignore[method-assign]
+    trainer(tmp_path, max_steps=20, limit_val_batches=0).fit(task, data_of())
+    assert seen == pytest.approx(heights(20))

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import csv
 import shlex
-import shutil
 import signal
-import sys
 from functools import wraps
 from importlib import import_module
 
@@ -16,13 +14,12 @@ import torch
 import yaml
 from command_line import fails, run
 from pytorch_lightning import Trainer
-from small_training import CONFIG, DESCRIPTOR, FRAMES, MINE, footage, train, warned
+from small_training import CONFIG, DESCRIPTOR, FRAMES, footage, train, warned
 
 from dejavu_torch import DejaVu, TemplateMap
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.features.cnn import SmallCNN
-from dejavu_torch.maps.file import read_map
 from dejavu_torch.maps.spectral_map import SpectralMap
 
 
@@ -93,11 +90,7 @@ def test_options_of_our_own_parts_need_no_class_name(folder, tmp_path):
         "trainer: {max_steps: 2, accelerator: cpu, enable_progress_bar: false, devices: auto}\n"
     )
     options = ["--model.mapper.periods.periods", "[11,12,13,17]", "--data.augmentation.rotation", 0]
-    options += [
-        "--model.mapper.reduction=sum",
-        "--model.preprocess.contrast=patch",
-        "--model.losses.phase=.5",
-    ]
+    options += ["--model.mapper.reduction=sum", "--model.preprocess.contrast=patch"]
     options += ["--trainer.default_root_dir", tmp_path, "--trainer.log_every_n_steps", 1]
     options += ["--model.losses.phase", 0.5]
     train("fit", *options, config=str(tmp_path / "short.yaml"))
@@ -114,19 +107,6 @@ def test_options_of_our_own_parts_need_no_class_name(folder, tmp_path):
     seen = figures(tmp_path)
     expected = np.array(seen["train/place"]) + 0.5 * np.array(seen["train/phase"])
     np.testing.assert_allclose(seen["train/loss"], expected, rtol=1e-4)
-
-
-def test_a_class_in_the_current_folder_is_found(tmp_path, monkeypatch):
-    """As by the console command, whose first path is that of its script."""
-    np.save(tmp_path / "one.npy", footage().numpy())
-    (tmp_path / "own_classes.py").write_text(MINE)
-    (tmp_path / "train.yaml").write_text(CONFIG)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", [path for path in sys.path if path not in ("", str(tmp_path))])
-    train("fit", "--model.backbone", "own_classes.Plain", "--trainer.enable_checkpointing", "false")
-    assert "own_classes.Plain" in str(read_map(tmp_path / "run" / "map.safetensors")[1]["features"])
-    assert not list(tmp_path.rglob("*.ckpt"))  # which can be switched off
-    del sys.modules["own_classes"]
 
 
 def test_a_users_own_checkpoints_decide_which_is_the_map(folder, tmp_path):
@@ -152,19 +132,6 @@ trainer:
     assert checkpoint["epoch"] == 0  # stopped at the first
 
 
-def test_export_makes_a_map_of_a_checkpoint(folder, tmp_path, capsys):
-    """With the config that the fit has left."""
-    last = folder / "run" / "checkpoints" / "last.ckpt"
-    config = str(folder / "run" / "lightning_logs" / "version_0" / "config.yaml")
-    train("export", "--ckpt_path", last, "--trainer.default_root_dir", tmp_path / "new", config=config)
-    written = DejaVu.load(tmp_path / "new" / "map.safetensors")
-    frames = torch.rand(2, 1, 16, 16)
-    assert torch.equal(written(frames), DejaVu.load(folder / "run" / "map.safetensors")(frames))
-    assert written.trained is not None
-    assert written.trained.steps == 4
-    assert f"--map {tmp_path}/new/map.safetensors" in capsys.readouterr().out
-
-
 def test_a_spectral_map_whatever_mapper_a_preset_has(folder, tmp_path, capfd, caplog):
     chosen = [*DESCRIPTOR, "--model.mapper.route_bytes_per_place", 12]
     train("fit", *chosen, "--trainer.default_root_dir", tmp_path / "fit")
@@ -181,27 +148,6 @@ def test_a_spectral_map_whatever_mapper_a_preset_has(folder, tmp_path, capfd, ca
     assert [model.calibration is not None for model in maps] == [False, True, True]
     assert torch.equal(maps[0].map.streams, maps[1].map.streams)  # type: ignore[arg-type]
     assert len(maps[2].map.level) < len(maps[1].map.level)  # type: ignore[arg-type]
-
-
-def test_a_preset_by_name_and_options_that_have_the_last_word(tmp_path):
-    options = ["--trainer.max_steps=2", "--data.source=sim:aerial?frames=40", "--trainer.accelerator=cpu"]
-    options += ["--trainer.precision", "32-true", "--trainer.default_root_dir", str(tmp_path)]
-    run("train", "fit", *options, "--config", "train_road")
-    model = DejaVu.load(tmp_path / "map.safetensors")
-    assert model.trained is not None
-    assert model.trained.steps == 2
-    assert model.features.squeeze == 24
-
-
-def test_help_has_our_options_first(capsys):
-    with pytest.raises(SystemExit) as stop:
-        run("train", "fit", "--help")
-    assert stop.value.code == 0
-    usage, _, options = capsys.readouterr().out.partition("options:")
-    assert usage.startswith("usage: dejavu train ")
-    expected = ("--model.help", "--data.second_truth", "--trainer.max_steps")
-    places = [options.index(word) for word in expected]
-    assert places == sorted(places)
 
 
 # what it says --------------------------------------------------------------------------------------------
@@ -227,16 +173,12 @@ def test_a_normal_run_prints_its_map_and_what_to_do_next(
     assert [str(w.message) for w in recwarn if not issubclass(w.category, DeprecationWarning)] == []
 
 
-@pytest.mark.parametrize(
-    "option", [("--data.validation_truth", "0", "--data.validation"), ("--data.truth", "0", "--data.query")]
-)
-def test_a_second_traverse_shows_a_trained_map_beside_untrained_ones(
-    folder, tmp_path, caplog, capsys, option
-):
+def test_a_second_traverse_shows_a_trained_map_beside_untrained_ones(folder, tmp_path, caplog, capsys):
     """Two steps of a tiny rate teach nothing, so that HOG is better, and is said to be."""
     np.save(tmp_path / "first.npy", footage(side=32).numpy())
     np.save(tmp_path / "second.npy", footage(0.1, side=32).numpy())
-    options = ["--data.source", tmp_path / "first.npy", *option, tmp_path / "second.npy"]
+    options = ["--data.source", tmp_path / "first.npy", "--data.truth", "0"]
+    options += ["--data.query", tmp_path / "second.npy"]
     options += ["--model.lr", 1e-6, "--trainer.max_steps", 2, "--trainer.default_root_dir", tmp_path / "run"]
     train("fit", *options)
     lines = [line for line in capsys.readouterr().out.splitlines() if "recall@1" in line]
@@ -251,17 +193,6 @@ def test_a_second_traverse_shows_a_trained_map_beside_untrained_ones(
     assert [line for line in warned(caplog) if "worse than" in line and "HOG of all frames" in line]
     logged = figures(tmp_path / "run")["unseen/auc_of_HOG_of_all_frames"]
     assert logged[-1] == pytest.approx(auc["HOG of all frames"], abs=6e-4)
-
-
-def test_a_trial_run_leaves_an_earlier_run_as_it_is(folder, tmp_path, caplog, capsys):
-    shutil.copytree(folder / "run", tmp_path / "run")
-    files = [tmp_path / "run" / "map.safetensors", *(tmp_path / "run" / "checkpoints").iterdir()]
-    before = [path.read_bytes() for path in files]
-    options = ["--trainer.default_root_dir", tmp_path / "run", "--seed_everything", 5]
-    train("fit", *options, "--trainer.fast_dev_run", "true")
-    assert [path.read_bytes() for path in files] == before
-    assert "written to" not in capsys.readouterr().out
-    assert not [line for line in warned(caplog) if "earlier run" in line]
 
 
 def test_an_interrupt_is_one_line_and_130_and_leaves_a_map(folder, tmp_path, capsys):
@@ -296,9 +227,8 @@ def test_an_interrupt_is_one_line_and_130_and_leaves_a_map(folder, tmp_path, cap
         ),
         (["--model.mapper", "Nix"], ["model.mapper", "Nix"]),
         (["--model.backbone", "mine.Broken"], ["cannot be built", "no weights to be had"]),
-        (["--trainer.max_steps", "0"], ["no steps", "above 0"]),
         (["--trainer.max_steps", "-1"], ["no end", "trainer.max_epochs"]),
-        (["--trainer.max_steps", "null"], ["trainer.max_steps is None"]),
+        (["--trainer.max_steps", "0"], ["no steps", "above 0"]),
         (["--seed_everything", "-1"], ["seed_everything is -1", "2^32 - 1"]),
         (["--trainer.val_check_interval", "0"], ["trainer.val_check_interval is 0"]),
         (["--trainer.devices", "[0, 1]", "--trainer.strategy", "fsdp"], ["strategy is fsdp", "or ddp"]),
@@ -306,20 +236,17 @@ def test_an_interrupt_is_one_line_and_130_and_leaves_a_map(folder, tmp_path, cap
         (["--trainer.num_nodes", "2"], ["num_nodes is 2", "MASTER_ADDR"]),
         (["--model.backbone", "mine.Hungry"], ["not enough memory: it ran out"]),
         (["--seed_everything", str(2**63)], ["seed_everything", "expected whole numbers of at most"]),
-        (["--data.resize", "[1000000,1000000]"], ["frames of 1000000 x 1000000", "GB free"]),
         (["--model.backbone.widths", "[1000000,1000000]"], ["cannot be built", "memory"]),
         (["--trainer.overfit_batches", "2"], ["overfit_batches is 2", "expected 0"]),
-        (["--data.source", "gone.npy"], ["gone.npy is not there", "expected a folder"]),
         (["--data.augmentation.clop", "3"], ["clop"]),
-        (["--trainer.default_root_dir", "a_file"], ["a_file cannot be made a folder"]),
         (
             ["--trainer.callbacks+", "EarlyStopping", "--trainer.callbacks.monitor=nix"],
             ["early stopping", "`nix`"],
         ),
+        (["--trainer.default_root_dir", "a_file"], ["a_file cannot be made a folder"]),
         (["--trainer.accelerator", "mps"], ["mps", "not available"]),
         (["--model.backbone", "mine.Nothing"], ["model.backbone", "no attribute 'Nothing'"]),
         (["--config", "train_roa"], ["train_roa is not there", "train_road"]),
-        (["--data.source", "short.npy"], ["longer route"]),
         (["--ckpt_path", "run/map.safetensors"], ["map.safetensors", "dejavu train fit"]),
     ],
     ids=str,
