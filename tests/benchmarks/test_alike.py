@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -11,24 +10,9 @@ from command_line import benchmark
 from torch.nn.functional import normalize
 
 from benchmarks import alike, tables
-from benchmarks.alike import CAPPED, CHECKED, SINGLE, UNCAPPED, at_precisions
+from benchmarks.alike import CAPPED, CHECKED, SINGLE, UNCAPPED
 from benchmarks.trainings import Route
 from dejavu_torch import open_source
-from dejavu_torch.types import Match
-
-
-def test_answers_are_counted_at_each_precision():
-    probability = torch.tensor([0.4, 0.6, 0.95, 0.995])
-    match = Match(torch.arange(4), torch.zeros(4), torch.tensor([True, False, True, True]), probability)
-    scored, right = torch.tensor([True, True, False, True]), torch.tensor([True, False, False, True])
-    rows = [*at_precisions("road", "way", match, scored, right)]
-    assert [(row["precision"], row["accepted"], row["judged"], row["right"]) for row in rows] == [
-        (0.5, 3, 2, 1),
-        (0.9, 2, 1, 1),
-        (0.99, 1, 1, 1),
-    ]
-    (row,) = at_precisions("road", "way", replace(match, probability=None), scored, right)
-    assert (row["precision"], row["accepted"], row["judged"], row["right"]) == (None, 3, 2, 2)
 
 
 def test_routes_laps_and_drives_become_two_tables(tmp_path, monkeypatch):

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-from itertools import pairwise
 
 from command_line import benchmark
 
 from benchmarks import live, train
-from benchmarks.train import Rung, ladder
+from benchmarks.train import Rung
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.cnn import SmallCNN
 
@@ -53,12 +52,3 @@ def test_every_way_is_trained_with_every_seed(tmp_path, monkeypatch, capsys):
     assert len(shown) == 2
     assert all(line.endswith("-") for line in shown)  # too few bytes for so short a route
     assert (tmp_path / "bench.png").is_file()
-
-
-def test_each_rung_of_the_ladder_changes_one_thing():
-    told = [
-        (str(rung.backbone()), str(rung.augmentation()), rung.precision, rung.lr, rung.rate)
-        for rung in ladder()
-    ]
-    for before, after in pairwise(told):
-        assert sum(one != other for one, other in zip(before, after, strict=True)) == 1

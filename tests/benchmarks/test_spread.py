@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import ast
 import json
 
-import pytest
 from command_line import benchmark, benchmark_fails
 
 from benchmarks import spread
-from benchmarks.measure import done_once
-from tests.processors import chosen, compares_figures
 
 
 def test_every_processor_and_seed_is_run_and_compared(tmp_path, monkeypatch, capsys):
@@ -36,34 +32,3 @@ def test_every_processor_and_seed_is_run_and_compared(tmp_path, monkeypatch, cap
     assert "1 seeds" in benchmark_fails(capsys, *given, "--seeds", "1")
     monkeypatch.setattr(spread, "done_once", lambda *_: "a is not there")
     assert "a is not there" in benchmark_fails(capsys, *given)
-
-
-def test_commands_run_in_the_environment_of_a_processor(tmp_path):
-    environment = spread.environment_of("oldest", 2)
-    assert environment["ATEN_CPU_CAPABILITY"] == "default"
-    assert environment["OMP_NUM_THREADS"] == "2"
-    said = done_once(["nothing"], tmp_path, tmp_path / "report.json", environment)
-    assert said is not None
-    assert "'nothing' is no command" in said
-    assert "this" in spread.imitable()
-
-
-@pytest.mark.parametrize(
-    ("body", "expected"),
-    [
-        ("assert a == approx(b)", True),
-        ("assert share > 0.9", True),
-        ("torch.testing.assert_close(a, b)", True),
-        ("assert count == 3", False),
-        ("assert scale == 2.0", False),
-    ],
-)
-def test_tests_that_compare_figures_are_known(body, expected):
-    (test,) = ast.parse(f"def test_it():\n    {body}").body
-    assert isinstance(test, ast.FunctionDef)
-    assert compares_figures(test) is expected
-
-
-def test_goldens_and_figures_of_readme_are_among_them():
-    names = {path.name for path, _ in chosen()}
-    assert {"test_golden.py", "test_readme_figures.py", "test_real_routes.py", "test_hog.py"} <= names
