@@ -53,18 +53,6 @@ def test_a_map_grows_in_its_own_file_or_in_another(folder, tmp_path, capsys):
     assert model.calibration != DejaVu.load(first).calibration
 
 
-def test_calibration_of_the_new_places(folder, tmp_path):
-    first, out = folder / "first.safetensors", tmp_path / "m.safetensors"
-    run("learn", NEXT, "--append", first, "--map", out, "--calibration", "none")
-    assert DejaVu.load(out).calibration is None
-    another = ("--calibration", f"{NEXT}&traverse=1", "--precision", "0.9")
-    run("learn", NEXT, "--append", first, "--map", out, *another)
-    model = DejaVu.load(out)
-    assert (model.calibration is not None, model.precision) == (True, 0.9)
-    run("learn", NEXT, "--append", first, "--map", out, "--threshold", "0.25")
-    assert DejaVu.load(out).threshold == 0.25
-
-
 # maps of several routes
 
 

@@ -13,20 +13,16 @@ import torch
 from command_line import fails, run
 from torch import nn
 
-from dejavu_torch import HOG, DejaVu
+from dejavu_torch import DejaVu
 from dejavu_torch.cli.commands import run_learn
-from dejavu_torch.cli.localize import run_live, run_localize
 from dejavu_torch.cli.parser import parse
-from dejavu_torch.cli.reports import run_compare
 from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.features.hub import NETWORKS, Network
-from dejavu_torch.features.joined import Joined
 
 ROUTE = "sim:aerial?frames=40"
 MEAN, STD = [0.485, 0.456, 0.406], [0.229, 0.224, 0.225]
 RESNET = {"backbone": "ResNet50", "fc_output_dim": 2048}
 SELA = {"backbone": "dinov2-large", "aggregation": "gem", "hashing": True, "rerank": True}
-ANYLOC = {"backbone": "DINOv2", "domain": "urban"}
 # the call, the size of the frames, and how many numbers come of it
 CALLS = {
     "megaloc": (("gmberton/MegaLoc", "get_trained_model"), {}, (322, 322), 8448),
@@ -131,39 +127,6 @@ def test_the_words_in_full_are_the_same(asked):
 
 
 @pytest.mark.parametrize(
-    "value",
-    [
-        "[HOG, hub:cricavpr]",
-        "[{class_path: HOG}, {class_path: hub:cricavpr, init_args: {resize: [224, 224]}}]",
-    ],
-)
-def test_as_a_member_of_a_list(value, asked):
-    joined = features_of("--features", value)
-    assert isinstance(joined, Joined)
-    assert [type(one) for one in joined.members] == [HOG, Embedding]
-    assert repr(joined.members[1]) == repr(features_of("--features", "hub:cricavpr"))
-    assert asked[0] == asked[1]
-
-
-def test_a_member_has_settings_of_its_own(asked):
-    member = "{class_path: hub:megaloc, init_args: {resize: [28, 42], mean: .5}}"
-    net = features_of("--features", f"[HOG, {member}]").members[1]
-    assert (net.resize, net.mean, net.std) == ((28, 42), 0.5, STD)
-    assert len(asked) == 1
-
-
-def test_a_member_has_arguments_of_its_own(asked):
-    page = (Path(__file__).parents[1] / "docs" / "howto" / "pretrained.md").read_text().replace("\n", " ")
-    shown = re.findall(r"`(\[HOG, \{class_path: hub.*?\}\])`", page)
-    assert len(shown) == 1
-    for value in (shown[0], shown[0].replace("{domain: aerial}", "{init_args: {domain: aerial}}")):
-        net = features_of("--features", value).members[1]
-        assert (net.resize, net.mean) == ((224, 224), MEAN)
-    call = {"repository": "AnyLoc/DINO", "entry": "get_vlad_model", "trust_repo": True}
-    assert asked == [call | ANYLOC | {"domain": "aerial"}] * 2
-
-
-@pytest.mark.parametrize(
     ("beside", "seen"),
     [
         ("dict_kwargs: {domain: aerial}", "hub:anyloc with dict_kwargs;"),
@@ -196,33 +159,11 @@ def test_settings_of_a_config_are_not_its_own(features, asked, tmp_path):
     assert asked[0] == asked[1]
 
 
-@pytest.mark.parametrize("value", ["hub:megaloc", "[hub:megaloc]", "{class_path: hub:megaloc}"])
-def test_a_config_takes_it(value, asked, tmp_path):
-    (tmp_path / "own.yaml").write_text(f"features: {value}")
-    net = features_of("--config", str(tmp_path / "own.yaml"))
-    assert repr(net) == repr(features_of("--features", value))
-
-
 @pytest.mark.parametrize("value", ["hub:megalock", "[HOG, hub:megalock]", "hub:"])
 def test_an_unknown_name_lists_the_known(value, capsys):
     error = fails(capsys, "learn", ROUTE, "--map", "map.safetensors", "--features", value)
     assert ": hub:" in error
     assert all(f"hub:{name}" in error for name in CALLS)
-
-
-@pytest.mark.parametrize(
-    ("call", "words"),
-    [
-        (run_compare, (ROUTE, ROUTE, "--out", "report")),
-        (run_localize, ("map.safetensors", ROUTE, "--out", "matches.csv")),
-        (run_live, ("map.safetensors", ROUTE)),
-    ],
-)
-def test_other_commands_take_it(call, words, asked):
-    parsed = parse(call.__name__.removeprefix("run_"), call, [*words, "--features", "hub:megaloc"])
-    net = parsed["model"].features if "model" in parsed else parsed["loading"].features
-    assert isinstance(net, Embedding)
-    assert len(asked) == 1
 
 
 @pytest.mark.parametrize("value", ["hub:selavpr++", "[HOG, hub:eigenplaces]"])

@@ -90,16 +90,6 @@ def test_functions_methods_and_classes(words, channels):
     assert net(torch.rand(2, 3, 20, 20)).shape == (2, channels)
 
 
-def test_a_config_names_functions_likewise(tmp_path):
-    network = "{class_path: zoo.load, init_args: {repo: a, model: m, note: [1]}}"
-    settings = f"{{dimension: null, network: {network}}}"
-    (tmp_path / "own.yaml").write_text(f"features: {{class_path: Embedding, init_args: {settings}}}")
-    features_of("--config", "own.yaml")
-    import zoo
-
-    assert zoo.asked == {"repo": "a", "model": "m", "source": "github", "note": [1]}
-
-
 def test_the_next_line_brings_the_network_back(tmp_path, capsys):
     run(
         "learn",
@@ -145,15 +135,3 @@ def test_mistakes_are_one_line(words, seen, capsys):
     error = fails(capsys, "learn", ROUTE, "--map", "map.safetensors", *OWN, "--features.network", *words)
     for word in seen:
         assert word in error
-
-
-def test_a_training_says_the_words_of_its_network(capsys):
-    made = [word.replace("--features", "--model.backbone") for word in (*OWN, *HUB)]
-    made[2] = "--model.backbone.dimension=4"
-    steps = "--trainer.max_steps=1", "--trainer.accelerator=cpu", "--trainer.default_root_dir=run"
-    run("train", "fit", "--data.source", ROUTE, *made, *steps, "--model.mapper", "SpectralMapper")
-    told = capsys.readouterr().out.splitlines()[-1]
-    assert "--features zoo.load --features.repo=a/b --features.model m" in told
-    words = shlex.split(told.removeprefix("next: dejavu "))
-    assert words[words.index("--map") + 1] == "run/map.safetensors"
-    DejaVu.load("run/map.safetensors", features_of(*words[words.index("--features") :][:5]))

@@ -17,7 +17,7 @@ from helpers import refused
 from dejavu_torch import DejaVu, InputError
 from dejavu_torch.cli.commands import run_learn
 from dejavu_torch.cli.parser import parse
-from dejavu_torch.cli.presets import find_config, preset_names, read_config
+from dejavu_torch.cli.presets import find_config, preset_names
 from dejavu_torch.evaluation.reproduce import paper_model
 from dejavu_torch.model_file import PARTS, recipe_of
 
@@ -156,11 +156,6 @@ def test_a_config_is_a_regular_file(tmp_path):
     for name in (str(tmp_path), "a\0b", "a" * 5000, ""):
         with refused("--config"):
             find_config(name)
-
-
-def test_aliases_that_a_config_may_have(tmp_path):
-    (tmp_path / "mine.yaml").write_text("a: &a {x: 1}\nb: {<<: *a, y: 2}\nc: *a\n")
-    assert read_config(tmp_path / "mine.yaml") == {"a": {"x": 1}, "b": {"x": 1, "y": 2}, "c": {"x": 1}}
 
 
 @pytest.mark.parametrize("word", ["", "--batch_size="])

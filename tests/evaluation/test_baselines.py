@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dejavu_torch.evaluation.baselines import every, fair_stride, nearest_frames
+from dejavu_torch.evaluation.baselines import fair_stride, nearest_frames
 from dejavu_torch.recognition.localizer import Matching
 from dejavu_torch.recognition.sequence import SequenceMatcher
 
@@ -28,6 +28,13 @@ def literal_nearest(reference, query, k, metric):
     return found
 
 
+@pytest.fixture
+def _parts(monkeypatch):
+    """A few distances at a time."""
+    monkeypatch.setattr("dejavu_torch.evaluation.baselines.BLOCK_DISTANCES", 20)
+
+
+@pytest.mark.usefixtures("_parts")
 @pytest.mark.parametrize("metric", ["l1", "l2", "cosine"])
 def test_the_nearest_stored_frame(metric):
     torch.manual_seed(0)
@@ -40,6 +47,7 @@ def test_the_nearest_stored_frame(metric):
         assert match.accepted.all()
 
 
+@pytest.mark.usefixtures("_parts")
 @pytest.mark.parametrize("k", [1, 4])
 def test_frames_that_are_not_stored_are_driven_past_in_a_sequence(k):
     """Their distances are those of the nearest stored frame; a sequence tells where between them it is."""
@@ -52,17 +60,6 @@ def test_frames_that_are_not_stored_are_driven_past_in_a_sequence(k):
         assert match.index.tolist() == index.tolist()
         assert torch.allclose(match.score, score)
     assert found.sequences[1].index.tolist() == nearest_frames(reference, query, k).index.tolist()
-
-
-def test_distances_in_parts_change_nothing(monkeypatch):
-    reference, query = torch.rand(20, 4), torch.rand(11, 4)
-    for k, sequence in ((1, None), (3, None), (1, SequenceMatcher(4)), (3, SequenceMatcher(4))):
-        whole = nearest_frames(reference, query, k, matching=Matching(sequence))
-        for numbers in (1, 20, 45):
-            with monkeypatch.context() as patch:
-                patch.setattr("dejavu_torch.evaluation.baselines.BLOCK_DISTANCES", numbers)
-                parts = nearest_frames(reference, query, k, matching=Matching(sequence))
-            assert all(torch.equal(x, y) for x, y in zip(parts, whole, strict=True))
 
 
 @given(
@@ -83,8 +80,3 @@ def test_convention_8_the_stride_is_at_most_twice_the_tolerance():
     strides = {(0, 5): 10, (4000, 5): 10, (4001, 5): 9, (20000, 5): 2, (40000, 5): 1, (40001, 5): 1}
     strides |= {(0, 1): 2, (0, 0): 1}
     assert {given: fair_stride(1000, 10, 4, *given) for given in strides} == strides
-
-
-def test_strides_in_words():
-    words = {1: "every", 2: "every 2nd", 3: "every 3rd", 11: "every 11th", 12: "every 12th", 22: "every 22nd"}
-    assert {k: every(k, "frame") for k in words} == {k: f"{text} frame" for k, text in words.items()}

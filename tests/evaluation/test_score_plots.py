@@ -43,15 +43,6 @@ def test_curves_have_the_colour_of_the_key_whatever_else_is_drawn():
         assert "right within 2 frames" in texts(pictures["pr"].plot[0])
 
 
-def test_a_curve_that_reports_nothing_says_so_and_one_without_scores_is_left_out():
-    silent, unscored = contender("null: x", 0.0, points=0), Contender("unscored", None)
-    pictures = draw_curves({"null": silent, "hog": unscored, "leave_out": contender("other", 1)}, "2 frames")
-    assert list(pictures) == ["pr"]
-    assert "null: x (reports nothing)" in texts(pictures["pr"].plot[0])
-    assert len(pictures["pr"].plot[1].lines) == 1
-    assert draw_curves({"hog": unscored}, "2 frames") == {}
-
-
 def points(*pairs):
     return [Stored(size, area, area) for size, area in pairs]
 
