@@ -162,7 +162,6 @@ def test_a_visit_is_averaged_into_a_map_that_is_there(folder, tmp_path, capsys):
         ("learn d.npy --map m.safetensors --average e.npy --calibration ./e.npy", ["e.npy itself"]),
         ("learn d.npy d.npy --map m.safetensors --calibration ./d.npy", ["d.npy itself"]),
         ("learn d.npy --map m.safetensors --average_truth 0", ["--average SOURCE"]),
-        ("merge first.safetensors --map m.safetensors", ["first.safetensors", "at least two"]),
         ("merge first.safetensors ./first.safetensors --map m.safetensors", ["the same file"]),
         ("merge first.safetensors f.safetensors --map f.safetensors", ["f.safetensors is an input"]),
         ("compare a.npy a.npy --map both.safetensors --out e", ["both.safetensors has", "first, other"]),

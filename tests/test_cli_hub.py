@@ -21,38 +21,14 @@ from dejavu_torch.features.hub import NETWORKS, Network
 
 ROUTE = "sim:aerial?frames=40"
 MEAN, STD = [0.485, 0.456, 0.406], [0.229, 0.224, 0.225]
-RESNET = {"backbone": "ResNet50", "fc_output_dim": 2048}
-SELA = {"backbone": "dinov2-large", "aggregation": "gem", "hashing": True, "rerank": True}
-# the call, the size of the frames, and how many numbers come of it
-CALLS = {
-    "megaloc": (("gmberton/MegaLoc", "get_trained_model"), {}, (322, 322), 8448),
-    "eigenplaces": (("gmberton/eigenplaces", "get_trained_model"), RESNET, (480, 640), 2048),
-    "cosplace": (("gmberton/cosplace", "get_trained_model"), RESNET, (480, 640), 2048),
-    "sage": (("chenshunpeng/SAGE", "sage_vitb"), {}, (322, 322), 8448),
-    "salad": (("serizba/salad", "dinov2_salad"), {}, (322, 322), 8448),
-    "boq": (
-        ("amaralibey/bag-of-queries", "get_trained_boq"),
-        {"backbone_name": "dinov2", "output_dim": 12288},
-        (322, 322),
-        12288,
-    ),
-    "cricavpr": (("Lu-Feng/CricaVPR", "trained_model"), {}, (224, 224), 10752),
-    "anyloc": (
-        ("AnyLoc/DINO", "get_vlad_model"),
-        {"backbone": "DINOv2", "domain": "urban"},
-        (322, 322),
-        49152,
-    ),
-    "selavpr++": (("Lu-Feng/SelaVPRplusplus", "SelaVPRplusplus"), SELA, (322, 322), 512),
-}
 
 
 class Net(nn.Module):
-    """As many numbers as a network of the hub makes, in the form in which it makes them."""
+    """Numbers in the form in which a network of the hub makes them."""
 
-    def __init__(self, repository: str, numbers: int) -> None:
+    def __init__(self, repository):
         super().__init__()
-        self.repository, self.linear = repository, nn.Linear(12, numbers)
+        self.repository, self.linear = repository, nn.Linear(12, 512)
 
     def forward(self, frames):
         made = self.linear(nn.functional.adaptive_avg_pool2d(frames, 2).flatten(1))
@@ -70,8 +46,7 @@ def asked(monkeypatch):
         calls.append({"repository": repo_or_dir, "entry": model, **arguments})
         sys.stdout.write("Using a cache\n")  # as some do
         torch.manual_seed(0)
-        numbers = next(one[3] for one in CALLS.values() if one[0][0] == repo_or_dir)
-        net = Net(repo_or_dir, numbers)
+        net = Net(repo_or_dir)
         return nn.DataParallel(net) if repo_or_dir.startswith("Lu-Feng") else net
 
     monkeypatch.setattr(torch.hub, "load", load)
@@ -82,24 +57,16 @@ def features_of(*words):
     return parse("learn", run_learn, [ROUTE, "--map", "map.safetensors", *words])["model"].features
 
 
-@pytest.mark.parametrize("name", CALLS)
-def test_a_short_name_is_this_call(name, asked):
-    (repository, entry), arguments, size, numbers = CALLS[name]
-    net = features_of("--features", f"hub:{name}")
-    assert asked == [{"repository": repository, "entry": entry, "trust_repo": True} | arguments]
-    assert type(net) is Embedding
-    assert isinstance(net.network, Net)
-    assert (net.resize, net.mean, net.std, net.dimension, net.layer) == (size, MEAN, STD, None, None)
-    frames = torch.rand(2, 3, 60, 80)
+@pytest.mark.parametrize("name", NETWORKS)
+def test_a_short_name_is_a_call_of_the_hub(name, asked):
+    net, own = features_of("--features", f"hub:{name}"), NETWORKS[name]
+    assert asked == [{"repository": own.repository, "entry": own.entry, "trust_repo": True} | own.settings]
+    assert (net.resize, net.mean, net.std, net.dimension, net.layer) == (own.size, MEAN, STD, None, None)
     with torch.no_grad():
-        features = net.eval()(frames)
-    assert features.shape == (2, numbers)
+        features = net.eval()(torch.rand(2, 3, 60, 80))
+    assert features.shape == (2, 512)
     if name == "selavpr++":
         assert set(features.unique().tolist()) == {-1.0, 1.0}
-
-
-def test_all_of_them_are_tried():
-    assert NETWORKS.keys() == CALLS.keys()
 
 
 @pytest.mark.parametrize(
@@ -163,7 +130,7 @@ def test_settings_of_a_config_are_not_its_own(features, asked, tmp_path):
 def test_an_unknown_name_lists_the_known(value, capsys):
     error = fails(capsys, "learn", ROUTE, "--map", "map.safetensors", "--features", value)
     assert ": hub:" in error
-    assert all(f"hub:{name}" in error for name in CALLS)
+    assert all(f"hub:{name}" in error for name in NETWORKS)
 
 
 @pytest.mark.parametrize("value", ["hub:selavpr++", "[HOG, hub:eigenplaces]"])

@@ -209,7 +209,6 @@ def test_a_process_that_nobody_needs_any_more_ends(how, folder, tmp_path):
     ("words", "told"),
     [
         ("/dev/video99 --realtime", "is live already"),
-        ("missing.mp4", "missing.mp4 is not there"),
         ("sim:aerial?frames=20 --reference sim:aerial", "--page"),
         ("sim:aerial?frames=20 --page 0 --reference sim:aerial?frames=20", "20 frames"),
         ("/dev/video99 --timeout 0", "--timeout 0; expected seconds, above 0"),

@@ -128,7 +128,6 @@ def test_the_next_line_brings_the_network_back(tmp_path, capsys):
         (("zoo.nothing", "--features.network.name", "x"), ("'zoo' has no attribute 'nothing'",)),
         (("zoo.typed", "--features.network.widht", "x"), ("widht",)),
         (("zoo.load", "--features.network.repo", "x"), ("model",)),
-        (("zoo.typed", "--features.layer", "3"), ("Conv2d has no layer '3'",)),
     ],
 )
 def test_mistakes_are_one_line(words, seen, capsys):

@@ -73,7 +73,6 @@ def test_no_calibration_where_none_is_wanted_or_can_be(tmp_path, capsys):
         ("localize m a --out c --speeds [2]", ("--speeds [2.0]", "--match sequence:T")),
         ("compare a b --out c --filter --speeds [2]", ("--speeds [2.0]", "--match sequence:T")),
         ("live m a --speeds [2]", ("--speeds [2.0]", "--match sequence:T")),
-        ("localize m a --out c --precision 1", ("precision is 1", "below 1")),
         ("live m a --sequence 5 --filter", ("--sequence 5", "--filter")),
         (
             "compare a b --out c --sequence 5 --distractors sim:outdoor",

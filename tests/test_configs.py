@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import os
 import shutil
 import subprocess
 import sys
@@ -147,15 +146,6 @@ def test_a_config_that_is_none_is_refused_ahead_of_the_loader(tmp_path, text, wo
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with refused("mine.yaml", words, "expected a YAML file of options"):
         parse("learn", run_learn, ["x", "--map", "y", f"--config={path}"])
-
-
-def test_a_config_is_a_regular_file(tmp_path):
-    os.mkfifo(tmp_path / "fifo")
-    with refused("fifo is not a regular file"):
-        parse("learn", run_learn, ["x", "--map", "y", "--config", str(tmp_path / "fifo")])
-    for name in (str(tmp_path), "a\0b", "a" * 5000, ""):
-        with refused("--config"):
-            find_config(name)
 
 
 @pytest.mark.parametrize("word", ["", "--batch_size="])

@@ -13,7 +13,6 @@ from benchmarks import storage
 from benchmarks.measure import new_row
 from benchmarks.storage import (
     KEYS,
-    bench_storage,
     bytes_for,
     contenders_of,
     described,
@@ -45,8 +44,16 @@ def pair(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def rows(pair):
-    return list(bench_storage(pair))
+def bench(pair, tmp_path_factory):
+    out = tmp_path_factory.mktemp("bench") / "out"
+    benchmark("storage", *pair, "--out", out)
+    assert sorted(path.name for path in out.iterdir()) == ["bench.json", "bench.png"]
+    return json.loads((out / "bench.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def rows(bench):
+    return bench["rows"]
 
 
 @pytest.fixture(scope="module")
@@ -60,8 +67,9 @@ def row_of(route, name):
     return judged(route, next(one for one in contenders_of(route) if one.name == name))
 
 
-def test_all_families_are_there_and_what_is_skipped_says_why(rows):
+def test_all_families_are_there_and_what_is_skipped_says_why(bench, rows):
     pytest.importorskip("faiss")
+    assert {entry["T"] for entry in bench["equal_auc"]} == {1, 5, 11, 21}
     ran = {row["family"] for row in rows if row["skipped"] is None}
     stores = {"dejavu", "null", "frames", "interpolated", "PCA", "binary", "PQ, own codebooks"}
     assert ran == stores | {"dejavu, other whitenings", "RaBitQ", "EDEN", "OPQ, own codebooks"}
@@ -146,32 +154,6 @@ def test_what_is_missed_is_set_beside_the_best_rival():
     ratios = (0.5 / 0.25, 0.5 / 0.2, 0.1 / 0.2, 0.002 / 0.2)
     assert storage.missed([*rows, *rivals]) == {"case": pytest.approx(np.prod(ratios) ** 0.25)}
     assert storage.missed(rivals) == {"case": pytest.approx((1 / (0.25 * 0.2**3)) ** 0.25)}
-
-
-def test_rows_are_written_as_they_finish_the_map_that_is_given_among_them(pair, tmp_path, monkeypatch):
-    seen, out, path = [], tmp_path / "out", tmp_path / "map.safetensors"
-    given = "dejavu, map"
-
-    def some(*arguments):
-        names = ("dejavu 5", "dejavu 10", "null 5", given)
-        return [one for one in contenders_of(*arguments) if one.name in names]
-
-    def watched(*arguments):
-        seen.append(len(json.loads((out / "bench.json").read_text())["rows"]) if out.exists() else 0)
-        return judged(*arguments)
-
-    monkeypatch.setattr(storage, "contenders_of", some)
-    monkeypatch.setattr(storage, "judged", watched)
-    run("learn", pair[0], "--map", path, "--mapper.route_bytes_per_place", "5")
-    benchmark("storage", *pair, "--map", path, "--out", out)
-    assert seen == [0, 1, 2, 3]
-    written = json.loads((out / "bench.json").read_text())
-    assert {entry["T"] for entry in written["equal_auc"]} == {1, 5, 11, 21}
-    assert min(row["ratio_to_ours"] for row in written["rows"] if row["family"] == "dejavu") == 1
-    assert sorted(path.name for path in out.iterdir()) == ["bench.json", "bench.png"]
-    rows = {row["contender"]: row for row in written["rows"]}
-    assert rows[given]["auc"] == pytest.approx(rows["dejavu 5"]["auc"], abs=0.02)
-    assert rows[given]["route_bytes"] == pytest.approx(rows["dejavu 5"]["route_bytes"], rel=0.03)
 
 
 REFUSALS = {

@@ -41,23 +41,3 @@ def test_a_training_is_set_beside_the_untrained_map_and_made_once(tmp_path, monk
     assert found["broken", "trained"]["skipped"].startswith("lr is 0")  # told, not lost
     assert "broken, seed 3: " in capsys.readouterr().out
     assert (tmp_path / "out" / "bench.png").is_file()
-    # the same training again is not run; another is, and one that did not end well
-    row = found["flight, short", "trained 5 B"]
-    monkeypatch.setattr(trainings.Judge, "of", lambda *_: [row])
-    monkeypatch.setattr(trainings.Judge, "hog", lambda *_: row)
-    calls = []
-
-    def counted(command, **settings):
-        if command[0] == "git":  # asks for the commit
-            return run_here(command, **settings)
-        calls.append(command)
-        return run_here(["sh", "-c", "exit 3"], **settings)
-
-    monkeypatch.setattr(subprocess, "run", counted)
-    monkeypatch.setattr(trainings, "ROUTES", {"flight, short": flight})
-    benchmark(*given)
-    assert not calls
-    for repeat in range(2):
-        benchmark(*given, "--options=--model.rate 0")
-        assert len(calls) == repeat + 1
-    assert "status 3" in capsys.readouterr().out

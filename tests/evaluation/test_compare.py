@@ -14,7 +14,7 @@ from helpers import Fixed, all_of, refused, template_model
 from PIL import Image
 from torch import nn
 
-from dejavu_torch import HOG, DejaVu, SequenceMatcher, SpectrogramAnalysis, open_source
+from dejavu_torch import DejaVu, SequenceMatcher, SpectrogramAnalysis, open_source
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.evaluation.compare import compare
 from dejavu_torch.evaluation.controls import null_control
@@ -153,23 +153,6 @@ def pictures(seed):
     noise, texture = torch.Generator().manual_seed(seed), torch.Generator().manual_seed(7)
     frames = torch.rand(8, 1, 24, 24, generator=texture)[torch.arange(64) % 8]
     return ArrayTraverse((frames + 0.1 * torch.randn(frames.shape, generator=noise)).clamp(0, 1))
-
-
-def contenders(features):
-    model = template_model(features, SpectrogramAnalysis(window=64, min_period=4, strongest=1))
-    return dict(compare(pictures(1), pictures(2), "0", model, tolerance=3).report.contenders)
-
-
-def test_hog_stands_beside_other_features():
-    found = contenders(nn.Sequential(nn.AvgPool2d(4), nn.Flatten()))
-    dimension = HOG()(torch.rand(1, 1, 24, 24)).shape[1]
-    for key, k, name in (("hog", 1, "HOG, every frame"), ("hog_stride_coarsest", 6, "HOG, every 6th frame")):
-        assert (found[key].name, found[key].k) == (name, k)
-        assert found[key].bytes == -(-64 // k) * dimension * 4
-        assert found[key].scores is not None
-    # of the eight that look alike the noise decides: all are frames, none is the map
-    assert 0 < found["hog"].scores.recall_at_1 < 0.9
-    assert not {"hog", "hog_stride_coarsest"} & contenders(None).keys()  # not beside itself
 
 
 def test_whatever_stores_features_needs_the_backbone_as_well():
