@@ -8,7 +8,6 @@ import re
 import shlex
 import subprocess
 import sys
-from fractions import Fraction
 from importlib import import_module
 from pathlib import Path
 
@@ -16,7 +15,6 @@ import numpy as np
 import pytest
 import torch
 from command_line import TEMPLATES, fails, frames, report_of, run, write_images
-from videos import H264, clip, pictures
 
 from dejavu_torch import DejaVu, SpectrogramAnalysis, TemplateMapper, open_source
 from dejavu_torch.cli import COMMANDS, commands
@@ -74,14 +72,6 @@ def test_wide_descriptors_are_told_to_be_reduced_not_whitened(tmp_path, capsys):
     told = capsys.readouterr().out
     assert told.count("descriptors of 300 dimensions are reduced to ") == 2
     assert "Whitening, " not in told
-
-
-def test_pixels_that_are_not_square_are_named_where_a_video_does_not_fit(tmp_path, capsys):
-    square = clip(tmp_path / "square.mp4", pictures(12, 48, 64), **H264)
-    wide = clip(tmp_path / "wide.mp4", pictures(12, 48, 40), aspect=Fraction(8, 5), **H264)
-    error = fails(capsys, "compare", square, wide, "--truth", 0, "--features", "HOG", "--out", tmp_path / "o")
-    assert "frame of 3 x 48 x 40 (its pixels are 8:5, not square)" in error
-    assert error.count("not square") == 1
 
 
 def test_convention_4_threshold_option_then_map_then_probability_then_all(small_map, tmp_path, capsys):

@@ -22,12 +22,8 @@ def folder(tmp_path_factory):
     run("learn", FIRST, "--map", folder / "first.safetensors", *CHUNKS)
     np.save(folder / "a.npy", frames(40, seed=1))
     np.save(folder / "d.npy", np.random.default_rng(0).normal(size=(96, 8)).astype(np.float32))
-    none = ("--calibration", "none", "--whitening", "none")
-    for name, options in {
-        "whole": none,
-        "f": (*none, "--mapper.chunk", "32"),
-    }.items():
-        run("learn", folder / "d.npy", "--map", folder / f"{name}.safetensors", *options)
+    plain = ("--calibration", "none", "--whitening", "none", "--mapper.chunk", "32")
+    run("learn", folder / "d.npy", "--map", folder / "f.safetensors", *plain)
     sure = DejaVu.load(folder / "f.safetensors")
     sure.precision = 0.9
     sure.save(folder / "sure.safetensors")

@@ -31,11 +31,9 @@ def folder(tmp_path_factory):
     """A spectral map of the route, and frames and features in files."""
     folder = tmp_path_factory.mktemp("spectral")
     run("learn", ROUTE, "--map", folder / "m.safetensors")
-    noise = np.random.default_rng(0)
     np.save(folder / "a.npy", frames(64, seed=1))
     np.save(folder / "b.npy", frames(64, seed=2))
     np.save(folder / "c.npy", frames(50, seed=3))
-    np.save(folder / "noise.npy", noise.normal(size=(900, 100)).astype(np.float32))
     return folder
 
 

@@ -32,9 +32,7 @@ def test_rates_in_closed_form():
     alone, fused = rates(best, index, truth, tolerance=1, places=60)
     assert alone == pytest.approx((2 / 3, 1 / 2, 3 / 10))
     assert fused == pytest.approx((2 / 3, 1 / 2, 3 / 60))
-
-
-def test_unknown_queries_and_those_without_an_answer_do_not_count():
+    # neither unknown queries nor those without an answer count
     right = torch.tensor([[3], [13], [-1]])
     truth = GroundTruth(right, torch.tensor([True, False, True]), right.new_zeros(3, 0))
     alone, fused = rates([8, 3, 3], [8, 3, 3], truth, 0, 40)
