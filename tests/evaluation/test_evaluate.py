@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import NamedTuple
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.evaluation.curves import RECALL_DEFINITION, evaluate
 from dejavu_torch.evaluation.evaluate import evaluate_file
 from dejavu_torch.evaluation.matches import write_matches
-from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.types import Match
 
 HEADER = "query,place,score,accepted\n"
@@ -156,27 +154,19 @@ def test_what_does_not_fit_is_refused(tmp_path):
 # a map of resampled places
 
 
-class Resampled(NamedTuple):
-    """A map, its matches in a file, and the queries and matches themselves."""
-
-    map: Path
-    matches: Path
-    query: ResampledTraverse
-    match: Match
-
-
 @pytest.fixture(scope="module")
 def resampled(tmp_path_factory):
+    """A map, its matches in a file, and the queries and matches themselves."""
     folder = tmp_path_factory.mktemp("resampled")
     model = template_model(periods=everything(101), velocity=camera()).learn(footage(REFERENCE))
     model.save(folder / "m.safetensors")
     query = model.resample(ArrayTraverse(footage(QUERY, noise=0.02)), model.step)
-    assert isinstance(query, ResampledTraverse)
     match = model.localize(query)
     write_matches(folder / "matches.csv", [match], query.frame, model.map.frame_of)
     nearest = (REFERENCE - QUERY[:, None]).abs().argmin(1).tolist()
     (folder / "truth.csv").write_text("".join(f"{q},{p}\n" for q, p in enumerate(nearest)))
-    return Resampled(folder / "m.safetensors", folder / "matches.csv", query, match)
+    files = {"map": folder / "m.safetensors", "matches": folder / "matches.csv"}
+    return SimpleNamespace(**files, query=query, match=match)
 
 
 def test_convention_11_the_map_turns_frames_into_places(resampled):
