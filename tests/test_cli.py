@@ -398,30 +398,12 @@ def test_what_lacks_memory_is_one_line_and_a_bug_is_a_traceback(capsys, monkeypa
         run("info", "a")
 
 
-@pytest.fixture(scope="module")
-def own_process(small_map, tmp_path_factory):
-    """What commands behind one another in a process of their own print, and what they say on stderr."""
+def test_quiet_where_not_a_terminal_and_a_warning_of_a_library_is_one_line(small_map, tmp_path):
     code = (
-        "import resource, sys, warnings; from dejavu_torch.cli import commands, main\n"
-        "for count in (128, 1280):\n"
-        "    main(['localize', sys.argv[1], f'sim:aerial?frames={count}', '--out', sys.argv[2]])\n"
-        "    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)\n"
-        f"main(['learn', {SMALL!r}, '--map', sys.argv[3], '--whitening.views', '1'])\n"
+        "import sys, warnings; from dejavu_torch.cli import commands, main\n"
+        f"main(['learn', {SMALL!r}, '--map', sys.argv[2], '--whitening.views', '1'])\n"
         "print('learned', file=sys.stderr)\n"
         "commands.print_map = lambda model: warnings.warn('two\\nlines')\nmain(['info', sys.argv[1]])"
     )
-    folder = tmp_path_factory.mktemp("process")
-    words = map(str, (small_map, folder / "m.csv", folder / "a.safetensors"))
-    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=True)
-    return done.stdout, done.stderr
-
-
-@pytest.mark.slow
-def test_localize_memory_does_not_grow_with_the_queries(own_process):
-    few, many = (int(line) for line in own_process[0].splitlines() if line.isdigit())
-    # features of the further frames would take 8 MB, their frames 57 MB, the painted route takes 2 MB
-    assert many - few < 8_000
-
-
-def test_quiet_where_not_a_terminal_and_a_warning_of_a_library_is_one_line(own_process):
-    assert own_process[1] == "learned\ndejavu: two lines\n"
+    words = [sys.executable, "-c", code, str(small_map), str(tmp_path / "a.safetensors")]
+    assert subprocess.run(words, capture_output=True, text=True).stderr == "learned\ndejavu: two lines\n"

@@ -152,13 +152,8 @@ def test_the_next_line_runs(value, asked, tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize("config", [(), ("--config", "train_road")])
 def test_a_training_takes_it_and_says_the_words(config, asked, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    made = (
-        "--model.backbone",
-        "hub:cosplace",
-        "--model.backbone.dimension=4",
-        "--model.mapper",
-        "SpectralMapper",
-    )
+    made = "--model.backbone", "hub:cosplace", "--model.backbone.dimension=4"
+    made += "--model.mapper", "SpectralMapper"
     steps = "--trainer.max_steps=1", "--trainer.accelerator=cpu", "--trainer.default_root_dir=run"
     run("train", "fit", "--data.source", ROUTE, *config, *made, *steps)
     words = shlex.split(capsys.readouterr().out.splitlines()[-1].removeprefix("next: dejavu "))

@@ -38,12 +38,8 @@ def transform(name):
 """
 ROUTE = "sim:aerial?frames=40"
 OWN = ("--features", "dejavu_torch.Embedding", "--features.dimension=null", "--features.resize", "[16,16]")
-NOTES = (
-    "--features.network.note",
-    "it's",
-    "--features.network.notes=a b",
-    '--features.network.more={"a": 1}',
-)
+NOTES = ("--features.network.note", "it's", "--features.network.notes=a b")
+NOTES += ('--features.network.more={"a": 1}',)
 HUB = ("--features.network", "zoo.load", "--features.network.repo=a/b", "--features.network.model", "m")
 
 
@@ -91,18 +87,8 @@ def test_functions_methods_and_classes(words, channels):
 
 
 def test_the_next_line_brings_the_network_back(tmp_path, capsys):
-    run(
-        "learn",
-        ROUTE,
-        "--map",
-        "map.safetensors",
-        *OWN,
-        *HUB,
-        *NOTES,
-        "--features.layer",
-        "0",
-        "--features.mean=.5",
-    )
+    words = (*OWN, *HUB, *NOTES, "--features.layer", "0", "--features.mean=.5")
+    run("learn", ROUTE, "--map", "map.safetensors", *words)
     before, _, told = capsys.readouterr().out.rpartition("next: dejavu ")
     assert [word for word in NOTES if word not in shlex.split(told)] == []
     assert "backbone 448" in before  # of 112 numbers: what lies behind the layer is not kept

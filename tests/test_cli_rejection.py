@@ -8,15 +8,8 @@ from command_line import fails, report_of, run
 
 from dejavu_torch import DejaVu
 
-ROUTE, AGAIN, THIRD, SEA = (
-    f"sim:{name}"
-    for name in (
-        "aerial?frames=64",
-        "aerial?frames=64&traverse=1",
-        "aerial?frames=64&traverse=2",
-        "outdoor?frames=50",
-    )
-)
+ROUTE, AGAIN, THIRD = (f"sim:aerial?frames=64&traverse={traverse}" for traverse in range(3))
+SEA = "sim:outdoor?frames=50"
 
 
 def test_compare_reports_what_is_accepted_on_and_off_the_map(tmp_path):

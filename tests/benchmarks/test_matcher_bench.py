@@ -16,14 +16,6 @@ L1, HOG, SEQUENCE, FILTER = "l1 9 x 40 x 410", "hog 24 x 16", "sequence 9 x 5 x 
 EXPORT = "single frames 3 x 24 x 16 on 200"
 
 
-def small(*only):
-    """The rows of small cases, of these kinds alone if any are named."""
-    sizes = {"images": [(24, 16)], "distances": [(9, 40, 410)], "sequences": [(9, 5, 5000)]}
-    sizes |= {"filters": [(40, 3000)], "exports": [(3, 24, 16, 200)]}
-    sizes = {name: size if not only or name in only else [] for name, size in sizes.items()}
-    return list(bench_matcher(frames=70, repeats=1, torch_compile=False, **sizes))  # type: ignore[arg-type]
-
-
 @pytest.fixture(scope="module", autouse=True)
 def one_thread():
     """With more there are rows of ours with one as well."""
@@ -35,7 +27,11 @@ def one_thread():
 
 @pytest.fixture(scope="module")
 def rows():
-    return {(row["case"], row["contender"]): row for row in small()}
+    """The rows of small cases."""
+    sizes = {"images": [(24, 16)], "distances": [(9, 40, 410)], "sequences": [(9, 5, 5000)]}
+    sizes |= {"filters": [(40, 3000)], "exports": [(3, 24, 16, 200)]}
+    found = bench_matcher(frames=70, repeats=1, torch_compile=False, **sizes)
+    return {(row["case"], row["contender"]): row for row in found}
 
 
 def test_all_contenders_of_all_cases_give_what_we_give(rows):

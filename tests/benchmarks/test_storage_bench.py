@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 
+import av
 import numpy as np
 import pytest
 import torch
 from command_line import benchmark, benchmark_fails, run
+from helpers import all_of
 
 from benchmarks import storage
+from benchmarks.coded_video import CodedVideo
 from benchmarks.measure import new_row
 from benchmarks.storage import (
     KEYS,
@@ -21,7 +24,7 @@ from benchmarks.storage import (
     judged,
     skipped_lines,
 )
-from dejavu_torch import DejaVu
+from dejavu_torch import DejaVu, open_source
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.maps.spectral import SpectralMapper
 
@@ -154,6 +157,20 @@ def test_what_is_missed_is_set_beside_the_best_rival():
     ratios = (0.5 / 0.25, 0.5 / 0.2, 0.1 / 0.2, 0.002 / 0.2)
     assert storage.missed([*rows, *rivals]) == {"case": pytest.approx(np.prod(ratios) ** 0.25)}
     assert storage.missed(rivals) == {"case": pytest.approx((1 / (0.25 * 0.2**3)) ** 0.25)}
+
+
+@pytest.mark.skipif("libx264" not in av.codecs_available, reason="no libx264")
+def test_fewer_bytes_of_a_video_give_back_less():
+    traverse = open_source("sim:aerial?frames=40")
+    fine, coarse, third = (CodedVideo(traverse, "libx264", *of) for of in ((10, 1), (45, 1), (10, 3)))
+    assert fine.bytes > 2 * coarse.bytes > 0
+    assert third.bytes < fine.bytes
+    frames = all_of(traverse)
+    errors = [float((all_of(coded) - frames).square().mean()) for coded in (fine, coarse)]
+    still = float((frames[torch.randperm(40)] - frames).square().mean())
+    assert errors[0] < min(errors[1], still / 4)  # and in their order
+    last = (all_of(third)[-1] - frames).square().mean((1, 2, 3))
+    assert (len(third), int(last.argmin())) == (14, 39)
 
 
 REFUSALS = {

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dejavu_torch.evaluation.baselines import fair_stride, nearest_frames
+from dejavu_torch.evaluation.baselines import every, fair_stride, nearest_frames
 from dejavu_torch.recognition.localizer import Matching
 from dejavu_torch.recognition.sequence import SequenceMatcher
 
@@ -80,3 +80,8 @@ def test_convention_8_the_stride_is_at_most_twice_the_tolerance():
     strides = {(0, 5): 10, (4000, 5): 10, (4001, 5): 9, (20000, 5): 2, (40000, 5): 1, (40001, 5): 1}
     strides |= {(0, 1): 2, (0, 0): 1}
     assert {given: fair_stride(1000, 10, 4, *given) for given in strides} == strides
+
+
+def test_strides_in_words():
+    words = {1: "every", 2: "every 2nd", 3: "every 3rd", 11: "every 11th", 12: "every 12th", 22: "every 22nd"}
+    assert {k: every(k, "frame") for k in words} == {k: f"{text} frame" for k, text in words.items()}
