@@ -46,6 +46,16 @@ def test_examples_are_the_surest_right_the_surest_wrong_and_one_at_the_border():
     assert example_queries(match, None, 0) == {2: "surest answer", 4: answers[4]}
 
 
+def test_scores_are_scaled_and_the_best_of_each_block_is_shown():
+    scores = torch.rand(30, 50)
+    least, median = scores.amin(1, keepdim=True), scores.median(1, keepdim=True).values
+    scaled = ((scores - least) / (median - least)).clamp(max=1)
+    picture = draw_scores(run_of(scores), cells=20)["scores"]
+    for column, block in enumerate(scaled[::2].split(3, 1)):
+        assert torch.allclose(image(picture.plot[1])[:, column], block.amin(1))
+    assert picture.caption.endswith("Shown: 15 of 30 queries; the best of every 3 neighbouring places.")
+
+
 def test_convention_11_places_and_queries_are_drawn_at_their_frames():
     """Of ten places, the camera stands at the fourth from frame 6 to 29; the query moves twice as fast."""
     borders = torch.tensor([0, 2, 4, 6, 30, 31, 32, 33, 34, 35, 40])

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+from types import SimpleNamespace
+
+import numpy as np
 import pytest
 import torch
 from drawn import layer, run_of, texts
@@ -11,8 +15,10 @@ from dejavu_torch.evaluation.map_plots import plot_answers
 from dejavu_torch.evaluation.template_plots import (
     draw_chunks,
     draw_layers,
+    draw_templates,
     edges_seen,
 )
+from dejavu_torch.types import FrequencyLayer
 
 STANDS = torch.tensor([0, 2, 4, 30, 31, 32, 33, 34, 35])  # the camera stands from frame 4 to 29
 
@@ -38,6 +44,26 @@ def test_convention_11_axes_along_the_route_count_frames_and_periods_count_place
     assert [line.get_xdata()[0] for line in rows[0].lines] == [33]
     assert rows[0].images[0].get_extent()[:2] == [31, 35]
     assert "difference of query 77 (lower is better)" in texts(figure)
+
+
+def test_templates_lie_over_the_frames_they_are_the_mean_of():
+    one = FrequencyLayer(Fraction(5), 5, 3, 15, (0, 4))
+    values = torch.arange(15).remainder(5).float()[:, None].expand(-1, 5)  # the phase itself
+    templates = torch.stack([torch.ones(5), torch.arange(5.0)], 1)
+    model = SimpleNamespace(trained=None)
+    run = run_of(torch.zeros(1, 15), reference_features=values, model=model, unit="places")
+    figure, (above, below) = draw_templates(run, one, templates, 1)["templates"].plot
+    assert [np.stack(line.get_data(), 1).tolist() for line in above.lines[:-1]] == [
+        [[3, 3], [4, 4]],
+        [[0, 0], [1, 1], [2, 2], [3, 3], [4, 4]],
+        [[0, 0], [1, 1], [2, 2], [3, 3], [4, 4]],
+    ]
+    mean = above.lines[-1]
+    assert mean.get_xdata().tolist() == mean.get_ydata().tolist() == [0, 1, 2, 3, 4]
+    assert below.images[0].get_array().shape == (2, 5)
+    assert [label.get_text() for label in below.get_yticklabels()] == ["4"]
+    told = {"feature 4, 3 cycles; thick: their mean", "phase, of a period of 5 (places)"}
+    assert told <= set(texts(figure))
 
 
 @pytest.mark.parametrize("degrees", [10, 70, 130])
