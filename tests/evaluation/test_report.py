@@ -72,6 +72,30 @@ def test_the_table_has_bytes_where_the_places_are_known():
     assert score_table(report(), every=True) == [["", *main, *more], ["this map", *few, *many]]
 
 
+STORED = {  # of a storage curve, as in report.json
+    "frames": 40,
+    "storage": {
+        "map": [
+            {"route_bytes_per_place": size, "auc": area, "recall_at_1": 0.5}
+            for size, area in ((0.981, 0.25), (2.5, 0.375), (4.91, 0.625), (9.9, 0.75))
+        ]
+    },
+}
+
+
+def test_the_table_has_the_map_in_five_bytes_and_in_one():
+    one = report(STORED, null=Contender("null", SCORES))
+    one = one._replace(ours=Contender("this map", SCORES, 440, fixed=40))
+    assert [row[0] for row in score_table(one)] == [
+        *("", "this map", "the map in 4.9 route bytes per place"),
+        *("the map in 0.98 route byte per place", "null"),
+    ]
+    assert score_table(one)[2][1:] == ["0.625", "0.500", "", "5.9", "4.9"]
+    assert score_table(one, every=True)[3][1:] == ["0.250", "0.500", *4 * [""], "79", "2.0", "1.0"]
+    assert "AUC 0.500" in repr(one)  # the scores of the map itself
+    assert len(score_table(report({"storage": STORED["storage"]}))) == 2  # of no known number of places
+
+
 def test_areas_of_sequences_in_a_table_below_the_scores(tmp_path):
     areas = {1: SCORES, 5: SCORES._replace(auc=0.875)}
     null = Contender("null", SCORES, sequences=areas)

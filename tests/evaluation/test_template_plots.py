@@ -15,12 +15,24 @@ from dejavu_torch.evaluation.map_plots import plot_answers
 from dejavu_torch.evaluation.template_plots import (
     draw_chunks,
     draw_layers,
+    draw_spectrogram,
     draw_templates,
     edges_seen,
 )
+from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.types import FrequencyLayer
 
 STANDS = torch.tensor([0, 2, 4, 30, 31, 32, 33, 34, 35])  # the camera stands from frame 4 to 29
+
+
+def wave(period, frames=256):
+    return torch.sin(torch.arange(frames) * 2 * torch.pi / period)
+
+
+def described(values, **parts):
+    """A run of which only the reference's features (N,D) matter."""
+    model = SimpleNamespace(trained=None, mapper=SimpleNamespace(**parts))
+    return run_of(torch.zeros(1, len(values)), reference_features=values, model=model, unit="places")
 
 
 def test_convention_11_axes_along_the_route_count_frames_and_periods_count_places():
@@ -46,13 +58,30 @@ def test_convention_11_axes_along_the_route_count_frames_and_periods_count_place
     assert "difference of query 77 (lower is better)" in texts(figure)
 
 
+@pytest.mark.parametrize("hop", [None, 64])
+def test_spectrogram_is_darkest_at_the_period(hop):
+    values, analysis = torch.cat([wave(32), wave(16)])[:, None], SpectrogramAnalysis(window=256, hop=hop)
+    run = described(values, periods=analysis)
+    figure, (above, below) = draw_spectrogram(run, (layer(32, 0, 256, 1),), 0)["spectrogram"].plot
+    line = above.collections[0].get_paths()[0].vertices[1:513]
+    assert np.allclose(line, torch.stack([torch.arange(512), values[:, 0]], 1))
+    for mesh, period in zip((below.collections[0], below.collections[-1]), (32, 16), strict=True):
+        borders = mesh.get_coordinates()[:, 0, 1]
+        power = mesh.get_array().ravel()
+        assert borders[power.argmax()] > period > borders[power.argmax() + 1]
+        assert power.max() == pytest.approx(100 * 2 / 3, rel=1e-3)  # what a pure wave holds under Hann
+    starts = [float(mesh.get_coordinates()[0, 0, 0]) for mesh in below.collections]
+    assert starts == [start for start, _, _ in analysis(values)]
+    kept = [line.get_ydata() for line in below.lines if line.get_marker() == "o"]
+    assert kept == [[32]]
+    assert "feature 0 along the route" in texts(figure)
+
+
 def test_templates_lie_over_the_frames_they_are_the_mean_of():
     one = FrequencyLayer(Fraction(5), 5, 3, 15, (0, 4))
     values = torch.arange(15).remainder(5).float()[:, None].expand(-1, 5)  # the phase itself
     templates = torch.stack([torch.ones(5), torch.arange(5.0)], 1)
-    model = SimpleNamespace(trained=None)
-    run = run_of(torch.zeros(1, 15), reference_features=values, model=model, unit="places")
-    figure, (above, below) = draw_templates(run, one, templates, 1)["templates"].plot
+    figure, (above, below) = draw_templates(described(values), one, templates, 1)["templates"].plot
     assert [np.stack(line.get_data(), 1).tolist() for line in above.lines[:-1]] == [
         [[3, 3], [4, 4]],
         [[0, 0], [1, 1], [2, 2], [3, 3], [4, 4]],
