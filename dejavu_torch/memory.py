@@ -150,7 +150,8 @@ def _blocks(batches: Iterable[Tensor], most: int) -> Iterator[Tensor]:
     for batch in batches:
         dimension, dtype = seen = batch.shape[1], batch.dtype
         kind = kind or seen
-        expect(seen == kind, f"{kind[0]} {kind[1]} as before", f"batch of {dimension} {dtype}")
+        before = f"{kind[0]} of {kind[1]} as before"
+        expect(seen == kind, before, f"features {rows}.. are {dimension} of {dtype}")
         rows, held = rows + len(batch), held + batch.nbytes
         loose.append(batch)
         if held > most:

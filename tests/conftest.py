@@ -59,7 +59,7 @@ FEW_VIEWS = {
     *("test_cli_growth", "test_faults", "test_readme", "test_memory_bench", "test_scale", "test_demo"),
     *("test_cli_networks", "test_pretrained", "test_cli_rejection", "test_onnx_export", "test_reproduce"),
     *("test_routes", "test_spectral_training", "test_results", "test_trainings", "test_compare"),
-    *("test_cli_live", "test_cli_hub", "test_cli_streaming", "test_configs", "test_joined", "test_cluster"),
+    *("test_cli_live", "test_cli_hub", "test_configs", "test_joined", "test_cluster"),
     *("test_storage_bench", "test_train_command", "test_held_out", "test_devices", "test_free_memory"),
     *("test_spectral_model", "test_notebooks"),
 }

@@ -13,8 +13,6 @@ from functools import cache
 from threading import Lock
 from typing import Any
 
-Done = subprocess.CompletedProcess[str]
-run = subprocess.run  # tests put `forked` in its place
 TORCH, PACKAGE = "torch", "dejavu_torch.cli.reports"
 SERVER = """
 import importlib, json, os, socket, sys
@@ -103,13 +101,3 @@ def python(code, *words, input=None, **settings):
     with Forked(code, *words, stdin=None if input is None else subprocess.PIPE, **settings) as process:
         printed = process.communicate(input)
     return subprocess.CompletedProcess(words, process.returncode, *printed)
-
-
-def forked(command, **settings):
-    """In the place of `subprocess.run`, for `python -m MODULE WORDS` with the package imported."""
-    if "-m" not in command:
-        return run(command, **settings)
-    at = command.index("-m")
-    code = f"import runpy; runpy.run_module({command[at + 1]!r}, run_name='__main__', alter_sys=True)"
-    settings = {name: value for name, value in settings.items() if name in ("stdout", "stderr", "cwd", "env")}
-    return python(code, *command[at + 2 :], imports=PACKAGE, **settings)

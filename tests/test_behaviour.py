@@ -148,3 +148,9 @@ def test_the_null_takes_as_many_bytes_as_the_map():
     null = null_control(model, route, route).index
     # in the map's steps lines of shuffled frames take more bytes, and hold nearly all of these
     assert (null == torch.arange(300)).float().mean() < 0.3
+
+
+def test_a_summary_names_few_of_many_chunks():
+    told = str(of_features(SpectralMapper(step=0.1, chunk=16), noise(400, 4)).summary())
+    assert "more chunks" in told
+    assert told.count("\n") < 15

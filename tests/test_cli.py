@@ -8,7 +8,6 @@ import re
 import shlex
 import subprocess
 import sys
-from fractions import Fraction
 from importlib import import_module
 from pathlib import Path
 
@@ -16,7 +15,6 @@ import numpy as np
 import pytest
 import torch
 from command_line import TEMPLATES, fails, frames, report_of, run, write_images
-from videos import H264, clip, pictures
 
 from dejavu_torch import DejaVu, SpectrogramAnalysis, TemplateMapper, open_source
 from dejavu_torch.cli import COMMANDS, commands
@@ -26,7 +24,6 @@ from dejavu_torch.types import Training
 
 SMALL = "sim:aerial?frames=96"
 QUERY = "sim:aerial?frames=96&traverse=1"
-LONG = "sim:aerial?frames=256"  # longer than the window of periods that some tests give
 
 
 @pytest.fixture(scope="module")
@@ -77,26 +74,6 @@ def test_wide_descriptors_are_told_to_be_reduced_not_whitened(tmp_path, capsys):
     assert "Whitening, " not in told
 
 
-def test_pixels_that_are_not_square_are_named_where_a_video_does_not_fit(tmp_path, capsys):
-    square = clip(tmp_path / "square.mp4", pictures(12, 48, 64), **H264)
-    wide = clip(tmp_path / "wide.mp4", pictures(12, 48, 40), aspect=Fraction(8, 5), **H264)
-    error = fails(capsys, "compare", square, wide, "--truth", 0, "--features", "HOG", "--out", tmp_path / "o")
-    assert "frame of 3 x 48 x 40 (its pixels are 8:5, not square)" in error
-    assert error.count("not square") == 1
-
-
-@pytest.mark.parametrize(
-    ("words", "hint"),
-    [
-        ("--features hog", "not hog; did you mean HOG?"),
-        ("--velocity none", "not none; did you mean null?"),
-        ("--preprocess.size none", "--preprocess.size is none; expected null, or int"),
-    ],
-)
-def test_what_a_wrong_word_may_mean(words, hint, capsys):
-    assert hint in fails(capsys, "learn", SMALL, "--map", "a.safetensors", *words.split())
-
-
 def test_convention_4_threshold_option_then_map_then_probability_then_all(small_map, tmp_path, capsys):
     route, out = tmp_path / "a.safetensors", tmp_path / "m.csv"
 
@@ -125,30 +102,6 @@ def test_convention_4_threshold_option_then_map_then_probability_then_all(small_
     assert 35 <= accepted() <= 41
     run("localize", route, QUERY, "--out", out, "--threshold", "0")
     assert accepted() == 0
-
-
-def test_a_drive_that_is_asked_for_is_in_order(small_map, tmp_path):
-    frames, out, found = 255 * open_source(QUERY)[:].float(), tmp_path / "m.csv", []
-    np.save(tmp_path / "q.npy", frames.movedim(1, -1).byte().numpy())
-    for words in ((), ("--ordered",)):
-        run("localize", small_map, tmp_path / "q.npy", "--match", "drive", *words, "--out", out)
-        found.append(out.read_text())
-    assert found[0] == found[1]
-
-
-def test_config_and_options(tmp_path):
-    config = tmp_path / "mine.yaml"
-    config.write_text(
-        "mapper: {class_path: dejavu_torch.TemplateMapper, init_args: {reduction: sum, "
-        "periods: {class_path: dejavu_torch.SpectrogramAnalysis, init_args: {window: 128}}}}\n"
-    )
-    route = tmp_path / "a.safetensors"
-    run("learn", LONG, "--map", route, "--config", config, "--batch_size", "16")
-    model = DejaVu.load(route)
-    assert model.mapper.periods.window == 128
-    assert model.map.reduction == "sum"
-    assert model.batch_size == 16
-    assert {(layer.start, layer.stop) for layer in model.map.plan} == {(0, 128), (128, 256)}
 
 
 @pytest.mark.parametrize(
@@ -304,6 +257,20 @@ def test_threads_do_not_spin_while_they_wait(helped):
     assert "OMP_WAIT_POLICY = 'PASSIVE'" in helped[1]
 
 
+def test_several_sources_are_one_route(tmp_path):
+    images = frames(60, size=16)
+    every = write_images(tmp_path / "every", images)
+    parts = write_images(tmp_path / "a", images[:25]), write_images(tmp_path / "b", images[25:])
+    settings = ("--whitening", "none", "--calibration", "none", "--mapper.route_bytes_per_place", "20")
+    run("learn", *parts, "--map", tmp_path / "parts.safetensors", *settings)
+    run("learn", every, "--map", tmp_path / "every.safetensors", *settings)
+    one, other = (DejaVu.load(tmp_path / f"{name}.safetensors") for name in ("parts", "every"))
+    assert one.frame_names[24:26] == ["a/24.png", "b/0.png"]
+    assert one.map.places == other.map.places == 60
+    queries = torch.rand(3, 1, 16, 16)
+    assert torch.allclose(one(queries), other(queries), atol=0.05)
+
+
 # a map that is evaluated as it is
 
 
@@ -358,6 +325,9 @@ WRONG = {  # a line of words behind `dejavu`, and what its one line holds
     "learn a.npy --map m --threshold high": ("--threshold is high", "expected float"),
     "learn a.npy --map m --weight_bits 4": ("--weight_bits is 4", "[8, 32]"),
     "learn a.npy --map m --seed 99999999999999999999": ("--seed is 99999999999999999999", "at most"),
+    "learn a.npy --map m --features hog": ("not hog; did you mean HOG?",),
+    "learn a.npy --map m --velocity none": ("not none; did you mean null?",),
+    "learn a.npy --map m --preprocess.size none": ("--preprocess.size is none; expected null, or int",),
     "learn a.npy --map m --features short": ("--features", "import path of a class, not short"),
     "learn a.npy --map m --features no.such.Net": ("--features", "'no'"),
     "learn a.npy --map m --features torch.nn.Linear": ("--features.in_features", "required"),
@@ -376,18 +346,16 @@ WRONG = {  # a line of words behind `dejavu`, and what its one line holds
     "learn a.npy --map m.safetensors --second c.npy": ("6 frames", "a truth for", "30 frames in order"),
     "learn a.npy --map m.safetensors --average c.npy": ("6 frames", "or a truth for"),
     "learn a.npy --map m.safetensors --calibration c.npy": ("6 frames", "or a truth for"),
-    "learn nan.npy --map m.safetensors": ("frame 70",),
     "learn nowhere --map m.safetensors": ("nowhere is not there", "expected"),
     "learn nowhere --map a.txt": ("--map a.txt", "a.safetensors"),
     "learn a.npy": ("required: --map",),
     "localize m": ("required: source, --out",),
     "localize m a.npy --out m.csv --speeds [fast]": ("--speeds", "fast", "float"),
-    "compare a.npy b.npy --out new/r --tolerance -1": ("tolerance is -1",),
     "compare a.npy b.npy --out r --config paper": ("18 places", "1024", "--mapper.periods.short shrink"),
     "evaluate nowhere.csv --truth 0 --out new/r": ("nowhere.csv",),
-    "reproduce mars --out new/r": ("mars", "aerial"),
     "compare a.npy b.npy --out new/r --map m -cpaper": ("-cpaper: the map of --map has its own settings",),
     "live m a.npy --page many": ("--page is many", "int"),
+    "completion fish": ("dejavu: shell is fish; expected one of ['bash', 'zsh']",),
     "train": ("no stage given", "fit, validate, test, export"),
     "train fit --data.source a.npy --model.lr fast": ("--model.lr is fast", "float"),
     "train fit --data.source a.npy --trainer.accelerator abacus": ("accelerator='abacus'", "cpu"),
@@ -402,7 +370,6 @@ def test_what_is_wrong_is_told_by_options_and_without_python(line, tmp_path, cap
     monkeypatch.chdir(tmp_path)
     for name, count in (("a", 18), ("b", 18), ("c", 6)):
         np.save(f"{name}.npy", frames(count))
-    np.save("nan.npy", np.where(np.arange(100) == 70, np.nan, 1)[:, None] * np.ones(8))
     Path("part.yaml").write_text("mapper: {class_path: dejavu_torch.HOG}\n")
     Path("key.yaml").write_text("mapper:\n  class_path: SpectralMapper\n  init_args: {stepp: 3}\n")
     there = {*tmp_path.iterdir()}
@@ -410,14 +377,6 @@ def test_what_is_wrong_is_told_by_options_and_without_python(line, tmp_path, cap
     assert [word for word in WRONG[line] if word not in error] == [], error
     assert not re.search(r"<class|typing\.|Parser key|NoneType|\bNone\b|import path string", error), error
     assert {*tmp_path.iterdir()} == there
-
-
-def test_unreadable_image_in_the_middle(small_map, tmp_path, capsys):
-    folder = write_images(tmp_path / "broken", frames(100, size=64))
-    (folder / "77.png").write_bytes(b"no image")
-    assert "77.png" in fails(capsys, "localize", small_map, folder, "--out", tmp_path / "m.csv")
-    # the first batch was matched by then: nothing of it may stay
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["broken"]
 
 
 def test_what_lacks_memory_is_one_line_and_a_bug_is_a_traceback(capsys, monkeypatch):
@@ -439,30 +398,12 @@ def test_what_lacks_memory_is_one_line_and_a_bug_is_a_traceback(capsys, monkeypa
         run("info", "a")
 
 
-@pytest.fixture(scope="module")
-def own_process(small_map, tmp_path_factory):
-    """What commands behind one another in a process of their own print, and what they say on stderr."""
+def test_quiet_where_not_a_terminal_and_a_warning_of_a_library_is_one_line(small_map, tmp_path):
     code = (
-        "import resource, sys, warnings; from dejavu_torch.cli import commands, main\n"
-        "for count in (128, 1280):\n"
-        "    main(['localize', sys.argv[1], f'sim:aerial?frames={count}', '--out', sys.argv[2]])\n"
-        "    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)\n"
-        f"main(['learn', {SMALL!r}, '--map', sys.argv[3], '--whitening.views', '1'])\n"
+        "import sys, warnings; from dejavu_torch.cli import commands, main\n"
+        f"main(['learn', {SMALL!r}, '--map', sys.argv[2], '--whitening.views', '1'])\n"
         "print('learned', file=sys.stderr)\n"
         "commands.print_map = lambda model: warnings.warn('two\\nlines')\nmain(['info', sys.argv[1]])"
     )
-    folder = tmp_path_factory.mktemp("process")
-    words = map(str, (small_map, folder / "m.csv", folder / "a.safetensors"))
-    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=True)
-    return done.stdout, done.stderr
-
-
-@pytest.mark.slow
-def test_localize_memory_does_not_grow_with_the_queries(own_process):
-    few, many = (int(line) for line in own_process[0].splitlines() if line.isdigit())
-    # features of the further frames would take 8 MB, their frames 57 MB, the painted route takes 2 MB
-    assert many - few < 8_000
-
-
-def test_quiet_where_not_a_terminal_and_a_warning_of_a_library_is_one_line(own_process):
-    assert own_process[1] == "learned\ndejavu: two lines\n"
+    words = [sys.executable, "-c", code, str(small_map), str(tmp_path / "a.safetensors")]
+    assert subprocess.run(words, capture_output=True, text=True).stderr == "learned\ndejavu: two lines\n"

@@ -22,12 +22,8 @@ def folder(tmp_path_factory):
     run("learn", FIRST, "--map", folder / "first.safetensors", *CHUNKS)
     np.save(folder / "a.npy", frames(40, seed=1))
     np.save(folder / "d.npy", np.random.default_rng(0).normal(size=(96, 8)).astype(np.float32))
-    none = ("--calibration", "none", "--whitening", "none")
-    for name, options in {
-        "whole": none,
-        "f": (*none, "--mapper.chunk", "32"),
-    }.items():
-        run("learn", folder / "d.npy", "--map", folder / f"{name}.safetensors", *options)
+    plain = ("--calibration", "none", "--whitening", "none", "--mapper.chunk", "32")
+    run("learn", folder / "d.npy", "--map", folder / "f.safetensors", *plain)
     sure = DejaVu.load(folder / "f.safetensors")
     sure.precision = 0.9
     sure.save(folder / "sure.safetensors")
@@ -51,18 +47,6 @@ def test_a_map_grows_in_its_own_file_or_in_another(folder, tmp_path, capsys):
     assert model.map.places == 128
     assert model.calibration is not None
     assert model.calibration != DejaVu.load(first).calibration
-
-
-def test_calibration_of_the_new_places(folder, tmp_path):
-    first, out = folder / "first.safetensors", tmp_path / "m.safetensors"
-    run("learn", NEXT, "--append", first, "--map", out, "--calibration", "none")
-    assert DejaVu.load(out).calibration is None
-    another = ("--calibration", f"{NEXT}&traverse=1", "--precision", "0.9")
-    run("learn", NEXT, "--append", first, "--map", out, *another)
-    model = DejaVu.load(out)
-    assert (model.calibration is not None, model.precision) == (True, 0.9)
-    run("learn", NEXT, "--append", first, "--map", out, "--threshold", "0.25")
-    assert DejaVu.load(out).threshold == 0.25
 
 
 # maps of several routes
@@ -174,7 +158,6 @@ def test_a_visit_is_averaged_into_a_map_that_is_there(folder, tmp_path, capsys):
         ("learn d.npy --map m.safetensors --average e.npy --calibration ./e.npy", ["e.npy itself"]),
         ("learn d.npy d.npy --map m.safetensors --calibration ./d.npy", ["d.npy itself"]),
         ("learn d.npy --map m.safetensors --average_truth 0", ["--average SOURCE"]),
-        ("merge first.safetensors --map m.safetensors", ["first.safetensors", "at least two"]),
         ("merge first.safetensors ./first.safetensors --map m.safetensors", ["the same file"]),
         ("merge first.safetensors f.safetensors --map f.safetensors", ["f.safetensors is an input"]),
         ("compare a.npy a.npy --map both.safetensors --out e", ["both.safetensors has", "first, other"]),

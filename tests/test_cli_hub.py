@@ -13,50 +13,22 @@ import torch
 from command_line import fails, run
 from torch import nn
 
-from dejavu_torch import HOG, DejaVu
+from dejavu_torch import DejaVu
 from dejavu_torch.cli.commands import run_learn
-from dejavu_torch.cli.localize import run_live, run_localize
 from dejavu_torch.cli.parser import parse
-from dejavu_torch.cli.reports import run_compare
 from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.features.hub import NETWORKS, Network
-from dejavu_torch.features.joined import Joined
 
 ROUTE = "sim:aerial?frames=40"
 MEAN, STD = [0.485, 0.456, 0.406], [0.229, 0.224, 0.225]
-RESNET = {"backbone": "ResNet50", "fc_output_dim": 2048}
-SELA = {"backbone": "dinov2-large", "aggregation": "gem", "hashing": True, "rerank": True}
-ANYLOC = {"backbone": "DINOv2", "domain": "urban"}
-# the call, the size of the frames, and how many numbers come of it
-CALLS = {
-    "megaloc": (("gmberton/MegaLoc", "get_trained_model"), {}, (322, 322), 8448),
-    "eigenplaces": (("gmberton/eigenplaces", "get_trained_model"), RESNET, (480, 640), 2048),
-    "cosplace": (("gmberton/cosplace", "get_trained_model"), RESNET, (480, 640), 2048),
-    "sage": (("chenshunpeng/SAGE", "sage_vitb"), {}, (322, 322), 8448),
-    "salad": (("serizba/salad", "dinov2_salad"), {}, (322, 322), 8448),
-    "boq": (
-        ("amaralibey/bag-of-queries", "get_trained_boq"),
-        {"backbone_name": "dinov2", "output_dim": 12288},
-        (322, 322),
-        12288,
-    ),
-    "cricavpr": (("Lu-Feng/CricaVPR", "trained_model"), {}, (224, 224), 10752),
-    "anyloc": (
-        ("AnyLoc/DINO", "get_vlad_model"),
-        {"backbone": "DINOv2", "domain": "urban"},
-        (322, 322),
-        49152,
-    ),
-    "selavpr++": (("Lu-Feng/SelaVPRplusplus", "SelaVPRplusplus"), SELA, (322, 322), 512),
-}
 
 
 class Net(nn.Module):
-    """As many numbers as a network of the hub makes, in the form in which it makes them."""
+    """Numbers in the form in which a network of the hub makes them."""
 
-    def __init__(self, repository: str, numbers: int) -> None:
+    def __init__(self, repository):
         super().__init__()
-        self.repository, self.linear = repository, nn.Linear(12, numbers)
+        self.repository, self.linear = repository, nn.Linear(12, 512)
 
     def forward(self, frames):
         made = self.linear(nn.functional.adaptive_avg_pool2d(frames, 2).flatten(1))
@@ -74,8 +46,7 @@ def asked(monkeypatch):
         calls.append({"repository": repo_or_dir, "entry": model, **arguments})
         sys.stdout.write("Using a cache\n")  # as some do
         torch.manual_seed(0)
-        numbers = next(one[3] for one in CALLS.values() if one[0][0] == repo_or_dir)
-        net = Net(repo_or_dir, numbers)
+        net = Net(repo_or_dir)
         return nn.DataParallel(net) if repo_or_dir.startswith("Lu-Feng") else net
 
     monkeypatch.setattr(torch.hub, "load", load)
@@ -86,24 +57,16 @@ def features_of(*words):
     return parse("learn", run_learn, [ROUTE, "--map", "map.safetensors", *words])["model"].features
 
 
-@pytest.mark.parametrize("name", CALLS)
-def test_a_short_name_is_this_call(name, asked):
-    (repository, entry), arguments, size, numbers = CALLS[name]
-    net = features_of("--features", f"hub:{name}")
-    assert asked == [{"repository": repository, "entry": entry, "trust_repo": True} | arguments]
-    assert type(net) is Embedding
-    assert isinstance(net.network, Net)
-    assert (net.resize, net.mean, net.std, net.dimension, net.layer) == (size, MEAN, STD, None, None)
-    frames = torch.rand(2, 3, 60, 80)
+@pytest.mark.parametrize("name", NETWORKS)
+def test_a_short_name_is_a_call_of_the_hub(name, asked):
+    net, own = features_of("--features", f"hub:{name}"), NETWORKS[name]
+    assert asked == [{"repository": own.repository, "entry": own.entry, "trust_repo": True} | own.settings]
+    assert (net.resize, net.mean, net.std, net.dimension, net.layer) == (own.size, MEAN, STD, None, None)
     with torch.no_grad():
-        features = net.eval()(frames)
-    assert features.shape == (2, numbers)
+        features = net.eval()(torch.rand(2, 3, 60, 80))
+    assert features.shape == (2, 512)
     if name == "selavpr++":
         assert set(features.unique().tolist()) == {-1.0, 1.0}
-
-
-def test_all_of_them_are_tried():
-    assert NETWORKS.keys() == CALLS.keys()
 
 
 @pytest.mark.parametrize(
@@ -128,39 +91,6 @@ def test_the_words_in_full_are_the_same(asked):
     assert repr(nets[0]) == repr(nets[1])
     assert asked[0] == asked[1]
     assert asked[0]["repository"] == "gmberton/eigenplaces"
-
-
-@pytest.mark.parametrize(
-    "value",
-    [
-        "[HOG, hub:cricavpr]",
-        "[{class_path: HOG}, {class_path: hub:cricavpr, init_args: {resize: [224, 224]}}]",
-    ],
-)
-def test_as_a_member_of_a_list(value, asked):
-    joined = features_of("--features", value)
-    assert isinstance(joined, Joined)
-    assert [type(one) for one in joined.members] == [HOG, Embedding]
-    assert repr(joined.members[1]) == repr(features_of("--features", "hub:cricavpr"))
-    assert asked[0] == asked[1]
-
-
-def test_a_member_has_settings_of_its_own(asked):
-    member = "{class_path: hub:megaloc, init_args: {resize: [28, 42], mean: .5}}"
-    net = features_of("--features", f"[HOG, {member}]").members[1]
-    assert (net.resize, net.mean, net.std) == ((28, 42), 0.5, STD)
-    assert len(asked) == 1
-
-
-def test_a_member_has_arguments_of_its_own(asked):
-    page = (Path(__file__).parents[1] / "docs" / "howto" / "pretrained.md").read_text().replace("\n", " ")
-    shown = re.findall(r"`(\[HOG, \{class_path: hub.*?\}\])`", page)
-    assert len(shown) == 1
-    for value in (shown[0], shown[0].replace("{domain: aerial}", "{init_args: {domain: aerial}}")):
-        net = features_of("--features", value).members[1]
-        assert (net.resize, net.mean) == ((224, 224), MEAN)
-    call = {"repository": "AnyLoc/DINO", "entry": "get_vlad_model", "trust_repo": True}
-    assert asked == [call | ANYLOC | {"domain": "aerial"}] * 2
 
 
 @pytest.mark.parametrize(
@@ -196,33 +126,11 @@ def test_settings_of_a_config_are_not_its_own(features, asked, tmp_path):
     assert asked[0] == asked[1]
 
 
-@pytest.mark.parametrize("value", ["hub:megaloc", "[hub:megaloc]", "{class_path: hub:megaloc}"])
-def test_a_config_takes_it(value, asked, tmp_path):
-    (tmp_path / "own.yaml").write_text(f"features: {value}")
-    net = features_of("--config", str(tmp_path / "own.yaml"))
-    assert repr(net) == repr(features_of("--features", value))
-
-
 @pytest.mark.parametrize("value", ["hub:megalock", "[HOG, hub:megalock]", "hub:"])
 def test_an_unknown_name_lists_the_known(value, capsys):
     error = fails(capsys, "learn", ROUTE, "--map", "map.safetensors", "--features", value)
     assert ": hub:" in error
-    assert all(f"hub:{name}" in error for name in CALLS)
-
-
-@pytest.mark.parametrize(
-    ("call", "words"),
-    [
-        (run_compare, (ROUTE, ROUTE, "--out", "report")),
-        (run_localize, ("map.safetensors", ROUTE, "--out", "matches.csv")),
-        (run_live, ("map.safetensors", ROUTE)),
-    ],
-)
-def test_other_commands_take_it(call, words, asked):
-    parsed = parse(call.__name__.removeprefix("run_"), call, [*words, "--features", "hub:megaloc"])
-    net = parsed["model"].features if "model" in parsed else parsed["loading"].features
-    assert isinstance(net, Embedding)
-    assert len(asked) == 1
+    assert all(f"hub:{name}" in error for name in NETWORKS)
 
 
 @pytest.mark.parametrize("value", ["hub:selavpr++", "[HOG, hub:eigenplaces]"])
@@ -244,13 +152,8 @@ def test_the_next_line_runs(value, asked, tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize("config", [(), ("--config", "train_road")])
 def test_a_training_takes_it_and_says_the_words(config, asked, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    made = (
-        "--model.backbone",
-        "hub:cosplace",
-        "--model.backbone.dimension=4",
-        "--model.mapper",
-        "SpectralMapper",
-    )
+    made = "--model.backbone", "hub:cosplace", "--model.backbone.dimension=4"
+    made += "--model.mapper", "SpectralMapper"
     steps = "--trainer.max_steps=1", "--trainer.accelerator=cpu", "--trainer.default_root_dir=run"
     run("train", "fit", "--data.source", ROUTE, *config, *made, *steps)
     words = shlex.split(capsys.readouterr().out.splitlines()[-1].removeprefix("next: dejavu "))

@@ -20,8 +20,6 @@ from processes import PACKAGE, Forked
 from videos import H264, clip, piped
 
 from dejavu_torch import DejaVu, LiveLocalizer, PlaceFilter, SpectralMapper, Whitening, open_source
-from dejavu_torch.cli.localize import run_live
-from dejavu_torch.cli.parser import parse
 from dejavu_torch.live.page import Page
 
 KEYS = ["frame", "time", "place", "reference_frame", "name", "score", "posterior", "probability", "accepted"]
@@ -102,31 +100,6 @@ def test_with_a_lag_each_frame_has_its_line_later(lag, folder, capsys, monkeypat
     assert titles[-1][1] == 63
     assert f"answers come {lag} frames later" in titles[-1][0]
     assert "64 frames, 0 dropped" in err
-
-
-def test_a_filter_learns_and_queries_are_centred_on_the_way(folder, capsys):
-    run("live", folder / "map.safetensors", folder / "second.mkv", "--learns", "--centre", "mean")
-    found, model = lines_of(capsys.readouterr().out), DejaVu.load(folder / "map.safetensors")
-    frames = open_source(folder / "second.mkv", model.frame_shape[1:])  # type: ignore[index,arg-type]
-    ways = [(learns, centre) for learns in (True, False) for centre in (True, False)]
-    scores = []
-    for learns, centre in ways:
-        localizer = LiveLocalizer(model, PlaceFilter(learns=learns), centre=centre)
-        scores.append([localizer(frame).score for frame in frames])
-    assert [line["score"] for line in found] == pytest.approx(scores[0], abs=1e-3)
-    assert all(one != pytest.approx(scores[0], abs=1e-3) for one in scores[1:])
-
-
-def test_a_pipe_is_brought_to_the_size_of_the_map(folder, tmp_path, capsys):
-    with piped(tmp_path, (folder / "second.ts").read_bytes()) as pipe:
-        run("live", folder / "map.safetensors", pipe)
-    out, err = capsys.readouterr()
-    found = lines_of(out)
-    told = re.match(r"dejavu: (\d+) frames, (\d+) dropped", err)
-    assert told is not None
-    assert [len(found), 40] == [int(told[1]), int(told[1]) + int(told[2])]
-    assert found[-1]["frame"] == 39
-    assert abs(found[-1]["place"] - 39) <= 5
 
 
 @pytest.mark.parametrize(
@@ -232,28 +205,10 @@ def test_a_process_that_nobody_needs_any_more_ends(how, folder, tmp_path):
         assert re.fullmatch(r"dejavu: \d+ frames, \d+ dropped; .*\n", live.stderr.read())
 
 
-def test_a_page_of_a_file_plays_in_real_time_and_stays_until_ctrl_c(folder, tmp_path):
-    """A folder has no times: 10 frames a second. Nobody looks at the page, and none of its frames is lost."""
-    np.save(tmp_path / "frames.npy", _pixels(next(open_source(folder / "second.mkv").batches(8))))
-    with process(folder / "map.safetensors", tmp_path / "frames.npy", "--page", "0") as live:
-        url = live.stderr.readline().split()[-1]
-        began, lines = time.monotonic(), [json.loads(live.stdout.readline()) for _ in range(8)]
-        assert time.monotonic() - began > 0.5
-        assert [line["frame"] for line in lines] == [*range(8)]
-        assert url in live.stderr.readline()
-        with urlopen(f"{url}state") as answer:
-            assert json.load(answer)["number"] == 7
-        assert live.poll() is None
-        live.send_signal(signal.SIGINT)
-        assert live.wait(20) == 0
-        assert live.stderr.read().startswith("dejavu: 8 frames, 0 dropped")
-
-
 @pytest.mark.parametrize(
     ("words", "told"),
     [
         ("/dev/video99 --realtime", "is live already"),
-        ("missing.mp4", "missing.mp4 is not there"),
         ("sim:aerial?frames=20 --reference sim:aerial", "--page"),
         ("sim:aerial?frames=20 --page 0 --reference sim:aerial?frames=20", "20 frames"),
         ("/dev/video99 --timeout 0", "--timeout 0; expected seconds, above 0"),
@@ -267,7 +222,3 @@ def test_a_page_of_a_file_plays_in_real_time_and_stays_until_ctrl_c(folder, tmp_
 )
 def test_mistakes_are_one_line(words, told, folder, capsys):
     assert told in fails(capsys, "live", folder / "map.safetensors", *words.split())
-
-
-def test_a_bare_page_has_a_port():
-    assert parse("live", run_live, ["map", "source", "--page"])["page"] == 8765

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import math
 import re
 from pathlib import Path
 
@@ -32,11 +31,9 @@ def folder(tmp_path_factory):
     """A spectral map of the route, and frames and features in files."""
     folder = tmp_path_factory.mktemp("spectral")
     run("learn", ROUTE, "--map", folder / "m.safetensors")
-    noise = np.random.default_rng(0)
     np.save(folder / "a.npy", frames(64, seed=1))
     np.save(folder / "b.npy", frames(64, seed=2))
     np.save(folder / "c.npy", frames(50, seed=3))
-    np.save(folder / "noise.npy", noise.normal(size=(900, 100)).astype(np.float32))
     return folder
 
 
@@ -151,16 +148,6 @@ def test_the_whitening_of_another_map_with_what_is_ahead_of_it(folder):
     assert report_of(folder / "fixed")["recall_at_1"] > 0.8
 
 
-def test_compare_learns_its_whitening_from_a_third_traverse(folder):
-    out = folder / "third"
-    run("compare", ROUTE, SECOND, "--second", THIRD, "--seed", "1", "--out", out)
-    run("learn", ROUTE, "--map", folder / "third.safetensors", "--second", THIRD, "--seed", "1")
-    assert same_maps(out / "map.safetensors", folder / "third.safetensors")
-    assert not same_maps(out / "map.safetensors", folder / "m.safetensors")
-    assert report_of(out)["recall_at_1"] > 0.9
-    assert report_of(out)["kind"] == "spectral"
-
-
 def test_whitening_learns_from_several_visits(folder):
     fourth = ROUTE + "&traverse=3"
     both = f"['{THIRD}','{fourth}']"
@@ -178,43 +165,20 @@ def test_whitening_learns_from_several_visits(folder):
     assert report_of(folder / "of_both")["recall_at_1"] > 0.9
 
 
-def test_a_map_that_holds_a_share(folder, capsys):
-    """By a word or a file; the map knows it."""
-    path, config = folder / "held.safetensors", folder / "hold.yaml"
-    config.write_text("mapper: {class_path: SpectralMapper, init_args: {hold: 0.9, chunk: 300}}\n")
-    options = "--whitening", "none", "--calibration", "none"
-    run("learn", folder / "noise.npy", "--map", path, "--config", config, *options)
-    by_file = DejaVu.load(path).mapper
-    assert isinstance(by_file, SpectralMapper)
-    assert (by_file.hold, by_file.route_bytes_per_place, by_file.chunk) == (0.9, None, 300)
-    first = DejaVu.load(path)
-    hold = "--mapper.chunk", "300", "--mapper.hold", "0.9"
-    run("learn", folder / "noise.npy", "--map", path, *hold, *options)
-    assert torch.equal(first.map.streams, DejaVu.load(path).map.streams)
-    capsys.readouterr()
-    run("info", path)
-    assert "hold=0.9" in capsys.readouterr().out
-
-
 # what is refused
 
 
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        ("--mapper.route_bytes_per_place 0.4", ("route_bytes_per_place is 0.4", "chunks")),
-        ("--mapper.hold 1.5", ("hold is 1.5; expected a number above 0 and below 1",)),
         ("--mapper.hold .9 --mapper.step .5", ("step is 0.5 and hold is 0.9; expected one of them",)),
         ("--mapper.periods.window 64", ("--mapper", "unrecognized", "periods.window")),
-        ("--whitening nowhere.safetensors", ("nowhere.safetensors is not there",)),
         ("--whitening m.safetensors", ("(64, 1764)", "(B, 3204)")),
         ("--whitening m.safetensors --whitening.views 2", ("--whitening.views", "no settings")),
         ("--whitening=m.safetensors --preprocess.patch 5", ("--preprocess.patch", "has its own")),
         ("--whitening m.safetensors --features.cell 16", ("learned with Joined; got HOG",)),
         ("--whitening m.safetensors --second b.npy", ("another map's",)),
         ("--second_truth 0", ("--second_truth 0", "--second SOURCE")),
-        ("--second c.npy --second_truth 70", ("no query has a right answer",)),
-        ("--second b.npy --whitening none", ("no whitening", "b.npy")),
         ("--second []", ("no traverses", "at least one")),
         ("--second [b.npy,./b.npy]", ("--second ./b.npy is b.npy itself",)),
         ("--second [b.npy,a.npy]", ("--second a.npy is a.npy itself",)),
@@ -268,29 +232,3 @@ def test_a_sequence_is_of_the_map_and_of_all_beside_it(noisy, tmp_path, capsys):
     run("localize", known, two, "--sequence", 9, "--speeds", "[2]", "--out", matches)
     expected = DejaVu.load(known).localize(open_source(two), sequence=SequenceMatcher(9, (2.0,)))
     assert places(matches) == [str(place) for place in expected.index.tolist()]
-
-
-def test_a_filter_is_of_the_map_and_of_all_beside_it(noisy, tmp_path):
-    one, two = noisy
-    out = tmp_path / "out"
-    run("compare", one, two, "--truth", 0, "--filter", "--out", out)
-    report = report_of(out)
-    assert (report["filter"], report["sequence"]) == (True, 1)
-    assert report["auc"] > report["sequences"]["1"]["auc"]
-    assert (out / "posterior.png").exists()
-
-    matches, route = tmp_path / "matches.csv", out / "map.safetensors"
-    run("localize", route, two, "--filter", "--out", matches)
-    assert_same_matches(matches, out / "matches.csv")
-    rows = list(csv.DictReader(matches.open(newline="")))
-    assert {row["accepted"] for row in rows} == {"0", "1"}
-    assert all((float(row["score"]) < math.log(2)) == (row["accepted"] == "1") for row in rows)
-    assert report["threshold"] == pytest.approx(math.log(2))  # ready features are not calibrated
-    assert report["least_probability"] is None
-    run("compare", one, two, "--filter", "--threshold", 0.1, "--out", out)
-    assert report_of(out)["threshold"] == 0.1
-    assert DejaVu.load(route).threshold is None  # it is none of single queries
-    run("localize", route, two, "--filter", "--threshold", 100, "--top", 2, "--out", matches)
-    rows = list(csv.DictReader(matches.open(newline="")))
-    assert len(rows) == 400
-    assert {row["accepted"] for row in rows} == {"1"}

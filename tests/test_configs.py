@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import os
 import shutil
 import subprocess
 import sys
@@ -17,7 +16,7 @@ from helpers import refused
 from dejavu_torch import DejaVu, InputError
 from dejavu_torch.cli.commands import run_learn
 from dejavu_torch.cli.parser import parse
-from dejavu_torch.cli.presets import find_config, preset_names, read_config
+from dejavu_torch.cli.presets import find_config, preset_names
 from dejavu_torch.evaluation.reproduce import paper_model
 from dejavu_torch.model_file import PARTS, recipe_of
 
@@ -147,20 +146,6 @@ def test_a_config_that_is_none_is_refused_ahead_of_the_loader(tmp_path, text, wo
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with refused("mine.yaml", words, "expected a YAML file of options"):
         parse("learn", run_learn, ["x", "--map", "y", f"--config={path}"])
-
-
-def test_a_config_is_a_regular_file(tmp_path):
-    os.mkfifo(tmp_path / "fifo")
-    with refused("fifo is not a regular file"):
-        parse("learn", run_learn, ["x", "--map", "y", "--config", str(tmp_path / "fifo")])
-    for name in (str(tmp_path), "a\0b", "a" * 5000, ""):
-        with refused("--config"):
-            find_config(name)
-
-
-def test_aliases_that_a_config_may_have(tmp_path):
-    (tmp_path / "mine.yaml").write_text("a: &a {x: 1}\nb: {<<: *a, y: 2}\nc: *a\n")
-    assert read_config(tmp_path / "mine.yaml") == {"a": {"x": 1}, "b": {"x": 1, "y": 2}, "c": {"x": 1}}
 
 
 @pytest.mark.parametrize("word", ["", "--batch_size="])

@@ -110,11 +110,11 @@ def test_a_comparison_of_loops_asks_all_contenders_for_them(tmp_path, capsys):
 
 
 def test_real_drives_with_and_without_loops(data_dir):
-    """Four laps of a small car on a track of 390 frames; a road in a city, driven once."""
-    laps = open_source(data_dir / "rc_car_laps" / "frames")
+    """Two laps of a small car on a track of 390 frames; a road in a city, driven once."""
+    laps = open_source(f"{data_dir}/rc_car_laps/frames?stop=1000&width=64")
     match = DejaVu().learn(laps).calibrate(laps).loops(laps, 50)
     found = match.accepted.nonzero()[:, 0]
-    starts = torch.tensor([194, 590, 982, 1356, 1750.0])
+    starts = torch.tensor([194, 590, 982, 1356.0])
     judged = found[(found >= 590) & (match.index[found] >= 194)]
 
     def around(frames):
@@ -122,7 +122,7 @@ def test_real_drives_with_and_without_loops(data_dir):
         return (frames - starts[lap]) / (starts[lap + 1] - starts[lap])
 
     off = ((around(judged) - around(match.index[judged]) + 0.5) % 1 - 0.5).abs()
-    assert len(judged) > 120
+    assert len(judged) > 100
     assert float((off < 0.1).double().mean()) > 0.98
     once = open_source(data_dir / "robotcar" / "t1" / "reference.npy")
     match = DejaVu().learn(once).calibrate(once).loops(once, 50)

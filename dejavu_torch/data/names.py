@@ -27,7 +27,7 @@ def encode_names(names: Sequence[str]) -> str:
         (True, True)
     """
     longest = max(map(len, names), default=0)
-    expect(longest <= MAX_NAME_LENGTH, f"at most {MAX_NAME_LENGTH}", f"a name has {longest} characters")
+    expect(longest <= MAX_NAME_LENGTH, f"at most {MAX_NAME_LENGTH}", f"a frame name has {longest} characters")
     numbered = _numbered(names)
     value = list(names) if numbered is None or _names(numbered) != list(names) else numbered
     return base64.b64encode(zlib.compress(json.dumps(value, separators=(",", ":")).encode(), 9)).decode()

@@ -190,5 +190,6 @@ def as_batch(frame: Tensor | np.ndarray, device: torch.device | str = "cpu") -> 
         return values[None].float().div_(255)
     values = values if values.dtype == torch.float64 else values.float()
     low, high = (float(end) for end in values.aminmax())
-    expect(low >= -ROUNDING and high <= 1 + ROUNDING, "0 to 1", f"the frame has {low:.4g} to {high:.4g}")
+    seen = f"the frame has values from {low:.4g} to {high:.4g}"
+    expect(low >= -ROUNDING and high <= 1 + ROUNDING, "0 to 1", seen)
     return values[None].clamp(0, 1)

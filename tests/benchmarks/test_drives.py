@@ -11,11 +11,10 @@ from command_line import benchmark
 from torch.nn.functional import normalize
 
 from benchmarks import drives, large_drives, storage_drives, tables
-from benchmarks.drives import AS_IT_WAS, ELSEWHERE, HALF, NO_OTHER, Known, asked, bench_drives, drives_of
+from benchmarks.drives import AS_IT_WAS, ELSEWHERE, HALF, NO_OTHER, bench_drives, drives_of
 from benchmarks.storage_drives import ANSWERS, Asked, bench_storage_drives, both_sides, drive_table
 from benchmarks.trainings import Route
-from dejavu_torch import DejaVu
-from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth
+from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.recognition.evidence import place_means, standardised
 
 PLACES, NUMBERS = 120, 24
@@ -26,28 +25,6 @@ def walk(seed, noise=0.0, route=7):
     profile, own = (torch.Generator().manual_seed(one) for one in (route, seed))
     smooth = torch.randn(PLACES, NUMBERS, generator=profile).cumsum(0)
     return smooth + noise * torch.randn(PLACES, NUMBERS, generator=own)
-
-
-def test_drives_are_cut_from_the_one_that_was():
-    made = drives_of(10, torch.zeros(4, 1))
-    listed = {name: numbers.tolist() for name, numbers in made.items() if numbers is not None}
-    assert listed["there and back"] == [0, 1, 2, 3, 4, 4, 3, 2, 1, 0]
-    assert listed["a third of the speed"][:7] == [0, 0, 0, 1, 1, 1, 2]
-    assert listed["five times the speed"] == [0, 5]
-    assert listed["a stop"] == [*range(5), *[5] * 200, *range(5, 10)]
-    assert listed["half of it off the map"] == [0, 1, 2, 3, 4, -1, -2, -3, -4]
-    assert listed[ELSEWHERE] == [-1, -2, -3, -4]
-    long = drives_of(300, None, seed=3)
-    assert [name for name, numbers in long.items() if numbers is None] == [*made][-3:]
-    cut = long["stretches of 20 to 40"]
-    assert cut is not None
-    borders = ((cut[1:] - cut[:-1]).abs() != 1).nonzero()[:, 0] + 1
-    lengths = {len(part) for part in cut.tensor_split(borders)}
-    assert min(lengths) >= 20
-    assert {*(cut[1:] - cut[:-1]).tolist()} >= {1, -1}  # both ways
-    again = drives_of(300, None, seed=3)["stretches of 20 to 40"]
-    assert again is not None
-    assert torch.equal(again, cut)
 
 
 def test_large_maps_are_measured_beside_all_places(tmp_path, monkeypatch, capsys):
@@ -66,16 +43,6 @@ def test_large_maps_are_measured_beside_all_places(tmp_path, monkeypatch, capsys
     assert len(queries) == len(truth) == 120
     monkeypatch.setattr(tables, "read", lambda _: {"rows": [row]})
     assert "| 120, 600, 5 |" in tables.large_drives()
-
-
-def test_queries_of_another_route_have_no_place_but_are_judged():
-    truth = GroundTruth(torch.tensor([[4], [5]]), torch.tensor([True, False]), torch.tensor([[7], [8]]))
-    known = Known(DejaVu(), torch.tensor([[1.0], [2]]), truth, 1, torch.tensor([[30.0], [40]]))
-    queries, found = asked(known, torch.tensor([1, -2, 0]))
-    assert queries.tolist() == [[2], [40], [1]]
-    assert found.positives.tolist() == [[5], [-1], [4]]
-    assert found.judged.tolist() == [False, True, True]
-    assert found.ignored.tolist() == [[8], [-1], [7]]
 
 
 def test_a_row_for_each_drive_of_a_route(tmp_path, monkeypatch, capsys):
@@ -140,18 +107,3 @@ def test_stores_are_asked_three_ways_from_the_same_scores(monkeypatch):
     areas = [found["dejavu 1", answer]["auc"] for answer in ANSWERS]
     assert ours[3] == " ".join(f"{area:.3f}".removeprefix("0") for area in areas)
     assert storage_drives.pictured(rows)[0].axes[1].get_title("left") == "whole drive\nwalk"
-
-
-def test_the_table_of_made_drives(monkeypatch):
-    def row(case, one, auc, taken):
-        facts = {"is_drive": taken, "above_half": 0.5, "above_nine_tenths": 0.25, "calibration_error": 0.125}
-        facts |= {"auc_one": one, "auc_uncentred": one - 0.25}
-        return {"case": case, "contender": "reversed", "auc": auc, **facts}
-
-    rows = [row("city", 0.5, 1.0, True), row("laps", 0.75, 0.5, False)]
-    monkeypatch.setattr(tables, "read", lambda _: {"rows": rows})
-    means, areas = tables.made_drives().split("\n\n")
-    assert means.splitlines()[2].startswith(
-        "| reversed | 2 | 1 | 0.625 | 0.375 | 0.750 | 0.250, laps | 0.500 | 0.250 |  | 0.125 |"
-    )
-    assert areas.splitlines()[2] == "| reversed | .500 1.000 | .750 .500* |"

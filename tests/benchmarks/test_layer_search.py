@@ -13,8 +13,6 @@ from benchmarks.template_search import in_layers
 from dejavu_torch import FrequencyLayer, TemplateMap
 from dejavu_torch.recognition.select import best_match
 
-LONG = tuple(FrequencyLayer(Fraction(p), p, 0, 60_000, (j,)) for j, p in enumerate((210, 286)))
-
 
 def random_values(draw, generator, *shape):
     """Many equal ones, sums that are equal once rounded, or neither."""
@@ -55,19 +53,3 @@ def test_equals_the_scan_in_random_cases():
             route = random_map(draw, generator)
             with patch.object(layer_search, "AHEAD", draw.choice([1, 7, 4096])):
                 check(route, random_values(draw, generator, draw.randint(1, 5), 3))
-
-
-def test_a_distance_that_is_not_finite_means_what_it_means_in_a_scan():
-    for value in (torch.nan, torch.inf):
-        generator = torch.Generator().manual_seed(0)
-        route = TemplateMap(
-            LONG, [torch.rand(layer.phases, 1, generator=generator) for layer in LONG], 60_000, 2
-        )
-        rows = route.distances(torch.rand(3, 2, generator=generator))
-        rows[0][0, 5], rows[1][1] = value, value
-        expected = best_match(route.combine(rows))
-        with patch.object(TemplateMap, "distances", return_value=rows):
-            score, place = in_layers(route, torch.rand(3, 2))
-        assert torch.equal(place, expected.index)
-        assert torch.equal(score.nan_to_num(-1, -2), expected.score.nan_to_num(-1, -2))
-        assert place[1] == -1

@@ -11,7 +11,6 @@ import torch
 from command_line import benchmark
 
 from benchmarks import memory
-from benchmarks.measure import in_process
 from benchmarks.memory import CONTENDERS, TOLERANCE, Drive, kept, localize, paint_drives, shown_by
 
 HOG = "HOG, float32"
@@ -61,16 +60,6 @@ def drives(tmp_path_factory):
     return folder
 
 
-def test_a_frame_is_a_window_of_the_drive(drives):
-    image = np.load(drives / "places.npy")
-    (batch,) = Drive(image, torch.tensor([3, 150, 0])).batches(8)
-    assert batch.shape == (3, 3, 64, 64)
-    assert torch.equal(batch[1], torch.from_numpy(image[:, 150:214]).permute(2, 0, 1) / 255)
-
-    assert shown_by(4, 12).tolist() == [0, 3, 6, 9]
-    assert shown_by(5, 2).tolist() == [0, 1, 0, 1, 0]
-
-
 def test_places_are_learned_and_found(drives):
     learned, found = (memory.measure(HOG, 200, queries, 1, drives) for queries in (0, 50))
     assert learned["bytes"] == found["bytes"] == kept(drives, HOG, 200).stat().st_size
@@ -89,21 +78,3 @@ def test_every_contender_finds_the_places(name, drives, tmp_path):
     CONTENDERS[name].learn(Drive(route, torch.arange(200)), tmp_path / "route")
     found = localize(CONTENDERS[name], tmp_path / "route", Drive(queries, shown))
     assert ((found - shown).abs() <= TOLERANCE).double().mean() > 0.9
-
-
-PROBE = """
-import importlib.util, json, sys
-(places,) = json.loads(sys.argv[1])
-if places > 100: raise SystemExit(f"no more than 100 places; got {places}")
-print("a line of a library", json.dumps({"found": importlib.util.find_spec("kornia").origin}), sep="\\n")
-"""
-
-
-def test_a_process_does_not_import_from_the_current_folder_and_says_why_it_failed(tmp_path, monkeypatch):
-    (tmp_path / "kornia.py").touch()
-    (tmp_path / "there").mkdir()
-    (tmp_path / "there" / "probe.py").write_text(PROBE)
-    monkeypatch.syspath_prepend(tmp_path / "there")
-    monkeypatch.chdir(tmp_path)
-    assert not Path(in_process("probe", [50])["found"]).is_relative_to(tmp_path)
-    assert in_process("probe", [150]) == {"skipped": "no more than 100 places; got 150"}

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import json
-import sys
 
+import av
 import numpy as np
 import pytest
 import torch
 from command_line import benchmark, benchmark_fails, run
+from helpers import all_of
 
 from benchmarks import storage
-from benchmarks.measure import PROCESS, Contender, new_row
-from benchmarks.plots import plot_frontiers
+from benchmarks.coded_video import CodedVideo
+from benchmarks.measure import new_row
 from benchmarks.storage import (
     KEYS,
-    bench_storage,
     bytes_for,
     contenders_of,
     described,
@@ -23,11 +23,8 @@ from benchmarks.storage import (
     front,
     judged,
     skipped_lines,
-    storage_tables,
-    stores_of,
-    whitenings,
 )
-from dejavu_torch import DejaVu
+from dejavu_torch import DejaVu, open_source
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.maps.spectral import SpectralMapper
 
@@ -50,8 +47,16 @@ def pair(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def rows(pair):
-    return list(bench_storage(pair))
+def bench(pair, tmp_path_factory):
+    out = tmp_path_factory.mktemp("bench") / "out"
+    benchmark("storage", *pair, "--out", out)
+    assert sorted(path.name for path in out.iterdir()) == ["bench.json", "bench.png"]
+    return json.loads((out / "bench.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def rows(bench):
+    return bench["rows"]
 
 
 @pytest.fixture(scope="module")
@@ -65,8 +70,9 @@ def row_of(route, name):
     return judged(route, next(one for one in contenders_of(route) if one.name == name))
 
 
-def test_all_families_are_there_and_what_is_skipped_says_why(rows):
+def test_all_families_are_there_and_what_is_skipped_says_why(bench, rows):
     pytest.importorskip("faiss")
+    assert {entry["T"] for entry in bench["equal_auc"]} == {1, 5, 11, 21}
     ran = {row["family"] for row in rows if row["skipped"] is None}
     stores = {"dejavu", "null", "frames", "interpolated", "PCA", "binary", "PQ, own codebooks"}
     assert ran == stores | {"dejavu, other whitenings", "RaBitQ", "EDEN", "OPQ, own codebooks"}
@@ -123,70 +129,6 @@ def test_more_bytes_recognise_more_and_the_whole_database_most(rows):
     assert row["recall_at_1"] == pytest.approx(float(right.float().mean()), abs=0.01)
 
 
-def test_other_whitenings_take_other_fixed_bytes(route, rows):
-    names = (*storage.WHITENINGS, "of another route")
-    others = {name: row_of(route, f"dejavu 5, whitening {name}") for name in names}
-    sizes = {name: row["fixed_bytes"] for name, row in others.items()}
-    assert sizes["16 bits"] > sizes["8 bits"]
-    assert route.fixed == sizes["of another route"]
-    for row in others.values():
-        assert row["skipped"] or row["route_bytes_per_place"] == pytest.approx(5, rel=0.02)
-    assert "numbers" in (others["64 numbers"]["skipped"] or "")  # of 24
-    shown = whitenings([*rows, others["of another route"]])  # of another case than the rows
-    expected = ["the default", "16 bits", "8 bits"]
-    assert [[name for name, _, _ in some] for some in shown.values()] == [expected]
-    (table,) = [table for table in storage_tables(rows) if "fixed kB" in table]
-    assert [line.partition("  ")[0] for line in table.splitlines()[-3:]] == expected
-    axes = storage.pictured(rows)[0].axes
-    assert axes[1].texts[-1].get_text() == f"16 bits, {sizes['16 bits'] / 1000:.0f} kB"
-
-
-def test_a_whitening_that_is_given_describes_all(pair, tmp_path, monkeypatch, capsys):
-    run("learn", pair[1], "--map", tmp_path / "map.safetensors")
-    whitened = []
-
-    def first(route):
-        whitened.append(route.places)
-        return list(stores_of(route))[1:2]  # a quarter of a byte is too few for 300 places
-
-    monkeypatch.setattr(storage, "stores_of", first)
-    benchmark("storage", *pair, "--whitening", tmp_path / "map.safetensors", "--out", tmp_path / "out")
-    model = DejaVu.load(tmp_path / "map.safetensors")
-    assert torch.equal(whitened[0], model.descriptor.whitened(series(0)))
-    written = json.loads((tmp_path / "out" / "bench.json").read_text())["rows"]
-    assert [row["family"] for row in written] == ["dejavu", "the paper"]
-    DejaVu(whitening="none").learn(series(0)).save(tmp_path / "raw.safetensors")
-    words = ("--whitening", tmp_path / "raw.safetensors", "--out", tmp_path / "o")
-    assert "without whitening" in benchmark_fails(capsys, "storage", *pair, *words)
-
-
-def test_the_paper_beside_them(route):
-    period = torch.arange(1024)[:, None] % torch.tensor([16, 32])
-    wave = (period < torch.tensor([8, 16])).float() + 0.01 * torch.rand(1024, 2)
-    row = row_of(described("wave", ArrayTraverse(wave), ArrayTraverse(wave + 0.01)), "the paper")
-    assert row["skipped"] is None
-    assert row["route_bytes"] > 0
-    assert "1024" in row_of(route, "the paper")["skipped"]
-
-
-def test_what_cannot_be_stored_is_a_row(route, monkeypatch):
-    def missing():
-        import av
-
-        av.CodecContext.create("libx999", "w")
-
-    assert "libx999" in judged(route, Contender("x999", missing))["skipped"]
-    short = described("short", *(ArrayTraverse(series(seed)[:40]) for seed in (0, 1)))
-    assert "route_bytes_per_place is 0.5; expected more than" in row_of(short, "dejavu 0.5")["skipped"]
-    assert "principal components" in row_of(short, "PCA, 32 numbers of every frame, int8")["skipped"]
-    name = "PQ4x8np of every 2nd frame, interpolated, own codebooks"
-    if not row_of(route, name)["skipped"]:
-        assert "bytes a place; tried up to 32" in row_of(short, name)["skipped"]
-    monkeypatch.setitem(sys.modules, "faiss", None)
-    assert "faiss" in row_of(route, name)["skipped"]
-    assert (row_of(route, "whole database, float")["peak_bytes"] is not None) == PROCESS.exists()
-
-
 def of(size, auc, family="other"):
     sequences = {"1": {"auc": auc, "recall_at_1": auc}}
     facts = {"seconds": 1.0, "auc": auc, "route_bytes_per_place": size, "sequences": sequences}
@@ -217,86 +159,18 @@ def test_what_is_missed_is_set_beside_the_best_rival():
     assert storage.missed(rivals) == {"case": pytest.approx((1 / (0.25 * 0.2**3)) ** 0.25)}
 
 
-def test_the_tables():
-    rows = [of(1, 0.5, "dejavu"), of(3.2, 0.75, "dejavu"), of(1.01, 0.4), of(10, 0.8), of(2, 0.99, "more")]
-    skipped = [new_row("case", name, KEYS, family="none", skipped="absent") for name in "abc"]
-    best, equal = storage_tables([*rows, *skipped], at=3.2)
-    assert best.startswith("case: AUC\n")
-    best, _, rest = best.rpartition("(1 - AUC) of dejavu")
-    assert f"{storage.missed(rows)['case']:.2f}" in rest
-    assert best.split()[-16:] == [
-        *("dejavu", "0.500", "0.500", "0.750", "0.750", "0.750"),
-        *("other", "0.400", "0.400", "0.400", "0.400", "0.800"),
-        *("more", "0.990", "0.990", "0.990"),
-    ]
-    other = f"{bytes_for(0.75, front(rows[2:4])):.2f}"
-    shown = [line.split()[:2] for line in equal.splitlines()]
-    assert shown[-4:] == [["AUC", "0.750"], ["dejavu", "3.20"], ["other", other], ["more", "<2.00"]]
-    _, equal = storage_tables([of(1, 0.9, "dejavu"), of(1.6, 0.99, "dejavu"), of(2, 0.8)])
-    shown = [line.split()[:2] for line in equal.splitlines()]
-    assert shown[-3:] == [["AUC", "0.950"], ["dejavu", f"{1.6 ** (5 / 9):.2f}"], ["other", "never"]]
-    assert skipped_lines(skipped) == ["case: skipped a and 2 more: absent"]
-    assert skipped_lines(skipped[:1]) == ["case: skipped a: absent"]
-
-
-def test_rows_are_written_as_they_finish_the_map_that_is_given_among_them(pair, tmp_path, monkeypatch):
-    seen, out, path = [], tmp_path / "out", tmp_path / "map.safetensors"
-    given = "dejavu, map"
-
-    def some(*arguments):
-        names = ("dejavu 5", "dejavu 10", "null 5", given)
-        return [one for one in contenders_of(*arguments) if one.name in names]
-
-    def watched(*arguments):
-        seen.append(len(json.loads((out / "bench.json").read_text())["rows"]) if out.exists() else 0)
-        return judged(*arguments)
-
-    monkeypatch.setattr(storage, "contenders_of", some)
-    monkeypatch.setattr(storage, "judged", watched)
-    run("learn", pair[0], "--map", path, "--mapper.route_bytes_per_place", "5")
-    benchmark("storage", *pair, "--map", path, "--out", out)
-    assert seen == [0, 1, 2, 3]
-    written = json.loads((out / "bench.json").read_text())
-    assert {entry["T"] for entry in written["equal_auc"]} == {1, 5, 11, 21}
-    assert min(row["ratio_to_ours"] for row in written["rows"] if row["family"] == "dejavu") == 1
-    assert sorted(path.name for path in out.iterdir()) == ["bench.json", "bench.png"]
-    rows = {row["contender"]: row for row in written["rows"]}
-    assert rows[given]["auc"] == pytest.approx(rows["dejavu 5"]["auc"], abs=0.02)
-    assert rows[given]["route_bytes"] == pytest.approx(rows["dejavu 5"]["route_bytes"], rel=0.03)
-
-
-def test_a_line_for_each_family_and_ours_the_thickest():
-    fronts = {"dejavu": [(0.5, 0.6), (2.0, 0.9999)], "null": [(1.0, 0.0)], "of a user": [(1.0, 0.5)]}
-    figure, axes = plot_frontiers({"one": fronts, "two": {"dejavu": [(1.0, 0.5)]}})
-    assert [axis.get_title("left") for axis in axes] == ["one", "two"]
-    assert all(axis.get_xscale() == "log" for axis in axes)
-    widths = {line.get_label(): line.get_linewidth() for line in axes[0].lines}
-    assert max(widths, key=lambda name: widths[name]) == "dejavu"
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == list(fronts)
-
-
-def test_built_in_routes():
-    routes = storage.routes_of((), (64, 300), None, False)
-    names = ["sim:aerial, 64 places", "sim:aerial, 300 places", "sim:outdoor", "sim:underground"]
-    assert [name.startswith(known) for (name, *_), known in zip(routes, names, strict=True)] == [True] * 4
-    for route, said in zip(routes[0][1:], ("seed=0&traverse=0", "seed=0&traverse=1", "seed=1"), strict=True):
-        assert route is not None
-        assert said in route.name
-
-
-def test_a_truth_and_a_tolerance_that_are_given(pair, tmp_path, monkeypatch):
-    monkeypatch.setattr(storage, "contenders_of", lambda route, *_: list(stores_of(route))[:8])
-    places = np.load(pair[0])
-    np.save(tmp_path / "later.npy", places[100:])
-    (tmp_path / "truth.csv").write_text("".join(f"{i},{i + 97}\n" for i in range(200)))
-    found = {}
-    for tolerance in (2, 3):
-        words = ("--truth", tmp_path / "truth.csv", "--tolerance", tolerance, "--out", tmp_path / "out")
-        benchmark("storage", pair[0], tmp_path / "later.npy", *words)
-        written = json.loads((tmp_path / "out" / "bench.json").read_text())
-        assert written["tolerance"] == tolerance
-        found[tolerance] = written["rows"][-2]["recall_at_1"]
-    assert found[2] < 0.5 < found[3]
+@pytest.mark.skipif("libx264" not in av.codecs_available, reason="no libx264")
+def test_fewer_bytes_of_a_video_give_back_less():
+    traverse = open_source("sim:aerial?frames=40")
+    fine, coarse, third = (CodedVideo(traverse, "libx264", *of) for of in ((10, 1), (45, 1), (10, 3)))
+    assert fine.bytes > 2 * coarse.bytes > 0
+    assert third.bytes < fine.bytes
+    frames = all_of(traverse)
+    errors = [float((all_of(coded) - frames).square().mean()) for coded in (fine, coarse)]
+    still = float((frames[torch.randperm(40)] - frames).square().mean())
+    assert errors[0] < min(errors[1], still / 4)  # and in their order
+    last = (all_of(third)[-1] - frames).square().mean((1, 2, 3))
+    assert (len(third), int(last.argmin())) == (14, 39)
 
 
 REFUSALS = {
@@ -322,6 +196,13 @@ REFUSALS = {
     "memory --device cuda": ["unrecognized"],
     "scale --places 7": ["7", "500"],
     "scale --device tpu": ["tpu"],
+    "scale --contenders grep": ["contenders are ['grep']", "faiss flat"],
+    "results data --ways all": ["expected one of 'default'"],
+    "results data --jobs 0": ["0 jobs"],
+    "results data --footage moon": ["no footage"],
+    "trainings data --options=--foo'": ["No closing quotation"],
+    "trainings data --routes roads": ["expected one of 'road, first half'"],
+    "trainings data --jobs 0": ["at least one"],
     "train sim:aerial": ["1 sources", "REFERENCE QUERY"],
     "train --steps 0": ["0 steps"],
     "train --seeds -1": ["seeds [-1]", "from 0"],
@@ -344,9 +225,3 @@ def test_what_is_refused(line, pair, tmp_path, capsys):
     error = benchmark_fails(capsys, *words, "--out", tmp_path / "out")
     assert [word for word in REFUSALS[line] if word not in error] == [], error
     assert not (tmp_path / "out").exists()
-
-
-def test_pairs_of_other_lengths_that_know_their_places(monkeypatch):
-    monkeypatch.setattr(storage, "contenders_of", lambda *_: [])
-    pair = [f"sim:aerial?frames=60&stop={stop}&traverse={stop % 2}" for stop in (60, 51)]
-    assert list(bench_storage(pair)) == []

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 import subprocess
-from pathlib import Path
 
-from command_line import benchmark, benchmark_fails, run_here
+from command_line import benchmark, run_here
 
 from benchmarks import trainings
-from benchmarks.trainings import PRESETS, ROUTES, Route
+from benchmarks.trainings import Route
 
 
 def test_a_training_is_set_beside_the_untrained_map_and_made_once(tmp_path, monkeypatch, capsys):
@@ -42,41 +41,3 @@ def test_a_training_is_set_beside_the_untrained_map_and_made_once(tmp_path, monk
     assert found["broken", "trained"]["skipped"].startswith("lr is 0")  # told, not lost
     assert "broken, seed 3: " in capsys.readouterr().out
     assert (tmp_path / "out" / "bench.png").is_file()
-    # the same training again is not run; another is, and one that did not end well
-    row = found["flight, short", "trained 5 B"]
-    monkeypatch.setattr(trainings.Judge, "of", lambda *_: [row])
-    monkeypatch.setattr(trainings.Judge, "hog", lambda *_: row)
-    calls = []
-
-    def counted(command, **settings):
-        if command[0] == "git":  # asks for the commit
-            return run_here(command, **settings)
-        calls.append(command)
-        return run_here(["sh", "-c", "exit 3"], **settings)
-
-    monkeypatch.setattr(subprocess, "run", counted)
-    monkeypatch.setattr(trainings, "ROUTES", {"flight, short": flight})
-    benchmark(*given)
-    assert not calls
-    for repeat in range(2):
-        benchmark(*given, "--options=--model.rate 0")
-        assert len(calls) == repeat + 1
-    assert "status 3" in capsys.readouterr().out
-
-
-def test_bad_options_are_refused_ahead_of_the_first_training(tmp_path, capsys):
-    given = ("trainings", tmp_path, "--out", tmp_path / "out")
-    assert "No closing quotation" in benchmark_fails(capsys, *given, "--options=--foo '")
-    assert "expected one of 'road, first half'" in benchmark_fails(capsys, *given, "--routes", "roads")
-    assert "at least one" in benchmark_fails(capsys, *given, "--jobs", "0")
-    assert not (tmp_path / "out").exists()
-
-
-def test_the_routes_are_below_the_folder_of_the_footage():
-    for route in (one.below(Path("/films")) for one in (*ROUTES.values(), *PRESETS.values())):
-        for name in (route.reference, route.query, *filter(None, [route.truth])):
-            assert "/films/" in name or name.startswith("sim:")
-        assert route.reference != route.query
-    start = PRESETS["train_residues, road"].below(Path("/films")).start
-    assert start is not None
-    assert "/films/" in start.reference

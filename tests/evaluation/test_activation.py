@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth
-from dejavu_torch.evaluation.activation import Rate, activation_rates, in_phase
+from dejavu_torch.evaluation.activation import activation_rates, in_phase
 from dejavu_torch.types import FrequencyLayer
 
 
@@ -32,9 +32,7 @@ def test_rates_in_closed_form():
     alone, fused = rates(best, index, truth, tolerance=1, places=60)
     assert alone == pytest.approx((2 / 3, 1 / 2, 3 / 10))
     assert fused == pytest.approx((2 / 3, 1 / 2, 3 / 60))
-
-
-def test_unknown_queries_and_those_without_an_answer_do_not_count():
+    # neither unknown queries nor those without an answer count
     right = torch.tensor([[3], [13], [-1]])
     truth = GroundTruth(right, torch.tensor([True, False, True]), right.new_zeros(3, 0))
     alone, fused = rates([8, 3, 3], [8, 3, 3], truth, 0, 40)
@@ -51,15 +49,3 @@ def test_the_phase_of_a_place_is_in_phase_with_it_and_shifts_go_around(period, p
     off = [min((k - own) % phases, (own - k) % phases) * period / phases for k in range(phases)]
     assert found.tolist() == [frames <= tolerance for frames in off]
     assert not in_phase(one, best, torch.full((phases, 1), -1), tolerance).any()
-
-
-@pytest.mark.parametrize(
-    ("rate", "text"),
-    [
-        (Rate(0.98, 0.87, 0.118), "right 98 % here, 87 % elsewhere, by chance 12 %"),
-        (Rate(1.0, None, 0.0036), "right 100 %, by chance 0.4 %"),
-        (Rate(None, 0.25, 0.1), "right 25 % elsewhere, by chance 10 %"),
-    ],
-)
-def test_rates_in_words(rate, text):
-    assert rate.describe() == text

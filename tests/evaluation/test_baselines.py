@@ -28,6 +28,13 @@ def literal_nearest(reference, query, k, metric):
     return found
 
 
+@pytest.fixture
+def _parts(monkeypatch):
+    """A few distances at a time."""
+    monkeypatch.setattr("dejavu_torch.evaluation.baselines.BLOCK_DISTANCES", 20)
+
+
+@pytest.mark.usefixtures("_parts")
 @pytest.mark.parametrize("metric", ["l1", "l2", "cosine"])
 def test_the_nearest_stored_frame(metric):
     torch.manual_seed(0)
@@ -40,6 +47,7 @@ def test_the_nearest_stored_frame(metric):
         assert match.accepted.all()
 
 
+@pytest.mark.usefixtures("_parts")
 @pytest.mark.parametrize("k", [1, 4])
 def test_frames_that_are_not_stored_are_driven_past_in_a_sequence(k):
     """Their distances are those of the nearest stored frame; a sequence tells where between them it is."""
@@ -52,17 +60,6 @@ def test_frames_that_are_not_stored_are_driven_past_in_a_sequence(k):
         assert match.index.tolist() == index.tolist()
         assert torch.allclose(match.score, score)
     assert found.sequences[1].index.tolist() == nearest_frames(reference, query, k).index.tolist()
-
-
-def test_distances_in_parts_change_nothing(monkeypatch):
-    reference, query = torch.rand(20, 4), torch.rand(11, 4)
-    for k, sequence in ((1, None), (3, None), (1, SequenceMatcher(4)), (3, SequenceMatcher(4))):
-        whole = nearest_frames(reference, query, k, matching=Matching(sequence))
-        for numbers in (1, 20, 45):
-            with monkeypatch.context() as patch:
-                patch.setattr("dejavu_torch.evaluation.baselines.BLOCK_DISTANCES", numbers)
-                parts = nearest_frames(reference, query, k, matching=Matching(sequence))
-            assert all(torch.equal(x, y) for x, y in zip(parts, whole, strict=True))
 
 
 @given(

@@ -14,18 +14,16 @@ from helpers import Fixed, all_of, refused, template_model
 from PIL import Image
 from torch import nn
 
-from dejavu_torch import HOG, DejaVu, SequenceMatcher, SpectrogramAnalysis, open_source
+from dejavu_torch import DejaVu, SequenceMatcher, SpectrogramAnalysis, open_source
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.evaluation.compare import compare
-from dejavu_torch.evaluation.controls import null_control, with_mapper
+from dejavu_torch.evaluation.controls import null_control
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.pictures import draw_pictures
 from dejavu_torch.evaluation.report import score_table, sequence_table
 from dejavu_torch.features.descriptor import Descriptor
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.views import LabelledFrames
-from dejavu_torch.maps.distance import phase_distances
-from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.types import FrequencyLayer, Training
 
@@ -92,26 +90,6 @@ def trained(model):
     return model
 
 
-def test_a_map_that_is_there_is_evaluated_as_it_is(trained):
-    before, expected = trained.map, trained.localize(route(1))
-    templates = before.templates.clone()
-    result = compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), "0", model=trained)
-    assert result.run.model.map is before
-    assert torch.equal(before.templates, templates)
-    for one, other in zip(result.run.match, expected, strict=True):
-        assert torch.equal(one, other)
-    report = result.report.as_json()
-    assert report["trained"] == {"steps": 30, "seed": 3}
-    assert report["seconds_learn"] == 0
-    assert report["map_bytes"] == trained.summary().map_bytes
-    # the area tells them apart: this map's is not that of one learned anew
-    fresh = with_mapper(trained, trained.mapper)
-    anew = compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)), "0", model=fresh).report.as_json()
-    assert anew["trained"] is None
-    assert anew["seconds_learn"] > 0
-    assert anew["auc"] != report["auc"]
-
-
 def test_the_null_of_a_trained_map_has_the_templates_of_shuffled_frames(trained):
     reference, query = route(0), route(1)
     result = compare(ArrayTraverse(reference), ArrayTraverse(query), "0", model=trained, seed=5)
@@ -175,23 +153,6 @@ def pictures(seed):
     noise, texture = torch.Generator().manual_seed(seed), torch.Generator().manual_seed(7)
     frames = torch.rand(8, 1, 24, 24, generator=texture)[torch.arange(64) % 8]
     return ArrayTraverse((frames + 0.1 * torch.randn(frames.shape, generator=noise)).clamp(0, 1))
-
-
-def contenders(features):
-    model = template_model(features, SpectrogramAnalysis(window=64, min_period=4, strongest=1))
-    return dict(compare(pictures(1), pictures(2), "0", model, tolerance=3).report.contenders)
-
-
-def test_hog_stands_beside_other_features():
-    found = contenders(nn.Sequential(nn.AvgPool2d(4), nn.Flatten()))
-    dimension = HOG()(torch.rand(1, 1, 24, 24)).shape[1]
-    for key, k, name in (("hog", 1, "HOG, every frame"), ("hog_stride_coarsest", 6, "HOG, every 6th frame")):
-        assert (found[key].name, found[key].k) == (name, k)
-        assert found[key].bytes == -(-64 // k) * dimension * 4
-        assert found[key].scores is not None
-    # of the eight that look alike the noise decides: all are frames, none is the map
-    assert 0 < found["hog"].scores.recall_at_1 < 0.9
-    assert not {"hog", "hog_stride_coarsest"} & contenders(None).keys()  # not beside itself
 
 
 def test_whatever_stores_features_needs_the_backbone_as_well():
@@ -277,41 +238,6 @@ def test_a_filter_stands_beside_single_queries_in_order_and_changes_nothing_else
     areas = [single["auc"], *(ordered["sequences"][way]["auc"] for way in ("filter", "smoother"))]
     assert areas[0] + 0.1 < areas[1] < areas[2]
     assert all("sequences" not in size for size in ordered["storage"]["map"])
-
-
-def test_many_queries_in_order_are_filtered_if_that_is_asked_for(monkeypatch):
-    pair = [open_source(f"sim:aerial?frames=30&traverse={i}") for i in range(2)]
-    found = []
-    for most in (900, 899):
-        monkeypatch.setattr("dejavu_torch.evaluation.compare.MAX_FILTERED", most)
-        found.append([bool(compare(*pair, ordered=ordered).run.matching.also) for ordered in (None, True)])
-    assert found == [[True, True], [False, True]]
-
-
-def test_the_scores_of_single_queries_are_computed_once(monkeypatch):
-    """Maps and stores are asked as many queries with a sequence as without."""
-    asked = []
-
-    def counting(function, queries):
-        def counted(*args, **settings):
-            asked.append(len(args[queries]))
-            scores = function(*args, **settings)
-            return scores
-
-        return counted
-
-    monkeypatch.setattr(SpectralMap, "score_blocks", counting(SpectralMap.score_blocks, 1))
-    stores = "dejavu_torch.evaluation.baselines.phase_distances"
-    monkeypatch.setattr(stores, counting(phase_distances, 0))
-    totals = []
-    for sequence in (None, SequenceMatcher(21), PlaceFilter()):
-        asked.clear()
-        model = DejaVu(whitening="none")
-        pair = ArrayTraverse(passing(1)), ArrayTraverse(passing(2))
-        compare(*pair, "0", model=model, sequence=sequence, storage_curve=True)
-        totals.append(sum(asked))
-    assert len(set(totals)) == 1
-    assert totals[0] > 64 * 10
 
 
 def test_seqslam_s_pixels_stand_beside_a_sequence_of_frames():

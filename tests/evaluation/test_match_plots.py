@@ -13,7 +13,6 @@ from dejavu_torch.evaluation.match_plots import (
     draw_posterior,
     draw_scores,
     example_queries,
-    plot_rows,
 )
 from dejavu_torch.types import Match
 
@@ -26,38 +25,9 @@ def dots(axis):
     }
 
 
-def scaled(scores):
-    """0 at a query's best score, 1 at its median and above."""
-    least, median = scores.amin(1, keepdim=True), scores.median(1, keepdim=True).values
-    return ((scores - least) / (median - least)).clamp(max=1)
-
-
 def image(axis):
     """What an axis shows, a row a query."""
     return torch.as_tensor(axis.images[0].get_array().filled(torch.nan)).T  # type: ignore[attr-defined]
-
-
-def test_without_a_truth_coverage_shows_the_probabilities():
-    sure = torch.tensor([0.9, 0.2, 0.0, 0.6], dtype=torch.float64)
-    match = Match(*matched(4, 9, -1, 2), sure)
-    figure, axis = draw_coverage(match, None, 1, torch.arange(11), torch.arange(4), "frames")["coverage"].plot
-    (points,) = axis.collections
-    shown = dict(zip(points.get_array().tolist(), map(tuple, points.get_offsets().tolist()), strict=True))
-    assert shown == {0.2: (1, 9), 0.6: (3, 2), 0.9: (0, 4)}
-    assert points.get_clim() == (0, 1)
-    assert dots(axis) == {"1 not reported": [(2, 0)]}
-    assert "probability of being right" in texts(figure)
-
-
-def test_coverage_leaves_grey_what_is_not_scored():
-    right, known = torch.arange(5)[:, None], torch.tensor([True, False, True, False, True])
-    truth = GroundTruth(right, known, torch.tensor([[-1], [-1], [7], [-1], [-1]]))
-    queries = torch.tensor([10, 20, 30, 40, 50])
-    picture = draw_coverage(matched(0, 1, 7, -1, 9), truth, 0, torch.arange(11), queries, "frames")
-    figure, axis = picture["coverage"].plot
-    assert dots(axis) == {"3 not scored": [(20, 1), (30, 7)], "1 wrong": [(50, 9)], "1 right": [(10, 0)]}
-    assert axis.get_xlim() == (10, 50)
-    assert {"3 not scored", "right within 0 frames"} <= set(texts(figure))
 
 
 def test_examples_are_the_surest_right_the_surest_wrong_and_one_at_the_border():
@@ -76,35 +46,14 @@ def test_examples_are_the_surest_right_the_surest_wrong_and_one_at_the_border():
     assert example_queries(match, None, 0) == {2: "surest answer", 4: answers[4]}
 
 
-def test_rows_show_frames_side_by_side_under_their_titles():
-    long, frames = "reported:\nframe 9 of_a_long_name_0009.png", torch.rand(3, 1, 16, 16)
-    first = dict(zip(["query:\nframe 0", long, "right:\nframe 1"], frames, strict=True))
-    second = {"query:\nframe 3": torch.rand(3, 8, 12), "reported": frames[0], "right:\nnone is known": None}
-    figure, axes = plot_rows([("surest answer", first), ("other", second)])
-    assert {"surest answer", "other", "query:\nframe 0", "right:\nnone is known"} <= set(texts(figure))
-    for axis, frame in zip(axes[0], frames, strict=True):
-        shown = torch.as_tensor(axis.images[0].get_array())
-        assert torch.equal(shown, frame.expand(3, -1, -1).permute(1, 2, 0))
-    assert not axes[1, 2].images
-    assert "".join(axes[0, 1].get_title(loc="left").split()) == "".join(long.split())  # wrapped
-
-
-def test_scores_are_scaled_and_the_best_of_each_block_is_shown(monkeypatch):
-    monkeypatch.setattr("dejavu_torch.evaluation.match_plots.BLOCK_SCORES", 200)
-    scores, asked = torch.rand(30, 50), []
-
-    def of(numbers):
-        asked.append(len(numbers))
-        return scores[numbers]
-
-    run = run_of(scores)
-    run.scores = of
-    picture = draw_scores(run, cells=20)["scores"]
-    for column, block in enumerate(scaled(scores)[::2].split(3, 1)):
+def test_scores_are_scaled_and_the_best_of_each_block_is_shown():
+    scores = torch.rand(30, 50)
+    least, median = scores.amin(1, keepdim=True), scores.median(1, keepdim=True).values
+    scaled = ((scores - least) / (median - least)).clamp(max=1)
+    picture = draw_scores(run_of(scores), cells=20)["scores"]
+    for column, block in enumerate(scaled[::2].split(3, 1)):
         assert torch.allclose(image(picture.plot[1])[:, column], block.amin(1))
-    assert (sum(asked), max(asked)) == (15, 4)
-    told = "Shown: 15 of 30 queries; the best of every 3 neighbouring places."
-    assert picture.caption.endswith(told)
+    assert picture.caption.endswith("Shown: 15 of 30 queries; the best of every 3 neighbouring places.")
 
 
 def test_convention_11_places_and_queries_are_drawn_at_their_frames():

@@ -11,7 +11,7 @@ from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dejavu_torch.evaluation.matches import ELSEWHERE, check_pair_names, read_matches, write_matches
+from dejavu_torch.evaluation.matches import ELSEWHERE, read_matches, write_matches
 from dejavu_torch.maps.place_map import Route
 from dejavu_torch.types import InputError, Match
 
@@ -69,8 +69,23 @@ def test_what_is_written_in_parts_is_read(scratch, rows, ranks, size):
     assert lines(path)[0] == f"query,place,score,accepted,{rank}query_name,place_name"
 
 
-def test_by_hand(tmp_path):
-    assert told(written(tmp_path, PLAIN)) == [(0, 7, 0.5, True), (1, -1, INF, False), (2, 3, -2.0, False)]
+@pytest.mark.parametrize(
+    ("text", "expected", "candidates"),
+    [
+        (PLAIN, [(0, 7, 0.5, True), (1, -1, INF, False), (2, 3, -2.0, False)], [[7], [-1], [3]]),
+        (
+            "query,place,score\n5,1,0.25\n3,2,inf\n4,-1,0.5\n",  # every finite score is accepted
+            [(3, -1, INF, False), (4, -1, INF, False), (5, 1, 0.25, True)],
+            [[1], [-1], [-1]],
+        ),
+        (RANKED, [(4, 7, 0.5, True), (9, 3, 0.1, True)], [[7, 20], [3, -1]]),
+    ],
+    ids=["plain", "not accepted", "ranked"],
+)
+def test_by_hand(tmp_path, text, expected, candidates):
+    path = written(tmp_path, text)
+    assert told(path) == expected
+    assert read_matches(path).candidates.tolist() == candidates
 
 
 @pytest.mark.parametrize(
@@ -88,11 +103,6 @@ def test_by_hand(tmp_path):
 )
 def test_other_ways_to_write_the_same(tmp_path, text):
     assert told(written(tmp_path, text)) == told(written(tmp_path, PLAIN))
-
-
-def test_without_the_column_every_finite_score_is_accepted(tmp_path):
-    path = written(tmp_path, "query,place,score\n5,1,0.25\n3,2,inf\n4,-1,0.5\n")
-    assert told(path) == [(3, -1, INF, False), (4, -1, INF, False), (5, 1, 0.25, True)]
 
 
 def test_convention_2_no_place_or_no_score_reports_nothing(tmp_path):
@@ -136,16 +146,6 @@ def test_what_cannot_be_read_is_refused(tmp_path, text, words):
 def test_what_reports_nothing_needs_no_probability(tmp_path):
     text = "query,place,score,probability\n0,-1,inf,\n1,4,0.5,0.75\n"
     assert read_matches(written(tmp_path, text)).match.probability.tolist() == [0, 0.75]
-
-
-# ranks
-
-
-def test_of_ranked_rows_the_first_is_the_match(tmp_path):
-    path = written(tmp_path, RANKED)
-    assert told(path) == [(4, 7, 0.5, True), (9, 3, 0.1, True)]
-    assert read_matches(path).candidates.tolist() == [[7, 20], [3, -1]]
-    assert read_matches(written(tmp_path, PLAIN)).candidates.tolist() == [[7], [-1], [3]]
 
 
 # frames of the sources, and their names
@@ -239,15 +239,6 @@ def test_neither_matches_nor_pairs_are_half_written(tmp_path):
     with refused("pairs.txt is a folder"):
         write_matches(path, [MATCH], None, None, *names, pairs=pairs)
     assert path.read_text() == PLAIN
-
-
-@pytest.mark.parametrize(
-    "names", [[], [""], ["a.jpg", ""], ["a.jpg", "b c.jpg"], [" a"], ["a\tb"], ["a\u2003b"]]
-)
-def test_names_that_no_pair_can_hold_are_refused(names):
-    check_pair_names(["a.jpg", "b/é.jpg"], "the query")
-    with refused("the query", repr(names[-1]) if names and names[-1] else "without a name", "--pairs"):
-        check_pair_names(names, "the query")
 
 
 def test_places_of_several_routes_are_told_by_route_and_frame(tmp_path):

@@ -9,16 +9,15 @@ from footage import QUERY, REFERENCE, STEP, camera, footage
 from helpers import Fixed, template_model
 from torch import nn
 
-from dejavu_torch import HOG, DejaVu, Match, PlaceFilter, Preprocess, SpectrogramAnalysis
+from dejavu_torch import HOG, Match, PlaceFilter, SpectrogramAnalysis
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth, offset_truth
 from dejavu_torch.data.positions import place_of
-from dejavu_torch.data.strip import SlidingWindow
 from dejavu_torch.evaluation.contenders import contend
 from dejavu_torch.evaluation.localization import Localization
 from dejavu_torch.evaluation.pictures import draw_pictures, paper_pictures
 from dejavu_torch.evaluation.report import PICTURES
-from dejavu_torch.evaluation.template_plots import as_hog_sees, best_explained, shown_chunk, slit_scan
+from dejavu_torch.evaluation.template_plots import shown_chunk
 from dejavu_torch.recognition.localizer import Matching
 from dejavu_torch.types import FrequencyLayer
 
@@ -118,30 +117,10 @@ def test_pictures_that_there_is_nothing_for_are_left_out(left_out, given):
         assert "lsewhere" not in pictures["activations"].caption
 
 
-def test_the_pairs_are_the_frames_that_were_matched(run):
-    pairs = draw_pictures(run, {})["pairs"]
-    numbers = [int(axis.get_title(loc="left").split()[-1]) for axis in pairs.plot[1].flat]
-    sources = [frames(1), frames(0), frames(0)] * len(pairs.plot[1])
-    for axis, number, source in zip(pairs.plot[1].flat, numbers, sources, strict=True):
-        assert torch.allclose(torch.tensor(axis.images[0].get_array())[..., 0], source[number, 0])
-    for asked, reported in zip(numbers[::3], numbers[1::3], strict=True):
-        assert int(run.match.index[asked]) == reported
-    assert "All answers are accepted" in pairs.caption
-    strict = run._replace(match=Match(run.match.index, run.match.score, run.match.accepted & False))
-    assert "best match of those that are rejected" in draw_pictures(strict, {})["pairs"].caption
-
-
 def sequenced(run, model):
     """The same, with the queries matched together."""
     match = run.model.localize(run.query_features, sequence=model)
     return run._replace(matching=Matching(model), match=match)
-
-
-def test_a_filter_shows_its_posterior(run):
-    pictures = draw_pictures(sequenced(run, PlaceFilter()), {})
-    assert list(pictures)[2:4] == ["scores", "posterior"]
-    assert "The scores are those of single queries" in pictures["scores"].caption
-    assert "Circles" in pictures["posterior"].caption
 
 
 def test_the_paper_s_own_pictures(run):
@@ -151,33 +130,6 @@ def test_the_paper_s_own_pictures(run):
     assert list(paper_pictures(nothing)) == ["frames"]
     features = localized(model_of(), HOG()(frames(0)), HOG()(frames(1)), same_places())
     assert list(paper_pictures(features)) == ["autocorrelogram", "layers"]
-
-
-def test_the_frame_under_the_features_is_what_hog_sees():
-    hog = HOG(cell=4, resize=(17, 41))
-    model, frame = DejaVu(hog, preprocess=Preprocess(channel="R-B", contrast="patch")), torch.rand(3, 50, 60)
-    seen = as_hog_sees(model, frame)
-    assert seen.shape == (1, 17, 41)
-    assert torch.equal(HOG(cell=4)(seen[None]), model.descriptor.describe(frame[None]))
-
-
-def test_the_feature_that_is_shown_is_the_one_that_its_templates_explain():
-    wave = torch.sin(torch.arange(80) * 2 * torch.pi / 8)
-    noise = torch.randn(80, 3)
-    stored = torch.stack([torch.ones(80), wave + noise[:, 0], wave + 0.1 * noise[:, 1], 5 * noise[:, 2]], 1)
-    one = layer(8, 0, 80, 0, 1, 2, 3)
-    templates = template_model(periods=Fixed(one)).learn_features(stored).map.blocks()[0]
-    assert best_explained(stored, one, templates) == 2
-
-
-def test_slit_scan_holds_no_more_than_it_shows():
-    scan = slit_scan(ArrayTraverse(torch.rand(300, 1, 16, 16)), 10, 290)
-    assert scan is not None
-    assert scan.untyped_storage().nbytes() <= 2 * 280 * 16 * 4
-    strip = torch.rand(3, 8, 200)
-    scan = slit_scan(SlidingWindow(strip, width=10), 20, 120)
-    assert scan is not None
-    assert torch.equal(scan, strip[:, :, 25:125])
 
 
 # a resampled map: places are even steps, the camera stands at one of them

@@ -54,19 +54,6 @@ def test_without_probabilities_or_truth_there_is_less_to_tell():
     assert rejection_table({"off_map": {}}) == rejection_table({}) == []
 
 
-def test_the_picture_shows_the_share_that_is_right():
-    figure, (above, below) = draw_reliability(MATCH, TRUTH, 0)["reliability"].plot
-    (points,) = above.collections
-    drawn = [tuple(point) for point in points.get_offsets().tolist()]
-    assert drawn == [
-        (pytest.approx(0.2), 0.0),
-        (pytest.approx(0.3), 0.0),
-        (pytest.approx((0.9 + 0.99 + 0.995) / 3), 1.0),
-    ]
-    assert [bar.get_height() for bar in below.patches] == [0, 0, 1, 1, 0, 0, 0, 0, 0, 3]
-    assert figure.get_size_inches()[0] == 4
-
-
 @pytest.mark.parametrize("shape", [(1, 8, 6), (3, 20, 30)])
 def test_frames_of_another_route_are_brought_to_the_map_s(shape):
     for channels in (1, 3):

@@ -7,7 +7,7 @@ import re
 import pytest
 import torch
 
-from dejavu_torch.evaluation.contenders import COLOURS, Contender, contend
+from dejavu_torch.evaluation.contenders import Contender, contend
 from dejavu_torch.evaluation.curves import Scores
 from dejavu_torch.evaluation.plots import Picture, canvas
 from dejavu_torch.evaluation.report import (
@@ -18,7 +18,6 @@ from dejavu_torch.evaluation.report import (
     sequence_table,
     steps,
     summary,
-    text_table,
     verdict,
     write_index,
     write_report,
@@ -115,15 +114,6 @@ def test_areas_of_sequences_in_a_table_below_the_scores(tmp_path):
     assert "T = " not in written(tmp_path, report(null=aside))
 
 
-def test_long_headings_of_a_text_table_take_several_lines():
-    table = text_table([["", "AUC", "route bytes per place"], ["a map", "0.5", "5.0"]])
-    assert table.splitlines() == [
-        "            route bytes",
-        "       AUC    per place",
-        "a map  0.5          5.0",
-    ]
-
-
 def test_the_summary_tells_what_was_scored():
     facts = {
         "truth": "place = query",
@@ -203,49 +193,6 @@ def test_whether_it_worked_and_what_to_do_next(facts, recall, told, after):
     assert [word for word, step in zip(after, found, strict=True) if word not in step] == []
 
 
-def test_the_next_step_is_the_whole_drive_or_more_bytes_if_these_find_more():
-    ours = Contender("this map", SCORES, 4000, sequences={"smoother": SCORES._replace(recall_at_1=0.8)})
-    floats = Contender("all frames", SCORES._replace(recall_at_1=0.9), 64000, 1)
-    one = report({"kind": "spectral"}, uncompressed=floats)._replace(ours=ours)
-    found = " ".join(steps(one)).replace("\xa0", " ")
-    assert "add `--ordered`" in found
-    drive = one._replace(facts=one.facts | {"answers": "drive", "drive": {"is_drive": True}})
-    assert "--ordered" not in " ".join(steps(drive))
-    assert "Partly: 16 of 20" in verdict(drive)
-    assert "--mapper.hold .95`: the" in found
-    # what --map would refuse
-    given = " ".join(steps(one._replace(facts=one.facts | {"seconds_learn": 0.0})))
-    assert given.count("without `--map`") == 2
-    trained = " ".join(steps(one._replace(facts=one.facts | {"trained": {"steps": 1}})))
-    assert "--model.mapper.route_bytes_per_place" in trained
-    assert "--mapper.hold" not in trained
-
-
-def key(page):
-    """The words that a part of a page explains."""
-    return dict(re.findall(r"<dt>([^<]+)</dt> <dd>([^<]+)</dd>", page.replace("\n", " ")))
-
-
-def test_the_key_explains_what_the_table_holds_and_no_more(tmp_path):
-    null, frames = Contender("null", SCORES), Contender("all", SCORES, 100, 1)
-    every = {"uncompressed": frames, "interpolated": frames, "null": null, "null_same_plan": null}
-    sizes = ["bytes per place", "route bytes per place"]
-    steps = {"step": 6.0, "reference_frames": 40, "query_frames": 30}
-    for facts, contenders, words, of_null in (
-        ({}, (), [], ""),
-        ({"frames": 32}, every, [*sizes, "all, every k-th frame", "interpolated", "null"], "the second"),
-        ({"resampling": steps}, ["uncompressed"], ["all, every k-th place"], ""),
-        ({"trained": {"steps": 1}}, ["null"], ["null"], "trained backbone"),
-        ({"kind": "spectral"}, ["null"], ["null"], "how many bytes it needs"),
-    ):
-        page = written(tmp_path, report(facts, **{name: every[name] for name in contenders}))
-        found = key(page.partition("<table")[0])
-        assert list(found) == ["AUC", "recall@1", "R@100P", *words]
-        assert of_null in found.get("null", "")
-        below = key(page.partition("the map</h2>")[2])
-        assert list(below) == (["lines", "strongest periods"] if "kind" in facts else ["layer"])
-
-
 def test_names_are_escaped(tmp_path):
     evil = "<script>alert('1 & 2')</script>"
     one = report({"truth": evil, "version": evil, "frames": 2}, hog=Contender(evil, SCORES))
@@ -281,62 +228,3 @@ def test_the_page_fits_a_phone_and_needs_no_other_file(tmp_path):
     write_report(tmp_path, report(), {}, "a title", "a command")
     bare = (tmp_path / "index.html").read_text()
     assert not [text for text in ("the map</h2>", "<img", "<ul>", "None", "bytes", "null") if text in bare]
-
-
-def test_the_first_screen_answers_and_the_pairs_are_beside_it(tmp_path):
-    page = written(
-        tmp_path, report({"frames": 32, "kind": "spectral"}), pr=picture("curves"), pairs=picture("pairs")
-    )
-    order = (
-        "did it work?",
-        "pairs</h2>",
-        "how well?",
-        "what next?",
-        "<code>",
-        "<table",
-        "curves</h2>",
-        "<footer>",
-    )
-    places = [page.index(one) for one in order]
-    assert places == sorted(places)
-    assert page.count("pairs</h2>") == 1
-    assert " </code>" not in page  # a blank before the colon or comma that follows
-    # definitions and details are folded
-    assert len(re.findall(r"<dl>", page)) == len(
-        re.findall(r"<details>(?:(?!</details>).)*?<dl>", page, re.DOTALL)
-    )
-
-
-def test_the_page_has_landmarks_headings_in_order_and_named_headers(tmp_path):
-    page = written(tmp_path, report({"frames": 32}, null=Contender("null", SCORES)), pr=picture("curves"))
-    assert '<html lang="en">' in page
-    assert [page.count(f"<{one}>") for one in ("header", "main", "footer")] == [1, 1, 1]
-    levels = [*map(int, re.findall(r"<h(\d)>", page))]
-    assert levels[0] == 1
-    assert {*levels[1:]} == {2}
-    assert re.findall(r"<th(?! scope=| ?e)", page) == []
-    assert re.findall(r'<img(?! alt="\w)', page) == []
-
-
-def test_each_row_has_the_colour_of_its_curve(tmp_path):
-    page = written(tmp_path, report(hog=Contender("HOG", SCORES), null=Contender("null", SCORES)))
-    colours = re.findall(r'<i style="background:(#\w+)"></i>([^<]+)', page)
-    expected = [("map", "this map"), ("hog", "HOG"), ("null", "null")]
-    assert colours == [(COLOURS[key], name) for key, name in expected] * 2  # in both tables
-    page = written(tmp_path, report(STORED, hog=Contender("HOG", SCORES), null=Contender("null", SCORES)))
-    found = re.findall(r'<i style="background:(#\w+)"></i>([^<]+)', page)
-    assert [colour for colour, _ in found] == [
-        COLOURS[key] for key in ("map", "map", "map", "hog", "null")
-    ] * 2
-
-
-def test_an_index_links_its_pages_and_shares_the_table(tmp_path):
-    rows = [["", "AUC", "R@100P rep."], ["outdoor", "0.5", ""], ["aerial", "0.6", "0.1"]]
-    links = {"outdoor": "outdoor/index.html"}
-    write_index(tmp_path, rows, ["one note", "another"], links, "all of them", "dejavu x")
-    page = (tmp_path / "index.html").read_text()
-    assert re.findall(r'href="([^"]+)">([^<]+)', page) == [("outdoor/index.html", "outdoor")]
-    assert re.findall(r'<td data-label="AUC">([^<]*)</td>', page) == ["0.5", "0.6"]
-    assert re.findall(r"<dt>([^<]+)</dt>", page) == ["AUC", "R@100P", "rep."]
-    for text in ("one note", "another", "dejavu x</pre>", "width=device-width"):
-        assert text in page

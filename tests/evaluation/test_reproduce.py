@@ -17,11 +17,9 @@ from dejavu_torch.data.source import open_source
 from dejavu_torch.evaluation.compare import compare
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.paper_tables import (
-    COLUMNS,
     PUBLISHED,
     boundary_lines,
     route_lines,
-    section_five,
 )
 from dejavu_torch.evaluation.report import Report
 from dejavu_torch.evaluation.reproduce import (
@@ -39,7 +37,7 @@ from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.types import Match
 
 PAPER = {"min_period": 8, "peaks": "bins", "false_alarm": None, "short": "refuse"}
-FRAMES, LENGTHS = 512, (256, 512, 1024)
+FRAMES = 512
 
 
 def shorter(dataset, window):
@@ -78,19 +76,6 @@ def test_the_database_itself_is_found_and_leaving_out_undoes_it(aerial):
     assert report["ideal"]["recall_at_1"] > 0.99 > report["recall_at_1"]
     assert report["ideal_leave_out"]["recall_at_1"] < 0.1
     assert report["published"] == PUBLISHED["aerial"]._asdict()
-
-
-@pytest.mark.slow
-def test_section_five_sets_the_papers_numbers_beside_ours(aerial):
-    head, paper, ideal, leave_out, own, *others = section_five({"aerial": aerial.report})
-    assert paper[1:4] == ["0.2064", "0.9590", "0.9813"]
-    assert "paper" in paper[0]
-    report = aerial.report.as_json()
-    for row, entry in ((ideal, report["ideal"]), (leave_out, report["ideal_leave_out"]), (own, report)):
-        assert row[1:6] == [f"{entry[key]:.4f}" for key in COLUMNS]
-    assert own[0] == "aerial: a second traverse"
-    assert len(others) == 5
-    assert {len(row) for row in (head, paper, ideal, own, *others)} == {len(head)}
 
 
 def test_other_datasets_are_refused():
@@ -151,22 +136,6 @@ def test_train_footage_is_resampled_to_even_steps(outdoor):
     places = metres_of(outdoor, 0, route.frame_of(right[known]))
     seen = metres_of(outdoor, 1, outdoor.run.query.frame[known])  # type: ignore[attr-defined]
     assert (places - seen).abs().max() < 0.8  # metres; a step is about 0.4
-
-
-@pytest.mark.slow
-def test_structures_cut_the_even_steps(outdoor):
-    cuts = structure_cuts(open_source("sim:outdoor?frames=310"))
-    assert cuts
-    facts, route = outdoor.report.facts, outdoor.run.model.map
-    places = route.place_of(torch.tensor(cuts)).unique()
-    assert facts["boundaries"]["cuts"] == len(places)
-    nearest = metres_of(outdoor, 0, route.frame_of(places))
-    assert (nearest - metres_of(outdoor, 0, torch.tensor(cuts))).abs().max() < 0.8
-    for name in ("comparable", "known_boundaries"):
-        effect = facts["boundaries"][name]
-        assert effect["queries_near"] + effect["queries_far"] == facts["with_answer"]
-    assert outdoor.report.as_json()["known_boundaries"]["bytes"] > 0
-    assert {"velocity", "frames", "layers", "autocorrelogram"} < set(outdoor.pictures)
 
 
 class Rails(ArrayTraverse):

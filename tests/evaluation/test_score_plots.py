@@ -15,7 +15,6 @@ from dejavu_torch.evaluation.plots import DARK, GREY, LAYERS, RIGHT, WRONG
 from dejavu_torch.evaluation.score_plots import (
     Stored,
     draw_curves,
-    draw_sequences,
     draw_storage,
 )
 
@@ -43,15 +42,6 @@ def test_curves_have_the_colour_of_the_key_whatever_else_is_drawn():
         assert "right within 2 frames" in texts(pictures["pr"].plot[0])
 
 
-def test_a_curve_that_reports_nothing_says_so_and_one_without_scores_is_left_out():
-    silent, unscored = contender("null: x", 0.0, points=0), Contender("unscored", None)
-    pictures = draw_curves({"null": silent, "hog": unscored, "leave_out": contender("other", 1)}, "2 frames")
-    assert list(pictures) == ["pr"]
-    assert "null: x (reports nothing)" in texts(pictures["pr"].plot[0])
-    assert len(pictures["pr"].plot[1].lines) == 1
-    assert draw_curves({"hog": unscored}, "2 frames") == {}
-
-
 def points(*pairs):
     return [Stored(size, area, area) for size, area in pairs]
 
@@ -71,33 +61,6 @@ def test_the_storage_picture_shows_the_points_and_what_the_null_takes():
     assert picture.numbers["null_over_map"] == [4.0]
     assert picture.numbers["map"][0] == {"route_bytes_per_place": 1, "auc": 0.5, "recall_at_1": 0.5}
     assert draw_storage({}, {}, "2 frames") == draw_storage({}, {"map": []}, "2 frames") == {}
-
-
-def at(*areas):
-    return {T: Scores(area, area, 0, 0, area, area, area) for T, area in zip((1, 5, 11), areas, strict=True)}
-
-
-def test_the_areas_of_sequences_of_all_contenders_and_of_the_map_at_other_sizes():
-    """Sizes that the map has, and those that no budget has, are not drawn twice."""
-    contenders = {
-        "map": Contender("this map", None, 1000, fixed=500, sequences=at(0.5, 0.7, 0.9)),
-        "hog": Contender("HOG, every frame", None, sequences=at(0.4, 0.6, 0.8)),
-        "leave_out": Contender("without", None),
-    }
-    coded = [
-        Stored(size, 0, 0, at(0.3, 0.4, area)) for size, area in ((0.97, 0.6), (4.9, 0.9), (5.1, 0.9), (9, 1))
-    ]
-    figure, axis = draw_sequences(contenders, coded, 100, "2 frames")["sequences"].plot
-    lines = {line.get_label(): line for line in axis.lines}
-    # 5 route bytes per place are its own; 2.5 are nearest to 0.97, which are there already
-    names = ["this map, 5 route bytes per place", "the map in 0.97 bytes", "HOG, every frame"]
-    assert list(lines) == names[::-1]  # the first on top
-    assert [list(line.get_xdata()) for line in axis.lines] == [[1, 5, 11]] * 3
-    assert list(lines[names[0]].get_ydata()) == [0.5, 0.7, 0.9]
-    assert list(lines[names[1]].get_ydata()) == [0.3, 0.4, 0.6]
-    assert [line.get_color() for line in axis.lines] == [COLOURS[key] for key in ("hog", "map", "map")]
-    assert {"1", "5", "11", "right within 2 frames"} <= set(texts(figure))
-    assert draw_sequences({"map": Contender("this map", None)}, [], 100, "2 frames") == {}
 
 
 # Machado, Oliveira and Fernandes 2009: how linear RGB looks without one kind of cone

@@ -97,10 +97,3 @@ def test_what_has_no_curve_is_refused(result):
         coded_at_sizes(result.run._replace(truth=None))
     with refused("'templates'", "spectral"):
         coded_at_sizes(result.run._replace(model=template_model().learn(route(0))))
-
-
-def test_without_truth_there_is_no_curve():
-    model = DejaVu(whitening="none", mapper=SpectralMapper(2.0))
-    unscored = compare(ArrayTraverse(route(0)), ArrayTraverse(route(1)[:50]), model=model, storage_curve=True)
-    assert "storage" not in unscored.report.as_json()
-    assert "storage" not in unscored.pictures

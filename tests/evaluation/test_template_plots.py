@@ -8,15 +8,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from drawn import layer, render, run_of, texts
+from drawn import layer, run_of, texts
 
-from dejavu_torch import HOG, DejaVu
-from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch import HOG
 from dejavu_torch.evaluation.map_plots import plot_answers
 from dejavu_torch.evaluation.template_plots import (
-    draw_autocorrelogram,
     draw_chunks,
-    draw_features,
     draw_layers,
     draw_spectrogram,
     draw_templates,
@@ -61,13 +58,6 @@ def test_convention_11_axes_along_the_route_count_frames_and_periods_count_place
     assert "difference of query 77 (lower is better)" in texts(figure)
 
 
-def test_layers_show_their_phases():
-    layers = [layer(tau, 20, 80, tau) for tau in range(5, 20)]
-    shown = draw_layers(layers, torch.arange(81), "frames")["layers"].plot[1].images[0].get_array()
-    assert shown.shape == (12, 60)  # the twelve of most features
-    assert shown[0].tolist() == pytest.approx([(i % 8) / 8 for i in range(20, 80)])
-
-
 @pytest.mark.parametrize("hop", [None, 64])
 def test_spectrogram_is_darkest_at_the_period(hop):
     values, analysis = torch.cat([wave(32), wave(16)])[:, None], SpectrogramAnalysis(window=256, hop=hop)
@@ -85,15 +75,6 @@ def test_spectrogram_is_darkest_at_the_period(hop):
     kept = [line.get_ydata() for line in below.lines if line.get_marker() == "o"]
     assert kept == [[32]]
     assert "feature 0 along the route" in texts(figure)
-
-
-def test_spectrogram_of_a_constant_feature_and_of_a_long_one():
-    run = described(torch.ones(64, 1), periods=SpectrogramAnalysis(window=64))
-    render(draw_spectrogram(run, (), 0)["spectrogram"].plot[0])
-    run = described(wave(32, 9000)[:, None], periods=SpectrogramAnalysis(window=1024))
-    above, _ = draw_spectrogram(run, (), 0)["spectrogram"].plot[1]
-    extremes = above.collections[0].get_datalim(above.transData)
-    assert (extremes.y0, extremes.y1) == pytest.approx((-1, 1), abs=1e-3)
 
 
 def test_templates_lie_over_the_frames_they_are_the_mean_of():
@@ -114,18 +95,6 @@ def test_templates_lie_over_the_frames_they_are_the_mean_of():
     assert told <= set(texts(figure))
 
 
-@pytest.mark.parametrize(("period", "phases"), [(Fraction(15, 2), 3), (Fraction(2), 1), (Fraction(8), 8)])
-def test_templates_of_any_period_and_of_many_features(period, phases):
-    one = FrequencyLayer(period, phases, 0, 40, tuple(range(100)))
-    picture = draw_templates(described(torch.rand(40, 100)), one, torch.rand(phases, 100), 3)["templates"]
-    above, below = picture.plot[1]
-    shown = above.lines[-1].get_xdata()
-    # the mean stands in the middle of the frames it averages
-    assert shown[0] - -0.5 == pytest.approx(float(period - Fraction(1, 2)) - shown[-1])
-    assert below.images[0].get_array().shape == (64, phases)
-    render(picture.plot[0])
-
-
 @pytest.mark.parametrize("degrees", [10, 70, 130])
 def test_an_edge_in_the_frame_is_drawn_where_it_is(degrees):
     """One edge through the middle of the frame: what lights up there is drawn along it."""
@@ -142,27 +111,3 @@ def test_an_edge_in_the_frame_is_drawn_where_it_is(degrees):
     # perpendicular to the gradient, or the bin beside it: sin(20 degrees)
     assert ((along @ gradient).abs() / along.norm(dim=1)).max() < 0.35
     assert (middle @ gradient).abs().max() < 4 * gradient.abs().sum() + 3  # its cell meets the edge
-
-
-@pytest.mark.parametrize("shape", [(3, 64, 64), (1, 64, 16)])
-def test_features_are_drawn_on_a_frame_of_any_shape(shape):
-    frames = torch.rand(9, *shape)
-    features = tuple(range(0, HOG()(frames[:1]).shape[1], 3))
-    layers = [FrequencyLayer(Fraction(p), p, 0, 9, features) for p in (9, 20)]
-    run = run_of(torch.zeros(1, 9), model=DejaVu(HOG()), reference=ArrayTraverse(frames))
-    for some in (layers, layers[:1]):
-        figure, axes = draw_features(run, some)["features"].plot
-        assert axes.size == len(some)
-        lines = axes.flat[0].collections[0]
-        assert np.array_equal(lines.get_segments(), edges_seen(torch.tensor(features), shape[1:])[0])
-        image = render(figure)
-        assert image.width < 5 * image.height
-
-
-def test_a_feature_that_repeats_is_like_itself_a_period_later():
-    figure, axis = draw_autocorrelogram(wave(50, 600), [50.0], 0, "frames")["autocorrelogram"].plot
-    render(figure)
-    line = axis.lines[0].get_ydata()
-    assert line[0] == pytest.approx(1)
-    assert line[50] == pytest.approx(550 / 600, abs=0.01)  # biased: as many frames less
-    assert line[25] == pytest.approx(-575 / 600, abs=0.01)
