@@ -60,18 +60,9 @@ def road(part: str = "", preset: str = "train_road") -> Route:
     return Route(ROAD.format(1, part), ROAD.format(2, part), preset=preset)
 
 
-def simulated(kind: str, preset: str) -> Route:
-    return Route(f"sim:{kind}?seed=1", f"sim:{kind}?seed=1&traverse=1", preset=preset)
-
-
 def drive(name: str, tolerance: int) -> Route:
     folder = f"{{data}}/{name}"
     return Route(f"{folder}/reference.npy", f"{folder}/query.npy", tolerance, f"{folder}/truth.csv")
-
-
-def nordland(places: str, options: str, start: Route | None = None) -> Route:
-    summer, winter = (f"{{data}}/nordland/{one}?{places}" for one in ("summer", "winter"))
-    return Route(summer, winter, 5, None, "train_nordland", options.format(winter=winter), start)
 
 
 ROUTES = {

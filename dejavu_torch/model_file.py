@@ -336,8 +336,11 @@ def opened(path: Path) -> Iterator[tuple[dict[str, Tensor], Facts]]:
         yield tensors, header
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
+    except MemoryError:
+        raise
     except Exception as error:  # of torch for other tensors, of a module for arguments of another version
-        raise InputError(f"{path} does not fit its modules: {one_line(error)}") from error
+        cause = one_line(error) or type(error).__name__
+        raise InputError(f"{path} does not fit its modules: {cause}") from error
 
 
 def _fill(place_map: PlaceMap, tensors: Mapping[str, Tensor], state: Facts) -> None:

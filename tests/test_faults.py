@@ -137,6 +137,15 @@ def test_what_a_writer_could_not_take_is_refused_ahead_of_the_work(folder, capsy
     assert (folder / "fifo.safetensors").is_fifo()
 
 
+def test_a_file_that_gets_what_is_printed_is_no_output(folder):
+    with (folder / "said.txt").open("w") as stdout:
+        pipes = {"stdout": stdout, "stderr": subprocess.PIPE}
+        words = [*DEJAVU, "localize", "map.safetensors", "b.npy", "--out", "/dev/stdout"]
+        done = subprocess.run(words, cwd=folder, **pipes)
+    assert done.returncode == 2
+    assert b"/dev/stdout is a standard stream of this process" in done.stderr
+
+
 @pytest.mark.parametrize(
     "words",
     [

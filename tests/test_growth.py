@@ -384,6 +384,10 @@ def test_a_state_that_does_not_fit_leaves_a_merged_map_as_it_was():
         with refused(*words):
             merged.map.load_state_dict(good | {"_extra_state": extra | change})
         assert torch.equal(merged(query), before)
+    for other in ({"steps": good["steps"][:-1]}, {"steps": good["steps"][:0]}, {"_extra_state": None}):
+        with refused("the map does not fit together"):
+            merged.map.load_state_dict(good | other)
+        assert torch.equal(merged(query), before)
 
 
 # further visits averaged in

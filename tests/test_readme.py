@@ -229,10 +229,11 @@ TRAINING = [
 
 @pytest.mark.parametrize("option", TRAINING)
 def test_options_of_training_in_prose_are_understood(option):
-    """By the preset of phase templates, or by that of spectral maps."""
+    """Without a preset, by the preset of phase templates, or by that of spectral maps."""
     templates = ".mapper.periods" in option
     preset = "train_residues" if templates else "train_road"
-    understand(f"dejavu train fit --config {preset} --data.source sim:aerial {option}")
+    for config in ("", f"--config {preset}"):
+        understand(f"dejavu train fit {config} --data.source sim:aerial {option}")
 
 
 @pytest.mark.parametrize("shown", with_block("class_path:"))

@@ -30,7 +30,7 @@ from dejavu_torch.data.output import check_output_folder, make_output_folder, re
 from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.model import DejaVu
 from dejavu_torch.text import one_line
-from dejavu_torch.training.checkpoint import EXPECTED, taking_over
+from dejavu_torch.training.checkpoint import EXPECTED, LastCheckpoint, taking_over
 from dejavu_torch.training.datamodule import RouteData
 from dejavu_torch.training.descriptors import DescriptorTask
 from dejavu_torch.training.export import DESCRIPTOR, MapExport, has_bf16
@@ -160,12 +160,15 @@ class TrainCLI(LightningCLI):
         for part in ("trainer", "model", "data"):
             expect(isinstance(chosen[part], Namespace), "KEY: VALUE", f"{part} is {chosen[part]!r:.40}")
         trainer, seed = chosen["trainer"], chosen["seed_everything"]
+        grads, epochs = trainer["accumulate_grad_batches"], trainer["check_val_every_n_epoch"]
         interval, steps = trainer["val_check_interval"], "a number of at least 1, or -1 for no end"
         for name, value, fits, expected in (
             ("trainer.max_steps", trainer["max_steps"], trainer["max_steps"] is not None, steps),
             ("trainer.strategy", trainer["strategy"], trainer["strategy"] in ("auto", "ddp"), "auto or ddp"),
             ("trainer.val_check_interval", interval, interval != 0, "a number above 0"),
             ("trainer.overfit_batches", trainer["overfit_batches"], not trainer["overfit_batches"], "0"),
+            ("trainer.accumulate_grad_batches", trainer["accumulate_grad_batches"], grads >= 1, "at least 1"),
+            ("trainer.check_val_every_n_epoch", epochs, epochs is None or epochs >= 1, "at least 1"),
             ("seed_everything", seed, seed is None or 0 <= seed < 2**32, "a number from 0 to 2^32 - 1"),
         ):
             expect(fits, expected, f"{name} is {value!s:.40}")
@@ -202,15 +205,7 @@ class TrainCLI(LightningCLI):
         if self.subcommand == "fit" and not asked["fast_dev_run"]:  # a trial keeps an earlier run
             own.append(MapExport())
             if asked["enable_checkpointing"] is not False and not any(isinstance(c, Checkpoint) for c in own):
-                last = ModelCheckpoint(
-                    folder,
-                    None,
-                    save_last=True,
-                    save_top_k=0,
-                    save_on_exception=True,
-                    every_n_train_steps=EVERY,
-                )
-                own.append(last)
+                own.append(LastCheckpoint(folder, save_last=True, save_top_k=0, every_n_train_steps=EVERY))
         bars = asked["enable_progress_bar"] in (None, True)
         if bars and not sys.stderr.isatty() and not any(isinstance(c, ProgressBar) for c in own):
             own.append(TQDMProgressBar(refresh_rate=EVERY))  # lines of a log

@@ -13,6 +13,7 @@ from dejavu_torch.types import Facts, InputError, expect
 
 MAX_NAME_LENGTH = 4096  # characters, as of a path
 MAX_DIGITS = 18  # of a number in a name
+MAX_TEXT = 2**28  # bytes of the names of a map
 
 
 def encode_names(names: Sequence[str]) -> str:
@@ -35,7 +36,7 @@ def encode_names(names: Sequence[str]) -> str:
 
 def decode_names(code: str, count: int | None = None) -> list[str]:
     """The names that `encode_names` encoded; `count`: their expected number, None for any."""
-    value = json.loads(zlib.decompress(base64.b64decode(code)))
+    value = json.loads(zlib.decompressobj().decompress(base64.b64decode(code), MAX_TEXT))
     columns = value["columns"] if isinstance(value, dict) else None
     seen = len(value) if columns is None else len(columns[0]) - 1
     expect(count in (None, seen), count, f"there are names of {seen} frames")

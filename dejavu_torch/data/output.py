@@ -27,15 +27,22 @@ def check_output_file(path: Path) -> None:
         for place in (target.parent, target):
             if place.exists() and not os.access(place, os.W_OK):
                 raise InputError(f"{path} cannot be written: no permission to write in {place}")
+        for stream in range(3) if target.exists() else ():
+            with suppress(OSError):  # a closed stream
+                same = os.path.samestat(target.stat(), os.fstat(stream))
+                expect(not same, "another file", f"{path} is a standard stream of this process")
 
 
 def check_output_folder(path: Path) -> None:
     """Refuse a folder that could not be created or written to, before long work starts."""
-    parent = _existing(path)
-    kind = "a file" if parent.is_file() else "not a folder"
-    expect(parent.is_dir(), "a new path", f"{path} cannot be made a folder: {parent} is {kind}")
-    if not os.access(parent, os.W_OK):
-        raise InputError(f"no permission to write in the folder {parent}")
+    with _refusing(path, "cannot be made a folder"):
+        with suppress(FileNotFoundError, NotADirectoryError):
+            path.lstat()  # refuses a name that is too long
+        parent = _existing(path)
+        kind = "a file" if parent.is_file() else "not a folder"
+        expect(parent.is_dir(), "a new path", f"{path} cannot be made a folder: {parent} is {kind}")
+        if not os.access(parent, os.W_OK):
+            raise InputError(f"no permission to write in the folder {parent}")
 
 
 def make_output_folder(path: Path) -> None:
@@ -146,8 +153,10 @@ def _refusing(path: Path, what: str) -> Iterator[None]:
     """Turn an OSError into an InputError of one line."""
     try:
         yield
-    except OSError as error:
-        raise InputError(f"{path} {what}: {error.strerror or error}") from error
+    except InputError:
+        raise
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the path
+        raise InputError(f"{path} {what}: {getattr(error, 'strerror', None) or error}") from error
 
 
 def _target(path: Path) -> Path:

@@ -192,14 +192,14 @@ class Preprocess(nn.Module):
         blank: float = BLANK,
     ) -> None:
         super().__init__()
-        sized = size is None or (isinstance(size, int) and size >= 1)
+        got, sized = "preprocess got", size is None or (isinstance(size, int) and size >= 1)
         tiled = len(grid) == 2 and all(tiles >= 1 and tiles == int(tiles) for tiles in grid)
-        expect(sized, "pixels of the longer side, at least 1, or null", f"{size=}")
-        expect(contrast in (None, *get_args(Contrast)), "'patch', 'clahe' or None", f"{contrast=}")
-        expect(patch >= 3 and patch % 2 == 1, "an odd number of pixels, at least 3", f"{patch=}")
-        expect(0 <= clip_limit <= MOST_CLIP, f"0 (no limit) to {MOST_CLIP:g}", f"{clip_limit=}")
-        expect(0 <= blank < 1, "a standard deviation of at least 0, below 1", f"{blank=}")
-        expect(tiled, "(rows, columns), integers of at least 1", f"grid={tuple(grid)}")
+        expect(sized, "pixels of the longer side, at least 1, or null", f"{got} {size=}")
+        expect(contrast in (None, *get_args(Contrast)), "'patch', 'clahe' or None", f"{got} {contrast=}")
+        expect(patch >= 3 and patch % 2 == 1, "an odd number of pixels, at least 3", f"{got} {patch=}")
+        expect(0 <= clip_limit <= MOST_CLIP, f"0 (no limit) to {MOST_CLIP:g}", f"{got} {clip_limit=}")
+        expect(0 <= blank < 1, "a standard deviation of at least 0, below 1", f"{got} {blank=}")
+        expect(tiled, "(rows, columns), integers of at least 1", f"{got} grid={tuple(grid)}")
         self.channel = None if channel is None else channel_name(channel)
         self.contrast: Contrast | None = contrast
         self.patch, self.clip_limit, self.size = patch, float(clip_limit), size
@@ -229,7 +229,8 @@ class Preprocess(nn.Module):
         """Which frames (B,C,H,W) show something, (B,) bool: their contrast is at least `blank`."""
         low, high = self.span
         values = frames.flatten(2)
-        variance = (values - values.mean(2, keepdim=True)).square().mean(2)  # Tensor.var takes 15 times as long
+        # Tensor.var takes 15 times as long
+        variance = (values - values.mean(2, keepdim=True)).square().mean(2)
         return variance.amax(1) >= (self.blank * (high - low)) ** 2
 
     extra_repr = settings_of

@@ -16,7 +16,7 @@ from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 
 from dejavu_torch.maps.compiling import compiled
 from dejavu_torch.memory import is_readable
-from dejavu_torch.types import check_shape, expect
+from dejavu_torch.types import InputError, check_shape, expect
 
 Metric = Literal["l1", "l2", "cosine"]
 Floats = NDArray[np.float32]
@@ -47,7 +47,10 @@ def phase_distances(query: Tensor, templates: Tensor, metric: Metric = "l1") -> 
     """
     expect(metric in get_args(Metric), ", ".join(get_args(Metric)), f"metric {metric!r} is unknown")
     check_shape(templates, "P F", "phase_distances got templates")
-    check_shape(query, f"Q {templates.shape[1]}", "phase_distances got queries")
+    # compared as they are, since a traced size has no number
+    if query.ndim != 2 or query.shape[1] != templates.shape[1]:
+        seen = f"phase_distances got queries {tuple(query.shape)}"
+        raise InputError(f"{seen}; expected (Q, {templates.shape[1]})")
     dtype = torch.promote_types(torch.promote_types(query.dtype, templates.dtype), torch.float32)
     query, templates = query.to(dtype), templates.to(dtype)
     with torch.autocast(query.device.type, enabled=False):

@@ -93,7 +93,7 @@ def read_map(path: Path) -> tuple[dict[str, Tensor], Facts]:
         damaged = sorted(part for part in {*computed, *sums} if computed.get(part) != sums.get(part))
     except InputError:
         raise
-    except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
+    except (SafetensorError, OSError, KeyError, TypeError, AttributeError, ValueError) as error:
         raise InputError(f"{path} is truncated or not a map file ({error}); expected a whole one") from error
     expect(not damaged, "it as it was written", f"{path} is damaged: its {' and '.join(damaged)}")
     return tensors, header

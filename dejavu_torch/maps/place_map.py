@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from dejavu_torch.data.positions import count_places
 from dejavu_torch.maps.frame_table import FrameTable, Link, Route
 from dejavu_torch.maps.summary import MapSummary
+from dejavu_torch.text import one_line
 from dejavu_torch.types import Facts, InputError, check_shape, expect
 
 log = logging.getLogger("dejavu_torch")
@@ -197,10 +198,12 @@ class PlaceMap(nn.Module, ABC):
             super()._load_from_state_dict(state_dict, prefix, *args)
             self.check()
             self.loaded()
-        except Exception:  # a refused state leaves the map as it was
+        except Exception as error:  # a refused state leaves the map as it was
             self.__dict__.clear()
             self.__dict__.update(before)
-            raise
+            if isinstance(error, InputError | MemoryError):
+                raise
+            raise InputError(f"the map does not fit together: {one_line(error)}") from error
 
     def packed(self) -> dict[str, Tensor]:
         """The tensors of a file: the state's, without visits if every place has one."""

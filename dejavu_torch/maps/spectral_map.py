@@ -486,6 +486,8 @@ class SpectralMap(PlaceMap):
         lengths, means = self.lengths.tolist(), self.means
         fits = min(lengths, default=1) >= 1 and sum(lengths) == self.places
         require(fits, f"chunks of {lengths!s:.100} places; expected {self.places} in all")
+        fits, seen = len(lengths) == len(self.steps) == len(self.stream_table), f"{len(self.steps)} steps"
+        require(fits, f"{seen} and {len(self.stream_table)} streams; expected {len(lengths)} of each")
         sizes, size = self.stream_table[:, 0].tolist(), len(self.streams)
         fits = min(sizes, default=0) >= 0 and sum(sizes) == size
         require(fits, f"the coded lines are {size} bytes; the table claims {sizes!s:.100}")

@@ -144,13 +144,16 @@ class SpectrogramAnalysis(PeriodFinder):
         short: Literal["shrink", "refuse"] = "shrink",
     ) -> None:
         super().__init__()
-        expect(min_period >= 2, "min_period >= 2", f"{window=}, {min_period=}")
-        expect(window >= 2 * min_period, "window >= 2 * min_period", f"{window=}, {min_period=}")
-        expect(strongest >= 1, "strongest >= 1", f"{strongest=}")
-        expect(hop is None or 1 <= hop <= window, f"1..{window} (the window)", f"{hop=}")
-        expect(peaks in ("local", "bins"), "'local' or 'bins'", f"{peaks=}")
-        expect(short in ("shrink", "refuse"), "'shrink' or 'refuse'", f"{short=}")
-        expect(false_alarm is None or 0 < false_alarm < 1, "None or a number in (0, 1)", f"{false_alarm=}")
+        got = "spectrogram got"
+        expect(min_period >= 2, "min_period >= 2", f"{got} {window=}, {min_period=}")
+        expect(window >= 2 * min_period, "window >= 2 * min_period", f"{got} {window=}, {min_period=}")
+        expect(strongest >= 1, "strongest >= 1", f"{got} {strongest=}")
+        expect(hop is None or 1 <= hop <= window, f"1..{window} (the window)", f"{got} {hop=}")
+        expect(peaks in ("local", "bins"), "'local' or 'bins'", f"{got} {peaks=}")
+        expect(short in ("shrink", "refuse"), "'shrink' or 'refuse'", f"{got} {short=}")
+        expect(
+            false_alarm is None or 0 < false_alarm < 1, "None or a number in (0, 1)", f"{got} {false_alarm=}"
+        )
         self.window, self.hop, self.min_period, self.strongest = window, hop, min_period, strongest
         self.peaks, self.false_alarm, self.short = peaks, false_alarm, short
         self._logged: set[str] = set()

@@ -11,6 +11,8 @@ from zipfile import ZipFile
 
 import torch
 from lightning_fabric.plugins.io.torch_io import TorchCheckpointIO
+from pytorch_lightning import LightningModule, Trainer
+from pytorch_lightning.callbacks import ModelCheckpoint
 
 from dejavu_torch.data.files import check_regular
 from dejavu_torch.data.output import make_output_folder, whole_file
@@ -41,6 +43,16 @@ class CheckpointFiles(TorchCheckpointIO):
     ) -> Facts:
         """See `read_checkpoint`; the other arguments are ignored."""
         return read_checkpoint(path)
+
+
+class LastCheckpoint(ModelCheckpoint):
+    """`last.ckpt` in a folder: at intervals, at the end, and, unlike Lightning's, the only file after an
+    exception too."""
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """Save the last step of a training."""
+        if trainer.state.fn == "fit" and trainer.global_step and not trainer.sanity_checking:
+            trainer.save_checkpoint(Path(str(self.dirpath)) / "last.ckpt")
 
 
 def read_checkpoint(path: str | Path) -> Facts:

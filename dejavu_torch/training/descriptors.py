@@ -84,7 +84,7 @@ class DescriptorTask(RouteTask):
     def __init__(
         self,
         backbone: nn.Module | None = None,
-        mapper: Mapper | None = None,
+        mapper: SpectralMapper | Mapper | None = None,
         whitening: Whitening | Literal["none"] | None = None,
         preprocess: Preprocess | None = None,
         start: str | None = None,

@@ -95,7 +95,10 @@ class MapExport(Callback):
         """Write the map of the last step if the user interrupts."""
         interrupted = isinstance(exception, KeyboardInterrupt) and trainer.state.fn == "fit"
         if interrupted and trainer.global_step and self.written is None:
-            self.write(pl_module, Path(trainer.default_root_dir))
+            try:
+                self.write(pl_module, Path(trainer.default_root_dir))
+            except InputError as error:  # the checkpoint is still to be written
+                log.warning("no map is written: %s", error)
 
     def write(self, task: RouteTask, folder: Path, data: RouteData | None = None) -> None:
         """Write the task's map, calibrated with unseen data if `data` is given."""

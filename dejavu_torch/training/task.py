@@ -9,6 +9,7 @@ import os
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NoReturn, cast
 
@@ -276,8 +277,9 @@ class RouteTask(pl.LightningModule):
             seen = ", ".join(f"{name} {float(part):g}" for name, part in parts.items())
             seen = f"the loss is {float(total)} at step {self.global_step} ({seen})"
             raise InputError(f"{seen}; expected a finite number: try a lower lr, or 32-bit precision")
-        if self.global_step >= self._rise():
-            self.last.append(parts)
+        if self.global_step >= self._rise() and not self.last.learned:  # all processes decide alike
+            mean = partial(self.trainer.strategy.reduce, reduce_op="mean")
+            self.last.append({name: mean(part) for name, part in parts.items()})
         several = self.trainer.world_size > 1
         self.log_dict({f"train/{name}": part for name, part in parts.items()}, sync_dist=several)
         self.log("train/left_out", left_out, on_step=False, on_epoch=True, reduce_fx="sum", sync_dist=several)
@@ -287,7 +289,7 @@ class RouteTask(pl.LightningModule):
     def on_train_batch_end(self, *_: object) -> None:
         """Stop a training that learns nothing, as soon as that is known."""
         self.resumed = False  # the optimizer accepted the checkpoint's state
-        if not self.last.learned and self.trainer.world_size == 1:
+        if not self.last.learned:
             self.last.check(self.chance())
 
     def train(self, mode: bool = True) -> RouteTask:

@@ -15,7 +15,6 @@ from dejavu_torch.features.embedding import Coder
 from dejavu_torch.features.extract import features_of, in_mode
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.preprocess import Preprocess
-from dejavu_torch.maps.place_map import Mapper
 from dejavu_torch.maps.template_map import TemplateMap, TemplateMapper, log_posterior
 from dejavu_torch.maps.weights import in_bits
 from dejavu_torch.model import DejaVu
@@ -67,7 +66,7 @@ class TemplateTask(RouteTask):
     def __init__(
         self,
         backbone: nn.Module | None = None,
-        mapper: Mapper | None = None,
+        mapper: TemplateMapper | None = None,
         preprocess: Preprocess | None = None,
         start: str | None = None,
         freeze: list[str] | None = None,

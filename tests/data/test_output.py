@@ -12,6 +12,7 @@ from helpers import refused
 
 from dejavu_torch.data.output import (
     check_output_file,
+    check_output_folder,
     make_output_folder,
     whole_file,
     whole_folder,
@@ -93,6 +94,9 @@ def test_an_exception_leaves_what_was_there(tmp_path, kind, before, problem):
         (make_output_folder, "file", "is a file"),
         (make_output_folder, "file/below", "is a file"),
         (check_output_file, "a" * 256, "too long"),
+        (check_output_folder, "a" * 256, "too long"),
+        (check_output_file, "a\0b", "null"),
+        (check_output_folder, "a\0b", "null"),
     ],
 )
 def test_what_cannot_be_written_is_refused_at_once(tmp_path, check, name, words):

@@ -70,6 +70,17 @@ def test_what_has_no_distance_is_refused():
         phase_distances(torch.rand(3, 4), torch.rand(5, 3))
 
 
+def test_queries_and_templates_of_any_dimension_are_exported():
+    class Distances(torch.nn.Module):
+        def forward(self, queries, templates):
+            return phase_distances(queries, templates, "cosine")
+
+    given, sizes = (torch.rand(3, 8), torch.rand(5, 8)), torch.export.Dim("dimension")
+    program = torch.export.export(Distances(), given, dynamic_shapes=({1: sizes}, {1: sizes}))
+    other = torch.rand(3, 9), torch.rand(5, 9)
+    torch.testing.assert_close(program.module()(*other), phase_distances(*other, "cosine"))
+
+
 def test_convention_10_float32_whatever_the_autocast():
     for metric in METRICS:
         query, mu = torch.rand(3, 50), torch.rand(5, 50)

@@ -6,6 +6,7 @@ import json
 import pickle
 import sys
 from fractions import Fraction
+from unittest.mock import Mock
 
 import pytest
 import safetensors.torch
@@ -258,6 +259,12 @@ def test_no_size_in_a_file_is_believed(path, whole_maps, kind, claims):
         craft(path, tensors, **header)
         with refused(str(path), words):
             DejaVu.load(path)
+
+
+def test_a_lack_of_memory_is_no_fault_of_the_file(saved, monkeypatch):
+    monkeypatch.setattr("dejavu_torch.model_file.build", Mock(side_effect=MemoryError))
+    with pytest.raises(MemoryError):
+        DejaVu.load(saved)
 
 
 @pytest.mark.parametrize(

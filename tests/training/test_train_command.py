@@ -209,7 +209,8 @@ def test_an_interrupt_is_one_line_and_130_and_leaves_a_map(folder, tmp_path, cap
     again = shlex.split(said.out.splitlines()[-1].removeprefix("to go on: dejavu "))
     assert again[:2] == ["train", "fit"]
     assert again[-2:] == ["--ckpt_path", str(tmp_path / "checkpoints" / "last.ckpt")]
-    last = torch.load(tmp_path / "checkpoints" / "last.ckpt", weights_only=True)
+    (file,) = (tmp_path / "checkpoints").iterdir()
+    last = torch.load(file, weights_only=True)
     model = DejaVu.load(tmp_path / "map.safetensors", import_module("mine").Interrupted())
     assert model.trained is not None
     assert model.trained.steps == last["global_step"] == 3
@@ -231,6 +232,8 @@ def test_an_interrupt_is_one_line_and_130_and_leaves_a_map(folder, tmp_path, cap
         (["--trainer.max_steps", "0"], ["no steps", "above 0"]),
         (["--seed_everything", "-1"], ["seed_everything is -1", "2^32 - 1"]),
         (["--trainer.val_check_interval", "0"], ["trainer.val_check_interval is 0"]),
+        (["--trainer.accumulate_grad_batches", "0"], ["accumulate_grad_batches is 0", "at least 1"]),
+        (["--trainer.check_val_every_n_epoch", "0"], ["check_val_every_n_epoch is 0", "at least 1"]),
         (["--trainer.devices", "[0, 1]", "--trainer.strategy", "fsdp"], ["strategy is fsdp", "or ddp"]),
         (["--trainer.devices", "[1]"], ["CPUAccelerator"]),  # one, which this machine does not have
         (["--trainer.num_nodes", "2"], ["num_nodes is 2", "MASTER_ADDR"]),
