@@ -15,6 +15,7 @@ from dejavu_torch.cli import process
 from dejavu_torch.cli.names import COMMANDS, FIRST_DAY, function_of
 from dejavu_torch.text import one_line, printable
 
+SPINS = "10000"  # some ten microseconds
 LONGEST = 300  # characters kept of torch's messages
 
 
@@ -26,12 +27,15 @@ def main(
     Args:
         program: runs a command line; that of `dejavu` by default.
 
-    Environment: OMP_NUM_THREADS, the number of threads of torch. OMP_WAIT_POLICY is passive unless it is set:
-        spinning threads, the default of most builds, take the cores from other programs.
+    Environment: OMP_NUM_THREADS, the number of threads of torch. Unless OMP_WAIT_POLICY is set, its threads wait
+        for work a few microseconds, then sleep: those that spin for long, the default of most builds, take
+        the cores from other programs, and to wake one takes longer than most of its work.
     """
     if arguments is None:
         process.take_over()
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read when torch is loaded, which is below
+    if "OMP_WAIT_POLICY" not in os.environ:  # read when torch is loaded, which is below
+        os.environ["OMP_WAIT_POLICY"] = "passive"
+        os.environ.setdefault("GOMP_SPINCOUNT", SPINS)  # GNU's, of the torch for Linux
     try:
         with _shortages_of_one_line():
             (program or run_command)(sys.argv[1:] if arguments is None else arguments)
