@@ -27,9 +27,9 @@ def main(
     Args:
         program: runs a command line; that of `dejavu` by default.
 
-    Environment: OMP_NUM_THREADS, the number of threads of torch. Unless OMP_WAIT_POLICY is set, its threads wait
-        for work a few microseconds, then sleep: those that spin for long, the default of most builds, take
-        the cores from other programs, and to wake one takes longer than most of its work.
+    Environment: OMP_NUM_THREADS, the number of threads of torch. Unless OMP_WAIT_POLICY is set, its threads
+        wait for work a few microseconds, then sleep: those that spin for long, the default of most builds,
+        take the cores from other programs, and to wake one takes longer than most of its work.
     """
     if arguments is None:
         process.take_over()

@@ -24,7 +24,7 @@ from dejavu_torch.cli import options
 from dejavu_torch.cli.device import device_of
 from dejavu_torch.data.output import check_output_file
 from dejavu_torch.data.source import check_not_read, open_source
-from dejavu_torch.data.traverse import chained
+from dejavu_torch.data.traverse import chained, kept
 from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.views import SAMPLE as SHORT
 from dejavu_torch.learning import Checkpoint, MapTasks
@@ -84,6 +84,8 @@ def run_learn(
     visits = None if growing.average is None else growing.visits(model, traverse)
     learning.check_calibrated(model, visits.traverse if traverse is None else traverse)  # type: ignore[union-attr]
     traverse, views, known = learning.with_views(model, traverse)
+    if traverse is not None and not isinstance(traverse, ResampledTraverse):
+        traverse = kept(traverse)
     places: Tensor | None = None  # that the traverse shows; None: all, from the first on
     done, start, checkpoint = "", model.map.places, Checkpoint(map)
     map_tasks: MapTasks = builtins.map

@@ -22,6 +22,10 @@ from dejavu_torch.types import Coordinates, InputError, Traverse, expect
 log = logging.getLogger("dejavu_torch")
 
 
+KEPT = 2**28  # bytes of the frames that are kept of a traverse
+KEPT_FRAMES = 10_000  # longer traverses are read in parts, and again
+
+
 class Part(Traverse):
     """The frames of a traverse with these numbers, which may repeat, renumbered from 0.
 
@@ -214,6 +218,43 @@ class Whole(Part):
             except InputError as error:
                 self.damaged[i] = str(error)
         raise InputError(f"none of the {len(self)} frames of {self.name} can be read: {self.damaged[0]}")
+
+
+class Kept(Part):
+    """Frames that are read once: up to `KEPT` bytes of them are held, as 8 bits where these are exact."""
+
+    def __init__(self, traverse: Traverse) -> None:
+        super().__init__(traverse, range(len(traverse)))
+        self.held: dict[int, Tensor] = {}
+        self.room = KEPT
+
+    def read(self, frames: range | list[int]) -> Tensor:
+        missing = [i for i in frames if i not in self.held]
+        if not missing:
+            return torch.stack([_floats(self.held[i]) for i in frames])
+        read = super().read(missing)
+        short = (read * 255).round().clamp(0, 255).byte()
+        exact = (_floats(short) == read).flatten(1).all(1).tolist()
+        for i, frame, bits, same in zip(missing, read, short, exact, strict=True):
+            kept = bits if same else frame
+            if kept.nbytes <= self.room:
+                self.held[i] = kept.clone()  # not a view that holds the whole batch
+                self.room -= kept.nbytes
+        if len(missing) == len(frames):
+            return read
+        fresh = dict(zip(missing, read, strict=True))
+        return torch.stack([fresh[i] if i in fresh else _floats(self.held[i]) for i in frames])
+
+
+def _floats(frames: Tensor) -> Tensor:
+    return frames.float() / 255 if frames.dtype == torch.uint8 else frames
+
+
+def kept(traverse: Traverse) -> Traverse:
+    """The traverse, with its frames held once they are read; a long one, or ready features, unchanged."""
+    if len(traverse.frame_shape) != 3 or len(traverse) > KEPT_FRAMES:
+        return traverse
+    return Kept(traverse)
 
 
 class Fitted(Part):

@@ -22,7 +22,7 @@ from dejavu_torch.data.ground_truth import (
     of_loops,
 )
 from dejavu_torch.data.source import Source, as_traverse
-from dejavu_torch.data.traverse import fitted
+from dejavu_torch.data.traverse import fitted, kept
 from dejavu_torch.evaluation.baselines import Baseline, baselines_of, with_drives
 from dejavu_torch.evaluation.contenders import Contender, contend, models_beside
 from dejavu_torch.evaluation.evaluate import RANKS
@@ -250,6 +250,7 @@ def _prepared(
             raise InputError(f"{other.name} has frames; expected ready features, as of {reference.name}")
     off = [other if is_ready(other) else fitted(other, reference.frame_shape) for other in off]
     features = model.descriptor.check_sizes(reference, query, *off)
+    reference, query = kept(reference), kept(query)
     even = partial(resampled, odometry=model.velocity, batch_size=model.batch_size, progress=progress)
     with timed(seconds, "describe" if has_map else "learn"):
         reference = even(reference, step=model.step if has_map else None)

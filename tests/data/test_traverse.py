@@ -30,6 +30,7 @@ from dejavu_torch.data.traverse import (
     at_size,
     chained,
     frame_range,
+    kept,
     runs,
 )
 from dejavu_torch.motion.resampling import ResampledTraverse
@@ -384,3 +385,46 @@ def test_images_of_other_modes_are_frames():
 def test_what_holds_no_frames_of_one_shape_is_refused(source, words):
     with refused(*words):
         as_traverse(source)[:]
+
+
+# frames that are kept
+
+
+class Counted(ArrayTraverse):
+    """Notes which frames were read."""
+
+    def __init__(self, values):
+        super().__init__(values)
+        self.seen = []
+
+    def read(self, frames):
+        self.seen += frames
+        return super().read(frames)
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_kept_frames_are_read_once_and_stay_the_same(whole):
+    frames = torch.rand(20, 3, 8, 8)
+    counted = Counted((frames * 255).byte() if whole else frames)
+    expected, held = counted[:], kept(counted)
+    counted.seen.clear()
+    for some in ([3, 4, 5], range(2, 9), [7, 19, 4, 7], range(20), [0]):
+        assert torch.equal(held[some], expected[some])
+    assert sorted(counted.seen) == [*range(20)]
+
+
+def test_frames_beyond_the_room_are_read_again(monkeypatch):
+    monkeypatch.setattr("dejavu_torch.data.traverse.KEPT", 3 * 8 * 8 * 5)
+    counted = Counted((torch.rand(20, 3, 8, 8) * 255).byte())
+    expected, held = counted[:], kept(counted)
+    counted.seen.clear()
+    for _ in range(2):
+        assert torch.equal(held[:], expected)
+    assert counted.seen == [*range(20), *range(5, 20)]
+
+
+def test_features_and_long_traverses_are_not_kept(monkeypatch):
+    features, frames = ArrayTraverse(torch.rand(9, 4)), ArrayTraverse(torch.rand(9, 1, 4, 4))
+    assert kept(features) is features
+    monkeypatch.setattr("dejavu_torch.data.traverse.KEPT_FRAMES", 8)
+    assert kept(frames) is frames
