@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from bisect import bisect_right
 from collections.abc import Sequence
 from contextlib import suppress
@@ -221,33 +222,29 @@ class Whole(Part):
 
 
 class Kept(Part):
-    """Frames that are read once: up to `KEPT` bytes of them are held, as 8 bits where these are exact."""
+    """Frames that are read once: the first ones are held, up to `KEPT` bytes."""
 
     def __init__(self, traverse: Traverse) -> None:
         super().__init__(traverse, range(len(traverse)))
-        self.held: dict[int, Tensor] = {}
-        self.room = KEPT
+        held = min(len(self), KEPT // (4 * math.prod(self.frame_shape)))
+        # of which a system gives only what is written to
+        self.values = torch.empty(held, *self.frame_shape, dtype=torch.float32)
+        self.known = torch.zeros(len(self), dtype=torch.bool)
 
     def read(self, frames: range | list[int]) -> Tensor:
-        missing = [i for i in frames if i not in self.held]
-        if not missing:
-            return torch.stack([_floats(self.held[i]) for i in frames])
-        read = super().read(missing)
-        short = (read * 255).round().clamp(0, 255).byte()
-        exact = (_floats(short) == read).flatten(1).all(1).tolist()
-        for i, frame, bits, same in zip(missing, read, short, exact, strict=True):
-            kept = bits if same else frame
-            if kept.nbytes <= self.room:
-                self.held[i] = kept.clone()  # not a view that holds the whole batch
-                self.room -= kept.nbytes
-        if len(missing) == len(frames):
+        numbers = torch.as_tensor(frames)
+        known = self.known[numbers]
+        if known.all():
+            return self.values[numbers]
+        read = super().read(numbers[~known].tolist())
+        holds = numbers[~known] < len(self.values)
+        new = numbers[~known][holds]
+        self.values[new], self.known[new] = read[holds], True
+        if not known.any():
             return read
-        fresh = dict(zip(missing, read, strict=True))
-        return torch.stack([fresh[i] if i in fresh else _floats(self.held[i]) for i in frames])
-
-
-def _floats(frames: Tensor) -> Tensor:
-    return frames.float() / 255 if frames.dtype == torch.uint8 else frames
+        mixed = read.new_empty(len(numbers), *self.frame_shape)
+        mixed[known], mixed[~known] = self.values[numbers[known]], read
+        return mixed
 
 
 def kept(traverse: Traverse) -> Traverse:
