@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 from torch import nn
@@ -25,10 +26,13 @@ from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.teaching import in_its_light
 from dejavu_torch.types import InputError
 
-FEATURES: dict[str, Callable[[], list[nn.Module]]] = {
-    "HOG, Distilled": lambda: [HOG(), Distilled()],
-    "HOG, Distilled, XFeat": lambda: [HOG(), Distilled(), XFeat()],
+Ways = dict[str, Callable[[], list[nn.Module]]]
+FEATURES: Ways = {
+    "HOG, Distilled": lambda: [HOG(cell=None), Distilled()],
+    "HOG, Distilled, XFeat": lambda: [HOG(cell=None), Distilled(), XFeat()],
 }
+CELLS = (8, 12, 16)  # pixels
+LARGE = ("corridor", "corridor laps")  # whose frames are above 100 pixels
 FOOTAGE: dict[str, Route] = {  # with frames
     **{
         name: route for name, (route, _) in ROUTES.items() if name not in ("magnetometer", "lidar", "gardens")
@@ -43,27 +47,34 @@ COLUMNS: dict[str, Column] = {
 }
 
 
-def run_features(data: Path, *, out: Path, seeds: int = 3) -> list[str]:
+def run_features(data: Path, *, out: Path, seeds: int = 3, cells: bool = False) -> list[str]:
     """XFeat beside the default features: AUC of one image and of the whole drive, and of the null.
 
     Args:
         data: folder of the footage, as for the tests
         out: folder for bench.json
         seeds: of the whitening and of the null, from 0 on
+        cells: instead, the sides of HOG's cells, in pixels, on frames above 100 pixels
     """
     rows: list[Row] = []
-    for name, route in tqdm(FOOTAGE.items(), "features", disable=None, leave=False):
+    sides: Ways = {f"{side} x {side}": partial(with_cells, side) for side in CELLS}
+    ways, names = (sides, LARGE) if cells else (FEATURES, [*FOOTAGE])
+    for name in tqdm(names, "features", disable=None, leave=False):
         for seed in range(seeds):
-            rows += bench_features(name, route.below(data), seed)
+            rows += bench_features(name, FOOTAGE[name].below(data), seed, ways)
             write_bench(out, rows)
     return [table(rows, COLUMNS), "AUC, centred where there are enough queries"]
 
 
-def bench_features(name: str, route: Route, seed: int) -> Iterator[Row]:
-    """A row for each of `FEATURES`."""
+def with_cells(side: int) -> list[nn.Module]:
+    return [HOG(cell=side), Distilled()]
+
+
+def bench_features(name: str, route: Route, seed: int, ways: Ways = FEATURES) -> Iterator[Row]:
+    """A row for each way to describe frames."""
     reference, query = open_source(route.reference), open_source(route.query)
     truth, tolerance = truth_of(reference, query, route.truth), route.tolerance
-    for way, features in FEATURES.items():
+    for way, features in ways.items():
         began = time.perf_counter()
         try:
             model = DejaVu(Joined(features()), whitening=Whitening(seed=seed))

@@ -281,10 +281,10 @@ def visits() -> str:
     return markdown(table)
 
 
-def features() -> str:
+def features(name: str = "features") -> str:
     """The mean AUC over seeds with further features: of one image, of the null, of the whole drive."""
     found: dict[str, dict[str, list[Row]]] = {}
-    for row in read("features")["rows"]:
+    for row in read(name)["rows"]:
         found.setdefault(row["case"], {}).setdefault(row["contender"], []).append(row)
     ways = [*next(iter(found.values()))]
     kinds = {"one image": "auc_one", "null": "null", "whole drive": "auc"}
@@ -377,7 +377,11 @@ TABLES: dict[str, Callable[[], str]] = {
     **{"rejection": rejection, "filtered": filtered, "drives": drives, "driven": driven},
     **{"trainings": trainings, "made drives": made_drives, "storage drives": storage_drives},
     **{"large drives": large_drives, "taught drives": taught, "visits": visits},
-    **{"features": features, "alike": lambda: f"{look_alikes()}\n{loops()}"},
+    **{
+        "features": features,
+        "cells": partial(features, "cells"),
+        "alike": lambda: f"{look_alikes()}\n{loops()}",
+    },
     **{f"storage {name}": partial(storage, name) for name in ("aerial", "road1", "road2", "city", "railway")},
 }
 

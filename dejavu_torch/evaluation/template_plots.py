@@ -247,7 +247,7 @@ def draw_features(run: Localization, layers: Sequence[FrequencyLayer]) -> plots.
     this cell and orientation in the layer.
     """
     model, hog = run.model, run.model.features
-    if type(hog) is not HOG or len(run.reference.frame_shape) != 3:
+    if type(hog) is not HOG or hog.cell is None or len(run.reference.frame_shape) != 3:
         return {}
     middle = (layers[0].start + layers[0].stop) // 2
     grey = as_hog_sees(model, frame_at(run.reference, middle)).mean(0)

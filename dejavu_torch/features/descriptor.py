@@ -18,7 +18,7 @@ from dejavu_torch.features.extract import (
     features_of,
     warn_of_bright,
 )
-from dejavu_torch.features.hog import HOG
+from dejavu_torch.features.hog import CELL, HOG
 from dejavu_torch.features.joined import Joined, groups_of
 from dejavu_torch.features.preprocess import BLANK, DEEP, Preprocess, measured_range
 from dejavu_torch.features.views import SAMPLE, AugmentedFrames, LabelledFrames, Sample, augmented_route
@@ -215,9 +215,12 @@ class Descriptor(nn.Module):
         return True
 
     def adapt(self, traverse: Traverse, resumed: bool = False) -> None:
-        """Measure a range that is "auto" on 32 frames of a reference, evenly drawn; for a run that is
-        resumed, also whether most count as blank, which the run before has found."""
+        """Fix the cells of HOG if they follow the size of a reference's frames, and measure a range that is
+        "auto" on 32 of them, evenly drawn; for a run that is resumed, also whether most count as blank, which
+        the run before has found."""
         own = self.preprocess
+        for part in self._histograms() if not is_ready(traverse) else ():
+            part.adapt(*traverse.frame_shape[1:])
         if is_ready(traverse) or not (own.range == "auto" or (resumed and own.blank == BLANK)):
             return
         drawn = torch.linspace(0, len(traverse) - 1, min(DRAWN, len(traverse))).round().long()
@@ -280,15 +283,21 @@ class Descriptor(nn.Module):
         batches = self.features_in(views.traverse, progress, f"learning what changes: {source}")
         return _with_places(batches, views.places.to(self.device))
 
+    def _histograms(self) -> list[HOG]:
+        return [part for part in self.features.modules() if isinstance(part, HOG)]
+
     @contextmanager
     def unchanged_by_errors(self) -> Iterator[None]:
         """Restores the whitening and what the preprocessing adapts if the block raises."""
         adapted = self.preprocess.range, self.preprocess.blank
+        cells = [(part, part.cell) for part in self._histograms()]
         before = self.whitening, self.reduces, None if self.whitening is None else self.whitening.state_dict()
         try:
             yield
         except BaseException:
             self.preprocess.range, self.preprocess.blank = adapted
+            for part, cell in cells:
+                part.cell = cell
             self.whitening, self.reduces, state = before
             if self.whitening is not None and state is not None:
                 self.whitening.load_state_dict(state)
@@ -372,7 +381,7 @@ def is_ready(traverse: Traverse | AugmentedFrames | None) -> bool:
 
 def default_features(whitens: bool = True) -> nn.Module:
     """HOG and the package's network side by side; without whitening HOG alone, as in the paper."""
-    return Joined([HOG(), Distilled()]) if whitens else HOG()
+    return Joined([HOG(cell=None), Distilled()]) if whitens else HOG()
 
 
 def own_size(features: nn.Module, block: bool = False) -> tuple[int, int] | None:
@@ -384,7 +393,7 @@ def own_size(features: nn.Module, block: bool = False) -> tuple[int, int] | None
     known = type(features).__module__.startswith("dejavu_torch.")
     size: tuple[int, int] | None = getattr(features, "resize", None) if known else None
     if size is None and block and type(features) is HOG:
-        size = (features.cell * features.block,) * 2
+        size = ((features.cell or CELL) * features.block,) * 2
     return size
 
 

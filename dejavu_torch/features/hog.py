@@ -13,6 +13,7 @@ from dejavu_torch.text import settings_of
 from dejavu_torch.types import InputError, expect
 
 MOST_ORIENTATIONS = 360
+CELL, LARGE = 8, 100  # pixels: side of a cell, and the longer side of frames above which it is doubled
 Bins = Literal["hard", "linear"]
 
 
@@ -21,7 +22,8 @@ class HOG(nn.Module):
 
     Args:
         orientations: unsigned orientation bins in [0, 180) degrees.
-        cell: side of a square cell, pixels. Pixels beyond the last whole cell only enter gradients.
+        cell: side of a square cell, pixels; None is 8, or 16 of frames whose longer side exceeds 100 pixels.
+            Pixels beyond the last whole cell only enter gradients.
         block: side of a square block, cells. Blocks overlap: they move by one cell.
         resize: (height, width) in pixels to resize to first, antialiased; None keeps the size.
         bins: "hard": a pixel votes for one bin, as in skimage. "linear": it shares its vote between the two
@@ -40,18 +42,25 @@ class HOG(nn.Module):
     def __init__(
         self,
         orientations: int = 9,
-        cell: int = 8,
+        cell: int | None = 8,
         block: int = 2,
         resize: tuple[int, int] | None = None,
         bins: Bins = "hard",
     ) -> None:
         super().__init__()
-        self.resize = _checked(orientations, cell, block, resize, bins)
+        self.resize = _checked(orientations, CELL if cell is None else cell, block, resize, bins)
         self.orientations, self.cell, self.block = orientations, cell, block
+        self.chooses = cell is None
         self.bins: Bins = bins
 
     def forward(self, frames: Tensor) -> Tensor:
-        return hog(frames, self.orientations, self.cell, self.block, self.resize, self.bins)
+        cell = self.cell or cell_for(*(self.resize or frames.shape[2:]))
+        return hog(frames, self.orientations, cell, self.block, self.resize, self.bins)
+
+    def adapt(self, height: int, width: int) -> None:
+        """Fix a cell that is None for frames of this size, so that a map's file names it."""
+        if self.chooses:
+            self.cell = cell_for(*(self.resize or (height, width)))
 
     extra_repr = settings_of
 
@@ -86,6 +95,11 @@ def hog(
         return _unit(blocks).flatten(1).to(part.dtype)
 
     return in_parts(described, frames)
+
+
+def cell_for(*size: int) -> int:
+    """The side of a cell for frames of this size, in pixels: on large frames small cells only take bytes."""
+    return 2 * CELL if max(size) > LARGE else CELL
 
 
 def _checked(

@@ -148,6 +148,20 @@ def test_what_is_refused(call, facts):
         call()
 
 
+def test_cells_follow_the_size_of_frames_until_a_map_is_learned():
+    small, large = torch.rand(2, 1, 80, 100), torch.rand(2, 1, 80, 101)
+    features = HOG(cell=None)
+    assert torch.equal(features(small), hog(small))
+    assert torch.equal(features(large), hog(large, cell=16))
+    for frames, cell in ((large, 16), (small, 8)):
+        features.adapt(*frames.shape[2:])
+        assert features.cell == cell
+    fixed = HOG(cell=4)
+    fixed.adapt(80, 101)
+    assert fixed.cell == 4
+    assert HOG(cell=None, resize=(64, 64))(large).shape == HOG(resize=(64, 64))(large).shape
+
+
 def linear_oracle(image, orientations, cell, block):
     """HOG with shared votes of a grey image (H,W), pixel by pixel."""
     height, width = image.shape
