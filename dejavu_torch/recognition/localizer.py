@@ -25,7 +25,8 @@ from dejavu_torch.text import with_progress
 from dejavu_torch.types import Match, SequenceModel, Together
 
 ROWS = 4096  # descriptors on the device at a time
-CACHED = 2**20  # scores processed at a time in a sequence: they stay in the cache
+CACHED = 2**20  # scores processed at a time: they stay in the cache
+SHORT = 2**15  # places of which all scores are kept: selecting the lowest of so few takes longer
 MAX_SHARE = 1 / 16  # of a block's places; selecting more of the lowest scores is slower than keeping all
 PLACES_PER_NUMBER = 64  # a coarse search holds at most one number of a query per this many places
 PER_BEST = 16  # held for each of a query's lowest scores, while two lists are merged
@@ -98,7 +99,7 @@ class Localizer:
         n = num_needed(wanted, places)
         few = n <= max(1, MAX_SHARE * min(places, place_map.block_places)) or places > SCORES_AT_ONCE
         searches = not self.models and matching.callback is None and matching.apart is None
-        searches = searches and (few or type(self.searcher) is not Scan)
+        searches = searches and (type(self.searcher) is not Scan or (few and places > SHORT))
         size = max(PER_BEST * n, places // PLACES_PER_NUMBER) if searches else places
         parts = descriptors.split(max(1, min(ROWS, SCORES_AT_ONCE // size)))
         moved = (part.to(place_map.device) for part in with_progress(parts, "localizing", progress))
@@ -119,9 +120,8 @@ class Localizer:
             numbers = self.matched + torch.arange(len(scores))
             scores = earlier(scores, numbers, self.matching.apart)
             self.matched += len(scores)
-        if not self.models:
-            return self._answer(self._candidates(scores), best_pair(scores))
-        return Match.joined(map(self._in_sequence, scores.split(max(1, CACHED // scores.shape[1]))))
+        step = self._in_sequence if self.models else self._alone
+        return Match.joined(map(step, scores.split(max(1, CACHED // scores.shape[1]))))
 
     def drive(
         self,
@@ -194,6 +194,9 @@ class Localizer:
         """(N+1,) of a filter for the latest answer; None without a filter, or before the first query."""
         state = self.states.get("filter")
         return state if state is None or state.ndim == 1 else state[0]
+
+    def _alone(self, scores: Tensor) -> Match:
+        return self._answer(self._candidates(scores), best_pair(scores))
 
     def _in_sequence(self, scores: Tensor, last: bool = False) -> Match:
         states = self.states or {T: m.start(scores.shape[1]).to(scores) for T, m in self.models.items()}

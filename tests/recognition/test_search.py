@@ -113,6 +113,7 @@ def test_candidates_are_those_of_all_scores(places, k, radius, values, seed):
 
 @pytest.mark.parametrize("settings", [{"chunk": 50}, {"chunk": 50, "metric": "l2"}], ids=str)
 def test_a_calibrated_map_finds_the_same_without_all_scores(settings, monkeypatch):
+    monkeypatch.setattr(localizer, "SHORT", 0)
     route = walk(600)
     model = DejaVu(whitening="none", mapper=SpectralMapper(6.0, **settings)).learn(route)
     platt = Platt(4.0, 1.0)
@@ -129,8 +130,11 @@ def test_a_calibrated_map_finds_the_same_without_all_scores(settings, monkeypatc
 
 
 def test_many_of_the_best_are_taken_from_all_scores(monkeypatch):
-    """Few of them block by block, for as many queries at a time as memory allows."""
+    """Few of them block by block on longer maps, for as many queries at a time as memory allows."""
     route = Scored(torch.rand(21, 2000), 1000)
+    assert torch.equal(Localizer(route)(rows_of(route)).index, route.rows.argmin(1))
+    assert route.batches == []
+    monkeypatch.setattr(localizer, "SHORT", 1999)
     for k, radius, batches in ((3, 5, [21]), (6, 100, [])):
         found = Localizer(route, Matching(k=k, radius=radius))(rows_of(route))
         assert torch.equal(found.index, best_candidates(route.rows, k, radius).index)
