@@ -231,6 +231,12 @@ class Kept(Part):
         self.values = torch.empty(held, *self.frame_shape, dtype=torch.float32)
         self.known = torch.zeros(len(self), dtype=torch.bool)
 
+    def __getattr__(self, name: str) -> Any:
+        """What only this kind of traverse has, such as the metres of a simulated one."""
+        if name == "traverse":  # of a copy that is being made
+            raise AttributeError(name)
+        return getattr(self.traverse, name)
+
     def read(self, frames: range | list[int]) -> Tensor:
         numbers = torch.as_tensor(frames)
         known = self.known[numbers]
