@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
+import torch
 from torch import nn
 from tqdm import tqdm
 
@@ -33,6 +34,7 @@ FEATURES: Ways = {
 }
 CELLS = (8, 12, 16)  # pixels
 LARGE = ("corridor", "corridor laps")  # whose frames are above 100 pixels
+LAPS, NEAR = (194, 590, 982, 1356), 15  # first frames of a small car's laps, about; frames
 FOOTAGE: dict[str, Route] = {  # with frames
     **{
         name: route for name, (route, _) in ROUTES.items() if name not in ("magnetometer", "lidar", "gardens")
@@ -57,13 +59,26 @@ def run_features(data: Path, *, out: Path, seeds: int = 3, cells: bool = False) 
         cells: instead, the sides of HOG's cells, in pixels, on frames above 100 pixels
     """
     rows: list[Row] = []
-    sides: Ways = {f"{side} x {side}": partial(with_cells, side) for side in CELLS}
-    ways, names = (sides, LARGE) if cells else (FEATURES, [*FOOTAGE])
-    for name in tqdm(names, "features", disable=None, leave=False):
+    ways, routes = FEATURES, FOOTAGE
+    if cells:
+        ways = {f"{side} x {side}": partial(with_cells, side) for side in CELLS}
+        routes = {name: FOOTAGE[name] for name in LARGE} | {f"lap {n}": lap(n, out) for n in (2, 3)}
+    for name, route in tqdm(routes.items(), "features", disable=None, leave=False):
         for seed in range(seeds):
-            rows += bench_features(name, FOOTAGE[name].below(data), seed, ways)
+            rows += bench_features(name, route.below(data), seed, ways)
             write_bench(out, rows)
     return [table(rows, COLUMNS), "AUC, centred where there are enough queries"]
+
+
+def lap(number: int, out: Path) -> Route:
+    """The first lap of a small car and another, whose places are in proportion; their file goes to `out`."""
+    start, stop = LAPS[number - 1 : number + 1]
+    place = torch.linspace(0, LAPS[1] - LAPS[0] - 1, stop - start).round().long().tolist()
+    out.mkdir(parents=True, exist_ok=True)
+    path = out / f"lap{number}.csv"
+    path.write_text("query,place\n" + "".join(f"{query},{at}\n" for query, at in enumerate(place)))
+    frames = "{{data}}/rc_car_laps/frames?start={}&stop={}"
+    return Route(frames.format(*LAPS[:2]), frames.format(start, stop), NEAR, str(path))
 
 
 def with_cells(side: int) -> list[nn.Module]:
