@@ -17,7 +17,7 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.growth import merge
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.recognition.centring import centred
-from dejavu_torch.updating import PIECE, update
+from dejavu_torch.updating import PIECE, Update, update
 
 END = 240  # places that the map has; the route goes on
 
@@ -147,6 +147,14 @@ def test_what_fits_no_map_is_refused():
     with refused("no map yet to update"):
         update(DejaVu(None, "none"), seen(ROUTE[:40]))
     assert model.map.routes == ()
+
+
+def test_an_update_in_words():
+    assert str(Update(None, True)) == "too few frames to learn from; nothing new"
+    told = str(Update(None, True, ((3, 40),), ("monday",), ((60, 90),)))
+    assert told.endswith(
+        "frames 3-39 are new, the route monday; frames 60-89 may be new, or hard to recognise"
+    )
 
 
 def test_connections_are_followed_by_a_whole_drive():
