@@ -71,6 +71,20 @@ def test_learning_a_second_model_leaves_the_first_alone(learned):
     assert torch.equal(learned(FRAMES[SOME]), before)
 
 
+def test_cells_follow_the_frames_of_each_model(tmp_path):
+    small, large = torch.rand(40, 1, 32, 48), torch.rand(40, 1, 80, 120)
+    first = DejaVu().learn(small)
+    before = first(small[:3])
+    second = DejaVu(**first.settings()).learn(large)
+    with refused("NaN"):
+        second.learn(small * torch.nan)
+    second.save(tmp_path / "large.safetensors")
+    loaded = DejaVu.load(tmp_path / "large.safetensors")
+    assert [model.features.members[0].cell for model in (first, second, loaded)] == [8, 16, 16]
+    assert torch.equal(first(small[:3]), before)
+    assert torch.equal(loaded(large[:3]), second(large[:3]))
+
+
 def test_an_optimiser_goes_on_with_the_templates_of_a_map_made_anew(caplog):
     model = templates(trainable=True).learn(FRAMES)
     kept, before = model.map.templates, model.map.templates.detach().clone()

@@ -219,8 +219,8 @@ class Descriptor(nn.Module):
         "auto" on 32 of them, evenly drawn; for a run that is resumed, also whether most count as blank, which
         the run before has found."""
         own = self.preprocess
-        for part in self._histograms() if not is_ready(traverse) else ():
-            part.adapt(*traverse.frame_shape[1:])
+        if not is_ready(traverse):
+            self.features = _for_frames(self.features, *traverse.frame_shape[1:])
         if is_ready(traverse) or not (own.range == "auto" or (resumed and own.blank == BLANK)):
             return
         drawn = torch.linspace(0, len(traverse) - 1, min(DRAWN, len(traverse))).round().long()
@@ -283,21 +283,17 @@ class Descriptor(nn.Module):
         batches = self.features_in(views.traverse, progress, f"learning what changes: {source}")
         return _with_places(batches, views.places.to(self.device))
 
-    def _histograms(self) -> list[HOG]:
-        return [part for part in self.features.modules() if isinstance(part, HOG)]
-
     @contextmanager
     def unchanged_by_errors(self) -> Iterator[None]:
         """Restores the whitening and what the preprocessing adapts if the block raises."""
         adapted = self.preprocess.range, self.preprocess.blank
-        cells = [(part, part.cell) for part in self._histograms()]
+        features = self.features
         before = self.whitening, self.reduces, None if self.whitening is None else self.whitening.state_dict()
         try:
             yield
         except BaseException:
             self.preprocess.range, self.preprocess.blank = adapted
-            for part, cell in cells:
-                part.cell = cell
+            self.features = features
             self.whitening, self.reduces, state = before
             if self.whitening is not None and state is not None:
                 self.whitening.load_state_dict(state)
@@ -382,6 +378,20 @@ def is_ready(traverse: Traverse | AugmentedFrames | None) -> bool:
 def default_features(whitens: bool = True) -> nn.Module:
     """HOG and the package's network side by side; without whitening HOG alone, as in the paper."""
     return Joined([HOG(cell=None), Distilled()]) if whitens else HOG()
+
+
+def _for_frames(features: nn.Module, height: int, width: int) -> nn.Module:
+    """Features whose HOG has the cells of frames of this size; other parts are the same modules."""
+    if isinstance(features, HOG):
+        return features.for_frames(height, width)
+    if not isinstance(features, Joined) or not any(map(_chooses, features.members)):
+        return features
+    members = [_for_frames(member, height, width) for member in features.members]
+    return Joined(members).train(features.training)
+
+
+def _chooses(features: nn.Module) -> bool:
+    return isinstance(features, HOG) and features.chooses
 
 
 def own_size(features: nn.Module, block: bool = False) -> tuple[int, int] | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Literal
 
 import torch
@@ -57,10 +58,13 @@ class HOG(nn.Module):
         cell = self.cell or cell_for(*(self.resize or frames.shape[2:]))
         return hog(frames, self.orientations, cell, self.block, self.resize, self.bins)
 
-    def adapt(self, height: int, width: int) -> None:
-        """Fix a cell that is None for frames of this size, so that a map's file names it."""
-        if self.chooses:
-            self.cell = cell_for(*(self.resize or (height, width)))
+    def for_frames(self, height: int, width: int) -> HOG:
+        """The same, but with the cell of frames of this size, if it was None: a map's file names it."""
+        if not self.chooses:
+            return self
+        sized = copy.copy(self)
+        sized.cell = cell_for(*(self.resize or (height, width)))
+        return sized
 
     extra_repr = settings_of
 

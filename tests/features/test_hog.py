@@ -154,11 +154,9 @@ def test_cells_follow_the_size_of_frames_until_a_map_is_learned():
     assert torch.equal(features(small), hog(small))
     assert torch.equal(features(large), hog(large, cell=16))
     for frames, cell in ((large, 16), (small, 8)):
-        features.adapt(*frames.shape[2:])
+        features = features.for_frames(*frames.shape[2:])
         assert features.cell == cell
-    fixed = HOG(cell=4)
-    fixed.adapt(80, 101)
-    assert fixed.cell == 4
+    assert HOG(cell=4).for_frames(80, 101).cell == 4
     assert HOG(cell=None, resize=(64, 64))(large).shape == HOG(resize=(64, 64))(large).shape
 
 
