@@ -27,13 +27,20 @@ from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.teaching import in_its_light
 from dejavu_torch.types import InputError
 
-Ways = dict[str, Callable[[], list[nn.Module]]]
+Ways = dict[str, Callable[[Whitening, int], DejaVu]]  # of a whitening, for so many frames
 FEATURES: Ways = {
-    "HOG, Distilled": lambda: [HOG(cell=None), Distilled()],
-    "HOG, Distilled, XFeat": lambda: [HOG(cell=None), Distilled(), XFeat()],
+    "HOG, Distilled": lambda whitening, _: DejaVu(whitening=whitening),
+    "HOG, Distilled, XFeat": lambda whitening, _: described(
+        [HOG(cell=None), Distilled(), XFeat()], whitening
+    ),
+}
+COPIES: Ways = {
+    "default": lambda whitening, _: DejaVu(whitening=whitening),
+    "twice as many": lambda whitening, frames: DejaVu(whitening=with_copies(2, whitening, frames)),
 }
 CELLS = (8, 12, 16)  # pixels
 LARGE = ("corridor", "corridor laps")  # whose frames are above 100 pixels
+WIDE = 1000  # features, more than there are components
 LAPS, NEAR = (194, 590, 982, 1356), 15  # first frames of a small car's laps, about; frames
 FOOTAGE: dict[str, Route] = {  # with frames
     **{
@@ -49,7 +56,9 @@ COLUMNS: dict[str, Column] = {
 }
 
 
-def run_features(data: Path, *, out: Path, seeds: int = 3, cells: bool = False) -> list[str]:
+def run_features(
+    data: Path, *, out: Path, seeds: int = 3, cells: bool = False, copies: bool = False
+) -> list[str]:
     """XFeat beside the default features: AUC of one image and of the whole drive, and of the null.
 
     Args:
@@ -57,12 +66,20 @@ def run_features(data: Path, *, out: Path, seeds: int = 3, cells: bool = False) 
         out: folder for bench.json
         seeds: of the whitening and of the null, from 0 on
         cells: instead, the sides of HOG's cells, in pixels, on frames above 100 pixels
+        copies: instead, twice as many altered copies of frames for the whitening, on routes of over 500 frames
     """
     rows: list[Row] = []
     ways, routes = FEATURES, FOOTAGE
     if cells:
         ways = {f"{side} x {side}": partial(with_cells, side) for side in CELLS}
         routes = {name: FOOTAGE[name] for name in LARGE} | {f"lap {n}": lap(n, out) for n in (2, 3)}
+    if copies:
+        kinds, long = ("aerial", "outdoor", "underground"), ("road", "railway")
+        routes = {name: route for name, route in FOOTAGE.items() if name.startswith(long)}
+        routes |= {
+            f"sim:{kind}": Route(f"sim:{kind}?seed=3", f"sim:{kind}?seed=3&traverse=1") for kind in kinds
+        }
+        ways = COPIES
     for name, route in tqdm(routes.items(), "features", disable=None, leave=False):
         for seed in range(seeds):
             rows += bench_features(name, route.below(data), seed, ways)
@@ -81,18 +98,27 @@ def lap(number: int, out: Path) -> Route:
     return Route(frames.format(*LAPS[:2]), frames.format(start, stop), NEAR, str(path))
 
 
-def with_cells(side: int) -> list[nn.Module]:
-    return [HOG(cell=side), Distilled()]
+def described(features: list[nn.Module], whitening: Whitening) -> DejaVu:
+    return DejaVu(Joined(features), whitening)
+
+
+def with_cells(side: int, whitening: Whitening, frames: int) -> DejaVu:
+    return described([HOG(cell=side), Distilled()], whitening)
+
+
+def with_copies(factor: int, whitening: Whitening, frames: int) -> Whitening:
+    whitening.views = factor * whitening.copies(frames, WIDE)
+    return whitening
 
 
 def bench_features(name: str, route: Route, seed: int, ways: Ways = FEATURES) -> Iterator[Row]:
     """A row for each way to describe frames."""
     reference, query = open_source(route.reference), open_source(route.query)
     truth, tolerance = truth_of(reference, query, route.truth), route.tolerance
-    for way, features in ways.items():
+    for way, made in ways.items():
         began = time.perf_counter()
         try:
-            model = DejaVu(Joined(features()), whitening=Whitening(seed=seed))
+            model = made(Whitening(seed=seed), len(reference))
         except InputError as error:  # the package is missing
             yield new_row(name, way, KEYS, seed=seed, skipped=failure(error))
             continue

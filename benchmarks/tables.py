@@ -379,7 +379,7 @@ TABLES: dict[str, Callable[[], str]] = {
     **{"large drives": large_drives, "taught drives": taught, "visits": visits},
     **{
         "features": features,
-        "cells": partial(features, "cells"),
+        **{name: partial(features, name) for name in ("cells", "copies")},
         "alike": lambda: f"{look_alikes()}\n{loops()}",
     },
     **{f"storage {name}": partial(storage, name) for name in ("aerial", "road1", "road2", "city", "railway")},

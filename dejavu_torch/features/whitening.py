@@ -23,8 +23,8 @@ DIMENSIONS = 128  # by default
 WIDEST = 256  # default dimensions without views
 PLACES_PER_DIMENSION = 2  # on a short route, at least
 COMPONENTS = 400  # principal components that are whitened, by default
-VIEWS = 4  # of a frame, at least
-VIEWS_PER_COMPONENT = 30  # at least: as 4 views of each of 3000 frames
+VIEWS = 2  # of a frame, at least
+VIEWS_PER_COMPONENT = 15  # at least: as 2 views of each of 3000 frames
 INDEPENDENT = 4  # copies of a frame; further ones are so much like these that they are no further samples
 MOST_VIEWS = 20_000  # in all: of more, frames are drawn evenly
 MAX_VIEWS = 12  # of a frame, unless a short route has fewer than COPIES then
@@ -116,7 +116,7 @@ class Whitening(nn.Module):
         numbers: K, at most the rank. None is 128, but at most half the places; without views 256.
         components: principal components that are whitened, at least K.
         shrinkage: of `learned_whitening`. None is 0.03, or more if there are few views.
-        views: augmented copies of each frame. None is 4, on a shorter route up to 12, 30 per component, or
+        views: augmented copies of each frame. None is 2, on a shorter route up to 12, 15 per component, or
             4000 in all if that is more, but at most 36 of each.
         strengths: arguments of `Augmentation`, instead of `STRENGTHS`.
         seed: of the copies.

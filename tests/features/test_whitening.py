@@ -196,8 +196,8 @@ def test_numbers_follow_the_rank_and_the_length_of_the_route(caplog):
 
 def test_short_routes_are_looked_at_more_often():
     frames = 60, 400, 1000, 2700, 3000, 90_000
-    assert [Whitening().copies(count, 1764) for count in frames] == [36, 12, 12, 5, 4, 4]
-    assert Whitening().copies(2000, 40) == 4  # 40 features have no more components
+    assert [Whitening().copies(count, 1764) for count in frames] == [36, 12, 6, 3, 2, 2]
+    assert Whitening().copies(2000, 40) == 2  # 40 features have no more components
     assert Whitening(components=100).copies(1000, 1764) == 4
     assert Whitening(views=2).copies(60, 1764) == 2
 
