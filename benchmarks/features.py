@@ -66,7 +66,7 @@ def run_features(
         out: folder for bench.json
         seeds: of the whitening and of the null, from 0 on
         cells: instead, the sides of HOG's cells, in pixels, on frames above 100 pixels
-        copies: instead, twice as many altered copies of frames for the whitening, on routes of over 500 frames
+        copies: instead, twice as many altered copies for the whitening, on routes of over 500 frames
     """
     rows: list[Row] = []
     ways, routes = FEATURES, FOOTAGE

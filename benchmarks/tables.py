@@ -377,11 +377,8 @@ TABLES: dict[str, Callable[[], str]] = {
     **{"rejection": rejection, "filtered": filtered, "drives": drives, "driven": driven},
     **{"trainings": trainings, "made drives": made_drives, "storage drives": storage_drives},
     **{"large drives": large_drives, "taught drives": taught, "visits": visits},
-    **{
-        "features": features,
-        **{name: partial(features, name) for name in ("cells", "copies")},
-        "alike": lambda: f"{look_alikes()}\n{loops()}",
-    },
+    **{name: partial(features, name) for name in ("features", "cells", "copies")},
+    **{"alike": lambda: f"{look_alikes()}\n{loops()}"},
     **{f"storage {name}": partial(storage, name) for name in ("aerial", "road1", "road2", "city", "railway")},
 }
 
