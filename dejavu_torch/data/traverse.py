@@ -23,7 +23,7 @@ from dejavu_torch.types import Coordinates, InputError, Traverse, expect
 log = logging.getLogger("dejavu_torch")
 
 
-KEPT = 2**28  # bytes of the frames that are kept of a traverse
+KEPT = 2**27  # bytes of the frames that are kept of a traverse
 KEPT_FRAMES = 10_000  # longer traverses are read in parts, and again
 
 
