@@ -177,7 +177,7 @@ class Localizer:
     def skip(self, queries: int) -> None:
         """Skip queries: a `PlaceFilter` moves once more for each."""
         filter = self.matching.sequence
-        if isinstance(filter, PlaceFilter) and self.states:
+        if queries and isinstance(filter, PlaceFilter) and self.states:
             state = filter.skipped(self.states["filter"], queries, self.route_starts)
             self.states = self.states | {"filter": state}
 
