@@ -167,7 +167,7 @@ class TrainCLI(LightningCLI):
             ("trainer.strategy", trainer["strategy"], trainer["strategy"] in ("auto", "ddp"), "auto or ddp"),
             ("trainer.val_check_interval", interval, interval != 0, "a number above 0"),
             ("trainer.overfit_batches", trainer["overfit_batches"], not trainer["overfit_batches"], "0"),
-            ("trainer.accumulate_grad_batches", trainer["accumulate_grad_batches"], grads >= 1, "at least 1"),
+            ("trainer.accumulate_grad_batches", grads, grads >= 1, "at least 1"),
             ("trainer.check_val_every_n_epoch", epochs, epochs is None or epochs >= 1, "at least 1"),
             ("seed_everything", seed, seed is None or 0 <= seed < 2**32, "a number from 0 to 2^32 - 1"),
         ):

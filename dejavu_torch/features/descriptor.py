@@ -384,14 +384,11 @@ def _for_frames(features: nn.Module, height: int, width: int) -> nn.Module:
     """Features whose HOG has the cells of frames of this size; other parts are the same modules."""
     if isinstance(features, HOG):
         return features.for_frames(height, width)
-    if not isinstance(features, Joined) or not any(map(_chooses, features.members)):
+    if not isinstance(features, Joined):
         return features
     members = [_for_frames(member, height, width) for member in features.members]
-    return Joined(members).train(features.training)
-
-
-def _chooses(features: nn.Module) -> bool:
-    return isinstance(features, HOG) and features.chooses
+    same = all(one is own for one, own in zip(members, features.members, strict=True))
+    return features if same else Joined(members).train(features.training)
 
 
 def own_size(features: nn.Module, block: bool = False) -> tuple[int, int] | None:
