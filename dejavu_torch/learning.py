@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
@@ -31,7 +31,7 @@ from dejavu_torch.maps.place_map import Mapper, PlaceMap
 from dejavu_torch.maps.spectral import SpectralMapper, encode_chunk
 from dejavu_torch.maps.spectral_map import Chunk, SpectralMap
 from dejavu_torch.maps.spectrum import Transform
-from dejavu_torch.memory import concatenate
+from dejavu_torch.memory import concatenate, in_one_thread
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.recognition.calibration import Calibration, calibrated
 from dejavu_torch.text import progress_of
@@ -72,17 +72,6 @@ class ChunkEncoder:
                 shown = views_of(self.visits, torch.arange(frames.start, frames.stop))
                 rows = averaged(self.descriptor, rows, shown)
             return encode_chunk(rows, self.mean, self.step, self.transform, self.resolution)
-
-
-@contextmanager
-def in_one_thread() -> Iterator[None]:
-    """Makes torch compute in one thread, so that products do not depend on the number of cores."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 class Checkpoint:

@@ -1,4 +1,4 @@
-"""Free memory, tensors in temporary files, and the type of new ones."""
+"""Free memory, tensors in temporary files, the type of new ones, and threads."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 IN_MEMORY = 2**29  # bytes of features that are kept in memory
+SMALL = 2**20  # numbers of an operation that one thread computes as fast as several that are disturbed
 BLOCK_BYTES = 2**26  # a tensor this large returns to the system when it is freed, a batch may not
 
 
@@ -35,6 +36,21 @@ def in_float32() -> Iterator[None]:
         yield
     finally:
         torch.set_default_dtype(before)
+
+
+@contextmanager
+def in_one_thread(numbers: float = 0) -> Iterator[None]:
+    """In the block torch computes in one thread if its operations have fewer than 2^20 numbers each.
+
+    Of two threads each operation is as slow as the one that another program disturbs, which is many times
+    slower. And the rounding of matrix products depends on the number of threads.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(1 if numbers < SMALL else before)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def without_autocast(function: Callable[P, R]) -> Callable[P, R]:

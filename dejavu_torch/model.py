@@ -373,8 +373,8 @@ class DejaVu(nn.Module):
             centre: remove what the descriptors of all queries have and the map's have not, see `centred`;
                 None does it for a smoother and at least 50 queries, not for single ones.
             search: for single queries: "scan" and "exact" score all places; "auto", "coarse" and None take
-                `self.searcher`, by default one that scores the places near the best samples of a long
-                spectral map, if that is faster.
+                `self.searcher`, by default one that compares all places of a spectral map in 8 bits, or
+                samples of a long one, and scores the best.
 
         Shape: -> Match of (Q,) on the CPU.
 

@@ -53,6 +53,7 @@ def same_maps(first, second):
 
 def test_searches_of_localize(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(coarse, "MIN_PLACES", 0)  # as a long map is searched
+    monkeypatch.setattr(coarse, "DECODED", 0)
     path, out = tmp_path / "m.safetensors", tmp_path / "m.csv"
     run("learn", ROUTE, "--map", path, "--mapper.chunk", "32", "--features", "HOG")
     found = []

@@ -41,7 +41,8 @@ from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.views import LabelledFrames
 from dejavu_torch.recognition import coarse
-from dejavu_torch.recognition.select import best_match
+from dejavu_torch.recognition.samples import RowSearch
+from dejavu_torch.recognition.select import best_candidates, best_match
 
 SEQUENCES = [PlaceFilter(), SequenceMatcher(3), None]
 ELSEWHERE = f"cuda:{torch.cuda.device_count()}"  # the first that is not there
@@ -229,16 +230,36 @@ def test_a_map_grows_on_a_gpu(device, visits):
     assert {one.device.type for one in merged.state_dict().values() if isinstance(one, Tensor)} == {device}
 
 
-def test_a_long_route_is_learned_and_searched_on_a_gpu(device, monkeypatch):
-    """From a sample, chunk by chunk, with principal components of wide features; then by its own samples."""
+@pytest.mark.parametrize("decoded", [0, coarse.DECODED])
+def test_a_long_route_is_learned_and_searched_on_a_gpu(decoded, device, monkeypatch):
+    """From a sample, chunk by chunk, with principal components of wide features; then by its own samples, or
+    all its places."""
     long_from(monkeypatch, 200)
     monkeypatch.setattr(coarse, "MIN_PLACES", 100)
+    monkeypatch.setattr(coarse, "DECODED", decoded)
     wave = torch.sin(0.05 * torch.arange(600.0)[:, None] * torch.rand(260) + torch.arange(260))
     model = DejaVu(mapper=SpectralMapper(8.0, chunk=200)).to(device).learn(wave)
     queries = wave[::50] + 0.01
     expected = model.localize(queries, search="scan")
     assert torch.equal(model.localize(queries).index, expected.index)
-    assert isinstance(model.searcher, coarse.CoarseSearch)
+    assert type(model.searcher) is (RowSearch if decoded else coarse.CoarseSearch)
+
+
+def test_a_search_reads_no_value_back(device):
+    """Nothing waits between the queries and their places."""
+    place_map = SpectralMapper(8.0).to(device)(torch.randn(600, 24, device=device).cumsum(0))
+    search, queries, wanted = RowSearch(place_map), torch.randn(5, 24), [(3, 2), (2, 5)]
+    expected = [best_candidates(place_map.scores(queries.to(device)), *spec).index.cpu() for spec in wanted]
+    here = queries.to(device)
+    if device == "cuda":
+        torch.cuda.set_sync_debug_mode("error")
+    try:
+        score, place = search(here, wanted)
+        found = [best_candidates(score, *spec, places=place).index for spec in wanted]
+    finally:
+        if device == "cuda":
+            torch.cuda.set_sync_debug_mode("default")
+    assert all(map(torch.equal, [one.cpu() for one in found], expected))
 
 
 def test_even_steps_are_learned_on_a_gpu(device):

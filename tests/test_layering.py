@@ -31,7 +31,7 @@ ARROWS = {
     "growth": "types data features maps motion learning model_file model teaching",
     "updating": "types data maps motion recognition model teaching growth",
     "cluster": "text types maps recognition",
-    "live": "types data features recognition model",
+    "live": "types memory data features recognition model",
     "evaluation": "lazy text version types memory resize data features periods maps recognition motion "
     "model_file model growth",
     "export": "text version types data features maps recognition model",

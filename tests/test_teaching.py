@@ -336,7 +336,7 @@ def test_what_knows_of_a_stage(tmp_path):
     best, at = score.min(1, keepdim=True)
     scores = model.map.scores(queries)
     torch.testing.assert_close(best, scores.gather(1, place.gather(1, at)), rtol=0, atol=1e-5)
-    assert (best[:, 0] - scores.amin(1) < 1e-5).float().mean() > 0.9
+    assert (best[:, 0] - scores.amin(1) < 1e-5).float().mean() > 0.85
 
 
 def test_a_calibration_is_learned_anew_from_all_of_a_drive():

@@ -161,9 +161,9 @@ class Searching:
     """How places are searched for single queries.
 
     Args:
-        search: coarse scores only the places near the best samples of a long spectral map, exact and scan
-            all; auto is the faster of coarse and scan
-        search_memory: MB for these samples; if not given 100, or 100 bytes per place above 10^6 places
+        search: auto and coarse score only the best places by 8-bit samples of a spectral map, exact and scan
+            all
+        search_memory: MB for these samples; if not given 300, or 100 bytes per place above 3 x 10^6 places
     """
 
     search: Search = "auto"

@@ -10,6 +10,7 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor, nn
 
+from dejavu_torch.memory import in_one_thread
 from dejavu_torch.text import settings_of
 from dejavu_torch.types import InputError, expect
 
@@ -38,7 +39,9 @@ def in_parts(work: Callable[[Tensor], Tensor], frames: Tensor) -> Tensor:
     if torch.compiler.is_compiling():  # the number of parts would fix the batch size
         return work(frames)
     size = max(1, VALUES_AT_ONCE // max(1, math.prod(frames.shape[1:])))
-    return torch.cat([work(part) for part in frames.split(size)])
+    parts = frames.split(size)
+    with in_one_thread(max((part.numel() for part in parts), default=0)):
+        return torch.cat([work(part) for part in parts])
 
 
 def channel_name(channel: str) -> str:

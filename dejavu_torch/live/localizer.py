@@ -12,6 +12,7 @@ from torch import Tensor
 
 from dejavu_torch.data.traverse import resize_like
 from dejavu_torch.features.extract import features_of, in_mode
+from dejavu_torch.memory import in_one_thread
 from dejavu_torch.model import DejaVu, check_queries
 from dejavu_torch.recognition.centring import running_mean
 from dejavu_torch.recognition.filter import PlaceFilter
@@ -84,6 +85,7 @@ class LiveLocalizer:
         self.model, self.sequence = model, PlaceFilter() if isinstance(sequence, str) else sequence
         self._shape: tuple[int, ...] | None = None  # of the latest valid frame
         whitening = model.whitening
+        self._parameters = sum(one.numel() for one in model.descriptor.parameters())
         self._projection = whitening.all_unpacked() if whitening is not None and whitening.learned else None
         self.reset()
 
@@ -107,11 +109,14 @@ class LiveLocalizer:
     def due(self, frame: Tensor | np.ndarray, left_out: int = 0) -> list[LiveMatch]:
         """The answers that a frame completes: its own, or that of the frame `lag` before, if there is one."""
         start, mean = time.perf_counter(), self._mean
-        descriptor = self._describe(as_batch(frame, self.model.map.device))
+        batch = as_batch(frame, self.model.map.device)
+        with in_one_thread(batch.numel() + self._parameters):
+            descriptor = self._describe(batch)
         if self.centring is not None:
             descriptor, mean = self.centring(descriptor, mean)
-        self._localizer.skip(min(left_out, MAX_SKIPPED))
-        match = self._localizer(descriptor)
+        with in_one_thread(self.model.map.places):
+            self._localizer.skip(min(left_out, MAX_SKIPPED))
+            match = self._localizer(descriptor)
         self._mean = mean
         return self._told(match, start)
 

@@ -1,14 +1,12 @@
 """Coarse-to-fine search for single queries: the low-frequency lines of a spectral map are its index.
 
 The inverse transform of the W / d lowest lines of a chunk of W places gives every d-th place, low-passed.
-Only places near the best of these samples are scored.
+Only places near the best of these samples are scored. Where memory allows, d is 1: see `RowSearch`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from functools import cache
 from typing import NamedTuple
 
 import torch
@@ -18,63 +16,89 @@ from torch import Tensor
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.maps.spectral_map import SpectralMap, scores_of
 from dejavu_torch.maps.spectrum import half_cycles
+from dejavu_torch.recognition.samples import (
+    GROUP,
+    WIDEST,
+    RowSearch,
+    Samples,
+    has_int8_products,
+    replaced,
+    to_int8,
+    topk_groups,
+    units_of,
+    width_of,
+)
 from dejavu_torch.recognition.search import NmsSpec, Scan, Search, TopK, check_search, empty_topk
 from dejavu_torch.recognition.select import best_candidates
 from dejavu_torch.types import expect
 
 MIN_PLACES = 20_000  # a shorter map is scanned, which is as fast
 OVERHEAD = 16  # bytes of a sample besides its descriptor
-MEMORY, MEMORY_PER_PLACE = 100_000_000, 100  # default bytes for the samples; the larger one applies
+MEMORY, MEMORY_PER_PLACE = 300_000_000, 100  # default bytes for the samples; the larger one applies
+FREE = 2  # on a GPU, samples take at most one in this many of its free bytes
+COMPARED = 2**24  # numbers of a map whose places are all compared, by products of 8 bits in the cache
+COMPARED_IN_FLOAT = 2**21  # without such products
+DECODED = 2**24  # numbers of a chunk that are decoded at a time, at most
 SPACINGS = (32, 16, 12, 8, 6, 4, 3, 2)  # places from one sample to the next
 COARSE, FINE = 0.93, 0.98  # shares of the lines' energy that coarse and fine samples should hold
-GROUP = 8  # consecutive samples, represented by the best of them
-GROUPS_PER_BLOCK = 16  # the best groups are searched for in the best blocks
 REFINED = 32  # best groups of a query that are refined; 4 times as many if the samples hold less than COARSE
 EXTRA_WINDOWS = 3  # further windows of a query that are scored if they are nearly as good
 NEARLY = 0.02  # difference in cosine that counts as nearly as good
 MIN_COSINE = 0.02  # a query whose best cosine is lower is scanned: places of norm 0 have cosine 0
-QUERIES_AT_ONCE = 16  # whose fine samples are compared at a time, in the cache
-BLOCK, PRODUCTS = 8192, 2**20  # samples, and products with them, at a time: these stay in the cache
-CLIP = 6  # standard deviations at which a component of a unit vector is clipped in 8 bits
 MEASURED_CHUNKS = 16  # evenly along the map, for the energy of the lines
 
 
 class SamplingPlan(NamedTuple):
     """How a map is sampled."""
 
-    coarse: int  # places from one coarse sample to the next
-    fine: int
+    coarse: int  # places from one coarse sample to the next; 1 compares all places, as a `RowSearch`
+    fine: int  # 1 holds the descriptors of all places
     refined: int  # best groups of coarse samples, around which fine ones are compared
     held: float  # share of the lines' energy in the coarse samples
     bytes: int  # of all samples
 
     def __str__(self) -> str:
+        size = f"{self.bytes / 1e6:.1f} MB"
+        if self.coarse == 1:
+            return f"all places are compared in 8 bits, and the best of them scored; {size}"
         return (
             f"samples every {self.coarse} places hold {self.held:.1%} of the lines' energy, the best "
-            f"{self.refined} groups of {GROUP} are refined every {self.fine}; {self.bytes / 1e6:.1f} MB"
+            f"{self.refined} groups of {GROUP} are refined every {self.fine}; {size}"
         )
 
 
 def plan(place_map: PlaceMap, limit: int | None = None) -> SamplingPlan | None:
-    """The widest spacings at which samples hold enough energy. None if the map has to be scanned: another
-    kind or metric, few places, a single chunk, or mainly high frequencies.
+    """All places if they fit and are few, or on a GPU; else the widest spacings at which samples hold enough
+    energy. None if the map has to be scanned: another kind or metric, mainly high frequencies, or a single
+    chunk of more places than fit.
 
     Args:
-        limit: bytes; None is 100 MB, or 100 bytes per place if that is more. Samples that exceed it get wider
-            spacings, and more of them are refined.
+        limit: bytes; None is half of what a GPU has free, else 300 MB, or 100 bytes per place if that is
+            more. Samples that exceed it get wider spacings, and more of them are refined.
 
     Raises:
         InputError: the limit is below the samples of a single chunk.
     """
     if not isinstance(place_map, SpectralMap) or place_map.metric != "cosine" or not place_map.chunks:
         return None
-    longest = max(stop - start for start, stop in place_map.chunks)
-    limit = max(MEMORY, MEMORY_PER_PLACE * place_map.places) if limit is None else limit
+    longest, device = max(stop - start for start, stop in place_map.chunks), place_map.device
+    width = width_of(place_map)
+    if limit is None:
+        limit = max(MEMORY, MEMORY_PER_PLACE * place_map.places)
+        if device.type == "cuda":
+            limit = torch.cuda.mem_get_info(device)[0] // FREE
 
     def size(places: int, *spacings: int) -> int:
-        return sum(-(-places // d) * (place_map.dimension + OVERHEAD) for d in spacings)
+        return sum(-(-places // d) * (width * (2 if d == 1 else 1) + OVERHEAD) for d in spacings)
 
-    if place_map.places < max(MIN_PLACES, 2 * longest):
+    every = SamplingPlan(1, 1, 0, 1.0, size(place_map.places, 1))
+    fits = every.bytes <= limit and longest * width <= DECODED and width <= WIDEST
+    most = math.inf if device.type == "cuda" else COMPARED if has_int8_products() else COMPARED_IN_FLOAT
+    # places of no frame are not to be found, nor in the way
+    seen = fits and not bool(place_map.norms.isinf().any())
+    if seen and place_map.places * width <= most:
+        return every
+    if place_map.places < max(MIN_PLACES, 2 * longest) or width > WIDEST:
         return None
     minimum = size(longest, SPACINGS[0], SPACINGS[1])
     expect(limit >= minimum, f"at least {minimum}, for a chunk", f"search_memory is {limit} bytes")
@@ -82,11 +106,12 @@ def plan(place_map: PlaceMap, limit: int | None = None) -> SamplingPlan | None:
     widest_coarse = next((d for d in SPACINGS if held[d] >= COARSE), 0)
     widest_fine = next((d for d in SPACINGS if held[d] >= FINE), 2)
     for coarse in [d for d in SPACINGS[::-1] if d >= max(4, widest_coarse)] if widest_coarse else ():
-        for fine in [d for d in SPACINGS[::-1] if min(widest_fine, coarse // 2) <= d <= coarse // 2]:
+        spacings = [d for d in SPACINGS[::-1] if min(widest_fine, coarse // 2) <= d <= coarse // 2]
+        for fine in [1, *spacings] if fits else spacings:
             if size(place_map.places, coarse, fine) <= limit:
                 refined = REFINED * (1 if coarse == widest_coarse else 4)
                 return SamplingPlan(coarse, fine, refined, held[coarse], size(place_map.places, coarse, fine))
-    return None
+    return every if seen else None
 
 
 def explained_variance(place_map: SpectralMap) -> dict[int, float]:
@@ -108,59 +133,15 @@ def searcher(place_map: PlaceMap, method: Search = "auto", memory: int | None = 
     """The searcher of a map.
 
     Args:
-        method: "auto" and "coarse" are a `CoarseSearch` if `plan` has one; "exact" and "scan" a `Scan`.
+        method: "auto" and "coarse" are what `plan` says: a `RowSearch`, a `CoarseSearch` or a `Scan`;
+            "exact" and "scan" are a `Scan`.
         memory: bytes of the samples, see `plan`.
     """
     check_search(method)
     chosen = plan(place_map, memory) if method in ("auto", "coarse") else None
-    return (
-        CoarseSearch(place_map, chosen) if isinstance(place_map, SpectralMap) and chosen else Scan(place_map)
-    )
-
-
-class Samples:
-    """Low-passed descriptors of a map, about every `spacing` places, padded to whole groups in each chunk and
-    to whole blocks of groups in the map.
-
-    Attributes:
-        rows: (S,K) int8, unit vectors on one scale. norm: (S,) of the rows. place: (S,) nearest to each, in
-            order.
-    """
-
-    def __init__(self, place_map: SpectralMap, spacing: int) -> None:
-        places = []
-        for chunk, (start, stop) in enumerate(place_map.chunks):
-            at = place_map.sampled(chunk, -(-(stop - start) // spacing))
-            places.append(F.pad(at, (0, -len(at) % GROUP), value=stop - start - 1) + start)
-        place = torch.cat(places)
-        self.place = F.pad(place, (0, -len(place) % (GROUP * GROUPS_PER_BLOCK)), value=place_map.places - 1)
-        # padding is 0, which is never the best
-        self.rows, first = self.place.new_zeros(len(self.place), place_map.dimension, dtype=torch.int8), 0
-        for chunk, (start, stop) in enumerate(place_map.chunks):
-            row = place_map.staged(place_map.samples(chunk, -(-(stop - start) // spacing)))
-            self.rows[first : first + len(row)] = to_int8(F.normalize(row))
-            first += len(places[chunk])
-        norms = [torch.linalg.vector_norm(block.float(), dim=1) for block in self.rows.split(BLOCK)]
-        self.norm = torch.cat(norms).clamp(min=1)
-
-    def products(self, queries: Tensor) -> Iterator[Tensor]:
-        """Dot products with queries, block by block: (Q,K) int8 -> (n,Q) int32."""
-        int8 = self.rows.device.type == "cpu" and has_int8_products()
-        for rows in self.rows.split(GROUP * max(1, PRODUCTS // (GROUP * len(queries))) if int8 else BLOCK):
-            yield torch._int_mm(rows, queries.T) if int8 else (rows.float() @ queries.T.float()).int()
-
-    def best_of_groups(self, queries: Tensor) -> Tensor:
-        """The largest `GROUP` x product + row of each group of rows, (Q,K) int8 -> (G,Q) int32: much faster
-        than an argmax."""
-        row = torch.arange(GROUP, dtype=torch.int32, device=queries.device)[:, None]
-        best = row.new_empty(len(self.rows) // GROUP, len(queries))
-        first = 0
-        for products in self.products(queries):
-            groups = products.view(-1, GROUP, len(queries))
-            last = first + len(groups)
-            torch.amax(torch.add(row, groups, alpha=GROUP, out=groups), 1, out=best[first:last])
-            first = last
-        return best
+    if chosen is None or not isinstance(place_map, SpectralMap):
+        return Scan(place_map)
+    return RowSearch(place_map) if chosen.coarse == 1 else CoarseSearch(place_map, chosen)
 
 
 class CoarseSearch(Scan):
@@ -172,7 +153,8 @@ class CoarseSearch(Scan):
 
     Shape: queries (Q,K), wanted -> scores and places (Q,M), by place, +inf for none.
 
-    Convention: scores are those of a scan. A query of norm 0, or one that is similar to no place, is scanned.
+    Convention: scores are those of a scan, to 1e-5 if the fine samples are all places. A query of norm 0, or
+        one that is similar to no place, is scanned.
     """
 
     place_map: SpectralMap
@@ -188,20 +170,13 @@ class CoarseSearch(Scan):
     def __call__(self, queries: Tensor, wanted: list[NmsSpec]) -> TopK:
         if not len(queries):
             return empty_topk(queries, max(k for k, _ in wanted))
-        queries = queries.to(torch.promote_types(queries.dtype, torch.float32))
-        units = F.normalize(self.place_map.staged(queries)).float()
-        place = self._windows(units, self.coarse.best_of_groups(to_int8(units)), wanted)
+        units = units_of(self.place_map, queries)
+        place = self._windows(units, self.coarse.best_of_groups(to_int8(units)[0]), wanted)
         score = self._scores(units, place)
         far = self._incomplete(score, place, wanted) | ~(score.amin(1) <= 1 - MIN_COSINE)
         rest = far.nonzero()[:, 0]
         if len(rest):
-            scanned = super().__call__(queries[rest], wanted)
-            at, order = scanned[1].sort(1)
-            more = max(0, at.shape[1] - score.shape[1])
-            score, place = F.pad(score, (0, more), value=math.inf), F.pad(place, (0, more))
-            score[rest] = math.inf
-            score[rest, : at.shape[1]] = scanned[0].gather(1, order)
-            place[rest, : at.shape[1]] = at
+            score, place = replaced((score, place), rest, super().__call__(queries[rest], wanted))
         return score, place
 
     def _windows(self, units: Tensor, best: Tensor, wanted: list[NmsSpec]) -> Tensor:
@@ -214,9 +189,7 @@ class CoarseSearch(Scan):
         offsets = torch.arange(-reach, reach + 1, device=group.device)
         middle = self.middle[GROUP * group + best % GROUP]
         at = (middle[:, :, None] + offsets).clamp(0, len(self.fine.place) - 1).flatten(1)
-        parts = zip(at.split(QUERIES_AT_ONCE), units.split(QUERIES_AT_ONCE), strict=True)
-        products = [(self.fine.rows[near] * part[:, None]).sum(2) for near, part in parts]
-        cosines = torch.cat(products) / self.fine.norm[at]
+        cosines = self.fine.cosines(units, at)
         width = min(places, plan.fine + 1 + max((k - 1) * (radius + 1) for k, radius in wanted))
         most = min(count + EXTRA_WINDOWS, at.shape[1])
         windows = best_candidates(-cosines, most, width, self.fine.place[at])
@@ -232,6 +205,10 @@ class CoarseSearch(Scan):
 
     def _scores(self, units: Tensor, place: Tensor) -> Tensor:
         """Exact scores of places (Q,M) for each query; +inf for none."""
+        if self.fine.finer is not None:
+            cosines = self.fine.cosines(units, place.clamp(min=0))
+            seen = self.place_map.norms[place].isfinite() & (place >= 0)
+            return torch.where(seen, 1 - cosines, math.inf)
         products = torch.full(place.shape, -math.inf, dtype=torch.float32, device=place.device)
         chunk = torch.bucketize(place, self.starts, right=True) - 1
         for g in chunk.unique().tolist():
@@ -249,26 +226,3 @@ class CoarseSearch(Scan):
             return score.new_ones(len(score), dtype=torch.bool)
         last = [best_candidates(score, *spec, place).score[:, -1] for spec in wanted]
         return torch.stack(last).isinf().any(0)
-
-
-def topk_groups(best: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """The highest groups of each query, from its best blocks: (G,Q) -> their indices and values (Q,n)."""
-    size = GROUPS_PER_BLOCK
-    blocks = best.view(-1, size, best.shape[1])
-    block = blocks.amax(1).T.topk(min(count, len(blocks)), 1, sorted=False).indices
-    inside = blocks.permute(2, 0, 1).gather(1, block[:, :, None].expand(-1, -1, size)).flatten(1)
-    value, at = inside.topk(min(count, inside.shape[1]), 1, sorted=False)
-    return block.gather(1, at // size) * size + at % size, value
-
-
-def to_int8(units: Tensor) -> Tensor:
-    """Unit vectors (n,K) as 8-bit integers, on a scale that depends on K alone."""
-    scale = 127 * max(1.0, math.sqrt(units.shape[1]) / CLIP)
-    rounded: Tensor = (units * scale).round().clamp(-127, 127)
-    return rounded.to(torch.int8)
-
-
-@cache
-def has_int8_products() -> bool:
-    """Whether torch multiplies 8-bit integers fast on this CPU."""
-    return torch.backends.mkldnn.is_available() and torch.cpu._is_vnni_supported()

@@ -11,6 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from dejavu_torch.memory import in_one_thread
 from dejavu_torch.recognition.calibration import TOLERANCE, Platt, confidence_of
 from dejavu_torch.recognition.evidence import Spacing, spacing_of
 from dejavu_torch.recognition.filter import near_scores
@@ -109,11 +110,22 @@ def answer_drives(drives: Sequence[DriveQuery], progress: bool = False) -> list[
     """
     shown: list[list[Shown]] = [[] for _ in drives]
     queries = sum(len(asked.descriptors) for asked in drives)
-    with progress_of("smoothing", queries, progress, "query") as update:
+    one_thread = in_one_thread(2 * sum(map(_work, drives)))
+    with one_thread, progress_of("smoothing", queries, progress, "query") as update:
         for i, seen in _seen(drives, progress):
             shown[i].append(_shown(drives[i], seen))
             update(len(seen.scores))
     return [_joined(asked, parts[::-1]) for asked, parts in zip(drives, shown, strict=True)]
+
+
+def _work(asked: DriveQuery) -> float:
+    """Numbers that an operation of a drive has: its places, unless it is matched in tiles."""
+    places = _places(asked)
+    return math.inf if is_large(len(asked.descriptors), places) else places
+
+
+def _places(asked: DriveQuery) -> int:
+    return asked.rows(torch.arange(min(1, len(asked.descriptors)))).shape[1]
 
 
 def _shown(asked: DriveQuery, seen: Seen) -> Shown:
@@ -159,7 +171,7 @@ def _seen(drives: Sequence[DriveQuery], progress: bool) -> Iterator[tuple[int, S
     fitted: dict[tuple[int, Layout, int], list[tuple[int, Drive]]] = {}
     for i, asked in enumerate(drives):
         rows, descriptors, smoother, _, _, starts, *_ = asked
-        places = rows(torch.arange(min(1, len(descriptors)))).shape[1]
+        places = _places(asked)
         if is_large(len(descriptors), places):
             yield from ((i, seen) for seen in _of_windows(asked, places, progress))
             continue

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.maps.place_map import PlaceMap
+from dejavu_torch.memory import in_one_thread
 from dejavu_torch.recognition.calibration import TOLERANCE, Platt, Track
 from dejavu_torch.recognition.calibration import confidence as confidence_of_pair
 from dejavu_torch.recognition.drive import DriveQuery, first_of, localize_drive
@@ -120,8 +121,11 @@ class Localizer:
             numbers = self.matched + torch.arange(len(scores))
             scores = earlier(scores, numbers, self.matching.apart)
             self.matched += len(scores)
-        step = self._in_sequence if self.models else self._alone
-        return Match.joined(map(step, scores.split(max(1, CACHED // scores.shape[1]))))
+        parts = scores.split(max(1, CACHED // scores.shape[1]))
+        if not self.models:
+            return Match.joined(map(self._alone, parts))
+        with in_one_thread(scores.shape[1]):
+            return Match.joined(map(self._in_sequence, parts))
 
     def drive(
         self,

@@ -776,10 +776,24 @@ MUTANTS = [
     ),
     Mutant(
         "The coarse search compares after the stage.",
-        "dejavu_torch/recognition/coarse.py",
-        "F.normalize(self.place_map.staged(queries)).float()",
+        "dejavu_torch/recognition/samples.py",
+        "F.normalize(place_map.staged(queries)).float()",
         "F.normalize(queries).float()",
         ("tests/test_teaching.py::-k knows_of_a_stage",),
+    ),
+    Mutant(
+        "A query that 8 bits leave in doubt is scanned.",
+        "dejavu_torch/recognition/samples.py",
+        "            if len(doubtful):",
+        "            if False:",
+        ("tests/recognition/test_coarse.py::-k eight_bits_leave",),
+    ),
+    Mutant(
+        "As many groups are scored as candidates may suppress.",
+        "dejavu_torch/recognition/samples.py",
+        "topk_groups(best, max(REFINED, count))",
+        "topk_groups(best, REFINED)",
+        ("tests/recognition/test_coarse.py::-k short_map_is_compared",),
     ),
     Mutant(
         "A stretch that is not surely off the map stays out.",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from functools import cache
 from typing import get_args
 
@@ -14,17 +15,27 @@ from test_search import walk
 from dejavu_torch import DejaVu, SpectralMapper
 from dejavu_torch.growth import append
 from dejavu_torch.maps.spectral_map import SpectralMap
-from dejavu_torch.recognition import coarse
+from dejavu_torch.recognition import coarse, samples
 from dejavu_torch.recognition.calibration import Calibration, Platt
 from dejavu_torch.recognition.coarse import CoarseSearch, SamplingPlan, plan, searcher
+from dejavu_torch.recognition.samples import RowSearch
 from dejavu_torch.recognition.search import NmsSpec, Scan, Search
 from dejavu_torch.recognition.select import best_candidates
 
 
 @pytest.fixture
 def searched(monkeypatch):
-    """Maps of a few hundred places are searched as long ones are."""
+    """Maps of a few hundred places are searched as those of millions are."""
     monkeypatch.setattr(coarse, "MIN_PLACES", 500)
+    monkeypatch.setattr(coarse, "DECODED", 0)
+
+
+@pytest.fixture
+def held(monkeypatch):
+    """Maps of a few hundred places are searched as those of 10^6, whose descriptors fit into memory."""
+    monkeypatch.setattr(coarse, "MIN_PLACES", 500)
+    for most in ("COMPARED", "COMPARED_IN_FLOAT"):
+        monkeypatch.setattr(coarse, most, 0)
 
 
 def smooth_model(places=3000, seed=0, **settings):
@@ -57,6 +68,62 @@ def test_coarse_finds_nearly_what_a_scan_finds(settings):
     assert (several.index == model.candidates(queries, 4, apart=5, search="scan").index).float().mean() > 0.97
 
 
+@pytest.mark.usefixtures("held")
+def test_coarse_samples_choose_among_all_descriptors():
+    model, queries = smooth_model(), queries_of()
+    chosen = plan(model.map)
+    assert chosen is not None
+    assert (chosen.coarse > 1, chosen.fine) == (True, 1)
+    scan, found = model.localize(queries, search="scan"), model.localize(queries)
+    assert (found.index == scan.index).float().mean() >= 0.99
+    same = found.index == scan.index
+    torch.testing.assert_close(found.score[same], scan.score[same], rtol=0, atol=5e-5)
+    several = model.candidates(queries, 4, apart=5)
+    assert (several.index == model.candidates(queries, 4, apart=5, search="scan").index).float().mean() > 0.97
+
+
+@pytest.mark.parametrize("settings", [{}, {"transform": "dct"}], ids=str)
+@pytest.mark.parametrize("stage", [False, True])
+@pytest.mark.parametrize("int8", [False, True])
+def test_a_short_map_is_compared_with_whole(settings, stage, int8, monkeypatch):
+    if not int8:
+        monkeypatch.setattr(samples, "has_int8_products", lambda: False)
+    model, queries = smooth_model(**settings), queries_of()
+    if stage:
+        mixed = torch.randn(24, 24, generator=torch.Generator().manual_seed(1))
+        model.map = model.map.refined(torch.eye(24) + 0.2 * mixed)
+    assert isinstance(searcher(model.map), RowSearch)
+    scan, found = model.localize(queries, search="scan"), model.localize(queries)
+    torch.testing.assert_close(found.score, scan.score, rtol=0, atol=5e-5)
+    assert (found.index == scan.index).float().mean() >= 0.99
+    for k, apart in ((4, 5), (2, 700), (40, 1)):
+        expected = model.candidates(queries, k, apart=apart, search="scan")
+        several = model.candidates(queries, k, apart=apart)
+        assert (several.index == expected.index).float().mean() > 0.97
+        near = (several.score - expected.score).abs() < 5e-5  # all but those that another choice suppressed
+        assert near.float().mean() > 0.99
+
+
+def test_a_query_of_which_eight_bits_leave_no_best_place_is_scanned():
+    """Of a standing camera: there are more places as good as the best than are looked at."""
+    still = walk(400, 24, 0, 0.9).repeat_interleave(torch.where(torch.arange(400) == 200, 600, 1), 0)
+    learned = SpectralMapper(None, 0.01)(still + 1e-4 * torch.randn(still.shape))
+    search, queries, wanted = searcher(learned), torch.cat([still[500:501], torch.zeros(1, 24)]), [(1, 0)]
+    assert isinstance(search, RowSearch)
+    score, place = search(queries, wanted)
+    expected = best_candidates(learned.scores(queries), 1, 0)
+    found = best_candidates(score, 1, 0, place)
+    assert torch.equal(found.index, expected.index)
+    torch.testing.assert_close(found.score, expected.score)
+    assert not search(torch.full((1, 24), math.nan), wanted)[0].isfinite().any()
+
+
+def test_places_that_no_frame_shows_leave_a_map_to_a_scan():
+    model = smooth_model(700)
+    model.map.count_visits((torch.arange(700) != 300).long())
+    assert type(searcher(model.map)) is Scan
+
+
 @pytest.mark.usefixtures("searched")
 def test_coarse_probabilities_are_those_of_a_scan():
     model, queries = smooth_model(), queries_of()
@@ -84,8 +151,8 @@ def test_products_are_the_same_without_those_of_integers(monkeypatch):
     assert isinstance(learned, SpectralMap)
     found = []
     for there in (True, False):
-        if not (there and coarse.has_int8_products()):
-            monkeypatch.setattr(coarse, "has_int8_products", lambda: False)
+        if not (there and samples.has_int8_products()):
+            monkeypatch.setattr(samples, "has_int8_products", lambda: False)
         found.append(CoarseSearch(learned, SamplingPlan(8, 4, 8, 1.0, 0))(queries, [(1, 0)]))
     assert all(map(torch.equal, *found))
 
@@ -115,8 +182,8 @@ def test_samples_follow_from_the_energy_of_the_lines_and_the_memory():
     assert (less.coarse, less.fine) > (chosen.coarse, chosen.fine)
     assert less.refined >= chosen.refined
     search = CoarseSearch(learned, chosen)  # type: ignore[arg-type]
-    kept = [one for part in (search.coarse, search.fine) for one in (part.rows, part.norm, part.place)]
-    padding = 2 * coarse.GROUP * coarse.GROUPS_PER_BLOCK * (24 + coarse.OVERHEAD)
+    kept = [one for part in (search.coarse, search.fine) for one in (part.rows, part.place)]
+    padding = 2 * samples.GROUP * samples.GROUPS_PER_BLOCK * (24 + coarse.OVERHEAD)
     assert sum(one.nbytes for one in kept) <= 1.1 * chosen.bytes + padding
     with refused("memory is 100 bytes", "for a chunk"):
         plan(learned, 100)

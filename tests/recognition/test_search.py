@@ -120,12 +120,12 @@ def test_a_calibrated_map_finds_the_same_without_all_scores(settings, monkeypatc
     model.calibration = Calibration(platt, None)
     queries = route[::7] + 0.2 * torch.randn(86, 6)
     scores = model.map.scores(queries)
-    match = model.localize_descriptors(queries)
+    match = model.localize(queries, search="scan")
     expected = platt.probability(confidence_of(scores))
     assert match.probability is not None
     torch.testing.assert_close(match.probability, expected, rtol=1e-5, atol=1e-5)
     assert (match.index == scores.argmin(1)).float().mean() > 0.98
-    several = model.candidates(queries, 4, apart=6)
+    several = model.candidates(queries, 4, apart=6, search="scan")
     torch.testing.assert_close(several.score, best_candidates(scores, 4, 6).score, rtol=1e-5, atol=1e-5)
 
 
