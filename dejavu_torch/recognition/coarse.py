@@ -224,5 +224,8 @@ class CoarseSearch(Scan):
         """Which queries lack some of the wanted candidates, (Q,)."""
         if score.shape[1] < max(k for k, _ in wanted):
             return score.new_ones(len(score), dtype=torch.bool)
+        enough = max((k - 1) * (2 * radius + 1) for k, radius in wanted)  # all that candidates may suppress
+        if bool((score.isfinite().sum(1) > enough).all()):
+            return score.new_zeros(len(score), dtype=torch.bool)
         last = [best_candidates(score, *spec, place).score[:, -1] for spec in wanted]
         return torch.stack(last).isinf().any(0)
