@@ -26,25 +26,31 @@ from dejavu_torch.types import Facts, InputError, expect
 
 if TYPE_CHECKING:
     from dejavu_torch.evaluation.compare import Comparison
+    from dejavu_torch.evaluation.localization import Localization
     from dejavu_torch.evaluation.report import Report
 
+DEMO = ("demo:road?traverse=0", "demo:road?traverse=1")
 COMPARED = ("map.safetensors", "matches.csv")  # files next to the report of a comparison
 
 
 def run_demo(
     *,
     out: Path = Path("dejavu_demo"),
+    simulated: bool = False,
+    verbose: bool = False,
     seed: int = 0,
     second: list[str] | str | None = None,
     model: DejaVu,
     command: str,
 ) -> None:
-    """Learn the built-in route, localize a second traverse of it, and write a report.
+    """Learn a flight over a real road, find the frames of a second flight on it, and write a report.
 
     Args:
         out: folder for report and pictures
-        seed: seed of the route, the whitening and the null control
-        second: second traverse from which to learn what changes, or several, '[A,B]'
+        simulated: two flights over a simulated road instead
+        verbose: print all scores, as compare does
+        seed: seed of the whitening and the controls, and of the simulated road
+        second: another visit to the road, to learn which changes to ignore, or several, '[A,B]'
     """
     from dejavu_torch.evaluation.compare import compare
     from dejavu_torch.evaluation.reproduce import paper_model
@@ -52,19 +58,21 @@ def run_demo(
     _check_report_folder(out, COMPARED, options.several(second))
     given = options.LearningOptions(seed, second)
     given.seed_whitening(model)
-    learned, localized = f"sim:aerial?seed={seed}", f"sim:aerial?seed={seed}&traverse=1"
+    learned, localized = DEMO
+    if simulated:
+        learned, localized = (f"sim:aerial?seed={seed}{second}" for second in ("", "&traverse=1"))
     reference, query = open_source(learned), open_source(localized)
-    print(f"learning {reference.name}, then finding {query.name} on it")
+    what = "simulated flights over one road" if simulated else "real flights over one road"
+    print(f"two {what}: learning {learned}, then finding the frames of {localized}", flush=True)
     reference, views, _ = given.with_views(model, reference, query)
     paper = paper_model()
     same = recipe_of(model.mapper) == recipe_of(paper.mapper)
     others = {} if same else {"paper": ("the paper to the letter", paper)}
     settings: Facts = {"seed": seed, "second": views, "others": others, "progress": True}
     result = compare(reference, query, model=model, storage_curve=True, **settings)
-    _publish(result, out, "dejavu demo: the built-in route", command)
+    _publish(result, out, f"dejavu demo: two {what}", command, verbose=verbose)
     print_localize(out / "map.safetensors", model, command, localized, "or try")
-    for pair in ((learned, localized, "--config", "local_maxima"), ("MORNING", "EVENING")):
-        print_next("compare", *pair, "--out", "report", lead="or try")
+    print_next("compare", "MORNING", "EVENING")
 
 
 def run_compare(
@@ -274,24 +282,27 @@ def _check_report_folder(
 
 
 def _publish(
-    result: Comparison, out: Path, title: str, command: str, given: Path | None = None, top: int | None = None
+    result: Comparison,
+    out: Path,
+    title: str,
+    command: str,
+    given: Path | None = None,
+    top: int | None = None,
+    verbose: bool = True,
 ) -> None:
     """Write map, matches and report of a comparison, and print its scores.
 
     Args:
         given: file of the map, unless it was learned.
         top: candidates of each query to write; None writes the matches.
+        verbose: print all of them, not only what was found.
     """
-    from dejavu_torch.evaluation.report import report_folder, write_report
+    from dejavu_torch.evaluation.report import found_lines, report_folder, write_report
 
     run, kept = result.run, out / "map.safetensors"
-    acceptance = run.model.acceptance(run.smoother or run.sequence)
     _print_contradiction(result.report)
-    print_map(run.model)
-    if run.truth is None:
-        print("no ground truth (see --truth): matches and pictures, but no scores")
-    if not acceptance.given:
-        print(acceptance)
+    if verbose:
+        _print_run(run)
     match = run.match
     if top is not None:
         match = result.candidates.map(lambda column: column[:, :top].flatten())
@@ -300,7 +311,21 @@ def _publish(
             run.model.save(folder / kept.name)
         write_matches(folder / "matches.csv", [match], run.query, run.model, top)
         write_report(folder, result.report, result.pictures, title, command, str(run.model.summary()))
-    _print_scores(result.report, out)
+    if verbose:
+        _print_scores(result.report, out)
+    else:
+        print("\n".join(found_lines(result.report)))
+        say(f"the page with pictures: {out / 'index.html'}")
+
+
+def _print_run(run: Localization) -> None:
+    """Print the map of a run, and what it accepts."""
+    acceptance = run.model.acceptance(run.smoother or run.sequence)
+    print_map(run.model)
+    if run.truth is None:
+        print("no ground truth (see --truth): matches and pictures, but no scores")
+    if not acceptance.given:
+        print(acceptance)
 
 
 def _print_contradiction(report: Report) -> None:

@@ -17,6 +17,7 @@ from torch.utils.data import Dataset
 
 from dejavu_torch.data.arrays import ArrayTraverse, read_array
 from dejavu_torch.data.coordinates import read_coordinates
+from dejavu_torch.data.demo import DEMOS
 from dejavu_torch.data.files import as_number
 from dejavu_torch.data.folder import IMAGE_SUFFIXES, ImageFolder, natural, read_image
 from dejavu_torch.data.h5 import H5_SUFFIXES, DescriptorFile
@@ -40,8 +41,8 @@ PART = {"start": 0, "stop": 0, "step": 1}  # options of every source, see `frame
 EVERY = PART | {"coordinates": "", "crop": "", "mask": ""}
 EXPECTED = (
     "a folder of images or a video, such as clip.mp4?width=160, an .npy file of frames or features, an .h5 "
-    "file of hloc, sim:aerial?seed=0&traverse=0&frames=3072, sim:outdoor, sim:underground, or "
-    "strip:IMAGE?width=96"
+    "file of hloc, demo:road?traverse=0, sim:aerial?seed=0&traverse=0&frames=3072, sim:outdoor, "
+    "sim:underground, or strip:IMAGE?width=96"
 )
 
 
@@ -69,7 +70,7 @@ def open_source(source: str | Path, size: tuple[int, int] | None = None) -> Trav
             `photos?glob=*.png&recursive=1` (see `ImageFolder`); a video file, `clip.mp4`, also with width and
             height; an `.npy` file of frames (N,H,W) or (N,H,W,3) uint8, or of features (N,D) float, with the
             names of their images in a `.txt` file next to it; an `.h5` file of hloc's global descriptors,
-            also with `order=`;
+            also with `order=`; `demo:road?traverse=0` or 1, the flights of the demo;
             `sim:NAME?seed=0&traverse=0&frames=3072`, NAME being aerial, outdoor or underground; or
             `strip:IMAGE?width=96&rows=32:128&halve=1&grey=1`, a window sliding along one long image. For all
             sources, `start=`, `stop=` and `step=` select every step-th of the frames [start, stop), and
@@ -143,7 +144,7 @@ def check_not_read(out: Path, *sources: str | Path | None) -> None:
 
 def _split(text: str) -> tuple[str, str]:
     """The address of a source, and its options."""
-    prefixed = text.startswith(("sim:", "strip:"))
+    prefixed = text.startswith(("sim:", "demo:", "strip:"))
     if "?" not in text or (not prefixed and os.path.exists(text)):  # exists: False for invalid paths
         return text, ""
     address, _, query = text.partition("?") if prefixed else text.rpartition("?")
@@ -156,6 +157,9 @@ def _reader(text: str, address: str) -> Callable[..., Traverse]:
     if kind + colon == "sim:":
         expect(name in SIMULATORS, ", ".join(sorted(SIMULATORS)), f"there is no simulator {name!r}")
         return SIMULATORS[name]
+    if kind + colon == "demo:":
+        expect(name in DEMOS, ", ".join(DEMOS), f"there is no demo {name!r}")
+        return DEMOS[name]
     if kind + colon == "strip:":
         return partial(read_strip, Path(name))
     path = Path(address)

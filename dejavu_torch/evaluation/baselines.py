@@ -10,12 +10,16 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
-from dejavu_torch.evaluation.controls import leave_out_match, null_map
+from dejavu_torch.evaluation.controls import leave_out_match, null_map, with_mapper
+from dejavu_torch.evaluation.quantiser import product_quantised
+from dejavu_torch.features.descriptor import is_ready
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.maps.distance import Metric, phase_distances
+from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.template_map import TemplateMap, TemplateMapper
 from dejavu_torch.model import DejaVu
@@ -138,20 +142,27 @@ def baselines_of(
     if spectral and metric != "l2":
         metric = "cosine"
 
-    def nearest(name: str, stored: Tensor, k: int, bytes: int, stride: int = 1) -> Baseline:
+    def nearest(name: str, stored: Tensor, k: int, bytes: int, stride: int = 1, more: int = 0) -> Baseline:
         match = run.match_by(lambda *how: nearest_frames(stored, how[0], stride, metric, progress, how[1]))
         asked = run.drive_query(scores_of_stored(stored, stride, metric))
-        return Baseline(name, match, bytes + fixed, k, fixed, asked)
+        return Baseline(name, match, bytes + fixed + more, k, fixed + more, asked)
 
     size, own = partial(stride_bytes, frames, dimension), reference.element_size()
     if spectral:
-        short = as_int8(reference)
+        short, code = as_int8(reference), max(1, round(summary.route_bytes / frames))
         between, spaced, keys = interpolated(short, summary.route_bytes)
-        name, interpolating = "its descriptors of", f"interpolated between {every(spaced, one)}, int8"
-        strided = f"{name} {every(coarsest, one)}, int8"
-        found = {
-            "uncompressed": nearest(f"{name} all {frames} {one}s, float", reference, 1, size(4, 1)),
-            "stride": nearest(strided, short, coarsest, size(1, coarsest), coarsest),
+        name, strided = "its descriptors", f"{every(coarsest, one)}, int8"
+        interpolating = f"{name}, {every(spaced, one)}, interpolated"
+        found = _in_one_byte(run, one, progress) if code > 1 else {}
+        found["uncompressed"] = nearest(f"{name}, {every(1, one)}, float", reference, 1, size(4, 1))
+        if is_ready(run.reference):
+            found = _as_given(run, code, seed, one, progress) | found
+        else:
+            quantised, codebooks = product_quantised(reference, code, seed)
+            quantiser = f"{name}, product quantiser, {code} B"
+            found["product_quantiser"] = nearest(quantiser, quantised, 1, frames * code, more=codebooks)
+        found |= {
+            "stride": nearest(f"{name}, {strided}", short, coarsest, size(1, coarsest), coarsest),
             "interpolated": nearest(interpolating, between, spaced, keys * dimension),
         }
     else:
@@ -180,6 +191,44 @@ def baselines_of(
     return found
 
 
+def _in_one_byte(run: Localization, one: str, progress: bool) -> dict[str, Baseline]:
+    """The run's map coded in one route byte per place, if that can be met."""
+    model, place_map = run.model, run.model.map
+    assert isinstance(place_map, SpectralMap)
+    same = place_map.chunk, place_map.transform, place_map.metric, place_map.resolution
+    small = with_mapper(model, SpectralMapper(1.0, None, *same))
+    try:
+        small.learn_features(run.reference_features)
+    except InputError:  # less than the mean takes
+        return {}
+    match = run.match_by(lambda query, how: small.localize_descriptors(query, how, progress=progress))
+    fixed, route = model.summary().fixed_bytes, small.summary().route_bytes
+    asked = run.drive_query(small.map.scores)
+    return {"one_byte": Baseline(f"this map in 1 byte per {one}", match, fixed + route, None, fixed, asked)}
+
+
+def _as_given(run: Localization, code: int, seed: int, one: str, progress: bool) -> dict[str, Baseline]:
+    """Descriptors of another program as they are, by cosine: all of them, and in `code` bytes each."""
+    plain = DejaVu(whitening="none", batch_size=run.model.batch_size)
+    stored, queries = (plain.descriptor.all_of(one, progress) for one in (run.reference, run.query))
+    stored = normalize(stored.float())
+    quantised, codebooks = product_quantised(stored, code, seed)
+
+    def baseline(name: str, rows: Tensor, bytes: int, fixed: int = 0) -> Baseline:
+        match = nearest_frames(rows, queries, 1, "cosine", progress, run.matching)
+        asked = None
+        if run.beside is not None:
+            asked = drive_query(queries, run.beside, scores_of_stored(rows, 1, "cosine"))
+        return Baseline(f"your descriptors, {name}", match, bytes + fixed, 1, fixed, asked)
+
+    return {
+        "exact": baseline(f"exact cosine, {every(1, one)}", stored, stored.nbytes),
+        "product_quantiser": baseline(
+            f"product quantiser, {code} B", quantised, code * len(stored), codebooks
+        ),
+    }
+
+
 def with_drives(found: Mapping[str, Baseline], progress: bool = False) -> dict[str, Baseline]:
     """Baselines with the answers of a smoother, all in one pass."""
     asked = {key: one.asked for key, one in found.items() if one.asked is not None}
@@ -199,7 +248,7 @@ def _null_controls(run: Localization, seed: int, one: str, progress: bool) -> di
     def null(name: str, same_plan: bool = False) -> Baseline:
         shuffled, order = null_map(model, run.reference_features, seed, same_plan)
         match = run.match_by(lambda query, how: shuffled.localize_descriptors(query, how, order, progress))
-        return Baseline(f"null: {name}", match, asked=run.drive_query(shuffled.scores_in(order)))
+        return Baseline(f"control: {name}", match, asked=run.drive_query(shuffled.scores_in(order)))
 
     foreign = isinstance(model.mapper, TemplateMapper) and model.mapper.periods is None
     if foreign:

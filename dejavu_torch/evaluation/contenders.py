@@ -22,6 +22,9 @@ LENGTHS = (1, 5, 11, 21)  # queries of the sequences that a report compares
 COLOURS = {
     "map": "#0072b2",
     "uncompressed": "#222222",
+    "one_byte": "#74b3d8",
+    "exact": "#555555",
+    "product_quantiser": "#d55e00",
     "stride": "#f2b80f",
     "stride_coarsest": "#c21f0a",
     "interpolated": "#5d0b81",

@@ -6,7 +6,6 @@ import base64
 import html
 import io
 import json
-import math
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from itertools import zip_longest
@@ -31,8 +30,9 @@ PICTURES = (
     *("posterior", "reliability"),
 )
 LATE = 0.1  # a curve that starts at a higher recall starts late
+SHORT = ("map", "one_byte", "stride", "product_quantiser", "hog", "null")  # rows of a short table
+FULL = 0.99  # share of a drive from which a control tells nothing
 HEADING = 11  # letters in a line of a heading
-SIZES = (1.0, 5.0)  # route bytes per place at which the table also lists the map
 
 _MAIN = {"auc": "AUC", "recall_at_1": "recall@1", "recall_at_100_precision": "R@100P"}
 _WAYS: dict[Together, str] = {1: "AUC, one image", "filter": "as it drives", "smoother": "whole drive"}
@@ -98,12 +98,6 @@ def score_table(report: Report, every: bool = False) -> list[list[str]]:
                 size = [f"{one.bytes}", f"{one.bytes / frames:.1f}", f"{one.route_bytes / frames:.1f}"]
             row += size if every else size[1:]
         rows.append(row)
-    for size in report.facts.get("storage", {}).get("map", ()):  # after ours, the largest first
-        route, scores = size["route_bytes_per_place"], [size.get(field) for field in columns]
-        if frames and any(math.isclose(route, one, rel_tol=0.02) for one in SIZES):
-            total = route * frames + report.ours.fixed
-            row = ["" if one is None else f"{one:.3f}" for one in scores] + [f"{total:.0f}"] * every
-            rows.insert(2, [_in_bytes(route), *row, f"{total / frames:.1f}", f"{route:.1f}"])
     return rows
 
 
@@ -120,6 +114,49 @@ def _ways(report: Report) -> dict[Together | str, str]:
 def _in_bytes(route: float) -> str:
     """The name of the map coded at another size."""
     return f"the map in {route:.2g} route byte{'s' * (round(route, 1) != 1)} per place"
+
+
+def found_lines(report: Report) -> list[str]:
+    """What was found, of what size, and a short table beside other ways to store the route."""
+    facts, ours, frames = report.facts, report.ours, report.facts["frames"]
+    one = facts["unit"].rstrip("s")
+    drive, single = ours.by_length.get("smoother"), ours.by_length.get(1)
+    found = drive or single or ours.scores
+    assert found is not None
+    assert single is not None or ours.scores is not None
+    by_image = (single or ours.scores or found).recall_at_1
+    count, accepted, right = facts["with_answer"], facts["accepted"], facts["accepted_right"]
+    taken = [
+        f"{what} {number} frames in {facts[seconds]:.1f} s ({1e3 * facts[seconds] / number:.1f} ms each)"
+        for what, number, seconds in (
+            ("learned", frames, "seconds_learn"),
+            ("searched", facts["queries"], "seconds_localize"),
+        )
+    ]
+    tolerance = f"{facts['tolerance']} {one}{'s' * (facts['tolerance'] != 1)}"
+    ways = f" by the whole drive, {round(by_image * count)} by one image" if drive else ""
+    lines = [
+        ", ".join(taken),
+        f"FOUND {round(found.recall_at_1 * count)} of {count} within {tolerance}{ways}",
+        f"accepted and right {right}, accepted and wrong {accepted - right}, "
+        f"not accepted {facts['queries'] - accepted}",
+        f"map file: {ours.fixed / 1e3:.0f} kB + {(ours.route_bytes or 0) / frames:.1f} bytes per {one}",
+        "",
+    ]
+    rows = [["found by", "one image", *(["whole drive"] if drive else []), f"bytes per {one}"]]
+    for key in SHORT:
+        if (contender := report.shown().get(key)) is None or contender.scores is None:
+            continue
+        shares = [contender.by_length.get(way) for way in ((1, "smoother") if drive else (1,))]
+        shares[0] = shares[0] or contender.scores
+        cells = ["" if share is None else f"{share.recall_at_1:.1%}" for share in shares]
+        size = "" if contender.route_bytes is None else f"{contender.route_bytes / frames:.1f}"
+        rows.append([contender.name, *cells, size])
+    lines += text_table(rows).splitlines()
+    control = report.contenders["null"].by_length.get("smoother") if "null" in report.contenders else None
+    if drive and control and control.recall_at_1 >= FULL * drive.recall_at_1:
+        lines.append("In order even the control is found here: compare one image, and bytes.")
+    return lines
 
 
 def sequence_table(report: Report) -> list[list[str]]:
@@ -225,8 +262,6 @@ def write_report(
     first = next((name for name in ("pairs", "coverage") if name in embedded), "")
     coded = ["map" for size in facts.get("storage", {}).get("map", ()) if "sequences" in size]
     sequenced = [*(key for key, one in shown.items() if one.sequences), *coded]
-    rows = score_table(report)
-    sizes = ["map"] * max(0, len(rows) - 1 - len(shown))  # rows of the map at other sizes
     _write_page(
         folder,
         title=printable(title),
@@ -234,8 +269,8 @@ def write_report(
         summary=summary(report),
         steps=steps(report),
         first=embedded.pop(first, None),
-        rows=rows,
-        colours=[colour_of(key) for key in (*sizes, *shown)],
+        rows=score_table(report),
+        colours=[colour_of(key) for key in shown],
         sequence_rows=sequence_table(report),
         sequence_colours=[colour_of(key) for key in sequenced],
         rejection_rows=rejection_table(facts.get("rejection", {})),

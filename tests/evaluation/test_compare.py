@@ -94,7 +94,7 @@ def test_the_null_of_a_trained_map_has_the_templates_of_shuffled_frames(trained)
     reference, query = route(0), route(1)
     result = compare(ArrayTraverse(reference), ArrayTraverse(query), "0", model=trained, seed=5)
     null = result.report.contenders["null"]
-    assert null.name == "null: templates of shuffled frames"
+    assert null.name == "control: templates of shuffled frames"
     assert "null_same_plan" not in result.report.contenders
     expected = null_control(trained, reference, query, 5, same_plan=True)
     assert null.scores == evaluate(expected, torch.arange(240)[:, None], 5)

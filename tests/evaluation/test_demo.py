@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from contextlib import redirect_stdout
 
 import pytest
@@ -23,10 +25,25 @@ def demo(tmp_path_factory):
     paper.mapper.periods.window = FRAMES  # type: ignore[union-attr]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(reproduce, "paper_model", lambda: paper)
-        patch.setattr(reports, "open_source", lambda source: open_source(f"{source}&frames={FRAMES}"))
+        patch.setattr(reports, "open_source", lambda source: open_source(f"{source}&stop={FRAMES}"))
         with (out / "printed.txt").open("w") as printed, redirect_stdout(printed):
             main(["demo", "--out", str(out)])
     return out
+
+
+def test_it_prints_what_was_found_in_few_lines(demo):
+    lines = (demo / "printed.txt").read_text().splitlines()
+    assert len(lines) <= 18
+    assert "real flights" in lines[0]
+    ways = r"by the whole drive, \d+ by one image"
+    assert re.fullmatch(rf"FOUND \d+ of {FRAMES} within 5 frames {ways}", lines[2])
+    assert re.fullmatch(r"accepted and right \d+, accepted and wrong \d+, not accepted \d+", lines[3])
+    assert lines[-3].endswith("index.html")
+    report = json.loads((demo / "report.json").read_text())
+    for key in ("one_byte", "product_quantiser", "hog", "null"):
+        assert f"{100 * report[key]['recall_at_1']:.1f}%" in "\n".join(lines)
+    for other in ("Whitening", "DejaVu("):  # settings are on the page
+        assert other not in "\n".join(lines)
 
 
 def test_pictures_show_something(demo):

@@ -13,6 +13,7 @@ from dejavu_torch.evaluation.plots import Picture, canvas
 from dejavu_torch.evaluation.report import (
     PICTURES,
     Report,
+    found_lines,
     report_folder,
     score_table,
     sequence_table,
@@ -83,17 +84,37 @@ STORED = {  # of a storage curve, as in report.json
 }
 
 
-def test_the_table_has_the_map_in_five_bytes_and_in_one():
-    one = report(STORED, null=Contender("null", SCORES))
-    one = one._replace(ours=Contender("this map", SCORES, 440, fixed=40))
-    assert [row[0] for row in score_table(one)] == [
-        *("", "this map", "the map in 4.9 route bytes per place"),
-        *("the map in 0.98 route byte per place", "null"),
+def drive_report(control=0.5, **facts):
+    """A report on a drive, with a map in one byte and a control."""
+    whole = {"smoother": SCORES._replace(recall_at_1=1.0)}
+    ours = Contender("this map", SCORES, 440, fixed=40, sequences=whole)
+    null = Contender("control", SCORES, sequences={"smoother": SCORES._replace(recall_at_1=control)})
+    small = Contender("this map in 1 byte", SCORES, 120, fixed=40, sequences=whole)
+    facts = {"queries": 4, "seconds_learn": 0.8, "seconds_localize": 0.4} | facts
+    facts = {"with_answer": 4, "accepted": 3, "accepted_right": 2, "unit": "frames", **facts}
+    return report(STORED | facts, one_byte=small, null=null)._replace(ours=ours)
+
+
+def test_what_was_found_in_a_few_lines():
+    lines = found_lines(drive_report(tolerance=1, frames=80))
+    assert lines[:4] == [
+        "learned 80 frames in 0.8 s (10.0 ms each), searched 4 frames in 0.4 s (100.0 ms each)",
+        "FOUND 4 of 4 within 1 frame by the whole drive, 3 by one image",
+        "accepted and right 2, accepted and wrong 1, not accepted 1",
+        "map file: 0 kB + 5.0 bytes per frame",
     ]
-    assert score_table(one)[2][1:] == ["0.625", "0.500", "", "5.9", "4.9"]
-    assert score_table(one, every=True)[3][1:] == ["0.250", "0.500", *4 * [""], "79", "2.0", "1.0"]
-    assert "AUC 0.500" in repr(one)  # the scores of the map itself
-    assert len(score_table(report({"storage": STORED["storage"]}))) == 2  # of no known number of places
+    rows = [line.split("  ")[0] for line in lines[5:]]
+    assert rows == ["", "found by", "this map", "this map in 1 byte", "control"]
+    assert lines[7].split()[2:] == ["75.0%", "100.0%", "5.0"]
+    assert "control is found" in found_lines(drive_report(control=1.0))[-1]
+
+
+def test_one_image_alone_has_no_column_of_drives():
+    one = drive_report()
+    one = one._replace(ours=one.ours._replace(sequences={}), contenders={})
+    lines = found_lines(one)
+    assert lines[1].endswith("frames")
+    assert "whole drive" not in "".join(lines)
 
 
 def test_areas_of_sequences_in_a_table_below_the_scores(tmp_path):

@@ -1,0 +1,30 @@
+"""Real footage that comes with the package: two flights over one road, `demo:road?traverse=0`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from dejavu_torch.data.strip import SlidingWindow, read_strip
+from dejavu_torch.types import expect
+
+FOLDER = Path(__file__).parent / "road"
+FLIGHTS = 2
+ROWS, WIDTH = "32:128", 96  # of a frame, pixels
+
+
+def open_road(traverse: int = 0) -> SlidingWindow:
+    """A window of 96 x 96 pixels that slides along the road, 2697 frames (3,96,96), 12.5 cm apart.
+
+    Args:
+        traverse: the flight, 0 or 1; frame i of both shows place i to within three pixels.
+    """
+    expect(traverse in range(FLIGHTS), f"0 to {FLIGHTS - 1}", f"demo:road has traverse={traverse}")
+    road = read_strip(FOLDER / f"flight_{traverse}.jpg", WIDTH, ROWS)
+    road.name = f"demo:road?traverse={traverse}"
+    road.places = torch.arange(len(road)).double()
+    return road
+
+
+DEMOS = {"road": open_road}
