@@ -176,14 +176,16 @@ def test_without_truth_there_are_no_scores_but_answers_that_ask_for_one(tmp_path
     assert report["probably_right"] == {"0.9": sure[0], "0.5": sure[1]}
     assert report["line"]["offset"] == 16
     for text in (told, page.partition("<details>")[0]):  # on the first screen
-        assert f"{sure[0]} of 96 answers are probably right (at least .9), {sure[1]} at .5" in text
-        assert "is it --truth 16?" in text
+        assert (
+            f"{sure[0]} of 96 answers have a probability of at least 0.9, {sure[1]} of at least 0.5" in text
+        )
+        assert "give --truth 16" in text
     for truth, contradicts in (("0", True), ("16", False)):
         run("evaluate", out / "matches.csv", f"--truth={truth}", "--out", tmp_path / "scores")
         assert capsys.readouterr().out.startswith("the answers contradict") == contradicts
         assert ("line" in report_of(tmp_path / "scores")) == contradicts
     run("localize", out / "map.safetensors", pair[1], "--filter", "--out", tmp_path / "m.csv")
-    assert "of 96 answers are probably right" in capsys.readouterr().out
+    assert "of 96 answers have a probability" in capsys.readouterr().out
 
 
 def test_a_negative_offset_and_a_map_that_is_given(tmp_path, capsys):

@@ -85,7 +85,7 @@ def test_a_comparison_of_loops_asks_all_contenders_for_them(tmp_path, capsys):
     where.write_text("x,y\n" + "\n".join(f"{i % 120},0" for i in range(240)))
     words = ["--loops", "30", "--ordered", "--truth", "metres:.5", "--tolerance", "0", "--out"]
     run("compare", f"{drive}?coordinates={where}", *words, tmp_path / "r")
-    assert "is it --truth" not in capsys.readouterr().out
+    assert "give --truth" not in capsys.readouterr().out
     report = report_of(tmp_path / "r")
     assert (report["answers"], report["loops"], report["with_answer"]) == ("loops", 30, 120)
     assert report["accepted"] == report["accepted_right"] == 120

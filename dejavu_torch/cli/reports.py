@@ -149,7 +149,8 @@ def run_compare(
         loops=loops,
         progress=True,
     )
-    title = f"loops within {reference}" if query is None else f"{query} found on {reference}"
+    on, asked = short_name(reference), None if query is None else short_name(query)
+    title = f"loops within {on}" if asked is None else f"{asked} found on {on}"
     _publish(result, out, title, command, map, judging.top)
 
 
@@ -213,7 +214,7 @@ def run_evaluate(
     given = first, second, map, route, recall_values, higher_is_better, loops
     result = evaluate_file(matches, truth, tolerance, interpolate, *given)
     with report_folder(out) as folder:
-        title = f"{matches} evaluated by {truth}"
+        title = f"{short_name(matches)} evaluated by {short_name(truth)}"
         write_report(folder, result.report, result.pictures, title, command)
     _print_contradiction(result.report)
     if recall_values:
@@ -261,6 +262,11 @@ def run_reproduce(
         write_index(folder, rows, notes, pages, "the paper's experiments", command)
     print("\n".join([text_table(rows), *notes]))
     say(f"right within {tolerance} places; next: open {out / 'index.html'}")
+
+
+def short_name(path: str | Path) -> str:
+    """The last two parts of a path, for a title."""
+    return "/".join(str(path).rstrip("/").split("/")[-2:])
 
 
 def _check_report_folder(

@@ -26,6 +26,7 @@ log = logging.getLogger("dejavu_torch")
 
 PAIRS_PER_BLOCK = 2**20
 OFTEN, FEW = 0.2, 20  # share of right pairs from which a warning is given, and places below which it is not
+ASSUMED = "assumed: frame i shows place i, as the names or cuts of both visits agree"
 EXPECTED = (
     "an integer offset such as 0, a .csv of query,place, a .json with a list of places for each query, an "
     ".npz with GThard, metres:25 for sources with coordinates, or utm:25, degrees:25 or metres:25 for those "
@@ -376,7 +377,7 @@ def describe_ground_truth(truth: Truth | None, interpolate: bool = False, positi
     """What `find_ground_truth` uses, in words; `positions`: whether both traverses have them."""
     if truth is None:
         carried = "the positions that both traverses carry"
-        return carried if positions else "place = query, as both sources are aligned"
+        return carried if positions else ASSUMED
     parsed = check_ground_truth(truth)
     if isinstance(parsed, GroundTruth):
         return "the places that the caller gave"

@@ -49,10 +49,10 @@ def describe_probable(counts: Mapping[str, int], answers: int) -> str:
 
     Example:
         >>> describe_probable({"0.9": 106, "0.5": 209}, 392)
-        '106 of 392 answers are probably right (at least .9), 209 at .5'
+        '106 of 392 answers have a probability of at least 0.9, 209 of at least 0.5'
     """
     (high, many), (low, more) = counts.items()
-    return f"{many} of {answers} answers are probably right (at least {high[1:]}), {more} at {low[1:]}"
+    return f"{many} of {answers} answers have a probability of at least {high}, {more} of at least {low}"
 
 
 def next_steps(together: bool, strict: bool) -> list[str]:
@@ -129,5 +129,6 @@ def describe_line(facts: Mapping[str, Any], scored: bool) -> str:
     line = Line(**facts["line"])
     if line.backwards:
         return str(line)
-    text = f"{line}: is it --truth {line.offset}?"
+    hint = f"if the visits started {abs(line.offset)} frames apart, give --truth {line.offset}"
+    text = f"{line}; {hint if line.offset else 'if frame i shows place i, give --truth 0'}"
     return f"the answers contradict the truth ({facts['truth']}): {text}" if scored else text

@@ -115,7 +115,7 @@ def recall_at_full_precision(curve: PRCurve) -> float:
 def threshold_of_full_precision(curve: PRCurve) -> float | None:
     """The threshold that accepts the most queries while all of them are right; None if there is none.
 
-    It is half way between the last accepted score and the next one.
+    It is between the last accepted score and the next one, with as few digits as that allows.
 
     Example:
         >>> scores, right = torch.tensor([1.0, 2.0, 3.0]), torch.tensor([True, True, False])
@@ -127,7 +127,9 @@ def threshold_of_full_precision(curve: PRCurve) -> float | None:
         return None
     last = float(curve.threshold[perfect[-1]])
     beyond = curve.threshold[perfect[-1] + 1 :]
-    return (last + float(beyond[0])) / 2 if len(beyond) else last * (1 + 1e-6) + 1e-12
+    middle = (last + float(beyond[0])) / 2 if len(beyond) else last * 1.001 + 1e-12
+    short = (float(f"{middle:.{digits}g}") for digits in range(1, 17))
+    return next((one for one in short if last < one < 2 * middle - last), middle)
 
 
 def curve_of(

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -68,6 +70,8 @@ def _run_facts(run: Localization, seconds: Mapping[str, float]) -> Facts:
         "trained": model.trained and model.trained._asdict(),
         "reference": reference.name,
         "query": query.name,
+        **_peak_memory(),
+        **_gap_facts(run),
     }
     if run.smoother is not None:
         facts["drive"] = drive = run.smoother.settled()
@@ -118,6 +122,29 @@ def metric_facts(run: Localization, truth: Truth | None) -> Facts:
             quantiles = distance[chosen].quantile(torch.tensor(QUANTILES, dtype=torch.float64)).tolist()
             facts[name] = {f"{share:g}": round(at, 3) for share, at in zip(QUANTILES, quantiles, strict=True)}
     return {"error_metres": facts}
+
+
+def _gap_facts(run: Localization) -> Facts:
+    """The longest stretch of queries without an accepted answer, in frames and, if known, seconds."""
+    ends = (run.match.accepted & (run.match.index >= 0)).nonzero()[:, 0].tolist()
+    edges = [-1, *ends, len(run.match.index)]
+    gap, first = max((after - before - 1, before + 1) for before, after in pairwise(edges))
+    facts: Facts = {"longest_gap": gap}
+    times = source_of(run.query).times
+    if gap and times is not None:
+        stretch = times[run.query_frames[first : first + gap]]
+        facts["longest_gap_seconds"] = float(stretch[-1] - stretch[0])
+    return facts
+
+
+def _peak_memory() -> Facts:
+    """The bytes that the process has held at most, where the system tells."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return {}
+    unit = 1 if sys.platform == "darwin" else 1024
+    return {"peak_memory": unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss}
 
 
 def _standing_facts(run: Localization) -> dict[str, int]:

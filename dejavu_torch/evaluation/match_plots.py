@@ -27,7 +27,36 @@ MARKS = 24  # queries whose right places are marked on a posterior, at most
 MIN_PROBABILITY = 1e-6  # lower ones are drawn as this
 LINES = 8  # right places drawn for each query, about
 BLOCK_SCORES = 2**22  # of Q x N, computed at a time
+ALONG, COLUMNS = 12, 4  # queries shown along a drive, and how many side by side
 EXAMPLES = 4  # places at which frames of both traverses are shown
+
+
+def draw_examples(run: Localization) -> plots.Pictures:
+    """Queries along the drive above the frames reported for them; empty for ready features."""
+    match, truth = run.scored, run.truth
+    if not run.has_frames or not (match.index >= 0).any():
+        return {}
+    chosen = torch.linspace(0, len(match.index) - 1, ALONG).round().long().unique().tolist()
+    scored, right = (None, None) if truth is None else scored_and_right(match.index, truth, run.tolerance)
+    columns = min(COLUMNS, len(chosen))
+    rows = -(-len(chosen) // columns)
+    side = run.query.frame_shape[1] / run.query.frame_shape[2]
+    figure, axes = plots.canvas(rows * (2 * side * plots.WIDTH / columns + 3 * plots.LINE), 2 * rows, columns)
+    for axis in axes.flat:
+        axis.set_axis_off()
+    for i, query in enumerate(chosen):
+        top, below = axes[2 * (i // columns) : 2 * (i // columns) + 2, i % columns]
+        place = int(match.index[query])
+        told = "" if match.probability is None or place < 0 else f", {float(match.probability[query]):.2f}"
+        plots.show_frame(top, frame_at(run.query, query), f"{int(run.query_frames[query])}")
+        found = f"{int(run.borders[place])}{told}" if place >= 0 else "none"
+        plots.show_frame(below, frame_at(run.reference, place) if place >= 0 else None, found)
+        colour = plots.GREY
+        if bool(match.accepted[query]) and (scored is None or bool(scored[query])):
+            colour = COLOURS["map"] if right is None else plots.RIGHT if bool(right[query]) else plots.WRONG
+        for axis in (top, below):
+            plots.frame_axis(axis, colour)
+    return plots.picture("examples", (figure, axes), truth=truth, probable=match.probability is not None)
 
 
 def draw_pairs(run: Localization) -> plots.Pictures:
@@ -138,8 +167,13 @@ def draw_coverage(
         scored, right = scored_and_right(match.index, truth, tolerance)
         wrong = scored & reported & ~right
         groups.append((reported & ~scored, plots.GREY, 3, f"{(~scored).sum()} not scored"))
-        groups.append((wrong, plots.WRONG, 3, f"{wrong.sum()} wrong"))
-        groups.append((right, plots.RIGHT, 4, f"{right.sum()} right"))
+        for which, colours, size, what in (
+            (wrong, (plots.PALE_WRONG, plots.WRONG), 3, "wrong"),
+            (right, (plots.PALE_RIGHT, plots.RIGHT), 4, "right"),
+        ):
+            kept = which & match.accepted
+            groups.append((which & ~kept, colours[0], size, f"{(which & ~kept).sum()} {what}, not accepted"))
+            groups.append((kept, colours[1], size, f"{kept.sum()} {what}, accepted"))
         plots.set_title(axis, f"right within {tolerance} {unit}")
         missing = missing & scored
     elif probability is not None:

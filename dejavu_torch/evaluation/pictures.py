@@ -10,6 +10,7 @@ from dejavu_torch.evaluation.localization import Localization
 from dejavu_torch.evaluation.map_plots import draw_motion
 from dejavu_torch.evaluation.match_plots import (
     draw_coverage,
+    draw_examples,
     draw_frames,
     draw_pairs,
     draw_posterior,
@@ -30,7 +31,7 @@ def draw_pictures(
 ) -> Pictures:
     """All pictures that can be drawn; some need ground truth, frames or layers."""
     place_map, tolerance, storage = run.model.map, f"{run.tolerance} {run.unit}", storage or {}
-    pictures = draw_pairs(run)
+    pictures = draw_examples(run) | draw_pairs(run)
     pictures |= draw_coverage(run.scored, run.truth, run.tolerance, run.borders, run.query_frames, run.unit)
     pictures |= draw_scores(run) | draw_posterior(run)
     pictures |= draw_curves(contenders, tolerance)

@@ -27,8 +27,10 @@ WIDTH = 4.0  # inches; phones show about 85 pixels per inch, so 9 points is the 
 LINE, LETTERS = 0.18, 54  # height of a line of text in inches, and letters of 9 points that fit in one
 QUERY, PLACE = "query (frame)", "place (frame)"  # axes, named as the columns of matches.csv
 DARK, GREY = "#333333", "#bbbbbb"
-RIGHT, WRONG = "#4daf7c", "#9e1b32"
+RIGHT, WRONG = "#2f9463", "#9e1b32"
+PALE_RIGHT, PALE_WRONG = "#a9dcc0", "#e3a5b0"  # of answers that are not accepted
 LAYERS = ("#b35806", "#542788")  # the two layers that several pictures show
+PHOTOS = ("examples", "pairs", "frames", "ground", "features")
 LABELLED = 8  # chunks along a route, beyond which their numbers do not fit
 BOX = {"facecolor": "white", "edgecolor": "none", "pad": 0.8}  # makes a number readable on any colour
 
@@ -40,6 +42,7 @@ class Picture(NamedTuple):
     heading: str
     caption: str
     numbers: Mapping[str, Any] = MappingProxyType({})
+    photos: bool = False  # whether it shows frames, whose colours stay as they are on a dark page
 
 
 Pictures = dict[str, Picture]  # by their names in a report
@@ -48,7 +51,7 @@ Pictures = dict[str, Picture]  # by their names in a report
 def picture(name: str, plot: Plot, numbers: Mapping[str, Any] | None = None, **facts: Any) -> Pictures:
     """A plot by its name in a report, with heading and caption from captions.html.j2 and these facts."""
     heading, _, caption = sentences("captions.html.j2", name=name, **facts).partition(" | ")
-    return {name: Picture(plot, heading, caption, numbers or {})}
+    return {name: Picture(plot, heading, caption, numbers or {}, name in PHOTOS)}
 
 
 def label(name: str) -> str:
@@ -91,6 +94,13 @@ def show_frame(axis: Any, frame: Tensor | None, text: str) -> None:
     axis.set_title(text, loc="left", fontsize=9, pad=3)
     if frame is not None:
         axis.imshow(pixels(frame))
+
+
+def frame_axis(axis: Any, colour: str) -> None:
+    """Draw a coloured border around what an axis shows."""
+    axis.set_axis_on()
+    axis.set(xticks=[], yticks=[])
+    axis.spines[:].set(visible=True, color=colour, linewidth=2)
 
 
 def pixels(frame: Tensor) -> np.ndarray[Any, Any]:

@@ -24,11 +24,12 @@ from dejavu_torch.text import printable
 from dejavu_torch.types import Facts, Together
 
 PICTURES = (
-    *("frames", "pairs", "coverage", "scores", "pr", "storage", "sequences"),
+    *("frames", "examples", "pairs", "coverage", "scores", "pr", "storage", "sequences"),
     *("ground", "velocity", "chunks"),
     *("spectrogram", "templates", "features", "activations", "autocorrelogram", "layers"),
     *("posterior", "reliability"),
 )
+FOLDED = {"sequences", "posterior", "spectrogram", "autocorrelogram", "layers", "chunks"}  # on the page
 LATE = 0.1  # a curve that starts at a higher recall starts late
 SHORT = ("map", "one_byte", "stride", "product_quantiser", "hog", "null")  # rows of a short table
 FULL = 0.99  # share of a drive from which a control tells nothing
@@ -139,7 +140,7 @@ def found_lines(report: Report) -> list[str]:
         ", ".join(taken),
         f"FOUND {round(found.recall_at_1 * count)} of {count} within {tolerance}{ways}",
         f"accepted and right {right}, accepted and wrong {accepted - right}, "
-        f"not accepted {facts['queries'] - accepted}",
+        f"not accepted {facts.get('judged', facts['queries']) - accepted}",
         f"map file: {ours.fixed / 1e3:.0f} kB + {(ours.route_bytes or 0) / frames:.1f} bytes per {one}",
         "",
     ]
@@ -259,7 +260,7 @@ def write_report(
         data = as_png(picture)
         (folder / f"{name}.png").write_bytes(data)
         embedded[name] = (picture, _embedded(data))
-    first = next((name for name in ("pairs", "coverage") if name in embedded), "")
+    first = next((name for name in ("examples", "pairs", "coverage") if name in embedded), "")
     coded = ["map" for size in facts.get("storage", {}).get("map", ()) if "sequences" in size]
     sequenced = [*(key for key, one in shown.items() if one.sequences), *coded]
     _write_page(
@@ -277,7 +278,8 @@ def write_report(
         every_row=score_table(report, every=True),
         contenders=report.contenders,
         facts=facts,
-        pictures=[*embedded.values()],
+        pictures=[shown for name, shown in embedded.items() if name not in FOLDED],
+        more_pictures=[shown for name, shown in embedded.items() if name in FOLDED],
         plan=plan,
         made_by=f"{printable(command)}\ndejavu_torch {facts['version']}, torch {facts['torch']}",
     )

@@ -81,7 +81,7 @@ def test_what_is_asked_of_a_line(scored, offset, asks):
     assert facts["probably_right"] == {"0.9": 0, "0.5": 40}
     assert facts.get("line") == ({"offset": 20, "answers": 40, "confident": 40} if asks else None)
     told = describe_line(facts | {"truth": "place = query + 0"}, scored)
-    assert ("40 of 40" in told) == ("is it --truth 20?" in told) == asks
+    assert ("40 of 40" in told) == ("give --truth 20" in told) == asks
     assert ("contradict the truth (place = query + 0)" in told) == (asks and scored)
 
 

@@ -15,7 +15,7 @@ from dejavu_torch.evaluation import reproduce
 from dejavu_torch.evaluation.reproduce import paper_model
 
 FRAMES = 256
-PICTURES = ("pairs", "coverage", "scores", "pr", "storage", "sequences", "reliability")
+PICTURES = ("examples", "pairs", "coverage", "scores", "pr", "storage", "sequences", "reliability")
 
 
 @pytest.fixture(scope="module")

@@ -5,11 +5,18 @@ from __future__ import annotations
 import numpy as np
 import torch
 from drawn import matched, run_of, texts
+from matplotlib.colors import to_hex
+from torch import nn
 
-from dejavu_torch import PlaceFilter
+from dejavu_torch import DejaVu, PlaceFilter
+from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth
+from dejavu_torch.evaluation import plots
+from dejavu_torch.evaluation.contenders import COLOURS
+from dejavu_torch.evaluation.localization import Localization
 from dejavu_torch.evaluation.match_plots import (
     draw_coverage,
+    draw_examples,
     draw_posterior,
     draw_scores,
     example_queries,
@@ -62,7 +69,7 @@ def test_convention_11_places_and_queries_are_drawn_at_their_frames():
     queries, match = torch.tensor([0, 4, 8, 12]), matched(0, 3, -1, 9)
     truth = as_ground_truth(torch.tensor([[0, -1], [4, -1], [2, -1], [9, 5]]))
     figure, axis = draw_coverage(match, truth, 1, borders, queries, "places")["coverage"].plot
-    assert dots(axis) == {"3 right": [(0, 0), (4, 6), (12, 35)], "1 not reported": [(8, 0)]}
+    assert dots(axis) == {"3 right, accepted": [(0, 0), (4, 6), (12, 35)], "1 not reported": [(8, 0)]}
     assert (axis.get_xlim(), axis.get_ylim()[1]) == ((0, 12), 40)
     labels = {"query (frame)", "reported place (frame)", "right within 1 places"}
     assert labels <= set(texts(figure))
@@ -111,3 +118,25 @@ def test_a_posterior_is_pooled_as_it_comes_and_shows_some_right_places(monkeypat
     axis, below = draw_posterior(run)["posterior"].plot[1]
     assert not axis.lines
     assert not below.collections
+
+
+def test_examples_along_a_drive_have_borders_that_tell_what_they_are():
+    """Right, wrong, not accepted, and nothing reported."""
+    frames = torch.rand(4, 1, 8, 8)
+    model = DejaVu(features=nn.Flatten(), whitening="none").learn(frames)
+    match = Match(
+        torch.tensor([0, 3, 2, -1]),
+        torch.tensor([0.1, 0.2, 0.3, torch.inf]),
+        torch.tensor([True, True, False, False]),
+        torch.tensor([0.9, 0.8, 0.3, 0.0]).double(),
+    )
+    traverse = ArrayTraverse(frames)
+    rows = frames.flatten(1)
+    truth = as_ground_truth(torch.arange(4)[:, None])
+    run = Localization(model, traverse, traverse, rows, rows, match, truth, 0)
+    _, axes = draw_examples(run)["examples"].plot
+    colours = [to_hex(axis.spines["left"].get_edgecolor()) for axis in axes[1]]
+    assert colours == [plots.RIGHT, plots.WRONG, plots.GREY, plots.GREY]
+    assert [axis.get_title(loc="left") for axis in axes[1]] == ["0, 0.90", "3, 0.80", "2, 0.30", "none"]
+    untold = draw_examples(run._replace(truth=None))["examples"].plot[1]
+    assert to_hex(untold[1][1].spines["left"].get_edgecolor()) == COLOURS["map"]

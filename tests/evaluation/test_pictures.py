@@ -22,7 +22,7 @@ from dejavu_torch.recognition.localizer import Matching
 from dejavu_torch.types import FrequencyLayer
 
 ALL = (
-    *("pairs", "coverage", "scores", "pr", "chunks"),
+    *("examples", "pairs", "coverage", "scores", "pr", "chunks"),
     *("spectrogram", "templates", "features", "activations"),
 )
 
@@ -96,12 +96,12 @@ OTHER = nn.Sequential(nn.AvgPool2d(2), nn.Flatten())
         ("", {"truth": GroundTruth(RIGHT, NUMBERS % 3 > 0, RIGHT - 5)}),  # some are unknown
         ("pr", {"truth": NOTHING}),
         ("", {"model": model_of(window=120)}),  # one chunk
-        ("pairs features", {"of": HOG()}),  # ready features
+        ("examples pairs features", {"of": HOG()}),  # ready features
         ("features", {"model": model_of(features=OTHER)}),
         ("features", {"model": model_of(features=type("OtherHOG", (HOG,), {})())}),
         ("activations spectrogram", {"model": template_model(periods=Fixed(layer(12, 0, 120, 0, 1, 2)))}),
         (
-            "pairs scores spectrogram templates features activations",
+            "examples pairs scores spectrogram templates features activations",
             {"model": template_model(periods=Fixed())},  # no layers
         ),
     ],

@@ -153,8 +153,8 @@ def test_the_summary_tells_what_was_scored():
         "20 queries; right within 3 places of the truth (place = query). 40 frames of the reference and 30 "
         "of the query were resampled to even steps of 2.5 pixels of ground. 15 of the queries are in the "
         "truth. 2 queries report an ignored place, which is neither right nor wrong. 9 of 13 scored answers "
-        "are accepted; 8 of these are right. On these queries --threshold 0.25 accepts right places only. "
-        "Learning took 1.2 s, localizing 2.0 s."
+        "are accepted; 8 of these are right. `--threshold 0.25` would have accepted no wrong answer here. "
+        "Learning took 1.2 s, localizing 2.0 s (100.0 ms a frame)."
     )
     assert summary(report()) == "20 queries; right within 3 frames."
 
@@ -179,7 +179,7 @@ STEPS = [  # facts, recall@1, verdict, steps
     ({"with_answer": 0}, 0.0, "No query has a right place", []),
     (
         {"rejection": {"off_map": {}}, "accepted": 9, "accepted_right": 8},
-        *(1.0, "Of 9 accepted answers 8 are right", ["--precision .99"]),
+        *(1.0, "Accepted and right: 8; accepted and wrong: 1; not accepted: 11.", ["--calibration"]),
     ),
     (
         {"line": {"offset": 7, "answers": 9, "confident": 9}, "truth": "place = query"},
@@ -187,17 +187,26 @@ STEPS = [  # facts, recall@1, verdict, steps
     ),
     (
         {"least_probability": 0.5, "accepted": 20, "accepted_right": 4, "kind": "spectral", "filter": True},
-        *(0.2, "Of 20 accepted answers 4", ["order of the frames", "--second", "localize"]),
+        *(
+            0.2,
+            "Accepted and right: 4; accepted and wrong: 16;",
+            ["order of the frames", "--second", "localize"],
+        ),
     ),
     (
         {"least_probability": 0.5, "accepted": 20, "accepted_right": 5, "filter": True},
-        *(0.2, "Of 20 accepted answers 5", []),
+        *(0.2, "Accepted and right: 5; accepted and wrong: 15; not accepted: 0.", []),
     ),
-    ({"probably_right": {"0.9": 18, "0.5": 19}}, None, "Probably: ", ["--ordered", "--precision", "--truth"]),
+    (
+        {"probably_right": {"0.9": 18, "0.5": 19}},
+        None,
+        "18 of 20 answers have a probability of at least 0.9, 19 of",
+        ["--ordered", "--precision", "--truth"],
+    ),
     (
         {"probably_right": {"0.9": 0, "0.5": 1}},
         None,
-        "Probably not: ",
+        "No ground truth. 0 of 20 answers",
         ["--ordered", "--precision", "--truth"],
     ),
     ({}, None, "neither a ground truth", ["--truth 12"]),
