@@ -8,6 +8,7 @@ import re
 import shlex
 import subprocess
 import sys
+import webbrowser
 from importlib import import_module
 from pathlib import Path
 
@@ -203,6 +204,25 @@ def test_a_negative_offset_and_a_map_that_is_given(tmp_path, capsys):
     given = report_of(out)
     assert given["seconds_learn"] == 0 < learned["seconds_learn"]
     assert {key: given[key] for key in ("auc", "null")} == {key: learned[key] for key in ("auc", "null")}
+
+
+def test_a_comparison_needs_nothing_but_two_visits(tmp_path, monkeypatch, capsys):
+    """Its folder is a new one, and the page is shown where there is a browser."""
+    monkeypatch.chdir(tmp_path)
+    shown = []
+    monkeypatch.setattr(webbrowser, "open", lambda address: shown.append(address) or len(shown) < 2)
+    pair = "sim:aerial?frames=40", "sim:aerial?frames=40&traverse=1", "--features", "HOG"
+    run("compare", *pair, "--bytes", "2")
+    assert shown == []
+    assert report_of(tmp_path / "dejavu_report")["route_bytes_per_place"] == pytest.approx(2, rel=0.2)
+    run("compare", *pair, "--bytes=4", "--open")
+    assert report_of(tmp_path / "dejavu_report_2")["route_bytes_per_place"] == pytest.approx(4, rel=0.2)
+    run("compare", *pair, "--open")
+    assert "there is no browser here" in capsys.readouterr().out
+    assert [address.rsplit("/", 2)[1] for address in shown] == ["dejavu_report_2", "dejavu_report_3"]
+    assert "bytes" in fails(capsys, "compare", *pair, "--bytes", "many")
+    given = "--map", tmp_path / "dejavu_report" / "map.safetensors"
+    assert "has its own settings" in fails(capsys, "compare", *pair, *given, "--bytes", 3)
 
 
 @pytest.mark.parametrize("command", [name for name in COMMANDS if name != "train"])

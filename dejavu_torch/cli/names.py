@@ -6,15 +6,15 @@ from collections.abc import Callable
 from importlib import import_module
 
 COMMANDS = {
-    "demo": "learn the built-in route, localize a second traverse, write a report",
+    "demo": "see it work on two real flights over a road",
     "learn": "learn a map",
     "localize": "find frames on a map",
     "live": "find the frames of a camera on a map, one at a time",
-    "compare": "learn, localize and evaluate, with baselines and a null control",
+    "compare": "learn one visit, find the frames of another, and write a report",
     "evaluate": "evaluate the matches of any method from a csv",
     "reproduce": "repeat the paper's experiments on simulated routes",
     "train": "train features that repeat: fit, validate, test or export",
-    "refine": "learn from a drive, whose places nobody tells, what changes along a map",
+    "refine": "learn from another drive what changes along a map; no ground truth needed",
     "update": "refine a map by a drive, and append ground that it lacks",
     "merge": "merge the maps of several routes",
     "export": "write a map and its features as an ONNX file",
@@ -24,8 +24,19 @@ COMMANDS = {
 FIRST_DAY = ("demo", "compare", "learn", "localize", "info")  # listed first by `dejavu --help`
 # the options that README and the first how-tos use, which --help shows; --help_all shows all
 FIRST_OPTIONS = {
-    "compare": ("out", "truth", "tolerance", "loops", "top", "second", "device", "map", "config", "features"),
-    "learn": ("map", "append", "second", "calibration", "device", "config", "features"),
+    "compare": (
+        "out",
+        "open",
+        "truth",
+        "tolerance",
+        "bytes",
+        "second",
+        "device",
+        "map",
+        "config",
+        "features",
+    ),
+    "learn": ("map", "bytes", "append", "second", "device", "config", "features"),
     "localize": ("out", "top", "precision", "match", "ordered"),
     "live": ("page", "reference", "realtime", "match"),
 }

@@ -253,12 +253,12 @@ class LearningOptions:
 
     Args:
         seed: seed of the whitening, unless it has its own, and of the null control
-        second: second traverse from which to learn what changes, or several, '[A,B]'
-        second_truth: places that it shows, in the formats of --truth; one for all, or '[A,B]'
+        second: another visit to the same route, to learn which changes to ignore, or several, '[A,B]'
+        second_truth: ground truth of --second, in the formats of --truth; one for all, or '[A,B]'
         descriptor: file to take the features from: a map, or a descriptor of `dejavu train`
-        calibration: traverse that calibrates the probability of right answers, or none; augmented frames of
-            the route if not given
-        calibration_truth: places that it shows, likewise
+        calibration: another visit, by whose answers probabilities are calibrated, or none; augmented frames
+            of the route if not given
+        calibration_truth: ground truth of --calibration, in the formats of --truth
         device: cpu, cuda or cuda:1
     """
 
@@ -335,9 +335,9 @@ class GrowthOptions:
     Args:
         append: append the places of the source to this map file; it is overwritten unless --map names another
             file
-        average: another traverse, averaged into the places of the source before they are coded; without a
+        average: another visit, averaged into the places of the source before they are coded; without a
             source, into those of --append, which are decoded, averaged and coded again with the same step
-        average_truth: places that it shows, in the formats of --truth of `dejavu compare`
+        average_truth: ground truth of --average, in the formats of --truth of `dejavu compare`
     """
 
     append: Path | None = None
@@ -373,11 +373,12 @@ class EvaluationOptions:
     Args:
         truth: offset (place = query + offset), csv of query,place[,place...], json with a list per query, npz
             with GThard, or by image names utm:25, degrees:25 or metres:25
-        tolerance: answers up to this many places off are right
+        tolerance: count an answer as right if it is at most this many frames off
         interpolate: interpolate a --truth that lists only some queries
-        leave_out: diagnostic for templates: the reference on itself, without this many frames on each side
+        leave_out: template maps only: match the reference with itself, ignoring this many frames around each
+            query
         top: write this many places per query, no two within the tolerance
-        distractors: other route, or several, '[A,B]', to report what is accepted there
+        distractors: footage of other places, or several, '[A,B]': how much of it is wrongly accepted?
         storage_curve: also evaluate maps of other sizes; this doubles the time
     """
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import inspect
 import os
+import re
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import is_dataclass
@@ -26,12 +27,13 @@ from dejavu_torch.data.source import check_not_read
 from dejavu_torch.features.hub import made as made  # config files name it here
 from dejavu_torch.model import DejaVu
 from dejavu_torch.text import one_line
-from dejavu_torch.types import Facts, InputError
+from dejavu_torch.types import Facts, InputError, expect
 
 MODEL = "model"  # the parameter of a command that is a DejaVu: each of its arguments is an option
 COMMAND = "command"  # the parameter that is the command line itself
 # the class whose options can be given without it, for a constructor argument of a base class
 DEFAULT_PARTS = {"mapper": {"class_path": "dejavu_torch.SpectralMapper"}}
+BYTES, ROUTE_BYTES = "--bytes", "--mapper.route_bytes_per_place"  # an option, and what it stands for
 HINT = (
     "Parts have options of their own, such as --whitening.numbers 64, --mapper.route_bytes_per_place 2.5 "
     "or, for HOG alone, --features.cell 4: see --features.help HOG, --whitening.help, --mapper.help "
@@ -138,6 +140,7 @@ class Parser(jsonargparse.ArgumentParser):
                 raise InputError(f"{word or 'a word'} is empty; expected a name or a value")
         # a nested null reaches the parser of its part as None
         words = [f"{word[:-4]}null" if word.endswith("=None") else word for word in args or ()]
+        words = [re.sub(f"^{BYTES}(?==|$)", ROUTE_BYTES, word) for word in words]
         start = 1 if self._subparsers is not None else 0  # after the subcommand
         words[start:] = self._in_order(words[start:])
         parsed = super().parse_args(words, *rest, **settings)
@@ -259,6 +262,8 @@ def add_model(parser: Parser) -> None:
     parser.add_class_arguments(DejaVu, None, skip={"whitening", "velocity"})
     group = parser._action_groups[-1]
     group.title = "The model"
+    size = f"size of the map: bytes per place that grow with the route ({ROUTE_BYTES})"
+    group.add_argument(BYTES, metavar="BYTES", help=size, default=argparse.SUPPRESS)
     helps = described(DejaVu)[1]
     parameters = inspect.signature(DejaVu, eval_str=True).parameters
     for name, also in (("whitening", MapFile), ("velocity", None)):
@@ -292,15 +297,17 @@ def _model_of(name: str, arguments: Facts, words: Sequence[str]) -> DejaVu:
         words: of the command line, without the values after `=`.
     """
     _check_settings(name, arguments, words)
+    expect("bytes" not in arguments, "mapper: {route_bytes_per_place: ..}", "bytes in a config file")
     del arguments["config"]
     settings = {one: arguments.pop(one) for one in inspect.signature(DejaVu).parameters}
     whitening, descriptor = settings["whitening"], arguments.get("descriptor")
     if isinstance(whitening, MapFile):
         refuse_with(f"--whitening {whitening}", descriptor=descriptor)
         _check_own(words, {"preprocess", "weight_bits"}, f"the whitening of {whitening}")
-        check_not_read(
-            arguments["map"] if name == "learn" else arguments["out"] / "map.safetensors", whitening
-        )
+        out = arguments.get("out")  # none of compare is a folder that is not there
+        written = arguments["map"] if name == "learn" else out and out / "map.safetensors"
+        if written is not None:
+            check_not_read(written, whitening)
         model = DejaVu(**settings | {"whitening": None})
         file = DejaVu.load(Path(whitening), named_features(model))
         try:
@@ -325,7 +332,7 @@ def _check_settings(name: str, arguments: Facts, words: Sequence[str]) -> None:
     given = {"compare": "map", "learn": "append"}.get(name)  # a map that keeps its settings
     if given and arguments[given]:
         own = {*inspect.signature(DejaVu).parameters} - {"features", "threshold", "precision"}
-        own |= {"config", "second", "second_truth", "descriptor"}
+        own |= {"config", "bytes", "second", "second_truth", "descriptor"}
         _check_own(words, own if given == "map" else {*own, "seed"}, f"the map of --{given}")
 
 

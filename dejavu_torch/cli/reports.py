@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import webbrowser
 from collections.abc import Sequence
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -36,6 +38,7 @@ COMPARED = ("map.safetensors", "matches.csv")  # files next to the report of a c
 def run_demo(
     *,
     out: Path = Path("dejavu_demo"),
+    open: bool = False,
     simulated: bool = False,
     verbose: bool = False,
     seed: int = 0,
@@ -47,6 +50,7 @@ def run_demo(
 
     Args:
         out: folder for report and pictures
+        open: show the report in a browser
         simulated: two flights over a simulated road instead
         verbose: print all scores, as compare does
         seed: seed of the whitening and the controls, and of the simulated road
@@ -70,7 +74,7 @@ def run_demo(
     others = {} if same else {"paper": ("the paper to the letter", paper)}
     settings: Facts = {"seed": seed, "second": views, "others": others, "progress": True}
     result = compare(reference, query, model=model, storage_curve=True, **settings)
-    _publish(result, out, f"dejavu demo: two {what}", command, verbose=verbose)
+    _publish(result, out, f"dejavu demo: two {what}", command, verbose=verbose, show=open)
     print_localize(out / "map.safetensors", model, command, localized, "or try")
     print_next("compare", "MORNING", "EVENING")
 
@@ -79,7 +83,8 @@ def run_compare(
     reference: str,
     query: str | None = None,
     *,
-    out: Path,
+    out: Path | None = None,
+    open: bool = False,
     loops: int | None = None,
     judging: options.EvaluationOptions,
     learning: options.LearningOptions,
@@ -90,17 +95,21 @@ def run_compare(
     model: DejaVu,
     command: str,
 ) -> None:
-    """Learn one traverse, localize another on it, and evaluate, with baselines and a null control.
+    """Learn one visit to a route, find the frames of another on it, and write a report that compares the map
+    with other ways to store the route.
 
     Args:
-        reference: traverse to learn, a source as in `dejavu learn`
-        query: traverse to localize, likewise; none with --loops
+        reference: the visit to learn: a folder of images, a video, or another source of `dejavu learn`
+        query: the visit whose frames are found; none with --loops
         loops: find where the reference comes back to its own places, as in localize
-        out: folder for report, pictures, matches.csv and map.safetensors
+        out: folder for report, pictures, matches.csv and map.safetensors; if not given dejavu_report, or
+            dejavu_report_2 and so on if that is there
+        open: show the report in a browser
         map: evaluate this map of the reference instead of learning one
     """
     from dejavu_torch.evaluation.compare import compare
 
+    out = _unused_folder() if out is None else out
     _check_loops(loops, query, sequences, ordering, judging)
     where = device_of(learning.device, learns=map is None)
     acceptance = options.Acceptance(model.threshold, model.precision)
@@ -151,7 +160,7 @@ def run_compare(
     )
     on, asked = short_name(reference), None if query is None else short_name(query)
     title = f"loops within {on}" if asked is None else f"{asked} found on {on}"
-    _publish(result, out, title, command, map, judging.top)
+    _publish(result, out, title, command, map, judging.top, show=open)
 
 
 def _check_loops(
@@ -194,10 +203,10 @@ def run_evaluate(
         matches: csv of query,place,score[,accepted][,probability][,rank][,route]
         truth: right places, as in `dejavu compare`
         out: folder for report and pictures
-        tolerance: answers up to this many places off are right
+        tolerance: count an answer as right if it is at most this many frames off
         interpolate: interpolate a --truth that lists only some queries
         reference: source of the places, for their number and coordinates in names; as in `dejavu learn`
-        query: source of the queries, likewise
+        query: source of the queries; as in `dejavu learn`
         map: map of the matches, for its number of frames and, if they are resampled, their places
         route: route of a merged map that --truth, --reference and the queries belong to; answers on other
             routes are wrong
@@ -235,7 +244,7 @@ def run_reproduce(
         dataset: aerial, outdoor, underground or all
         out: folder for the reports
         seed: seed of the routes
-        tolerance: answers up to this many places off are right
+        tolerance: count an answer as right if it is at most this many frames off
     """
     from dejavu_torch.evaluation import paper_tables as tables
     from dejavu_torch.evaluation.report import report_folder, text_table, write_index, write_report
@@ -295,13 +304,14 @@ def _publish(
     given: Path | None = None,
     top: int | None = None,
     verbose: bool = True,
+    show: bool = False,
 ) -> None:
     """Write map, matches and report of a comparison, and print its scores.
 
     Args:
         given: file of the map, unless it was learned.
         top: candidates of each query to write; None writes the matches.
-        verbose: print all of them, not only what was found.
+        verbose: print all of them, not only what was found. show: open the report.
     """
     from dejavu_torch.evaluation.report import found_lines, report_folder, write_report
 
@@ -322,6 +332,14 @@ def _publish(
     else:
         print("\n".join(found_lines(result.report)))
         say(f"the page with pictures: {out / 'index.html'}")
+    if show and not webbrowser.open((out / "index.html").absolute().as_uri()):
+        say(f"there is no browser here; the report is {(out / 'index.html').absolute()}")
+
+
+def _unused_folder() -> Path:
+    """A folder for a report that is not there yet."""
+    names = ("dejavu_report" + f"_{i}" * (i > 1) for i in count(1))
+    return next(path for path in map(Path, names) if not path.exists())
 
 
 def _print_run(run: Localization) -> None:
