@@ -12,6 +12,7 @@ from benchmarks import (
     distil,
     drives,
     features,
+    front,
     live,
     matcher,
     memory,
@@ -32,6 +33,7 @@ from dejavu_torch.text import printable
 
 BENCHES: dict[str, Any] = {  # each returns the lines to print
     "results": results.run_results,
+    "front": front.run_front,
     "matcher": matcher.run_matcher,
     "storage": storage.run_storage,
     "drives": drives.run_drives,
