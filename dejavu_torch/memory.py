@@ -40,13 +40,17 @@ def in_float32() -> Iterator[None]:
 
 @contextmanager
 def in_one_thread(numbers: float = 0) -> Iterator[None]:
-    """In the block torch computes in one thread if its operations have fewer than 2^20 numbers each.
+    """In the block torch computes in one thread, unless its operations have 2^20 numbers or more.
 
     Of two threads each operation is as slow as the one that another program disturbs, which is many times
-    slower. And the rounding of matrix products depends on the number of threads.
+    slower. And the rounding of matrix products depends on the number of threads. A Python thread that begins
+    to compute meanwhile has one from then on: torch gives it what was set last.
     """
     before = torch.get_num_threads()
-    torch.set_num_threads(1 if numbers < SMALL else before)
+    if numbers >= SMALL or before == 1:
+        yield
+        return
+    torch.set_num_threads(1)
     try:
         yield
     finally:

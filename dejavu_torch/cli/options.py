@@ -161,9 +161,10 @@ class Searching:
     """How places are searched for single queries.
 
     Args:
-        search: auto and coarse score only the best places by 8-bit samples of a spectral map, exact and scan
-            all
-        search_memory: MB for these samples; if not given 300, or 100 bytes per place above 3 x 10^6 places
+        search: auto and coarse compare 8-bit samples of a spectral map and score only the best places; exact
+            and scan score all places
+        search_memory: MB for these samples; if not given 300, or 100 bytes per place above 3 x 10^6 places,
+            and half of the free memory of a GPU
     """
 
     search: Search = "auto"

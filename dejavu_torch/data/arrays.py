@@ -98,6 +98,11 @@ def read_array(path: Path) -> ArrayTraverse:
     if values.ndim == 2 and text.exists():
         expected = f"{len(values)} names, one line for each row of {path}, or no such file"
         names = [line.strip() for line in read_text(text, expected).splitlines() if line.strip()]
-        expect(len(names) == len(values), expected, f"{text} has {len(names)} names")
+        swapped = len(names) == values.shape[1]
+        seen = (
+            f"{text} has {len(names)} names"
+            + ", as many as the array has columns (save its transpose)" * swapped
+        )
+        expect(len(names) == len(values), expected, seen)
         traverse.names, traverse.ordered = names, numbers_increase(names)
     return traverse

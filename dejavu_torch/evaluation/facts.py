@@ -68,6 +68,7 @@ def _run_facts(run: Localization, seconds: Mapping[str, float]) -> Facts:
         "speeds": list(run.sequence.speeds) if isinstance(run.sequence, SequenceMatcher) else None,
         "filter": isinstance(run.sequence, PlaceFilter),
         "trained": model.trained and model.trained._asdict(),
+        **({} if run.has_frames else {"ready": True}),
         "reference": reference.name,
         "query": query.name,
         **_peak_memory(),

@@ -17,6 +17,7 @@ from dejavu_torch.features.extract import (
     feature_batches,
     features_of,
     warn_of_bright,
+    warn_of_raw,
 )
 from dejavu_torch.features.hog import CELL, HOG
 from dejavu_torch.features.joined import Joined, groups_of
@@ -183,6 +184,7 @@ class Descriptor(nn.Module):
         def check_first(frames: Tensor, features: Tensor) -> None:
             self.warn_of_bright(frames, traverse.name)
             self._warn_of_narrow(frames, traverse)
+            warn_of_raw(self.features, frames)
             check_alone(self, self.describe, frames, features, traverse.name)
 
         again = traverse, second, progress, spectral, verb
@@ -358,7 +360,9 @@ class Descriptor(nn.Module):
                     f"{' x '.join(map(str, traverse.frame_shape))}{_pixels(traverse)}"
                     for traverse, number in ((reference, counts[0]), (query, count))
                 )
-                raise InputError(f"{seen}; expected the same number, from frames of the same size")
+                swapped = is_ready(reference) and is_ready(query) and len(reference) == len(query)
+                hint = ". If rows and columns are swapped, save the transposes" if swapped else ""
+                raise InputError(f"{seen}; expected the same number, from frames of the same size{hint}")
         return counts[0]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from itertools import chain
 
 import torch
@@ -17,6 +18,7 @@ from dejavu_torch.types import InputError, Traverse
 
 log = logging.getLogger("dejavu_torch")
 
+LARGE = 10**6  # parameters from which a network was probably trained elsewhere
 BRIGHTEST = 1.5  # frames should be in [0, 1]; preprocessing may exceed it a little
 BATCH_TOLERANCE = 1e-3  # of their length: how much features may differ between a frame alone and in a batch
 BATCH_ULPS = 4  # of the coarsest dtype: the same tolerance, if it is larger
@@ -99,6 +101,25 @@ def warn_of_bright(frames: Tensor, name: str) -> bool:
         seen = f"{name} has frames with values up to {most:.4g}"
         log.warning("%s; expected floats in [0, 1], such as frames / 255", seen)
     return most > BRIGHTEST
+
+
+def warn_of_raw(features: nn.Module, frames: Tensor) -> None:
+    """Warn once of each network that gets frames as they are, unlike those that it was trained on."""
+    for member in getattr(features, "members", [features]):
+        ours = type(member).__module__.partition(".")[0] == "dejavu_torch"
+        network = getattr(member, "network", None) if ours else member
+        prepared = getattr(member, "mean", None) is not None if ours else hasattr(member, "resize")
+        if frames.ndim != 4 or network is None or prepared:
+            continue
+        if sum(one.numel() for one in network.parameters()) >= LARGE:
+            size = getattr(member, "resize", None) or tuple(frames.shape[2:])
+            _warn_of_raw(f"{type(network).__name__} gets frames of {size[0]} x {size[1]} pixels")
+
+
+@cache
+def _warn_of_raw(seen: str) -> None:
+    why = "a network trained on others, as of ImageNet, needs its size and normalisation"
+    log.warning("%s, from 0 to 1; %s: resize, mean and std of dejavu_torch.Embedding", seen, why)
 
 
 def check_alone(

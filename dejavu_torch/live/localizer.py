@@ -11,7 +11,10 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.traverse import resize_like
+from dejavu_torch.features.distilled import Distilled
 from dejavu_torch.features.extract import features_of, in_mode
+from dejavu_torch.features.hog import HOG
+from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.memory import in_one_thread
 from dejavu_torch.model import DejaVu, check_queries
 from dejavu_torch.recognition.centring import running_mean
@@ -20,6 +23,7 @@ from dejavu_torch.types import InputError, Match, SequenceModel, check_shape, ex
 
 EXPECTED = "uint8 (H,W), (H,W,3) or (3,H,W), or float in [0, 1], or float (D,) for a map of ready features"
 DTYPES = ("uint8", "float16", "bfloat16", "float32", "float64")
+SMALL = (HOG, Distilled, PatchPixels)  # features that one thread computes as fast as several
 MAX_SKIPPED = 100  # skipped frames that a filter moves for; after more, a jump finds the place again
 ROUNDING = 1e-3  # tolerance of the range [0, 1]
 
@@ -85,7 +89,8 @@ class LiveLocalizer:
         self.model, self.sequence = model, PlaceFilter() if isinstance(sequence, str) else sequence
         self._shape: tuple[int, ...] | None = None  # of the latest valid frame
         whitening = model.whitening
-        self._parameters = sum(one.numel() for one in model.descriptor.parameters())
+        members = getattr(model.features, "members", [model.features])
+        self._small = all(isinstance(one, SMALL) for one in members)
         self._projection = whitening.all_unpacked() if whitening is not None and whitening.learned else None
         self.reset()
 
@@ -110,7 +115,7 @@ class LiveLocalizer:
         """The answers that a frame completes: its own, or that of the frame `lag` before, if there is one."""
         start, mean = time.perf_counter(), self._mean
         batch = as_batch(frame, self.model.map.device)
-        with in_one_thread(batch.numel() + self._parameters):
+        with in_one_thread(batch.numel() if self._small else math.inf):
             descriptor = self._describe(batch)
         if self.centring is not None:
             descriptor, mean = self.centring(descriptor, mean)

@@ -32,10 +32,11 @@ from dejavu_torch.recognition.search import NmsSpec, Scan, Search, TopK, check_s
 from dejavu_torch.recognition.select import best_candidates
 from dejavu_torch.types import expect
 
-MIN_PLACES = 20_000  # a shorter map is scanned, which is as fast
+MIN_PLACES = 20_000  # a map whose places are not all compared is scanned if it is shorter
 OVERHEAD = 16  # bytes of a sample besides its descriptor
 MEMORY, MEMORY_PER_PLACE = 300_000_000, 100  # default bytes for the samples; the larger one applies
 FREE = 2  # on a GPU, samples take at most one in this many of its free bytes
+MOST = 2**17  # places that are all compared: each has a share of a number for each query of a batch
 COMPARED = 2**24  # numbers of a map whose places are all compared, by products of 8 bits in the cache
 COMPARED_IN_FLOAT = 2**21  # without such products
 DECODED = 2**24  # numbers of a chunk that are decoded at a time, at most
@@ -96,10 +97,11 @@ def plan(place_map: PlaceMap, limit: int | None = None) -> SamplingPlan | None:
     most = math.inf if device.type == "cuda" else COMPARED if has_int8_products() else COMPARED_IN_FLOAT
     # places of no frame are not to be found, nor in the way
     seen = fits and not bool(place_map.norms.isinf().any())
-    if seen and place_map.places * width <= most:
+    few = device.type == "cuda" or place_map.places <= MOST
+    if seen and few and place_map.places * width <= most:
         return every
     if place_map.places < max(MIN_PLACES, 2 * longest) or width > WIDEST:
-        return None
+        return every if seen else None
     minimum = size(longest, SPACINGS[0], SPACINGS[1])
     expect(limit >= minimum, f"at least {minimum}, for a chunk", f"search_memory is {limit} bytes")
     held = explained_variance(place_map)

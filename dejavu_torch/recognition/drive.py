@@ -110,22 +110,14 @@ def answer_drives(drives: Sequence[DriveQuery], progress: bool = False) -> list[
     """
     shown: list[list[Shown]] = [[] for _ in drives]
     queries = sum(len(asked.descriptors) for asked in drives)
-    one_thread = in_one_thread(2 * sum(map(_work, drives)))
+    sizes = [one.rows(torch.arange(min(1, len(one.descriptors)))).shape[1] for one in drives]
+    large = any(is_large(len(one.descriptors), size) for one, size in zip(drives, sizes, strict=True))
+    one_thread = in_one_thread(math.inf if large else 2 * sum(sizes))
     with one_thread, progress_of("smoothing", queries, progress, "query") as update:
-        for i, seen in _seen(drives, progress):
+        for i, seen in _seen(drives, sizes, progress):
             shown[i].append(_shown(drives[i], seen))
             update(len(seen.scores))
     return [_joined(asked, parts[::-1]) for asked, parts in zip(drives, shown, strict=True)]
-
-
-def _work(asked: DriveQuery) -> float:
-    """Numbers that an operation of a drive has: its places, unless it is matched in tiles."""
-    places = _places(asked)
-    return math.inf if is_large(len(asked.descriptors), places) else places
-
-
-def _places(asked: DriveQuery) -> int:
-    return asked.rows(torch.arange(min(1, len(asked.descriptors)))).shape[1]
 
 
 def _shown(asked: DriveQuery, seen: Seen) -> Shown:
@@ -165,13 +157,12 @@ def _joined(asked: DriveQuery, parts: list[Shown]) -> Answers:
     return Answers(replace(match, probability=first_of(probability, k), confidence=confidence), absent)
 
 
-def _seen(drives: Sequence[DriveQuery], progress: bool) -> Iterator[tuple[int, Seen]]:
-    """Fit the smoothers; then the numbers of the drives with what is seen of each."""
+def _seen(drives: Sequence[DriveQuery], sizes: Sequence[int], progress: bool) -> Iterator[tuple[int, Seen]]:
+    """Fit the smoothers to drives on so many places; then the numbers of the drives with what is seen."""
     spacings: dict[int, Spacing] = {}  # of descriptors that several drives share
     fitted: dict[tuple[int, Layout, int], list[tuple[int, Drive]]] = {}
-    for i, asked in enumerate(drives):
+    for i, (asked, places) in enumerate(zip(drives, sizes, strict=True)):
         rows, descriptors, smoother, _, _, starts, *_ = asked
-        places = _places(asked)
         if is_large(len(descriptors), places):
             yield from ((i, seen) for seen in _of_windows(asked, places, progress))
             continue

@@ -18,6 +18,7 @@ from dejavu_torch.recognition.calibration import confidence as confidence_of_pai
 from dejavu_torch.recognition.drive import DriveQuery, first_of, localize_drive
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.large import Tiles
+from dejavu_torch.recognition.samples import GROUP, RowSearch
 from dejavu_torch.recognition.search import SCORES_AT_ONCE, NmsSpec, Scan, Search, Searcher, num_needed
 from dejavu_torch.recognition.select import Acceptance, accept, best_candidates, best_match
 from dejavu_torch.recognition.sequence import SequenceMatcher
@@ -101,7 +102,8 @@ class Localizer:
         few = n <= max(1, MAX_SHARE * min(places, place_map.block_places)) or places > SCORES_AT_ONCE
         searches = not self.models and matching.callback is None and matching.apart is None
         searches = searches and (type(self.searcher) is not Scan or (few and places > SHORT))
-        size = max(PER_BEST * n, places // PLACES_PER_NUMBER) if searches else places
+        per_number = GROUP if isinstance(self.searcher, RowSearch) else PLACES_PER_NUMBER
+        size = max(PER_BEST * n, places // per_number) if searches else places
         parts = descriptors.split(max(1, min(ROWS, SCORES_AT_ONCE // size)))
         moved = (part.to(place_map.device) for part in with_progress(parts, "localizing", progress))
         if searches:

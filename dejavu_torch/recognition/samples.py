@@ -34,7 +34,8 @@ class Samples:
 
     Attributes:
         rows: (S,K') int8; K' is K, padded to whole groups. step: () float32. place: (S,) int64, nearest to
-            each, in order. finer: (S,K') int8, the rest in parts of a step, if all places are samples.
+            each, in order. groups: number of groups without the padding. finer: (S,K') int8, the rest in
+            parts of a step, if all places are samples.
     """
 
     def __init__(self, place_map: SpectralMap, spacing: int) -> None:
@@ -42,6 +43,7 @@ class Samples:
         counts = [-(-(stop - start) // spacing) for start, stop in chunks]
         near = [place_map.sampled(g, count) + chunks[g][0] for g, count in enumerate(counts)]
         place = torch.cat(near)
+        self.groups = -(-len(place) // GROUP)  # without the padding
         self.place = F.pad(place, (0, -len(place) % size), value=place_map.places - 1)
         self.rows = self.place.new_zeros(len(self.place), width_of(place_map), dtype=torch.int8)
         self.finer = self.rows.clone() if spacing == 1 else None
@@ -66,6 +68,7 @@ class Samples:
             last = first + len(groups)
             torch.amax(torch.add(row, groups, alpha=GROUP, out=groups), 1, out=best[first:last])
             first = last
+        best[self.groups :] = torch.iinfo(torch.int32).min  # padding, which no query finds
         return best
 
     def cosines(self, units: Tensor, rows: Tensor) -> Tensor:
@@ -136,8 +139,9 @@ def units_at(place_map: SpectralMap, chunk: int, count: int) -> Tensor:
 
 def units_of(place_map: SpectralMap, queries: Tensor) -> Tensor:
     """Queries (Q,K) as a map compares them, of length 1 or 0, float32."""
-    queries = queries.to(torch.promote_types(queries.dtype, torch.float32))
-    return F.normalize(place_map.staged(queries)).float()
+    queries = place_map.staged(queries.to(torch.promote_types(queries.dtype, torch.float32)))
+    length = torch.linalg.vector_norm(queries, dim=1, keepdim=True)
+    return (queries / torch.where(length > 0, length, 1)).float()
 
 
 def to_int8(units: Tensor) -> tuple[Tensor, Tensor]:
@@ -156,7 +160,7 @@ def products_of(rows: Tensor, queries: Tensor) -> Iterator[Tensor]:
     int32."""
     size, device, count = GROUP * GROUPS_PER_BLOCK, rows.device.type, len(queries)
     queries = padded(queries, rows.shape[1])
-    int8 = device == "cuda" or (device == "cpu" and has_int8_products())
+    int8 = has_int8_products(device)
     if not int8:
         yield from ((part.float() @ queries.T.float()).int() for part in rows.split(BLOCK))
         return
@@ -183,12 +187,14 @@ def replaced(found: TopK, queries: Tensor, rest: TopK) -> TopK:
     more = max(0, place.shape[1] - found[0].shape[1])
     scores, places = F.pad(found[0], (0, more), value=math.inf), F.pad(found[1], (0, more))
     scores[queries] = math.inf
-    scores[queries, : place.shape[1]] = rest[0].gather(1, order)
+    scores[queries, : place.shape[1]] = rest[0].gather(1, order).to(scores)
     places[queries, : place.shape[1]] = place
     return scores, places
 
 
 @cache
-def has_int8_products() -> bool:
-    """Whether torch multiplies 8-bit integers fast on this CPU."""
-    return torch.backends.mkldnn.is_available() and torch.cpu._is_vnni_supported()
+def has_int8_products(device: str = "cpu") -> bool:
+    """Whether torch multiplies 8-bit integers fast on this kind of device."""
+    if device == "cuda":  # from Turing on; not ROCm
+        return torch.version.hip is None and torch.cuda.get_device_capability() >= (7, 5)
+    return device == "cpu" and torch.backends.mkldnn.is_available() and torch.cpu._is_vnni_supported()

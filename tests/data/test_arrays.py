@@ -9,6 +9,7 @@ import pytest
 import torch
 from helpers import all_of, refused
 
+from dejavu_torch import compare
 from dejavu_torch.data.arrays import ArrayTraverse, read_array
 
 RANDOM = np.random.default_rng(0)
@@ -60,6 +61,15 @@ def test_another_number_of_names_is_refused(tmp_path, count):
     (tmp_path / "a.txt").write_text("a.jpg\n" * count)
     with refused("a.txt", f"has {count} names", "expected 7 names", "a.npy"):
         read_array(tmp_path / "a.npy")
+
+
+def test_rows_and_columns_that_are_swapped_are_noticed_by_names_and_by_numbers(tmp_path):
+    np.save(tmp_path / "a.npy", FEATURES.T)
+    (tmp_path / "a.txt").write_text("a.jpg\n" * len(FEATURES))
+    with refused("as many as the array has columns", "its transpose"):
+        read_array(tmp_path / "a.npy")
+    with refused("6 features", "rows and columns are swapped", "transposes"):
+        compare(torch.rand(9, 6), torch.rand(9, 7))
 
 
 def test_names_that_are_no_text_are_refused_and_frames_have_none(tmp_path):

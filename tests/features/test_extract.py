@@ -9,9 +9,25 @@ import torch
 from helpers import refused
 from torch import Tensor, nn
 
-from dejavu_torch import HOG, Traverse, text, types
+from dejavu_torch import HOG, Embedding, Traverse, text, types
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.features.extract import feature_batches
+from dejavu_torch.features.extract import feature_batches, warn_of_raw
+from dejavu_torch.features.joined import Joined
+
+
+def test_a_large_network_that_gets_frames_as_they_are_is_told_of_once(caplog):
+    """Not one whose frames are prepared, nor a small one."""
+    large = nn.Sequential(nn.Flatten(), nn.Linear(64, 16_000), nn.Linear(16_000, 4))
+    small, frames = nn.Sequential(nn.Flatten(), nn.Linear(64, 4)), torch.rand(2, 1, 8, 8)
+    bare = Embedding(large, 4, 1, (8, 8))
+    for module in (small, Embedding(large, 4, 1, (8, 8), mean=0.5, std=0.2), HOG(cell=2), bare, bare):
+        warn_of_raw(module, frames)
+    warn_of_raw(Joined([HOG(cell=2), large]), frames[..., :7])
+    assert [record.message.partition(" pixels")[0] for record in caplog.records] == [
+        "Sequential gets frames of 8 x 8",
+        "Sequential gets frames of 8 x 7",
+    ]
+    assert all("mean and std of dejavu_torch.Embedding" in record.message for record in caplog.records)
 
 
 class Given(Traverse):

@@ -87,7 +87,7 @@ def test_coarse_samples_choose_among_all_descriptors():
 @pytest.mark.parametrize("int8", [False, True])
 def test_a_short_map_is_compared_with_whole(settings, stage, int8, monkeypatch):
     if not int8:
-        monkeypatch.setattr(samples, "has_int8_products", lambda: False)
+        monkeypatch.setattr(samples, "has_int8_products", lambda *_: False)
     model, queries = smooth_model(**settings), queries_of()
     if stage:
         mixed = torch.randn(24, 24, generator=torch.Generator().manual_seed(1))
@@ -116,6 +116,33 @@ def test_a_query_of_which_eight_bits_leave_no_best_place_is_scanned():
     assert torch.equal(found.index, expected.index)
     torch.testing.assert_close(found.score, expected.score)
     assert not search(torch.full((1, 24), math.nan), wanted)[0].isfinite().any()
+
+
+@pytest.mark.parametrize("places", [5, 129, 137, 1033])
+def test_padding_takes_no_place_of_a_candidate(places):
+    """Where nearly all places are opposed to the query, whose products are below those of the padding."""
+    draw = torch.Generator().manual_seed(0)
+    rows = 0.2 * torch.randn(places, 24, generator=draw) - torch.eye(24)[0]
+    rows[places // 2] *= -1
+    learned, query = SpectralMapper(None, 0.01)(rows), torch.eye(24)[:1]
+    search = searcher(learned)
+    assert isinstance(search, RowSearch)
+    for spec in ((2, 1), (min(20, places // 2), 0)):
+        score, place = search(query, [spec])
+        expected = best_candidates(learned.scores(query), *spec)
+        torch.testing.assert_close(
+            best_candidates(score, *spec, place).score, expected.score, rtol=0, atol=5e-5
+        )
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float16])
+def test_a_query_of_another_type_may_be_in_doubt(dtype):
+    model = smooth_model(700)
+    queries = torch.cat([torch.zeros(1, 24), queries_of(700)[:3]]).to(dtype)
+    found = model.localize(queries, search="scan").index
+    assert torch.equal(model.localize(queries).index, found)
+    tiny = 1e-14 * queries_of(700)[:3]
+    assert torch.equal(model.localize(tiny).index, model.localize(tiny, search="scan").index)
 
 
 def test_places_that_no_frame_shows_leave_a_map_to_a_scan():
@@ -152,7 +179,7 @@ def test_products_are_the_same_without_those_of_integers(monkeypatch):
     found = []
     for there in (True, False):
         if not (there and samples.has_int8_products()):
-            monkeypatch.setattr(samples, "has_int8_products", lambda: False)
+            monkeypatch.setattr(samples, "has_int8_products", lambda *_: False)
         found.append(CoarseSearch(learned, SamplingPlan(8, 4, 8, 1.0, 0))(queries, [(1, 0)]))
     assert all(map(torch.equal, *found))
 
