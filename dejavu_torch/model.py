@@ -56,15 +56,15 @@ class DejaVu(nn.Module):
     """Learn a compressed map of a route, by default a spectral map, and find places on it (section III).
 
     Args:
-        features: any nn.Module (B,C,H,W) -> (B,D), given frames in the type of its weights; None is HOG with
-            `Distilled`, HOG alone if unwhitened.
+        features: any nn.Module (B,C,H,W) -> (B,D), given frames in the type of its weights; None is HOG and
+            the built-in network of 65 kB, `Distilled`; HOG alone if unwhitened.
         whitening: reduces features to few dimensions, learned with each map unless it is `fixed`; None is
             Whitening for a SpectralMapper and "none" for templates. "none" keeps the features, except that a
             SpectralMapper reduces ready features of over 256 dimensions to principal components.
         mapper: makes the map from the descriptors of a traverse; None is SpectralMapper with its defaults.
         threshold: accept a match if its score is below; infinity accepts every finite score.
-        precision: instead, accept a match if its probability is at least this, in (0, 1); the map has to be
-            calibrated. See `acceptance` for the default.
+        precision: accept an answer if it is right with at least this probability, such as .99; the map has
+            to be calibrated. See `acceptance` for the default.
         batch_size: frames in memory at a time.
         preprocess: size, colour and contrast of the frames; None is Preprocess with its defaults, which
             reduces the longer side to 160 pixels, but no side below what the features need.

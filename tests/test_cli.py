@@ -82,7 +82,7 @@ def test_convention_4_threshold_option_then_map_then_probability_then_all(small_
         return sum(row["accepted"] == "1" for row in csv.DictReader(out.open()))
 
     run("localize", small_map, QUERY, "--out", out)
-    assert "default for this way of matching: accepted if the probability is" in capsys.readouterr().out
+    assert "accepting answers with a probability of at least 0.5" in capsys.readouterr().out
     assert accepted() == sum(float(row["probability"]) >= 0.5 for row in csv.DictReader(out.open()))
     np.save(tmp_path / "other.npy", np.random.default_rng(0).integers(0, 256, (96, 64, 64, 3), np.uint8))
     run("localize", small_map, tmp_path / "other.npy", "--ordered", "--out", out)
@@ -93,13 +93,13 @@ def test_convention_4_threshold_option_then_map_then_probability_then_all(small_
     assert accepted() == 96
     single = "--match", "single"
     run("localize", small_map, QUERY, *single, "--threshold", ".inf", "--out", out)
-    assert "default for this way" not in capsys.readouterr().out
+    assert "accepting answers with" not in capsys.readouterr().out
     assert accepted() == 96
     score = sorted(float(row["score"]) for row in csv.DictReader(out.open()))[40]
     run("learn", SMALL, "--map", route, "--threshold", str(score))
     capsys.readouterr()
     run("localize", route, QUERY, *single, "--out", out)
-    assert "default for this way" not in capsys.readouterr().out
+    assert "accepting answers with" not in capsys.readouterr().out
     assert 35 <= accepted() <= 41
     run("localize", route, QUERY, "--out", out, "--threshold", "0")
     assert accepted() == 0

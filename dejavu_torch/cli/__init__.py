@@ -136,7 +136,7 @@ def overview(word: str) -> NoReturn:
     if word == "--version":
         print(f"dejavu_torch {__version__}")
     elif word in ("--help", "-h"):
-        print("usage: dejavu COMMAND ...\n\nPlace recognition from repeating features.")
+        print("usage: dejavu COMMAND ...\n\nFind where on a known route each image was taken.")
         more = [name for name in COMMANDS if name not in FIRST_DAY]
         for heading, names in (("commands", FIRST_DAY), ("more", more)):
             print(f"\n{heading}:", *(f"  {name:<10}  {COMMANDS[name]}" for name in names), sep="\n")

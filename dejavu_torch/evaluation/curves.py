@@ -127,7 +127,7 @@ def threshold_of_full_precision(curve: PRCurve) -> float | None:
         return None
     last = float(curve.threshold[perfect[-1]])
     beyond = curve.threshold[perfect[-1] + 1 :]
-    middle = (last + float(beyond[0])) / 2 if len(beyond) else last * 1.001 + 1e-12
+    middle = (last + float(beyond[0])) / 2 if len(beyond) else last + abs(last) / 1000 + 1e-12
     short = (float(f"{middle:.{digits}g}") for digits in range(1, 17))
     return next((one for one in short if last < one < 2 * middle - last), middle)
 

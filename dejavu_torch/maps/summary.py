@@ -97,7 +97,7 @@ class MapSummary:
             lines.append(f"and {len(self.chunks) - CHUNKS_SHOWN} more chunks")
         content = f"{self.templates} templates, {self.template_numbers} numbers"
         if self.kind != "templates":
-            content = f"{self.lines} lines of their spectra"
+            content = f"{self.lines} coefficients kept"
         size = f"{self.map_bytes} bytes, {self.bytes_per_place:.1f} per place: {self.route_bytes} of the "
         size += f"route, {self.route_bytes / self.places:.2f} per place ({_parts(self.route)})"
         if self.fixed:

@@ -24,6 +24,8 @@ class Acceptance(NamedTuple):
 
     def __str__(self) -> str:
         if self.precision is not None:
+            if not self.given:
+                return f"accepting answers with a probability of at least {self.precision:.9g} (--precision)"
             rule = f"accepted if the probability is at least {self.precision:.9g}"
         elif self.threshold is None or self.threshold >= HIGHEST:
             rule = "every query with a finite score is accepted"

@@ -383,8 +383,8 @@ MUTANTS = [
     Mutant(
         "The threshold of full precision accepts all reports ahead of the first wrong one, and not that one.",
         "dejavu_torch/evaluation/curves.py",
-        "return (last + float(beyond[0])) / 2 if len(beyond)",
-        "return float(beyond[0]) * 1.001 if len(beyond)",
+        "middle = (last + float(beyond[0])) / 2 if len(beyond)",
+        "middle = float(beyond[0]) * 1.001 if len(beyond)",
         (
             "tests/evaluation/test_curves.py::test_the_threshold_of_full_precision_accepts_what_is_right_and_no_more",
         ),
@@ -777,9 +777,16 @@ MUTANTS = [
     Mutant(
         "The coarse search compares after the stage.",
         "dejavu_torch/recognition/samples.py",
-        "F.normalize(place_map.staged(queries)).float()",
-        "F.normalize(queries).float()",
+        "queries = place_map.staged(queries.to(torch.promote_types(queries.dtype, torch.float32)))",
+        "queries = queries.to(torch.promote_types(queries.dtype, torch.float32))",
         ("tests/test_teaching.py::-k knows_of_a_stage",),
+    ),
+    Mutant(
+        "Padding takes the place of no candidate.",
+        "dejavu_torch/recognition/samples.py",
+        "best[self.groups :] = torch.iinfo(torch.int32).min",
+        "best[self.groups :] = 0",
+        ("tests/recognition/test_coarse.py::-k padding_takes",),
     ),
     Mutant(
         "A query that 8 bits leave in doubt is scanned.",

@@ -138,7 +138,7 @@ def test_a_spectral_map_whatever_mapper_a_preset_has(folder, tmp_path, capfd, ca
     assert warned(caplog) == []
     said = capfd.readouterr()
     assert said.err == ""
-    assert "lines of their spectra" in said.out
+    assert "coefficients kept" in said.out
     for size in (12, 1.2):  # the map is made anew of the checkpoint's features
         options = [*chosen[:-1], size, "--trainer.default_root_dir", tmp_path / str(size)]
         options += ["--data.validation=two.npy", "--data.validation_truth=0"]  # which calibrates the map
