@@ -375,7 +375,9 @@ def storage(name: str) -> str:
             )
     ratio = next(iter(missed(rows).values()))
     errors = f"{100 * abs(1 - ratio):.0f} % {'fewer' if ratio < 1 else 'more'} errors"
-    return f"{markdown(table)}\nThe map makes {errors} than the best other code, on average over 1 to 5 bytes.\n"
+    return (
+        f"{markdown(table)}\nThe map makes {errors} than the best other code, on average over 1 to 5 bytes.\n"
+    )
 
 
 def trainings() -> str:
@@ -400,7 +402,13 @@ def trainings() -> str:
 
 
 TABLES: dict[str, Callable[[], str]] = {
-    **{"leaderboard": leaderboard, "routes": routes, "sizes": sizes, "descriptors": descriptors, "sequences": sequences},
+    **{
+        "leaderboard": leaderboard,
+        "routes": routes,
+        "sizes": sizes,
+        "descriptors": descriptors,
+        "sequences": sequences,
+    },
     **{"rejection": rejection, "filtered": filtered, "drives": drives, "driven": driven},
     **{"trainings": trainings, "made drives": made_drives, "storage drives": storage_drives},
     **{"large drives": large_drives, "taught drives": taught, "visits": visits},

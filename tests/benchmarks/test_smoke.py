@@ -10,7 +10,7 @@ import torch
 from command_line import benchmark, benchmark_fails
 from torch.nn.functional import normalize
 
-from benchmarks import alike, chunks, live, spread, tables, teaching, train, visits
+from benchmarks import alike, chunks, front, live, spread, tables, teaching, train, visits
 from benchmarks.alike import CAPPED, CHECKED, SINGLE, UNCAPPED
 from benchmarks.teaching import COPIES, PLACED, REFINED, TASKS, TOLD, Task, right_of, run_teaching
 from benchmarks.train import Rung
@@ -37,6 +37,19 @@ def films(tmp_path):
         np.save(tmp_path / f"{name}.npy", frames[..., ::2, ::2].mul(255).byte().permute(0, 2, 3, 1).numpy())
     (tmp_path / "truth.csv").write_text("query,place\n" + "".join(f"{i},{i}\n" for i in range(120)))
     return tmp_path
+
+
+def test_front(tmp_path, monkeypatch):
+    """Of a short road: a row for each way and size, and a picture with three pairs."""
+    monkeypatch.setattr(front, "ROAD", tuple(f"demo:road?traverse={i}&stop=90" for i in (0, 1)))
+    for name, value in (("SEEDS", (1,)), ("BYTES", (2.0, 4.0)), ("CODES", (2,)), ("SHOWN", (20, 60))):
+        monkeypatch.setattr(front, name, value)
+    benchmark("front", "--out", tmp_path)
+    rows = rows_of(tmp_path)
+    assert {row["contender"] for row in rows} == {*front.WAYS, *front.POINTS}
+    assert min(row["one_image"] for row in rows if row["contender"] == "uncompressed") > 0.9
+    assert all(0 <= row[f"{way}_span"][0] <= row[way] for row in rows for way in front.COLUMNS[1:])
+    assert (tmp_path / "bench.png").stat().st_size > 10_000
 
 
 def test_alike(films, monkeypatch):
