@@ -127,7 +127,7 @@ def leaderboard() -> str:
         return [*found, row["route_bytes_per_place"]]
 
     def shown(one: float | None, drive: float | None) -> str:
-        return " / ".join("" if share is None else f"{100 * share:.0f}" for share in (one, drive))
+        return " / ".join(f"{100 * share:.0f}" for share in (one, drive) if share is not None)
 
     rows = []
     for name, means in by_seeds(reports("default"), figures):
