@@ -220,7 +220,11 @@ def test_a_comparison_needs_nothing_but_two_visits(tmp_path, monkeypatch, capsys
     run("compare", *pair, "--open")
     assert "there is no browser here" in capsys.readouterr().out
     assert [address.rsplit("/", 2)[1] for address in shown] == ["dejavu_report_2", "dejavu_report_3"]
-    assert "bytes" in fails(capsys, "compare", *pair, "--bytes", "many")
+    assert "--bytes is many" in fails(capsys, "compare", *pair, "--bytes", "many")
+    assert "--bytes without a number" in fails(capsys, "compare", *pair, "--bytes")
+    assert "--bytes with TemplateMapper" in fails(
+        capsys, "compare", *pair, "--bytes", 2, "--mapper", "TemplateMapper"
+    )
     given = "--map", tmp_path / "dejavu_report" / "map.safetensors"
     assert "has its own settings" in fails(capsys, "compare", *pair, *given, "--bytes", 3)
 

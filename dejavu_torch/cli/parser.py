@@ -25,6 +25,7 @@ from dejavu_torch.cli.presets import find_config, read_config
 from dejavu_torch.data.files import LARGEST
 from dejavu_torch.data.source import check_not_read
 from dejavu_torch.features.hub import made as made  # config files name it here
+from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.text import one_line
 from dejavu_torch.types import Facts, InputError, expect
@@ -92,6 +93,7 @@ class Parser(jsonargparse.ArgumentParser):
     first: Collection[str] = ()  # options that --help shows; all if empty
     hint = ""  # that is shown with all of them
     whole = False  # whether all are shown
+    short = False  # whether a size is spelt --bytes
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, formatter_class=HelpFormatter, allow_abbrev=False, **kwargs)
@@ -140,7 +142,11 @@ class Parser(jsonargparse.ArgumentParser):
                 raise InputError(f"{word or 'a word'} is empty; expected a name or a value")
         # a nested null reaches the parser of its part as None
         words = [f"{word[:-4]}null" if word.endswith("=None") else word for word in args or ()]
-        words = [re.sub(f"^{BYTES}(?==|$)", ROUTE_BYTES, word) for word in words]
+        if BYTES in self._option_string_actions:
+            self.short = any(word.partition("=")[0] == BYTES for word in words)
+            words = [re.sub(f"^{BYTES}(?==|$)", ROUTE_BYTES, word) for word in words]
+            if words[-1:] == [ROUTE_BYTES]:
+                self.error(f"{BYTES} without a number; expected bytes per place, as 5")
         start = 1 if self._subparsers is not None else 0  # after the subcommand
         words[start:] = self._in_order(words[start:])
         parsed = super().parse_args(words, *rest, **settings)
@@ -181,6 +187,7 @@ class Parser(jsonargparse.ArgumentParser):
             ]
             message = f"{head}{required}{', '.join(words)}"
         text = one_line(by_options(message, ex, positional))
+        text = text.replace(ROUTE_BYTES, BYTES) if self.short else text
         raise UsageError(text if len(text) < LONGEST else f"{text[:LONGEST]} ...") from ex
 
 
@@ -298,6 +305,8 @@ def _model_of(name: str, arguments: Facts, words: Sequence[str]) -> DejaVu:
     """
     _check_settings(name, arguments, words)
     expect("bytes" not in arguments, "mapper: {route_bytes_per_place: ..}", "bytes in a config file")
+    if BYTES in words and not isinstance(arguments["mapper"], SpectralMapper | None):
+        raise UsageError(f"{BYTES} with {type(arguments['mapper']).__name__}; expected a SpectralMapper")
     del arguments["config"]
     settings = {one: arguments.pop(one) for one in inspect.signature(DejaVu).parameters}
     whitening, descriptor = settings["whitening"], arguments.get("descriptor")

@@ -149,7 +149,7 @@ def baselines_of(
 
     size, own = partial(stride_bytes, frames, dimension), reference.element_size()
     if spectral:
-        short, code = as_int8(reference), max(1, round(summary.route_bytes / frames))
+        short, code = as_int8(reference), min(dimension, max(1, round(summary.route_bytes / frames)))
         between, spaced, keys = interpolated(short, summary.route_bytes)
         name, strided = "its descriptors", f"{every(coarsest, one)}, int8"
         interpolating = f"{name}, {every(spaced, one)}, interpolated"
@@ -211,7 +211,7 @@ def _as_given(run: Localization, code: int, seed: int, one: str, progress: bool)
     """Descriptors of another program as they are, by cosine: all of them, and in `code` bytes each."""
     plain = DejaVu(whitening="none", batch_size=run.model.batch_size)
     stored, queries = (plain.descriptor.all_of(one, progress) for one in (run.reference, run.query))
-    stored = normalize(stored.float())
+    stored, code = normalize(stored.float()), min(code, stored.shape[1])
     quantised, codebooks = product_quantised(stored, code, seed)
 
     def baseline(name: str, rows: Tensor, bytes: int, fixed: int = 0) -> Baseline:

@@ -126,15 +126,18 @@ def metric_facts(run: Localization, truth: Truth | None) -> Facts:
 
 
 def _gap_facts(run: Localization) -> Facts:
-    """The longest stretch of queries without an accepted answer, in frames and, if known, seconds."""
-    ends = (run.match.accepted & (run.match.index >= 0)).nonzero()[:, 0].tolist()
-    edges = [-1, *ends, len(run.match.index)]
-    gap, first = max((after - before - 1, before + 1) for before, after in pairwise(edges))
+    """Of queries in order: the longest stretch without an accepted answer, in frames and, if known, seconds
+    from the answer before to that after."""
+    in_order = run.query.ordered or run.smoother is not None or run.sequence is not None
+    if not in_order or run.matching.apart is not None:
+        return {}
+    ends, count = (run.match.accepted & (run.match.index >= 0)).nonzero()[:, 0].tolist(), len(run.match.index)
+    gap, before, after = max((two - one - 1, one, two) for one, two in pairwise([-1, *ends, count]))
     facts: Facts = {"longest_gap": gap}
     times = source_of(run.query).times
     if gap and times is not None:
-        stretch = times[run.query_frames[first : first + gap]]
-        facts["longest_gap_seconds"] = float(stretch[-1] - stretch[0])
+        known = times[run.query_frames[[max(0, before), min(count - 1, after)]]]
+        facts["longest_gap_seconds"] = abs(float(known[1] - known[0]))
     return facts
 
 

@@ -41,22 +41,26 @@ def draw_examples(run: Localization) -> plots.Pictures:
     columns = min(COLUMNS, len(chosen))
     rows = -(-len(chosen) // columns)
     side = run.query.frame_shape[1] / run.query.frame_shape[2]
-    figure, axes = plots.canvas(rows * (2 * side * plots.WIDTH / columns + 3 * plots.LINE), 2 * rows, columns)
+    height = rows * (2 * side * plots.WIDTH / columns + 3 * plots.LINE)
+    figure, axes = plots.canvas(height, 2 * rows, columns, squeeze=False)
     for axis in axes.flat:
         axis.set_axis_off()
     for i, query in enumerate(chosen):
         top, below = axes[2 * (i // columns) : 2 * (i // columns) + 2, i % columns]
         place = int(match.index[query])
-        told = "" if match.probability is None or place < 0 else f", {float(match.probability[query]):.2f}"
+        sure = "" if match.probability is None or place < 0 else f", {float(match.probability[query]):.2f}"
         plots.show_frame(top, frame_at(run.query, query), f"{int(run.query_frames[query])}")
-        found = f"{int(run.borders[place])}{told}" if place >= 0 else "none"
+        found = f"{int(run.borders[place])}{sure}" if place >= 0 else "none"
         plots.show_frame(below, frame_at(run.reference, place) if place >= 0 else None, found)
         colour = plots.GREY
-        if bool(match.accepted[query]) and (scored is None or bool(scored[query])):
-            colour = COLOURS["map"] if right is None else plots.RIGHT if bool(right[query]) else plots.WRONG
+        if bool(match.accepted[query]) and place >= 0:
+            known = scored is not None and right is not None and bool(scored[query])
+            told = known and bool(right[query])  # type: ignore[index]
+            colour = COLOURS["map"] if not known else plots.RIGHT if told else plots.WRONG
         for axis in (top, below):
             plots.frame_axis(axis, colour)
-    return plots.picture("examples", (figure, axes), truth=truth, probable=match.probability is not None)
+    facts: Facts = {"truth": truth, "probable": match.probability is not None, "count": len(chosen)}
+    return plots.picture("examples", (figure, axes), **facts)
 
 
 def draw_pairs(run: Localization) -> plots.Pictures:

@@ -104,7 +104,7 @@ def warn_of_bright(frames: Tensor, name: str) -> bool:
 
 
 def warn_of_raw(features: nn.Module, frames: Tensor) -> None:
-    """Warn once of each network that gets frames as they are, unlike those that it was trained on."""
+    """Warn, once for each kind and size, of networks that get frames as they are."""
     for member in getattr(features, "members", [features]):
         ours = type(member).__module__.partition(".")[0] == "dejavu_torch"
         network = getattr(member, "network", None) if ours else member

@@ -140,3 +140,8 @@ def test_examples_along_a_drive_have_borders_that_tell_what_they_are():
     assert [axis.get_title(loc="left") for axis in axes[1]] == ["0, 0.90", "3, 0.80", "2, 0.30", "none"]
     untold = draw_examples(run._replace(truth=None))["examples"].plot[1]
     assert to_hex(untold[1][1].spines["left"].get_edgecolor()) == COLOURS["map"]
+    one = run._replace(match=match[:1], query_features=rows[:1], query=ArrayTraverse(frames[:1]), truth=None)
+    assert draw_examples(one)["examples"].heading.startswith("1 evenly spaced query")
+    unjudged = truth._replace(judged=torch.zeros(4, dtype=torch.bool))
+    shown = draw_examples(run._replace(truth=unjudged))["examples"].plot[1]
+    assert to_hex(shown[1][0].spines["left"].get_edgecolor()) == COLOURS["map"]
