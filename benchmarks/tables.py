@@ -121,9 +121,9 @@ def leaderboard() -> str:
     def figures(row: Row) -> list[float | None]:
         found: list[float | None] = []
         for key in ways.values():
-            one = row.get(key) if key else row
-            drive = one and one.get("sequences", {}).get("smoother")
-            found += [one and one["recall_at_1"], drive and drive["recall_at_1"]]
+            one = (row.get(key) if key else row) or {}
+            drive = one.get("sequences", {}).get("smoother", {})
+            found += [one.get("recall_at_1"), drive.get("recall_at_1")]
         return [*found, row["route_bytes_per_place"]]
 
     def shown(one: float | None, drive: float | None) -> str:

@@ -253,6 +253,11 @@ def test_the_threshold_of_full_precision_accepts_what_is_right_and_no_more():
         assert threshold is not None
         assert int((score < threshold).sum()) == count
     assert threshold_of_full_precision(pr_curve(score, ~every, every)) is None
+    for scores, short in (([0.26, 0.28], 0.27), ([0.2611, 0.29], 0.28), ([-3.0, -2.0], -2.5)):
+        curve = pr_curve(torch.tensor(scores).double(), torch.tensor([True, False]), torch.ones(2).bool())
+        assert threshold_of_full_precision(curve) == short
+    alone = pr_curve(torch.tensor([-3.0]), torch.tensor([True]), torch.tensor([True]))
+    assert -3 < float(threshold_of_full_precision(alone) or 0) < -2.99
 
 
 THREE, TWO = torch.zeros(3), torch.zeros(2, 1, dtype=torch.int64)

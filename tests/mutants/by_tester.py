@@ -383,8 +383,8 @@ MUTANTS = [
     Mutant(
         "The threshold of full precision accepts all reports ahead of the first wrong one, and not that one.",
         "dejavu_torch/evaluation/curves.py",
-        "middle = (last + float(beyond[0])) / 2 if len(beyond)",
-        "middle = float(beyond[0]) * 1.001 if len(beyond)",
+        "if last < one < 2 * middle - last",
+        "if last < one",
         (
             "tests/evaluation/test_curves.py::test_the_threshold_of_full_precision_accepts_what_is_right_and_no_more",
         ),
