@@ -402,13 +402,8 @@ def trainings() -> str:
 
 
 TABLES: dict[str, Callable[[], str]] = {
-    **{
-        "leaderboard": leaderboard,
-        "routes": routes,
-        "sizes": sizes,
-        "descriptors": descriptors,
-        "sequences": sequences,
-    },
+    **{"leaderboard": leaderboard, "routes": routes, "sizes": sizes},
+    **{"descriptors": descriptors, "sequences": sequences},
     **{"rejection": rejection, "filtered": filtered, "drives": drives, "driven": driven},
     **{"trainings": trainings, "made drives": made_drives, "storage drives": storage_drives},
     **{"large drives": large_drives, "taught drives": taught, "visits": visits},

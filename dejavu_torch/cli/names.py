@@ -25,16 +25,8 @@ FIRST_DAY = ("demo", "compare", "learn", "localize", "info")  # listed first by 
 # the options that README and the first how-tos use, which --help shows; --help_all shows all
 FIRST_OPTIONS = {
     "compare": (
-        "out",
-        "open",
-        "truth",
-        "tolerance",
-        "bytes",
-        "second",
-        "device",
-        "map",
-        "config",
-        "features",
+        *("out", "open", "truth", "tolerance", "bytes"),
+        *("second", "device", "map", "config", "features"),
     ),
     "learn": ("map", "bytes", "append", "second", "device", "config", "features"),
     "localize": ("out", "top", "precision", "match", "ordered"),
