@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
@@ -183,7 +183,9 @@ def baselines_of(
         found["leave_out"] = Baseline(f"reference on itself, +-{leave_out} left out", itself)
     pair, batch = (run.reference, run.query), model.batch_size
     if not _is_plain_hog(model):
-        found |= hog_baselines(*pair, batch, run.tolerance, progress, matching, run.beside)
+        same = recipe_of(model.preprocess) == recipe_of(Preprocess())
+        known = [model.descriptor.hog_of(traverse) for traverse in pair] if same else []
+        found |= hog_baselines(*pair, batch, run.tolerance, progress, matching, run.beside, known)
     if run.sequence is not None:  # SeqSLAM compares the grey pixels of small frames by L1
         plain = DejaVu(PatchPixels(), "none", batch_size=batch, preprocess=Preprocess("grey"))
         names = {"seqslam": ("SeqSLAM's pixels: grey, patches normalised", 1)}
@@ -319,13 +321,17 @@ def hog_baselines(
     progress: bool = False,
     matching: Matching = SINGLE,
     smoother: PlaceSmoother | None = None,
+    known: Sequence[Tensor | None] = (),
 ) -> dict[str, Baseline]:
-    """HOG of all frames and of every k-th, k = 2 x tolerance, by L1; empty if HOG cannot be computed."""
+    """HOG of all frames and of every k-th, k = 2 x tolerance, by L1; empty if HOG cannot be computed.
+
+    known: HOG of both traverses, if it has been computed before.
+    """
     one = "place" if isinstance(reference, ResampledTraverse) else "frame"
     strides = {"hog": 1, "hog_stride_coarsest": max(1, 2 * tolerance)}
     names = {key: (f"HOG, {every(k, one)}", k) for key, k in strides.items()}
     plain = DejaVu(whitening="none", batch_size=batch_size)
-    return _described_baselines(plain, names, (reference, query), progress, matching, smoother)
+    return _described_baselines(plain, names, (reference, query), progress, matching, smoother, known)
 
 
 def _described_baselines(
@@ -335,12 +341,16 @@ def _described_baselines(
     progress: bool,
     matching: Matching,
     smoother: PlaceSmoother | None,
+    known: Sequence[Tensor | None] = (),
 ) -> dict[str, Baseline]:
     """Baselines by L1 that store every k-th reference frame, described by `plain`."""
     if len(traverses[0].frame_shape) != 3:
         return {}
     try:
-        stored, queries = (plain.descriptor.all_of(traverse, progress) for traverse in traverses)
+        stored, queries = (
+            plain.descriptor.all_of(traverse, progress) if rows is None else rows
+            for traverse, rows in zip(traverses, known or (None, None), strict=True)
+        )
     except InputError as error:
         log.info("no %s to compare with: %s", type(plain.features).__name__, error)
         return {}

@@ -150,29 +150,33 @@ def compare(
     # without a given truth, each place would be its own answer
     known = None if itself and truth is None else ground_truth_of(truth, reference, query, interpolate)
 
-    with timed(seconds, "describe" if has_map else "learn"):
-        places = _learned(model, reference, second, tolerance, progress)
-        if isinstance(calibration, LabelledFrames) or (calibration is None and not has_map):
-            calibrate_if_possible(model, reference, calibration, progress=progress)
-    with timed(seconds, "localize"):
-        beside = in_order and known is not None and not itself  # without truth they have no scores
-        beside = beside and (ordered is not None or len(query) * model.map.places <= MAX_FILTERED)
-        also = models_beside(causal, beside, len(query), model.map.places, tolerance)
-        alike = PlaceSmoother(within=tolerance) if beside and len(query) > 1 else None
-        centring = in_order and model.centres(len(query)) if centre is None else centre
-        run = _described(model, reference, query, places, centring, tolerance, progress)
-        run = run._replace(matching=Matching(causal, also, apart=loops))
-        run, found = _localized(run, smoother is not None, top, progress)
-        run, candidates = _smoothed(run, found, smoother, alike, progress)
-    off_map = _match_distractors(model, off, smoother or causal, centring, progress)
+    rivals = () if known is None else (reference, query)  # of HOG, for its baseline
+    with model.descriptor.setting_aside(*rivals):
+        with timed(seconds, "describe" if has_map else "learn"):
+            places = _learned(model, reference, second, tolerance, progress)
+            if isinstance(calibration, LabelledFrames) or (calibration is None and not has_map):
+                calibrate_if_possible(model, reference, calibration, progress=progress)
+        with timed(seconds, "localize"):
+            beside = in_order and known is not None and not itself  # without truth they have no scores
+            beside = beside and (ordered is not None or len(query) * model.map.places <= MAX_FILTERED)
+            also = models_beside(causal, beside, len(query), model.map.places, tolerance)
+            alike = PlaceSmoother(within=tolerance) if beside and len(query) > 1 else None
+            centring = in_order and model.centres(len(query)) if centre is None else centre
+            run = _described(model, reference, query, places, centring, tolerance, progress)
+            run = run._replace(matching=Matching(causal, also, apart=loops))
+            run, found = _localized(run, smoother is not None, top, progress)
+            run, candidates = _smoothed(run, found, smoother, alike, progress)
+        off_map = _match_distractors(model, off, smoother or causal, centring, progress)
 
-    model.cpu()
-    if known is not None:
-        known = ground_truth_in_places(known, model.map.place_of)
-        known = of_loops(known, torch.arange(len(query)), loops) if loops is not None else known
-    run = run._replace(truth=known, reference_features=places.cpu(), query_features=run.query_features.cpu())
-    ours = run.contend("this map", run.judged.renumbered(model.map.table.scored), model)
-    contenders = _other_contenders(run, others or {}, leave_out, seed, progress)
+        model.cpu()
+        if known is not None:
+            known = ground_truth_in_places(known, model.map.place_of)
+            known = of_loops(known, torch.arange(len(query)), loops) if loops is not None else known
+        run = run._replace(
+            truth=known, reference_features=places.cpu(), query_features=run.query_features.cpu()
+        )
+        ours = run.contend("this map", run.judged.renumbered(model.map.table.scored), model)
+        contenders = _other_contenders(run, others or {}, leave_out, seed, progress)
     coded = model.map if ours.scores is not None and isinstance(model.map, SpectralMap) else None
     storage = coded_at_sizes(run, seed=seed, progress=progress) if storage_curve and coded else None
     pictures = draw_pictures(run, {"map": ours, **contenders}, storage)

@@ -75,6 +75,7 @@ class Descriptor(nn.Module):
         self.reduces = False  # whether the whitening was added for ready features that are too wide for a map
         self.warned: set[tuple[str, str]] = set()  # (traverse, line) of warnings that were logged
         self.known: dict[object, tuple[object, Tensor]] | None = None  # features, see `remembering`
+        self.aside: dict[int, list[Tensor]] = {}  # batches of HOG, see `setting_aside`
         self.register_buffer("_where", torch.zeros(0), persistent=False)
 
     @property
@@ -117,7 +118,8 @@ class Descriptor(nn.Module):
         size = max(1, min(self.batch_size, BATCH_NUMBERS // (3 * height * width)))
         settings = self.device, progress, verb, on_first, self.describe
         if self.known is None:
-            return feature_batches(traverse, self, size, *settings)
+            batches = feature_batches(traverse, self, size, *settings)
+            return self._set_aside(batches, traverse) if id(traverse) in self.aside else batches
         key = traverse.name if isinstance(traverse, AugmentedFrames) else id(traverse)
         if key not in self.known:
             features = concatenate(feature_batches(traverse, self, size, *settings))
@@ -132,6 +134,30 @@ class Descriptor(nn.Module):
             yield
         finally:
             self.known = None
+
+    @contextmanager
+    def setting_aside(self, *traverses: Traverse) -> Iterator[None]:
+        """In the block, `HOG()` of these traverses is kept where the features have it, for `hog_of`."""
+        self.aside = {id(traverse): [] for traverse in traverses}
+        try:
+            yield
+        finally:
+            self.aside = {}
+
+    def hog_of(self, traverse: Traverse) -> Tensor | None:
+        """`HOG()` (N,D) of a traverse, if it was set aside whole."""
+        parts = self.aside.get(id(traverse), [])
+        return torch.cat(parts) if sum(map(len, parts)) == len(traverse) else None
+
+    def _set_aside(self, batches: Iterator[Tensor], traverse: Traverse | AugmentedFrames) -> Iterator[Tensor]:
+        """The batches, whose part that is `HOG()` is kept, unless it is large."""
+        parts = self.aside[id(traverse)]
+        parts.clear()  # of an earlier reading
+        for batch in batches:
+            hog = _plain_hog(self.features, batch)
+            if hog is not None and 4 * len(traverse) * hog.shape[1] <= DESCRIPTOR_MEMORY:
+                parts.append(hog.to("cpu", copy=True))
+            yield batch
 
     def batches(
         self,
@@ -393,6 +419,15 @@ def _for_frames(features: nn.Module, height: int, width: int) -> nn.Module:
     members = [_for_frames(member, height, width) for member in features.members]
     same = all(one is own for one, own in zip(members, features.members, strict=True))
     return features if same else Joined(members).train(features.training)
+
+
+def _plain_hog(features: nn.Module, rows: Tensor) -> Tensor | None:
+    """The columns of features (B,D) that are those of `HOG()`, if any."""
+    members = [*features.members] if isinstance(features, Joined) else [features]
+    parts = rows.split(groups_of(features) or rows.shape[1], 1)
+    plain = HOG().extra_repr()
+    known = (type(one) is HOG and one.extra_repr() == plain for one in members)
+    return next((part for part, same in zip(parts, known, strict=True) if same), None)
 
 
 def own_size(features: nn.Module, block: bool = False) -> tuple[int, int] | None:

@@ -202,7 +202,7 @@ class TemplateMap(PlaceMap):
         for start, stop, layers in self.segments:
             if layers:
                 count, plan = stop - start, self.plan
-                rows = [_at_places(distances[j], laps[j], start - plan[j].start, count) for j in layers]
+                rows = (_at_places(distances[j], laps[j], start - plan[j].start, count) for j in layers)
                 parts.append(reduce(torch.add, rows) / self.divisor(layers))
             else:
                 parts.append(torch.full_like(distances[0][:, :1], math.inf).expand(-1, stop - start))

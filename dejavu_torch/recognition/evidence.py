@@ -14,6 +14,7 @@ LOWEST, HIGHEST, PER_DEVIATION = -8, 40, 64  # standard deviations of a rank tab
 MIN_SHARE = 1e-30  # of wrong scores, for a finite normal score
 SMALLEST = 0.05  # autocorrelation at which the sum over lags ends
 DETRENDED = 25  # queries to each side whose mean is a trend
+COLUMNS = 256  # of descriptors that are transformed at a time
 UNCHANGED = 0.05  # of a typical step: the queries of a stop differ less than that from its first
 STOP = 20  # queries of a stop; in a shorter one, as where frames repeat in the dark, the camera may move
 
@@ -39,10 +40,8 @@ def spacing_of(queries: Tensor) -> Spacing:
     same = unchanged(queries)
     length = run_lengths(same)
     moving = queries[~same]
-    trend = local_mean(moving, DETRENDED)
-    return Spacing(
-        1 / length, same & (length > STOP), correlation_time(moving), correlation_time(moving - trend)
-    )
+    detrended = correlation_time(moving, lambda part: part - local_mean(part, DETRENDED))
+    return Spacing(1 / length, same & (length > STOP), correlation_time(moving), detrended)
 
 
 def unchanged(queries: Tensor) -> Tensor:
@@ -75,18 +74,24 @@ def local_mean(queries: Tensor, side: int) -> Tensor:
     return ((sums[last] - sums[first]) / (last - first)[:, None]).to(queries)
 
 
-def correlation_time(queries: Tensor) -> float:
-    """1 + 2 x the autocorrelations of the centred descriptors (Q,K), up to the first below .05.
+def correlation_time(queries: Tensor, change: Callable[[Tensor], Tensor] = Tensor.double) -> float:
+    """1 + 2 x the autocorrelations of the centred descriptors (Q,K), up to the first below .05; of columns
+    that are changed first.
 
     Example:
         >>> correlation_time(torch.tensor([[1.0], [-1], [1], [-1]]))
         1.0
     """
     count = len(queries)
-    centred = (queries - queries.mean(0)).double() if count > 1 else queries.double()
-    if count < 2 or not centred.square().sum() > 0:
+    if count < 2:
         return 1.0
-    power = torch.fft.rfft(centred, n=2 * count, dim=0).abs().square().sum(1)
+    power = torch.zeros(count + 1, dtype=torch.float64, device=queries.device)
+    for part in queries.split(COLUMNS, 1):  # which the cache holds
+        part = change(part)
+        centred = (part - part.mean(0)).double()
+        power += torch.fft.rfft(centred, n=2 * count, dim=0).abs().square().sum(1)
+    if not power.sum() > 0:
+        return 1.0
     lags = torch.fft.irfft(power, n=2 * count)[:count] / torch.arange(count, 0, -1, device=power.device)
     lags = lags / lags[0]
     small = (lags < SMALLEST).nonzero()

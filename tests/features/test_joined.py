@@ -16,6 +16,7 @@ from dejavu_torch import (
     Embedding,
     SpectralMapper,
     Whitening,
+    compare,
     open_source,
 )
 from dejavu_torch.cli.commands import run_learn
@@ -227,3 +228,26 @@ def test_a_network_of_a_function_beside_hog(folder, capsys):
 def test_mistakes_are_one_line(words, seen, folder, capsys):
     assert seen in fails(capsys, *LEARN, *words)
     assert not (folder / "map.safetensors").exists()
+
+
+def test_plain_hog_is_set_aside_where_the_features_have_it():
+    route, other = (open_source(f"sim:aerial?frames=80&traverse={i}") for i in (0, 1))
+    model = DejaVu()
+    with model.descriptor.setting_aside(route, other):
+        model.learn(route)
+        next(model.descriptor.batches(other))  # not whole
+        assert torch.equal(model.descriptor.hog_of(route), HOG()(route[:]))
+        assert model.descriptor.hog_of(other) is None
+    assert model.descriptor.hog_of(route) is None
+    model = DejaVu(HOG(cell=16))
+    with model.descriptor.setting_aside(route):
+        model.learn(route)
+        assert model.descriptor.hog_of(route) is None
+
+
+def test_the_baseline_of_hog_is_that_of_the_features(monkeypatch):
+    route, other = (open_source(f"sim:aerial?frames=80&traverse={i}") for i in (0, 1))
+    same = compare(route, other, truth=0).report
+    monkeypatch.setattr(DejaVu().descriptor.__class__, "hog_of", lambda *_: None)  # described once more
+    again = compare(route, other, truth=0).report
+    assert again.contenders["hog"].scores == same.contenders["hog"].scores
