@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -50,7 +52,8 @@ class Augmentation(nn.Module):
     Convention: changes follow in this order. Rotation, shift, scale and perspective, together, change 90 %
         of clips and repeat the border; gamma, occlusion and noise 70 %, illumination and blur 50 %. Frames of
         a clip share all but the noise; a single clip is covered with black. No gradient passes. Random
-        numbers are from torch's generators. Eval mode returns the input itself.
+        numbers are from torch's generator of the frames' device, or from the one that is given, as of the CPU
+        for the same copies on every device. Eval mode returns the input itself.
 
     Raises:
         InputError: a strength out of range; forward: frames of another shape or dtype, or too small to blur.
@@ -101,7 +104,7 @@ class Augmentation(nn.Module):
 
     @torch.no_grad()
     @without_autocast
-    def forward(self, frames: Tensor) -> Tensor:
+    def forward(self, frames: Tensor, generator: torch.Generator | None = None) -> Tensor:
         if not self.training:
             return frames
         (blur,), (noise,) = self.strengths["blur"], self.strengths["noise"]
@@ -114,16 +117,18 @@ class Augmentation(nn.Module):
         if not len(frames):
             return frames
         clips = frames if frames.ndim == 5 else frames[:, None]
+        draw = _Draw(len(clips), clips.device, generator)
         gain, offset = self.strengths["colour"]
-        draw = _random(clips, 2, len(clips), 1, clips.shape[2], 1, 1) * 2 - 1
-        clips = (clips * (1 + gain * draw[0]) + offset * draw[1]).clamp_(0, 1)  # a copy, to change in place
-        clips = self._lit(self._warped(clips))
-        clips = self._occluded(_blurred(clips, blur, radius) if blur else clips)
+        colour = draw.numbers(2, len(clips), 1, clips.shape[2], 1, 1) * 2 - 1
+        # a copy, to change in place
+        clips = torch.addcmul(offset * colour[1], clips, 1 + gain * colour[0]).clamp_(0, 1)
+        clips = self._lit(self._warped(clips, draw), draw)
+        clips = self._occluded(_blurred(clips, blur, radius, draw) if blur else clips, draw)
         if noise:
-            clips = torch.randn_like(clips).mul_(_happens(clips, NOISY)).mul_(noise).add_(clips)
+            clips.addcmul_(draw.normal(*clips.shape), noise * draw.happens(NOISY))
         return clips.clamp_(0, 1).reshape(shape)
 
-    def _warped(self, clips: Tensor) -> Tensor:
+    def _warped(self, clips: Tensor, draw: _Draw) -> Tensor:
         """Rotation, shift, scale and perspective by one homography."""
         names = ("rotation", "scale", "perspective", "shift")
         (turn,), (zoom,), (slant,), shift = (self.strengths[name] for name in names)
@@ -132,45 +137,53 @@ class Augmentation(nn.Module):
         height, width = clips.shape[-2:]
         longest = max(height, width)  # the unit of length
         sides = clips.new_tensor([width, height]) / longest
-        draw = (2 * _random(clips, 6, len(clips)) - 1) * _happens(clips, WARPED).flatten()
-        angle, tilts = (turn * draw[0]).deg2rad(), (slant * draw[1:3]).deg2rad()
-        zooms, moves = 1 + zoom * draw[3], draw[4:] * sides[:, None] * clips.new_tensor(shift)[:, None]
+        drawn = (2 * draw.numbers(6, len(clips)) - 1) * draw.happens(WARPED).flatten()
+        angle, tilts = (turn * drawn[0]).deg2rad(), (slant * drawn[1:3]).deg2rad()
+        zooms, moves = 1 + zoom * drawn[3], drawn[4:] * sides[:, None] * clips.new_tensor(shift)[:, None]
         u, v = (torch.arange(1 - n, n, 2, device=clips.device) for n in (width, height))
         u, v = (pixels.to(clips) / (2 * longest) for pixels in (u, v))
         points = torch.stack(torch.broadcast_tensors(u, v[:, None], u.new_ones(()))).flatten(1)
-        source = _homography(angle, zooms, moves, tilts) @ points
-        grid = (source[:, :2] / source[:, 2:]).mT * (2 / sides)
+        homography = _homography(angle, zooms, moves, tilts)
+        if slant:
+            source = homography @ points
+            source = source[:, :2] / source[:, 2:]
+        else:  # the third row is 0, 0, 1
+            source = homography[:, :2] @ points
+        grid = source.mT * (2 / sides)
         images, grid = clips.flatten(1, 2), grid.view(-1, height, width, 2)
         return F.grid_sample(images, grid, padding_mode="border", align_corners=False).view(clips.shape)
 
-    def _lit(self, clips: Tensor) -> Tensor:
+    def _lit(self, clips: Tensor, draw: _Draw) -> Tensor:
         """Exposure, gamma and illumination, in place."""
         names = ("exposure", "gamma", "illumination")
         (gain, offset), (gamma,), (slope,) = (self.strengths[name] for name in names)
-        if offset:
-            clips = clips.add_(_uniform(clips, -offset, offset)).clamp_(0, 1)
-        if gain:
-            clips = clips.mul_(_uniform(clips, 1 - gain, 1 + gain)).clamp_(0, 1)
+        add = draw.between(-offset, offset) if offset else 0
+        times = draw.between(1 - gain, 1 + gain) if gain else 1
+        if offset or gain:  # clamped after each of both: the bounds of the first are multiplied by the second
+            low, high = (torch.as_tensor(bound).to(clips) for bound in (0.0, times))
+            clips = clips.add_(add).mul_(times)
+            clips = clips.clamp_(low, torch.minimum(high, torch.ones_like(high)))
         if gamma:
-            power = _uniform(clips, 1 / (1 + gamma), 1 + gamma)
-            power = torch.where(_happens(clips, DEVELOPED), power, 1)
-            clips = clips.log_().mul_(power).exp_()  # faster than pow; 0 stays 0
+            power = draw.between(1 / (1 + gamma), 1 + gamma)
+            changed = draw.happens(DEVELOPED).flatten().nonzero()[:, 0]
+            part = clips[changed].log_().mul_(power[changed]).exp_()  # faster than pow; 0 stays 0
+            clips[changed] = part
         if slope:
             height, width = clips.shape[-2:]
             x = torch.linspace(0, 1, width, dtype=clips.dtype, device=clips.device)
             y = torch.linspace(0, 1, height, dtype=clips.dtype, device=clips.device)[:, None]
             ramps = torch.stack(torch.broadcast_tensors(x, 1 - x, y, 1 - y))
-            side = torch.randint(4, (len(clips),), device=clips.device)
-            most = _uniform(clips, -slope, slope) * _happens(clips, LIT)
+            side = draw.below(4)
+            most = draw.between(-slope, slope) * draw.happens(LIT)
             clips = clips.add_(most * ramps[side][:, None, None]).clamp_(0, 1)
         return clips
 
-    def _occluded(self, clips: Tensor) -> Tensor:
+    def _occluded(self, clips: Tensor, draw: _Draw) -> Tensor:
         """A rectangle of each clip is replaced by that of the clip before."""
         (most,) = self.strengths["occlusion"]
         if not most:
             return clips
-        area, ratio, y, x = _random(clips, 4, len(clips), 1, 1, 1, 1)
+        area, ratio, y, x = draw.numbers(4, len(clips), 1, 1, 1, 1)
         area, ratio = most * area, 3 ** (2 * ratio - 1)
 
         def inside(pixels: int, side: Tensor, where: Tensor) -> Tensor:
@@ -182,24 +195,44 @@ class Augmentation(nn.Module):
         height, width = clips.shape[-2:]
         covered = inside(height, (area / ratio).sqrt(), y).mT & inside(width, (area * ratio).sqrt(), x)
         other = clips.roll(1, 0) if len(clips) > 1 else torch.zeros_like(clips)
-        return torch.where(covered & _happens(clips, OCCLUDED), other, clips)
+        # of 0 or 1 lerp is exact, and several times as fast as where
+        return clips.lerp_(other, (covered & draw.happens(OCCLUDED)).to(clips))
 
     def extra_repr(self) -> str:
         shown = {name: value if len(value) > 1 else value[0] for name, value in self.strengths.items()}
         return ", ".join(f"{name}={value}" for name, value in shown.items())
 
 
-def _uniform(clips: Tensor, low: float, high: float) -> Tensor:
-    """A random number for each clip, (B,1,1,1,1)."""
-    return low + (high - low) * _random(clips, len(clips), 1, 1, 1, 1)
+class _Draw(NamedTuple):
+    """Random numbers for clips, float32."""
 
+    clips: int
+    device: torch.device
+    generator: torch.Generator | None
 
-def _random(clips: Tensor, *shape: int) -> Tensor:
-    return torch.rand(shape, dtype=clips.dtype, device=clips.device)
+    def numbers(self, *shape: int) -> Tensor:
+        """Between 0 and 1."""
+        return torch.rand(shape, **self._where).to(self.device)
 
+    def normal(self, *shape: int) -> Tensor:
+        return torch.randn(shape, **self._where).to(self.device)
 
-def _happens(clips: Tensor, chance: float) -> Tensor:
-    return _uniform(clips, 0, 1) < chance
+    def below(self, most: int) -> Tensor:
+        """(B,) int64."""
+        return torch.randint(most, (self.clips,), **(self._where | {"dtype": torch.int64})).to(self.device)
+
+    def between(self, low: float, high: float) -> Tensor:
+        """For each clip, (B,1,1,1,1)."""
+        return low + (high - low) * self.numbers(self.clips, 1, 1, 1, 1)
+
+    def happens(self, chance: float) -> Tensor:
+        """For each clip, (B,1,1,1,1) bool."""
+        return self.between(0, 1) < chance
+
+    @property
+    def _where(self) -> dict[str, Any]:
+        device = self.device if self.generator is None else self.generator.device
+        return {"dtype": torch.float32, "device": device, "generator": self.generator}
 
 
 def _homography(angle: Tensor, zoom: Tensor, shift: Tensor, tilt: Tensor) -> Tensor:
@@ -216,11 +249,13 @@ def _homography(angle: Tensor, zoom: Tensor, shift: Tensor, tilt: Tensor) -> Ten
     return torch.stack(turned, 1).view(-1, 3, 3) @ torch.stack(seen, 1).view(-1, 3, 3)
 
 
-def _blurred(clips: Tensor, most: float, radius: int) -> Tensor:
+def _blurred(clips: Tensor, most: float, radius: int, draw: _Draw) -> Tensor:
     from kornia.filters import gaussian_blur2d  # loading kornia takes a second
 
-    sigma = _uniform(clips, min(0.1, most), most)
-    sigma = torch.where(_happens(clips, BLURRED), sigma, NO_BLUR).view(-1, 1).expand(-1, 2)
-    size = (2 * radius + 1, 2 * radius + 1)
-    blurred: Tensor = gaussian_blur2d(clips.flatten(1, 2), size, sigma, separable=radius > LARGE_BLUR)
-    return blurred.view(clips.shape)
+    sigma = draw.between(min(0.1, most), most)
+    changed = draw.happens(BLURRED).flatten().nonzero()[:, 0]
+    if len(changed):
+        sigma, size, part = sigma[changed].view(-1, 1).expand(-1, 2), (2 * radius + 1,) * 2, clips[changed]
+        blurred = gaussian_blur2d(part.flatten(1, 2), size, sigma, separable=radius > LARGE_BLUR)
+        clips[changed] = blurred.view(part.shape)
+    return clips

@@ -138,7 +138,7 @@ class Descriptor(nn.Module):
     @contextmanager
     def setting_aside(self, *traverses: Traverse) -> Iterator[None]:
         """In the block, `HOG()` of these traverses is kept where the features have it, for `hog_of`."""
-        self.aside = {id(traverse): [] for traverse in traverses}
+        self.aside = {id(traverse): [] for traverse in traverses if not is_ready(traverse)}
         try:
             yield
         finally:

@@ -52,7 +52,8 @@ def feature_batches(
     done, copies = 0, traverse.copies if isinstance(traverse, AugmentedFrames) else 1
     size = max(batch_size, READY) if len(traverse.frame_shape) == 1 else batch_size
     with progress_of(verb, len(traverse) // copies, progress) as update, in_mode(module, False):
-        for batch in traverse.batches(size):
+        where = (device,) if isinstance(traverse, AugmentedFrames) else ()
+        for batch in traverse.batches(size, *where):
             with torch.no_grad():
                 features = features_of(batch.to(device), describe or module, traverse.name).detach()
             if features.dtype in (torch.float16, torch.bfloat16):  # too coarse for sums and transforms

@@ -6,6 +6,7 @@ import copy
 from typing import Literal
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from dejavu_torch.features.preprocess import check_frames, in_parts
@@ -160,6 +161,10 @@ def cell_histograms(dy: Tensor, dx: Tensor, orientations: int, cell: int, bins: 
             (lower.remainder(orientations), magnitude * (1 - upper_share)),
             ((lower + 1).remainder_(orientations), magnitude * upper_share),
         ]
+    if dy.device.type != "cpu":  # three operations, and the same sums each time
+        bin = torch.arange(orientations, device=dy.device)[:, None, None]
+        voted = torch.stack([(slot[:, None] == bin) * share[:, None] for slot, share in shares])
+        return F.avg_pool2d(voted.sum(0), cell).permute(0, 2, 3, 1).contiguous()
     y, x = (torch.arange(n * cell, device=dy.device).div(cell, rounding_mode="floor") for n in (ny, nx))
     first = (y[:, None] * nx + x) * orientations
     votes = magnitude.new_zeros(batch, ny * nx * orientations)

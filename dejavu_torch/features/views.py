@@ -155,17 +155,14 @@ class AugmentedFrames:
     def __len__(self) -> int:
         return len(self.places)
 
-    def batches(self, size: int) -> Iterator[Tensor]:
-        """All copies, at most `size` at a time."""
-        state = torch.Generator().manual_seed(self.seed).get_state()
+    def batches(self, size: int, device: torch.device | str = "cpu") -> Iterator[Tensor]:
+        """All copies, at most `size` at a time, made on a device of random numbers of the CPU."""
+        generator = torch.Generator().manual_seed(self.seed)
         size = self.traverse.at_once(size)
         for block in (run[i : i + self.block] for run in self.runs for i in range(0, len(run), self.block)):
-            frames, (low, high) = spread(self.traverse[block], self.span), self.span
+            frames, (low, high) = spread(self.traverse[block].to(device), self.span), self.span
             for _ in range(self.copies):
-                with torch.random.fork_rng(devices=[]):
-                    torch.set_rng_state(state)
-                    copies: Tensor = self.augmentation.train()(frames)
-                    state = torch.get_rng_state()
+                copies: Tensor = self.augmentation.train()(frames, generator)
                 copies = copies if self.span == (0, 1) else low + (high - low) * copies
                 yield from (as_shape(part, self.frame_shape) for part in copies.split(size))
 

@@ -21,7 +21,7 @@ from dejavu_torch.data.source import as_traverse, routes_of
 from dejavu_torch.data.traverse import runs as runs_of
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.views import SEGMENT
-from dejavu_torch.memory import check_room, concatenate
+from dejavu_torch.memory import check_room, concatenate, free_memory
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, resampled
 from dejavu_torch.resize import resize_frames
@@ -60,10 +60,16 @@ class StoredFrames(Dataset[Batch]):
         frames, first = torch.tensor(index), 0
         chosen = self.values.new_empty(len(frames), *self.values.shape[1:])
         for part in self.parts:  # not joined, as they may lie in files
-            here = (frames >= first) & (frames < first + len(part))
-            chosen[here] = part[frames[here] - first]
+            here = ((frames >= first) & (frames < first + len(part))).nonzero()[:, 0]
+            chosen[here.to(chosen.device)] = part[(frames[here] - first).to(part.device)]
             first += len(part)
         return Batch(as_frames(chosen), GroundTruth(*(part[index] for part in self.truth)))
+
+    def move(self, device: torch.device) -> None:
+        """Keep them on the device that trains, if they take at most half of what it has free."""
+        free = torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else free_memory()
+        if device.type != "cpu" and 2 * sum(part.nbytes for part in self.parts) <= free:
+            self.parts = [part.to(device) for part in self.parts]
 
 
 class InOrder(DistributedSampler[list[int]]):  # a class that Lightning does not replace
@@ -352,6 +358,9 @@ class RouteData(LightningDataModule):
 
     def train_dataloader(self) -> DataLoader[Batch]:
         """Stored frames of the reference and of the second traverse; this process's part."""
+        if self.trainer is not None:
+            for one in self.sets.values():
+                one.move(self.trainer.strategy.root_device)
         return self.training_batches(*self._processes)
 
     @property

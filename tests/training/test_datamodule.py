@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from devices import pretend
 from footage import QUERY, REFERENCE, camera
 from footage import footage as ground
 from helpers import refused
@@ -14,6 +15,7 @@ from hypothesis import strategies as st
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth
 from dejavu_torch.features.augmentation import Augmentation
+from dejavu_torch.training import datamodule
 from dejavu_torch.training.datamodule import Batch, Clips, RouteData, as_frames, store
 
 
@@ -192,3 +194,16 @@ class Mixed(ArrayTraverse):
 def test_what_does_not_fit_is_refused(settings, facts):
     with refused(*facts):
         route(**settings).train_dataloader()
+
+
+def test_frames_move_to_the_device_that_trains_if_they_fit(monkeypatch):
+    with pretend() as device:
+        for free, moved in ((10**9, True), (0, False)):
+            monkeypatch.setattr(datamodule, "free_memory", lambda free=free: free)
+            data = RouteData(torch.rand(12, 3, 4, 4), tolerance=2)
+            data.setup("fit")
+            stored = data.sets["reference"]
+            here = stored[[3, 5]].frames
+            stored.move(device)
+            assert (stored.values.device == device) is moved
+            assert torch.equal(stored[[3, 5]].frames.cpu(), here)
