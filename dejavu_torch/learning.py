@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import accumulate, pairwise
 from pathlib import Path
 from time import monotonic
 from typing import NoReturn, cast
@@ -12,6 +13,7 @@ from typing import NoReturn, cast
 import torch
 from torch import Tensor
 
+from dejavu_torch.area import Area
 from dejavu_torch.data.traverse import Part
 from dejavu_torch.features.descriptor import Descriptor
 from dejavu_torch.features.views import (
@@ -28,7 +30,7 @@ from dejavu_torch.features.views import (
 from dejavu_torch.features.whitening import STRENGTHS
 from dejavu_torch.maps.file import part_of, read_map, write_map
 from dejavu_torch.maps.place_map import Mapper, PlaceMap
-from dejavu_torch.maps.spectral import SpectralMapper, encode_chunk
+from dejavu_torch.maps.spectral import SpectralMapper, encode_chunk, line_sizes
 from dejavu_torch.maps.spectral_map import Chunk, SpectralMap
 from dejavu_torch.maps.spectrum import Transform
 from dejavu_torch.memory import concatenate, in_one_thread
@@ -71,7 +73,9 @@ class ChunkEncoder:
             if self.visits is not None:
                 shown = views_of(self.visits, torch.arange(frames.start, frames.stop))
                 rows = averaged(self.descriptor, rows, shown)
-            return encode_chunk(rows, self.mean, self.step, self.transform, self.resolution)
+            area = self.traverse.area
+            columns = 1 if area is None else area.columns_from(frames.start)
+            return encode_chunk(rows, self.mean, self.step, self.transform, self.resolution, columns)
 
 
 class Checkpoint:
@@ -163,13 +167,15 @@ def fit(
     progress: bool = False,
 ) -> SpectralMap:
     """A map without places, but with whitening, mean and step from the sample of a long traverse."""
-    sample = Sample.of(len(traverse), mapper.chunk)
+    sample = Sample.of(len(traverse), mapper.chunk, traverse.area)
     views = second and sample.views(second)
     rows = descriptor.learn(Part(traverse, sample.frame), views, progress, verb="sampling")
     if visits is not None:
         rows = averaged(descriptor, rows, views_of(visits, sample.frame), progress)
     # the sample is charged its share of the fixed bytes
-    return mapper.fit(rows, sample.segment, len(rows) / len(traverse)).to(descriptor.device)
+    place_map = mapper.fit(rows, sample.sizes, len(rows) / len(traverse)).to(descriptor.device)
+    place_map.area = traverse.area
+    return place_map
 
 
 def append_places(
@@ -195,7 +201,9 @@ def append_places(
     frames, settings = len(traverse), (place_map.transform, place_map.resolution)
     encode = ChunkEncoder(traverse, descriptor, place_map.means[-1], place_map.step, *settings, visits)
     done = range(place_map.places - start)
-    tasks = [range(i, min(i + place_map.chunk, frames)) for i in range(len(done), frames, place_map.chunk)]
+    sizes = line_sizes(frames, place_map.chunk) if traverse.area is None else traverse.area.tiles
+    bounds = pairwise(accumulate((rows * columns for rows, columns in sizes), initial=0))
+    tasks = [range(*each) for each in bounds if each[0] >= len(done)]
     held: list[Chunk] = []
 
     def add() -> None:
@@ -232,9 +240,11 @@ def count_drives(place_map: PlaceMap, second: LabelledFrames | None) -> None:
 
 
 @torch.no_grad()
-def learn_descriptors(mapper: Mapper, descriptors: Tensor) -> PlaceMap:
-    """The map of descriptors (N,K); a map of other sizes is refused."""
-    place_map: PlaceMap = mapper(descriptors)
+def learn_descriptors(mapper: Mapper, descriptors: Tensor, area: Area | None = None) -> PlaceMap:
+    """The map of descriptors (N,K), of an area if one is given; a map of other sizes is refused."""
+    seen = f"{type(mapper).__name__}, and an area of {len(descriptors)} places"
+    expect(area is None or isinstance(mapper, SpectralMapper), "a SpectralMapper for an area", seen)
+    place_map: PlaceMap = mapper(descriptors) if area is None else mapper(descriptors, area)
     if (place_map.places, place_map.dimension) != tuple(descriptors.shape):
         seen = f"{place_map.places} places and {place_map.dimension} features"
         seen = f"{type(mapper).__name__} made a map of {seen}"

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torch.nn.parameter import is_lazy
 
 from dejavu_torch import learning, model_file
+from dejavu_torch.area import Area
 from dejavu_torch.data.source import Source, as_traverse
 from dejavu_torch.data.traverse import at_size, resize_like, size_like
 from dejavu_torch.features.descriptor import Descriptor, own_size
@@ -233,14 +234,18 @@ class DejaVu(nn.Module):
                 rows = descriptor.learn(traverse, second, progress, isinstance(mapper, SpectralMapper))
                 if visits is not None:
                     rows = learning.averaged(descriptor, rows, visits, progress)
-                learned = learning.learn_descriptors(mapper, rows)
+                learned = learning.learn_descriptors(mapper, rows, traverse.area)
             if counts is not None:
                 learned.count_visits(learned.visit_counts + counts.to(learned.device))
             learning.count_drives(learned, second)
         return self.replace_map(learned, _state_of(self, learned, traverse))
 
     def learn_features(
-        self, features: Tensor, traverse: Traverse | None = None, second: LabelledFrames | None = None
+        self,
+        features: Tensor,
+        traverse: Traverse | None = None,
+        second: LabelledFrames | None = None,
+        area: Area | None = None,
     ) -> DejaVu:
         """As `learn`, from ready descriptors.
 
@@ -249,8 +254,10 @@ class DejaVu(nn.Module):
             traverse: their source, if known: it tells the map which frames to expect, and the frame of each
                 resampled place.
             second: what the whitening has learned from; the map tells how many drives taught it.
+            area: of the places, if they are in rows and columns and the traverse does not say so.
         """
-        learned = learning.learn_descriptors(self.mapper, features)
+        area = area if traverse is None else traverse.area
+        learned = learning.learn_descriptors(self.mapper, features, area)
         learning.count_drives(learned, second)
         return self.replace_map(learned, _state_of(self, learned, traverse))
 
@@ -453,6 +460,8 @@ class DejaVu(nn.Module):
         require_map(self)
         check_search(matching.search)
         if matching.sequence is not None:
+            seen = f"{type(matching.sequence).__name__}, and the map of an area"
+            expect(self.map.area is None, "single images, sequence=None", seen)
             matching.sequence.check(None, self.map.places)
         single = matching.sequence is None and matching.callback is None
         if not single or matching.search not in ("auto", "coarse"):
@@ -479,7 +488,7 @@ class DejaVu(nn.Module):
             check_candidates(k, apart, self.map.places)
         queries = self.at_map_size(as_traverse(queries), self.frame_shape or ())
         if isinstance(sequence, str):
-            sequence = PlaceSmoother() if queries.ordered else None
+            sequence = PlaceSmoother() if queries.ordered and self.map.area is None else None
         matching = self.matching(sequence, search)._replace(k=k, radius=apart)
         localizer = self.localizer(matching)
         if sequence is not None:

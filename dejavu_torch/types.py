@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import Dataset
 
+from dejavu_torch.area import Area
 from dejavu_torch.text import printable
 
 BATCH_NUMBERS = 2**26  # values in a batch of more than one frame: 256 MB
@@ -84,6 +85,8 @@ class Traverse(Dataset[Tensor], ABC):
         ordered: whether they are known to be consecutive, as in a video; see the filter and sequences.
         sized: whether the user asked for their size, as with `width=` of a video.
         deep: whether its images have more than 8 bits a pixel.
+        area: the rows and columns of windows over an area, whose places are numbered as in `Area`; None along
+            a route.
         cut: of windows of one long image, its size, the window's, and their range; equal: the same places.
 
     Raises:
@@ -104,6 +107,7 @@ class Traverse(Dataset[Tensor], ABC):
     ordered: bool = False
     sized: bool = False
     cut: tuple[tuple[int, ...], range] | None = None
+    area: Area | None = None
 
     @property
     def deep(self) -> bool:

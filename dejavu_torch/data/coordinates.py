@@ -20,8 +20,9 @@ from dejavu_torch.types import Coordinates, InputError, Traverse, expect
 
 log = logging.getLogger("dejavu_torch")
 
-Kind = Literal["utm", "degrees", "metres"]
-FORMS: dict[Kind, str] = {"utm": "@easting@northing@...", "degrees": "@lat@lon@...", "metres": "@x@y@..."}
+Kind = Literal["utm", "degrees", "metres", "pixels"]
+FORMS: dict[Kind, str] = {"utm": "@easting@northing@...", "degrees": "@lat@lon@..."}
+FORMS |= {"metres": "@x@y@...", "pixels": "@x@y@..."}
 MAJOR, ECCENTRICITY = 6_378_137.0, 0.081819190842622  # of the WGS84 ellipsoid: metres, and e
 NAN = (math.nan, math.nan)
 EXPECTED = (
@@ -52,13 +53,13 @@ class Fix(NamedTuple):
 
 def coordinates_of(traverses: Sequence[Traverse], kind: Kind) -> list[Tensor]:
     """Coordinates of traverses in one frame, (N,2) or (N,3) float64 metres each, NaN for frames without. They
-    are those that the traverses carry, for "metres", if one does, else those in names.
+    are those that the traverses carry, for "metres" and "pixels", if one does, else those in names.
 
     Raises:
         InputError: as `named_coordinates`; only some traverses that carry some, or of different kinds.
     """
     carried = [traverse.coordinates for traverse in traverses]
-    if kind != "metres" or not any(carried):
+    if kind not in ("metres", "pixels") or not any(carried):
         return named_coordinates(traverses, kind)
     for own, traverse in zip(carried, traverses, strict=True):
         if own is None:
@@ -176,7 +177,7 @@ def named_coordinates(traverses: Sequence[Traverse], kind: Kind) -> list[Tensor]
     Args:
         kind: "utm": the names have fields @easting@northing[@zone@letter[@lat@lon]]@, as of
             VPR-datasets-downloader; where frames lie in different zones, latitude and longitude are used.
-            "degrees": @lat@lon@. "metres": @x@y@.
+            "degrees": @lat@lon@. "metres", "pixels": @x@y@.
 
     Raises:
         InputError: no names, no coordinates in any of them, degrees where metres were asked for, or zones

@@ -384,8 +384,9 @@ def describe_ground_truth(truth: Truth | None, interpolate: bool = False, positi
     if isinstance(parsed, int):
         return "place = query" + (f" {'-' if parsed < 0 else '+'} {abs(parsed)}" if parsed else "")
     if isinstance(parsed, Near):
-        where = "" if parsed.kind == "metres" else " in image names"
-        return f"within {parsed.radius:g} m by the coordinates{where}"
+        where = "" if parsed.kind in ("metres", "pixels") else " in image names"
+        unit = "px" if parsed.kind == "pixels" else "m"
+        return f"within {parsed.radius:g} {unit} by the coordinates{where}"
     return f"{truth}, interpolated" if interpolate else str(truth)
 
 

@@ -20,6 +20,7 @@ from dejavu_torch.data.coordinates import read_coordinates
 from dejavu_torch.data.demo import DEMOS
 from dejavu_torch.data.files import as_number
 from dejavu_torch.data.folder import IMAGE_SUFFIXES, ImageFolder, natural, read_image
+from dejavu_torch.data.grid import read_grid
 from dejavu_torch.data.h5 import H5_SUFFIXES, DescriptorFile
 from dejavu_torch.data.simulate import SIMULATORS
 from dejavu_torch.data.strip import read_strip
@@ -36,13 +37,14 @@ CONVERTED = {  # kinds of files that other programs turn into images
 }
 READERS: dict[str, Callable[..., Traverse]] = {".npy": read_array}  # by suffix
 READERS |= dict.fromkeys(VIDEO_SUFFIXES, Video) | dict.fromkeys(H5_SUFFIXES, DescriptorFile)
+PICTURES: dict[str, Callable[..., Traverse]] = {"strip:": read_strip, "grid:": read_grid}  # of one image
 KINDS = {int: "integer", float: "floating-point number"}  # types of option values
 PART = {"start": 0, "stop": 0, "step": 1}  # options of every source, see `frame_range`
 EVERY = PART | {"coordinates": "", "crop": "", "mask": ""}
 EXPECTED = (
     "a folder of images or a video, such as clip.mp4?width=160, an .npy file of frames or features, an .h5 "
     "file of hloc, demo:road?traverse=0, sim:aerial?seed=0&traverse=0&frames=3072, sim:outdoor, "
-    "sim:underground, or strip:IMAGE?width=96"
+    "sim:underground, strip:IMAGE?width=96, or grid:IMAGE?window=64"
 )
 
 
@@ -72,7 +74,8 @@ def open_source(source: str | Path, size: tuple[int, int] | None = None) -> Trav
             names of their images in a `.txt` file next to it; an `.h5` file of hloc's global descriptors,
             also with `order=`; `demo:road?traverse=0` or 1, the flights of the demo;
             `sim:NAME?seed=0&traverse=0&frames=3072`, NAME being aerial, outdoor or underground; or
-            `strip:IMAGE?width=96&rows=32:128&halve=1&grey=1`, a window sliding along one long image. For all
+            `strip:IMAGE?width=96&rows=32:128&halve=1&grey=1`, a window sliding along one long image; or
+            `grid:IMAGE?window=64&stride=8&scale=.5`, windows over a picture of an area, see `Grid`. For all
             sources, `start=`, `stop=` and `step=` select every step-th of the frames [start, stop), and
             `coordinates=FILE` tells where they were taken, see `read_coordinates`. `mask=IMAGE` makes what is
             black in an image black in all frames, then `crop=TOP,BOTTOM,LEFT,RIGHT` removes pixels.
@@ -131,7 +134,7 @@ def check_not_read(out: Path, *sources: str | Path | None) -> None:
     sources may be any text."""
     for source in filter(None, sources):
         address, query = _split(str(source))
-        path, read = Path(address.removeprefix("strip:")), False
+        path, read = Path(address.removeprefix("strip:").removeprefix("grid:")), False
         beside = [Path(file) for name, file in parse_qsl(query) if name in ("coordinates", "mask")]
         with suppress(OSError, ValueError, RuntimeError):  # missing, not a valid path, or a link to itself
             names = [path.with_suffix(".txt")] if path.suffix.lower() == ".npy" else []
@@ -144,7 +147,7 @@ def check_not_read(out: Path, *sources: str | Path | None) -> None:
 
 def _split(text: str) -> tuple[str, str]:
     """The address of a source, and its options."""
-    prefixed = text.startswith(("sim:", "demo:", "strip:"))
+    prefixed = text.startswith(("sim:", "demo:", *PICTURES))
     if "?" not in text or (not prefixed and os.path.exists(text)):  # exists: False for invalid paths
         return text, ""
     address, _, query = text.partition("?") if prefixed else text.rpartition("?")
@@ -160,8 +163,8 @@ def _reader(text: str, address: str) -> Callable[..., Traverse]:
     if kind + colon == "demo:":
         expect(name in DEMOS, ", ".join(DEMOS), f"there is no demo {name!r}")
         return DEMOS[name]
-    if kind + colon == "strip:":
-        return partial(read_strip, Path(name))
+    if kind + colon in PICTURES:
+        return partial(PICTURES[kind + colon], Path(name))
     path = Path(address)
     expect(address and os.path.exists(path), EXPECTED, f"{text or 'a source without a name'} is not there")
     if path.is_dir():

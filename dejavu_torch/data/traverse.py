@@ -44,6 +44,8 @@ class Part(Traverse):
         if traverse.coordinates is not None:
             values, degrees = traverse.coordinates
             self.coordinates = Coordinates(values[torch.as_tensor(frame)], degrees)
+        if isinstance(frame, range) and frame == range(len(traverse)):
+            self.area = traverse.area
         if traverse.cut is not None and isinstance(frame, range):
             image, cuts = traverse.cut
             self.cut = image, cuts[frame.start : frame.stop : frame.step]

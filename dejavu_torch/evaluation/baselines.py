@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from dejavu_torch.area import Area
 from dejavu_torch.evaluation.controls import leave_out_match, null_map, with_mapper
 from dejavu_torch.evaluation.quantiser import product_quantised
 from dejavu_torch.features.descriptor import is_ready
@@ -62,6 +63,7 @@ def nearest_frames(
     metric: Metric = "l1",
     progress: bool = False,
     matching: Matching = SINGLE,
+    area: Area | None = None,
 ) -> Match:
     """The nearest stored frame of each query, if every k-th reference frame is stored.
 
@@ -69,17 +71,18 @@ def nearest_frames(
         reference: (N,D) features. query: (Q,D) features.
         k: 1 stores all frames. Other frames have the distance of the nearest stored one.
         progress: show progress on stderr.
+        area: of the frames, if they are of one: every k-th is stored in rows and in columns.
 
     Returns:
         Match of (Q,). Single queries find stored frames only, sequences also frames between these.
     """
     parts = query.split(max(1, BLOCK_DISTANCES // len(reference)))
     batches = with_progress(parts, "baselines", progress)
-    matcher, nearest = Localizer(None, matching), _nearest_stored(len(reference), k)
-    match = Match.joined(map(matcher.match, map(scores_of_stored(reference, k, metric), batches)))
+    matcher, (stored, nearest) = Localizer(None, matching), stored_frames(len(reference), k, area)
+    match = Match.joined(map(matcher.match, map(scores_of_stored(reference, k, metric, area), batches)))
 
     def stored_frame(frame: Tensor) -> Tensor:
-        return torch.where(frame >= 0, k * nearest[frame], -1)
+        return torch.where(frame >= 0, stored[nearest[frame]], -1)
 
     sequences = dict(match.sequences)
     if 1 in sequences:
@@ -89,9 +92,12 @@ def nearest_frames(
     return replace(match, probability=None, sequences=sequences)
 
 
-def scores_of_stored(reference: Tensor, k: int = 1, metric: Metric = "l1") -> Scoring:
+def scores_of_stored(
+    reference: Tensor, k: int = 1, metric: Metric = "l1", area: Area | None = None
+) -> Scoring:
     """The distances of queries from the nearest stored frame of each place, see `nearest_frames`."""
-    stored, nearest = reference[:: min(k, len(reference))], _nearest_stored(len(reference), k)
+    frames, nearest = stored_frames(len(reference), k, area)
+    stored = reference if k == 1 else reference[frames.to(reference.device)]
 
     def score(queries: Tensor) -> Tensor:
         scores = phase_distances(queries.to(stored.device), stored, metric)
@@ -100,13 +106,29 @@ def scores_of_stored(reference: Tensor, k: int = 1, metric: Metric = "l1") -> Sc
     return score
 
 
-def _nearest_stored(frames: int, k: int) -> Tensor:
-    return ((torch.arange(frames) + k // 2) // k).clamp(max=-(-frames // min(k, frames)) - 1)
+def stored_frames(frames: int, k: int, area: Area | None = None) -> tuple[Tensor, Tensor]:
+    """The frames that a stride of k stores, (n,), and of each frame the nearest of these, (N,).
+
+    Example:
+        >>> [table.tolist() for table in stored_frames(6, 3)]
+        [[0, 3], [0, 0, 1, 1, 1, 1]]
+    """
+
+    def along(count: int) -> tuple[Tensor, Tensor]:
+        stored = torch.arange(0, count, k)
+        return stored, ((torch.arange(count) + k // 2) // k).clamp(max=len(stored) - 1)
+
+    if area is None:
+        return along(frames)
+    (rows, above), (columns, beside) = along(area.rows), along(area.columns)
+    cells = area.cells(torch.arange(frames))
+    stored = area.place_at(torch.cartesian_prod(rows, columns).view(-1, 2))
+    return stored, above[cells[:, 0]] * len(columns) + beside[cells[:, 1]]
 
 
-def stride_bytes(frames: int, dimension: int, itemsize: int, k: int) -> int:
+def stride_bytes(frames: int, dimension: int, itemsize: int, k: int, area: Area | None = None) -> int:
     """Bytes of every k-th of `frames` frames."""
-    return -(-frames // k) * dimension * itemsize
+    return len(stored_frames(frames, k, area)[0]) * dimension * itemsize
 
 
 def fair_stride(frames: int, dimension: int, itemsize: int, map_bytes: int, tolerance: int) -> int:
@@ -133,9 +155,10 @@ def baselines_of(
         progress: show progress bars on a terminal.
     """
     model, reference, matching = run.model, run.reference_features, run.matching
+    area = model.map.area
     spectral = isinstance(model.map, SpectralMap)
-    one = "place" if len(model.map.positions) else "frame"
-    summary, coarsest, (frames, dimension) = model.summary(), max(1, 2 * run.tolerance), reference.shape
+    one = "place" if len(model.map.positions) else "frame" if area is None else "window"
+    summary, coarsest, (frames, dimension) = model.summary(), run.coarsest, reference.shape
     needed = ("backbone", "whitening") if spectral else ("backbone",)  # by every baseline
     fixed = sum(summary.fixed.get(part, 0) for part in needed)
     metric: Metric = getattr(model.map, "metric", "l1")
@@ -143,16 +166,16 @@ def baselines_of(
         metric = "cosine"
 
     def nearest(name: str, stored: Tensor, k: int, bytes: int, stride: int = 1, more: int = 0) -> Baseline:
-        match = run.match_by(lambda *how: nearest_frames(stored, how[0], stride, metric, progress, how[1]))
+        match = run.match_by(
+            lambda *how: nearest_frames(stored, how[0], stride, metric, progress, how[1], area)
+        )
         asked = run.drive_query(scores_of_stored(stored, stride, metric))
         return Baseline(name, match, bytes + fixed + more, k, fixed + more, asked)
 
-    size, own = partial(stride_bytes, frames, dimension), reference.element_size()
+    size, own = partial(stride_bytes, frames, dimension, area=area), reference.element_size()
     if spectral:
         short, code = as_int8(reference), min(dimension, max(1, round(summary.route_bytes / frames)))
-        between, spaced, keys = interpolated(short, summary.route_bytes)
         name, strided = "its descriptors", f"{every(coarsest, one)}, int8"
-        interpolating = f"{name}, {every(spaced, one)}, interpolated"
         found = _in_one_byte(run, one, progress) if code > 1 else {}
         found["uncompressed"] = nearest(f"{name}, {every(1, one)}, float", reference, 1, size(4, 1))
         if is_ready(run.reference):
@@ -161,10 +184,11 @@ def baselines_of(
             quantised, codebooks = product_quantised(reference, code, seed)
             quantiser = f"{name}, product quantiser, {code} B"
             found["product_quantiser"] = nearest(quantiser, quantised, 1, frames * code, more=codebooks)
-        found |= {
-            "stride": nearest(f"{name}, {strided}", short, coarsest, size(1, coarsest), coarsest),
-            "interpolated": nearest(interpolating, between, spaced, keys * dimension),
-        }
+        found["stride"] = nearest(f"{name}, {strided}", short, coarsest, size(1, coarsest), coarsest)
+        if area is None:  # along a route
+            between, spaced, keys = interpolated(short, summary.route_bytes)
+            interpolating = f"{name}, {every(spaced, one)}, interpolated"
+            found["interpolated"] = nearest(interpolating, between, spaced, keys * dimension)
     else:
         fair = fair_stride(frames, dimension, own, summary.map_bytes - fixed, run.tolerance)
         name = "" if isinstance(model.features, HOG) else "same features, "
@@ -185,7 +209,7 @@ def baselines_of(
     if not _is_plain_hog(model):
         same = recipe_of(model.preprocess) == recipe_of(Preprocess())
         known = [model.descriptor.hog_of(traverse) for traverse in pair] if same else []
-        found |= hog_baselines(*pair, batch, run.tolerance, progress, matching, run.beside, known)
+        found |= hog_baselines(*pair, batch, run.coarsest // 2, progress, matching, run.beside, known)
     if run.sequence is not None:  # SeqSLAM compares the grey pixels of small frames by L1
         plain = DejaVu(PatchPixels(), "none", batch_size=batch, preprocess=Preprocess("grey"))
         names = {"seqslam": ("SeqSLAM's pixels: grey, patches normalised", 1)}
@@ -200,7 +224,7 @@ def _in_one_byte(run: Localization, one: str, progress: bool) -> dict[str, Basel
     same = place_map.chunk, place_map.transform, place_map.metric, place_map.resolution
     small = with_mapper(model, SpectralMapper(1.0, None, *same))
     try:
-        small.learn_features(run.reference_features)
+        small.learn_features(run.reference_features, area=place_map.area)
     except InputError:  # less than the mean takes
         return {}
     match = run.match_by(lambda query, how: small.localize_descriptors(query, how, progress=progress))
@@ -327,7 +351,8 @@ def hog_baselines(
 
     known: HOG of both traverses, if it has been computed before.
     """
-    one = "place" if isinstance(reference, ResampledTraverse) else "frame"
+    resampled = isinstance(reference, ResampledTraverse)
+    one = "place" if resampled else "frame" if reference.area is None else "window"
     strides = {"hog": 1, "hog_stride_coarsest": max(1, 2 * tolerance)}
     names = {key: (f"HOG, {every(k, one)}", k) for key, k in strides.items()}
     plain = DejaVu(whitening="none", batch_size=batch_size)
@@ -354,10 +379,11 @@ def _described_baselines(
     except InputError as error:
         log.info("no %s to compare with: %s", type(plain.features).__name__, error)
         return {}
-    size = partial(stride_bytes, len(stored), stored.shape[1], stored.element_size())
+    area = traverses[0].area
+    size = partial(stride_bytes, len(stored), stored.shape[1], stored.element_size(), area=area)
 
     def baseline(name: str, k: int) -> Baseline:
-        match = nearest_frames(stored, queries, k, "l1", progress, matching)
+        match = nearest_frames(stored, queries, k, "l1", progress, matching, area)
         asked = None if smoother is None else drive_query(queries, smoother, scores_of_stored(stored, k))
         return Baseline(name, match, size(k), k, asked=asked)
 

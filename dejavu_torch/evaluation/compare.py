@@ -105,7 +105,8 @@ def compare(
             baselines.
         model: settings; None is DejaVu with its defaults. A map that it already has is evaluated as it is; it
             must be of this reference. The model is on the CPU afterwards.
-        tolerance: places within which a match is right, inclusive.
+        tolerance: places within which a match is right, inclusive; in an area, the distance of the middles of
+            windows, in the unit of its coordinates.
         leave_out: also query the reference with itself, see `leave_out_match`; a diagnostic.
         seed: for shuffling the null control.
         interpolate: see `find_ground_truth`.
@@ -143,7 +144,11 @@ def compare(
     query = reference if query is None else query
     reference, query, off = _prepared(model, reference, query, distractors, seconds, progress, loops)
     check_candidates(top, tolerance, len(reference))
-    in_order = source_of(query).ordered if ordered is None else ordered
+    radius, area = tolerance, reference.area
+    if area is not None and truth is None and query.coordinates is not None:
+        truth = f"{'metres' if area.unit == 'm' else 'pixels'}:{radius}"
+    tolerance = tolerance if area is None else 0  # all windows within the radius are right
+    in_order = (source_of(query).ordered if ordered is None else ordered) and area is None
     smoother, causal = _ways(sequence, in_order and len(query) > 1, tolerance)
     if causal is not None:
         causal.check(None, len(reference))
@@ -163,7 +168,7 @@ def compare(
             alike = PlaceSmoother(within=tolerance) if beside and len(query) > 1 else None
             centring = in_order and model.centres(len(query)) if centre is None else centre
             run = _described(model, reference, query, places, centring, tolerance, progress)
-            run = run._replace(matching=Matching(causal, also, apart=loops))
+            run = run._replace(matching=Matching(causal, also, apart=loops), radius=radius)
             run, found = _localized(run, smoother is not None, top, progress)
             run, candidates = _smoothed(run, found, smoother, alike, progress)
         off_map = _match_distractors(model, off, smoother or causal, centring, progress)

@@ -100,13 +100,16 @@ def match_facts(
     ranked, shown = place_map.table.scored(candidates.index), run.match.renumbered(place_map.frame_of)
     facts = evaluation_facts(run.scored, ranked, run.truth, tolerance, place_map.positions, words, off)
     alone = answer_facts(shown, run.query_frames, tolerance, run.truth is not None, offset)
-    if run.matching.apart is not None:
+    if run.matching.apart is not None or place_map.area is not None:
         alone.pop("line", None)  # a second lap lies on one
+    if place_map.area is not None and run.radius:
+        unit = "metres" if place_map.area.unit == "m" else "pixels"
+        alone |= {"tolerance": run.radius, "unit": unit, "truth": "the coordinates of both"}
     return facts | alone
 
 
 def metric_facts(run: Localization, truth: Truth | None) -> Facts:
-    """The entry `error_metres` of report.json: quantiles of the distances between queries and the places
+    """The entry `error_metres` of report.json, or `error_pixels`: quantiles of the distances between queries and the places
     reported for them, where the truth is by coordinates."""
     parsed = None if truth is None else check_ground_truth(truth)
     if not isinstance(parsed, Near):
@@ -122,7 +125,7 @@ def metric_facts(run: Localization, truth: Truth | None) -> Facts:
         if chosen.any():
             quantiles = distance[chosen].quantile(torch.tensor(QUANTILES, dtype=torch.float64)).tolist()
             facts[name] = {f"{share:g}": round(at, 3) for share, at in zip(QUANTILES, quantiles, strict=True)}
-    return {"error_metres": facts}
+    return {f"error_{parsed.kind if parsed.kind == 'pixels' else 'metres'}": facts}
 
 
 def _gap_facts(run: Localization) -> Facts:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
@@ -30,7 +31,8 @@ class Localization(NamedTuple):
     tolerance: in places, inclusive. matching: for the map and all baselines. causal_features: the queries
     for sequences and filters, if query_features are centred, which takes all of them. match: the answers.
     judged: the matches that the scores at top level judge, with those of other models. smoother: of the
-    answers, if they are those of the whole drive. beside: one to compare all contenders by, if any.
+    answers, if they are those of the whole drive. beside: one to compare all contenders by, if any. radius:
+    in an area, the distance within which a match is right, in the unit of its coordinates; tolerance is 0.
 
     Convention 11: match and truth count places and queries, pictures show frames of the sources.
     """
@@ -48,6 +50,7 @@ class Localization(NamedTuple):
     judged: Match = NOTHING
     smoother: PlaceSmoother | None = None
     beside: PlaceSmoother | None = None
+    radius: int = 0
 
     def __repr__(self) -> str:
         return f"{self.query.name} on {self.reference.name}"
@@ -72,6 +75,12 @@ class Localization(NamedTuple):
         if self.beside is None:
             return None
         return drive_query(self.query_features, self.beside, score, self.causal_features)
+
+    @property
+    def coarsest(self) -> int:
+        """The largest stride of stored frames that lets every place be found: twice the tolerance."""
+        area = self.model.map.area
+        return max(1, 2 * self.tolerance if area is None else int(2 * self.radius / math.hypot(*area.right)))
 
     @property
     def answers(self) -> str:

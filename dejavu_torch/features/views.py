@@ -9,6 +9,7 @@ from typing import NamedTuple, cast
 import torch
 from torch import Tensor
 
+from dejavu_torch.area import Area
 from dejavu_torch.data.traverse import Part, as_shape
 from dejavu_torch.features.augmentation import LARGEST, Augmentation
 from dejavu_torch.features.preprocess import spread
@@ -29,18 +30,34 @@ class Sample(NamedTuple):
 
     frame: Tensor  # (n,) int64
     segment: int  # frames of each segment
+    sizes: list[tuple[int, int]]  # rows and columns of each; of a route one column
 
     @classmethod
-    def of(cls, frames: int, chunk: int) -> Sample:
-        """The sample of a route longer than `SAMPLE`, coded in chunks of `chunk` places.
+    def of(cls, frames: int, chunk: int, area: Area | None = None) -> Sample:
+        """The sample of a route longer than `SAMPLE`, coded in chunks of `chunk` places, or of an area.
 
         Example:
             >>> sample = Sample.of(100_000, chunk=1000)
             >>> len(sample.frame), sample.frame[::1000].tolist()
             (10000, [0, 11000, 22000, 33000, 44000, 55000, 66000, 77000, 88000, 99000])
         """
+        if area is not None:
+            return cls.of_area(area)
         segment = min(chunk, SAMPLE // MIN_SEGMENTS)
-        return cls(evenly_spaced(frames, segment, SAMPLE // segment), segment)
+        count = SAMPLE // segment
+        return cls(evenly_spaced(frames, segment, count), segment, [(segment, 1)] * count)
+
+    @classmethod
+    def of_area(cls, area: Area) -> Sample:
+        """Evenly spaced blocks of an area, with about as many frames as the segments of a route."""
+        tall = min(area.rows, round((SAMPLE // MIN_SEGMENTS) ** 0.5))
+        wide = min(area.columns, SAMPLE // MIN_SEGMENTS // tall)
+        down, across = area.rows // tall, area.columns // wide
+        drawn = torch.linspace(0, down * across - 1, min(down * across, MIN_SEGMENTS)).round().long()
+        corner = torch.stack([drawn // across * tall, drawn % across * wide], 1)
+        inside = torch.cartesian_prod(torch.arange(tall), torch.arange(wide)).view(-1, 2)
+        places = area.place_at(corner[:, None] + inside).flatten()
+        return cls(places, tall * wide, [(tall, wide)] * len(drawn))
 
     def views(self, second: LabelledFrames) -> LabelledFrames:
         """The views of the sample in a second traverse; InputError if there are none."""

@@ -11,6 +11,7 @@ from typing import ClassVar, Self, TypeVar, get_args
 import torch
 from torch import Tensor, nn
 
+from dejavu_torch.area import Area
 from dejavu_torch.data.positions import count_places
 from dejavu_torch.maps.frame_table import FrameTable, Link, Route
 from dejavu_torch.maps.summary import MapSummary
@@ -58,6 +59,7 @@ class PlaceMap(nn.Module, ABC):
     kept: ClassVar[tuple[str, ...]] = ("positions",)  # tensors that are always of the type of a file
     optional: ClassVar[Mapping[str, tuple[int, ...]]] = {"visits": (0, 2)}  # that files may lack
     routes: tuple[Route, ...] = ()
+    area: Area | None = None
     positions: Tensor
     visits: Tensor
 

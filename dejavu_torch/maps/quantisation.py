@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.maps.codec import coded_bytes
-from dejavu_torch.maps.spectrum import Transform, half_cycles, spectrum
+from dejavu_torch.maps.spectrum import Transform, frequencies, lines_of
 from dejavu_torch.memory import empty
 
 ROUNDING = 0.35  # added before rounding down: a dead zone of 1.3 steps around 0
@@ -35,20 +35,23 @@ def quantise(lines: Tensor, step: Tensor | float, width: Tensor | None = None) -
     return levels if width is None else levels * (lines.abs() >= (1 - ROUNDING) * step * width)
 
 
-def dead_zone(lines: Tensor, sizes: Sequence[int], resolution: float, transform: Transform) -> Tensor | None:
-    """Factor on the dead zone of each of (N,K) lines in chunks of these sizes: 1 + (resolution / P)^2 for a
-    line of period P, (N,1); None if that is 1 for all."""
+def dead_zone(
+    lines: Tensor, sizes: Sequence[tuple[int, int]], resolution: float, transform: Transform
+) -> Tensor | None:
+    """Factor on the dead zone of each of (N,K) lines in chunks of these rows and columns: 1 +
+    (resolution / P)^2 for a line of period P, (N,1); None if that is 1 for all."""
     if not resolution:
         return None
-    inverse = torch.cat([half_cycles(torch.arange(n), transform) / (2 * n) for n in sizes]).to(lines)
-    return (1 + (resolution * inverse).square())[:, None]
+    squares = [frequencies(rows, columns, transform).square().sum(1) for rows, columns in sizes]
+    return (1 + resolution**2 * torch.cat(squares).to(lines))[:, None]
 
 
 class RouteLines:
     """The lines of a route, chunk by chunk; those of a long route are in a temporary file.
 
     Args:
-        lengths: places of each chunk. transform, resolution: see `spectrum`, `dead_zone`.
+        sizes: rows and columns of each chunk; a route has one column. transform, resolution: see `spectrum`,
+            `dead_zone`.
         mean: (K,) to subtract; None is the route's in bfloat16, or 0 if it is small and cheaper as line 0.
 
     Shape: features (N,K), float of any kind.
@@ -57,7 +60,7 @@ class RouteLines:
     def __init__(
         self,
         features: Tensor,
-        lengths: Sequence[int],
+        sizes: Sequence[tuple[int, int]],
         transform: Transform,
         resolution: float = 0.0,
         mean: Tensor | None = None,
@@ -74,14 +77,15 @@ class RouteLines:
             if square < SMALL * power:
                 mean, self.mean_energy = torch.zeros_like(mean), places * square
         self.mean = mean
-        self.chunks = [*pairwise(accumulate(lengths, initial=0))]
+        self.sizes, places_of = [*sizes], [rows * columns for rows, columns in sizes]
+        self.chunks = [*pairwise(accumulate(places_of, initial=0))]
         self.lines = empty(places, dimension, features.device)
-        for start, stop in self.chunks:
+        for (start, stop), (_, width) in zip(self.chunks, sizes, strict=True):
             for some in torch.arange(dimension).split(max(1, BLOCK // (stop - start))):
                 columns = slice(int(some[0]), int(some[-1]) + 1)
                 part = features[start:stop, columns].float() - mean[columns].float()
-                self.lines[start:stop, columns] = spectrum(part.T, transform).T
-        self.width = dead_zone(self.lines, lengths, resolution, transform)
+                self.lines[start:stop, columns] = lines_of(part.T, width, transform).T
+        self.width = dead_zone(self.lines, sizes, resolution, transform)
 
     @property
     def mean_bytes(self) -> int:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
+from dejavu_torch.area import Area
 from dejavu_torch.maps.codec import encode
 from dejavu_torch.maps.place_map import Mapper
 from dejavu_torch.maps.quantisation import RouteLines
@@ -35,7 +37,7 @@ class SpectralMapper(Mapper):
             squared errors / squared differences from the mean. The step is the largest that holds it. None,
             without bytes and step, is .85, or more if 5 bytes per place hold more, as with few features.
 
-    Shape: descriptors (N,K) -> SpectralMap of N places.
+    Shape: descriptors (N,K) -> SpectralMap of N places; with an `Area` of as many places, of that.
 
     Convention: the written route takes 98 to 100 % of the budget, or less if the finest useful step needs
         less. Without `resolution` a map holds at least `hold`, unless that step holds less; a long route is
@@ -83,30 +85,40 @@ class SpectralMapper(Mapper):
         return cls(size, None, place_map.chunk, place_map.transform, place_map.metric)
 
     @torch.no_grad()
-    def forward(self, features: Tensor) -> SpectralMap:
-        place_map, lines = self._fitted(features, self.chunk)
-        for (start, stop), levels in zip(lines.chunks, lines.levels(place_map.step), strict=True):
-            chunk = stop - start, place_map.step, encode(levels), unseen(features[start:stop])
+    def forward(self, features: Tensor, area: Area | None = None) -> SpectralMap:
+        check_descriptors(features)
+        sizes = line_sizes(len(features), self.chunk)
+        if area is not None:
+            seen = f"{len(features)} descriptors of an area of {area.rows} x {area.columns} places"
+            expect(len(features) == area.places, "one for each", seen)
+            sizes = area.tiles
+        place_map, lines = self._fitted(features, sizes)
+        place_map.area = area
+        for (start, stop), (_, columns), levels in zip(
+            lines.chunks, sizes, lines.levels(place_map.step), strict=True
+        ):
+            chunk = stop - start, place_map.step, encode(levels), unseen(features[start:stop]), columns
             place_map.extend([Chunk(*chunk)], [levels])
         return place_map
 
     @torch.no_grad()
-    def fit(self, sample: Tensor, segment: int, share: float = 1.0) -> SpectralMap:
-        """A map without places: mean and step for the chunks of a route, from sampled segments (n,K) of it.
-        The sample pays for a `share` of the mean, its part of the route's places."""
-        return self._fitted(sample, segment, share)[0]
+    def fit(self, sample: Tensor, sizes: Sequence[tuple[int, int]], share: float = 1.0) -> SpectralMap:
+        """A map without places: mean and step for the chunks of a route or an area, from a sample (n,K) of
+        these rows and columns. It pays for a `share` of the mean, its part of the places."""
+        return self._fitted(sample, sizes, share)[0]
 
     def empty(self, means: Tensor | None = None, step: float = 0.0) -> SpectralMap:
         return SpectralMap(means, self.metric, self.transform, self.chunk, self.resolution, step)
 
     extra_repr = settings_of
 
-    def _fitted(self, features: Tensor, chunk: int, share: float = 1.0) -> tuple[SpectralMap, RouteLines]:
+    def _fitted(
+        self, features: Tensor, sizes: Sequence[tuple[int, int]], share: float = 1.0
+    ) -> tuple[SpectralMap, RouteLines]:
         """The map without places, and the lines to code with its step."""
         check_descriptors(features)
         places = len(features)
-        lengths = [min(chunk, places - start) for start in range(0, places, chunk)]
-        lines = RouteLines(features, lengths, self.transform, self.resolution)
+        lines = RouteLines(features, sizes, self.transform, self.resolution)
         if not lines.scale > 1e-6 * float(lines.mean.float().square().mean().sqrt()):
             raise InputError(f"the {places} descriptors are all the same; expected a route that changes")
         fixed = round(share * lines.mean_bytes) + CHUNK_BYTES * len(lines.chunks)
@@ -133,14 +145,30 @@ class SpectralMapper(Mapper):
         return lines.step_of(budget * places - fixed)
 
 
+def line_sizes(places: int, chunk: int) -> list[tuple[int, int]]:
+    """Rows and columns, one, of the chunks of a route.
+
+    Example:
+        >>> line_sizes(25, 10)
+        [(10, 1), (10, 1), (5, 1)]
+    """
+    return [(min(chunk, places - start), 1) for start in range(0, places, chunk)]
+
+
 @torch.no_grad()
 def encode_chunk(
-    descriptors: Tensor, mean: Tensor, step: float, transform: Transform = "dft", resolution: float = 0.0
+    descriptors: Tensor,
+    mean: Tensor,
+    step: float,
+    transform: Transform = "dft",
+    resolution: float = 0.0,
+    columns: int = 1,
 ) -> Chunk:
     """The coded lines of one chunk, for `SpectralMap.extend`; the same on any machine.
 
     Args:
-        mean: (K,) of the route's descriptors. step: of the lines. transform, resolution: of the map.
+        mean: (K,) of the route's descriptors. step: of the lines. transform, resolution: of the map. columns:
+            of a tile of an area.
 
     Shape: descriptors (W,K).
 
@@ -148,9 +176,9 @@ def encode_chunk(
         InputError: descriptors that are not finite floats (W,K).
     """
     check_descriptors(descriptors, len(mean))
-    lines = RouteLines(descriptors, [len(descriptors)], transform, resolution, mean)
-    (levels,) = lines.levels(step)
-    return Chunk(len(descriptors), step, encode(levels), unseen(descriptors))
+    size = len(descriptors) // columns, columns
+    (levels,) = RouteLines(descriptors, [size], transform, resolution, mean).levels(step)
+    return Chunk(len(descriptors), step, encode(levels), unseen(descriptors), columns)
 
 
 def unseen(descriptors: Tensor) -> tuple[int, ...]:

@@ -16,10 +16,11 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from dejavu_torch.area import Area, area_of
 from dejavu_torch.maps.codec import Stream, decode
 from dejavu_torch.maps.frame_table import Link, Route
 from dejavu_torch.maps.place_map import PlaceMap, ScoreBlocks, one_of, require
-from dejavu_torch.maps.spectrum import Transform, from_slots, half_cycles, slots
+from dejavu_torch.maps.spectrum import Transform, by_frequency, frequencies, from_lines, from_slots, slots
 from dejavu_torch.maps.summary import ChunkSummary, MapSummary
 from dejavu_torch.memory import is_readable
 from dejavu_torch.types import Facts, InputError, expect
@@ -43,20 +44,23 @@ FILE = {  # dtype and dimensions of the tensors of a file
     "stage_scale": (torch.float32, 1),
     "drives": (torch.int32, 1),
     "links": (torch.int32, 2),
+    "columns": (torch.int32, 1),
 }
 LINK_SHARES = 1000  # the probability of a link is stored in thousandths
 STAGE = ("stage", "stage_scale", "drives")
-TAUGHT = (*STAGE, "links")  # by drives; files of other maps lack them
+RARE = (*STAGE, "links", "columns")  # files of maps without them lack these
 CHUNK_BYTES = 8 + 4 + 8 + 8  # a chunk's length, step, stream length and checksum in a file
 
 
 class Chunk(NamedTuple):
-    """Consecutive places as a file stores them; `unseen` are those whose descriptors are 0, from 0."""
+    """Consecutive places as a file stores them; `unseen` are those whose descriptors are 0, from 0; `columns`
+    of a tile of an area, row by row."""
 
     places: int
     step: float
     stream: Stream
     unseen: tuple[int, ...] = ()
+    columns: int = 1
 
 
 class Lines(NamedTuple):
@@ -81,6 +85,7 @@ class SpectralMap(PlaceMap):
         stage, stage_scale: (K,K) int8 and (K,), a linear map P that drives have taught: queries and coded
             descriptors are compared after it, see `refined`. drives: (1,) int32, how many, and those that
             taught the whitening without being told where they are. Empty without.
+        columns: (G,) int32, of the tiles of an area, see `lines_of`; empty for a route.
         links: (L,3) int32, steps from a place of a route to one of another, and their probability in
             thousandths; see `connections`.
     Buffers derived from these:
@@ -90,7 +95,7 @@ class SpectralMap(PlaceMap):
             places that no frame shows (0 visits), whose scores are +inf.
 
     Attributes:
-        chunks: the places [start, stop) of each.
+        chunks: the places [start, stop) of each. area: the rows and columns of an area; None for a route.
 
     Args:
         means: as above; None makes a map that can load any state.
@@ -108,7 +113,14 @@ class SpectralMap(PlaceMap):
 
     kind = "spectral"
     kept = ("positions", "steps", "means", "norms", "stage_scale")
-    optional = {"visits": (0, 2), "stage": (0, 0), "stage_scale": (0,), "drives": (0,), "links": (0, 3)}  # noqa: RUF012
+    optional = {  # noqa: RUF012
+        "visits": (0, 2),
+        "stage": (0, 0),
+        "stage_scale": (0,),
+        "drives": (0,),
+        "links": (0, 3),
+        "columns": (0,),
+    }
 
     lengths: Tensor
     steps: Tensor
@@ -119,6 +131,7 @@ class SpectralMap(PlaceMap):
     stage_scale: Tensor
     drives: Tensor
     links: Tensor
+    columns: Tensor
     counts: Tensor
     feature: Tensor
     level: Tensor
@@ -140,6 +153,7 @@ class SpectralMap(PlaceMap):
         self.transform: Transform = one_of(transform, Transform, "transform")
         self.chunk, self.resolution = chunk, resolution
         self._step = step
+        self.area: Area | None = None
         for name in ("counts", "feature", "level", "norms"):
             self.register_buffer(name, None, persistent=False)
         for name, (dtype, ndim) in FILE.items():
@@ -151,7 +165,7 @@ class SpectralMap(PlaceMap):
 
     def _clear(self) -> None:
         """Remove all chunks and their decoded lines."""
-        for name in ("lengths", "steps", "stream_table", "streams", "visits"):
+        for name in ("lengths", "steps", "stream_table", "streams", "visits", "columns"):
             setattr(self, name, getattr(self, name)[:0])
         self.counts = self.lengths.to(_dtype_for(self.dimension))
         self.feature = self.lengths.to(_dtype_for(self.dimension - 1))
@@ -187,6 +201,9 @@ class SpectralMap(PlaceMap):
 
         for name, column in zip(("counts", "feature", "level"), zip(*parts, strict=True), strict=True):
             append(name, *column)
+        if len(self.columns) or any(chunk.columns > 1 for chunk in chunks):
+            before = self.columns if len(self.columns) else self.lengths.new_ones(len(self.lengths)).int()
+            self.columns = torch.cat([before, before.new_tensor([chunk.columns for chunk in chunks])])
         append("lengths", torch.tensor(places))
         append("steps", self.steps.new_tensor([chunk.step for chunk in chunks]))
         append("stream_table", torch.tensor([[len(c.stream.bytes), c.stream.checksum] for c in chunks]))
@@ -240,7 +257,18 @@ class SpectralMap(PlaceMap):
         unseen = [
             tuple((counts == 0).nonzero()[:, 0].tolist()) for counts in self.visit_counts.split(lengths)
         ]
-        return [*map(Chunk, lengths, self.steps.tolist(), streams, unseen)]
+        columns = map(self.width_of, range(len(lengths)))
+        return [*map(Chunk, lengths, self.steps.tolist(), streams, unseen, columns)]
+
+    def width_of(self, chunk: int) -> int:
+        """The columns of a chunk, 1 of a route."""
+        return int(self.columns[chunk]) if len(self.columns) else 1
+
+    def size_of(self, chunk: int) -> tuple[int, int]:
+        """Rows and columns of a chunk."""
+        start, stop = self.chunks[chunk]
+        columns = self.width_of(chunk)
+        return (stop - start) // columns, columns
 
     def of_chunks(self, chunks: Iterable[Chunk]) -> SpectralMap:
         """A map of other chunks with this map's mean, settings and device."""
@@ -375,27 +403,41 @@ class SpectralMap(PlaceMap):
         for some in units.split(max(1, LONG // (stop - start))):
             yield self._all_products(some, range(chunk, chunk + 1))
 
-    def samples(self, chunk: int, count: int) -> Tensor:
-        """Low-passed descriptors at M = `count` even positions of a chunk, from the first M lines: (M,K)."""
-        (start, stop), (line, feature, value) = self.chunks[chunk], self.lines(chunk)
-        slot, factor = slots(stop - start, self.transform, value.dtype, value.device)
-        size = len(slots(count, self.transform, value.dtype, value.device)[1])
-        low = value.new_zeros(self.dimension, size)
-        kept = (slot[line] < size).nonzero()[:, 0]
-        at = slot[line[kept]]
-        low[feature[kept], at] = value[kept] * factor[at]
+    def samples(self, chunk: int, spacing: int) -> Tensor:
+        """Low-passed descriptors (M,K) at even positions of a chunk, about every `spacing` places along rows
+        and columns, from the first lines of each direction."""
+        line, feature, value = self.lines(chunk)
+        size, cells = self.size_of(chunk), by_frequency(*self.size_of(chunk), self.transform, line.device)
+        counts, where = self._counts(chunk, spacing), (self.transform, value.dtype, value.device)
+        at = cells[line] // size[1], cells[line] % size[1]
+        tables = [slots(n, *where) for n in size]
+        widths = [len(slots(count, *where)[1]) for count in counts]
+        slot = [table[0][one] for table, one in zip(tables, at, strict=True)]
+        kept = ((slot[0] < widths[0]) & (slot[1] < widths[1])).nonzero()[:, 0]
+        row, column = (one[kept] for one in slot)
+        low = value.new_zeros(self.dimension, *widths)
+        low[feature[kept], row, column] = value[kept] * tables[0][1][row] * tables[1][1][column]
         mean = self.means[self._routes_of(range(chunk, chunk + 1))][0].to(low)
-        low[:, 0] += mean * (math.sqrt(stop - start) * factor[0])
-        if self.transform == "dft" and count % 2 == 0 and count < stop - start:  # half is aliased
-            low[:, -2:] = 0
-        return from_slots(low, count, self.transform).T * math.sqrt(count / (stop - start))
+        low[:, 0, 0] += mean * (math.sqrt(math.prod(size)) * tables[0][1][0] * tables[1][1][0])
+        for axis, (count, n) in enumerate(zip(counts, size, strict=True)):
+            if self.transform == "dft" and count % 2 == 0 and count < n:  # half is aliased
+                low.narrow(axis + 1, widths[axis] - 2, 2).zero_()
+        across = from_slots(low, counts[1], self.transform).mT.contiguous()
+        series = from_slots(across, counts[0], self.transform).mT.flatten(1).T
+        return series * math.sqrt(math.prod(counts) / math.prod(size))
 
-    def sampled(self, chunk: int, count: int) -> Tensor:
-        """The places in a chunk nearest to M = `count` even positions, (M,) int64."""
-        start, stop = self.chunks[chunk]
-        half = 0.5 if self.transform == "dct" else 0.0  # DCT places are in the middle of a step
-        at = (torch.arange(count, device=self.device) + half) * ((stop - start) / count) - half
-        return at.round().long().clamp(max=stop - start - 1)
+    def sampled(self, chunk: int, spacing: int) -> Tensor:
+        """The places in a chunk nearest to the positions of `samples`, (M,) int64."""
+        near = []
+        for n, count in zip(self.size_of(chunk), self._counts(chunk, spacing), strict=True):
+            half = 0.5 if self.transform == "dct" else 0.0  # DCT places are in the middle of a step
+            at = (torch.arange(count, device=self.device) + half) * (n / count) - half
+            near.append(at.round().long().clamp(max=n - 1))
+        return (near[0][:, None] * self.width_of(chunk) + near[1]).flatten()
+
+    def _counts(self, chunk: int, spacing: int) -> list[int]:
+        """Samples of a chunk down its rows and across its columns."""
+        return [-(-n // spacing) for n in self.size_of(chunk)]
 
     def products(self, queries: Tensor, chunks: range) -> Tensor:
         """Inner products of staged queries with all staged descriptors of G chunks of equal length W:
@@ -420,10 +462,15 @@ class SpectralMap(PlaceMap):
     def _products(self, queries: Tensor, chunks: range) -> Tensor:
         first, last = self.chunks[chunks.start][0], self.chunks[chunks.stop - 1][1]
         count, length = len(chunks), (last - first) // len(chunks)
+        some = slice(self._bounds[chunks.start], self._bounds[chunks.stop])
+        if (columns := self.width_of(chunks.start)) > 1:
+            lines = sparse_products(queries, self.counts[first:last], self.feature[some], self.level[some])
+            lines = lines.unflatten(1, (count, length)) * self.steps[chunks.start : chunks.stop, None]
+            lines[..., 0] += (queries @ self.means.to(queries).T) * math.sqrt(length)
+            return from_lines(lines, columns, self.transform).flatten(1)
         slot, factor = slots(length, self.transform, queries.dtype, queries.device)
         counts = self.counts[first:last].view(count, length)
         rows = counts.new_zeros(count, len(factor)).index_copy(1, slot, counts).flatten()
-        some = slice(self._bounds[chunks.start], self._bounds[chunks.stop])
         lines = sparse_products(queries, rows, self.feature[some], self.level[some])
         lines = lines.unflatten(1, (count, len(factor)))
         lines = lines * (self.steps[chunks.start : chunks.stop, None].to(factor) * factor)
@@ -434,13 +481,14 @@ class SpectralMap(PlaceMap):
         return from_slots(lines, length, self.transform).flatten(1)
 
     def _runs(self, rows: int) -> Iterator[range]:
-        """Consecutive chunks of equal length, with at most `BLOCK` numbers in this many rows."""
+        """Consecutive chunks of equal size, with at most `BLOCK` numbers in this many rows."""
         first = 0
         while first < len(self.chunks):
             start, stop = self.chunks[first]
             most = min(len(self.chunks), first + max(1, BLOCK // (rows * (stop - start))))
             end = first + 1
-            while end < most and self.chunks[end][1] - self.chunks[end][0] == stop - start:
+            size = self.size_of(first)
+            while end < most and self.size_of(end) == size:
                 end += 1
             yield range(first, end)
             first = end
@@ -476,11 +524,13 @@ class SpectralMap(PlaceMap):
         return {name: getattr(self, name) for name in ("metric", "transform", "chunk", "resolution")}
 
     def get_extra_state(self) -> Facts:
-        return {**super().get_extra_state(), "routes": [route._asdict() for route in self.routes]}
+        state = {**super().get_extra_state(), "routes": [route._asdict() for route in self.routes]}
+        return state if self.area is None else state | {"area": self.area._asdict()}
 
     def set_extra_state(self, state: Facts) -> None:
         super().set_extra_state(state)
         self.routes = tuple(Route(**route) for route in state["routes"])
+        self.area = area_of(state["area"]) if "area" in state else None
 
     def check(self) -> None:
         lengths, means = self.lengths.tolist(), self.means
@@ -494,6 +544,13 @@ class SpectralMap(PlaceMap):
         shape = max(1, len(self.routes)), self.dimension
         fits = means.shape in (shape, (0, self.dimension)) and bool(means.isfinite().all())
         require(not self.places or fits, f"means {tuple(means.shape)}; expected {shape} finite numbers")
+        columns = self.columns.tolist() or [1] * len(lengths)
+        fits = len(columns) == len(lengths) and all(map(_divides, columns, lengths))
+        require(fits, f"tiles of {columns!s:.100} columns; expected divisors of {lengths!s:.100}")
+        if self.area is not None:
+            tiles = [(places // width, width) for places, width in zip(lengths, columns, strict=True)]
+            wanted = f"those of {self.area.rows} x {self.area.columns}"
+            require(tiles == self.area.tiles[: len(tiles)], f"tiles {tiles!s:.100}; expected {wanted}")
         require(bool(self.stage_scale.isfinite().all()), "a stage that is not finite")
         links, most = self.links, self.links.new_tensor([self.places - 1, self.places - 1, LINK_SHARES])
         row = f"rows of two places, and a number up to {LINK_SHARES}"
@@ -518,7 +575,7 @@ class SpectralMap(PlaceMap):
     def packed(self) -> dict[str, Tensor]:
         """See `PlaceMap`; means that are all 0 are omitted."""
         packed = super().packed()
-        packed = {name: value for name, value in packed.items() if len(value) or name not in TAUGHT}
+        packed = {name: value for name, value in packed.items() if len(value) or name not in RARE}
         return packed if bool(self.means.any()) else packed | {"means": self.means[:0]}
 
     def summary(self) -> MapSummary:
@@ -534,20 +591,33 @@ class SpectralMap(PlaceMap):
         return MapSummary(self.kind, self.places, covered, 0, 0, tuple(chunks), route, fixed, len(self.level))
 
     def _periods(self, chunk: int) -> tuple[Fraction, ...]:
-        """The periods of the strongest lines, sorted, with the cosine and sine of each frequency together."""
+        """The periods of the strongest lines, sorted, with the cosine and sine of each frequency together; in
+        an area, the distances from wave to wave."""
         line, _, value = self.lines(chunk)
-        start, stop = self.chunks[chunk]
-        energy = value.new_zeros(stop - start + 1)
-        energy.index_add_(0, half_cycles(line, self.transform), value.square())
+        size = self.size_of(chunk)
+        square = (2 * math.prod(size) * frequencies(*size, self.transform)).square().sum(1).round().long()
+        found, kind = square.to(line.device).unique(return_inverse=True)
+        energy = value.new_zeros(len(found)).index_add_(0, kind[line], value.square())
         strongest = energy[1:].argsort(descending=True, stable=True)[:STRONGEST] + 1
-        kept = strongest[energy[strongest] > 0].tolist()
-        return tuple(sorted(Fraction(2 * (stop - start), halves) for halves in kept))
+        kept = found[strongest[energy[strongest] > 0]].tolist()
+        waves = (2 * math.prod(size) / math.sqrt(one) for one in kept)
+        exact = size[1] == 1
+        return tuple(
+            sorted(
+                Fraction(2 * size[0], math.isqrt(one)) if exact else Fraction(wave).limit_denominator(10)
+                for one, wave in zip(kept, waves, strict=True)
+            )
+        )
 
     def extra_repr(self) -> str:
         return (
             f"places={self.places}, dimension={self.dimension}, lines={len(self.level)}, "
             f"chunks={len(self.chunks)}, metric={self.metric!r}, transform={self.transform!r}"
         )
+
+
+def _divides(columns: int, places: int) -> bool:
+    return columns >= 1 and places % columns == 0
 
 
 def scores_of(products: Tensor, norms: Tensor, length: Tensor, metric: SpectralMetric) -> Tensor:

@@ -49,6 +49,41 @@ def from_spectrum(lines: Tensor, transform: Transform = "dft") -> Tensor:
     return from_slots(slotted * factor, count, transform)
 
 
+def lines_of(series: Tensor, columns: int = 1, transform: Transform = "dft") -> Tensor:
+    """The W lines of W places in rows of some columns, one row after the other; of a route in one column.
+
+    Shape: (...,W) -> (...,W).
+
+    Convention: `spectrum` along columns and along rows; the lines in the order of `by_frequency`.
+    """
+    if columns == 1:
+        return spectrum(series, transform)
+    plane = spectrum(series.unflatten(-1, (-1, columns)), transform)
+    plane = spectrum(plane.mT, transform).mT
+    return plane.flatten(-2)[..., by_frequency(*plane.shape[-2:], transform, series.device)]
+
+
+def from_lines(lines: Tensor, columns: int = 1, transform: Transform = "dft") -> Tensor:
+    """The inverse of `lines_of`: (...,W) -> (...,W)."""
+    if columns == 1:
+        return from_spectrum(lines, transform)
+    rows = lines.shape[-1] // columns
+    order = by_frequency(rows, columns, transform, lines.device)
+    plane = torch.zeros_like(lines).index_copy(-1, order, lines).unflatten(-1, (rows, columns))
+    plane = from_spectrum(plane.mT.contiguous(), transform).mT.contiguous()
+    return from_spectrum(plane, transform).flatten(-2)
+
+
+@lru_cache(64)
+def by_frequency(rows: int, columns: int, transform: Transform, device: torch.device) -> Tensor:
+    """The lines of a plane, row x columns + column, by the sum of the squares of both frequencies, (W,)
+    int64: alike ones then are near each other, as the coder expects."""
+    # whole numbers, whose order is the same on any machine
+    down, across = (half_cycles(torch.arange(n), transform).square() for n in (rows, columns))
+    key = down[:, None] * columns**2 + across * rows**2
+    return key.flatten().argsort(stable=True).to(device)
+
+
 def slots(n: int, transform: Transform, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
     """For `from_slots`: the slot of each of n lines, (n,) int64, and the factor of each of S slots, (S,), 0
     without a line. Both are cached: do not change them."""
@@ -83,6 +118,14 @@ def from_slots(slotted: Tensor, count: int, transform: Transform) -> Tensor:
 def half_cycles(line: N, transform: Transform) -> N:
     """Number of half cycles of a line over the series."""
     return line if transform == "dct" else (line + 1) // 2 * 2
+
+
+def frequencies(rows: int, columns: int, transform: Transform) -> Tensor:
+    """Cycles per place of each line of `lines_of`, down the rows and across the columns, (W,2) float64."""
+    down, across = (half_cycles(torch.arange(n), transform).double() / (2 * n) for n in (rows, columns))
+    return torch.cartesian_prod(down, across).view(-1, 2)[
+        by_frequency(rows, columns, transform, torch.device("cpu"))
+    ]
 
 
 def period_of(line: int, count: int, transform: Transform = "dft") -> Fraction:

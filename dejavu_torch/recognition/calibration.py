@@ -10,6 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from dejavu_torch.area import Area, around, distance
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.recognition.filter import PlaceFilter, moments_of
 from dejavu_torch.recognition.select import best_candidates, best_match
@@ -122,10 +123,10 @@ def look_alikes(platt: Platt, right: Tensor, own: Tensor, others: Tensor) -> Pla
     return platt._replace(most=tuple(most))
 
 
-def confidence_of(scores: Tensor) -> Tensor:
+def confidence_of(scores: Tensor, area: Area | None = None) -> Tensor:
     """Confidence in the best place of each query, (Q,N) -> (Q,): -score + `MARGIN` x margin, or -inf if no
     place is found. The margin is the difference to the best score beyond `TOLERANCE` places."""
-    return confidence(best_candidates(scores, min(2, scores.shape[1]), TOLERANCE))
+    return confidence(best_candidates(scores, min(2, scores.shape[1]), TOLERANCE, area=area))
 
 
 def confidence(candidates: Match) -> Tensor:
@@ -161,10 +162,9 @@ class Track:
         return torch.where(score.isfinite(), odds + NATS_PER_DEVIATION * odds.new_tensor(means), -math.inf)
 
 
-def _window(index: Tensor, radius: int, scores: Tensor) -> Tensor:
-    """The places within a radius of each index, (B,) -> (B, 2 radius + 1), clamped to the map."""
-    window = index.clamp(min=0)[:, None] + torch.arange(-radius, radius + 1, device=index.device)
-    return window.clamp(0, scores.shape[1] - 1)
+def _window(index: Tensor, radius: int, scores: Tensor, area: Area | None = None) -> Tensor:
+    """The places within a radius of each index, (B,) -> (B,n), clamped to the map."""
+    return around(index.clamp(min=0), radius, scores.shape[1], area)
 
 
 @torch.no_grad()
@@ -184,22 +184,26 @@ def calibrated(
         own: descriptors (n,K) of the map's own frames, and their places: what look like them elsewhere limits
             the probability of single queries, see `look_alikes`.
     """
-    answers: tuple[list[tuple[Tensor, ...]], ...] = [], []  # of single queries, of a filter
+    area = place_map.area
+    answers: tuple[list[tuple[Tensor, ...]], ...] = [], []  # of single queries, of a filter along a route
     for descriptors, places in segments:
         scores = torch.cat([place_map.scores(part) for part in descriptors.split(64)])
         places = places.to(scores.device)
-        off_map = scores.scatter(1, _window(places, 2 * TOLERANCE, scores), math.inf)
+        off_map = scores.scatter(1, _window(places, 2 * TOLERANCE, scores, area), math.inf)
         for single, on_map in ((scores, True), (off_map, False)):
-            filtered = PlaceFilter()(single)
-            pairs = (single, confidence_of(single)), (filtered, Track()(filtered, single))
-            for rows, (scored, confidences) in zip(answers, pairs, strict=True):
+            pairs = [(single, confidence_of(single, area))]
+            if area is None:
+                filtered = PlaceFilter()(single)
+                pairs.append((filtered, Track()(filtered, single)))
+            for rows, (scored, confidences) in zip(answers, pairs, strict=False):
                 index = best_match(scored).index
-                right = ((index - places).abs() <= TOLERANCE) & (index >= 0) & on_map
+                near = distance(index.clamp(min=0), places.clamp(min=0), area) <= TOLERANCE
+                right = near & (index >= 0) & (places >= 0) & on_map
                 columns = confidences, right, torch.full_like(right, on_map)
                 rows.append(tuple(column.cpu()[places.cpu() >= 0] for column in columns))
     expect(answers[0], "some", "there are no queries to calibrate by")
     platts: list[Platt | None] = []
-    for rows in answers:
+    for rows in filter(None, answers):
         confidences, right, on_the_map = map(torch.cat, zip(*rows, strict=True))
         wrong = int((on_the_map & ~right).sum())
         off_weight = max(0, MIN_WRONG - wrong) / max(1, int((~on_the_map).sum())) if another_visit else 1.0
@@ -209,9 +213,12 @@ def calibrated(
             known = torch.where(right, confidences, -math.inf)[on_the_map]
             scores = torch.cat([place_map.scores(part) for part in own[0].split(64)])
             places, reach = own[1].to(scores.device), min(STRETCH, place_map.places // 4)
-            near = places[:, None] + torch.arange(-reach, reach + 1, device=scores.device)
-            near = near.remainder(place_map.places)  # a route may end where it begins
-            pair = (confidence_of(one).cpu() for one in (scores, scores.scatter(1, near, math.inf)))
+            if area is None:
+                near = places[:, None] + torch.arange(-reach, reach + 1, device=scores.device)
+                near = near.remainder(place_map.places)  # a route may end where it begins
+            else:
+                near = area.around(places, round(reach**0.5))
+            pair = (confidence_of(one, area).cpu() for one in (scores, scores.scatter(1, near, math.inf)))
             platts[0] = look_alikes(platts[0], known, *pair)
     return Calibration(*platts)
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.maps.spectral_map import SpectralMap, scores_of
-from dejavu_torch.maps.spectrum import half_cycles
+from dejavu_torch.maps.spectrum import frequencies
 from dejavu_torch.recognition.samples import (
     GROUP,
     WIDEST,
@@ -28,7 +28,15 @@ from dejavu_torch.recognition.samples import (
     units_of,
     width_of,
 )
-from dejavu_torch.recognition.search import NmsSpec, Scan, Search, TopK, check_search, empty_topk
+from dejavu_torch.recognition.search import (
+    NmsSpec,
+    Scan,
+    Search,
+    TopK,
+    check_search,
+    empty_topk,
+    num_needed,
+)
 from dejavu_torch.recognition.select import best_candidates
 from dejavu_torch.types import expect
 
@@ -90,7 +98,8 @@ def plan(place_map: PlaceMap, limit: int | None = None) -> SamplingPlan | None:
             limit = torch.cuda.mem_get_info(device)[0] // FREE
 
     def size(places: int, *spacings: int) -> int:
-        return sum(-(-places // d) * (width * (2 if d == 1 else 1) + OVERHEAD) for d in spacings)
+        each = {d: d if place_map.area is None else d * d for d in spacings}  # of an area in both directions
+        return sum(-(-places // n) * (width * (2 if d == 1 else 1) + OVERHEAD) for d, n in each.items())
 
     every = SamplingPlan(1, 1, 0, 1.0, size(place_map.places, 1))
     fits = every.bytes <= limit and longest * width <= DECODED and width <= WIDEST
@@ -109,6 +118,7 @@ def plan(place_map: PlaceMap, limit: int | None = None) -> SamplingPlan | None:
     widest_fine = next((d for d in SPACINGS if held[d] >= FINE), 2)
     for coarse in [d for d in SPACINGS[::-1] if d >= max(4, widest_coarse)] if widest_coarse else ():
         spacings = [d for d in SPACINGS[::-1] if min(widest_fine, coarse // 2) <= d <= coarse // 2]
+        spacings = spacings if place_map.area is None else []
         for fine in [1, *spacings] if fits else spacings:
             if size(place_map.places, coarse, fine) <= limit:
                 refined = REFINED * (1 if coarse == widest_coarse else 4)
@@ -120,14 +130,14 @@ def explained_variance(place_map: SpectralMap) -> dict[int, float]:
     """The share of the lines' energy that samples at each of `SPACINGS` hold, from some chunks of a map."""
     held, whole = dict.fromkeys(SPACINGS, 0.0), 1e-30
     for chunk in range(0, len(place_map.chunks), max(1, len(place_map.chunks) // MEASURED_CHUNKS)):
-        length = place_map.chunks[chunk][1] - place_map.chunks[chunk][0]
-        line, _, value = place_map.lines(chunk)
-        energy = value.new_zeros(length + 1, dtype=torch.float64)
-        energy.index_add_(0, half_cycles(line, place_map.transform), value.double().square())
-        below = energy.cumsum(0).tolist()
-        whole += below[-1]
+        size, (line, _, value) = place_map.size_of(chunk), place_map.lines(chunk)
+        energy = value.new_zeros(math.prod(size), dtype=torch.float64)
+        energy.index_add_(0, line, value.double().square())
+        half_cycles = 2 * frequencies(*size, place_map.transform).to(energy) * energy.new_tensor(size)
+        whole += float(energy.sum())
         for d in SPACINGS:
-            held[d] += below[length // d]
+            most = energy.new_tensor([n // d + 0.5 for n in size])
+            held[d] += float(energy[(half_cycles <= most).all(1)].sum())
     return {d: energy / whole for d, energy in held.items()}
 
 
@@ -187,6 +197,11 @@ class CoarseSearch(Scan):
         plan, places = self.plan, self.place_map.places
         count = max(k for k, _ in wanted)
         group, best = topk_groups(best, max(plan.refined, 2 * count))
+        if (area := self.place_map.area) is not None:
+            reach = plan.coarse // 2 + 1 + max((k > 1) * radius for k, radius in wanted)
+            near = area.around(self.coarse.place[GROUP * group + best % GROUP].flatten(), reach)
+            place = near.view(len(group), -1).sort(1).values
+            return place.masked_fill(F.pad(place[:, 1:] == place[:, :-1], (0, 1)), -1)
         reach = -(-plan.coarse // (2 * plan.fine))
         offsets = torch.arange(-reach, reach + 1, device=group.device)
         middle = self.middle[GROUP * group + best % GROUP]
@@ -226,8 +241,9 @@ class CoarseSearch(Scan):
         """Which queries lack some of the wanted candidates, (Q,)."""
         if score.shape[1] < max(k for k, _ in wanted):
             return score.new_ones(len(score), dtype=torch.bool)
-        enough = max((k - 1) * (2 * radius + 1) for k, radius in wanted)  # all that candidates may suppress
+        enough = num_needed(wanted, self.place_map.places, self.place_map.area) - 1
         if bool((score.isfinite().sum(1) > enough).all()):
             return score.new_zeros(len(score), dtype=torch.bool)
-        last = [best_candidates(score, *spec, place).score[:, -1] for spec in wanted]
+        area = self.place_map.area
+        last = [best_candidates(score, *spec, place, area).score[:, -1] for spec in wanted]
         return torch.stack(last).isinf().any(0)

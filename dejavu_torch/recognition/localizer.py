@@ -11,6 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from dejavu_torch.area import Area
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.memory import in_one_thread
 from dejavu_torch.recognition.calibration import TOLERANCE, Platt, Track
@@ -201,8 +202,13 @@ class Localizer:
         state = self.states.get("filter")
         return state if state is None or state.ndim == 1 else state[0]
 
+    @property
+    def area(self) -> Area | None:
+        """Of the map's places; None along a route."""
+        return None if self.place_map is None else self.place_map.area
+
     def _alone(self, scores: Tensor) -> Match:
-        return self._answer(self._candidates(scores), best_pair(scores))
+        return self._answer(self._candidates(scores), best_pair(scores, self.area))
 
     def _in_sequence(self, scores: Tensor, last: bool = False) -> Match:
         states = self.states or {T: m.start(scores.shape[1]).to(scores) for T, m in self.models.items()}
@@ -225,7 +231,7 @@ class Localizer:
     def _candidates(self, scores: Tensor) -> Match:
         if self.matching.callback is not None:
             self.matching.callback(scores)
-        return best_candidates(scores, self.matching.k or 1, self.matching.radius)
+        return best_candidates(scores, self.matching.k or 1, self.matching.radius, area=self.area)
 
     def _answer(self, match: Match, pair: Match, confidence: Tensor | None = None) -> Match:
         """Candidates (B,k) with all that is known of them.
@@ -259,7 +265,7 @@ class Localizer:
         """Candidates from the lowest scores alone; `wanted` has those of the answer first."""
         assert self.searcher is not None
         score, place = self.searcher(descriptors, wanted)
-        match, pair = (best_candidates(score, *spec, places=place) for spec in wanted)
+        match, pair = (best_candidates(score, *spec, place, self.area) for spec in wanted)
         return self._answer(match, pair)
 
 
@@ -277,6 +283,6 @@ def earlier(scores: Tensor, numbers: Tensor, apart: int) -> Tensor:
     return scores.masked_fill(place >= (numbers[:, None] - apart).to(scores.device), math.inf)
 
 
-def best_pair(scores: Tensor) -> Match:
+def best_pair(scores: Tensor, area: Area | None = None) -> Match:
     """The two best places of each query that are more than `TOLERANCE` apart, (B,N) -> (B,2)."""
-    return best_candidates(scores, min(2, scores.shape[1]), TOLERANCE)
+    return best_candidates(scores, min(2, scores.shape[1]), TOLERANCE, area=area)

@@ -40,18 +40,18 @@ class Samples:
 
     def __init__(self, place_map: SpectralMap, spacing: int) -> None:
         chunks, size = place_map.chunks, GROUP * GROUPS_PER_BLOCK
-        counts = [-(-(stop - start) // spacing) for start, stop in chunks]
-        near = [place_map.sampled(g, count) + chunks[g][0] for g, count in enumerate(counts)]
+        near = [place_map.sampled(g, spacing) + start for g, (start, _) in enumerate(chunks)]
         place = torch.cat(near)
         self.groups = -(-len(place) // GROUP)  # without the padding
         self.place = F.pad(place, (0, -len(place) % size), value=place_map.places - 1)
         self.rows = self.place.new_zeros(len(self.place), width_of(place_map), dtype=torch.int8)
         self.finer = self.rows.clone() if spacing == 1 else None
-        largest = [units_at(place_map, g, count).abs().amax() for g, count in enumerate(counts)]
+        largest = [units_at(place_map, g, spacing).abs().amax() for g in range(len(chunks))]
         self.step, first = torch.stack(largest).amax().clamp(min=1e-30) / LEVELS, 0
-        for g, count in enumerate(counts):
-            steps = units_at(place_map, g, count) / self.step
-            whole, some = steps.round(), (slice(first, first + count), slice(place_map.dimension))
+        for g in range(len(chunks)):
+            steps = units_at(place_map, g, spacing) / self.step
+            count, whole = len(steps), steps.round()
+            some = slice(first, first + count), slice(place_map.dimension)
             self.rows[some] = whole.to(torch.int8)
             if self.finer is not None:
                 self.finer[some] = ((steps - whole) * FINER).round().to(torch.int8)
@@ -108,8 +108,10 @@ class RowSearch(Scan):
         units, samples = units_of(self.place_map, queries), self.samples
         whole, step = to_int8(units)
         best = samples.best_of_groups(whole)
-        # each candidate suppresses 2 radius + 1 places
-        count = max(2 + (k - 1) * (2 * radius // GROUP + 2) for k, radius in wanted)
+        # each candidate suppresses 2 radius + 1 places, in an area in as many rows
+        rows = (1 if self.place_map.area is None else 2 * radius + 1 for _, radius in wanted)
+        each = zip(wanted, rows, strict=True)
+        count = max(2 + (k - 1) * n * (2 * radius // GROUP + 2) for (k, radius), n in each)
         group, value = topk_groups(best, max(REFINED, count))
         row = GROUP * group.sort(1).values[:, :, None] + torch.arange(GROUP, device=group.device)
         row = row.flatten(1)
@@ -127,11 +129,12 @@ def width_of(place_map: SpectralMap) -> int:
     return -(-place_map.dimension // GROUP) * GROUP
 
 
-def units_at(place_map: SpectralMap, chunk: int, count: int) -> Tensor:
-    """Staged descriptors (M,K) at M even positions of a chunk, of length 1; all are those of the map."""
+def units_at(place_map: SpectralMap, chunk: int, spacing: int) -> Tensor:
+    """Staged descriptors (M,K) about every `spacing` places of a chunk, of length 1; all are those of the
+    map."""
     start, stop = place_map.chunks[chunk]
-    if count < stop - start:
-        return F.normalize(place_map.staged(place_map.samples(chunk, count)))
+    if spacing > 1 and stop - start > 1:
+        return F.normalize(place_map.staged(place_map.samples(chunk, spacing)))
     norms = place_map.norms[start:stop, None]
     units: Tensor = place_map.staged(place_map.decode(chunk)) * torch.where(norms > 0, 1 / norms, 0)
     return units

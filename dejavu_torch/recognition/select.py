@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from dejavu_torch.area import Area, around, distance
 from dejavu_torch.types import Match, check_shape, expect
 
 HIGHEST = torch.finfo(torch.float64).max  # threshold that accepts every finite score; JSON has no infinity
@@ -58,11 +59,14 @@ def best_match(scores: Tensor, threshold: float | None = None) -> Match:
     return replace(match, accepted=accept(match.score, threshold))
 
 
-def best_candidates(scores: Tensor, k: int, radius: int, places: Tensor | None = None) -> Match:
+def best_candidates(
+    scores: Tensor, k: int, radius: int, places: Tensor | None = None, area: Area | None = None
+) -> Match:
     """The k best places of each query, by non-maximum suppression with a radius in places.
 
     Args:
-        places: (Q,N) of the scores, if they are not all places in order.
+        places: (Q,N) of the scores, if they are not all places in order. area: of the places, if they are of
+            one: the radius then counts rows and columns.
 
     Shape: (Q,N) -> Match of (Q,k).
 
@@ -80,11 +84,10 @@ def best_candidates(scores: Tensor, k: int, radius: int, places: Tensor | None =
         found.append((index, score))
         if rank + 1 == k:
             break
-        if places is None:  # clamping only repeats an end of the map that is inside the window
-            window = torch.arange(-min(radius, columns), min(radius, columns) + 1, device=scores.device)
-            scores = scores.scatter(1, (at[:, None] + window).clamp(0, columns - 1), torch.inf)
+        if places is None:  # a border of the map may be named twice
+            scores = scores.scatter(1, around(at, radius, columns, area), torch.inf)
         else:
-            scores = scores.masked_fill((places - index[:, None]).abs() <= radius, torch.inf)
+            scores = scores.masked_fill(distance(places, index[:, None], area) <= radius, torch.inf)
     index, score = (torch.stack(column, 1) for column in zip(*found, strict=True))
     finite = score.isfinite()
     if k > 1:  # NaN in a query leaves it without candidates

@@ -234,7 +234,7 @@ def test_resolution_is_kept_and_extends_alike():
     assert again.resolution == 6.0
     assert torch.equal(levels_of(again)[:200], levels_of(grown))
     lines = spectrum((descriptors[200:] - grown.means[0].float()).T).T
-    levels = [quantise(lines, 0.3, dead_zone(lines, [100], r, "dft")).long() for r in (6.0, 0.0)]
+    levels = [quantise(lines, 0.3, dead_zone(lines, [(100, 1)], r, "dft")).long() for r in (6.0, 0.0)]
     assert torch.equal(levels_of(again)[200:], levels[0])
     assert not torch.equal(levels[0], levels[1])
 

@@ -278,11 +278,12 @@ def test_the_cosine_of_samples_is_near_that_of_places():
         learned = smooth_model(700, transform=transform).map
         assert isinstance(learned, SpectralMap)
         for chunk, (start, _) in enumerate(learned.chunks):
-            rows, at = learned.samples(chunk, 60), learned.sampled(chunk, 60)
+            spacing = -(-len(learned.decode(chunk)) // 60)
+            rows, at = learned.samples(chunk, spacing), learned.sampled(chunk, spacing)
             own = learned.decode(chunk)[at]
             assert float(torch.cosine_similarity(rows, own).quantile(0.1)) > 0.97, (transform, start)
             own = learned.decode(chunk)
-            same, at = learned.samples(chunk, len(own)), learned.sampled(chunk, len(own))
+            same, at = learned.samples(chunk, 1), learned.sampled(chunk, 1)
             torch.testing.assert_close(same, own[at], rtol=0, atol=1e-4)
 
 

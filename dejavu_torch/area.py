@@ -1,0 +1,122 @@
+"""Places in a plane: the rows and columns of windows over an area, numbered tile by tile."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+SIDE = 128  # windows of a tile to a side
+
+
+class Area(NamedTuple):
+    """Windows in rows and columns, as over a picture of the ground.
+
+    Args:
+        rows, columns: of windows. first: (x, y) of the middle of the first window. right, down: (x, y) from a
+            window to the next of its row, and of its column. unit: of these, "px" or "m".
+
+    Convention: places are numbered tile by tile and in a tile row by row, so that a tile is a run of places.
+        Tiles have about `SIDE` windows to a side, or in an area that is narrow as many, and equal sizes.
+
+    Example:
+        >>> area = Area(2, 3, first=(32.0, 32.0), right=(4.0, 0.0), down=(0.0, 4.0))
+        >>> area.coordinates(torch.tensor([0, 2, 3])).tolist()
+        [[32.0, 32.0], [40.0, 32.0], [32.0, 36.0]]
+    """
+
+    rows: int
+    columns: int
+    first: tuple[float, float] = (0.0, 0.0)
+    right: tuple[float, float] = (1.0, 0.0)
+    down: tuple[float, float] = (0.0, 1.0)
+    unit: str = "px"
+
+    @property
+    def places(self) -> int:
+        """N, the number of windows."""
+        return self.rows * self.columns
+
+    @property
+    def tiles(self) -> list[tuple[int, int]]:
+        """Rows and columns of each tile."""
+        _, size, _ = _tiles(self.rows, self.columns)
+        return [(rows, columns) for rows, columns in size.tolist()]
+
+    def columns_from(self, place: int) -> int:
+        """The columns of the tile that begins at a place."""
+        _, size, start = _tiles(self.rows, self.columns)
+        return int(size[int((start == place).nonzero()[0]), 1])
+
+    def cells(self, places: Tensor) -> Tensor:
+        """Row and column of places, int64 of any shape -> (..., 2)."""
+        corner, size, start = (table.to(places.device) for table in _tiles(self.rows, self.columns))
+        tile = torch.bucketize(places, start, right=True) - 1
+        inside, width = places - start[tile], size[tile, 1]
+        return corner[tile] + torch.stack([inside // width, inside % width], -1)
+
+    def place_at(self, cells: Tensor) -> Tensor:
+        """The places of rows and columns inside the area, (..., 2) -> (...)."""
+        corner, size, start = (table.to(cells.device) for table in _tiles(self.rows, self.columns))
+        tops, lefts = corner[:, 0].unique(), corner[:, 1].unique()
+        row = torch.bucketize(cells[..., 0].contiguous(), tops, right=True) - 1
+        column = torch.bucketize(cells[..., 1].contiguous(), lefts, right=True) - 1
+        tile = row * len(lefts) + column
+        inside = cells - corner[tile]
+        return start[tile] + inside[..., 0] * size[tile, 1] + inside[..., 1]
+
+    def coordinates(self, places: Tensor) -> Tensor:
+        """(x, y) of the middle of windows, int64 (...) -> (..., 2) float64."""
+        steps = torch.tensor([self.down, self.right], dtype=torch.float64, device=places.device)
+        return self.cells(places).double() @ steps + steps.new_tensor(self.first)
+
+    def distance(self, one: Tensor, other: Tensor) -> Tensor:
+        """The larger of the distances in rows and columns, int64."""
+        return (self.cells(one) - self.cells(other)).abs().amax(-1)
+
+    def around(self, places: Tensor, radius: int) -> Tensor:
+        """The windows up to a radius in rows and columns, (n,) -> (n, (2 radius + 1)^2); those beyond a
+        border are others of them."""
+        offset = torch.arange(-radius, radius + 1, device=places.device)
+        cells = self.cells(places)[:, None] + torch.cartesian_prod(offset, offset)
+        most = torch.tensor([self.rows - 1, self.columns - 1], device=places.device)
+        return self.place_at(torch.minimum(cells.clamp(min=0), most))
+
+
+def area_of(stored: Mapping[str, Any]) -> Area:
+    """An area from the values of `_asdict`, as JSON keeps them."""
+    points: dict[str, Any] = {name: tuple(stored[name]) for name in ("first", "right", "down")}
+    return Area(**{**stored, **points})
+
+
+def distance(one: Tensor, other: Tensor, area: Area | None) -> Tensor:
+    """Places between two, along a route or in an area."""
+    return (one - other).abs() if area is None else area.distance(one, other)
+
+
+def around(places: Tensor, radius: int, count: int, area: Area | None) -> Tensor:
+    """The places up to a radius from each, (n,) -> (n, m), of N = `count`; some may be named twice."""
+    if area is not None:
+        return area.around(places, radius)
+    radius = min(radius, count)
+    offset = torch.arange(-radius, radius + 1, device=places.device)
+    return (places[:, None] + offset).clamp(0, count - 1)
+
+
+@lru_cache(16)
+def _tiles(rows: int, columns: int) -> tuple[Tensor, Tensor, Tensor]:
+    """The first cell of each tile (T,2), its rows and columns (T,2), and its first place (T,)."""
+    down = _edges(rows, SIDE)
+    across = _edges(columns, SIDE * SIDE // int(down.diff().max()))
+    corner = torch.cartesian_prod(down[:-1], across[:-1]).view(-1, 2)
+    size = torch.cartesian_prod(down.diff(), across.diff()).view(-1, 2)
+    return corner, size, torch.cat([size.new_zeros(1), size.prod(1).cumsum(0)[:-1]])
+
+
+def _edges(count: int, most: int) -> Tensor:
+    """Borders of equal parts of at most so many."""
+    parts = max(1, round(count / most))
+    return torch.arange(parts + 1) * count // parts
