@@ -314,6 +314,7 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
         if not isinstance(place_map, SpectralMap) or not place_map.places:
             seen = f"a map of kind {place_map.kind!r}" if place_map.places else "no map"
             raise InputError(f"{name} is {seen}; expected one of kind {SpectralMap.kind!r} to merge")
+        expect(place_map.area is None, "maps of routes to merge", f"{name} is the map of an area")
         if problem := _difference(first, model):
             raise InputError(f"{names[0]} and {name} cannot be merged: {problem}")
         maps = [(route.name, place_map.part(route.name)) for route in place_map.routes] or [(name, place_map)]

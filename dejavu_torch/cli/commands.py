@@ -408,5 +408,5 @@ def write_matches(
     if isinstance(query, ResampledTraverse):
         frames, source = query.frame, query.traverse
     names = source.names, model.frame_names
-    facts = model.map.frame_of, *names, ranks, model.map.routes, pairs
+    facts = model.map.frame_of, *names, ranks, model.map.routes, pairs, model.map.area
     return files.write_matches(path, matches, frames, *facts)

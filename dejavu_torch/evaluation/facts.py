@@ -102,15 +102,16 @@ def match_facts(
     alone = answer_facts(shown, run.query_frames, tolerance, run.truth is not None, offset)
     if run.matching.apart is not None or place_map.area is not None:
         alone.pop("line", None)  # a second lap lies on one
-    if place_map.area is not None and run.radius:
-        unit = "metres" if place_map.area.unit == "m" else "pixels"
-        alone |= {"tolerance": run.radius, "unit": unit, "truth": "the coordinates of both"}
+    if place_map.area is not None:
+        size = {"area": {"rows": place_map.area.rows, "columns": place_map.area.columns}}
+        alone |= size | {"unit": run.within.partition(" ")[2], "tolerance": run.radius or tolerance}
+        alone["truth"] = "the coordinates of both" if run.radius else words
     return facts | alone
 
 
 def metric_facts(run: Localization, truth: Truth | None) -> Facts:
-    """The entry `error_metres` of report.json, or `error_pixels`: quantiles of the distances between queries and the places
-    reported for them, where the truth is by coordinates."""
+    """The entry `error_metres` or `error_pixels` of report.json: quantiles of the distances between queries
+    and the places reported for them, where the truth is by coordinates."""
     parsed = None if truth is None else check_ground_truth(truth)
     if not isinstance(parsed, Near):
         return {}

@@ -115,6 +115,14 @@ class Localization(NamedTuple):
         return unit_of(self.model.map.positions)
 
     @property
+    def within(self) -> str:
+        """The tolerance with its unit."""
+        area = self.model.map.area
+        if area is None or not self.radius:
+            return f"{self.tolerance} {self.unit}"
+        return f"{self.radius} {'metres' if area.unit == 'm' else 'pixels'}"
+
+    @property
     def has_frames(self) -> bool:
         """Whether both traverses hold frames rather than ready features."""
         return len(self.reference.frame_shape) == len(self.query.frame_shape) == 3

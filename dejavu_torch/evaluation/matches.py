@@ -1,4 +1,4 @@
-"""Matches as a csv: query,place,score,accepted[,probability][,confidence][,rank][,route], and two names."""
+"""Matches as a csv: query,place,score,accepted[,probability][,confidence][,rank][,route][,x,y], two names."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from typing import NamedTuple, TextIO
 import torch
 from torch import Tensor
 
+from dejavu_torch.area import Area
 from dejavu_torch.data.files import as_number, read_rows
 from dejavu_torch.data.output import whole_file
 from dejavu_torch.maps.frame_table import Route
@@ -54,6 +55,7 @@ def write_matches(
     ranks: int | None = None,
     routes: Sequence[Route] = (),
     pairs: Path | None = None,
+    area: Area | None = None,
 ) -> tuple[int, int]:
     """Write batches of matches as a csv; return the numbers of (queries, queries with an accepted match).
 
@@ -66,6 +68,7 @@ def write_matches(
         ranks: matches per query; None is one, without a column for the rank.
         routes: of a merged map, for `Match.route`: their names get a column, and the place is a frame of that
             route. `frame_of` and `place_names` count through all routes.
+        area: of the places: x and y of the middles of windows get columns.
         pairs: another file, with a line `query_name place_name` for each reported place: the image pairs
             that hloc and COLMAP read.
 
@@ -84,7 +87,7 @@ def write_matches(
             return stack.enter_context(temporary.open("w", newline="", encoding="utf-8"))
 
         file, paired = opened(path), None if pairs is None else opened(pairs)
-        others = ["rank"] * (ranks is not None) + ["route"] * bool(routes)
+        others = ["rank"] * (ranks is not None) + ["route"] * bool(routes) + ["x", "y"] * (area is not None)
         columns = [*NUMBERS, *known, *others, *NAMES]
         writer = csv.DictWriter(file, columns, extrasaction="ignore")
         writer.writeheader()
@@ -121,6 +124,9 @@ def write_matches(
                     "query_name": _name(query_names, query),
                     "place_name": _name(place_names, place),
                 }
+                if area is not None and place >= 0:
+                    x, y = area.coordinates(torch.tensor(place)).tolist()
+                    row |= {"x": f"{x:.9g}", "y": f"{y:.9g}"}
                 writer.writerow(row)
                 if paired and place >= 0:
                     paired.write(f"{row['query_name']} {row['place_name']}\n")

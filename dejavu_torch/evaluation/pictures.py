@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from dejavu_torch.evaluation.area_plots import draw_area, draw_heat
 from dejavu_torch.evaluation.contenders import Contender
 from dejavu_torch.evaluation.controls import template_map_of
 from dejavu_torch.evaluation.localization import Localization
@@ -30,10 +31,14 @@ def draw_pictures(
     storage: Mapping[str, Sequence[Stored]] | None = None,
 ) -> Pictures:
     """All pictures that can be drawn; some need ground truth, frames or layers."""
-    place_map, tolerance, storage = run.model.map, f"{run.tolerance} {run.unit}", storage or {}
+    place_map, tolerance, storage = run.model.map, run.within, storage or {}
     pictures = draw_examples(run) | draw_pairs(run)
-    pictures |= draw_coverage(run.scored, run.truth, run.tolerance, run.borders, run.query_frames, run.unit)
-    pictures |= draw_scores(run) | draw_posterior(run)
+    if place_map.area is not None:
+        pictures |= draw_area(run) | draw_heat(run)
+    else:
+        seen = run.borders, run.query_frames, run.unit
+        pictures |= draw_coverage(run.scored, run.truth, run.tolerance, *seen)
+        pictures |= draw_scores(run) | draw_posterior(run)
     pictures |= draw_curves(contenders, tolerance)
     pictures |= draw_storage(contenders, storage, tolerance)
     pictures |= draw_sequences(contenders, storage.get("map", ()), place_map.places, tolerance)

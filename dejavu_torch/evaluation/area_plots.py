@@ -1,0 +1,91 @@
+"""Pictures of an area: where queries were found, and what one of them looks like everywhere."""
+
+from __future__ import annotations
+
+import torch
+
+from dejavu_torch.data.ground_truth import scored_and_right
+from dejavu_torch.evaluation import plots
+from dejavu_torch.evaluation.contenders import COLOURS
+from dejavu_torch.evaluation.localization import Localization
+from dejavu_torch.motion.resampling import source_of
+from dejavu_torch.types import Facts
+
+LOWEST, HIGHEST = 0.3, 1.5  # height of a picture, relative to its width; axes of other areas are not equal
+
+
+def draw_area(run: Localization) -> plots.Pictures:
+    """The places reported for the queries, on the ground; lines lead to wrong ones from where they are."""
+    area, match = run.model.map.area, run.scored
+    assert area is not None
+    found = match.index >= 0
+    at = area.coordinates(match.index.clamp(min=0))
+    known = source_of(run.query).coordinates
+    own = None if known is None else known.values[run.query_frames, :2]
+    figure, axis = _ground(run)
+    if run.truth is None:
+        groups = [
+            (found & ~match.accepted, plots.GREY, "not accepted"),
+            (found & match.accepted, COLOURS["map"], "accepted"),
+        ]
+    else:
+        scored, right = scored_and_right(match.index, run.truth, run.tolerance)
+        wrong = scored & found & ~right
+        groups = [
+            (wrong & ~match.accepted, plots.PALE_WRONG, "wrong, not accepted"),
+            (right & ~match.accepted, plots.PALE_RIGHT, "right, not accepted"),
+            (right & match.accepted, plots.RIGHT, "right, accepted"),
+            (wrong & match.accepted, plots.WRONG, "wrong, accepted"),
+        ]
+        if own is not None:
+            ends = torch.stack([own, at], 1)[wrong & match.accepted]
+            axis.plot(*ends.T, color=plots.WRONG, linewidth=0.4, alpha=0.5)
+    for which, colour, name in groups:
+        if which.any():
+            axis.plot(*at[which].T, ".", color=colour, markersize=3, label=f"{int(which.sum())} {name}")
+    plots.legend(figure, ncols=2, markerscale=3)
+    return plots.picture("coverage", (figure, axis), truth=run.truth, area=True, lines=own is not None)
+
+
+def draw_heat(run: Localization) -> plots.Pictures:
+    """The scores of one query in the middle at all places."""
+    area, query = run.model.map.area, len(run.query_features) // 2
+    assert area is not None
+    scores = run.scores(torch.tensor([query]))[0]
+    if not scores.isfinite().any():
+        return {}
+    cells = area.cells(torch.arange(area.places))
+    plane = scores.new_full((area.rows, area.columns), torch.nan)
+    plane[cells[:, 0], cells[:, 1]] = scores.masked_fill(scores.isinf(), torch.nan)
+    figure, axis = _ground(run)
+    (left, top), (right, bottom) = area.coordinates(torch.tensor([0, area.places - 1])).tolist()
+    image = axis.imshow(
+        plane.numpy(), cmap="gray", extent=(left, right, bottom, top), aspect=axis.get_aspect()
+    )
+    plots.colour_bar(figure, image, axis, "score", shrink=0.8)
+    index = int(run.scored.index[query])
+    style: Facts = {"markerfacecolor": "none", "markersize": 9, "linestyle": "none"}
+    if index >= 0:
+        place = area.coordinates(torch.tensor(index))
+        axis.plot(*place, "o", color=COLOURS["map"], label="reported place", **style)
+    known = source_of(run.query).coordinates
+    if known is not None:
+        axis.plot(*known.values[run.query_frames[query], :2], "s", color=plots.RIGHT, label="query", **style)
+    plots.legend(figure, ncols=2)
+    return plots.picture("scores", (figure, axis), area=True, query=int(run.query_frames[query]))
+
+
+def _ground(run: Localization) -> plots.Plot:
+    """Axes with the sides of the area."""
+    area = run.model.map.area
+    assert area is not None
+    corners = area.coordinates(torch.tensor([0, area.places - 1]))
+    (left, top), (right, bottom) = corners.tolist()
+    wide, tall = (max(1e-6, abs(side)) for side in (right - left, bottom - top))
+    shape = min(HIGHEST, max(LOWEST, tall / wide))
+    figure, axis = plots.canvas(plots.WIDTH * shape + 6 * plots.LINE)
+    unit = "metres" if area.unit == "m" else "pixels"
+    axis.set(
+        xlim=(left, right), ylim=(bottom, top), xlabel=f"x ({unit})", ylabel=f"y ({unit})", aspect="equal"
+    )
+    return figure, axis

@@ -1,0 +1,296 @@
+"""Maps of areas: windows in rows and columns, lines of two frequencies, and places in a plane."""
+
+from __future__ import annotations
+
+import csv
+
+import numpy as np
+import pytest
+import torch
+from command_line import fails, run
+from helpers import long_from, refused
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+import dejavu_torch.area as areas
+from dejavu_torch import DejaVu, PlaceSmoother, SpectralMapper, TemplateMapper, compare, open_source
+from dejavu_torch.area import Area, around, distance
+from dejavu_torch.data.grid import Grid
+from dejavu_torch.evaluation.baselines import stored_frames
+from dejavu_torch.growth import append, merge
+from dejavu_torch.maps.spectral_map import SpectralMap
+from dejavu_torch.maps.spectrum import by_frequency, frequencies, from_lines, lines_of
+from dejavu_torch.recognition.coarse import CoarseSearch, SamplingPlan
+from dejavu_torch.recognition.samples import RowSearch
+from dejavu_torch.recognition.search import Scan
+from dejavu_torch.recognition.select import best_candidates
+
+SIDES = st.integers(1, 40)
+
+
+@pytest.fixture
+def small_tiles(monkeypatch):
+    """Tiles of about six windows to a side."""
+    areas._tiles.cache_clear()
+    monkeypatch.setattr(areas, "SIDE", 6)
+    yield
+    areas._tiles.cache_clear()
+
+
+def smooth(rows, columns, dimension=12, seed=0):
+    """Descriptors (rows x columns, K) that change slowly in both directions, row by row."""
+    draw = torch.Generator().manual_seed(seed)
+    noise = torch.randn(dimension, 1, rows + 8, columns + 8, generator=draw)
+    plane = torch.nn.functional.avg_pool2d(noise, 9, 1, 4)[:, 0, 4:-4, 4:-4]
+    return torch.nn.functional.normalize(plane.flatten(1).T)
+
+
+def learned(area, transform="dft", step=0.02, seed=0):
+    """A map of smooth descriptors, and these in the order of its places."""
+    rows = smooth(area.rows, area.columns, seed=seed)
+    cells = area.cells(torch.arange(area.places))
+    own = rows[cells[:, 0] * area.columns + cells[:, 1]]
+    return SpectralMapper(step=step, transform=transform)(own, area), own
+
+
+@given(rows=SIDES, columns=SIDES, side=st.integers(1, 9))
+def test_every_window_is_one_place_and_a_tile_is_a_run_of_places(rows, columns, side):
+    areas._tiles.cache_clear()
+    before, areas.SIDE = areas.SIDE, side
+    try:
+        area = Area(rows, columns)
+        places = torch.arange(area.places)
+        cells = area.cells(places)
+        assert {(r, c) for r in range(rows) for c in range(columns)} == {*map(tuple, cells.tolist())}
+        assert torch.equal(area.place_at(cells), places)
+        assert area.tiles[0] == (area.tiles[0][0], area.columns_from(0))
+        for (tall, wide), run_of in zip(area.tiles, cells.split([r * c for r, c in area.tiles]), strict=True):
+            inside = run_of - run_of[0]
+            assert torch.equal(
+                inside, torch.cartesian_prod(torch.arange(tall), torch.arange(wide)).view(-1, 2)
+            )
+    finally:
+        areas.SIDE = before
+        areas._tiles.cache_clear()
+
+
+def test_neighbours_are_those_in_the_plane(small_tiles):
+    area = Area(13, 17)
+    place = area.place_at(torch.tensor([[5, 5], [0, 16]]))
+    near = around(place, 2, area.places, area)
+    for one, found in zip(place, near, strict=True):
+        every = torch.arange(area.places)
+        assert {*found.tolist()} == {*every[distance(every, one, area) <= 2].tolist()}
+    assert distance(torch.tensor(3), torch.tensor(10), None) == 7
+
+
+@given(rows=SIDES, columns=SIDES, transform=st.sampled_from(["dft", "dct"]), seed=st.integers(0, 99))
+def test_lines_of_a_plane_are_orthonormal_and_in_the_order_of_their_frequency(rows, columns, transform, seed):
+    plane = torch.randn(3, rows * columns, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    lines = lines_of(plane, columns, transform)
+    torch.testing.assert_close(lines.square().sum(1), plane.square().sum(1))
+    torch.testing.assert_close(from_lines(lines, columns, transform), plane)
+    torch.testing.assert_close(lines[:, 0], plane.sum(1) / (rows * columns) ** 0.5)
+    squares = frequencies(rows, columns, transform).square().sum(1)
+    assert (squares.diff() >= -1e-12).all()
+    assert by_frequency(rows, 1, transform, torch.device("cpu")).tolist() == [*range(rows)]
+
+
+def test_a_wave_over_the_plane_is_one_line():
+    """cos(2 pi (2 r / 8 + 3 c / 12)) is half the product of two cosines less that of two sines."""
+    row, column = torch.meshgrid(torch.arange(8.0), torch.arange(12.0), indexing="ij")
+    wave = torch.cos(2 * torch.pi * (2 * row / 8 + 3 * column / 12)).flatten()
+    lines = lines_of(wave, 12)
+    strong = (lines.abs() > 1e-4).nonzero()[:, 0]
+    assert len(strong) == 2
+    found = frequencies(8, 12, "dft")[strong]
+    torch.testing.assert_close(found, torch.tensor([[2 / 8, 3 / 12]] * 2, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("transform", ["dft", "dct"])
+def test_the_map_of_an_area_scores_as_its_descriptors(small_tiles, transform):
+    area = Area(13, 17)
+    place_map, own = learned(area, transform)
+    assert [place_map.size_of(g) for g in range(len(place_map.chunks))] == area.tiles
+    decoded = torch.cat([place_map.decode(g) for g in range(len(place_map.chunks))])
+    assert float((decoded - own).norm() / own.norm()) < 0.1
+    queries = torch.randn(5, own.shape[1])
+    exact = 1 - torch.cosine_similarity(queries[:, None], decoded, dim=2)
+    torch.testing.assert_close(place_map.scores(queries), exact, rtol=1e-4, atol=1e-4)
+    again = place_map._without_places(place_map.means)
+    again.load_packed(place_map.packed(), place_map.get_extra_state())
+    assert again.area == area
+    assert torch.equal(again.scores(queries), place_map.scores(queries))
+    assert place_map.summary().covered == area.places
+
+
+def test_two_directions_take_fewer_bytes_than_one():
+    area = Area(40, 40)
+    place_map, own = learned(area, step=0.3)
+    rows = SpectralMapper(step=0.3, chunk=40)(own)  # one tile, row by row
+    shuffled = SpectralMapper(step=0.3)(own[torch.randperm(len(own))], area)
+    sizes = [one.summary().route["lines"] for one in (place_map, rows, shuffled)]
+    assert sizes[0] < 0.8 * sizes[1] < 0.8 * sizes[2]
+
+
+def test_a_route_of_one_column_is_the_map_of_a_route():
+    rows = smooth(50, 1)
+    place_map, route = SpectralMapper(step=0.1)(rows, Area(50, 1)), SpectralMapper(step=0.1)(rows)
+    assert torch.equal(place_map.streams, route.streams)
+    assert not len(place_map.columns)
+
+
+@pytest.mark.parametrize("transform", ["dft", "dct"])
+def test_samples_are_low_passed_in_both_directions(small_tiles, transform, monkeypatch):
+    monkeypatch.setattr(areas, "SIDE", 20)
+    areas._tiles.cache_clear()
+    place_map, _ = learned(Area(40, 37), transform, step=0.01)
+    for chunk in range(len(place_map.chunks)):
+        decoded = place_map.decode(chunk)
+        torch.testing.assert_close(place_map.samples(chunk, 1), decoded, rtol=0, atol=1e-4)
+        near = decoded[place_map.sampled(chunk, 2)]
+        assert float(torch.cosine_similarity(place_map.samples(chunk, 2), near).median()) > 0.9
+
+
+def test_searches_find_what_a_scan_finds(small_tiles, monkeypatch):
+    monkeypatch.setattr(areas, "SIDE", 16)
+    areas._tiles.cache_clear()
+    place_map, own = learned(Area(48, 50), step=0.05)
+    queries = own[::37] + 0.02 * torch.randn(len(own[::37]), own.shape[1])
+    wanted = [(3, 2), (2, 5)]
+    scan = Scan(place_map)
+    for search in (RowSearch(place_map), CoarseSearch(place_map, SamplingPlan(2, 1, 64, 1.0, 0))):
+        for spec in wanted:
+            score, place = search(queries, wanted)
+            found = best_candidates(score, *spec, place, place_map.area)
+            best = best_candidates(place_map.scores(queries), *spec, area=place_map.area)
+            exact = best_candidates(
+                *(scan(queries, wanted)[0], *spec, scan(queries, wanted)[1]), place_map.area
+            )
+            assert torch.equal(exact.index, best.index)
+            assert float((found.index[:, 0] == best.index[:, 0]).float().mean()) > 0.95
+            torch.testing.assert_close(found.score[:, 0], best.score[:, 0], rtol=0, atol=1e-2)
+
+
+def test_candidates_are_apart_in_the_plane(small_tiles):
+    area = Area(13, 17)
+    scores = torch.rand(4, area.places)
+    found = best_candidates(scores, 4, 3, area=area)
+    for row in found.index:
+        apart = distance(row[:, None], row, area) + 99 * torch.eye(4, dtype=torch.long)
+        assert int(apart.min()) > 3
+
+
+def test_every_kth_window_is_stored_in_both_directions(small_tiles):
+    area = Area(13, 17)
+    stored, nearest = stored_frames(area.places, 4, area)
+    assert len(stored) == 4 * 5
+    every = torch.arange(area.places)
+    assert int(distance(stored[nearest], every, area).max()) <= 2
+    assert [table.tolist() for table in stored_frames(5, 2)] == [[0, 2, 4], [0, 1, 1, 2, 2]]
+
+
+def ground(side, seed=0, light=0.0):
+    """A picture of coarse and fine texture, (side,side,3) uint8."""
+    draw = torch.Generator().manual_seed(seed)
+    layers = [torch.rand(1, 3, side // n, side // n, generator=draw) for n in (16, 8, 4)]
+    resized = [torch.nn.functional.interpolate(one, (side, side), mode="bicubic") for one in layers]
+    picture = (sum(resized) / 3 + light).clamp(0, 1)[0]  # type: ignore[operator]
+    return (255 * picture).byte().permute(1, 2, 0).numpy()
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory):
+    """Two pictures of the same ground, in another light."""
+    folder = tmp_path_factory.mktemp("ground")
+    for name, light in (("one", 0.0), ("two", 0.08)):
+        Image.fromarray(ground(192, light=light)).save(folder / f"{name}.png")
+    return folder
+
+
+def test_windows_are_parts_of_the_picture(pictures, small_tiles):
+    grid = open_source(f"grid:{pictures}/one.png?window=32&stride=16&rows=10:190&columns=4:180")
+    assert isinstance(grid, Grid)
+    picture = np.asarray(Image.open(pictures / "one.png"))
+    assert (grid.area.rows, grid.area.columns) == (10, 10)
+    for place in (0, 7, 58, 99):
+        row, column = grid.area.cells(torch.tensor(place)).tolist()
+        top, left = 10 + 16 * row, 4 + 16 * column
+        own = torch.from_numpy(picture[top : top + 32, left : left + 32].copy()).permute(2, 0, 1) / 255
+        torch.testing.assert_close(grid[place], own)
+        assert grid.coordinates.values[place].tolist() == [left + 16, top + 16]
+    halved = open_source(f"grid:{pictures}/one.png?window=32&stride=16&scale=.5")
+    assert (halved.area.rows, halved.frame_shape) == (5, (3, 32, 32))
+    assert open_source(f"grid:{pictures}/one.png?stop=5").area is None  # no longer rows and columns
+
+
+def test_an_area_is_compared_by_distance(pictures, small_tiles, tmp_path, monkeypatch, capsys):
+    long_from(monkeypatch, 200)  # learned tile by tile
+    one = f"grid:{pictures}/one.png?window=48&stride=8"
+    two = f"grid:{pictures}/two.png?window=48&stride=11&rows=3:180"
+    run("compare", one, two, "--tolerance", "6", "--bytes", "6", "--out", tmp_path / "report")
+    said = capsys.readouterr().out
+    assert "within 6 pixels" in said
+    assert "every 2nd window" not in said  # twice 6 pixels are one window
+    rows = [*csv.DictReader((tmp_path / "report" / "matches.csv").open())]
+    own = open_source(two).coordinates.values
+    found = torch.tensor([[float(row["x"]), float(row["y"])] for row in rows], dtype=torch.float64)
+    right = (found - own).norm(dim=1) <= 6
+    report = compare(one, two, tolerance=6, model=DejaVu(mapper=SpectralMapper(6.0))).report.as_json()
+    assert report["recall_at_1"] == pytest.approx(float(right.double().mean()))
+    assert report["recall_at_1"] > 0.8
+    assert report["null"]["recall_at_1"] < 0.5 * report["recall_at_1"]
+    assert report["area"] == {"rows": 19, "columns": 19}
+    assert report["error_pixels"]["all"]["0.5"] < 6
+    run("localize", tmp_path / "report" / "map.safetensors", two, "--out", tmp_path / "m.csv")
+    assert f"{len(own)} queries" in capsys.readouterr().out
+    again = [*csv.DictReader((tmp_path / "m.csv").open())]
+    assert [row["place"] for row in again] == [row["place"] for row in rows]
+
+
+def test_what_a_map_of_an_area_does_not_do_is_refused(pictures, small_tiles):
+    source = f"grid:{pictures}/one.png?window=48&stride=16"
+    model = DejaVu().learn(source)
+    assert isinstance(model.map, SpectralMap)
+    with refused("map of an area", "append", "route"):
+        append(model, open_source(source))
+    with refused("map of an area", "merge"):
+        merge([model, model], ["a", "b"])
+    with refused("PlaceSmoother", "area", "single images"):
+        model.localize(source, sequence=PlaceSmoother())
+    with refused("TemplateMapper", "area", "SpectralMapper"):
+        DejaVu(mapper=TemplateMapper()).learn(source)
+    with refused("100 descriptors", "10 x 11", "one for each"):
+        SpectralMapper()(smooth(10, 10), Area(10, 11))
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("window=300", ("192 x 192", "windows 300", "1 to 192")),
+        ("window=32&stride=40", ("stride 40", "leave gaps")),
+        ("window=32&stride=0", ("stride 0",)),
+        ("scale=2", ("scale is 2", "at most 1")),
+        ("scale=.1&window=32", ("19 x 19",)),
+        ("rows=50:300", ("rows 50:300", "0:192")),
+        ("columns=7", ("columns 7", "first:stop")),
+        ("windows=7", ("unknown 'windows'", "window")),
+    ],
+)
+def test_bad_options_are_told_in_one_line(pictures, options, words):
+    with refused(*words):
+        open_source(f"grid:{pictures}/one.png?{options}")
+
+
+def test_other_pictures(tmp_path, capsys):
+    Image.fromarray(ground(64)).convert("RGBA").save(tmp_path / "alpha.png")
+    assert open_source(f"grid:{tmp_path}/alpha.png?window=32").frame_shape == (3, 32, 32)
+    deep = (np.arange(64 * 64).reshape(64, 64) * 16).astype(np.uint16)
+    Image.fromarray(deep).save(tmp_path / "deep.png")
+    assert open_source(f"grid:{tmp_path}/deep.png?window=32").frame_shape == (1, 32, 32)
+    (tmp_path / "broken.png").write_bytes(b"\x89PNG\r\n")
+    assert "cannot be read" in fails(
+        capsys, "learn", f"grid:{tmp_path}/broken.png", "--map", tmp_path / "map"
+    )
+    assert "missing.png" in fails(capsys, "learn", f"grid:{tmp_path}/missing.png", "--map", tmp_path / "map.safetensors")
