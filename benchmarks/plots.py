@@ -123,7 +123,7 @@ def plot_growth(
         linear: panels of shares from 0 to 1.
     """
     names = list(dict.fromkeys(name for lines in panels.values() for name in lines))
-    styles = _growth_styles(names)
+    styles = growth_styles(names)
     figure, axes = canvas(2.6 * len(panels) + 1.1 * LINE * len(names), len(panels), squeeze=False)
     drawn = {}
     for axis, (heading, lines) in zip(axes[:, 0], panels.items(), strict=True):
@@ -142,7 +142,7 @@ def plot_growth(
     return figure, axes[:, 0]
 
 
-def _growth_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
+def growth_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
     """A style for each contender: a colour of its family, a marker and a line of its own."""
     colours: dict[str, str] = {}
     members: Counter[str] = Counter()

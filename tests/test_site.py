@@ -72,6 +72,7 @@ def test_every_public_name_has_its_docstring_on_the_page_of_its_folder(site):
     assert {f"dejavu_torch.{home}.{name}" for name, home in dejavu_torch._HOMES.items()} <= set(names)
     assert set(names) <= set(entries)
     assert "dejavu_torch.evaluation.plots.Picture" in entries  # in signatures by an alias only
+    assert not (site / "_downloads").exists()  # to which Sphinx copies what a page links to and is no page
     for name, text in names.items():
         page = site / entries[name].uri.partition("#")[0]
         assert page.parent == site / "reference" / "api"
