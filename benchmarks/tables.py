@@ -142,64 +142,39 @@ def leaderboard() -> str:
 def losses() -> str:
     """Where something else finds as much as the map or more, and where what it accepts is wrong."""
     known = reports("default")
-    trainings, drives = (by("case", coded(name)) for name in ("trainings", "made drives"))
+    trained, drives = (by("case", coded(name)) for name in ("trainings", "made drives"))
     (elsewhere,) = known["road, first half"]["rejection"]["off_map"].values()
 
-    def found(case: str, rival: str) -> list[float]:
+    def recalls(case: str, rival: str) -> list[float | None]:
         return [of["recall_at_1"] for of in (known[case], known[case][rival])]
 
     def stored_in(size: float, name: str) -> list[float | None]:
         rows = families(coded(name))
         return [best(some, size) for some in (rows["dejavu"], [*rows["PQ"], *rows["OPQ"]])]
 
-    def trained(case: str) -> list[float]:
-        ways = by("contender", trainings[case])
-        return [mean(row["auc"] for row in ways[f"{way} default"]) for way in ("trained", "untrained")]
+    def jumping(case: str) -> list[float | None]:
+        (row,) = (row for row in drives[case] if row["contender"] == JUMPS)
+        return [row["auc"], row["auc_one"]]
 
-    def jumping(case: str) -> list[float]:
-        return next([row["auc"], row["auc_one"]] for row in drives[case] if row["contender"] == JUMPS)
+    def training(case: str) -> list[float | None]:
+        rows = by("contender", trained[case])
+        return [mean(row["auc"] for row in rows[f"{way} default"]) for way in ("trained", "untrained")]
 
-    cells: dict[str, tuple[Sequence[float | None], str]] = {
-        "city 3, recall@1": (found("city 3", "null"), "its frames shuffled"),
-        "railway, second half, recall@1": (found("railway, second half", "uncompressed"), "float"),
-        "city 1, AUC in 1 B": (stored_in(1, "storage city"), "product quantiser"),
-        "road, second half, AUC in 5 B": (stored_in(5, "storage road2"), "product quantiser"),
-        f"laps, {JUMPS} frames in random order, AUC": (jumping("laps"), "each image by itself"),
-        "lidar, the same": (jumping("lidar"), "each image by itself"),
-        "city 1, features trained on it, AUC": (trained("city 1"), "untrained"),
-        "corridor, the same": (trained("corridor"), "untrained"),
-        "road, first half, frames of the other half accepted at `--precision .9`": (
-            [elsewhere["accepted"]["0.9"], 0.0],
-            "accepting none",
-        ),
-    }
-    rows = [[name, *map(area, pair), rival] for name, (pair, rival) in cells.items()]
-    return markdown([["where", "this map", "better", "by"], *rows])
-
-
-def sizes() -> str:
-    """The AUC of map and null by size."""
-    known = reports("default")
-    budgets = (1, 2.5, 5, 10, 20)
-
-    def at(row: Row, contender: str, budget: float) -> float | None:
-        return next(
-            (
-                one["auc"]
-                for one in row["storage"][contender]
-                if abs(one["route_bytes_per_place"] / budget - 1) < 0.1
-            ),
-            None,
-        )
-
-    def figures(row: Row) -> list[float | None]:
-        return [at(row, name, budget) for budget in budgets for name in ("map", "null")]
-
-    rows = []
-    for name, means in by_seeds(known, figures):
-        pairs = zip(map(area, means[::2]), map(area, means[1::2]), strict=True)
-        rows.append([name, *(f"{map}, {null}" if map else "" for map, null in pairs)])
-    return markdown([["AUC of map, null; route bytes per place", *map(str, budgets)], *rows])
+    elsewhere_accepted = [elsewhere["accepted"]["0.9"], 0.0]
+    table = [
+        ("city 3, recall@1", recalls("city 3", "null"), "its frames shuffled"),
+        ("railway, second half, recall@1", recalls("railway, second half", "uncompressed"), "float"),
+        ("city 1, AUC in 1 B", stored_in(1, "storage city"), "product quantiser"),
+        ("road, second half, AUC in 5 B", stored_in(5, "storage road2"), "product quantiser"),
+        (f"laps, {JUMPS} frames in random order, AUC", jumping("laps"), "each image by itself"),
+        ("lidar, the same", jumping("lidar"), "each image by itself"),
+        ("city 1, features trained on it, AUC", training("city 1"), "untrained"),
+        ("corridor, the same", training("corridor"), "untrained"),
+        ("road, first half, frames of the other half accepted at .9", elsewhere_accepted, "accepting none"),
+    ]
+    return markdown(
+        [["where", "this map", "better", "by"], *([a, *map(area, pair), b] for a, pair, b in table)]
+    )
 
 
 def descriptors() -> str:
@@ -443,7 +418,7 @@ def trainings() -> str:
 
 
 TABLES: dict[str, Callable[[], str]] = {
-    **{"leaderboard": leaderboard, "losses": losses, "routes": routes, "sizes": sizes},
+    **{"leaderboard": leaderboard, "losses": losses, "routes": routes},
     **{"descriptors": descriptors, "sequences": sequences},
     **{"rejection": rejection, "filtered": filtered, "drives": drives, "driven": driven},
     **{"trainings": trainings, "made drives": made_drives, "storage drives": storage_drives},

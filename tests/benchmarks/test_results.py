@@ -95,18 +95,20 @@ def test_tables_stand_where_they_are_marked_and_seeds_are_means(tmp_path, monkey
 
 
 def test_the_pictures_of_results_are_of_what_is_kept():
-    panels, city = pictures.recall_over_bytes(), tables.reports("default")["city 1"]
+    panels, city = pictures.recalls(), tables.reports("default")["city 1"]
     assert {*panels} == {name.partition(", seed")[0] for name in FOOTAGE} | {"road of the demo"}
     for way in ("map", "null"):
-        kept = [point["recall_at_1"] for point in city["storage"][way]]
-        assert panels["city 1"][way] == [*zip(pictures.BUDGETS, kept, strict=True)]
+        assert [recall for _, recall in panels["city 1"][way]] == [
+            row["recall_at_1"] for row in city["storage"][way]
+        ]
     for way in ("uncompressed", "hog"):
         assert panels["city 1"][way] == [(0.0, city[way]["recall_at_1"])]
     assert len(panels["road of the demo"]["product_quantiser"]) == 5
-    assert [places for places, _ in pictures.growth()["recall@1"]["dejavu 4 B"]] == [10**4, 10**5, 10**6]
-    drawn, grown = pictures.plot_recall(panels), pictures.plot_scale(pictures.growth())
-    assert [axis.get_title("left") for axis in drawn[1].flat[: len(panels)]] == [*panels]
-    assert [len(axis.lines) for axis in grown[1]] == [8, 8]
+    drawn = pictures.plot_recalls(panels)[1]
+    assert [axis.get_title("left") for axis in drawn.flat[: len(panels)]] == [*panels]
+    grown = pictures.growth()
+    assert [len(lines) for lines in grown.values()] == [8, 8]
+    assert [places for places, _ in grown["recall@1"]["dejavu 4 B"]] == [10**4, 10**5, 10**6]
 
 
 PAGES = sorted([*tables.DOCS.rglob("*.md"), *tables.FOLDER.glob("*.md")])
