@@ -191,14 +191,29 @@ def is_skipped(app: Any, what: str, name: str, one: Any, skip: bool, options: An
     return True if type(one).__name__ == "_tuplegetter" else None
 
 
+def mend(app: Any, pagename: str, template: str, context: dict[str, Any], doctree: Any) -> None:
+    """Let the keyboard scroll code and tables that are too wide; give headings of the sidebar their level."""
+    if "furo_navigation_tree" in context:
+        level = 'role="heading" aria-level="2"'
+        context["furo_navigation_tree"] = context["furo_navigation_tree"].replace('role="heading"', level)
+    if "body" in context:
+        wide = r'<(pre|div class="table-wrapper[^"]*")>'
+        context["body"] = re.sub(wide, r'<\1 tabindex="0">', context["body"])
+
+
 def setup(app: Any) -> dict[str, bool]:
     """What Sphinx calls first."""
+    for room in {path.parent.name for path in (ROOT / "dejavu_torch").glob("*/__init__.py")} - {"cli"}:
+        name = f"dejavu_torch.{room}"
+        text = f"# {name}\n\n{import_module(name).__doc__}\n\n```{{api}}\n{name}\n```\n"
+        (DOCS / "reference" / "api" / f"{room}.md").write_text(text, encoding="utf-8")
     shutil.rmtree(NOTEBOOKS, ignore_errors=True)
     shutil.copytree(ROOT / "notebooks", NOTEBOOKS, ignore=shutil.ignore_patterns(".*"))
     app.add_config_value("repository", address("Repository"), "env")
     app.connect("source-read", write)
     app.connect("autodoc-process-docstring", as_rst)
     app.connect("autodoc-process-signature", signed)
+    app.connect("html-page-context", mend, priority=900)  # after the theme
     app.connect("autodoc-skip-member", is_skipped)
     app.connect("env-get-outdated", lambda *_: ["reference/commands"])  # it follows the code
     return {"parallel_read_safe": True}
