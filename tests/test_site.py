@@ -122,7 +122,6 @@ def test_addresses_are_those_of_the_project(monkeypatch, tmp_path):
     import pages
 
     monkeypatch.setattr(pages, "ROOT", tmp_path)
-    (tmp_path / "pyproject.toml").write_text('[project]\nname = "a"\n')
-    assert pages.address("Repository") == ""
-    (tmp_path / "pyproject.toml").write_text('[project.urls]\nRepository = "https://example.org/a/"\n')
-    assert (pages.address("Repository"), pages.address("Documentation")) == ("https://example.org/a", "")
+    for urls, address in (("", ""), ("urls.Repository = 'https://a.org/b/'", "https://a.org/b")):
+        (tmp_path / "pyproject.toml").write_text(f"[project]\nname = 'b'\n{urls}\n")
+        assert pages.address("Repository") == address
