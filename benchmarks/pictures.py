@@ -1,4 +1,4 @@
-"""Draw the pictures of docs/results from kept json files: `python -m benchmarks.pictures`."""
+"""Draw the pictures of docs from kept json files: `python -m benchmarks.pictures`."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from benchmarks.measure import Row
-from benchmarks.plots import plot_growth, wide
+from benchmarks.plots import plot_growth, plot_visits, wide
 from benchmarks.scale_report import KEYS, MEMORY, RECALL, pictured
 from benchmarks.tables import DOCS, by_seeds, read, reports
+from benchmarks.visits import curves
 from dejavu_torch.evaluation.contenders import COLOURS
 from dejavu_torch.evaluation.plots import Plot, legend, set_title
 
@@ -81,6 +82,7 @@ def growth() -> dict[str, dict[str, Points]]:
 def main() -> None:
     plot_recalls(recalls())[0].savefig(DOCS / "bytes.png")
     plot_growth(growth(), linear=[RECALL])[0].savefig(DOCS / "scale.png")
+    plot_visits(curves(read("visits")["rows"]))[0].savefig(DOCS / "visits.png")
 
 
 if __name__ == "__main__":

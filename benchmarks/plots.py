@@ -95,7 +95,7 @@ def plot_areas(cases: Mapping[str, Mapping[str, float]], kinds: Mapping[str, str
 
 def plot_visits(cases: Mapping[str, Mapping[str, Sequence[float]]]) -> Plot:
     """The AUC after 0, 1, .. drives, a panel for each case, "WHAT asked", a line for each way to learn."""
-    figure, axes = canvas(1.9 * -(-len(cases) // 2) + 0.6, -(-len(cases) // 2), 2, squeeze=False, sharex=True)
+    figure, axes = wide(2.3, 1, len(cases))
     most = max(len(areas) for ways in cases.values() for areas in ways.values())
     drawn: dict[str, Any] = {}
     for axis, (case, ways) in zip(axes.flat, cases.items(), strict=False):
@@ -106,11 +106,10 @@ def plot_visits(cases: Mapping[str, Mapping[str, Sequence[float]]]) -> Plot:
         axis.set_ylim(min(low - 0.03, high - 0.2), min(high + 0.03, 1.005))
         set_title(axis, label(case.removesuffix(" asked")))
         axis.set_xticks(range(most))
-        axis.grid(alpha=0.25)
-    for axis in axes[-1]:
         axis.set_xlabel("drives that taught", fontsize=9)
-    axes[0, 0].set_ylabel("AUC of another, one image", fontsize=9)
-    legend(figure, [*drawn.values()], [*drawn])
+        axis.grid(alpha=0.25)
+    axes[0, 0].set_ylabel("AUC, one image", fontsize=9)
+    legend(figure, [*drawn.values()], [*drawn], ncols=2)
     return figure, axes
 
 
