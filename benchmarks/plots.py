@@ -10,6 +10,8 @@ from textwrap import fill
 from types import MappingProxyType
 from typing import Any
 
+from matplotlib.figure import Figure
+
 from dejavu_torch.evaluation.contenders import COLOURS
 from dejavu_torch.evaluation.plots import GREY, LETTERS, LINE, Plot, canvas, label, legend, set_title
 from dejavu_torch.evaluation.score_plots import area_axis, drawn_areas
@@ -93,7 +95,7 @@ def plot_areas(cases: Mapping[str, Mapping[str, float]], kinds: Mapping[str, str
 
 def plot_visits(cases: Mapping[str, Mapping[str, Sequence[float]]]) -> Plot:
     """The AUC after 0, 1, .. drives, a panel for each case, "WHAT asked", a line for each way to learn."""
-    figure, axes = canvas(1.9 * -(-len(cases) // 2) + 0.6, -(-len(cases) // 2), 2, squeeze=False, sharex=True)
+    figure, axes = wide(2.3, 1, len(cases))
     most = max(len(areas) for ways in cases.values() for areas in ways.values())
     drawn: dict[str, Any] = {}
     for axis, (case, ways) in zip(axes.flat, cases.items(), strict=False):
@@ -104,18 +106,17 @@ def plot_visits(cases: Mapping[str, Mapping[str, Sequence[float]]]) -> Plot:
         axis.set_ylim(min(low - 0.03, high - 0.2), min(high + 0.03, 1.005))
         set_title(axis, label(case.removesuffix(" asked")))
         axis.set_xticks(range(most))
-        axis.grid(alpha=0.25)
-    for axis in axes[-1]:
         axis.set_xlabel("drives that taught", fontsize=9)
-    axes[0, 0].set_ylabel("AUC of another, one image", fontsize=9)
-    legend(figure, [*drawn.values()], [*drawn])
+        axis.grid(alpha=0.25)
+    axes[0, 0].set_ylabel("AUC, one image", fontsize=9)
+    legend(figure, [*drawn.values()], [*drawn], ncols=2)
     return figure, axes
 
 
 def plot_growth(
     panels: Mapping[str, Mapping[str, Sequence[tuple[float, float]]]], linear: Collection[str] = ()
 ) -> Plot:
-    """Lines of contenders over the number of places, both axes logarithmic.
+    """Lines of contenders over the number of places, both axes logarithmic, two panels beside each other.
 
     Args:
         panels: heading -> contender -> points (places, figure). The part of a name before the first comma is
@@ -124,22 +125,32 @@ def plot_growth(
     """
     names = list(dict.fromkeys(name for lines in panels.values() for name in lines))
     styles = _growth_styles(names)
-    figure, axes = canvas(2.6 * len(panels) + 1.1 * LINE * len(names), len(panels), squeeze=False)
+    rows = math.ceil(len(panels) / 2)
+    figure, axes = wide(2.4 * rows + 1.1 * LINE * math.ceil(len(names) / 4), rows, 2)
     drawn = {}
-    for axis, (heading, lines) in zip(axes[:, 0], panels.items(), strict=True):
+    for axis, (heading, lines) in zip(axes.flat, panels.items(), strict=False):
         for name, points in lines.items():
             drawn[name] = axis.plot(*zip(*points, strict=True), **styles[name])[0]
-        axis.set_xscale("log")
+        axis.set(xscale="log", xlabel="places")
         if heading in linear:
             axis.set_ylim(0, 1.02)
         else:
             axis.set_yscale("log")
         set_title(axis, heading)
         axis.grid(alpha=0.25)
-    axes[-1, 0].set_xlabel("places")
-    handles = [drawn[name] for name in names]
-    legend(figure, handles, names, handlelength=4)
-    return figure, axes[:, 0]
+    for axis in axes.flat[len(panels) :]:
+        axis.axis("off")
+    legend(figure, [drawn[name] for name in names], names, ncols=4)
+    return figure, axes.flat[: len(panels)]
+
+
+def wide(height: float, rows: int, columns: int, **grid: Any) -> Plot:
+    """A figure for pages, with empty axes: as wide as two of a report."""
+    figure = Figure(figsize=(7.2, height), layout="constrained", dpi=160)
+    axes = figure.subplots(rows, columns, squeeze=False, **grid)
+    for axis in axes.flat:
+        axis.spines[["top", "right"]].set_visible(False)
+    return figure, axes
 
 
 def _growth_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
@@ -159,7 +170,7 @@ def _growth_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
             "color": colours[family],
             "marker": "os^Dv"[order % 5],
             "markerfacecolor": colours[family] if order % 2 == 0 else "white",
-            "markersize": 6,
+            "markersize": 4,
             "linestyle": ":" if family.startswith("null") else ("-", "--", "-.")[order % 3],
             "linewidth": 1.6 if family.startswith("dejavu") else 1.2,
         }
@@ -223,39 +234,3 @@ def _plot_whitenings(axis: Any, whitenings: Sequence[tuple[str, int, float]]) ->
     axis.locator_params(axis="x", nbins=5)
     axis.set(ylim=(-0.6, len(ordered) - 0.4), yticks=[], xlabel="AUC of the map, by whitening")
     axis.grid(alpha=0.25)
-
-
-def plot_both_ways(
-    cases: Mapping[str, Mapping[str, Mapping[str, Sequence[tuple[float, float]]]]], ways: Mapping[str, str]
-) -> Plot:
-    """The AUC of families of stores over route bytes per place, a row of panels for each route.
-
-    Args:
-        cases: case -> way of answering -> family -> bytes per place and area, ascending.
-        ways: the columns, with their headings.
-    """
-    height = 1.7 * len(cases) + 0.9
-    figure, axes = canvas(height, len(cases), len(ways), squeeze=False, sharex=True, sharey=True)
-    drawn: dict[str, Any] = {}
-    for row, (case, found) in zip(axes, cases.items(), strict=True):
-        for axis, (way, heading) in zip(row, ways.items(), strict=True):
-            for name, points in reversed(list(found.get(way, {}).items())):  # ours, the first, on top
-                colour, line = FAMILIES[name]
-                width = 2.4 if name == "dejavu" else 1.2
-                sizes, areas = zip(*points, strict=True)
-                (drawn[name],) = axis.plot(
-                    sizes, drawn_areas(areas), line, marker="o", markersize=2.5, color=colour, linewidth=width
-                )
-            axis.set_xscale("log")
-            axis.set_xticks(ticks := [0.25, 4, 64, 1024], [f"{tick:g}" for tick in ticks])
-            axis.minorticks_off()
-            area_axis(axis)
-            axis.set_ylabel("")
-            heading = f"{heading}\n" if axis in axes[0] else ""
-            set_title(axis, f"{heading}{label(case)}")
-    for axis in axes[-1]:
-        axis.set_xlabel("route bytes per place", fontsize=9)
-    names = [name for name in FAMILIES if name in drawn]
-    handles = [drawn[name] for name in names]
-    legend(figure, handles, names, ncols=2)
-    return figure, axes

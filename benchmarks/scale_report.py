@@ -12,7 +12,7 @@ from benchmarks.scale_contenders import GIVEN
 from dejavu_torch.data.simulate.aerial import LONGEST
 
 FITTED = 3  # fewest sizes to fit
-RECALL = "recall@1"  # name of its panel
+RECALL, MEMORY = "recall@1", "MB while localizing"  # names of panels
 KEYS = (
     *("places", "seconds", "seconds_one", "peak_bytes", "learn_peak_bytes", "bytes", "route_bytes"),
     *("bytes_per_place", "learn_rate", "recall_at_1", "auc", "queries", "threads", "ratio_to_ours"),
@@ -37,7 +37,7 @@ GROWING = ("bytes_per_place", "route_bytes", "seconds", "seconds_one", "peak_byt
 PANELS = {
     RECALL: ("places", "recall_at_1", 1.0),
     "milliseconds of a query in a batch": ("places", "seconds", 1e3),
-    "MB while localizing": ("places", "peak_bytes", 1e-6),
+    MEMORY: ("places", "peak_bytes", 1e-6),
     "route bytes of ground that repeats": ("repeat", "route_bytes", 1.0),
 }
 

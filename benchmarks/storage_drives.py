@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,9 +15,8 @@ from tqdm import tqdm
 
 from benchmarks.drives import ROUTES, SUMMER
 from benchmarks.measure import Row, failure, new_row, truth_of, write_bench
-from benchmarks.plots import plot_both_ways
 from benchmarks.quantisers import Kept, Quantiser, every_kth, spectral
-from benchmarks.storage import NULL, OURS, Points, best, both, by, front, named, skipped_lines
+from benchmarks.storage import NULL, OURS, best, both, by, named, skipped_lines
 from dejavu_torch.data.ground_truth import GroundTruth
 from dejavu_torch.data.source import open_source
 from dejavu_torch.data.traverse import fitted
@@ -75,12 +74,12 @@ class Asked(NamedTuple):
 
 
 def run_storage_drives(data: Path, out: Path) -> list[str]:
-    """See `run_storage`; writes bench.json and bench.png."""
+    """See `run_storage`; writes bench.json."""
     rows: list[Row] = []
     for name in BOOKS:
         rows += bench_storage_drives(described(name, data))
         write_bench(out, rows)  # as soon as a route is finished
-    write_bench(out, rows, pictured(rows))
+    write_bench(out, rows)
     note = "AUC by one image, by sums over a window, and by the whole drive"
     return [text_table(drive_table(rows)), *skipped_lines(rows), note]
 
@@ -213,14 +212,3 @@ def drive_table(rows: Sequence[Row]) -> list[list[str]]:
             if any(cells):
                 table.append([f"{case}: {name}", *cells])
     return table
-
-
-def pictured(rows: Sequence[Row]) -> Any:
-    """AUC over bytes by one image and by the whole drive, the front of each family on each route."""
-    cases: dict[str, dict[str, dict[str, Points]]] = {}
-    for case, own in by("case", rows).items():
-        found = split(own)
-        cases[case] = {
-            answer: {name: front(some) for name, some in found[answer].items()} for answer in found
-        }
-    return plot_both_ways(cases, {"one": "one image", "drive": "whole drive"})

@@ -1,7 +1,7 @@
-"""Write the tables of docs/results from its json files: `python -m benchmarks.tables [NAME=bench.json ...]`.
+"""Write the tables of docs and of benchmarks/results: `python -m benchmarks.tables [NAME=bench.json ...]`.
 
-A given file is first stored there as NAME.json. Tables are between `<!-- table: NAME -->` and
-`<!-- end of table -->`.
+They come from json files in benchmarks/results, where a given file is first stored as NAME.json. Tables are
+between `<!-- table: NAME -->` and `<!-- end of table -->`.
 """
 
 from __future__ import annotations
@@ -24,8 +24,10 @@ from benchmarks.storage_drives import drive_table
 from benchmarks.teaching import COPIES, PLACED, REFINED, TOLD
 from dejavu_torch.evaluation.contenders import LENGTHS
 
-FOLDER = Path(__file__).parents[1] / "docs" / "results"
+FOLDER, DOCS = Path(__file__).parent / "results", Path(__file__).parents[1] / "docs"
 MARKED = re.compile(r"(<!-- table: ([\w ,:]+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
+LOST = ("routes", "storage city", "storage road2", "made drives", "trainings")  # what `losses` reads
+JUMPS = "stretches of 5 to 15"
 CODES = {  # rows of codes of the same kind
     **{"dejavu": ("dejavu",), "null": ("null",), "dejavu, trained": ("dejavu, given maps",)},
     **{"every k-th frame": ("interpolated",), "PCA": ("PCA",), "signs": ("binary",)},
@@ -37,11 +39,11 @@ CODES = {  # rows of codes of the same kind
 
 def stored(bench: dict[str, Any]) -> dict[str, Any]:
     """A bench.json without unknown values and what no table shows."""
-    left_out = ("equal_auc", "seconds", "peak_bytes", "ratio_to_ours", "missed_over_best")
+    left_out = ("equal_auc", "exponents", "seconds", "ratio_to_ours", "missed_over_best")
     rows = [{k: v for k, v in row.items() if v is not None and k not in left_out} for row in bench["rows"]]
     for row in rows:
         if "family" in row:  # of a store: the curve suffices
-            for name in ("sequences", "bytes", "route_bytes", "recall_at_1"):
+            for name in ("sequences", "bytes", "route_bytes", "peak_bytes", "recall_at_1"):
                 row.pop(name, None)
     facts = {name: of for name, of in bench.items() if name not in ("rows", *left_out)}
     return facts | {"rows": rounded(rows)}
@@ -108,22 +110,23 @@ def routes() -> str:
 
 
 def leaderboard() -> str:
-    """The share of queries found by one image and, where they are in order, by the whole drive."""
+    """The share of queries found by one image and by the whole drive."""
+    known = reports("drive")  # of queries that `--ordered` says to be in order
     ways = {
         "**map**": "",
         "in 1 B": "one_byte",
         "product quantiser": "product_quantiser",
         "float": "uncompressed",
         "HOG": "hog",
-        "null": "null",
+        "shuffled": "null",
     }
 
     def figures(row: Row) -> list[float | None]:
         found: list[float | None] = []
         for key in ways.values():
-            one = (row.get(key) if key else row) or {}
-            drive = one.get("sequences", {}).get("smoother", {})
-            found += [one.get("recall_at_1"), drive.get("recall_at_1")]
+            one, told = ((of.get(key, {}) if key else of) for of in (row, known.get(row["case"], {})))
+            drives = [of["sequences"]["smoother"]["recall_at_1"] for of in (one, told) if of.get("sequences")]
+            found += [one.get("recall_at_1"), *(drives or [None])[:1]]
         return [*found, row["route_bytes_per_place"]]
 
     def shown(one: float | None, drive: float | None) -> str:
@@ -133,32 +136,45 @@ def leaderboard() -> str:
     for name, means in by_seeds(reports("default"), figures):
         pairs = zip(means[:-1:2], means[1::2], strict=True)
         rows.append([name, *(shown(*pair) for pair in pairs), size(means[-1] or 0)])
-    return markdown([["found, %: one image / whole drive", *ways, "bytes"], *rows])
+    return markdown([["route", *ways, "bytes"], *rows])
 
 
-def sizes() -> str:
-    """The AUC of map and null by size."""
+def losses() -> str:
+    """Where something else finds as much as the map or more, and where what it accepts is wrong."""
     known = reports("default")
-    budgets = (1, 2.5, 5, 10, 20)
+    trained, drives = (by("case", coded(name)) for name in ("trainings", "made drives"))
+    (elsewhere,) = known["road, first half"]["rejection"]["off_map"].values()
 
-    def at(row: Row, contender: str, budget: float) -> float | None:
-        return next(
-            (
-                one["auc"]
-                for one in row["storage"][contender]
-                if abs(one["route_bytes_per_place"] / budget - 1) < 0.1
-            ),
-            None,
-        )
+    def recalls(case: str, rival: str) -> list[float | None]:
+        return [of["recall_at_1"] for of in (known[case], known[case][rival])]
 
-    def figures(row: Row) -> list[float | None]:
-        return [at(row, name, budget) for budget in budgets for name in ("map", "null")]
+    def stored_in(size: float, name: str) -> list[float | None]:
+        rows = families(coded(name))
+        return [best(some, size) for some in (rows["dejavu"], [*rows["PQ"], *rows["OPQ"]])]
 
-    rows = []
-    for name, means in by_seeds(known, figures):
-        pairs = zip(map(area, means[::2]), map(area, means[1::2]), strict=True)
-        rows.append([name, *(f"{map}, {null}" if map else "" for map, null in pairs)])
-    return markdown([["AUC of map, null; route bytes per place", *map(str, budgets)], *rows])
+    def jumping(case: str) -> list[float | None]:
+        (row,) = (row for row in drives[case] if row["contender"] == JUMPS)
+        return [row["auc"], row["auc_one"]]
+
+    def training(case: str) -> list[float | None]:
+        rows = by("contender", trained[case])
+        return [mean(row["auc"] for row in rows[f"{way} default"]) for way in ("trained", "untrained")]
+
+    elsewhere_accepted = [elsewhere["accepted"]["0.9"], 0.0]
+    table = [
+        ("city 3, recall@1", recalls("city 3", "null"), "its frames shuffled"),
+        ("railway, second half, recall@1", recalls("railway, second half", "uncompressed"), "float"),
+        ("city 1, AUC in 1 B", stored_in(1, "storage city"), "product quantiser"),
+        ("road, second half, AUC in 5 B", stored_in(5, "storage road2"), "product quantiser"),
+        (f"laps, {JUMPS} frames in random order, AUC", jumping("laps"), "each image by itself"),
+        ("lidar, the same", jumping("lidar"), "each image by itself"),
+        ("city 1, features trained on it, AUC", training("city 1"), "untrained"),
+        ("corridor, the same", training("corridor"), "untrained"),
+        ("road, first half, frames of the other half accepted at .9", elsewhere_accepted, "accepting none"),
+    ]
+    return markdown(
+        [["where", "this map", "better", "by"], *([a, *map(area, pair), b] for a, pair, b in table)]
+    )
 
 
 def descriptors() -> str:
@@ -402,7 +418,7 @@ def trainings() -> str:
 
 
 TABLES: dict[str, Callable[[], str]] = {
-    **{"leaderboard": leaderboard, "routes": routes, "sizes": sizes},
+    **{"leaderboard": leaderboard, "losses": losses, "routes": routes},
     **{"descriptors": descriptors, "sequences": sequences},
     **{"rejection": rejection, "filtered": filtered, "drives": drives, "driven": driven},
     **{"trainings": trainings, "made drives": made_drives, "storage drives": storage_drives},
@@ -415,6 +431,8 @@ TABLES: dict[str, Callable[[], str]] = {
 
 def made(name: str) -> str:
     """A table, and what it was measured with."""
+    if name == "losses":
+        return f"{losses()}\n*{', '.join(file_of(source).name for source in LOST)}.*\n"
     source = name if file_of(name).exists() else "routes"
     facts = read(source)
     said = ", ".join(str(facts[key]) for key in ("commit", "date", "machine") if key in facts)
@@ -431,7 +449,7 @@ def main(given: Sequence[str]) -> None:
         bench = stored(json.loads(Path(path).read_text(encoding="utf-8")))
         rows = ",\n".join(json.dumps(row) for row in bench.pop("rows"))  # a line each
         file_of(name).write_text(f'{json.dumps(bench)[:-1]}, "rows": [\n{rows}\n]}}\n', encoding="utf-8")
-    for page in FOLDER.parent.rglob("*.md"):
+    for page in (*DOCS.rglob("*.md"), *FOLDER.glob("*.md")):
         page.write_text(filled(page.read_text(encoding="utf-8")), encoding="utf-8")
 
 

@@ -5,6 +5,8 @@ from pathlib import Path
 
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
 
+from pages import address  # noqa: E402
+
 from dejavu_torch import __version__  # noqa: E402
 
 project = "dejavu_torch"
@@ -15,6 +17,7 @@ version = release = __version__
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.viewcode", "pages"]
 html_theme = "furo"
 html_title = "dejavu_torch"
+html_baseurl = address("Documentation")
 html_static_path, html_css_files = ["_static"], ["site.css"]
 html_copy_source = False
 

@@ -10,6 +10,8 @@ import re
 import shlex
 import shutil
 import sys
+import tomllib
+from collections import Counter
 from contextlib import redirect_stdout, suppress
 from functools import cache
 from importlib import import_module
@@ -22,7 +24,14 @@ NOTEBOOKS = DOCS / "notebooks"  # copies, as Sphinx reads one folder
 TEXTS = (r"Convention(?: \d+)?", "Environment", "Returns", "Shape", "Source")  # sections without entries
 SECTION = re.compile(rf"^(Args|Attributes|Buffers[\w ,]*|Example|Raises|{'|'.join(TEXTS)}):(?: (.*))?$", re.M)
 MARKUP = re.compile(r"(`[^`]*`|\*[\w'][^*\n]*[\w']\*)|[|*\\]|(?<=\w)_(?!\w)")  # what stays; what is escaped
+LINK = re.compile(r"(!?\[[^]]*\]\()([\w./-]+)(#[^)\s]*)?\)")
 WIDTH = "88"  # characters of a line of help, as many as the page shows
+
+
+def address(name: str) -> str:
+    """An address in [project.urls] of pyproject.toml, "" if it is not there."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    return str(project.get("urls", {}).get(name, "")).rstrip("/")
 
 
 def help_of(lines: str) -> str:
@@ -87,25 +96,33 @@ def room_of(one: Any) -> str:
     return ".".join(parts[:2]) if (ROOT / "/".join(parts[:2])).is_dir() else parts[0]
 
 
-def front_door() -> list[str]:
-    """The names that `import dejavu_torch` has, and where each part of the paper is."""
-    import dejavu_torch
-
-    names = [f"[{name}](#dejavu_torch.{dejavu_torch._HOMES[name]}.{name})" for name in dejavu_torch.__all__]
-    return [f"`from dejavu_torch import ...` has {', '.join(names)}.", "", dejavu_torch.__doc__ or "", ""]
+@cache
+def imported() -> Counter[str]:
+    """How often pages import each name."""
+    text = "\n".join(page.read_text(encoding="utf-8") for page in DOCS.rglob("*.md"))
+    return Counter(re.findall(r"\w+", " ".join(re.findall(r"^from dejavu_torch.* import (.*)", text, re.M))))
 
 
 def api_of(room: str) -> str:
-    """Public names of a room, module by module."""
+    """Public names of a room, module by module, beginning with those that users call."""
+    import dejavu_torch
+
+    def asked(name: str) -> tuple[bool, int]:
+        short = name.rpartition(".")[2]
+        return short not in dejavu_torch.__all__, -imported()[short]
+
     modules: dict[str, list[str]] = {}
-    for name, one in public_names().items():
-        if room_of(one) == room:
+    for name in sorted(names := public_names(), key=asked):
+        if room_of(one := names[name]) == room:
             kind = "autoclass" if inspect.isclass(one) else "autofunction"
             modules.setdefault(one.__module__, []).append(f".. {kind}:: {name}")
-    lines = front_door() if room == "dejavu_torch" else []
+    door = [f"[{name}](#dejavu_torch.{home}.{name})" for name, home in sorted(dejavu_torch._HOMES.items())]
+    lines = [f"`from dejavu_torch import ...` has {', '.join(door)}.", ""] if room == "dejavu_torch" else []
     for module, directives in modules.items():
         lines += [f"## {module.removeprefix('dejavu_torch.')}", "", import_module(module).__doc__ or "", ""]
         lines += ["```{eval-rst}", *directives, "```", ""]
+    if room == "dejavu_torch":
+        lines += ["## The paper", "", dejavu_torch.__doc__ or ""]
     return "\n".join(lines)
 
 
@@ -113,23 +130,31 @@ GENERATED = {"help": help_of, "api": api_of}
 
 
 def write(app: Any, docname: str, source: list[str]) -> None:
-    """Put in what is generated, and let links lead where they lead on GitHub."""
+    """Put in what is generated, and let links lead where they lead on GitHub.
+
+    A link to a file that is no page leads to the repository, or is the file's name if that has no address.
+    """
     page = Path(app.env.doc2path(docname))
     folder = ROOT / "notebooks" if page.parent == NOTEBOOKS else page.parent
 
     def link(found: re.Match[str]) -> str:
-        target, anchor = Path(os.path.normpath(folder / found[1])), found[2] or ""
+        target, anchor = Path(os.path.normpath(folder / found[2])), found[3] or ""
         if target == ROOT / "README.md":
             target, anchor = DOCS / "index.md", ""
         elif target.parent == ROOT / "notebooks":
             target = NOTEBOOKS / target.name
-        return f"]({os.path.relpath(target, page.parent)}{anchor})" if target.is_file() else found[0]
+        if ROOT not in target.parents or not target.is_file():
+            return found[0]
+        if DOCS in target.parents:
+            return f"{found[1]}{os.path.relpath(target, page.parent)}{anchor})"
+        path, repository = target.relative_to(ROOT).as_posix(), app.config.repository
+        return f"{found[1]}{repository}/blob/main/{path}{anchor})" if repository else f"`{path}`"
 
     def generated(found: re.Match[str]) -> str:
         return GENERATED[found[1]](found[2])
 
     text = re.sub(r"^```\{(help|api)\}\n(.*?)\n```$", generated, source[0], flags=re.M | re.S)
-    source[0] = re.sub(r"\]\(([\w./-]+)(#[^)\s]*)?\)", link, text)
+    source[0] = LINK.sub(link, text)
 
 
 def as_rst(app: Any, what: str, name: str, one: Any, options: Any, lines: list[str]) -> None:
@@ -155,17 +180,40 @@ def as_rst(app: Any, what: str, name: str, one: Any, options: Any, lines: list[s
         lines += ["", ":Example:", "", *example.split("\n"), ""]
 
 
+def signed(app: Any, what: str, name: str, one: Any, options: Any, *texts: str | None) -> list[str | None]:
+    """A signature without defaults that Sphinx cannot read: a class is its name, a factory three dots."""
+    unread = r"<class '([\w.]+)'>|<factory>"
+    return [text and re.sub(unread, lambda found: found[1] or "...", text) for text in texts]
+
+
 def is_skipped(app: Any, what: str, name: str, one: Any, skip: bool, options: Any) -> bool | None:
     """Fields of a NamedTuple have no docstring of their own."""
     return True if type(one).__name__ == "_tuplegetter" else None
 
 
+def mend(app: Any, pagename: str, template: str, context: dict[str, Any], doctree: Any) -> None:
+    """Let the keyboard scroll code and tables that are too wide; give headings of the sidebar their level."""
+    if "furo_navigation_tree" in context:
+        level = 'role="heading" aria-level="2"'
+        context["furo_navigation_tree"] = context["furo_navigation_tree"].replace('role="heading"', level)
+    if "body" in context:
+        wide = r'<(pre|div class="table-wrapper[^"]*")>'
+        context["body"] = re.sub(wide, r'<\1 tabindex="0">', context["body"])
+
+
 def setup(app: Any) -> dict[str, bool]:
     """What Sphinx calls first."""
+    for room in {path.parent.name for path in (ROOT / "dejavu_torch").glob("*/__init__.py")} - {"cli"}:
+        name = f"dejavu_torch.{room}"
+        text = f"# {name}\n\n{import_module(name).__doc__}\n\n```{{api}}\n{name}\n```\n"
+        (DOCS / "reference" / "api" / f"{room}.md").write_text(text, encoding="utf-8")
     shutil.rmtree(NOTEBOOKS, ignore_errors=True)
     shutil.copytree(ROOT / "notebooks", NOTEBOOKS, ignore=shutil.ignore_patterns(".*"))
+    app.add_config_value("repository", address("Repository"), "env")
     app.connect("source-read", write)
     app.connect("autodoc-process-docstring", as_rst)
+    app.connect("autodoc-process-signature", signed)
+    app.connect("html-page-context", mend, priority=900)  # after the theme
     app.connect("autodoc-skip-member", is_skipped)
     app.connect("env-get-outdated", lambda *_: ["reference/commands"])  # it follows the code
     return {"parallel_read_safe": True}

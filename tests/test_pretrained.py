@@ -26,7 +26,7 @@ def network():
 
 @pytest.mark.figures
 def test_nordland_beside_hog(data_dir, network):
-    """What docs/results/pretrained.md says of the winter of places that nothing was learned or chosen on."""
+    """What benchmarks/results/pretrained.md says of a winter that nothing was learned or chosen on."""
     net = Embedding(network, None, resize=(64, 128), grid=4, layer="_blocks.3", mean=0.5, std=0.5)
     seasons = [data_dir / "nordland" / name for name in ("summer", "winter")]
     summer, winter = (open_source(f"{one}?stop=900") for one in seasons)

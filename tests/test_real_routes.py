@@ -1,4 +1,4 @@
-"""What docs/results/paper.md tells of real footage is what the commands say."""
+"""What benchmarks/results/paper.md tells of real footage is what the commands say."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse
 
 ROOT = Path(__file__).parents[1]
-TOLD = (ROOT / "docs" / "results" / "paper.md").read_text()
+TOLD = (ROOT / "benchmarks" / "results" / "paper.md").read_text()
 TEMPLATES = ("--config", "local_maxima")
 SOURCES = {
     "road": [f"strip:{{}}/aerial_road/pass{i}.png?halve=1&rows=32:128&width=96" for i in (1, 2)],

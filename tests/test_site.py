@@ -7,6 +7,7 @@ import re
 from functools import cache
 from html import unescape
 from pathlib import Path
+from types import SimpleNamespace
 
 import processes
 import pytest
@@ -17,7 +18,7 @@ from dejavu_torch.cli import COMMANDS
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[1]
-PACKAGE = ROOT / "dejavu_torch"
+PACKAGE, DOCS = ROOT / "dejavu_torch", ROOT / "docs"
 SECTIONS = re.compile("^(Args|Attributes|Convention|Raises|Returns|Shape|Example):", re.MULTILINE)
 
 
@@ -71,6 +72,7 @@ def test_every_public_name_has_its_docstring_on_the_page_of_its_folder(site):
     assert {f"dejavu_torch.{home}.{name}" for name, home in dejavu_torch._HOMES.items()} <= set(names)
     assert set(names) <= set(entries)
     assert "dejavu_torch.evaluation.plots.Picture" in entries  # in signatures by an alias only
+    assert not (site / "_downloads").exists()  # to which Sphinx copies what a page links to and is no page
     for name, text in names.items():
         page = site / entries[name].uri.partition("#")[0]
         assert page.parent == site / "reference" / "api"
@@ -85,3 +87,41 @@ def test_every_command_has_its_help(site):
         assert f"usage python m benchmarks {name} " in text
     for option in ("search_memory", "mapper route_bytes_per_place", "model rate", "codebooks"):
         assert option in text
+
+
+def test_a_page_of_the_api_begins_with_what_users_call(site):
+    for page in (site / "reference" / "api").glob("*.html"):
+        first = re.search(r'<dt class="sig [^>]*id="dejavu_torch[\w.]*\.(\w+)"', page.read_text())
+        assert first[1] in dejavu_torch.__all__, page.name
+
+
+def test_the_sidebar_has_at_most_thirty_entries():
+    text = (DOCS / "index.md").read_text()
+    entries = "\n".join(re.findall(r"```{toctree}(.*?)```", text, re.S))
+    shown = re.findall(r"^(?:[\w ]+<)?([\w/*]+)>?$", entries, re.M)
+    pages = {page for one in shown for page in (ROOT if "notebooks" in one else DOCS).glob(f"{one}.*")}
+    assert 20 < len(pages) <= 30
+    assert shown[0] == "tutorial/install"
+
+
+@pytest.mark.parametrize("repository", ["", "https://example.org/dejavu"])
+def test_a_file_that_is_no_page_is_a_link_if_the_repository_has_an_address(repository, monkeypatch):
+    monkeypatch.syspath_prepend(DOCS)
+    import pages
+
+    source = ["[its text](../../LICENSE#a-part), [files](files.md), ![](../scale.png), [d](../../gone.md)"]
+    page = SimpleNamespace(doc2path=lambda name: str(DOCS / f"{name}.md"))
+    app = SimpleNamespace(env=page, config=SimpleNamespace(repository=repository))
+    pages.write(app, "reference/modules", source)
+    file = f"[its text]({repository}/blob/main/LICENSE#a-part)" if repository else "`LICENSE`"
+    assert source == [f"{file}, [files](files.md), ![](../scale.png), [d](../../gone.md)"]
+
+
+def test_addresses_are_those_of_the_project(monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(DOCS)
+    import pages
+
+    monkeypatch.setattr(pages, "ROOT", tmp_path)
+    for urls, address in (("", ""), ("urls.Repository = 'https://a.org/b/'", "https://a.org/b")):
+        (tmp_path / "pyproject.toml").write_text(f"[project]\nname = 'b'\n{urls}\n")
+        assert pages.address("Repository") == address

@@ -106,4 +106,3 @@ def test_stores_are_asked_three_ways_from_the_same_scores(monkeypatch):
     ours = next(row for row in table if row[0] == "walk: **dejavu**")
     areas = [found["dejavu 1", answer]["auc"] for answer in ANSWERS]
     assert ours[3] == " ".join(f"{area:.3f}".removeprefix("0") for area in areas)
-    assert storage_drives.pictured(rows)[0].axes[1].get_title("left") == "whole drive\nwalk"

@@ -12,7 +12,7 @@ from benchmarks.pages import SCHEMES, WIDTHS, check_pages, live_page
 from dejavu_torch import compare, open_source
 from dejavu_torch.evaluation.report import report_folder, write_report
 
-KEPT = Path(__file__).parents[2] / "docs" / "results" / "axe.json"
+KEPT = Path(__file__).parents[2] / "benchmarks" / "results" / "axe.json"
 
 
 def test_the_kept_result_has_no_finding_at_any_width():

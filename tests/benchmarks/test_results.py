@@ -9,7 +9,7 @@ import subprocess
 import pytest
 from command_line import benchmark, run_here
 
-from benchmarks import results, tables
+from benchmarks import pictures, results, tables
 from benchmarks.results import FOOTAGE, SEEDS, WAYS, Footage, runs
 from dejavu_torch.cli.parser import command_parser
 from dejavu_torch.cli.reports import run_compare
@@ -76,6 +76,7 @@ def rows():
 def test_tables_stand_where_they_are_marked_and_seeds_are_means(tmp_path, monkeypatch):
     (tmp_path / "results").mkdir()
     monkeypatch.setattr(tables, "FOLDER", tmp_path / "results")
+    monkeypatch.setattr(tables, "DOCS", tmp_path)
     page = tmp_path / "page.md"
     page.write_text("A\n<!-- table: routes -->\nold\n<!-- end of table -->\nB\n")
     (tmp_path / "bench.json").write_text(json.dumps({"rows": rows(), "commit": "abc", "equal_auc": 1}))
@@ -93,7 +94,27 @@ def test_tables_stand_where_they_are_marked_and_seeds_are_means(tmp_path, monkey
     assert page.read_text() == before
 
 
-@pytest.mark.parametrize("page", sorted(tables.FOLDER.parent.rglob("*.md")), ids=lambda page: page.stem)
+def test_the_pictures_of_results_are_of_what_is_kept():
+    panels, city = pictures.recalls(), tables.reports("default")["city 1"]
+    assert {*panels} == {name.partition(", seed")[0] for name in FOOTAGE} | {"road of the demo"}
+    for way in ("map", "null"):
+        assert [recall for _, recall in panels["city 1"][way]] == [
+            row["recall_at_1"] for row in city["storage"][way]
+        ]
+    for way in ("uncompressed", "hog"):
+        assert panels["city 1"][way] == [(0.0, city[way]["recall_at_1"])]
+    assert len(panels["road of the demo"]["product_quantiser"]) == 5
+    drawn = pictures.plot_recalls(panels)[1]
+    assert [axis.get_title("left") for axis in drawn.flat[: len(panels)]] == [*panels]
+    grown = pictures.growth()
+    assert [len(lines) for lines in grown.values()] == [8, 8]
+    assert [places for places, _ in grown["recall@1"]["dejavu 4 B"]] == [10**4, 10**5, 10**6]
+
+
+PAGES = sorted([*tables.DOCS.rglob("*.md"), *tables.FOLDER.glob("*.md")])
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_the_tables_of_the_documentation_are_those_of_its_json(page):
     text = page.read_text()
     assert tables.filled(text) == text

@@ -83,7 +83,7 @@ def test_readme_tells_what_the_demo_measures(report):
 
 
 def test_readme_tells_what_the_picture_shows():
-    rows = json.loads((README.parent / "docs/results/front.json").read_text())["rows"]
+    rows = json.loads((README.parent / "benchmarks/results/front.json").read_text())["rows"]
     text = " ".join(README.read_text().split())
     share = {(row["contender"], row["bytes_per_place"]): row for row in rows}
     one = [share[way]["one_image"] for way in (("map", 1.0), ("product_quantiser", 1))]
