@@ -7,6 +7,7 @@ from typing import Any
 
 from benchmarks import (
     alike,
+    areas,
     chunks,
     cluster,
     distil,
@@ -34,6 +35,7 @@ from dejavu_torch.text import printable
 BENCHES: dict[str, Any] = {  # each returns the lines to print
     "results": results.run_results,
     "front": front.run_front,
+    "areas": areas.run_areas,
     "matcher": matcher.run_matcher,
     "storage": storage.run_storage,
     "drives": drives.run_drives,

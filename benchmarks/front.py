@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -101,7 +101,7 @@ def measured(seed: int) -> tuple[list[Row], Tensor, Tensor]:
     return rows, answers, hard
 
 
-def summarised(rows: list[Row]) -> list[Row]:
+def summarised(rows: list[Row], figures: Sequence[str] = COLUMNS[1:]) -> list[Row]:
     """Means and extremes over the seeds, a row for each way and size."""
     groups: dict[tuple[Any, Any], list[Row]] = {}
     for row in rows:
@@ -109,7 +109,7 @@ def summarised(rows: list[Row]) -> list[Row]:
         groups.setdefault((row["contender"], round(size, 1 if size > 1 else 2)), []).append(row)
     found = []
     for (key, size), same in groups.items():
-        means = {name: float(np.mean([row[name] for row in same])) for name in ("one_image", "whole_drive")}
+        means = {name: float(np.mean([row[name] for row in same])) for name in figures}
         spread = {f"{name}_span": [min(r[name] for r in same), max(r[name] for r in same)] for name in means}
         found.append({"contender": key, "bytes_per_place": size, **means, **spread})
     return found

@@ -220,12 +220,13 @@ def _known_places(
 
 def second_traverse(
     model: DejaVu,
-    reference: Traverse,
-    second: Traverse | Sequence[Traverse],
+    reference: Source,
+    second: Source | Sequence[Traverse],
     truth: str | Sequence[str | None] | None = None,
     progress: bool = False,
 ) -> LabelledFrames:
-    """As `associate`, for one or more traverses that whitening learns from, with one truth or one for each.
+    """As `associate`, for one or more traverses that whitening learns from, with one truth or one for each;
+    several are a list of `Traverse`.
 
     Where nothing says which places one shows, its frames have to be in order: a smoother places them on a map
     of the reference, see `teaching.place_drives`.
@@ -234,7 +235,8 @@ def second_traverse(
         InputError: no whitening that learns, another number of truths, other frame sizes, fewer than 30
             frames to place, or as `associate`.
     """
-    visits = [second] if isinstance(second, Traverse) else [*second]
+    several = isinstance(second, list | tuple) and all(isinstance(one, Traverse) for one in second)
+    reference, visits = as_traverse(reference), [*second] if several else [as_traverse(second)]  # type: ignore[misc]
     model.descriptor.require_learning(" + ".join(traverse.name for traverse in visits))
     truths = [truth] if isinstance(truth, str | None) else [*truth]
     truths *= len(visits) if len(truths) == 1 else 1

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from torch import nn
 
 Step = TypeVar("Step")
+TOLD = 20  # times as much as is done, in all, for a line to tell the time that is left
 FIRST_LINE, LINE_EVERY = 30.0, 60.0  # seconds until the first line of progress, and between lines
 
 
@@ -56,8 +57,9 @@ def progress_of(
         if not progress or now < due or not done:
             return
         due = now + LINE_EVERY
-        left = max(0, total - done) * (now - began) / done
-        tqdm.write(f"dejavu: {verb}: {done} of {total} {units}, {left:.0f} s left", file=sys.stderr)
+        # the first of many take longer: something is compiled, or the work before them is counted
+        left = f", {max(0, total - done) * (now - began) / done:.0f} s left" if TOLD * done >= total else ""
+        tqdm.write(f"dejavu: {verb}: {done} of {total} {units}{left}", file=sys.stderr)
 
     yield update
 

@@ -1,13 +1,15 @@
-"""Real footage that comes with the package: two flights over one road, `demo:road?traverse=0`."""
+"""Real footage that comes with the package: two flights over one road, `demo:road` and `demo:area`."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
 
+from dejavu_torch.data.grid import Grid, read_grid
 from dejavu_torch.data.strip import SlidingWindow, read_strip
-from dejavu_torch.types import expect
+from dejavu_torch.types import Traverse, expect
 
 FOLDER = Path(__file__).parent / "road"
 FLIGHTS = 2
@@ -27,4 +29,17 @@ def open_road(traverse: int = 0) -> SlidingWindow:
     return road
 
 
-DEMOS = {"road": open_road}
+def open_area(traverse: int = 0, window: int = 64, stride: int = 8) -> Grid:
+    """The same road as an area: windows in rows and columns over a flight's picture of 160 x 2792 pixels.
+
+    Args:
+        traverse: the flight, 0 or 1; a pixel of both shows the same ground to within three pixels.
+        window, stride: see `Grid`; pixels of 12.5 cm.
+    """
+    expect(traverse in range(FLIGHTS), f"0 to {FLIGHTS - 1}", f"demo:area has traverse={traverse}")
+    area = read_grid(FOLDER / f"flight_{traverse}.jpg", window, stride)
+    area.name = f"demo:area?traverse={traverse}"
+    return area
+
+
+DEMOS: dict[str, Callable[..., Traverse]] = {"area": open_area, "road": open_road}

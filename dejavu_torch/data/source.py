@@ -72,7 +72,7 @@ def open_source(source: str | Path, size: tuple[int, int] | None = None) -> Trav
             `photos?glob=*.png&recursive=1` (see `ImageFolder`); a video file, `clip.mp4`, also with width and
             height; an `.npy` file of frames (N,H,W) or (N,H,W,3) uint8, or of features (N,D) float, with the
             names of their images in a `.txt` file next to it; an `.h5` file of hloc's global descriptors,
-            also with `order=`; `demo:road?traverse=0` or 1, the flights of the demo;
+            also with `order=`; `demo:road?traverse=0` or 1, the flights of the demo, and `demo:area`;
             `sim:NAME?seed=0&traverse=0&frames=3072`, NAME being aerial, outdoor or underground; or
             `strip:IMAGE?width=96&rows=32:128&halve=1&grey=1`, a window sliding along one long image; or
             `grid:IMAGE?window=64&stride=8&scale=.5`, windows over a picture of an area, see `Grid`. For all

@@ -1,0 +1,126 @@
+"""`benchmarks areas`: windows of one flight over a road, found on the map of another, over bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from benchmarks.front import summarised
+from benchmarks.measure import Row, write_bench
+from benchmarks.quantisers import Quantiser
+from dejavu_torch import DejaVu, SpectralMapper, Whitening
+from dejavu_torch.area import Area
+from dejavu_torch.data.demo import open_area
+from dejavu_torch.evaluation.baselines import as_int8, scores_of_stored, stored_frames
+from dejavu_torch.evaluation.contenders import COLOURS
+from dejavu_torch.evaluation.controls import shuffled
+from dejavu_torch.evaluation.plots import Plot, legend
+from dejavu_torch.evaluation.quantiser import product_quantised
+from dejavu_torch.recognition.localizer import Scoring
+
+SEEDS = (1, 2, 3)  # of whitening, queries, codebooks and the order of the control; settings were chosen on 0
+STRIDE, QUERIES = 4, 1500  # pixels of 12.5 cm; queries at any offset
+RADIUS = 10.0  # pixels
+BYTES = (0.42, 1.0, 2.2, 4.0)
+CODES = (1, 2, 4)
+NAMES = {
+    "map": "this map, both directions",
+    "rows": "maps of its rows",
+    "null": "shuffled windows",
+    "product_quantiser": "product quantiser",
+    "PQ": "the same, codebooks of another area",
+    "RQ": "residual quantiser, likewise",
+    "stride": "int8, every 5th window",
+    "uncompressed": "float32, every window",
+}
+
+
+def ways_of(places: Tensor, area: Area, seed: int) -> Iterator[tuple[str, float, Scoring]]:
+    """Keys, bytes per place and scores of all ways to store descriptors (N,K) of an area."""
+    order, mixed = shuffled(places, seed)
+    by_row = torch.cartesian_prod(torch.arange(area.rows), torch.arange(area.columns))
+    in_rows = area.place_at(by_row)
+    for size in BYTES:
+        for key, rows in (("map", places), ("null", mixed), ("rows", places[in_rows])):
+            if key == "rows":
+                made = SpectralMapper(size, chunk=area.columns)(rows)
+            else:
+                made = SpectralMapper(size)(rows, area)
+            where = {"map": None, "null": order.argsort(), "rows": in_rows.argsort()}[key]
+            yield key, made.summary().route_bytes / len(places), in_order(made.scores, where)
+    # codebooks of the other half of the road
+    half = area.cells(torch.arange(len(places)))[:, 1] < area.columns // 2
+    for code in CODES:
+        restored, _ = product_quantised(places, code, seed)
+        yield "product_quantiser", code, scores_of_stored(restored, 1, "cosine")
+        for kind in ("PQ", "RQ"):
+            restored = torch.empty_like(places)
+            for one, other in ((half, ~half), (~half, half)):
+                restored[one] = Quantiser(places[other], f"{kind}{code}x8")(places[one])
+            yield kind, code, scores_of_stored(restored, 1, "cosine")
+    kept = len(stored_frames(len(places), 5, area)[0]) / len(places)
+    yield "stride", kept * places.shape[1], scores_of_stored(as_int8(places), 5, "cosine", area)
+    yield "uncompressed", 4.0 * places.shape[1], scores_of_stored(places, 1, "cosine")
+
+
+def in_order(score: Scoring, order: Tensor | None) -> Scoring:
+    """Scores with their columns in another order."""
+    return score if order is None else lambda queries: score(queries)[:, order]
+
+
+@torch.no_grad()
+def measured(seed: int) -> list[Row]:
+    """The rows of a seed."""
+    reference, second = open_area(0, stride=STRIDE), open_area(1, stride=1)
+    draw = torch.Generator().manual_seed(seed)
+    asked = torch.randint(len(second), (QUERIES,), generator=draw)
+    model = DejaVu(whitening=Whitening(seed=seed))
+    places = model.descriptor.learn(reference).float()
+    queries = torch.cat([model.descriptor(second[part.tolist()]) for part in asked.split(64)])
+    where, own = reference.coordinates, second.coordinates
+    assert where is not None
+    assert own is not None
+    rows = []
+    for key, size, score in ways_of(places, reference.area, seed):
+        best = torch.cat([score(part).argmin(1) for part in queries.split(256)])
+        right = (where.values[best] - own.values[asked]).norm(dim=1) <= RADIUS
+        recall = float(right.double().mean())
+        rows.append({"seed": seed, "contender": key, "bytes_per_place": size, "recall_at_1": recall})
+    return rows
+
+
+def plot_areas(rows: list[Row]) -> Plot:
+    """Recall over bytes."""
+    figure = Figure(figsize=(5, 3.4), layout="constrained", dpi=160)
+    axis: Any = figure.subplots()
+    colours = COLOURS | {"rows": "#7f6fb0", "PQ": "#b35806", "RQ": "#e08214"}
+    for key, name in NAMES.items():
+        same = sorted((r["bytes_per_place"], r["recall_at_1"]) for r in rows if r["contender"] == key)
+        axis.plot(*zip(*same, strict=True), "o-", label=name, color=colours[key], markersize=4)
+    axis.set_xscale("log")
+    axis.set_xticks([0.5, 1, 2, 4, 16, 64, 512], ["½", "1", "2", "4", "16", "64", "512"])
+    axis.minorticks_off()
+    axis.set(xlabel="bytes per window", ylabel="found within 10 pixels", ylim=(0, 1.03))
+    axis.spines[["top", "right"]].set_visible(False)
+    legend(figure, ncols=2)
+    return figure, axis
+
+
+def run_areas(*, out: Path) -> list[str]:
+    """Recall over bytes on an area, the road of the demo in two directions: map, rows, quantisers, controls.
+
+    Args:
+        out: folder for bench.json and bench.png
+    """
+    means = summarised([row for seed in SEEDS for row in measured(seed)], ("recall_at_1",))
+    write_bench(out, means, plot_areas(means), seeds=list(SEEDS), radius=RADIUS)
+    lines = [f"{'':<38}{'bytes':>8}{'recall@1':>10}"]
+    for row in means:
+        name = NAMES[row["contender"]]
+        lines.append(f"{name:<38}{row['bytes_per_place']:>8}{row['recall_at_1']:>10.3f}")
+    return [*lines, f"means of {len(SEEDS)} seeds"]
