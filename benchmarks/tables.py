@@ -17,6 +17,7 @@ from statistics import mean
 from typing import Any
 
 from benchmarks.alike import CAPPED, CHECKED, PRECISIONS, SINGLE, UNCAPPED
+from benchmarks.areas import NAMES as AREA_WAYS
 from benchmarks.measure import Row
 from benchmarks.results import FOOTAGE, rounded
 from benchmarks.storage import SHOWN, best, by, families, missed
@@ -326,6 +327,17 @@ def visits() -> str:
     return markdown(table)
 
 
+def areas() -> str:
+    """Recall@1 of one image on an area by ways to store it, over their bytes."""
+    found: dict[str, dict[float, str]] = {}
+    for row in read("areas")["rows"]:
+        found.setdefault(row["contender"], {})[row["bytes_per_place"]] = f"{row['recall_at_1']:.3f}"
+    sizes = sorted({each for own in found.values() for each in own})
+    table = [["bytes per window", *(f"{each:g}" for each in sizes)]]
+    table += [[name, *(found[key].get(each, "") for each in sizes)] for key, name in AREA_WAYS.items()]
+    return markdown(table)
+
+
 def features(name: str = "features") -> str:
     """The mean AUC over seeds with further features: of one image, of the null, of the whole drive."""
     found: dict[str, dict[str, list[Row]]] = {}
@@ -422,7 +434,7 @@ TABLES: dict[str, Callable[[], str]] = {
     **{"descriptors": descriptors, "sequences": sequences},
     **{"rejection": rejection, "filtered": filtered, "drives": drives, "driven": driven},
     **{"trainings": trainings, "made drives": made_drives, "storage drives": storage_drives},
-    **{"large drives": large_drives, "taught drives": taught, "visits": visits},
+    **{"areas": areas, "large drives": large_drives, "taught drives": taught, "visits": visits},
     **{name: partial(features, name) for name in ("features", "cells", "copies")},
     **{"alike": lambda: f"{look_alikes()}\n{loops()}"},
     **{f"storage {name}": partial(storage, name) for name in ("aerial", "road1", "road2", "city", "railway")},

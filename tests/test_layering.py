@@ -33,7 +33,7 @@ ARROWS = {
     "updating": "types data maps motion recognition model teaching growth",
     "cluster": "text types maps recognition",
     "live": "types memory data features recognition model",
-    "evaluation": "lazy text version types memory resize data features periods maps recognition motion "
+    "evaluation": "area lazy text version types memory resize data features periods maps recognition motion "
     "model_file model growth",
     "export": "text version types data features maps recognition model",
     "training": "lazy text types memory resize data features periods maps recognition "

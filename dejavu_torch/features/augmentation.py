@@ -165,9 +165,8 @@ class Augmentation(nn.Module):
             clips = clips.clamp_(low, torch.minimum(high, torch.ones_like(high)))
         if gamma:
             power = draw.between(1 / (1 + gamma), 1 + gamma)
-            changed = draw.happens(DEVELOPED).flatten().nonzero()[:, 0]
-            part = clips[changed].log_().mul_(power[changed]).exp_()  # faster than pow; 0 stays 0
-            clips[changed] = part
+            power = torch.where(draw.happens(DEVELOPED), power, 1)
+            clips = clips.log_().mul_(power).exp_()  # faster than pow; 0 stays 0
         if slope:
             height, width = clips.shape[-2:]
             x = torch.linspace(0, 1, width, dtype=clips.dtype, device=clips.device)
@@ -231,8 +230,9 @@ class _Draw(NamedTuple):
 
     @property
     def _where(self) -> dict[str, Any]:
-        device = self.device if self.generator is None else self.generator.device
-        return {"dtype": torch.float32, "device": device, "generator": self.generator}
+        if self.generator is None:  # which compiles
+            return {"dtype": torch.float32, "device": self.device}
+        return {"dtype": torch.float32, "device": self.generator.device, "generator": self.generator}
 
 
 def _homography(angle: Tensor, zoom: Tensor, shift: Tensor, tilt: Tensor) -> Tensor:
@@ -253,9 +253,7 @@ def _blurred(clips: Tensor, most: float, radius: int, draw: _Draw) -> Tensor:
     from kornia.filters import gaussian_blur2d  # loading kornia takes a second
 
     sigma = draw.between(min(0.1, most), most)
-    changed = draw.happens(BLURRED).flatten().nonzero()[:, 0]
-    if len(changed):
-        sigma, size, part = sigma[changed].view(-1, 1).expand(-1, 2), (2 * radius + 1,) * 2, clips[changed]
-        blurred = gaussian_blur2d(part.flatten(1, 2), size, sigma, separable=radius > LARGE_BLUR)
-        clips[changed] = blurred.view(part.shape)
-    return clips
+    sigma = torch.where(draw.happens(BLURRED), sigma, NO_BLUR).view(-1, 1).expand(-1, 2)
+    size = (2 * radius + 1, 2 * radius + 1)
+    blurred: Tensor = gaussian_blur2d(clips.flatten(1, 2), size, sigma, separable=radius > LARGE_BLUR)
+    return blurred.view(clips.shape)

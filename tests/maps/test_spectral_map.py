@@ -117,7 +117,7 @@ def test_a_mean_that_is_next_to_nothing_takes_no_bytes():
 def test_a_sample_pays_its_share_of_a_mean(shift):
     features = route(400, 12) - route(400, 12).mean(0) + shift
     mapper = SpectralMapper(6.0)
-    whole, part = (mapper.fit(features, 400, share).step for share in (1.0, 0.1))
+    whole, part = (mapper.fit(features, [(400, 1)], share).step for share in (1.0, 0.1))
     assert (part < whole) == bool(shift)
     assert part == whole or shift
 
