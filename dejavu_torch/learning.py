@@ -154,7 +154,7 @@ class Checkpoint:
 
 def is_long(traverse: Traverse, chunk: int) -> bool:
     """Whether a route with chunks of this many places is learned from a sample, chunk by chunk."""
-    return len(traverse) > max(SAMPLE, chunk)
+    return len(traverse) > max(SAMPLE, chunk if traverse.area is None else 0)
 
 
 @in_one_thread()

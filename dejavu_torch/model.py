@@ -460,8 +460,9 @@ class DejaVu(nn.Module):
         require_map(self)
         check_search(matching.search)
         if matching.sequence is not None:
+            fits = self.map.area is None or isinstance(matching.sequence, PlaceSmoother)
             seen = f"{type(matching.sequence).__name__}, and the map of an area"
-            expect(self.map.area is None, "single images, sequence=None", seen)
+            expect(fits, "single images, or a PlaceSmoother", seen)
             matching.sequence.check(None, self.map.places)
         single = matching.sequence is None and matching.callback is None
         if not single or matching.search not in ("auto", "coarse"):
@@ -488,7 +489,7 @@ class DejaVu(nn.Module):
             check_candidates(k, apart, self.map.places)
         queries = self.at_map_size(as_traverse(queries), self.frame_shape or ())
         if isinstance(sequence, str):
-            sequence = PlaceSmoother() if queries.ordered and self.map.area is None else None
+            sequence = PlaceSmoother() if queries.ordered else None
         matching = self.matching(sequence, search)._replace(k=k, radius=apart)
         localizer = self.localizer(matching)
         if sequence is not None:

@@ -14,17 +14,28 @@ from hypothesis import strategies as st
 from PIL import Image
 
 import dejavu_torch.area as areas
-from dejavu_torch import DejaVu, PlaceSmoother, SpectralMapper, TemplateMapper, compare, open_source
+from dejavu_torch import (
+    DejaVu,
+    PlaceFilter,
+    PlaceSmoother,
+    SpectralMapper,
+    TemplateMapper,
+    compare,
+    open_source,
+)
 from dejavu_torch.area import Area, around, distance
 from dejavu_torch.data.grid import Grid
 from dejavu_torch.evaluation.baselines import stored_frames
 from dejavu_torch.growth import append, merge
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.spectrum import by_frequency, frequencies, from_lines, lines_of
+from dejavu_torch.recognition import plane
 from dejavu_torch.recognition.coarse import CoarseSearch, SamplingPlan
+from dejavu_torch.recognition.evidence import RankTable, standardised
 from dejavu_torch.recognition.samples import RowSearch
 from dejavu_torch.recognition.search import Scan
 from dejavu_torch.recognition.select import best_candidates
+from dejavu_torch.recognition.smoother import log_likelihood
 
 SIDES = st.integers(1, 40)
 
@@ -191,6 +202,95 @@ def test_every_kth_window_is_stored_in_both_directions(small_tiles):
     assert [table.tolist() for table in stored_frames(5, 2)] == [[0, 2, 4], [0, 1, 1, 2, 2]]
 
 
+def test_a_sweep_gives_the_masses_of_the_model(small_tiles):
+    """Against matrices of all transitions between the windows, and the state off the area."""
+    area, reach, queries = Area(4, 5), 1, 5
+    smoother, draw = PlaceSmoother((0.5, 0.5)), torch.Generator().manual_seed(0)
+    std = standardised(torch.rand(queries, area.places, generator=draw), torch.zeros(area.places))
+    values = RankTable()
+    values.add(std.z, torch.ones_like(std.z))
+    kernel = torch.rand(3, 3, generator=draw)
+    kernel /= kernel.sum()
+    still = torch.tensor([False, False, True, False, False])
+    weight = torch.tensor([1.0, 1.0, 0.5, 0.5, 1.0])
+    swept = plane._sweep(smoother, area, std, weight, still, values.values, 2.0, kernel)
+
+    n, cells = area.places, torch.cartesian_prod(torch.arange(4), torch.arange(5))
+    _, jump, leave = smoother.rate_logits.detach().softmax(0).double()
+    enter = smoother.enter_logit.detach().sigmoid().double()
+    step = torch.zeros(n + 1, n + 1, dtype=torch.float64)
+    moves = (cells[None] - cells[:, None]) + reach
+    inside = ((moves >= 0) & (moves <= 2 * reach)).all(2)
+    at = moves.clamp(0, 2 * reach)
+    step[:n, :n] = (1 - jump - leave) * torch.where(inside, kernel[at[..., 0], at[..., 1]], 0).double()
+    lost = 1 - jump - leave - step[:n, :n].sum(1)  # over the border
+    step[:n, :n] += jump / n
+    step[:n, n] = leave + lost
+    step[n, :n], step[n, n] = enter / n, 1 - enter
+    log = log_likelihood(values.values, std, weight, 2.0, smoother.tempering)[:, area.place_at(cells)]
+    seen = torch.cat([log.exp(), torch.ones(queries, 1)], 1).double()
+    belief = torch.full((n + 1,), 0.5 / n, dtype=torch.float64)
+    belief[n] = 0.5
+    forward, before, total = [], [], 0.0
+    for t in range(queries):
+        if t and not still[t]:
+            belief = belief @ step
+        before.append(belief)
+        belief = belief * seen[t]
+        total += float(belief.sum().log())
+        belief = belief / belief.sum()
+        forward.append(belief)
+    message = torch.ones(n + 1, dtype=torch.float64)
+    for t in reversed(range(queries)):
+        for own, found in ((forward[t], swept.mass[t]), (before[t], swept.others[t])):
+            mass = own * message / (own * message).sum()
+            # off the area a step over the border is no message: it is told by `lost` alone
+            assert float((mass[:n].view(4, 5) - found).abs().max()) < 0.05
+        message = message * seen[t]
+        message = message if still[t] else step @ message
+    assert swept.log == pytest.approx(total, abs=1e-3)
+
+
+def flight(area, images, seed=0):
+    """Places of a flight over an area that keeps to its course for a while, (n,)."""
+    draw = torch.Generator().manual_seed(seed)
+    at, course, found = torch.tensor([5.0, 5.0]), torch.tensor([0.7, 1.2]), []
+    most = torch.tensor([area.rows - 1.0, area.columns - 1.0])
+    for _ in range(images):
+        course = course + 0.2 * torch.randn(2, generator=draw)
+        course = torch.where(((at + course) < 0) | ((at + course) > most), -course, course).clamp(-2, 2)
+        at = (at + course).clamp(torch.zeros(2), most)
+        found.append(at.round().long())
+    return area.place_at(torch.stack(found))
+
+
+def test_a_flight_is_found_where_single_images_are_not(small_tiles, monkeypatch):
+    monkeypatch.setattr(areas, "SIDE", 30)
+    areas._tiles.cache_clear()
+    area = Area(30, 40)
+    _, own = learned(area)
+    model = DejaVu(whitening="none", mapper=SpectralMapper(step=0.05)).learn_features(own, area=area)
+    truth, draw = flight(area, 90), torch.Generator().manual_seed(1)
+    queries = own[truth] + 0.25 * torch.randn(90, own.shape[1], generator=draw)
+
+    def near(match):
+        return float((distance(match.index.clamp(min=0), truth, area) <= 2).double().mean())
+
+    one, smoother = model.localize_descriptors(queries), PlaceSmoother()
+    whole = model.localize_descriptors(queries, smoother)
+    assert smoother.is_drive
+    assert near(whole) > near(one) + 0.1
+    assert near(whole) > 0.9
+    right = distance(whole.index.clamp(min=0), truth, area) <= 5
+    assert float(whole.probability.mean()) == pytest.approx(float(right.double().mean()), abs=0.1)
+    mixed = PlaceSmoother()
+    model.localize_descriptors(queries[torch.randperm(90, generator=draw)], mixed)
+    assert not mixed.is_drive  # in no order
+    elsewhere, away = smooth(30, 40, seed=9), PlaceSmoother()
+    model.localize_descriptors(elsewhere[truth], away)
+    assert not away.is_drive  # over other ground
+
+
 def ground(side, seed=0, light=0.0):
     """A picture of coarse and fine texture, (side,side,3) uint8."""
     draw = torch.Generator().manual_seed(seed)
@@ -257,8 +357,8 @@ def test_what_a_map_of_an_area_does_not_do_is_refused(pictures, small_tiles):
         append(model, open_source(source))
     with refused("map of an area", "merge"):
         merge([model, model], ["a", "b"])
-    with refused("PlaceSmoother", "area", "single images"):
-        model.localize(source, sequence=PlaceSmoother())
+    with refused("PlaceFilter", "area", "PlaceSmoother"):
+        model.localize(source, sequence=PlaceFilter())
     with refused("TemplateMapper", "area", "SpectralMapper"):
         DejaVu(mapper=TemplateMapper()).learn(source)
     with refused("100 descriptors", "10 x 11", "one for each"):

@@ -163,7 +163,8 @@ def test_a_whitening_learned_on_a_gpu_is_that_of_the_cpu(device, frames):
     models = [DejaVu(whitening=copy.deepcopy(whitening)).to(one).learn(frames) for one in ("cpu", device)]
     known = [model.descriptor(frames.to(model.map.device)).cpu() for model in models]
     # up to the signs of its numbers, what 16 bits round, and votes that rounding moves to another bin
-    torch.testing.assert_close(known[1] @ known[1].T, known[0] @ known[0].T, rtol=3e-3, atol=3e-3)
+    products = [one @ one.T for one in known]
+    assert float((products[1] - products[0]).norm() / products[0].norm()) < 0.01
 
 
 def test_copies_of_frames_are_those_of_the_cpu(device, frames):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import logging
+import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -147,9 +148,12 @@ def compare(
     radius, area = tolerance, reference.area
     if area is not None and truth is None and query.coordinates is not None:
         truth = f"{'metres' if area.unit == 'm' else 'pixels'}:{radius}"
+    within = tolerance if area is None else round(radius / math.hypot(*area.right))  # places
     tolerance = tolerance if area is None else 0  # all windows within the radius are right
-    in_order = (source_of(query).ordered if ordered is None else ordered) and area is None
-    smoother, causal = _ways(sequence, in_order and len(query) > 1, tolerance)
+    in_order = source_of(query).ordered if ordered is None else ordered
+    smoother, causal = _ways(sequence, in_order and len(query) > 1, within)
+    if smoother is not None and area is not None:
+        smoother.within = within
     if causal is not None:
         causal.check(None, len(reference))
     # without a given truth, each place would be its own answer
@@ -163,6 +167,7 @@ def compare(
                 calibrate_if_possible(model, reference, calibration, progress=progress)
         with timed(seconds, "localize"):
             beside = in_order and known is not None and not itself  # without truth they have no scores
+            beside = beside and area is None  # where they would take minutes
             beside = beside and (ordered is not None or len(query) * model.map.places <= MAX_FILTERED)
             also = models_beside(causal, beside, len(query), model.map.places, tolerance)
             alike = PlaceSmoother(within=tolerance) if beside and len(query) > 1 else None

@@ -17,11 +17,13 @@ from dejavu_torch.recognition.evidence import Spacing, spacing_of
 from dejavu_torch.recognition.filter import near_scores
 from dejavu_torch.recognition.large import TILE, LargeDrive, Tiles, is_large
 from dejavu_torch.recognition.motion import Layout
+from dejavu_torch.recognition.plane import near_in_plane, place_flight
 from dejavu_torch.recognition.select import best_candidates
 from dejavu_torch.recognition.smoother import Drive, PlaceSmoother, Rows, blocks_together, normalised
 from dejavu_torch.text import progress_of
 from dejavu_torch.types import Match
 
+SHARP = 2  # windows around a place of an area whose mass an answer is chosen by, at most
 DOUBT = 0.1  # nats for each deviation by which an answer's own score is worse than is usual in the drive
 KEPT = 2**26  # scores of drives that are smoothed together, up to which they are computed once
 NORMAL = 1.4826  # standard deviations of a Gaussian over its median absolute deviation
@@ -124,17 +126,25 @@ def _shown(asked: DriveQuery, seen: Seen) -> Shown:
     """The answers of some queries."""
     mass, scores, known = seen
     smoother, queries = asked.smoother, len(asked.descriptors)
-    scores = scores.masked_fill(scores.isnan(), math.inf)
-    ranked = near_scores(mass, scores, smoother.within) if asked.answers else scores
+    area, within = smoother.area, smoother.within
+    ranked = scores = scores.masked_fill(scores.isnan(), math.inf)
+    if asked.answers and area is None:
+        ranked = near_scores(mass, scores, within)
+    elif asked.answers and area is not None:
+        near = near_in_plane(mass, min(within, SHARP), area).clamp(min=torch.finfo(mass.dtype).tiny)
+        ranked = (-near.log()).masked_fill(~scores.isfinite(), math.inf)
     columns = None if known is None else known.expand_as(ranked)
-    pair = best_candidates(ranked, min(2, ranked.shape[1]), TOLERANCE, columns)
-    match = best_candidates(ranked, asked.k, asked.radius, columns)
+    pair = best_candidates(ranked, min(2, ranked.shape[1]), TOLERANCE, columns, area)
+    match = best_candidates(ranked, asked.k, asked.radius, columns, area)
     at = match.index[:, :1].clamp(min=0)
     if known is not None:
         at = torch.searchsorted(known, at).clamp(max=len(known) - 1)
-    probability = mass_around(mass, at, smoother.within)
+    if area is None:
+        probability = mass_around(mass, at, within)
+    else:
+        probability = near_in_plane(mass, within, area).gather(1, at)[:, 0]
     if not asked.answers and asked.platt is not None:
-        by_itself = asked.platt.probability(confidence_of(scores))
+        by_itself = asked.platt.probability(confidence_of(scores, area))
         probability = by_itself if queries == 1 else torch.minimum(probability, by_itself)
     probability = probability.masked_fill(match.index[:, 0] < 0, 0)
     margin = pair.score[:, -1] - pair.score[:, 0] if pair.index.shape[1] > 1 else pair.score[:, 0] * math.nan
@@ -163,6 +173,11 @@ def _seen(drives: Sequence[DriveQuery], sizes: Sequence[int], progress: bool) ->
     fitted: dict[tuple[int, Layout, int], list[tuple[int, Drive]]] = {}
     for i, (asked, places) in enumerate(zip(drives, sizes, strict=True)):
         rows, descriptors, smoother, _, _, starts, *_ = asked
+        if smoother.area is not None:
+            mass = place_flight(smoother, rows, len(descriptors), smoother.area, spacing_of(descriptors))
+            own = rows if asked.answers else asked.single or rows
+            yield i, Seen(mass.double(), own(torch.arange(len(descriptors))).cpu())
+            continue
         if is_large(len(descriptors), places):
             yield from ((i, seen) for seen in _of_windows(asked, places, progress))
             continue

@@ -163,6 +163,7 @@ class Localizer:
             tiles = Tiles(blocks, place_map.block_places)
 
         smoother.map_links = () if place_map is None else place_map.connections
+        smoother.area = self.area
         smoother.removed = matching.removed
 
         def rows(queries: Tensor) -> Rows:

@@ -10,6 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from dejavu_torch.area import Area
 from dejavu_torch.maps.frame_table import Link
 from dejavu_torch.recognition.evidence import (
     RankTable,
@@ -182,6 +183,7 @@ class PlaceSmoother(SequenceModel):
         self.within, self.threshold = within, threshold
         self.links, self.loop = tuple(links), loop
         self.map_links: tuple[Link, ...] = ()  # those of the map that a `Localizer` matches to
+        self.area: Area | None = None  # of that map's places, see `place_flight`
         self.removed = 1.0  # share of each place's mean score that is removed
         self.log_likelihood: float | None = None  # nats above being off the map throughout, as fitted
         self.correlation = 1.0  # tau of these queries

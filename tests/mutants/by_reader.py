@@ -54,9 +54,9 @@ MUTANTS = [
     Mutant(
         "With a resolution, cosine and sine of one frequency of the DFT have the same dead zone, by "
         "their period.",
-        "dejavu_torch/maps/quantisation.py",
-        "half_cycles(torch.arange(n), transform) / (2 * n) for n in sizes",
-        "torch.arange(n) // 2 * 2 / (2 * n) for n in sizes",
+        "dejavu_torch/maps/spectrum.py",
+        "half_cycles(torch.arange(n), transform).double() / (2 * n)",
+        "(torch.arange(n) // 2 * 2).double() / (2 * n)",
         ("tests/test_behaviour.py::test_cosine_and_sine_have_the_same_dead_zone",),
     ),
     Mutant(
@@ -119,15 +119,15 @@ MUTANTS = [
     Mutant(
         "Two candidates of a query are more than `radius` places from each other, to both sides of the "
         "better one.",
-        "dejavu_torch/recognition/select.py",
-        "window = torch.arange(-min(radius, columns), min(radius, columns) + 1, device=scores.device)",
-        "window = torch.arange(-min(radius, columns), min(radius, columns), device=scores.device)",
+        "dejavu_torch/area.py",
+        "(places[:, None] + offset).clamp(0, count - 1)",
+        "(places[:, None] + offset[:-1]).clamp(0, count - 1)",
         ("tests/recognition/test_select.py::test_candidates_equal_reference",),
     ),
     Mutant(
         "A search keeps enough of the best places that candidates and probabilities are those of all scores.",
         "dejavu_torch/recognition/search.py",
-        "(k - 1) * (2 * radius + 1) + 1 for",
+        "(k - 1) * suppressed(radius) + 1 for",
         "(k - 1) * (radius + 1) + 1 for",
         ("tests/recognition/test_search.py::-k candidates_are_those or calibrated_map",),
     ),
@@ -266,8 +266,8 @@ MUTANTS = [
     Mutant(
         "Chunks of a long route, and of appended places, are coded with the resolution of the map.",
         "dejavu_torch/learning.py",
-        "self.step, self.transform, self.resolution)",
-        "self.step, self.transform, 0.0)",
+        "self.step, self.transform, self.resolution, columns)",
+        "self.step, self.transform, 0.0, columns)",
         (
             "tests/test_growth.py::-k those_of_a_long_route or learned_at_once",
             "tests/maps/test_spectral.py::test_resolution_is_kept_and_extends_alike",

@@ -102,8 +102,8 @@ MUTANTS = [
     Mutant(
         "In the periods of a summary cosine and sine of one frequency count together, once.",
         "dejavu_torch/maps/spectral_map.py",
-        "half_cycles(line, self.transform), value.square()",
-        "line, value.square()",
+        "kind[line], value.square()",
+        "kind[line // 2 * 2], value.square()",
         ("tests/test_behaviour.py::test_a_frequency_is_one_period_of_a_summary",),
     ),
     Mutant(
@@ -455,8 +455,8 @@ MUTANTS = [
     Mutant(
         "A run that goes on makes no chunk again that FILE.part holds.",
         "dejavu_torch/learning.py",
-        "for i in range(len(done), frames, place_map.chunk)]",
-        "for i in range(0, frames, place_map.chunk)]",
+        "for each in bounds if each[0] >= len(done)]",
+        "for each in bounds]",
         ("tests/test_learning.py::test_finished_chunks_are_not_made_again",),
     ),
     Mutant(
@@ -878,5 +878,26 @@ MUTANTS = [
         "word.isalpha() or size == int(word)",
         "word.isalpha() or size >= int(word)",
         ("tests/test_expect.py",),
+    ),
+    Mutant(
+        "The lines of an area are in the order of both their frequencies.",
+        "dejavu_torch/maps/spectrum.py",
+        "down[:, None] * columns**2 + across * rows**2",
+        "down[:, None] * columns**4 + across",
+        ("tests/test_area.py::-k order_of_their_frequency",),
+    ),
+    Mutant(
+        "Candidates in an area are apart in rows and columns.",
+        "dejavu_torch/area.py",
+        "    if area is not None:\n        return area.around(places, radius)\n",
+        "",
+        ("tests/test_area.py::-k candidates_are_apart",),
+    ),
+    Mutant(
+        "The tiles of a long area are coded in both directions.",
+        "dejavu_torch/learning.py",
+        "columns = 1 if area is None else area.columns_from(frames.start)",
+        "columns = 1",
+        ("tests/test_area.py::-k compared_by_distance",),
     ),
 ]
