@@ -183,7 +183,7 @@ STEPS = [  # facts, recall@1, verdict, steps
     ),
     (
         {"line": {"offset": 7, "answers": 9, "confident": 9}, "truth": "place = query"},
-        *(0.0, "Not by this ground truth", ["--truth 7"]),
+        *(0.0, "Not according to this ground truth", ["--truth 7"]),
     ),
     (
         {"least_probability": 0.5, "accepted": 20, "accepted_right": 4, "kind": "spectral", "filter": True},
