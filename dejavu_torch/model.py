@@ -57,13 +57,13 @@ class DejaVu(nn.Module):
     """Learn a compressed map of a route, by default a spectral map, and find places on it (section III).
 
     Args:
-        features: any nn.Module (B,C,H,W) -> (B,D), given frames in the type of its weights; None is HOG and
-            the built-in network of 65 kB, `Distilled`; HOG alone if unwhitened.
+        features: any nn.Module (B,C,H,W) -> (B,D), given frames in the type of its weights; by default HOG
+            and the built-in 65 kB network `Distilled`, or HOG alone if unwhitened.
         whitening: reduces features to few dimensions, learned with each map unless it is `fixed`; None is
             Whitening for a SpectralMapper and "none" for templates. "none" keeps the features, except that a
-            SpectralMapper reduces ready features of over 256 dimensions to principal components.
-        mapper: makes the map from the descriptors of a traverse; None is SpectralMapper with its defaults.
-        threshold: accept a match if its score is below; infinity accepts every finite score.
+            SpectralMapper reduces precomputed features of over 256 dimensions to principal components.
+        mapper: makes the map from the descriptors of a route; None is SpectralMapper with its defaults.
+        threshold: accept a match if its score is below this; infinity accepts every finite score.
         precision: accept an answer if it is right with at least this probability, such as .99; the map has
             to be calibrated. See `acceptance` for the default.
         batch_size: frames in memory at a time.

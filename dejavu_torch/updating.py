@@ -67,7 +67,7 @@ class Update(NamedTuple):
 
     def __str__(self) -> str:
         if not self.is_drive:
-            return "no drive of this map; nothing is learned, the map stays as it was"
+            return "not a drive on this map; nothing is learned, the map stays as it was"
         told = "too few frames to learn from" if self.refinement is None else str(self.refinement)
         pairs = zip(self.stretches, self.names, strict=True)
         new = [f"frames {first}-{last - 1} are new, the route {name}" for (first, last), name in pairs]

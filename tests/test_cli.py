@@ -86,7 +86,7 @@ def test_convention_4_threshold_option_then_map_then_probability_then_all(small_
     assert accepted() == sum(float(row["probability"]) >= 0.5 for row in csv.DictReader(out.open()))
     np.save(tmp_path / "other.npy", np.random.default_rng(0).integers(0, 256, (96, 64, 64, 3), np.uint8))
     run("localize", small_map, tmp_path / "other.npy", "--ordered", "--out", out)
-    assert "no drive of this map" in capsys.readouterr().out
+    assert "do not look like a drive on this map" in capsys.readouterr().out
     assert accepted() == sum(float(row["probability"]) >= 0.5 for row in csv.DictReader(out.open())) == 0
     run("localize", small_map, QUERY, "--sequence", 5, "--out", out)  # which has no probabilities
     assert "every query with a finite score" in capsys.readouterr().out

@@ -82,10 +82,10 @@ def test_options_that_exclude_each_other_are_told_before_anything_is_read(capsys
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (("--calibration", AGAIN), "itself; expected another traverse"),
-        (("--calibration", ROUTE), "itself; expected another traverse"),
-        (("--second", AGAIN), "itself; expected another traverse"),
-        (("--distractors", AGAIN), "itself; expected another traverse"),
+        (("--calibration", AGAIN), "itself; expected another visit"),
+        (("--calibration", ROUTE), "itself; expected another visit"),
+        (("--second", AGAIN), "itself; expected another visit"),
+        (("--distractors", AGAIN), "itself; expected another visit"),
         (("--calibration_truth", "0"), "--calibration SOURCE"),
         (
             ("--match", "single", "--precision", ".9", "--calibration", "none"),

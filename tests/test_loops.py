@@ -101,7 +101,7 @@ def test_a_comparison_of_loops_asks_all_contenders_for_them(tmp_path, capsys):
     for option in ("--top 3", "--match filter", "--centre mean", "--leave_out 2"):
         failed = fails(capsys, "compare", drive, *words, tmp_path / "x", *option.split())
         assert f"--loops 30 and {option}" in failed
-    with refused("expected a second traverse, or loops"):
+    with refused("expected a second visit, or loops"):
         compare(twice(), None)
     with refused("without query"):
         compare(twice(), twice(), loops=5)

@@ -213,7 +213,7 @@ def test_the_command_updates_a_map(tmp_path, capsys):
     run("learn", tmp_path / "route.npy", "--map", path)
     before = path.read_bytes()
     run("update", path, tmp_path / "other.npy")
-    assert "no drive of this map; nothing is learned, the map stays as it was" in capsys.readouterr().out
+    assert "not a drive on this map; nothing is learned, the map stays as it was" in capsys.readouterr().out
     assert path.read_bytes() == before
     run("update", path, tmp_path / "monday.npy", tmp_path / "monday.npy")
     out = capsys.readouterr().out

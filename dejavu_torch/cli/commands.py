@@ -64,7 +64,7 @@ def run_learn(
             strip:IMAGE?width=96; several follow each other along one route
         map: map file to write (.safetensors)
         cluster: encode the chunks of a long route on Ray workers: auto starts one per processor, else the
-            address of a cluster. They read the sources by the same paths
+            address of a cluster. They read the sources at the same paths
     """
     append = growing.append
     expect(sources or (append and growing.average), "one, or --append and --average", "there is no source")
@@ -170,7 +170,7 @@ def run_refine(
     loading: options.Loading,
     command: str,
 ) -> None:
-    """Learn from drives, whose places nobody tells, what changes along a map; its places stay as they are.
+    """Learn from drives without ground truth what changes along a map; its places stay as they are.
 
     Args:
         map: map file, which is overwritten unless --out names another one
@@ -190,7 +190,7 @@ def run_update(
     loading: options.Loading,
     command: str,
 ) -> None:
-    """Refine a map by drives, as `dejavu refine`, and append ground that it lacks as routes of their own.
+    """Refine a map with drives, as `dejavu refine` does, and append new ground as separate routes.
 
     Args:
         map: map file, which is overwritten unless --out names another one

@@ -48,7 +48,7 @@ def follow(
         InputError: the source fails; the lines and the summary of earlier frames are printed first.
     """
     localizer = LiveLocalizer(model, sequence, port is not None, centre)
-    title += f"; answers come {localizer.lag} frames later and know of these" if localizer.lag else ""
+    title += f"; answers come {localizer.lag} frames later and use these" if localizer.lag else ""
     frames, newest, name = frames_from(source, model, realtime, port is not None)
     recent: deque[float] = deque(maxlen=RECENT)  # milliseconds
     waiting: deque[Frame] = deque()  # for their answers

@@ -31,7 +31,7 @@ from dejavu_torch.recognition.select import check_candidates
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.types import InputError, Match, Traverse, expect
 
-NO_DRIVE = "the queries are no drive of this map, as far as they show: each is matched by itself"
+NO_DRIVE = "the queries do not look like a drive on this map: each is matched by itself"
 
 
 def run_localize(
@@ -57,14 +57,14 @@ def run_localize(
         map: map file
         source: frames to find, as in `dejavu learn`
         out: csv of query,place,score,accepted[,probability],confidence[,rank][,route],query_name,place_name
-        top: write this many places per query, no two within 5 of each other, each in a row with its rank; a
-            probability is that of the first
-        loops: find where a drive comes back to places it has passed, if the map was learned from it: this
-            many frames before each, and those after it, are no answers
+        top: write this many places per query, no two within 5 of each other, each in a row with its rank;
+            only the first has a probability
+        loops: find where a drive returns to its own places, on a map learned from it; ignore this many frames
+            before each frame, and all after it
         pairs: also write lines `query_name place_name` for hloc and COLMAP, one per place
         corners: where this camera sees the patch of ground that the map's --velocity.corners describe
         cluster: divide the map among Ray workers, as in `dejavu learn`; for single queries only
-        skip_damaged: frames that cannot be read find nothing, and do not stop the others
+        skip_damaged: go on if frames cannot be read; they find nothing
     """
     device_of(loading.device)
     _check_written(out, pairs, map, source)
@@ -181,7 +181,7 @@ def run_live(
     timeout: float = 10.0,
     loading: options.Loading,
 ) -> None:
-    """Find frames as they arrive: a line of JSON for each on stdout, a summary on stderr at the end.
+    """Localize frames as they arrive: print a line of JSON for each, and a summary on stderr at the end.
 
     Frames are resized to the size of the map's frames.
 
@@ -192,7 +192,7 @@ def run_live(
             drop those that arrived meanwhile; files drop none
         page: show frame, reference frame and posterior at http://127.0.0.1:PORT; 8765 if no port is given, 0
             for any free port. A file then plays in real time, and the page stays until Ctrl-C
-        reference: what the map was learned from, a source as in `dejavu learn`, for the pictures of the page
+        reference: the source that the map was learned from, for the pictures of the page
         realtime: play a video in real time, and drop frames that arrive too fast
         timeout: seconds without a frame after which a camera, address or pipe has stalled
     """

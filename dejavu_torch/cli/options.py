@@ -37,11 +37,11 @@ WAYS = "drive, filter, single or sequence:T with a whole number T of at least 1"
 
 @dataclass
 class Sequences:
-    """How consecutive queries support each other.
+    """How consecutive queries are matched together.
 
     Args:
         match: drive (each query with all others; default if in order), filter (with those before), sequence:T
-            (T together at constant speed) or single; the first two score at least -log(probability)
+            (T queries at constant speed) or single; scores of the first two are at least -log(probability)
         speeds: speeds of a sequence in places per query, such as '[.8,1,1.25]'; 1 if not given
     """
 
@@ -91,14 +91,14 @@ class Sequences:
 
 @dataclass
 class LiveSequences(Sequences):
-    """The filter unless another way is given.
+    """How frames are matched.
 
     Args:
-        match: filter matches each frame with those before it, and is the default; sequence:T with T - 1
-            before it, at constant speed; single by itself
-        lag: frames by which the filter's answers come later, and which they know of
-        learns: the filter learns moves and sharpness on the way
-        centre: mean removes the mean of the frames so far from each
+        match: filter (each frame with those before it; default), sequence:T (with the T - 1 before it, at
+            constant speed) or single
+        lag: delay the filter's answers by this many frames, and use these frames for them
+        learns: let the filter learn the camera's moves and the sharpness of scores from the drive
+        centre: mean subtracts the mean of the frames so far from each frame
     """
 
     lag: int = 0
@@ -120,12 +120,12 @@ class LiveSequences(Sequences):
 
 @dataclass
 class Ordering:
-    """Whether queries are in order, and what follows from it.
+    """The order of the queries.
 
     Args:
         ordered: queries are in order, as in a video; needed for a .npy of frames
         unordered: queries are in no order: match each by itself
-        centre: mean removes what all queries have and the map has not; default for 50 or more in order
+        centre: mean removes what all queries share but the map does not; default for 50 or more in order
     """
 
     ordered: bool = False
@@ -163,8 +163,8 @@ class Searching:
     Args:
         search: auto and coarse compare 8-bit samples of a spectral map and score only the best places; exact
             and scan score all places
-        search_memory: MB for these samples; if not given 300, or 100 bytes per place above 3 x 10^6 places,
-            and half of the free memory of a GPU
+        search_memory: MB for these samples; by default 300, or 100 bytes per place above 3 x 10^6 places;
+            on a GPU half of its free memory
     """
 
     search: Search = "auto"
@@ -224,8 +224,8 @@ class Acceptance:
 
     Args:
         threshold: accept matches with a score below this; .inf accepts all
-        precision: accept matches that are right with at least this probability, such as .99. If neither the
-            options nor the map say anything: .5 for a whole drive or on a calibrated map, else all
+        precision: accept matches that are right with at least this probability, such as .99. If neither
+            this nor a threshold is set: .5 for a whole drive or on a calibrated map, else all
     """
 
     threshold: float | None = None
@@ -250,15 +250,15 @@ class Acceptance:
 
 @dataclass
 class LearningOptions:
-    """What a map is learned with in addition to its route.
+    """How a map is learned.
 
     Args:
         seed: seed of the whitening, unless it has its own, and of the null control
         second: another visit to the same route, to learn which changes to ignore, or several, '[A,B]'
         second_truth: ground truth of --second, in the formats of --truth; one for all, or '[A,B]'
         descriptor: file to take the features from: a map, or a descriptor of `dejavu train`
-        calibration: another visit, by whose answers probabilities are calibrated, or none; augmented frames
-            of the route if not given
+        calibration: another visit on which to calibrate probabilities, or none; by default augmented frames
+            of the route
         calibration_truth: ground truth of --calibration, in the formats of --truth
         device: cpu, cuda or cuda:1
     """
@@ -336,7 +336,7 @@ class GrowthOptions:
     Args:
         append: append the places of the source to this map file; it is overwritten unless --map names another
             file
-        average: another visit, averaged into the places of the source before they are coded; without a
+        average: another visit, to average into the places of the source before they are coded; without a
             source, into those of --append, which are decoded, averaged and coded again with the same step
         average_truth: ground truth of --average, in the formats of --truth of `dejavu compare`
     """
@@ -418,5 +418,5 @@ def open_another(option: str, source: str, others: Iterable[Traverse | None]) ->
     traverse = open_source(source)
     for other in others:
         if other is not None and Path(other.name).resolve() == Path(traverse.name).resolve():
-            raise InputError(f"--{option} {source} is {other.name} itself; expected another traverse")
+            raise InputError(f"--{option} {source} is {other.name} itself; expected another visit")
     return traverse

@@ -36,9 +36,9 @@ COMMAND = "command"  # the parameter that is the command line itself
 DEFAULT_PARTS = {"mapper": {"class_path": "dejavu_torch.SpectralMapper"}}
 BYTES, ROUTE_BYTES = "--bytes", "--mapper.route_bytes_per_place"  # an option, and what it stands for
 HINT = (
-    "Parts have options of their own, such as --whitening.numbers 64, --mapper.route_bytes_per_place 2.5 "
+    "Parts have their own options, such as --whitening.numbers 64, --mapper.route_bytes_per_place 2.5 "
     "or, for HOG alone, --features.cell 4: see --features.help HOG, --whitening.help, --mapper.help "
-    "SpectralMapper, --preprocess.help and --velocity.help. --config local_maxima makes a map of templates, "
+    "SpectralMapper, --preprocess.help and --velocity.help. --config local_maxima makes a template map, "
     "with options such as --mapper.periods.window 512. --features '[HOG, Distilled]' joins several features. "
     "--features hub:megaloc is a pretrained network: it downloads and runs code from GitHub. --whitening "
     "also accepts none, or a map file, whose features are then used as well; --descriptor uses only the "
@@ -121,7 +121,7 @@ class Parser(jsonargparse.ArgumentParser):
             if self.whole or not self.first:
                 self.description = f"{description} {self.hint}".strip() if description else None
                 return str(super().format_help(*given))
-            part = ", `--features.help HOG` those of a part" * bool(self.hint)
+            part = ", `--features.help HOG` those of one part" * bool(self.hint)
             self.epilog = f"`{self.prog} --help_all` shows all options{part}."
             for one in hidden:
                 one.help = argparse.SUPPRESS

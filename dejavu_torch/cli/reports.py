@@ -101,9 +101,9 @@ def run_compare(
     Args:
         reference: the visit to learn: a folder of images, a video, or another source of `dejavu learn`
         query: the visit whose frames are found; none with --loops
-        loops: find where the reference comes back to its own places, as in localize
-        out: folder for report, pictures, matches.csv and map.safetensors; if not given dejavu_report, or
-            dejavu_report_2 and so on if that is there
+        loops: find where the reference returns to its own places, as in localize
+        out: folder for report, pictures, matches.csv and map.safetensors; by default dejavu_report, or
+            dejavu_report_2 and so on if that exists
         open: show the report in a browser
         map: evaluate this map of the reference instead of learning one
     """
@@ -172,7 +172,7 @@ def _check_loops(
 ) -> None:
     """Refuse a comparison without a query, and loops with what needs one."""
     if loops is None:
-        expect(query is not None, "a second traverse, or --loops within the first", "compare without QUERY")
+        expect(query is not None, "a second visit, or --loops within the first", "compare without QUERY")
         return
     expect(query is None, "the reference alone", f"--loops {loops} and the query {query}")
     of_routes = {
@@ -197,7 +197,7 @@ def run_evaluate(
     loops: int | None = None,
     command: str,
 ) -> None:
-    """Evaluate the matches of any method from a csv: scores, curve, coverage.
+    """Score a csv of matches from any method: scores, curve, coverage.
 
     Args:
         matches: csv of query,place,score[,accepted][,probability][,rank][,route]
@@ -205,7 +205,7 @@ def run_evaluate(
         out: folder for report and pictures
         tolerance: count an answer as right if it is at most this many frames off
         interpolate: interpolate a --truth that lists only some queries
-        reference: source of the places, for their number and coordinates in names; as in `dejavu learn`
+        reference: source of the places, for their number and coordinates; as in `dejavu learn`
         query: source of the queries; as in `dejavu learn`
         map: map of the matches, for its number of frames and, if they are resampled, their places
         route: route of a merged map that --truth, --reference and the queries belong to; answers on other
@@ -213,7 +213,7 @@ def run_evaluate(
         recall_values: also print the share of queries with a right answer among their first N ranks, for each
             N, such as 1 5 10 20; with --tolerance 0 these are the figures of VPR-methods-evaluation
         higher_is_better: the scores are similarities, not distances
-        loops: as in localize: only places over this many frames before a query are right
+        loops: as in localize: only places more than this many frames before a query are right
     """
     from dejavu_torch.evaluation.evaluate import evaluate_file
     from dejavu_torch.evaluation.report import report_folder, write_report
@@ -256,7 +256,7 @@ def run_reproduce(
     check_output_folder(out)
     reports: dict[str, Report] = {}
     for name in names:
-        print(f"{name}: a second traverse, and the reference itself", flush=True)
+        print(f"{name}: a second visit, and the reference itself", flush=True)
         result = reproduce(name, tolerance=tolerance, seed=seed, progress=True)
         run, title = result.run, f"dejavu reproduce: {name}"
         plan = str(run.model.summary())

@@ -321,8 +321,8 @@ def print_written(export: MapExport, data: RouteData, words: Sequence[str]) -> N
     elif model.map.places:
         seen, another = "augmented copies of its own frames", "a second"
         if data.sources["second"]:
-            seen, another = "augmented frames of both its traverses", "a third"
-        print(f"written to {path}; trained on {seen}, so only {another} traverse shows its accuracy:")
+            seen, another = "augmented frames of both visits", "a third"
+        print(f"written to {path}; trained on {seen}, so only {another} visit shows its accuracy:")
     else:
         print(f"written to {path}")
     print_what_next(path, data, model, words)

@@ -376,7 +376,7 @@ def are_aligned(reference: Traverse, query: Traverse) -> bool:
 def describe_ground_truth(truth: Truth | None, interpolate: bool = False, positions: bool = False) -> str:
     """What `find_ground_truth` uses, in words; `positions`: whether both traverses have them."""
     if truth is None:
-        carried = "the positions that both traverses carry"
+        carried = "the positions in both sources"
         return carried if positions else ASSUMED
     parsed = check_ground_truth(truth)
     if isinstance(parsed, GroundTruth):

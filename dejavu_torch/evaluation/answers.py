@@ -58,8 +58,8 @@ def describe_probable(counts: Mapping[str, int], answers: int) -> str:
 def next_steps(together: bool, strict: bool) -> list[str]:
     """What to try next on answers that have a probability, in words."""
     steps = {
-        "--ordered answers each from the whole drive, if the queries are consecutive": not together,
-        "--precision .9 accepts only answers that are at least that probable": not strict,
+        "--ordered matches the queries as a whole drive, if they are consecutive": not together,
+        "--precision .9 accepts only answers with at least that probability": not strict,
     }
     return [step for step, applies in steps.items() if applies]
 

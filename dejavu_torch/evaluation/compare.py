@@ -141,7 +141,7 @@ def compare(
         _check_loops(loops, alone, sequence)
         reference, centre = as_traverse(reference), False  # the mean is that of the map
     elif query is None:
-        raise InputError("there is no query; expected a second traverse, or loops within the reference")
+        raise InputError("there is no query; expected a second visit, or loops within the reference")
     query = reference if query is None else query
     reference, query, off = _prepared(model, reference, query, distractors, seconds, progress, loops)
     check_candidates(top, tolerance, len(reference))
@@ -255,7 +255,7 @@ def _prepared(
     itself, has_map = reference is query, model.map.places > 0
     reference, query = as_traverse(reference), as_traverse(query)
     if loops is None and (itself or (reference.name == query.name != UNNAMED)):
-        line = "%s is matched with itself, each frame with its own copy; expected a second traverse"
+        line = "%s is matched with itself, each frame with its own copy; expected a second visit"
         log.warning(line, query.name)
     reference = model.at_map_size(reference, model.frame_shape if has_map else None)
     query = model.at_map_size(query, reference.frame_shape)

@@ -114,7 +114,7 @@ def evaluate_file(
         raise InputError(f"{matches} reports place {int(candidates.max())}; expected one below {frames}")
     known = find_ground_truth(truth, reference, query, frames, queries, interpolate, resampled)
     if known is None:
-        raise InputError("there is no ground truth; expected one, or traverses that carry positions")
+        raise InputError("there is no ground truth; expected one, or sources with coordinates")
     carried = all(traverse is not None and traverse.places is not None for traverse in (reference, query))
     alone = answer_facts(match, queries, tolerance, True, offset_of(truth, carried))
     if place_map is not None:

@@ -42,7 +42,7 @@ def section_five(reports: Mapping[str, Report]) -> list[list[str]]:
     for dataset, report in reports.items():
         paper = [_text(report.facts["published"].get(field)) for field in COLUMNS]
         rows.append([f"{dataset}: the paper, its own footage", *paper, ""])
-        own = report.ours._replace(name="a second traverse")
+        own = report.ours._replace(name="a second visit")
         others = [one for key, one in report.contenders.items() if key not in IDEAL]
         for one in (*(report.contenders[key] for key in IDEAL), own, *others):
             scores = [_text(getattr(one.scores, field, None)) for field in COLUMNS]

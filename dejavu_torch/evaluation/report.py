@@ -156,7 +156,7 @@ def found_lines(report: Report) -> list[str]:
     lines += text_table(rows).splitlines()
     control = report.contenders["null"].by_length.get("smoother") if "null" in report.contenders else None
     if drive and control and control.recall_at_1 >= FULL * drive.recall_at_1:
-        lines.append("Matched as a whole drive, even the control is found: compare one image, and bytes.")
+        lines.append("Matched as a whole drive, even the control is found: compare 'one image' and bytes.")
     return lines
 
 

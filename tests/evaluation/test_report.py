@@ -154,14 +154,14 @@ def test_the_summary_tells_what_was_scored():
         "of the query were resampled to even steps of 2.5 pixels of ground. 15 of the queries are in the "
         "truth. 2 queries report an ignored place, which is neither right nor wrong. 9 of 13 scored answers "
         "are accepted; 8 of these are right. `--threshold 0.25` would have accepted no wrong answer here. "
-        "Learning took 1.2 s, localizing 2.0 s (100.0 ms a frame)."
+        "Learning took 1.2 s, localizing 2.0 s (100.0 ms per frame)."
     )
     assert summary(report()) == "20 queries; right within 3 frames."
 
 
 def test_the_summary_weighs_the_bytes_of_the_map():
     baseline = Contender("all frames", SCORES._replace(recall_at_1=0.9), 64000, 1)
-    words = "The map takes 125 bytes per place. All features uncompressed would take 2000 and find 90.0 %."
+    words = "The map takes 125 bytes per place. All uncompressed features would take 2000 and find 90.0 %."
     assert words in summary(report({"frames": 32}, uncompressed=baseline)).replace("\xa0", " ")
     ours = Contender("this map", SCORES, 4000, fixed=3900)
     spectral = report({"frames": 32, "kind": "spectral"})._replace(ours=ours)
@@ -183,7 +183,7 @@ STEPS = [  # facts, recall@1, verdict, steps
     ),
     (
         {"line": {"offset": 7, "answers": 9, "confident": 9}, "truth": "place = query"},
-        *(0.0, "Not by this ground truth", ["--truth 7"]),
+        *(0.0, "Not according to this ground truth", ["--truth 7"]),
     ),
     (
         {"least_probability": 0.5, "accepted": 20, "accepted_right": 4, "kind": "spectral", "filter": True},

@@ -166,7 +166,7 @@ def test_a_normal_run_prints_its_map_and_what_to_do_next(
         assert said.err == ""
         plan, *rest = said.out.split("written to ")
         assert plan.endswith(f"{DejaVu.load(tmp_path / 'map.safetensors').summary()!s}\n")
-        assert "only a second traverse" in rest[0]
+        assert "only a second visit" in rest[0]
         scored = f"--map {tmp_path}/map.safetensors --tolerance 2 --out report"
         assert rest[0].splitlines()[-1] == f"next: dejavu compare one.npy SECOND {scored}"
     # Python itself keeps deprecations to those who develop
