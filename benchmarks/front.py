@@ -109,7 +109,8 @@ def summarised(rows: list[Row], figures: Sequence[str] = COLUMNS[1:]) -> list[Ro
         groups.setdefault((row["contender"], round(size, 1 if size > 1 else 2)), []).append(row)
     found = []
     for (key, size), same in groups.items():
-        means = {name: float(np.mean([row[name] for row in same])) for name in figures}
+        known = [name for name in figures if name in same[0]]
+        means = {name: float(np.mean([row[name] for row in same])) for name in known}
         spread = {f"{name}_span": [min(r[name] for r in same), max(r[name] for r in same)] for name in means}
         found.append({"contender": key, "bytes_per_place": size, **means, **spread})
     return found

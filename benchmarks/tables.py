@@ -331,7 +331,8 @@ def areas() -> str:
     """Recall@1 of one image on an area by ways to store it, over their bytes."""
     found: dict[str, dict[float, str]] = {}
     for row in read("areas")["rows"]:
-        found.setdefault(row["contender"], {})[row["bytes_per_place"]] = f"{row['recall_at_1']:.3f}"
+        whole = f" / {row['flight']:.3f}" if "flight" in row else ""
+        found.setdefault(row["contender"], {})[row["bytes_per_place"]] = f"{row['recall_at_1']:.3f}{whole}"
     sizes = sorted({each for own in found.values() for each in own})
     table = [["bytes per window", *(f"{each:g}" for each in sizes)]]
     table += [[name, *(found[key].get(each, "") for each in sizes)] for key, name in AREA_WAYS.items()]
