@@ -274,8 +274,10 @@ def run_reproduce(
 
 
 def short_name(path: str | Path) -> str:
-    """The last two parts of a path, for a title."""
-    return "/".join(str(path).rstrip("/").split("/")[-2:])
+    """The last two parts of a path, and the options of a source but for files, for a title."""
+    address, _, options = str(path).partition("?")
+    kept = "&".join(one for one in options.split("&") if one and "/" not in one)
+    return "/".join(address.rstrip("/").split("/")[-2:]) + (f"?{kept}" if kept else "")
 
 
 def _check_report_folder(

@@ -39,7 +39,7 @@ def draw_area(run: Localization) -> plots.Pictures:
         ]
         if own is not None:
             ends = torch.stack([own, at], 1)[wrong & match.accepted]
-            axis.plot(*ends.T, color=plots.WRONG, linewidth=0.4, alpha=0.5)
+            axis.plot(*ends.permute(2, 1, 0), color=plots.WRONG, linewidth=0.4, alpha=0.5)
     for which, colour, name in groups:
         if which.any():
             axis.plot(*at[which].T, ".", color=colour, markersize=3, label=f"{int(which.sum())} {name}")
@@ -85,7 +85,6 @@ def _ground(run: Localization) -> plots.Plot:
     shape = min(HIGHEST, max(LOWEST, tall / wide))
     figure, axis = plots.canvas(plots.WIDTH * shape + 6 * plots.LINE)
     unit = "metres" if area.unit == "m" else "pixels"
-    axis.set(
-        xlim=(left, right), ylim=(bottom, top), xlabel=f"x ({unit})", ylabel=f"y ({unit})", aspect="equal"
-    )
+    axis.set(xlim=(left, right), ylim=(bottom, top), aspect="equal" if shape == tall / wide else "auto")
+    axis.set(xlabel=f"x ({unit})", ylabel=f"y ({unit})")
     return figure, axis
