@@ -139,6 +139,7 @@ def _sweep(
         belief, off, total = belief / scale, off / scale, total + float(scale.log())
         after[t], outside[t, 1] = belief, off
     message, absent = torch.ones_like(belief), seen.new_tensor(1.0)
+    gone_over = leave + stays * (1 - moved(message, kernel))  # also over the border
     steps = torch.zeros_like(kernel)
     for t in reversed(range(len(seen))):
         others, gone = before[t] * message, outside[t, 0] * absent
@@ -151,7 +152,7 @@ def _sweep(
             padded = F.pad(later, (reach,) * 4)[None, None]
             pairs = F.conv2d(padded, after[t - 1][None, None])[0, 0]
             anywhere = later.mean()
-            back = stays * moved(later, kernel) + jump * anywhere + leave * later_off
+            back = stays * moved(later, kernel) + jump * anywhere + gone_over * later_off
             back_off = enter * anywhere + (1 - enter) * later_off
             explained = (after[t - 1] * back).sum() + outside[t - 1, 1] * back_off
             steps += stays * kernel * pairs / explained.clamp(min=TINY)

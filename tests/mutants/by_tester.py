@@ -898,6 +898,20 @@ MUTANTS = [
         "dejavu_torch/learning.py",
         "columns = 1 if area is None else area.columns_from(frames.start)",
         "columns = 1",
-        ("tests/test_area.py::-k compared_by_distance",),
+        ("tests/test_area.py::-k tile_by_tile",),
+    ),
+    Mutant(
+        "A smoother over an area moves as its kernel says, forward and backward.",
+        "dejavu_torch/recognition/plane.py",
+        "flipped = kernel.flip(0, 1)",
+        "flipped = kernel",
+        ("tests/test_area.py::-k masses_of_the_model",),
+    ),
+    Mutant(
+        "A flight is a flight over an area only if it explains its images.",
+        "dejavu_torch/recognition/plane.py",
+        "smoother.is_drive = swept.log >= DRIVE",
+        "smoother.is_drive = True",
+        ("tests/test_area.py::-k flight_is_found",),
     ),
 ]
