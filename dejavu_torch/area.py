@@ -106,10 +106,15 @@ def around(places: Tensor, radius: int, count: int, area: Area | None) -> Tensor
     return (places[:, None] + offset).clamp(0, count - 1)
 
 
-@lru_cache(16)
 def _tiles(rows: int, columns: int) -> tuple[Tensor, Tensor, Tensor]:
     """The first cell of each tile (T,2), its rows and columns (T,2), and its first place (T,)."""
-    down = _edges(rows, SIDE)
+    with torch.inference_mode(False):  # cached tensors are also used with gradients
+        return _cached_tiles(rows, columns)
+
+
+@lru_cache(16)
+def _cached_tiles(rows: int, columns: int) -> tuple[Tensor, Tensor, Tensor]:
+    down = _edges(rows, max(SIDE, SIDE * SIDE // columns))
     across = _edges(columns, SIDE * SIDE // int(down.diff().max()))
     corner = torch.cartesian_prod(down[:-1], across[:-1]).view(-1, 2)
     size = torch.cartesian_prod(down.diff(), across.diff()).view(-1, 2)
@@ -117,6 +122,6 @@ def _tiles(rows: int, columns: int) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _edges(count: int, most: int) -> Tensor:
-    """Borders of equal parts of at most so many."""
+    """Borders of equal parts of about so many."""
     parts = max(1, round(count / most))
     return torch.arange(parts + 1) * count // parts

@@ -256,7 +256,7 @@ class DejaVu(nn.Module):
             second: what the whitening has learned from; the map tells how many drives taught it.
             area: of the places, if they are in rows and columns and the traverse does not say so.
         """
-        area = area if traverse is None else traverse.area
+        area = area if traverse is None or traverse.area is None else traverse.area
         learned = learning.learn_descriptors(self.mapper, features, area)
         learning.count_drives(learned, second)
         return self.replace_map(learned, _state_of(self, learned, traverse))
@@ -462,7 +462,7 @@ class DejaVu(nn.Module):
         if matching.sequence is not None:
             fits = self.map.area is None or isinstance(matching.sequence, PlaceSmoother)
             seen = f"{type(matching.sequence).__name__}, and the map of an area"
-            expect(fits, "single images, or a PlaceSmoother", seen)
+            expect(fits, "single images (--match single), or a PlaceSmoother", seen)
             matching.sequence.check(None, self.map.places)
         single = matching.sequence is None and matching.callback is None
         if not single or matching.search not in ("auto", "coarse"):

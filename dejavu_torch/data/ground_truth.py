@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
+from dejavu_torch.area import Area
 from dejavu_torch.data.coordinates import FORMS as COORDINATES
 from dejavu_torch.data.coordinates import Near, coordinates_of
 from dejavu_torch.data.files import LARGEST, as_number, check_regular
@@ -180,6 +181,13 @@ def near_truth(reference: Tensor, query: Tensor, radius: float) -> Tensor:
         check_table(len(query), int(near.sum(1).max()))
         rows += [row.nonzero()[:, 0] for row in near]
     return padded(rows)
+
+
+def widened(truth: GroundTruth, area: Area, radius: int) -> GroundTruth:
+    """A ground truth of which all windows up to a radius from a right one are right."""
+    known = truth.positives.clamp(min=0).flatten()
+    near = area.around(known, radius).view(*truth.positives.shape, -1)
+    return truth._replace(positives=near.masked_fill((truth.positives < 0)[..., None], -1).flatten(1))
 
 
 def of_loops(truth: GroundTruth, queries: Tensor, apart: int) -> GroundTruth:

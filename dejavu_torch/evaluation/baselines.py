@@ -78,7 +78,7 @@ def nearest_frames(
     """
     parts = query.split(max(1, BLOCK_DISTANCES // len(reference)))
     batches = with_progress(parts, "baselines", progress)
-    matcher, (stored, nearest) = Localizer(None, matching), stored_frames(len(reference), k, area)
+    matcher, (stored, nearest) = Localizer(None, matching, area=area), stored_frames(len(reference), k, area)
     match = Match.joined(map(matcher.match, map(scores_of_stored(reference, k, metric, area), batches)))
 
     def stored_frame(frame: Tensor) -> Tensor:

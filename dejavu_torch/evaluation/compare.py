@@ -16,11 +16,13 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.arrays import UNNAMED
+from dejavu_torch.data.coordinates import Near
 from dejavu_torch.data.ground_truth import (
     Truth,
     check_ground_truth,
     ground_truth_in_places,
     of_loops,
+    widened,
 )
 from dejavu_torch.data.source import Source, as_traverse
 from dejavu_torch.data.traverse import fitted, kept
@@ -145,11 +147,14 @@ def compare(
     query = reference if query is None else query
     reference, query, off = _prepared(model, reference, query, distractors, seconds, progress, loops)
     check_candidates(top, tolerance, len(reference))
-    radius, area = tolerance, reference.area
-    if area is not None and truth is None and query.coordinates is not None:
-        truth = f"{'metres' if area.unit == 'm' else 'pixels'}:{radius}"
-    within = tolerance if area is None else round(radius / math.hypot(*area.right))  # places
-    tolerance = tolerance if area is None else 0  # all windows within the radius are right
+    radius, area, within = float(tolerance), reference.area, tolerance
+    if area is not None:
+        if truth is None and query.coordinates is not None:
+            truth = f"{'metres' if area.unit == 'm' else 'pixels'}:{tolerance}"
+        parsed = None if truth is None else check_ground_truth(truth)
+        radius = parsed.radius if isinstance(parsed, Near) else radius
+        # all windows within the radius are right
+        within, tolerance = round(radius / math.hypot(*area.right)), 0
     in_order = source_of(query).ordered if ordered is None else ordered
     smoother, causal = _ways(sequence, in_order and len(query) > 1, within)
     if smoother is not None and area is not None:
@@ -158,6 +163,8 @@ def compare(
         causal.check(None, len(reference))
     # without a given truth, each place would be its own answer
     known = None if itself and truth is None else ground_truth_of(truth, reference, query, interpolate)
+    if area is not None and known is not None and not isinstance(parsed, Near):
+        known = widened(known, area, within)
 
     rivals = () if known is None else (reference, query)  # of HOG, for its baseline
     with model.descriptor.setting_aside(*rivals):

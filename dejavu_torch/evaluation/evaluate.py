@@ -13,6 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from dejavu_torch.data.coordinates import Near
 from dejavu_torch.data.ground_truth import (
     GroundTruth,
     check_ground_truth,
@@ -37,7 +38,7 @@ from dejavu_torch.evaluation.score_plots import draw_curves
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.model_file import read_place_map
 from dejavu_torch.text import printable
-from dejavu_torch.types import Facts, InputError, Match, Traverse
+from dejavu_torch.types import Facts, InputError, Match, Traverse, expect
 from dejavu_torch.version import __version__
 
 RANKS = (5, 10)  # the N of recall@N
@@ -95,6 +96,12 @@ def evaluate_file(
     if truth is not None:
         check_ground_truth(truth, interpolate)
     place_map = None if map is None else read_place_map(map)
+    area = reference.area if reference is not None else None if place_map is None else place_map.area
+    if area is not None and tolerance:  # numbers of places tell no distance there
+        by_distance = truth is not None and isinstance(check_ground_truth(truth, interpolate), Near)
+        expected = "--tolerance 0, or the distance in the truth, such as --truth pixels:10"
+        expect(by_distance, expected, f"the places are those of an area, the tolerance is {tolerance} places")
+        tolerance = 0
     if isinstance(place_map, SpectralMap) and place_map.routes:
         if route is None:
             names = ", ".join(part.name for part in place_map.routes)

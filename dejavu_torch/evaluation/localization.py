@@ -50,7 +50,7 @@ class Localization(NamedTuple):
     judged: Match = NOTHING
     smoother: PlaceSmoother | None = None
     beside: PlaceSmoother | None = None
-    radius: int = 0
+    radius: float = 0.0
 
     def __repr__(self) -> str:
         return f"{self.query.name} on {self.reference.name}"
@@ -120,7 +120,7 @@ class Localization(NamedTuple):
         area = self.model.map.area
         if area is None or not self.radius:
             return f"{self.tolerance} {self.unit}"
-        return f"{self.radius} {'metres' if area.unit == 'm' else 'pixels'}"
+        return f"{self.radius:g} {'metres' if area.unit == 'm' else 'pixels'}"
 
     @property
     def has_frames(self) -> bool:

@@ -50,11 +50,15 @@ class Sample(NamedTuple):
     @classmethod
     def of_area(cls, area: Area) -> Sample:
         """Evenly spaced blocks of an area, with about as many frames as the segments of a route."""
-        tall = min(area.rows, round((SAMPLE // MIN_SEGMENTS) ** 0.5))
-        wide = min(area.columns, SAMPLE // MIN_SEGMENTS // tall)
+        size = SAMPLE // MIN_SEGMENTS
+        side = round(size**0.5)
+        tall = min(area.rows, max(side, size // min(area.columns, side)))
+        wide = min(area.columns, size // tall)
         down, across = area.rows // tall, area.columns // wide
         drawn = torch.linspace(0, down * across - 1, min(down * across, MIN_SEGMENTS)).round().long()
-        corner = torch.stack([drawn // across * tall, drawn % across * wide], 1)
+        tops = torch.linspace(0, area.rows - tall, down).round().long()  # from border to border
+        lefts = torch.linspace(0, area.columns - wide, across).round().long()
+        corner = torch.stack([tops[drawn // across], lefts[drawn % across]], 1)
         inside = torch.cartesian_prod(torch.arange(tall), torch.arange(wide)).view(-1, 2)
         places = area.place_at(corner[:, None] + inside).flatten()
         return cls(places, tall * wide, [(tall, wide)] * len(drawn))

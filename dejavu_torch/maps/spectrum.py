@@ -60,7 +60,8 @@ def lines_of(series: Tensor, columns: int = 1, transform: Transform = "dft") -> 
         return spectrum(series, transform)
     plane = spectrum(series.unflatten(-1, (-1, columns)), transform)
     plane = spectrum(plane.mT, transform).mT
-    return plane.flatten(-2)[..., by_frequency(*plane.shape[-2:], transform, series.device)]
+    rows = plane.shape[-2]
+    return plane.flatten(-2)[..., by_frequency(rows, columns, transform, series.device)]
 
 
 def from_lines(lines: Tensor, columns: int = 1, transform: Transform = "dft") -> Tensor:
@@ -74,10 +75,15 @@ def from_lines(lines: Tensor, columns: int = 1, transform: Transform = "dft") ->
     return from_spectrum(plane, transform).flatten(-2)
 
 
-@lru_cache(64)
 def by_frequency(rows: int, columns: int, transform: Transform, device: torch.device) -> Tensor:
     """The lines of a plane, row x columns + column, by the sum of the squares of both frequencies, (W,)
-    int64: alike ones then are near each other, as the coder expects."""
+    int64: alike ones then are near each other, as the coder expects. Cached: do not change it."""
+    with torch.inference_mode(False):  # cached tensors are also used with gradients
+        return _by_frequency(rows, columns, transform, device)
+
+
+@lru_cache(64)
+def _by_frequency(rows: int, columns: int, transform: Transform, device: torch.device) -> Tensor:
     # whole numbers, whose order is the same on any machine
     down, across = (half_cycles(torch.arange(n), transform).square() for n in (rows, columns))
     key = down[:, None] * columns**2 + across * rows**2

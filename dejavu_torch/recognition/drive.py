@@ -19,11 +19,18 @@ from dejavu_torch.recognition.large import TILE, LargeDrive, Tiles, is_large
 from dejavu_torch.recognition.motion import Layout
 from dejavu_torch.recognition.plane import near_in_plane, place_flight
 from dejavu_torch.recognition.select import best_candidates
-from dejavu_torch.recognition.smoother import Drive, PlaceSmoother, Rows, blocks_together, normalised
+from dejavu_torch.recognition.smoother import (
+    Drive,
+    PlaceSmoother,
+    Rows,
+    blocks_together,
+    check_descriptors,
+    normalised,
+)
 from dejavu_torch.text import progress_of
 from dejavu_torch.types import Match
 
-SHARP = 2  # windows around a place of an area whose mass an answer is chosen by, at most
+SHARP = 2  # windows around a place of an area whose mass an answer is chosen by
 DOUBT = 0.1  # nats for each deviation by which an answer's own score is worse than is usual in the drive
 KEPT = 2**26  # scores of drives that are smoothed together, up to which they are computed once
 NORMAL = 1.4826  # standard deviations of a Gaussian over its median absolute deviation
@@ -131,7 +138,7 @@ def _shown(asked: DriveQuery, seen: Seen) -> Shown:
     if asked.answers and area is None:
         ranked = near_scores(mass, scores, within)
     elif asked.answers and area is not None:
-        near = near_in_plane(mass, min(within, SHARP), area).clamp(min=torch.finfo(mass.dtype).tiny)
+        near = near_in_plane(mass, SHARP, area, weighted=True).clamp(min=torch.finfo(mass.dtype).tiny)
         ranked = (-near.log()).masked_fill(~scores.isfinite(), math.inf)
     columns = None if known is None else known.expand_as(ranked)
     pair = best_candidates(ranked, min(2, ranked.shape[1]), TOLERANCE, columns, area)
@@ -174,7 +181,8 @@ def _seen(drives: Sequence[DriveQuery], sizes: Sequence[int], progress: bool) ->
     for i, (asked, places) in enumerate(zip(drives, sizes, strict=True)):
         rows, descriptors, smoother, _, _, starts, *_ = asked
         if smoother.area is not None:
-            mass = place_flight(smoother, rows, len(descriptors), smoother.area, spacing_of(descriptors))
+            near = spacing_of(check_descriptors(descriptors))
+            mass = place_flight(smoother, rows, len(descriptors), smoother.area, near)
             own = rows if asked.answers else asked.single or rows
             yield i, Seen(mass.double(), own(torch.arange(len(descriptors))).cpu())
             continue

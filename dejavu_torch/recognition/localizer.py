@@ -61,6 +61,7 @@ class Localizer:
     Args:
         route: the map; None if only `match` is used, with scores from elsewhere.
         searcher: finds the best places of single queries; None is a `Scan`.
+        area: of the places, without a map.
 
     Shape: descriptors (B,K) of the next queries -> Match of (B,), or (B,k), on the CPU, without gradients.
 
@@ -79,7 +80,10 @@ class Localizer:
         place_map: PlaceMap | None = None,
         matching: Matching = SINGLE,
         searcher: Searcher | None = None,
+        area: Area | None = None,
     ) -> None:
+        # of the places; None along a route
+        self.area = area if place_map is None else place_map.area
         self.place_map, self.matching, self.track = place_map, matching, Track()
         self.searcher = Scan(place_map) if searcher is None and place_map is not None else searcher
         sequence = matching.sequence
@@ -202,11 +206,6 @@ class Localizer:
         """(N+1,) of a filter for the latest answer; None without a filter, or before the first query."""
         state = self.states.get("filter")
         return state if state is None or state.ndim == 1 else state[0]
-
-    @property
-    def area(self) -> Area | None:
-        """Of the map's places; None along a route."""
-        return None if self.place_map is None else self.place_map.area
 
     def _alone(self, scores: Tensor) -> Match:
         return self._answer(self._candidates(scores), best_pair(scores, self.area))

@@ -31,7 +31,7 @@ from dejavu_torch.recognition.smoother import (
 # of which the fit starts: among so many windows a right one has to stand out more than along a route
 SEPARATION, SPREAD = 3.0, 2.0  # standard deviations of scores; windows that a step goes in each direction
 FITTED = 300  # queries in a row, from the middle, that a smoother is fitted to
-BYTES = 40  # of memory for each query and window
+BYTES = 70  # of memory for each query and window
 TINY = 1e-30
 
 
@@ -90,9 +90,14 @@ def place_flight(smoother: PlaceSmoother, rows: Rows, queries: int, area: Area, 
     return _by_place(swept.mass, area)
 
 
-def near_in_plane(mass: Tensor, radius: int, area: Area) -> Tensor:
-    """The mass of each window and those up to a radius in rows and columns, (Q,N) -> (Q,N)."""
-    return _by_place(boxes(_as_plane(mass, area), radius), area).clamp(0, 1)
+def near_in_plane(mass: Tensor, radius: int, area: Area, weighted: bool = False) -> Tensor:
+    """The mass of each window and those up to a radius in rows and columns, or `weighted` by a pyramid that
+    is highest at the window, (Q,N) -> (Q,N)."""
+    plane = _as_plane(mass, area)
+    if not weighted:
+        return _by_place(boxes(plane, radius), area).clamp(0, 1)
+    half = max(1, radius // 2)  # two boxes make a pyramid
+    return _by_place(boxes(boxes(plane, half), half) / (2 * half + 1) ** 2, area).clamp(0, 1)
 
 
 def boxes(mass: Tensor, radius: int) -> Tensor:

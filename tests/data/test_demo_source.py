@@ -27,7 +27,7 @@ def test_two_flights_show_the_same_places_with_their_own_truth():
 
 
 def test_what_is_no_flight():
-    with refused("there is no demo 'rail'", "expected road"):
+    with refused("there is no demo 'rail'", "expected area, road"):
         open_source("demo:rail")
     with refused("traverse=2", "expected 0 to 1"):
         open_source("demo:road?traverse=2")
