@@ -39,7 +39,7 @@ def live_page(places: int = 256) -> Iterator[str]:
     match = LiveMatch(place, place, "", score, float(posterior[place]), 0.99, True, 12.5)
     pixels = (second[place].permute(1, 2, 0).clamp(0, 1) * 255).byte().numpy()
     snapshot = Snapshot(Frame(place, 4.2, pixels), match, posterior, True, place, 3, 11.0, 19.0)
-    with Page(0, "a camera on a map", lambda frame: as_picture(first[frame])) as page:
+    with Page(0, "a camera on a map", lambda frame: (frame, as_picture(first[frame]))) as page:
         page.show(snapshot)
         yield page.url
 

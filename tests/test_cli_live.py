@@ -7,6 +7,7 @@ import json
 import re
 import signal
 import subprocess
+import threading
 import time
 from contextlib import contextmanager
 from urllib.request import urlopen
@@ -137,24 +138,30 @@ def test_frames_are_dropped_in_real_time_only(folder, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize("options", [(), ("--sequence", "1")], ids=" ".join)
-def test_the_page_shows_frame_reference_and_answer(options, folder, capsys, monkeypatch):
-    states = []
+@pytest.mark.parametrize("reference", ["sim:aerial?frames=64", "first.mkv"])
+def test_the_page_shows_frame_reference_and_answer(options, reference, folder, capsys, monkeypatch):
+    states, pages = [], []
     show = Page.show
 
     def shown(self, snapshot):
         show(self, snapshot)
+        pages[:] = [self]
         if snapshot.frame.number in (2, 30, 39):
             with urlopen(f"{self.url}state") as answer:
                 states.append(json.load(answer))
 
     def interrupted(seconds):
         if seconds > 60:
+            end = time.monotonic() + 20
+            while (state := pages[0].state())["shown"] != state["frame"]:
+                assert time.monotonic() < end
             raise KeyboardInterrupt
 
     monkeypatch.setattr(Page, "show", shown)
     monkeypatch.setattr("dejavu_torch.cli.live.time.sleep", interrupted)
-    source, reference = f"{folder / 'second.mkv'}?stop=40", ("--reference", "sim:aerial?frames=64")
-    run("live", folder / "map.safetensors", source, "--page", "0", *reference, *options)
+    monkeypatch.chdir(folder)
+    run("live", "map.safetensors", "second.mkv?stop=40", "--page", "0", "--reference", reference, *options)
+    assert "dejavu pictures" not in [thread.name for thread in threading.enumerate()]
     out, err = capsys.readouterr()
     where, stays, summary = err.splitlines()
     assert re.fullmatch(r"dejavu: the page is at http://127\.0\.0\.1:\d+/", where)

@@ -61,7 +61,7 @@ def follow(
                 seen = f"--reference {reference}: the map has {len(model.map.routes)} routes"
                 expect(not model.map.routes, "the map of one route, or no --reference", seen)
                 shown = len(model.map.positions) or model.map.places
-                pictures = ReferencePictures(open_source(reference), shown)
+                pictures = stack.enter_context(ReferencePictures(open_source(reference), shown))
             page = stack.enter_context(Page(port, title, pictures))
             _log(f"the page is at {page.url}")
         reader = stack.enter_context(

@@ -5,14 +5,17 @@ from __future__ import annotations
 import base64
 import io
 import json
+import logging
 import math
 import threading
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from itertools import chain
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
@@ -21,6 +24,8 @@ from PIL import Image
 from torch import Tensor
 
 from dejavu_torch.data.camera import Frame
+from dejavu_torch.data.traverse import Part, at_size
+from dejavu_torch.data.video import Video
 from dejavu_torch.live.localizer import LiveMatch
 from dejavu_torch.types import Facts, InputError, Traverse, expect
 
@@ -28,7 +33,12 @@ HOST = "127.0.0.1"
 PORT = 8765  # default
 COLUMNS = 512  # of the curve
 WIDTH = 640  # maximum, of pictures in pixels
+SMALL, MOST = 320, 2**25  # pixels and characters, of the pictures of a video
+BEFORE = 32  # frames before the one that is asked for, decoded with it
 PAGE = Path(__file__).with_name("page.html")
+
+Shown: TypeAlias = tuple[int, str | None]  # the number of a frame of the reference, and its picture
+log = logging.getLogger("dejavu_torch")
 
 
 class Snapshot(NamedTuple):
@@ -50,14 +60,14 @@ class Page:
     Args:
         port: 0 is any free one, see `url`. A port in use is refused.
         title: a line below the heading.
-        reference: gives pictures of the reference's frames.
+        reference: gives the frame of the reference nearest to this one that can be shown, and its picture.
 
     Convention: only requests for 127.0.0.1 and localhost are answered, so that other sites cannot read the
         page through a host name that resolves to this machine.
     """
 
     def __init__(
-        self, port: int = PORT, title: str = "", reference: Callable[[int], str | None] | None = None
+        self, port: int = PORT, title: str = "", reference: Callable[[int], Shown] | None = None
     ) -> None:
         expect(0 <= port < 2**16, "one from 0 to 65535, 0 for any free one", f"port {port}")
         self.title, self.reference = title, reference
@@ -80,7 +90,7 @@ class Page:
         self.url = f"http://{HOST}:{self._server.server_address[1]}/"
 
     def __enter__(self) -> Page:
-        threading.Thread(target=self._server.serve_forever, daemon=True).start()
+        threading.Thread(target=self._server.serve_forever, args=(0.1,), daemon=True).start()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -114,12 +124,19 @@ class Page:
             request.wfile.write(body)
 
     def state(self, seen: str = "") -> Facts:
-        """What the page polls; only the number of the frame if the page has `seen` it."""
+        """What the page polls. Of a frame that it has `seen`, "NUMBER,SHOWN", only the number, and the
+        reference's picture if that of a nearer frame is known by now."""
         if self.snapshot is None:
             return {"title": self.title, "number": -1}
         frame, match, scores, posterior, *counts = self.snapshot
         facts: Facts = {"title": self.title, "number": frame.number}
-        if seen == str(frame.number):
+        if seen == f"{frame.number},{match.frame}":
+            return facts
+        shown, picture = self.reference(match.frame) if self.reference and match.frame >= 0 else (-1, None)
+        if seen == f"{frame.number},{shown}":
+            return facts
+        facts |= {"shown": shown, "reference": picture}
+        if seen.partition(",")[0] == str(frame.number):
             return facts
         facts |= match._asdict() | {"time": frame.seconds}
         facts |= zip(("frames", "dropped", "p50", "p99"), counts, strict=True)
@@ -129,7 +146,6 @@ class Page:
             "kind": "Posterior along the route" if posterior else "Relative match along the route (best = 1)",
             "curve": curve(scores, posterior),
             "query": as_picture(frame.pixels),
-            "reference": self.reference(match.frame) if self.reference and match.frame >= 0 else None,
         }
 
 
@@ -169,15 +185,71 @@ def as_picture(pixels: np.ndarray | Tensor, width: int = WIDTH) -> str | None:
 
 
 class ReferencePictures:
-    """Pictures of the frames of the map's reference, for `Page`, read as they are asked for."""
+    """A context manager that gives pictures of the frames of the map's reference, for `Page`.
 
-    def __init__(self, reference: Traverse, frames: int) -> None:
+    Args:
+        most: characters of all pictures that are kept of a video.
+
+    Convention: most sources are read as they are asked for. A video has to be decoded in order: a thread
+        makes small pictures of its frames, from the first on, or on from shortly before the frame that is
+        asked for; if they exceed `most`, it drops every second one. After each it rests as long as it worked,
+        four times as long if the frame that is asked for is known.
+    """
+
+    def __init__(self, reference: Traverse, frames: int, most: int = MOST) -> None:
         seen = f"{reference.name} has {len(reference)} frames"
         expect(len(reference) == frames, f"{frames}, as the map's reference", seen)
         expect(len(reference.frame_shape) == 3, "frames to show", f"{reference.name} holds features")
-        self.reference, self._one_at_a_time = reference, threading.Lock()  # requests come in threads
+        self.reference, self.most, self._one_at_a_time = reference, most, threading.Lock()
+        self._known: dict[int, str] = {}  # of a video, by frame
+        self._asked, self._closed, source = 0, threading.Event(), reference
+        while isinstance(source, Part):
+            source = source.traverse
+        self._video = isinstance(source, Video)
+        if self._video:
+            height, width = reference.frame_shape[1:]
+            size = (max(1, round(height * SMALL / width)), SMALL) if width > SMALL else (height, width)
+            self.reference = at_size(reference, size)
+            self._thread = threading.Thread(target=self._make, name="dejavu pictures", daemon=True)
 
-    def __call__(self, frame: int) -> str | None:
-        with suppress(InputError), self._one_at_a_time:  # the image was removed
-            return as_picture(self.reference[frame])
-        return None
+    def __enter__(self) -> ReferencePictures:
+        if self._video:
+            self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._closed.set()
+        if self._video:  # a thread that computes must not outlive the interpreter
+            self._thread.join(10)
+
+    def __call__(self, frame: int) -> Shown:
+        if self._video:
+            self._asked, known = frame, self._known
+            nearest = min([*known], key=lambda one: abs(one - frame), default=-1)
+            return nearest, known.get(nearest)
+        with suppress(InputError), self._one_at_a_time:  # requests come in threads, and images may be gone
+            return frame, as_picture(self.reference[frame])
+        return frame, None
+
+    def _make(self) -> None:
+        at, step, size = 0, 1, 0
+        try:
+            while not self._closed.is_set():
+                start, known = time.monotonic(), self._known
+                asked = self._asked - self._asked % step
+                rest = 4 if asked in known else 1
+                if rest == 1 and not at <= asked <= at + BEFORE:
+                    at = max(0, asked - BEFORE // step * step)
+                order = chain(range(at, len(self.reference), step), range(0, at, step))
+                if (at := next((i for i in order if i not in known), -1)) < 0:
+                    return
+                known[at] = as_picture(self.reference[at]) or ""
+                size += len(known[at])
+                if size > self.most:
+                    step *= 2
+                    self._known = known = {i: picture for i, picture in known.items() if i % step == 0}
+                    size = sum(map(len, known.values()))
+                at += step - at % step
+                self._closed.wait(rest * (time.monotonic() - start))
+        except InputError as error:
+            log.warning("%s", error)

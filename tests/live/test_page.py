@@ -6,6 +6,8 @@ import http.client
 import json
 import math
 import re
+import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from urllib.request import urlopen
 
@@ -13,11 +15,13 @@ import numpy as np
 import pytest
 import torch
 from helpers import refused
-from videos import clip, pictures
+from PIL import Image
+from videos import H264, clip, pictures
 
 from dejavu_torch import open_source
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.camera import Frame
+from dejavu_torch.data.video import Video
 from dejavu_torch.live.localizer import LiveMatch
 from dejavu_torch.live.page import PAGE, Page, ReferencePictures, Snapshot, as_picture, curve
 
@@ -104,15 +108,104 @@ def test_reference_pictures_of_any_source(tmp_path):
     frames = pictures(5)
     np.save(tmp_path / "frames.npy", frames)
     by_index = ReferencePictures(open_source(tmp_path / "frames.npy"), 5)
-    assert by_index(3) == as_picture(frames[3])
-    video = ReferencePictures(open_source(clip(tmp_path / "clip.mkv", frames)), 5)
-    with ThreadPoolExecutor(4) as requests:
-        shown = requests.map(video, [4, 0, 3, 3, 1, 2, 4])
-    assert [*shown] == [as_picture(frames[i]) for i in (4, 0, 3, 3, 1, 2, 4)]
-    (tmp_path / "clip.mkv").unlink()
-    assert video(2) is None  # as of an image that was removed
+    with by_index, ThreadPoolExecutor(4) as requests:
+        shown = requests.map(by_index, [4, 0, 3, 3, 1, 2, 4])
+    assert [*shown] == [(i, as_picture(frames[i])) for i in (4, 0, 3, 3, 1, 2, 4)]
+    for i in (0, 1):
+        Image.fromarray(frames[i]).save(tmp_path / f"{i}.png")
+    images = ReferencePictures(open_source(f"{tmp_path}?glob=*.png"), 2)
+    (tmp_path / "1.png").unlink()
+    assert images(0) == (0, as_picture(frames[0]))
+    assert images(1) == (1, None)
     with refused("5 frames", "7"):
         ReferencePictures(open_source(tmp_path / "frames.npy"), 7)
     with refused("the array holds features", "frames to show"):
         ReferencePictures(ArrayTraverse(torch.rand(5, 8)), 5)
     assert as_picture(torch.rand(6)) is None  # ready features
+
+
+def until(fits, seconds=10.0):
+    """Wait until this holds."""
+    end = time.monotonic() + seconds
+    while not fits():
+        assert time.monotonic() < end
+        time.sleep(0.005)
+
+
+def decoded_by(monkeypatch, seconds=0.0):
+    """The frames of videos that are decoded by name of the thread, in order, each in so many seconds."""
+    decoded, picture = {}, Video._picture
+
+    def slow(self, i):
+        decoded.setdefault(threading.current_thread().name, []).append(i)
+        time.sleep(seconds)
+        return picture(self, i)
+
+    monkeypatch.setattr(Video, "_picture", slow)
+    return decoded
+
+
+@pytest.mark.parametrize("options", ["", "?start=10", "?crop=0,0,0,4"])
+def test_the_pictures_of_a_video_are_made_before_they_are_asked_for(options, tmp_path):
+    source = open_source(f"{clip(tmp_path / 'clip.mkv', pictures(40))}{options}")
+    frames = source[:]
+    with ReferencePictures(source, len(source)) as video:
+        until(lambda: video(17) == (17, as_picture(frames[17])))
+        video._thread.join(10)
+        (tmp_path / "clip.mkv").unlink()
+        assert [video(i) for i in (29, 0, 23)] == [(i, as_picture(frames[i])) for i in (29, 0, 23)]
+
+
+def test_the_frame_that_is_asked_for_goes_first(tmp_path, monkeypatch):
+    source = open_source(clip(tmp_path / "clip.mp4", pictures(200), group=50, **H264))
+    decoded = decoded_by(monkeypatch, 0.004)
+    with ReferencePictures(source, 200) as video:
+        until(lambda: video(0)[0] == 0)
+        near, picture = video(150)
+        assert near < 50  # nothing nearer is known yet, and nobody waits
+        assert picture is not None
+        until(lambda: video(150)[0] == 150)
+        until(lambda: video(149)[0] == 149)
+    made = decoded["dejavu pictures"]
+    assert not {*range(60, 110)} & {*made}
+    assert len(made) == len({*made})  # none is decoded twice
+    assert not video._thread.is_alive()
+
+
+def test_of_a_long_video_every_nth_frame_is_kept(tmp_path):
+    source = open_source(clip(tmp_path / "clip.mkv", pictures(64)))
+    size = len(as_picture(source[0]) or "")
+    with ReferencePictures(source, 64, most=20 * size) as video:
+        video._thread.join(10)
+        shown = [video(i)[0] for i in range(64)]
+    step = min({*shown} - {0})
+    assert step in (4, 8)
+    assert {*shown} == {*range(0, 64, step)}
+    assert all(abs(one - i) <= max(step / 2, i + step - 64) for i, one in enumerate(shown))
+    assert sum(len(video(i)[1] or "") for i in {*shown}) <= 20 * size
+
+
+def test_a_video_that_breaks_off_is_one_line(tmp_path, caplog):
+    source = open_source(clip(tmp_path / "clip.mkv", pictures(40)))
+    video = ReferencePictures(source, 40)
+    (tmp_path / "clip.mkv").unlink()
+    with video:
+        video._thread.join(10)
+        assert video(7) == (-1, None)
+    assert [record.message.count("\n") for record in caplog.records] == [0]
+    assert "clip.mkv" in caplog.text
+
+
+def test_a_nearer_picture_of_the_same_frame_is_sent_when_it_is_known():
+    known = [(3, "data:far")]
+    with Page(0, reference=lambda frame: known[-1]) as page:
+        page.show(moment())
+        first = state_of(page)
+        assert (first["shown"], first["reference"], first["frame"]) == (3, "data:far", 1204)
+        assert state_of(page, seen="7,3").keys() == {"title", "number"}
+        known.append((1204, "data:near"))
+        later = state_of(page, seen="7,3")
+        assert later == {"title": "", "number": 7, "shown": 1204, "reference": "data:near"}
+        assert "reference" not in state_of(page, seen="7,1204")
+        page.show(moment(8))
+        assert state_of(page, seen="7,1204")["reference"] == "data:near"

@@ -6,6 +6,27 @@ from .mutant import Mutant
 
 MUTANTS = [
     Mutant(
+        "The frame of a reference video that the page asks for is decoded before all others.",
+        "dejavu_torch/live/page.py",
+        "at = max(0, asked - BEFORE // step * step)",
+        "pass",
+        ("tests/live/test_page.py::-k goes_first",),
+    ),
+    Mutant(
+        "Pictures of a long reference video stay within their limit.",
+        "dejavu_torch/live/page.py",
+        "if size > self.most:",
+        "if False:",
+        ("tests/live/test_page.py::-k nth_frame",),
+    ),
+    Mutant(
+        "A nearer picture of a frame that the page has seen is sent.",
+        "dejavu_torch/live/page.py",
+        'if seen == f"{frame.number},{shown}":',
+        'if seen.partition(",")[0] == str(frame.number):',
+        ("tests/live/test_page.py::-k nearer_picture",),
+    ),
+    Mutant(
         "A second model made of the settings of a first learns a whitening of its own.",
         "dejavu_torch/model.py",
         "            whitening = copy.deepcopy(whitening)\n        return settings",
