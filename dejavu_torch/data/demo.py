@@ -38,7 +38,7 @@ def open_area(traverse: int = 0, window: int = 64, stride: int = 8) -> Grid:
     """
     expect(traverse in range(FLIGHTS), f"0 to {FLIGHTS - 1}", f"demo:area has traverse={traverse}")
     area = read_grid(FOLDER / f"flight_{traverse}.jpg", window, stride)
-    area.name = f"demo:area?traverse={traverse}"
+    area.name = f"demo:area?traverse={traverse}&window={window}&stride={stride}"
     return area
 
 

@@ -93,7 +93,9 @@ def read_grid(
     ]
     (top, bottom), (left, right) = bounds
     kept = (picture[:, top:bottom, left:right] * BYTES).round().byte()
-    return Grid(kept, window, stride, (top, left), name)
+    options = {"window": window, "stride": stride, "scale": f"{scale:g}", "rows": rows, "columns": columns}
+    told = "&".join(f"{key}={value}" for key, value in options.items() if value not in ("", "1"))
+    return Grid(kept, window, stride, (top, left), f"{name}?{told}")  # of a run that resumes, too
 
 
 def _bounds(name: str, which: str, text: str, size: int) -> tuple[int, int]:
