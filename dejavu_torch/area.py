@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 SIDE = 128  # windows of a tile to a side
+Tables = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 
 
 class Area(NamedTuple):
@@ -20,7 +21,8 @@ class Area(NamedTuple):
             window to the next of its row, and of its column. unit: of these, "px" or "m".
 
     Convention: places are numbered tile by tile and in a tile row by row, so that a tile is a run of places.
-        Tiles have about `SIDE` windows to a side, or in an area that is narrow as many, and equal sizes.
+        Tiles are as equal as possible and have about `SIDE`^2 windows, `SIDE` to a side unless the area is
+        narrower.
 
     Example:
         >>> area = Area(2, 3, first=(32.0, 32.0), right=(4.0, 0.0), down=(0.0, 4.0))
@@ -43,25 +45,25 @@ class Area(NamedTuple):
     @property
     def tiles(self) -> list[tuple[int, int]]:
         """Rows and columns of each tile."""
-        _, size, _ = _tiles(self.rows, self.columns)
+        _, size, *_ = _tiles(self.rows, self.columns)
         return [(rows, columns) for rows, columns in size.tolist()]
 
     def columns_from(self, place: int) -> int:
         """The columns of the tile that begins at a place."""
-        _, size, start = _tiles(self.rows, self.columns)
+        _, size, start, *_ = _tiles(self.rows, self.columns)
         return int(size[int((start == place).nonzero()[0]), 1])
 
     def cells(self, places: Tensor) -> Tensor:
         """Row and column of places, int64 of any shape -> (..., 2)."""
-        corner, size, start = (table.to(places.device) for table in _tiles(self.rows, self.columns))
+        corner, size, start, *_ = (table.to(places.device) for table in _tiles(self.rows, self.columns))
         tile = torch.bucketize(places, start, right=True) - 1
         inside, width = places - start[tile], size[tile, 1]
         return corner[tile] + torch.stack([inside // width, inside % width], -1)
 
     def place_at(self, cells: Tensor) -> Tensor:
         """The places of rows and columns inside the area, (..., 2) -> (...)."""
-        corner, size, start = (table.to(cells.device) for table in _tiles(self.rows, self.columns))
-        tops, lefts = corner[:, 0].unique(), corner[:, 1].unique()
+        tables = (table.to(cells.device) for table in _tiles(self.rows, self.columns))
+        corner, size, start, tops, lefts = tables
         row = torch.bucketize(cells[..., 0].contiguous(), tops, right=True) - 1
         column = torch.bucketize(cells[..., 1].contiguous(), lefts, right=True) - 1
         tile = row * len(lefts) + column
@@ -106,19 +108,21 @@ def around(places: Tensor, radius: int, count: int, area: Area | None) -> Tensor
     return (places[:, None] + offset).clamp(0, count - 1)
 
 
-def _tiles(rows: int, columns: int) -> tuple[Tensor, Tensor, Tensor]:
-    """The first cell of each tile (T,2), its rows and columns (T,2), and its first place (T,)."""
+def _tiles(rows: int, columns: int) -> Tables:
+    """The first cell of each tile (T,2), its rows and columns (T,2), and its first place (T,); the first rows
+    of tiles, and the first columns."""
     with torch.inference_mode(False):  # cached tensors are also used with gradients
         return _cached_tiles(rows, columns)
 
 
 @lru_cache(16)
-def _cached_tiles(rows: int, columns: int) -> tuple[Tensor, Tensor, Tensor]:
+def _cached_tiles(rows: int, columns: int) -> Tables:
     down = _edges(rows, max(SIDE, SIDE * SIDE // columns))
     across = _edges(columns, SIDE * SIDE // int(down.diff().max()))
     corner = torch.cartesian_prod(down[:-1], across[:-1]).view(-1, 2)
     size = torch.cartesian_prod(down.diff(), across.diff()).view(-1, 2)
-    return corner, size, torch.cat([size.new_zeros(1), size.prod(1).cumsum(0)[:-1]])
+    start = torch.cat([size.new_zeros(1), size.prod(1).cumsum(0)[:-1]])
+    return corner, size, start, down[:-1].contiguous(), across[:-1].contiguous()
 
 
 def _edges(count: int, most: int) -> Tensor:

@@ -265,13 +265,17 @@ def flight(area, images, seed=0):
     return area.place_at(torch.stack(found))
 
 
-def test_a_flight_is_found_where_single_images_are_not(small_tiles, monkeypatch):
-    monkeypatch.setattr(areas, "SIDE", 30)
-    areas._cached_tiles.cache_clear()
+def flown(step):
+    """A model of an area, its descriptors, and the places of a flight over it."""
     area = Area(30, 40)
     _, own = learned(area)
-    model = DejaVu(whitening="none", mapper=SpectralMapper(step=0.05)).learn_features(own, area=area)
-    truth, draw = flight(area, 90), torch.Generator().manual_seed(1)
+    model = DejaVu(whitening="none", mapper=SpectralMapper(step=step)).learn_features(own, area=area)
+    return model, own, flight(area, 90)
+
+
+def test_a_flight_is_found_where_single_images_are_not():
+    model, own, truth = flown(step=0.05)
+    area, draw = model.map.area, torch.Generator().manual_seed(1)
     queries = own[truth] + 0.25 * torch.randn(90, own.shape[1], generator=draw)
 
     def near(match):
@@ -350,16 +354,11 @@ def test_an_area_is_compared_by_distance(pictures, small_tiles, tmp_path, monkey
     assert [row["place"] for row in again] == [row["place"] for row in rows]
 
 
-def test_a_flight_is_placed_as_exactly_as_its_images(small_tiles, monkeypatch):
-    """Of a map that tells every window, an answer is the window itself, not one near it."""
-    monkeypatch.setattr(areas, "SIDE", 30)
-    areas._cached_tiles.cache_clear()
-    area = Area(30, 40)
-    _, own = learned(area)
-    model = DejaVu(whitening="none", mapper=SpectralMapper(step=0.01)).learn_features(own, area=area)
-    truth = flight(area, 90)
+def test_a_flight_is_placed_near_its_images():
+    """On a map that tells every window: neighbours look alike, and rank nearly as high."""
+    model, own, truth = flown(step=0.01)
     found = model.localize_descriptors(own[truth], PlaceSmoother())
-    off = distance(found.index.clamp(min=0), truth, area)
+    off = distance(found.index.clamp(min=0), truth, model.map.area)
     assert float(off.double().quantile(0.5)) <= 1
     assert float((off <= 2).double().mean()) > 0.8
 
@@ -382,6 +381,21 @@ def test_other_truths_count_windows_around_the_right_one(pictures, small_tiles, 
     assert found["recall_at_1"] == near["recall_at_1"]
     told = fails(capsys, "evaluate", *judged[:-1], tmp_path / "again", "--truth", "0")
     assert "--tolerance 0" in told
+
+
+def test_the_map_of_an_area_is_exported(small_tiles):
+    place_map, own = learned(Area(13, 17))
+
+    class Scores(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.place_map = place_map
+
+        def forward(self, queries):
+            return self.place_map.scores(queries)
+
+    program = torch.export.export(Scores(), (own[:3],))
+    torch.testing.assert_close(program.module()(own[:3]), place_map.scores(own[:3]), rtol=1e-4, atol=1e-4)
 
 
 def test_gradients_pass_a_map_that_was_first_used_without(small_tiles):

@@ -15,6 +15,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from dejavu_torch.area import Area
 from dejavu_torch.data.arrays import UNNAMED
 from dejavu_torch.data.coordinates import Near
 from dejavu_torch.data.ground_truth import (
@@ -147,14 +148,12 @@ def compare(
     query = reference if query is None else query
     reference, query, off = _prepared(model, reference, query, distractors, seconds, progress, loops)
     check_candidates(top, tolerance, len(reference))
-    radius, area, within = float(tolerance), reference.area, tolerance
+    area, radius, within, near = reference.area, float(tolerance), tolerance, None
     if area is not None:
-        if truth is None and query.coordinates is not None:
-            truth = f"{'metres' if area.unit == 'm' else 'pixels'}:{tolerance}"
-        parsed = None if truth is None else check_ground_truth(truth)
-        radius = parsed.radius if isinstance(parsed, Near) else radius
-        # all windows within the radius are right
-        within, tolerance = round(radius / math.hypot(*area.right)), 0
+        truth, near = _by_distance(truth, query, area, tolerance)
+        radius = radius if near is None else near.radius
+        within = round(radius / math.hypot(*area.right))
+        tolerance = 0  # all windows within the radius are right
     in_order = source_of(query).ordered if ordered is None else ordered
     smoother, causal = _ways(sequence, in_order and len(query) > 1, within)
     if smoother is not None and area is not None:
@@ -163,7 +162,7 @@ def compare(
         causal.check(None, len(reference))
     # without a given truth, each place would be its own answer
     known = None if itself and truth is None else ground_truth_of(truth, reference, query, interpolate)
-    if area is not None and known is not None and not isinstance(parsed, Near):
+    if area is not None and known is not None and near is None:
         known = widened(known, area, within)
 
     rivals = () if known is None else (reference, query)  # of HOG, for its baseline
@@ -209,6 +208,16 @@ def compare(
     if coded is not None and len(coded.chunks) == 1:
         facts["noise_over_map"] = noise_over_map(coded, run.reference_features, seed)
     return Comparison(Report(ours, contenders, facts), pictures, run, candidates)
+
+
+def _by_distance(
+    truth: Truth | None, query: Traverse, area: Area, tolerance: int
+) -> tuple[Truth | None, Near | None]:
+    """The truth of queries in an area, by coordinates if none is given, and the same if it is by distance."""
+    if truth is None and query.coordinates is not None:
+        truth = f"{'metres' if area.unit == 'm' else 'pixels'}:{tolerance}"
+    parsed = None if truth is None else check_ground_truth(truth)
+    return truth, parsed if isinstance(parsed, Near) else None
 
 
 def _check_settings(

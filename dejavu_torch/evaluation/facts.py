@@ -104,8 +104,8 @@ def match_facts(
         alone.pop("line", None)  # a second lap lies on one
     if place_map.area is not None:
         size = {"area": {"rows": place_map.area.rows, "columns": place_map.area.columns}}
-        radius, _, unit = run.within.partition(" ")
-        alone |= size | {"unit": unit, "tolerance": plain_number(float(radius)), "truth": words}
+        radius, unit = run.reach
+        alone |= size | {"unit": unit, "tolerance": plain_number(radius), "truth": words}
     return facts | alone
 
 

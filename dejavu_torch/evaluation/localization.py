@@ -115,12 +115,18 @@ class Localization(NamedTuple):
         return unit_of(self.model.map.positions)
 
     @property
+    def reach(self) -> tuple[float, str]:
+        """The tolerance and its unit: in an area a distance."""
+        area = self.model.map.area
+        if area is None:
+            return self.tolerance, self.unit
+        return self.radius, "metres" if area.unit == "m" else "pixels"
+
+    @property
     def within(self) -> str:
         """The tolerance with its unit."""
-        area = self.model.map.area
-        if area is None or not self.radius:
-            return f"{self.tolerance} {self.unit}"
-        return f"{self.radius:g} {'metres' if area.unit == 'm' else 'pixels'}"
+        number, unit = self.reach
+        return f"{number:g} {unit}"
 
     @property
     def has_frames(self) -> bool:

@@ -77,8 +77,7 @@ class RouteLines:
             if square < SMALL * power:
                 mean, self.mean_energy = torch.zeros_like(mean), places * square
         self.mean = mean
-        self.sizes, places_of = [*sizes], [rows * columns for rows, columns in sizes]
-        self.chunks = [*pairwise(accumulate(places_of, initial=0))]
+        self.chunks = [*pairwise(accumulate((rows * columns for rows, columns in sizes), initial=0))]
         self.lines = empty(places, dimension, features.device)
         for (start, stop), (_, width) in zip(self.chunks, sizes, strict=True):
             for some in torch.arange(dimension).split(max(1, BLOCK // (stop - start))):

@@ -172,6 +172,7 @@ class SpectralMap(PlaceMap):
         self.level, self.norms = self.lengths.to(torch.int8), self.lengths.float()
         self.chunks: list[tuple[int, int]] = []
         self._bounds = [0]  # of each chunk's coefficients
+        self._widths: list[int] = []  # `columns`, 1 along a route
         self.places = 0
 
     def extend(self, chunks: Iterable[Chunk], levels: Iterable[Tensor] | None = None) -> None:
@@ -217,6 +218,7 @@ class SpectralMap(PlaceMap):
         for chunk, (*_, level) in zip(chunks, parts, strict=True):
             self.chunks.append((self.places, self.places + chunk.places))
             self._bounds.append(self._bounds[-1] + len(level))
+            self._widths.append(chunk.columns)
             self.places += chunk.places
         norms = [*map(self._norms_of, range(len(self.chunks) - len(chunks), len(self.chunks)))]
         append("norms", *norms)
@@ -257,12 +259,12 @@ class SpectralMap(PlaceMap):
         unseen = [
             tuple((counts == 0).nonzero()[:, 0].tolist()) for counts in self.visit_counts.split(lengths)
         ]
-        columns = map(self.width_of, range(len(lengths)))
+        columns = self.columns.tolist() or [1] * len(lengths)
         return [*map(Chunk, lengths, self.steps.tolist(), streams, unseen, columns)]
 
     def width_of(self, chunk: int) -> int:
         """The columns of a chunk, 1 of a route."""
-        return int(self.columns[chunk]) if len(self.columns) else 1
+        return self._widths[chunk]
 
     def size_of(self, chunk: int) -> tuple[int, int]:
         """Rows and columns of a chunk."""
@@ -309,7 +311,8 @@ class SpectralMap(PlaceMap):
         """A map that shares the lines, to be changed."""
         place_map = copy.copy(self)
         place_map._buffers = {**self._buffers}
-        place_map.chunks, place_map._bounds = [*self.chunks], [*self._bounds]
+        for name in ("chunks", "_bounds", "_widths"):
+            setattr(place_map, name, [*getattr(self, name)])
         return place_map
 
     def with_route(self, name: str, route: SpectralMap, own: str) -> SpectralMap:
