@@ -16,7 +16,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from datetime import UTC, datetime
+from datetime import datetime, timezone
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -273,7 +273,7 @@ def write_bench(out: Path, rows: Sequence[Row], picture: Plot | None = None, **f
         "cpu_capability": torch.backends.cpu.get_cpu_capability(),
         "version": dejavu_torch.__version__,
         "versions": dict.fromkeys(COMPARED) | versions,
-        "date": f"{datetime.now(UTC):%Y-%m-%d}",
+        "date": f"{datetime.now(timezone.utc):%Y-%m-%d}",
         "machine": f"{os.cpu_count()} cores, {platform.machine()}",
         "commit": commit(),
     }
