@@ -16,7 +16,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from datetime import UTC, datetime
+from datetime import datetime, timezone
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -189,13 +189,13 @@ def give_back() -> None:
 
 def in_process(module: str, arguments: object) -> dict[str, Any]:
     """The JSON that a module prints when it is run on arguments; if it fails, the reason as `skipped`."""
-    # without the current folder (-P), but with the same search path
+    # without the current folder (from Python 3.11 on), but with the same search path
     search = os.pathsep.join(filter(None, sys.path))
     done = subprocess.run(
-        [sys.executable, "-P", "-m", module, json.dumps(arguments)],
+        [sys.executable, "-m", module, json.dumps(arguments)],
         capture_output=True,
         text=True,
-        env={**os.environ, "PYTHONPATH": search},
+        env={**os.environ, "PYTHONPATH": search, "PYTHONSAFEPATH": "1"},
         preexec_fn=end_with_parent if sys.platform == "linux" else None,
     )
     if done.returncode < 0:
@@ -273,7 +273,7 @@ def write_bench(out: Path, rows: Sequence[Row], picture: Plot | None = None, **f
         "cpu_capability": torch.backends.cpu.get_cpu_capability(),
         "version": dejavu_torch.__version__,
         "versions": dict.fromkeys(COMPARED) | versions,
-        "date": f"{datetime.now(UTC):%Y-%m-%d}",
+        "date": f"{datetime.now(timezone.utc):%Y-%m-%d}",
         "machine": f"{os.cpu_count()} cores, {platform.machine()}",
         "commit": commit(),
     }

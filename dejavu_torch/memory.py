@@ -62,10 +62,11 @@ def without_autocast(function: Callable[P, R]) -> Callable[P, R]:
 
     @functools.wraps(function)
     def exact(*args: P.args, **kwargs: P.kwargs) -> R:
-        device = next((arg.device.type for arg in (*args, *kwargs.values()) if isinstance(arg, Tensor)), "")
-        if not device or not torch.amp.is_autocast_available(device):
+        devices = [arg.device.type for arg in (*args, *kwargs.values()) if isinstance(arg, Tensor)]
+        # is_compiling: older versions of torch do not compile the question
+        if not devices or not (torch.compiler.is_compiling() or torch.amp.is_autocast_available(devices[0])):
             return function(*args, **kwargs)
-        with torch.autocast(device, enabled=False):
+        with torch.autocast(devices[0], enabled=False):
             return function(*args, **kwargs)
 
     return exact

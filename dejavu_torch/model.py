@@ -150,7 +150,7 @@ class DejaVu(nn.Module):
         self.searcher: Searcher | None = None  # of this map; None is made at the first search
 
     def __getattr__(self, name: str) -> Any:
-        known = vars(self)  # not all of it while a model is made
+        known = self.__dict__  # not all of it while a model is made
         if name in DESCRIBES and "descriptor" in known.get("_modules", ()):
             return getattr(self.descriptor, name)
         return getattr(self.state, name) if name in STATE and "state" in known else super().__getattr__(name)

@@ -11,11 +11,12 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, Literal, NamedTuple, Self, SupportsIndex, TypeAlias
+from typing import Any, Literal, NamedTuple, SupportsIndex, TypeAlias
 
 import torch
 from torch import Tensor, nn
 from torch.utils.data import Dataset
+from typing_extensions import Self
 
 from dejavu_torch.area import Area
 from dejavu_torch.text import printable

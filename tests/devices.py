@@ -15,6 +15,8 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from dejavu_torch.periods import spectrogram
+
 DEVICE = torch.device("lazy", 0)  # the one kind whose gradients need nothing but Python, and which nobody has
 aten = torch.ops.aten
 COPIES = {aten.copy_, aten._to_copy}
@@ -74,6 +76,7 @@ def pretend():
     with pytest.MonkeyPatch.context() as patch, Pretend():
         for name in ("autocast", "is_autocast_enabled"):  # which know some kinds of device only
             patch.setattr(torch, name, as_cpu(getattr(torch, name)))
+        patch.setattr(spectrogram, "torchaudio", None)  # reshapes what stft transposed in place
         future.set_overwrite_module_params_on_conversion(True)  # as `data` of another tensor keeps its `here`
         torch._C._set_only_lift_cpu_tensors(True)  # torch.tensor(.., device=) is then seen by the mode
         try:

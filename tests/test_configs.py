@@ -118,7 +118,7 @@ def test_the_wheel_holds_package_and_presets(tmp_path):
     presets = {path.relative_to(ROOT) for path in (ROOT / "configs").rglob("*.yaml")}
     assert {path for path in presets if not (package / path).is_file()} == set()
     code = "import dejavu_torch.cli.presets as p; print(p.find_config('train_road'))"
-    python = [sys.executable, "-P", "-c", f"import sys; sys.path.insert(0, {str(package.parent)!r}); {code}"]
+    python = [sys.executable, "-c", f"import sys; sys.path.insert(0, {str(package.parent)!r}); {code}"]
     ran = subprocess.run(python, cwd=tmp_path, capture_output=True, text=True, check=True)
     assert Path(ran.stdout.strip()) == package / "configs" / "train_road.yaml"
 

@@ -144,7 +144,7 @@ class ImageFolder(Traverse):
             reading(file, "cannot be read as an image", "one"),
             Image.open(file, formats=formats()) as opened,
         ):
-            return opened.mode.startswith("I")
+            return bool(opened.mode.startswith("I"))
 
 
 def formats() -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import math
 import os
@@ -46,6 +47,8 @@ VP8_SHOWN = 16  # the bit of a packet's first byte that says whether its frame i
 UNEVEN_RATIO = 1.5  # of the longest to the median interval; rounding to half a frame stays below it
 
 Index = tuple[list[Any], list[int], Fraction | None]  # time stamps, key frames, seconds of a stamp
+# SWS_FULL_CHR_H_INT and _INP, which only new versions of av name; else colours are averaged over two columns
+FULL_CHROMA = 0x6000
 _FORKED: list[object] = []  # decoders of parent processes
 
 
@@ -218,6 +221,8 @@ class Video(Traverse):
     def _open(self) -> Iterator[tuple[InputContainer, VideoStream]]:
         import av
 
+        if int(av.__version__.split(".")[0]) < 18 and hasattr(os, "register_at_fork"):
+            _collect_before_forks()
         options = {"format_whitelist": FORMATS, "protocol_whitelist": "file"}
         kind = "mjpeg" if self.path.suffix.lower() == ".mjpeg" else None  # often detected as another
         with reading(self.path, "cannot be read as a video", "a video file"):
@@ -235,6 +240,13 @@ def _decode(container: InputContainer, stream: VideoStream) -> Iterator[VideoFra
         if packet.is_corrupt:
             raise ValueError("the data are incomplete")
         yield from packet.decode()
+
+
+@cache
+def _collect_before_forks() -> None:
+    """PyAV before 18 leaves decoders to the garbage collector, which in a forked process would wait for their
+    threads, and these are not there."""
+    os.register_at_fork(before=gc.collect)
 
 
 @cache  # a command may open a video several times
@@ -266,15 +278,16 @@ def pixels_of(frame: VideoFrame, path: Path, width: int = 0, height: int = 0) ->
     """A decoded frame, upright and resized as by `fitted_size`: (H,W,3) uint8; `path` is for messages."""
     from av.video.reformatter import Interpolation as How
 
-    # without full chroma, colours are averaged over pairs of columns
-    how = int(How.AREA | How.FULL_CHR_H_INT | How.FULL_CHR_H_INP)
+    how = How.AREA | FULL_CHROMA
     turns = round(frame.rotation / 90) % 4  # quarter turns, counterclockwise
     w, h = (frame.height, frame.width) if turns % 2 else (frame.width, frame.height)
     height, width = fitted_size(path, h, w, width, height)
     if turns % 2:
         width, height = height, width
     check_pixels(path, height, width, MOST_PIXELS)
-    return np.rot90(frame.reformat(width, height, "rgb24", interpolation=how).to_ndarray(), turns)
+    # threads of its own cost each frame more than they save, and would be waited for in a forked process
+    picture = frame.reformat(width, height, "rgb24", interpolation=how, threads=1)
+    return np.rot90(picture.to_ndarray(), turns)
 
 
 def seconds_of(stamp: int | None, base: Fraction | None) -> float:
@@ -298,8 +311,8 @@ def _is_whole(path: Path) -> bool:
             if head[:4] == b"RIFF":
                 length = 8 + int.from_bytes(head[4:8], "little")
             elif head[4:8] in BOXES:
-                length = int.from_bytes(head[:4])
-                length = int.from_bytes(head[8:]) if length == 1 else length
+                length = int.from_bytes(head[:4], "big")
+                length = int.from_bytes(head[8:], "big") if length == 1 else length
             else:
                 return True  # other data follow
             if length in (0, 7 + 2**32):  # to the end of the file, or a live recording: no length to check
@@ -318,7 +331,7 @@ def _elements_fit(file: BinaryIO, start: int, stop: int) -> bool:
         if j > len(head):
             return False
         unknown = (1 << 7 * (j - i)) - 1
-        length = int.from_bytes(head[i:j]) & unknown
+        length = int.from_bytes(head[i:j], "big") & unknown
         if length == unknown:  # a live recording: no length to check
             return head[:i] in (SEGMENT, CLUSTER)
         end = start + j + length

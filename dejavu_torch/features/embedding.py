@@ -199,7 +199,7 @@ class Embedding(nn.Module):
         if self.channels == 1:
             frames = select_channel(frames, "grey")
         frames = resize_frames(frames.expand(-1, self.channels, -1, -1), self.resize)
-        weight = next(self.network.parameters(), frames)
+        weight = [*self.network.parameters(), frames][0]  # older versions do not compile next with a default
         frames = frames.to(weight.dtype) if weight.is_floating_point() else frames
         if self.cell:
             frames = local_contrast(frames, self.cell)
@@ -210,7 +210,7 @@ class Embedding(nn.Module):
     def code(self, descriptors: Tensor) -> Tensor:
         """Features of descriptors: (B,K) -> (B,D)."""
         features: Tensor = self.linear(descriptors)
-        buffer = next(self.standardise.buffers(), None)
+        buffer = [*self.standardise.buffers(), None][0]
         dtype = torch.promote_types(features.dtype, torch.float32) if buffer is None else buffer.dtype
         standardised: Tensor = self.standardise(features.to(dtype))
         return standardised

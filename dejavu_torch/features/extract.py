@@ -74,8 +74,8 @@ def as_weights(frames: Tensor, module: nn.Module) -> Tensor:
     """Frames in the type of a module's weights, else of its buffers, which torch expects."""
     if getattr(module, "casts", False):
         return frames
-    dtypes = (tensor.dtype for tensor in chain(module.parameters(), module.buffers()))
-    return frames.to(next((dtype for dtype in dtypes if dtype.is_floating_point), frames.dtype))
+    dtypes = [tensor.dtype for tensor in chain(module.parameters(), module.buffers())]
+    return frames.to([*(dtype for dtype in dtypes if dtype.is_floating_point), frames.dtype][0])
 
 
 def features_of(batch: Tensor, describe: Callable[[Tensor], Tensor], name: str = "the input") -> Tensor:

@@ -150,7 +150,11 @@ def equalise(frames: Tensor, clip_limit: float = 2.0, grid: tuple[int, int] = (8
     detached = frames.detach()
     low, high = (bound.item() for bound in detached.aminmax())
     expect(low >= 0 and high <= 1, "values in [0, 1]", f"clahe got values from {low:g} to {high:g}")
-    equalised = in_parts(lambda part: equalize_clahe(part, clip_limit, grid), detached)
+    try:
+        equalised = in_parts(lambda part: equalize_clahe(part, clip_limit, grid), detached)
+    except IndexError as error:
+        seen = f"clahe got a grid of {rows} x {columns} tiles"
+        raise InputError(f"{seen}; expected as many rows as columns, or kornia 0.9") from error
     return frames + (equalised - detached) if frames.requires_grad else equalised
 
 

@@ -6,10 +6,11 @@ import logging
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from itertools import accumulate
-from typing import ClassVar, Self, TypeVar, get_args
+from typing import ClassVar, TypeVar, get_args
 
 import torch
 from torch import Tensor, nn
+from typing_extensions import Self
 
 from dejavu_torch.area import Area
 from dejavu_torch.data.positions import count_places

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from typing_extensions import Self
 
 BLOCK = 25  # queries, whose mean varies by as much as they depend on each other
 PRIOR, MOVE_PRIOR = 100.0, 50.0  # queries that the given sharpness, and the given moves, count as

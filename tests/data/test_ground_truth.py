@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from contextlib import chdir
 from itertools import pairwise
 from pathlib import Path
 
@@ -248,9 +247,10 @@ NO_TRUTH = ["x", "", "1.5", "utm:", "utm:far", "utm:-1", "utm:nan", "utm2", "9" 
         ("folder.csv", {}, ("folder.csv", "is a folder")),
     ],
 )
-def test_what_is_no_truth_is_refused_early(truth, options, words, scratch):
+def test_what_is_no_truth_is_refused_early(truth, options, words, scratch, monkeypatch):
     (scratch / "folder.csv").mkdir(exist_ok=True)
-    with chdir(scratch), refused(*words):
+    monkeypatch.chdir(scratch)
+    with refused(*words):
         check_ground_truth(truth, **options)
 
 

@@ -32,7 +32,7 @@ MODULES = {
     "grey": Preprocess("grey"),
     "patches": Preprocess(contrast="patch"),
     "difference in patches": Preprocess("R-B", "patch", patch=5),
-    "clahe": Preprocess("G", "clahe", clip_limit=3, grid=[2, 3]),
+    "clahe": Preprocess("G", "clahe", clip_limit=3, grid=[3, 3]),
 }
 OTHERS = {
     "grouped whitening": Whitening(groups=[30, 20]),
