@@ -10,13 +10,14 @@ import re
 import shlex
 import shutil
 import sys
-import tomllib
 from collections import Counter
 from contextlib import redirect_stdout, suppress
 from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any, get_args
+
+import tomllib
 
 DOCS = Path(__file__).parent
 ROOT = DOCS.parent
