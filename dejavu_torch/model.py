@@ -460,9 +460,9 @@ class DejaVu(nn.Module):
         require_map(self)
         check_search(matching.search)
         if matching.sequence is not None:
-            fits = self.map.area is None or isinstance(matching.sequence, PlaceSmoother)
+            fits = self.map.area is None or isinstance(matching.sequence, PlaceSmoother | PlaceFilter)
             seen = f"{type(matching.sequence).__name__}, and the map of an area"
-            expect(fits, "single images (--match single), or a PlaceSmoother", seen)
+            expect(fits, "single images (--match single), a PlaceFilter or a PlaceSmoother", seen)
             matching.sequence.check(None, self.map.places)
         single = matching.sequence is None and matching.callback is None
         if not single or matching.search not in ("auto", "coarse"):

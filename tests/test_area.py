@@ -19,6 +19,7 @@ from dejavu_torch import (
     DejaVu,
     PlaceFilter,
     PlaceSmoother,
+    SequenceMatcher,
     SpectralMapper,
     TemplateMapper,
     compare,
@@ -31,13 +32,16 @@ from dejavu_torch.features.views import Sample
 from dejavu_torch.growth import append, merge
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.spectrum import by_frequency, frequencies, from_lines, lines_of
-from dejavu_torch.recognition import plane
+from dejavu_torch.recognition import flight as flights
 from dejavu_torch.recognition.coarse import CoarseSearch, SamplingPlan
 from dejavu_torch.recognition.evidence import RankTable, standardised
+from dejavu_torch.recognition.motion import Rates
+from dejavu_torch.recognition.plane import Followed, PlaneMotion
 from dejavu_torch.recognition.samples import RowSearch
 from dejavu_torch.recognition.search import Scan
 from dejavu_torch.recognition.select import best_candidates
 from dejavu_torch.recognition.smoother import log_likelihood
+from dejavu_torch.types import Match
 
 SIDES = st.integers(1, 40)
 
@@ -204,22 +208,9 @@ def test_every_kth_window_is_stored_in_both_directions(small_tiles):
     assert [table.tolist() for table in stored_frames(5, 2)] == [[0, 2, 4], [0, 1, 1, 2, 2]]
 
 
-def test_a_sweep_gives_the_masses_of_the_model(small_tiles):
-    """Against matrices of all transitions between the windows, and the state off the area."""
-    area, reach, queries = Area(4, 5), 1, 5
-    smoother, draw = PlaceSmoother((0.5, 0.5)), torch.Generator().manual_seed(0)
-    std = standardised(torch.rand(queries, area.places, generator=draw), torch.zeros(area.places))
-    values = RankTable()
-    values.add(std.z, torch.ones_like(std.z))
-    kernel = torch.rand(3, 3, generator=draw)
-    kernel /= kernel.sum()
-    still = torch.tensor([False, False, True, False, False])
-    weight = torch.tensor([1.0, 1.0, 0.5, 0.5, 1.0])
-    swept = plane._sweep(smoother, area, std, weight, still, values.values, 2.0, kernel)
-
-    n, cells = area.places, torch.cartesian_prod(torch.arange(4), torch.arange(5))
-    _, jump, leave = smoother.rate_logits.detach().softmax(0).double()
-    enter = smoother.enter_logit.detach().sigmoid().double()
+def transitions(cells, kernel, jump, leave, enter):
+    """Probabilities from each window, or off the area, to each, (N+1,N+1) float64."""
+    n, reach = len(cells), len(kernel) // 2
     step = torch.zeros(n + 1, n + 1, dtype=torch.float64)
     moves = (cells[None] - cells[:, None]) + reach
     inside = ((moves >= 0) & (moves <= 2 * reach)).all(2)
@@ -229,6 +220,71 @@ def test_a_sweep_gives_the_masses_of_the_model(small_tiles):
     step[:n, :n] += jump / n
     step[:n, n] = leave + lost
     step[n, :n], step[n, n] = enter / n, 1 - enter
+    return step
+
+
+def test_a_filter_moves_over_an_area(small_tiles):
+    """Against matrices of all transitions."""
+    area = Area(7, 11)
+    assert len(area.tiles) > 1
+    kernel = torch.rand(5, 5, generator=torch.Generator().manual_seed(2))
+    kernel /= kernel.sum()
+    rates = Rates(kernel.flatten(), *torch.tensor([0.05, 0.1, 0.2]))
+    motion = PlaneMotion(area, rates)
+    step = transitions(area.cells(torch.arange(77)), kernel, *rates[1:])
+    belief, message = torch.rand(2, 78, generator=torch.Generator().manual_seed(0))
+    belief /= belief.sum()
+    torch.testing.assert_close(motion.moved(belief), (belief.double() @ step).float())
+    torch.testing.assert_close(motion.expected(message), (step @ message.double()).float())
+    assert float(motion.anywhere().sum()) == pytest.approx(1)
+    counts = motion.counts(belief[None], message[None])
+    assert float(counts.moves.sum() + sum(counts[1:])) == pytest.approx(1)
+    # of one move between two windows
+    one, two = torch.zeros(2, 78)
+    one[area.place_at(torch.tensor([3, 4]))] = two[area.place_at(torch.tensor([2, 6]))] = 1
+    counts = PlaneMotion(area, rates._replace(jump=torch.tensor(0.0))).counts(one[None], two[None])
+    assert counts.moves.nonzero().tolist() == [[5 * 1 + 4]]
+    kernel = Followed(torch.zeros(25)).moves_after(torch.tensor([0.2, 0.3, 0.5])).view(5, 5)
+    torch.testing.assert_close(kernel, kernel.T)
+    assert float(kernel[0, 1] / kernel[2, 2]) == pytest.approx(0.5 / 0.2)
+
+
+def test_a_filter_finds_a_flight_on_the_way(small_tiles):
+    model, own, truth = flown(step=0.05)
+    draw = torch.Generator().manual_seed(1)
+    queries = own[truth] + 0.25 * torch.randn(90, own.shape[1], generator=draw)
+    filter = PlaceFilter()
+
+    def near(match):
+        return float((distance(match.index.clamp(min=0), truth, model.map.area) <= 2).double().mean())
+
+    found = model.localize_descriptors(queries, filter)
+    assert filter.area is None  # of a filter that may belong to several maps
+    assert near(found) > near(model.localize_descriptors(queries)) + 0.05
+    localizer = model.localizer(model.matching(PlaceFilter(lag=5, learns=True)))
+    answers = [localizer(queries[t : t + 1]) for t in range(90)]
+    later = Match.joined([*answers, localizer.finish()])
+    assert len(later) == 90
+    assert near(later) >= near(found)
+
+
+def test_a_sweep_gives_the_masses_of_the_model(small_tiles):
+    """Against matrices of all transitions between the windows, and the state off the area."""
+    area, queries = Area(4, 5), 5
+    smoother, draw = PlaceSmoother((0.5, 0.5)), torch.Generator().manual_seed(0)
+    std = standardised(torch.rand(queries, area.places, generator=draw), torch.zeros(area.places))
+    values = RankTable()
+    values.add(std.z, torch.ones_like(std.z))
+    kernel = torch.rand(3, 3, generator=draw)
+    kernel /= kernel.sum()
+    still = torch.tensor([False, False, True, False, False])
+    weight = torch.tensor([1.0, 1.0, 0.5, 0.5, 1.0])
+    with torch.no_grad():
+        swept = flights._sweep(smoother, area, std, weight, still, values.values, 2.0, kernel)
+
+    n, cells = area.places, torch.cartesian_prod(torch.arange(4), torch.arange(5))
+    _, jump, leave = smoother.rate_logits.detach().softmax(0)
+    step = transitions(cells, kernel, jump, leave, smoother.enter_logit.detach().sigmoid())
     log = log_likelihood(values.values, std, weight, 2.0, smoother.tempering)[:, area.place_at(cells)]
     seen = torch.cat([log.exp(), torch.ones(queries, 1)], 1).double()
     belief = torch.full((n + 1,), 0.5 / n, dtype=torch.float64)
@@ -445,8 +501,8 @@ def test_what_a_map_of_an_area_does_not_do_is_refused(pictures, small_tiles):
         append(model, open_source(source))
     with refused("map of an area", "merge"):
         merge([model, model], ["a", "b"])
-    with refused("PlaceFilter", "area", "PlaceSmoother"):
-        model.localize(source, sequence=PlaceFilter())
+    with refused("SequenceMatcher", "area", "PlaceFilter"):
+        model.localize(source, sequence=SequenceMatcher(3))
     with refused("TemplateMapper", "area", "SpectralMapper"):
         DejaVu(mapper=TemplateMapper()).learn(source)
     with refused("100 descriptors", "10 x 11", "one for each"):

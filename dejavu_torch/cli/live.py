@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import sys
 import time
 from collections import deque
@@ -148,8 +149,9 @@ def _with_warning(camera: Camera) -> Iterable[Frame]:
 def line_of(image: Frame, match: LiveMatch) -> str:
     """An answer as a line of JSON."""
     answer = match._asdict() | {"milliseconds": round(match.milliseconds, 3)}
-    place, frame, route = (answer.pop(name) for name in ("place", "frame", "route"))
+    place, frame, route, x, y = (answer.pop(name) for name in ("place", "frame", "route", "x", "y"))
     facts = {"frame": image.number, "time": image.seconds, "place": place, "reference_frame": frame, **answer}
+    facts |= {} if math.isnan(x) else {"x": x, "y": y}
     return json.dumps(without_nan(facts | ({"route": route} if route else {})))
 
 

@@ -17,6 +17,7 @@ from dejavu_torch.types import InputError, expect
 
 SIZE = (96, 96)  # pixels of its training frames
 STRIDES = (2, 2, 2, 1, 1)  # of its convolutions
+AT_ONCE = 16  # frames, so that their feature maps stay in the cache
 WIDEST = 12  # cells along a side of its feature maps
 WEIGHTS = {"lite0": Path(__file__).with_name("lite0.safetensors")}
 
@@ -59,8 +60,14 @@ class Distilled(nn.Module):
         check_frames(frames, "Distilled got")
         if frames.shape[1] not in (1, 3):
             frames = frames.mean(1, keepdim=True)
-        maps = distilled_maps(resize_frames(frames, SIZE), dict(self.named_buffers()))
-        return adaptive_avg_pool2d(maps, self.grid).flatten(1)
+        layers = dict(self.named_buffers())
+        # a graph has one batch, and a GPU takes as long for few frames
+        whole = torch.compiler.is_compiling() or frames.device.type != "cpu"
+        maps = (
+            distilled_maps(resize_frames(part, SIZE), layers)
+            for part in ([frames] if whole else frames.split(AT_ONCE))
+        )
+        return torch.cat([adaptive_avg_pool2d(part, self.grid).flatten(1) for part in maps])
 
     def _load_from_state_dict(self, state: dict[str, Tensor], prefix: str, *args: object) -> None:
         stored = state.get(f"{prefix}checksum")

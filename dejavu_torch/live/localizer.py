@@ -40,6 +40,8 @@ class LiveMatch(NamedTuple):
     accepted: bool
     milliseconds: float  # taken by this frame
     route: str = ""  # of a merged map
+    x: float = math.nan  # of the place in an area, pixels or metres as its coordinates
+    y: float = math.nan
 
 
 class LiveLocalizer:
@@ -144,6 +146,8 @@ class LiveLocalizer:
         model = self.model
         place, score, table = int(match.index), float(match.score), model.map.table
         shown, routes = int(table.frame_of(match.index)), model.map.routes
+        area, nowhere = model.map.area, [math.nan, math.nan]
+        x, y = nowhere if area is None or place < 0 else area.coordinates(match.index).tolist()
         return LiveMatch(
             place=place,
             frame=int(table.own_frame_of(match.index)) if routes else shown,
@@ -154,6 +158,8 @@ class LiveLocalizer:
             accepted=bool(match.accepted),
             milliseconds=milliseconds,
             route=routes[int(match.route)].name if match.route is not None and place >= 0 else "",
+            x=x,
+            y=y,
         )
 
     @property

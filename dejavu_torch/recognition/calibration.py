@@ -141,15 +141,15 @@ class Track:
     queries stand out at these places. The posterior alone is overconfident off the map, where it follows the
     best of the wrong places."""
 
-    def __init__(self) -> None:
-        self.sum = self.weight = 0.0
+    def __init__(self, area: Area | None = None) -> None:
+        self.area, self.sum, self.weight = area, 0.0, 0.0
 
     def __call__(self, filtered: Tensor, scores: Tensor) -> Tensor:
         """The filter's scores and those of single queries, each (B,N) -> (B,) float64 on the CPU."""
         match = best_match(filtered)
         mean, spread, *_ = moments_of(scores)
-        own = scores.gather(1, _window(match.index, ANSWER_RADIUS, scores)).amin(1)
-        rival = scores.scatter(1, _window(match.index, TOLERANCE, scores), math.inf).amin(1)
+        own = scores.gather(1, _window(match.index, ANSWER_RADIUS, scores, self.area)).amin(1)
+        rival = scores.scatter(1, _window(match.index, TOLERANCE, scores, self.area), math.inf).amin(1)
         margin = torch.where(rival.isfinite(), rival - own, 0)
         deviations = torch.where(own.isfinite(), (mean[:, 0] - own + MARGIN * margin) / spread[:, 0], 0)
         means = []
@@ -185,17 +185,15 @@ def calibrated(
             the probability of single queries, see `look_alikes`.
     """
     area = place_map.area
-    answers: tuple[list[tuple[Tensor, ...]], ...] = [], []  # of single queries, of a filter along a route
+    answers: tuple[list[tuple[Tensor, ...]], ...] = [], []  # of single queries, of a filter
     for descriptors, places in segments:
         scores = torch.cat([place_map.scores(part) for part in descriptors.split(64)])
         places = places.to(scores.device)
         off_map = scores.scatter(1, _window(places, 2 * TOLERANCE, scores, area), math.inf)
         for single, on_map in ((scores, True), (off_map, False)):
-            pairs = [(single, confidence_of(single, area))]
-            if area is None:
-                filtered = PlaceFilter()(single)
-                pairs.append((filtered, Track()(filtered, single)))
-            for rows, (scored, confidences) in zip(answers, pairs, strict=False):
+            filtered = PlaceFilter().over(area)(single)
+            pairs = (single, confidence_of(single, area)), (filtered, Track(area)(filtered, single))
+            for rows, (scored, confidences) in zip(answers, pairs, strict=True):
                 index = best_match(scored).index
                 near = distance(index.clamp(min=0), places.clamp(min=0), area) <= TOLERANCE
                 right = near & (index >= 0) & (places >= 0) & on_map
@@ -203,7 +201,7 @@ def calibrated(
                 rows.append(tuple(column.cpu()[places.cpu() >= 0] for column in columns))
     expect(answers[0], "some", "there are no queries to calibrate by")
     platts: list[Platt | None] = []
-    for rows in filter(None, answers):
+    for rows in answers:
         confidences, right, on_the_map = map(torch.cat, zip(*rows, strict=True))
         wrong = int((on_the_map & ~right).sum())
         off_weight = max(0, MIN_WRONG - wrong) / max(1, int((~on_the_map).sum())) if another_visit else 1.0

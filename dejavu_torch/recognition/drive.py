@@ -15,9 +15,10 @@ from dejavu_torch.memory import in_one_thread
 from dejavu_torch.recognition.calibration import TOLERANCE, Platt, confidence_of
 from dejavu_torch.recognition.evidence import Spacing, spacing_of
 from dejavu_torch.recognition.filter import near_scores
+from dejavu_torch.recognition.flight import place_flight
 from dejavu_torch.recognition.large import TILE, LargeDrive, Tiles, is_large
 from dejavu_torch.recognition.motion import Layout
-from dejavu_torch.recognition.plane import near_in_plane, place_flight
+from dejavu_torch.recognition.plane import SHARP, near_in_plane
 from dejavu_torch.recognition.select import best_candidates
 from dejavu_torch.recognition.smoother import (
     Drive,
@@ -30,7 +31,6 @@ from dejavu_torch.recognition.smoother import (
 from dejavu_torch.text import progress_of
 from dejavu_torch.types import Match
 
-SHARP = 2  # windows around a place of an area whose mass an answer is chosen by
 DOUBT = 0.1  # nats for each deviation by which an answer's own score is worse than is usual in the drive
 KEPT = 2**26  # scores of drives that are smoothed together, up to which they are computed once
 NORMAL = 1.4826  # standard deviations of a Gaussian over its median absolute deviation

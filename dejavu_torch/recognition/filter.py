@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -10,11 +11,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from dejavu_torch.area import Area
 from dejavu_torch.memory import is_plain, without_autocast
 from dejavu_torch.recognition.motion import MIN_PROBABILITY, Layout, Motion, Rates, checked_rates, logits
 from dejavu_torch.recognition.online import Learned
+from dejavu_torch.recognition.plane import SHARP, Followed, PlaneMotion, near_in_plane
 from dejavu_torch.recognition.sequence import each
 from dejavu_torch.types import InputError, SequenceModel, expect
+
+MOVES = (0.2, 0.6, 0.2)
+PLANE_MOVES, PLANE_SHARPNESS = (1 / 6,) * 6, 2.0  # of an area, where images are farther apart
 
 
 class Moments(NamedTuple):
@@ -45,9 +51,12 @@ class PlaceFilter(SequenceModel):
 
     Args:
         moves: probabilities of moving by 0, 1, .., V places from one query to the next; they add up to 1.
-            Moving past the end of the map leaves it.
+            Moving past the end of the map leaves it. In an area, weights of the windows so many rows or
+            columns away, whichever are more; from there on the moves of the latest queries count. None is
+            (0.2, 0.6, 0.2), in an area the same for windows up to 5 away.
         jump: probability of being anywhere on the map next. leave, enter: of leaving and entering the map.
-        sharpness: nats per standard deviation; low, since consecutive frames are similar.
+        sharpness: nats per standard deviation; low, since consecutive frames are similar. None is 1, in an
+            area 2.
         off_map: standard deviations; a query with no place further below the mean suggests being off the map.
         within: places; the score of a place includes its neighbours up to this distance, with weights that
             decrease with it.
@@ -55,7 +64,7 @@ class PlaceFilter(SequenceModel):
         lag: queries. An answer comes so many queries later and takes them into account: `step` gives the
             answers that are due, in the order of the queries, and `finish` the rest.
         learns: moves, sharpness and off_map are learned from the queries so far, see `Learned`; those given
-            are where they begin.
+            are where they begin. In an area only the moves are, in any case.
 
     Shape: scores (..., Q, N), the posterior (..., N+1) before them or None -> (..., Q, N), -log of a
         probability in nats. From B queries `step` has B answers; with a lag L, those of the queries up to the
@@ -86,11 +95,11 @@ class PlaceFilter(SequenceModel):
 
     def __init__(
         self,
-        moves: Sequence[float] = (0.2, 0.6, 0.2),
+        moves: Sequence[float] | None = None,
         jump: float = 0.001,
         leave: float = 0.001,
         enter: float = 0.01,
-        sharpness: float = 1.0,
+        sharpness: float | None = None,
         off_map: float = 1.25,
         within: int = 5,
         threshold: float | None = None,
@@ -98,7 +107,9 @@ class PlaceFilter(SequenceModel):
         learns: bool = False,
     ) -> None:
         super().__init__()
-        moves = checked_rates(moves, jump, leave, enter)
+        self.given = moves is not None, sharpness is not None
+        moves = checked_rates(MOVES if moves is None else moves, jump, leave, enter)
+        sharpness = 1.0 if sharpness is None else sharpness
         fits = 0 < sharpness < math.inf and math.isfinite(off_map)
         expect(fits, "finite numbers, the sharpness above 0", f"sharpness {sharpness}, off_map {off_map}")
         expect(isinstance(within, int) and within >= 0, "a whole number, at least 0", within=within)
@@ -110,6 +121,17 @@ class PlaceFilter(SequenceModel):
         self.log_sharpness = nn.Parameter(torch.tensor(float(sharpness), dtype=torch.float32).log())
         self.off_map = nn.Parameter(torch.tensor(float(off_map), dtype=torch.float32))
         self.within, self.threshold, self.lag, self.learns = within, threshold, lag, learns
+        self.area: Area | None = None  # of the places, which a `Localizer` sets
+
+    def over(self, area: Area | None) -> PlaceFilter:
+        """A copy for the places of an area, or of a route."""
+        copied = copy.deepcopy(self)
+        copied.area = area
+        if area is not None and not self.given[0]:
+            copied.move_logits = nn.Parameter(logits(*PLANE_MOVES).to(self.off_map.device))
+        if area is not None and not self.given[1]:
+            copied.log_sharpness.data.fill_(math.log(PLANE_SHARPNESS))
+        return copied
 
     def start(self, places: int, fixed: bool = False) -> Tensor:
         return self.off_map.new_zeros(self._shape(places))
@@ -118,7 +140,11 @@ class PlaceFilter(SequenceModel):
         if scores.ndim > 2:
             check_posterior(before, scores.shape[-1])
             return each(self, scores, before)
-        return near_scores(self.posterior(scores, before)[:, :-1], scores, self.within)
+        return self.near(self.posterior(scores, before)[:, :-1], scores)
+
+    def near(self, posterior: Tensor, scores: Tensor) -> Tensor:
+        """`near_scores` of this filter."""
+        return near_scores(posterior, scores, self.within, self.area)
 
     def posterior(self, scores: Tensor, before: Tensor | None = None) -> Tensor:
         """Probability of each place, and of being off the map, after each query; with a lag, given the
@@ -139,7 +165,7 @@ class PlaceFilter(SequenceModel):
         self, scores: Tensor, state: Tensor, route_starts: Sequence[int] = (0,), last: bool = False
     ) -> tuple[Tensor, Tensor]:
         posteriors, answered, state = self._answers(scores, state, route_starts, last)
-        return near_scores(posteriors[:, :-1], answered, self.within), state
+        return self.near(posteriors[:, :-1], answered), state
 
     def finish(self, state: Tensor, route_starts: Sequence[int] = (0,)) -> tuple[Tensor, Tensor]:
         """The answers that wait for later queries, at the end of all: -> scores (B,N), the next state."""
@@ -164,17 +190,26 @@ class PlaceFilter(SequenceModel):
 
     def _shape(self, places: int) -> tuple[int, ...]:
         """Of the state while no query waits."""
-        rows = 1 + (self.lag > 0) + (Learned.rows(places, len(self.move_logits)) if self.learns else 0)
-        return (rows, places + 1)[not self.lag and not self.learns :]
+        size = 0 if (kind := self._learned) is None else kind.size(places, len(self.move_logits))
+        rows = 1 + (self.lag > 0) + -(-size // (places + 1))
+        return (rows, places + 1)[not self.lag and kind is None :]
 
-    def _parts(self, state: Tensor) -> tuple[Tensor, Tensor, Learned | None, Tensor]:
+    @property
+    def _learned(self) -> type[Learned] | type[Followed] | None:
+        """The kind of what is learned on the way."""
+        if self.area is not None:
+            return Followed
+        return Learned if self.learns else None
+
+    def _parts(self, state: Tensor) -> tuple[Tensor, Tensor, Learned | Followed | None, Tensor]:
         """Posterior of the latest answer (N+1,), that of the filter, what is learned, and (R,N+1) queries
         that wait."""
         rows, heads = state.reshape(-1, state.shape[-1]), 1 + (self.lag > 0)
-        end, learned = heads, None
-        if self.learns:
-            end = self._shape(rows.shape[1] - 1)[0]
-            learned = Learned.unpacked(rows[heads:end], len(self.move_logits))
+        if (kind := self._learned) is None:
+            return rows[0], rows[heads - 1], None, rows[heads:]
+        places = rows.shape[1] - 1
+        end = self._shape(places)[0]
+        learned = kind.unpacked(rows[heads:end].flatten(), places, len(self.move_logits))
         return rows[0], rows[heads - 1], learned, rows[end:]
 
     @without_autocast
@@ -223,10 +258,13 @@ class PlaceFilter(SequenceModel):
         if any(left_out[due:]):
             rest[:, -1] = rest.new_tensor(left_out[due:])
         parts = [posterior[None], *([belief[None]] if self.lag else [])]
-        parts += [rest] if learned is None else [learned.packed, rest]
+        if learned is not None:
+            numbers = torch.cat(learned)
+            parts.append(F.pad(numbers, (0, -len(numbers) % (places + 1))).view(-1, places + 1))
+        parts.append(rest)
         return answers, scores[:due], torch.cat(parts)
 
-    def _message(self, motion: Motion, likelihoods: Tensor, left_out: Sequence[int]) -> Tensor:
+    def _message(self, motion: Motion | PlaneMotion, likelihoods: Tensor, left_out: Sequence[int]) -> Tensor:
         """What the queries after the first one say of it, (R,N+1) -> (N+1,)."""
         message = torch.ones_like(likelihoods[0])
         for t in range(len(likelihoods) - 1, 0, -1):
@@ -236,7 +274,9 @@ class PlaceFilter(SequenceModel):
                 message = motion.expected(message)
         return message
 
-    def likelihoods(self, scores: Tensor, moments: Moments, learned: Learned | None = None) -> Tensor:
+    def likelihoods(
+        self, scores: Tensor, moments: Moments, learned: Learned | Followed | None = None
+    ) -> Tensor:
         """Likelihoods of the places and of being off the map, (Q,N) -> (Q,N+1), scaled to a maximum of 1 in
         each row."""
         valid, sharpness = scores.isfinite(), self.log_sharpness.to(scores).exp()
@@ -250,12 +290,14 @@ class PlaceFilter(SequenceModel):
         return (logits - logits.amax(1, keepdim=True)).exp()
 
     def motion(
-        self, like: Tensor, route_starts: Sequence[int] = (0,), learned: Learned | None = None
-    ) -> Motion:
+        self, like: Tensor, route_starts: Sequence[int] = (0,), learned: Learned | Followed | None = None
+    ) -> Motion | PlaneMotion:
         """The transitions of a map, in the type of its scores (..., N)."""
         moves, (_, jump, leave) = (one.to(like).softmax(0) for one in (self.move_logits, self.rate_logits))
         moves = moves if learned is None else learned.moves_after(moves)
         rates = Rates(moves, jump, leave, self.enter_logit.to(like).sigmoid())
+        if self.area is not None:
+            return PlaneMotion(self.area, rates)
         return Motion(Layout(like.shape[-1], route_starts=tuple(route_starts)), rates)
 
     def check(self, queries: int | None, places: int) -> None:
@@ -293,12 +335,15 @@ def check_posterior(before: Tensor | None, places: int) -> None:
 
 
 @without_autocast
-def near_scores(posterior: Tensor, scores: Tensor, within: int) -> Tensor:
+def near_scores(posterior: Tensor, scores: Tensor, within: int, area: Area | None = None) -> Tensor:
     """-log of the probability of each place and its neighbours, weighted by a triangle that ends `within`
-    places away, (Q,N) -> (Q,N); +inf if the place's score is."""
+    places away, in an area by a pyramid that ends sooner, (Q,N) -> (Q,N); +inf if the place's score is."""
     within = min(within, posterior.shape[1])
     side = within + 1  # two box filters make a triangle
-    mass = window_sums(window_sums(F.pad(posterior, (within, within)), side), side) / side
+    if area is not None:
+        mass = near_in_plane(posterior, min(within, SHARP), area, weighted=True) if within else posterior
+    else:
+        mass = window_sums(window_sums(F.pad(posterior, (within, within)), side), side) / side
     mass = mass.clamp(torch.finfo(mass.dtype).tiny, 1.0)  # an exporter promotes no types
     return (-mass.log()).masked_fill(~scores.isfinite(), math.inf)
 

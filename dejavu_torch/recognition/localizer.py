@@ -84,9 +84,12 @@ class Localizer:
     ) -> None:
         # of the places; None along a route
         self.area = area if place_map is None else place_map.area
-        self.place_map, self.matching, self.track = place_map, matching, Track()
-        self.searcher = Scan(place_map) if searcher is None and place_map is not None else searcher
         sequence = matching.sequence
+        if isinstance(sequence, PlaceFilter):
+            sequence = sequence.over(self.area)
+            matching = matching._replace(sequence=sequence)
+        self.place_map, self.matching, self.track = place_map, matching, Track(self.area)
+        self.searcher = Scan(place_map) if searcher is None and place_map is not None else searcher
         self.own: Together = sequence.length if isinstance(sequence, SequenceMatcher) else "filter"
         self.models: dict[Together, SequenceModel] = {**matching.also}
         if isinstance(sequence, SequenceModel):
@@ -220,7 +223,7 @@ class Localizer:
             answered = torch.cat([filter.waiting(states[self.own]), scores])
             scores = answered[: len(steps[self.own][0])]
         final = scores if single else steps[self.own][0]
-        pair, confidence = best_pair(final), None
+        pair, confidence = best_pair(final, self.area), None
         if self.matching.platt is not None and not single:
             confidence = self.track(final, scores)
         match = self._answer(self._candidates(final), pair, confidence)

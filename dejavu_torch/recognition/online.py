@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 from typing_extensions import Self
 
@@ -29,21 +28,13 @@ class Learned(NamedTuple):
     moves: Tensor
 
     @classmethod
-    def rows(cls, places: int, moves: int) -> int:
-        """Rows of N+1 numbers that `packed` needs."""
-        return -(-(2 * places + 4 + moves) // (places + 1))
+    def size(cls, places: int, moves: int) -> int:
+        """How many numbers these are."""
+        return 2 * places + 4 + moves
 
     @classmethod
-    def unpacked(cls, rows: Tensor, moves: int) -> Self:
-        places = rows.shape[1] - 1
-        sizes = [places, places, 4, moves]
-        return cls(*rows.flatten()[: sum(sizes)].split(sizes))
-
-    @property
-    def packed(self) -> Tensor:
-        """All of it in rows of N+1."""
-        numbers, width = torch.cat(self), len(self.total) + 1
-        return F.pad(numbers, (0, -len(numbers) % width)).view(-1, width)
+    def unpacked(cls, numbers: Tensor, places: int, moves: int) -> Self:
+        return cls(*numbers[: cls.size(places, moves)].split([places, places, 4, moves]))
 
     def after(self, z: Tensor, speaks: Tensor, expected: Tensor, moves: Tensor) -> Learned:
         """The sums after another query.

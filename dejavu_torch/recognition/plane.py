@@ -1,8 +1,4 @@
-"""The places of all queries of a flight over an area, each given all of them: a smoother in the plane.
-
-As along a route, but the states are the windows of an area and being off it, and moves are a kernel over rows
-and columns, which is learned from the queries as the rest is. A step over the border leaves the area.
-"""
+"""How a camera moves over an area from one query to the next, and masses of windows near each other."""
 
 from __future__ import annotations
 
@@ -14,90 +10,142 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dejavu_torch.area import Area
-from dejavu_torch.memory import check_room
-from dejavu_torch.recognition.evidence import RankTable, Spacing, Standardised, place_means, standardised
-from dejavu_torch.recognition.motion import logits
-from dejavu_torch.recognition.smoother import (
-    DRIVE,
-    MOVE_SHARE,
-    RADIUS,
-    ROUNDS,
-    PlaceSmoother,
-    Rows,
-    log_likelihood,
-    tempering_of,
-)
+from dejavu_torch.recognition.motion import MIN_PROBABILITY, Counts, Rates
 
-# of which the fit starts: among so many windows a right one has to stand out more than along a route
-SEPARATION, SPREAD = 3.0, 2.0  # standard deviations of scores; windows that a step goes in each direction
-FITTED = 300  # queries in a row, from the middle, that a smoother is fitted to
-BYTES = 70  # of memory for each query and window
-TINY = 1e-30
+SHARP = 2  # windows around a place whose mass an answer is chosen by
+KEPT, MOVES_GIVEN = (
+    0.95,
+    5.0,
+)  # of learned moves from one query to the next; queries that those given count as
 
 
-class Swept(NamedTuple):
-    """mass: (T,R,C), of windows. others: the same without a query's own evidence. moves: (2 V + 1, 2 V + 1),
-    expected steps. log: nats above being off the area throughout."""
+class Steps(NamedTuple):
+    """A step over an area, and its transpose, of the mass of windows (R,C) and that of being off it ().
 
-    mass: Tensor
-    others: Tensor
+    kernel: (2 V + 1, 2 V + 1), probabilities of a move by rows and columns, `jump` and `leave` taken off.
+    jump, leave, enter: see `Motion`; a move over the border leaves the area.
+    """
+
+    kernel: Tensor
+    jump: Tensor
+    leave: Tensor
+    enter: Tensor
+
+    def moved(self, on: Tensor, off: Tensor) -> tuple[Tensor, Tensor]:
+        """The belief before the next query."""
+        total = on.sum()
+        goes = F.conv2d(on[None, None], self.kernel.flip(0, 1)[None, None], padding=self.reach)[0, 0]
+        lost = self.kernel.sum() * total - goes.sum()
+        anywhere = (self.jump * total + self.enter * off) / on.numel()
+        return goes + anywhere, (1 - self.enter) * off + self.leave * total + lost
+
+    def expected(self, on: Tensor, off: Tensor) -> tuple[Tensor, Tensor]:
+        """What a message of the next query says of the state before."""
+        goes = F.conv2d(self._bordered(on, off), self.kernel[None, None])[0, 0]
+        anywhere = on.mean()
+        back = goes + self.jump * anywhere + self.leave * off
+        return back, self.enter * anywhere + (1 - self.enter) * off
+
+    def pairs(self, before: Tensor, on: Tensor, off: Tensor) -> Tensor:
+        """Of each move (2 V + 1, 2 V + 1), the weight of belief before (R,C) and message after it."""
+        weight: Tensor = self.kernel * F.conv2d(self._bordered(on, off), before[None, None])[0, 0]
+        return weight
+
+    @property
+    def reach(self) -> int:
+        """V."""
+        return len(self.kernel) // 2
+
+    def _bordered(self, on: Tensor, off: Tensor) -> Tensor:
+        """A message, with that of being off the area around it, (1, 1, R + 2 V, C + 2 V)."""
+        around = off.expand(tuple(side + 2 * self.reach for side in on.shape)).clone()
+        around[self.reach : self.reach + len(on), self.reach : self.reach + on.shape[1]] = on
+        return around[None, None]
+
+
+class Followed(NamedTuple):
+    """What a filter over an area learns on the way: the moves by rows and columns, of which the latest count
+    most, since a camera keeps its course. moves: (M,), M = (2 V + 1)^2, expected numbers of each."""
+
     moves: Tensor
-    log: float
+
+    @classmethod
+    def size(cls, places: int, moves: int) -> int:
+        """M, if windows up to V = `moves` - 1 rows or columns away are reached."""
+        return (2 * moves - 1) ** 2
+
+    @classmethod
+    def unpacked(cls, numbers: Tensor, places: int, moves: int) -> Followed:
+        return cls(numbers[: cls.size(places, moves)])
+
+    def after(self, z: Tensor, speaks: Tensor, expected: Tensor, moves: Tensor) -> Followed:
+        """The numbers after another query, see `Learned`."""
+        return Followed(KEPT * self.moves + moves)
+
+    def likelihood(self, sharpness: Tensor, off_map: Tensor) -> tuple[Tensor, Tensor]:
+        """Both as given."""
+        return sharpness, off_map
+
+    def moves_after(self, given: Tensor) -> Tensor:
+        """Probabilities of the moves (M,), from weights (V+1,) of windows 0 to V rows or columns away,
+        whichever are more."""
+        kernel = given[rings(len(given) - 1).to(given.device).flatten()]
+        moves = MOVES_GIVEN * kernel / kernel.sum() + self.moves
+        return moves / moves.sum()
 
 
-@torch.no_grad()
-def place_flight(smoother: PlaceSmoother, rows: Rows, queries: int, area: Area, spacing: Spacing) -> Tensor:
-    """The mass of each window of an area for each query of a flight, (Q,N); what is off the area is missing.
-    The smoother knows afterwards what was learned from the queries, and whether they are a flight over it.
+class PlaneMotion:
+    """`Motion` over an area, for a filter. Beliefs are (N+1,): the places, then being off the area.
 
     Args:
-        rows: scores (B,N) of queries by their numbers. queries: Q. spacing: `spacing_of` their descriptors.
-
-    Raises:
-        InputError: more queries and windows than fit into memory.
+        rates: with moves (M,) by rows and columns, see `Followed`.
     """
-    check_room(BYTES * queries * area.places, f"a drive of {queries} images over {area.places} windows")
-    scores = rows(torch.arange(queries)).float().cpu()
-    weight = spacing.weight.to(scores)
-    means = smoother.removed * place_means(scores, weight)
-    std, ranks = standardised(scores, means), RankTable()
-    ranks.add(std.z, std.only((weight * std.speaks)[:, None].expand_as(std.z), 0))
-    smoother.correlation, smoother.tempering = spacing.correlation, tempering_of(spacing)
-    reach, first = len(smoother.move_logits) - 1, max(0, (queries - FITTED) // 2)
-    part = slice(first, first + FITTED)
-    some, own = std.map(lambda column: column[part]), weight[part]
-    away = torch.arange(-reach, reach + 1).square()
-    prior = torch.exp(-(away[:, None] + away) / (2 * SPREAD**2))
-    kernel, prior = prior / prior.sum(), MOVE_SHARE * len(own) * prior / prior.sum()
-    separation, table = SEPARATION, ranks
-    for _ in range(ROUNDS):
-        values = table.values
-        swept = _sweep(smoother, area, some, own, spacing.still[part], values, separation, kernel)
-        others = _by_place(swept.others, area) * (own * some.speaks)[:, None]
-        known = some.only(RankTable.look_up(values, some.z), 0)
-        separation = max(1.0, float((others * known).sum() / others.sum().clamp(min=TINY)))
-        table = RankTable(ranks.counts)
-        near = _by_place(boxes(swept.mass, RADIUS).clamp(0, 1), area)
-        table.add(some.z, some.only(-near * (own * some.speaks)[:, None], 0))
-        kernel = swept.moves + prior
-        kernel = kernel / kernel.sum()
-    swept = _sweep(smoother, area, std, weight, spacing.still, table.values, separation, kernel)
-    smoother.separation, smoother.log_likelihood = separation, swept.log
-    smoother.is_drive = swept.log >= DRIVE
-    steps = torch.maximum(*torch.meshgrid(away.sqrt(), away.sqrt(), indexing="ij")).round().long()
-    moves = torch.zeros(reach + 1).index_add_(0, steps.flatten(), kernel.flatten())
-    smoother.move_logits.copy_(logits(*moves.tolist()))
-    return _by_place(swept.mass, area)
+
+    def __init__(self, area: Area, rates: Rates) -> None:
+        self.area, self.rates = area, rates
+        side = math.isqrt(len(rates.moves))
+        kernel = (1 - rates.jump - rates.leave) * rates.moves.view(side, side)
+        self.steps = Steps(kernel, rates.jump, rates.leave, rates.enter)
+
+    def moved(self, belief: Tensor) -> Tensor:
+        """The belief before the next query."""
+        return self._joined(*self.steps.moved(*self._split(belief)))
+
+    def expected(self, message: Tensor) -> Tensor:
+        """What a message of the next query says of the state before: the transpose of `moved`."""
+        return self._joined(*self.steps.expected(*self._split(message)))
+
+    def anywhere(self) -> Tensor:
+        """The belief before the first query, see `Motion.anywhere`."""
+        _, _, leave, enter = self.rates
+        off = (leave / (leave + enter).clamp(min=MIN_PROBABILITY)).clamp(max=0.5)
+        return torch.cat([((1 - off) / self.area.places).expand(self.area.places), off[None]])
+
+    def counts(self, before: Tensor, after: Tensor) -> Counts:
+        """Expected numbers of steps, see `Motion.counts`, of one step: (1,N+1)."""
+        (on, off), (later, absent) = self._split(before[0]), self._split(after[0])
+        _, jump, leave, enter = self.rates
+        total, mean = on.sum(), later.mean()
+        rest = [jump * total * mean, leave * total * absent, enter * off * mean, (1 - enter) * off * absent]
+        each = torch.cat([self.steps.pairs(on, later, absent).flatten(), torch.stack(rest)])
+        each = each / each.sum().clamp(min=MIN_PROBABILITY)
+        return Counts(each[:-4], *each[-4:])
+
+    def _split(self, state: Tensor) -> tuple[Tensor, Tensor]:
+        return as_plane(state[None, :-1], self.area)[0], state[-1]
+
+    def _joined(self, on: Tensor, off: Tensor) -> Tensor:
+        return torch.cat([by_place(on[None], self.area)[0], off[None]])
 
 
 def near_in_plane(mass: Tensor, radius: int, area: Area, weighted: bool = False) -> Tensor:
     """The mass of each window and those up to a radius in rows and columns, or `weighted` by a pyramid that
     is highest at the window, (Q,N) -> (Q,N)."""
-    plane = _as_plane(mass, area)
+    plane = as_plane(mass, area)
     if not weighted:
-        return _by_place(boxes(plane, radius), area).clamp(0, 1)
+        return by_place(boxes(plane, radius), area).clamp(0, 1)
     half = max(1, radius // 2)  # two boxes make a pyramid
-    return _by_place(boxes(boxes(plane, half), half) / (2 * half + 1) ** 2, area).clamp(0, 1)
+    return by_place(boxes(boxes(plane, half), half) / (2 * half + 1) ** 2, area).clamp(0, 1)
 
 
 def boxes(mass: Tensor, radius: int) -> Tensor:
@@ -107,65 +155,10 @@ def boxes(mass: Tensor, radius: int) -> Tensor:
     return sums
 
 
-def _sweep(
-    smoother: PlaceSmoother,
-    area: Area,
-    std: Standardised,
-    weight: Tensor,
-    still: Tensor,
-    values: Tensor,
-    separation: float,
-    kernel: Tensor,
-) -> Swept:
-    """Forward and backward over the queries."""
-    log = log_likelihood(values, std, weight, separation, smoother.tempering)
-    seen = _as_plane(log.exp(), area)
-    _, jump, leave = smoother.rate_logits.softmax(0)
-    enter, stays, count = smoother.enter_logit.sigmoid(), 1 - jump - leave, area.places
-    reach = len(kernel) // 2
-
-    def moved(belief: Tensor, by: Tensor) -> Tensor:
-        return F.conv2d(belief[None, None], by[None, None], padding=reach)[0, 0]
-
-    belief, off, total = seen.new_full(seen.shape[1:], 0.5 / count), seen.new_tensor(0.5), 0.0
-    before, after = torch.empty_like(seen), torch.empty_like(seen)  # beliefs without and with each query
-    outside = seen.new_zeros(len(seen), 2)
-    flipped = kernel.flip(0, 1)
-    for t, likely in enumerate(seen):
-        if t and not still[t]:
-            on = belief.sum()
-            goes = stays * moved(belief, flipped)
-            lost = stays * on - goes.sum()
-            belief = goes + (jump * on + enter * off) / count
-            off = (1 - enter) * off + leave * on + lost
-        before[t], outside[t, 0] = belief, off
-        belief = belief * likely
-        scale = belief.sum() + off
-        belief, off, total = belief / scale, off / scale, total + float(scale.log())
-        after[t], outside[t, 1] = belief, off
-    message, absent = torch.ones_like(belief), seen.new_tensor(1.0)
-    gone_over = leave + stays * (1 - moved(message, kernel))  # also over the border
-    steps = torch.zeros_like(kernel)
-    for t in reversed(range(len(seen))):
-        others, gone = before[t] * message, outside[t, 0] * absent
-        mass, away = after[t] * message, outside[t, 1] * absent
-        later = message * seen[t]
-        largest = torch.maximum(later.amax(), absent)
-        later, later_off = later / largest, absent / largest
-        if t and not still[t]:
-            # expected steps: of each window with a belief before to each that the later queries like
-            padded = F.pad(later, (reach,) * 4)[None, None]
-            pairs = F.conv2d(padded, after[t - 1][None, None])[0, 0]
-            anywhere = later.mean()
-            back = stays * moved(later, kernel) + jump * anywhere + gone_over * later_off
-            back_off = enter * anywhere + (1 - enter) * later_off
-            explained = (after[t - 1] * back).sum() + outside[t - 1, 1] * back_off
-            steps += stays * kernel * pairs / explained.clamp(min=TINY)
-            message, absent = back, back_off
-        else:
-            message, absent = later, later_off
-        before[t], after[t] = others / (others.sum() + gone), mass / (mass.sum() + away)
-    return Swept(after, before, steps, total if math.isfinite(total) else -math.inf)
+def rings(reach: int) -> Tensor:
+    """The larger of the rows and columns of each move, (2 V + 1, 2 V + 1) int64."""
+    away = torch.arange(-reach, reach + 1).abs()
+    return torch.maximum(away[:, None], away)
 
 
 def _rows_first(area: Area) -> Tensor:
@@ -174,11 +167,11 @@ def _rows_first(area: Area) -> Tensor:
     return area.place_at(cells.view(-1, 2))
 
 
-def _as_plane(values: Tensor, area: Area) -> Tensor:
+def as_plane(values: Tensor, area: Area) -> Tensor:
     """Values by place, (T,N) -> (T,R,C)."""
     return values[:, _rows_first(area)].view(len(values), area.rows, area.columns)
 
 
-def _by_place(values: Tensor, area: Area) -> Tensor:
+def by_place(values: Tensor, area: Area) -> Tensor:
     """Values of a plane by place, (T,R,C) -> (T,N)."""
     return values.flatten(1)[:, _rows_first(area).argsort()]

@@ -924,13 +924,13 @@ MUTANTS = [
     Mutant(
         "A smoother over an area moves as its kernel says, forward and backward.",
         "dejavu_torch/recognition/plane.py",
-        "flipped = kernel.flip(0, 1)",
-        "flipped = kernel",
+        "self.kernel.flip(0, 1)",
+        "self.kernel",
         ("tests/test_area.py::-k masses_of_the_model",),
     ),
     Mutant(
         "A flight is a flight over an area only if it explains its images.",
-        "dejavu_torch/recognition/plane.py",
+        "dejavu_torch/recognition/flight.py",
         "smoother.is_drive = swept.log >= DRIVE",
         "smoother.is_drive = True",
         ("tests/test_area.py::-k flight_is_found",),
