@@ -1,0 +1,91 @@
+"""TIFF files in parts, and their coordinates, by rasterio."""
+
+from __future__ import annotations
+
+import os
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from dejavu_torch.area import Ground
+from dejavu_torch.data.files import reading
+from dejavu_torch.data.folder import as_bytes
+from dejavu_torch.types import Facts, expect
+
+UNREAD, EXPECTED = "cannot be read as a TIFF", "a GeoTIFF of grey, RGB or more bands"
+DEGREES, WEB_MERCATOR = "EPSG:4326", 3857  # whose metres are longer than those of the ground
+BENT = 1.0  # metres, or pixels if these are larger, by which rows may differ from a straight line
+
+
+def has_rasterio() -> bool:
+    """Whether rasterio is installed."""
+    try:
+        import_module("rasterio")
+    except ImportError:
+        return False
+    return True
+
+
+class GeoTiff:
+    """The pixels of a TIFF file: `tiff(top, bottom, left, right)` are (C,h,w) uint8, black where none are.
+
+    Attributes:
+        shape: (C,H,W). ground: where they lie; None without coordinates. plain: whether its pixels are values
+            of grey or colours, not numbers of a palette or single bits.
+
+    Convention: the first three bands are colours; of fewer, the first is grey.
+
+    Raises:
+        InputError: no TIFF, or coordinates that no plane fits; while reading, values outside [0, 1].
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path, self._file, self._owner = path, None, 0
+        with reading(path, UNREAD, EXPECTED):
+            file = self._opened()
+            self.bands = [1, 2, 3] if file.count >= 3 else [1]
+            self.shape = len(self.bands), file.height, file.width
+            self.plain = file.colorinterp[0].name != "palette"
+            self.plain &= "NBITS" not in file.tags(1, ns="IMAGE_STRUCTURE")
+            self.ground = None if file.crs is None or file.transform.is_identity else _ground(path, file)
+
+    def __getstate__(self) -> Facts:
+        return self.__dict__ | {"_file": None}
+
+    def _opened(self) -> Any:
+        """The file, opened in each process."""
+        if self._file is None or self._owner != os.getpid():
+            rasterio = import_module("rasterio")
+            self._file, self._owner = rasterio.open(self.path.absolute(), driver="GTiff"), os.getpid()
+        return self._file
+
+    def __call__(self, top: int, bottom: int, left: int, right: int) -> Tensor:
+        with reading(self.path, UNREAD, EXPECTED):
+            part = {"window": ((top, bottom), (left, right))}
+            pixels = self._opened().read(self.bands, **part)
+            return as_bytes(self.path, np.where(self._opened().dataset_mask(**part) > 0, pixels, 0))
+
+
+def _ground(path: Path, file: Any) -> Ground:
+    """The coordinates of the file, if they are metres on the ground; else those of its zone of UTM."""
+    crs, corner, code = file.crs, file.transform, file.crs.to_epsg()
+    metres = crs.is_projected and crs.linear_units_factor[1] == 1 and code != WEB_MERCATOR
+    if metres:
+        frame = f"EPSG:{code}" if code else crs.to_wkt()
+        return Ground((corner.c, corner.f), (corner.a, corner.d), (corner.b, corner.e), "m", frame)
+    convert = import_module("rasterio.warp").transform
+    at = np.array([(x * file.width, y * file.height) for x in (0, 0.5, 1) for y in (0, 0.5, 1)])
+    points = np.array([corner * point for point in at.tolist()])
+    (longitude,), (latitude,) = convert(crs, DEGREES, *points[4:5].T.tolist())
+    zone = f"EPSG:{32601 + 100 * (latitude < 0) + int((longitude + 180) // 6) % 60}"
+    known = np.array(convert(crs, zone, *points.T.tolist())).T
+    known, origin = known - known[4], known[4]
+    fit = np.linalg.lstsq(np.column_stack([at, np.ones(len(at))]), known, rcond=None)[0]
+    bent = np.abs(np.column_stack([at, np.ones(len(at))]) @ fit - known).max()
+    seen = f"{path} has coordinates of {f'EPSG:{code}' if code else 'a system'} that bend by {bent:.3g} m"
+    expect(bent <= max(BENT, np.hypot(*fit[0])), f"metres, as by gdalwarp -t_srs {zone}", seen)
+    right, down, first = ((float(x), float(y)) for x, y in (*fit[:2], fit[2] + origin))
+    return Ground(first, right, down, "m", zone)
