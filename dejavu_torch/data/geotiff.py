@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,7 @@ from dejavu_torch.types import Facts, expect
 
 UNREAD, EXPECTED = "cannot be read as a TIFF", "a GeoTIFF of grey, RGB or more bands"
 DEGREES, WEB_MERCATOR = "EPSG:4326", 3857  # whose metres are longer than those of the ground
+CACHE = 2**28  # bytes of decoded blocks that GDAL keeps
 BENT = 1.0  # metres, or pixels if these are larger, by which rows may differ from a straight line
 
 
@@ -44,8 +47,7 @@ class GeoTiff:
 
     def __init__(self, path: Path) -> None:
         self.path, self._file, self._owner = path, None, 0
-        with reading(path, UNREAD, EXPECTED):
-            file = self._opened()
+        with self._opened() as file:
             self.bands = [1, 2, 3] if file.count >= 3 else [1]
             self.shape = len(self.bands), file.height, file.width
             self.plain = file.colorinterp[0].name != "palette"
@@ -55,18 +57,24 @@ class GeoTiff:
     def __getstate__(self) -> Facts:
         return self.__dict__ | {"_file": None}
 
-    def _opened(self) -> Any:
+    @contextmanager
+    def _opened(self) -> Iterator[Any]:
         """The file, opened in each process."""
-        if self._file is None or self._owner != os.getpid():
-            rasterio = import_module("rasterio")
-            self._file, self._owner = rasterio.open(self.path.absolute(), driver="GTiff"), os.getpid()
-        return self._file
+        rasterio = import_module("rasterio")
+        with reading(self.path, UNREAD, EXPECTED), rasterio.Env(GDAL_CACHEMAX=CACHE):
+            try:
+                if self._file is None or self._owner != os.getpid():
+                    self._file = rasterio.open(self.path.absolute(), driver="GTiff")
+                    self._owner = os.getpid()
+                yield self._file
+            except rasterio.errors.RasterioIOError as error:
+                raise (error.__cause__ or error) from None  # it says no more than that reading failed
 
     def __call__(self, top: int, bottom: int, left: int, right: int) -> Tensor:
-        with reading(self.path, UNREAD, EXPECTED):
-            part = {"window": ((top, bottom), (left, right))}
-            pixels = self._opened().read(self.bands, **part)
-            return as_bytes(self.path, np.where(self._opened().dataset_mask(**part) > 0, pixels, 0))
+        part = {"window": ((top, bottom), (left, right))}
+        with self._opened() as file:
+            seen = file.dataset_mask(**part) > 0
+            return as_bytes(self.path, np.where(seen, file.read(self.bands, **part), 0))
 
 
 def _ground(path: Path, file: Any) -> Ground:

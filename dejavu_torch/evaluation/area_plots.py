@@ -12,6 +12,7 @@ from dejavu_torch.evaluation.localization import Localization
 from dejavu_torch.motion.resampling import source_of
 from dejavu_torch.types import Facts
 
+LONG = 1e5
 LOWEST, HIGHEST = 0.3, 1.5  # height of a picture, relative to its width; axes of other areas are not equal
 
 
@@ -89,4 +90,5 @@ def _ground(run: Localization) -> plots.Plot:
     unit = "metres" if area.unit == "m" else "pixels"
     axis.set(xlim=(left, right), ylim=(bottom, top), aspect="equal" if shape == tall / wide else "auto")
     axis.set(xlabel=f"x ({unit})", ylabel=f"y ({unit})")
+    axis.locator_params(axis="x", nbins=4 if corners.amax() >= LONG else "auto")  # numbers of six digits
     return figure, axis
