@@ -7,13 +7,12 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
-from torch.nn.functional import grid_sample
+from torch.nn.functional import grid_sample, normalize
 
 from dejavu_torch.area import Ground
 from dejavu_torch.data.files import as_number, read_rows
 from dejavu_torch.data.grid import BYTES, PIXELS
 from dejavu_torch.data.picture import Pixels, read_picture
-from dejavu_torch.memory import without_autocast
 from dejavu_torch.text import printable
 from dejavu_torch.types import Coordinates, InputError, Traverse, expect
 
@@ -27,8 +26,9 @@ class Flight(Traverse):
     Args:
         picture: (C,H,W) uint8. points: (N,2) float64, the middles (x, y), in coordinates of `ground`.
         headings: (N,) float64, degrees clockwise from north that are up in a window; None leaves the windows
-            upright in the picture. North is up in a picture in pixels. window: side, pixels. name: for
-            messages. ground: where the picture lies. rows: of the points in a file, for messages.
+            upright in the picture. North is up where y grows downwards, as in
+            pixels. window: side, pixels. name: for messages. ground: where the picture lies. rows: of the
+            points in a file, for messages.
 
     Convention: between pixels values are interpolated, bilinear.
 
@@ -53,38 +53,25 @@ class Flight(Traverse):
         ground: Ground = PIXELS,
         rows: Sequence[str] = (),
     ) -> None:
-        height, width = picture.shape[1:]
         expect(window >= 1, "at least 1", f"{name}: window={window}")
-        expect(len(points), "at least one", f"{name}: there are no points")
         self.name, self.picture, points = name, picture, points.double()
         self.coordinates = Coordinates(points, frame=ground.frame)
-        pixel = torch.tensor([ground.right, ground.down], dtype=torch.float64).inverse()
-        self.middle = (points - points.new_tensor(ground.first)) @ pixel  # (column, row) from the corner
-        if headings is None:
-            up = points.new_tensor([0.0, -1.0]).expand(len(points), 2)
-        else:
-            x, y = headings.double().deg2rad().sin(), headings.double().deg2rad().cos()
-            up = torch.nn.functional.normalize(torch.stack([x, y if ground.unit == "m" else -y], 1) @ pixel)
-        self.axes = torch.stack([torch.stack([-up[:, 1], up[:, 0]], 1), -up], 1)  # (N,2,2): right, down
-        self.offsets = torch.arange(window, dtype=torch.float64) - (window - 1) / 2
-        ends = self._pixels(slice(None), self.offsets[[0, -1]])
-        inside = ((ends >= -SLACK) & (ends <= points.new_tensor([width - 1, height - 1]) + SLACK)).all(
-            (1, 2, 3)
-        )
-        if not inside.all():
-            i = int((~inside).nonzero()[0])
-            where = rows[i] if rows else f"point {i} of {name}"
-            x, y = points[i].tolist()
-            seen = f"{where}: the window of {window} pixels around x={x:.9g}, y={y:.9g}"
-            raise InputError(f"{seen} leaves the picture; expected it inside {width} x {height} pixels")
-
-    def _pixels(self, which: slice | int, offsets: Tensor) -> Tensor:
-        """The numbers (column, row) of the pixels of windows at offsets (k,) to both sides, (...,k,k,2)."""
-        right, down = self.axes[which].unbind(-2)
-        grid = (
-            offsets[:, None, None] * down[..., None, None, :] + offsets[:, None] * right[..., None, None, :]
-        )
-        return grid + self.middle[which][..., None, None, :] - 0.5
+        steps = points.new_tensor([ground.right, ground.down])
+        pixel = steps.inverse()
+        self.middle = (points - points.new_tensor(ground.first)) @ pixel - 0.5  # column and row
+        up = points.new_tensor([[0.0, -1.0]]).expand(len(points), 2)
+        if headings is not None:
+            angle, north = headings.double().deg2rad(), -steps.det().sign()  # y grows downwards in pixels
+            up = normalize(torch.stack([angle.sin(), north * angle.cos()], 1) @ pixel)
+        self.axes = torch.stack([-up[:, 1], up[:, 0], -up[:, 0], -up[:, 1]], 1).view(-1, 2, 2)  # right, down
+        line = torch.arange(window, dtype=torch.float64) - (window - 1) / 2
+        self.offsets = torch.stack(torch.meshgrid(line, line, indexing="xy"), -1)  # (window,window,2)
+        ends = self.offsets[[0, 0, -1, -1], [0, -1, 0, -1]] @ self.axes + self.middle[:, None]
+        self.last = torch.tensor(picture.shape[:0:-1]) - 1
+        for i in ((ends < -SLACK) | (ends > self.last + SLACK)).any(2).any(1).nonzero()[:1, 0].tolist():
+            where, (x, y) = rows[i] if rows else f"point {i} of {name}", points[i].tolist()
+            seen = f"{where}: the window of {window} pixels around x={x:.9g}, y={y:.9g} leaves the picture"
+            raise InputError(f"{seen}; expected it inside {picture.shape[2]} x {picture.shape[1]} pixels")
 
     def __len__(self) -> int:
         return len(self.middle)
@@ -92,19 +79,13 @@ class Flight(Traverse):
     def read(self, frames: range | list[int]) -> Tensor:
         return torch.stack([self._window(i) for i in frames])
 
-    @without_autocast
     def _window(self, i: int) -> Tensor:
-        at = self._pixels(i, self.offsets)
-        sides = torch.tensor(self.picture.shape[:0:-1])
+        at = self.offsets @ self.axes[i] + self.middle[i]
         first = at.amin((0, 1)).floor().long().clamp(min=0)
-        (left, top), (right, bottom) = (
-            first.tolist(),
-            (first.maximum(at.amax((0, 1)).ceil().long()) + 1).tolist(),
-        )
-        right, bottom = min(right, int(sides[0])), min(bottom, int(sides[1]))
+        stop = at.amax((0, 1)).ceil().long().minimum(self.last) + 1
+        (left, top), (right, bottom) = first.tolist(), stop.tolist()
         part = self.picture[:, top:bottom, left:right].float() / BYTES
-        size = torch.tensor([right - left, bottom - top])
-        at = (2 * (at - first) + 1) / size - 1
+        at = (2 * (at - first) + 1) / (stop - first) - 1
         return grid_sample(part[None], at[None].float(), padding_mode="border", align_corners=False)[0]
 
 

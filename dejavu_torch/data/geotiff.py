@@ -19,6 +19,7 @@ from dejavu_torch.types import Facts, expect
 
 UNREAD, EXPECTED = "cannot be read as a TIFF", "a GeoTIFF of grey, RGB or more bands"
 DEGREES, WEB_MERCATOR = "EPSG:4326", 3857  # whose metres are longer than those of the ground
+KIND = "IMAGE_STRUCTURE"
 CACHE = 2**28  # bytes of decoded blocks that GDAL keeps
 BENT = 1.0  # metres, or pixels if these are larger, by which rows may differ from a straight line
 
@@ -37,7 +38,7 @@ class GeoTiff:
 
     Attributes:
         shape: (C,H,W). ground: where they lie; None without coordinates. plain: whether its pixels are values
-            of grey or colours, not numbers of a palette or single bits.
+            of grey or colours, not single bits, or numbers of a palette.
 
     Convention: the first three bands are colours; of fewer, the first is grey.
 
@@ -50,8 +51,8 @@ class GeoTiff:
         with self._opened() as file:
             self.bands = [1, 2, 3] if file.count >= 3 else [1]
             self.shape = len(self.bands), file.height, file.width
-            self.plain = file.colorinterp[0].name != "palette"
-            self.plain &= "NBITS" not in file.tags(1, ns="IMAGE_STRUCTURE")
+            kind = {*file.tags(ns=KIND), *file.tags(1, ns=KIND), file.colorinterp[0].name}
+            self.plain = kind.isdisjoint({"NBITS", "MINISWHITE", "palette"})
             self.ground = None if file.crs is None or file.transform.is_identity else _ground(path, file)
 
     def __getstate__(self) -> Facts:
@@ -86,13 +87,13 @@ def _ground(path: Path, file: Any) -> Ground:
         return Ground((corner.c, corner.f), (corner.a, corner.d), (corner.b, corner.e), "m", frame)
     convert = import_module("rasterio.warp").transform
     at = np.array([(x * file.width, y * file.height) for x in (0, 0.5, 1) for y in (0, 0.5, 1)])
-    points = np.array([corner * point for point in at.tolist()])
+    points = at @ [[corner.a, corner.d], [corner.b, corner.e]] + [corner.c, corner.f]
     (longitude,), (latitude,) = convert(crs, DEGREES, *points[4:5].T.tolist())
     zone = f"EPSG:{32601 + 100 * (latitude < 0) + int((longitude + 180) // 6) % 60}"
     known = np.array(convert(crs, zone, *points.T.tolist())).T
-    known, origin = known - known[4], known[4]
-    fit = np.linalg.lstsq(np.column_stack([at, np.ones(len(at))]), known, rcond=None)[0]
-    bent = np.abs(np.column_stack([at, np.ones(len(at))]) @ fit - known).max()
+    known, origin, terms = known - known[4], known[4], np.column_stack([at, np.ones(len(at))])
+    fit = np.linalg.lstsq(terms, known, rcond=None)[0]
+    bent = np.abs(terms @ fit - known).max()
     seen = f"{path} has coordinates of {f'EPSG:{code}' if code else 'a system'} that bend by {bent:.3g} m"
     expect(bent <= max(BENT, np.hypot(*fit[0])), f"metres, as by gdalwarp -t_srs {zone}", seen)
     right, down, first = ((float(x), float(y)) for x, y in (*fit[:2], fit[2] + origin))

@@ -82,7 +82,7 @@ def _ground(run: Localization) -> plots.Plot:
     ends = torch.tensor([[row, column] for row in (0, area.rows - 1) for column in (0, area.columns - 1)])
     corners = area.coordinates(area.place_at(ends))
     (left, top), (right, bottom) = corners.amin(0).tolist(), corners.amax(0).tolist()
-    if area.unit == "m":  # north is up
+    if torch.tensor([area.right, area.down]).det() < 0:  # y grows upwards, as to the north
         top, bottom = bottom, top
     wide, tall = (max(1e-6, abs(side)) for side in (right - left, bottom - top))
     shape = min(HIGHEST, max(LOWEST, tall / wide))
