@@ -13,6 +13,30 @@ SIDE = 128  # windows of a tile to a side
 Tables = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 
 
+class Ground(NamedTuple):
+    """Where the pixels of a picture lie.
+
+    Args:
+        first: (x, y) of its upper left corner. right, down: (x, y) from a pixel to the next of its row, and
+            of its column. unit: of these, "px" or "m". frame: of the coordinates, see `Coordinates`.
+    """
+
+    first: tuple[float, float] = (0.0, 0.0)
+    right: tuple[float, float] = (1.0, 0.0)
+    down: tuple[float, float] = (0.0, 1.0)
+    unit: str = "px"
+    frame: str = "pixels"
+
+    def scaled(self, across: float, down: float) -> Ground:
+        """That of pixels so many times as large."""
+        (a, b), (c, d) = self.right, self.down
+        return self._replace(right=(a * across, b * across), down=(c * down, d * down))
+
+    def at(self, pixels: Tensor) -> Tensor:
+        """(x, y) of points (column, row) in pixels from the corner, (...,2) float64."""
+        return pixels @ pixels.new_tensor([self.right, self.down]) + pixels.new_tensor(self.first)
+
+
 class Area(NamedTuple):
     """Windows in rows and columns, as over a picture of the ground.
 

@@ -192,10 +192,12 @@ def as_range(numbers: list[int]) -> range | list[int]:
 
 class Coordinates(NamedTuple):
     """Where frames were taken: (N,2) or (N,3) float64 in metres, or latitude and longitude in degrees (N,2);
-    NaN where that is unknown."""
+    NaN where that is unknown. frame: what they count from, such as "EPSG:32632" of a map, or "pixels" of a
+    picture; only those of one frame are compared. "" is any."""
 
     values: Tensor
     degrees: bool = False
+    frame: str = ""
 
 
 @dataclass(frozen=True)

@@ -61,7 +61,7 @@ def run_learn(
     Args:
         sources: folder of images (9 before 10, or photos?order=lexicographic), video (clip.mp4?width=160),
             .npy of frames or features, .h5 of hloc's global descriptors, sim:NAME?seed=0&traverse=0, or
-            strip:IMAGE?width=96; several follow each other along one route
+            strip:IMAGE?width=96; several follow each other along one route. Of an area, grid:IMAGE?window=64
         map: map file to write (.safetensors)
         cluster: encode the chunks of a long route on Ray workers: auto starts one per processor, else the
             address of a cluster. They read the sources at the same paths

@@ -56,7 +56,8 @@ def coordinates_of(traverses: Sequence[Traverse], kind: Kind) -> list[Tensor]:
     are those that the traverses carry, for "metres" and "pixels", if one does, else those in names.
 
     Raises:
-        InputError: as `named_coordinates`; only some traverses that carry some, or of different kinds.
+        InputError: as `named_coordinates`; only some traverses that carry some, or of different kinds or
+            frames.
     """
     carried = [traverse.coordinates for traverse in traverses]
     if kind not in ("metres", "pixels") or not any(carried):
@@ -70,6 +71,9 @@ def coordinates_of(traverses: Sequence[Traverse], kind: Kind) -> list[Tensor]:
     expect(len({own.degrees for own in known}) < 2, "one kind", "coordinates in metres and in degrees")
     if known[0].degrees:
         return in_metres([own.values for own in known])
+    frames = {own.frame: one.name for own, one in zip(known, traverses, strict=True) if own.frame}
+    seen = " and ".join(f"coordinates of {name} in {frame}" for frame, name in frames.items())
+    expect(len(frames) < 2, "one system for both, as by gdalwarp -t_srs", seen)
     shared = min(own.values.shape[1] for own in known)
     return [own.values[:, :shared] for own in known]
 

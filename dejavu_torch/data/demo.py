@@ -29,16 +29,18 @@ def open_road(traverse: int = 0) -> SlidingWindow:
     return road
 
 
-def open_area(traverse: int = 0, window: int = 64, stride: int = 8) -> Grid:
+def open_area(
+    traverse: int = 0, window: int = 64, stride: int = 8, rows: str = "", columns: str = ""
+) -> Grid:
     """The same road as an area: windows in rows and columns over a flight's picture of 160 x 2792 pixels.
 
     Args:
         traverse: the flight, 0 or 1; a pixel of both shows the same ground to within three pixels.
-        window, stride: see `Grid`; pixels of 12.5 cm.
+        window, stride: see `Grid`; pixels of 12.5 cm. rows, columns: see `read_picture`.
     """
     expect(traverse in range(FLIGHTS), f"0 to {FLIGHTS - 1}", f"demo:area has traverse={traverse}")
-    area = read_grid(FOLDER / f"flight_{traverse}.jpg", window, stride)
-    area.name = f"demo:area?traverse={traverse}&window={window}&stride={stride}"
+    area = read_grid(FOLDER / f"flight_{traverse}.jpg", window, stride, 1, rows, columns)
+    area.name = f"demo:area?traverse={traverse}&{area.name.rpartition('?')[2]}"
     return area
 
 

@@ -277,16 +277,29 @@ def read_image(path: Path, least: int = 0) -> Tensor:
         plain = mode if wide else "L" if mode in ("1", "L", "LA") else "RGB"
         pixels = np.asarray(opened if mode == plain else opened.convert(plain))
     if wide:
-        image = torch.from_numpy(pixels.astype(np.float32))[None]
-        image.div_(65535 if mode.startswith("I") else 1)
-        low, high = image.aminmax()
-        slack = ROUNDING if mode.startswith("F") else 0
-        if not (low >= -slack and high <= 1 + slack):  # also True for NaN
-            raise InputError(f"{path} has values from {low:.4g} to {high:.4g} (1 is white); expected 0 to 1")
-        return image.clamp_(0, 1)
+        return _levels(path, pixels)[None]
     # transposing bytes, not floats, keeps the peak of memory low
     channels = np.array(pixels.reshape(*pixels.shape[:2], -1).transpose(2, 0, 1), order="C")
     return torch.from_numpy(channels).float().div_(255)
+
+
+def _levels(path: Path, pixels: np.ndarray) -> Tensor:
+    """Pixels of 16 bits, or floats already in [0, 1], as float32 in [0, 1]."""
+    floats = pixels.dtype.kind == "f"
+    image = torch.from_numpy(pixels.astype(np.float32)).div_(1 if floats else 65535)
+    low, high = image.aminmax()
+    slack = ROUNDING if floats else 0
+    if not (low >= -slack and high <= 1 + slack):  # also True for NaN
+        raise InputError(f"{path} has values from {low:.4g} to {high:.4g} (1 is white); expected 0 to 1")
+    return image.clamp_(0, 1)
+
+
+def as_bytes(path: Path, pixels: np.ndarray) -> Tensor:
+    """Pixels of 8 or 16 bits, or floats in [0, 1], as uint8 of the same shape; InputError for others."""
+    expect(pixels.dtype.kind in "uif", "8 or 16 bits, or floats", f"{path} has pixels of {pixels.dtype}")
+    if pixels.dtype == np.uint8:
+        return torch.from_numpy(np.array(pixels, order="C"))
+    return (_levels(path, pixels) * 255).round().byte()
 
 
 def natural(name: str) -> tuple[list[str | int], str]:

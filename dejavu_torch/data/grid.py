@@ -7,15 +7,13 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from dejavu_torch.area import Area
-from dejavu_torch.data.files import as_number
-from dejavu_torch.data.folder import read_image
-from dejavu_torch.memory import check_room
-from dejavu_torch.resize import resize_frames
+from dejavu_torch.area import Area, Ground
+from dejavu_torch.data.picture import Pixels, read_picture
 from dejavu_torch.text import printable
-from dejavu_torch.types import Coordinates, InputError, Traverse, expect
+from dejavu_torch.types import Coordinates, Traverse, expect
 
 BYTES = 255
+PIXELS = Ground()
 
 
 class Grid(Traverse):
@@ -24,9 +22,10 @@ class Grid(Traverse):
     Args:
         picture: (C,H,W) uint8. window: side of a window, pixels. stride: pixels from one to the next, in both
             directions. corner: (row, column) of the picture's first pixel in a larger one, whose pixels are
-            counted for coordinates. name: for messages.
+            counted for coordinates. name: for messages. ground: where the larger picture lies; by default
+            coordinates are pixels from its upper left corner.
 
-    Convention: coordinates are (x, y) of the middle of a window, in pixels from the upper left corner.
+    Convention: coordinates are (x, y) of the middle of a window.
 
     Raises:
         InputError: not (C,H,W) uint8, or windows that do not fit.
@@ -42,11 +41,12 @@ class Grid(Traverse):
 
     def __init__(
         self,
-        picture: Tensor,
+        picture: Pixels,
         window: int,
         stride: int,
         corner: tuple[int, int] = (0, 0),
         name: str = "the picture",
+        ground: Ground = PIXELS,
     ) -> None:
         seen = f"{name} is {tuple(picture.shape)} {picture.dtype}"
         expect(picture.ndim == 3 and picture.dtype == torch.uint8, "uint8 (C,H,W)", seen)
@@ -54,20 +54,22 @@ class Grid(Traverse):
         seen = f"{name} has {width} x {height} pixels, windows {window} and stride {stride}"
         expect(1 <= window <= min(height, width), f"windows of 1 to {min(height, width)} pixels", seen)
         expect(1 <= stride <= window, "a stride of 1 to the window's side, as others leave gaps", seen)
-        self.name = name
-        # (C,rows,columns,window,window), a view
-        self.windows = picture.unfold(1, window, stride).unfold(2, window, stride)
-        first = corner[1] + window / 2, corner[0] + window / 2
-        down, across = self.windows.shape[1:3]
-        self.area = Area(down, across, first, (float(stride), 0.0), (0.0, float(stride)))
-        self.coordinates = Coordinates(self.area.coordinates(torch.arange(self.area.places)))
+        self.name, self.picture, self.window, self.stride = name, picture, window, stride
+        middle = torch.tensor([corner[1] + window / 2, corner[0] + window / 2], dtype=torch.float64)
+        x, y = ground.at(middle).tolist()
+        steps = ground.scaled(stride, stride)
+        down, across = ((side - window) // stride + 1 for side in (height, width))
+        self.area = Area(down, across, (x, y), steps.right, steps.down, ground.unit)
+        every = self.area.coordinates(torch.arange(self.area.places))
+        self.coordinates = Coordinates(every, frame=ground.frame)
 
     def __len__(self) -> int:
         return self.area.places
 
     def read(self, frames: range | list[int]) -> Tensor:
-        row, column = self.area.cells(torch.as_tensor(frames)).unbind(1)
-        return self.windows[:, row, column].transpose(0, 1).float() / BYTES
+        corners = (self.area.cells(torch.as_tensor(frames)) * self.stride).tolist()
+        side = self.window
+        return torch.stack([self.picture[:, y : y + side, x : x + side] for y, x in corners]).float() / BYTES
 
 
 def read_grid(
@@ -76,33 +78,10 @@ def read_grid(
     """Windows of an image file.
 
     Args:
-        window, stride: pixels, after scaling. scale: of the picture's sides, 0.5 halves them.
-        rows, columns: "first:stop" of the pixels to keep after scaling; "" keeps all.
+        window, stride: pixels, after scaling. scale, rows, columns: see `read_picture`.
     """
-    name = printable(path)
-    picture = read_image(path)
-    if not 0 < scale <= 1:
-        raise InputError(f"{name}: scale is {scale:g}; expected a number above 0, and at most 1")
-    if scale < 1:
-        size = tuple(max(1, round(scale * side)) for side in picture.shape[1:])
-        check_room(4 * picture.numel(), f"{name} in {size[1]} x {size[0]} pixels")
-        picture = resize_frames(picture[None], (size[0], size[1]))[0].clamp(0, 1)
-    bounds = [
-        _bounds(name, which, text, picture.shape[axis])
-        for axis, (which, text) in enumerate((("rows", rows), ("columns", columns)), 1)
-    ]
-    (top, bottom), (left, right) = bounds
-    kept = (picture[:, top:bottom, left:right] * BYTES).round().byte()
+    picture, corner, ground = read_picture(path, scale, rows, columns)
     options = {"window": window, "stride": stride, "scale": f"{scale:g}", "rows": rows, "columns": columns}
     told = "&".join(f"{key}={value}" for key, value in options.items() if value not in ("", "1"))
-    return Grid(kept, window, stride, (top, left), f"{name}?{told}")  # of a run that resumes, too
-
-
-def _bounds(name: str, which: str, text: str, size: int) -> tuple[int, int]:
-    """The first pixel to keep and the first behind it."""
-    if not text:
-        return 0, size
-    first, stop = map(as_number, text.partition(":")[::2])
-    if first is None or stop is None or first % 1 or stop % 1 or not 0 <= first < stop <= size:
-        raise InputError(f"{name}: {which} {text}; expected first:stop inside 0:{size}")
-    return int(first), int(stop)
+    name = f"{printable(path)}?{told}"  # of a run that resumes, too
+    return Grid(picture, window, stride, corner, name, ground)

@@ -19,6 +19,7 @@ from dejavu_torch.data.arrays import ArrayTraverse, read_array
 from dejavu_torch.data.coordinates import read_coordinates
 from dejavu_torch.data.demo import DEMOS
 from dejavu_torch.data.files import as_number
+from dejavu_torch.data.flight import read_flight
 from dejavu_torch.data.folder import IMAGE_SUFFIXES, ImageFolder, natural, read_image
 from dejavu_torch.data.grid import read_grid
 from dejavu_torch.data.h5 import H5_SUFFIXES, DescriptorFile
@@ -38,13 +39,14 @@ CONVERTED = {  # kinds of files that other programs turn into images
 READERS: dict[str, Callable[..., Traverse]] = {".npy": read_array}  # by suffix
 READERS |= dict.fromkeys(VIDEO_SUFFIXES, Video) | dict.fromkeys(H5_SUFFIXES, DescriptorFile)
 PICTURES: dict[str, Callable[..., Traverse]] = {"strip:": read_strip, "grid:": read_grid}  # of one image
+PICTURES["path:"] = read_flight
 KINDS = {int: "integer", float: "floating-point number"}  # types of option values
 PART = {"start": 0, "stop": 0, "step": 1}  # options of every source, see `frame_range`
 EVERY = PART | {"coordinates": "", "crop": "", "mask": ""}
 EXPECTED = (
     "a folder of images or a video, such as clip.mp4?width=160, an .npy file of frames or features, an .h5 "
     "file of hloc, demo:road?traverse=0, sim:aerial?seed=0&traverse=0&frames=3072, sim:outdoor, "
-    "sim:underground, strip:IMAGE?width=96, or grid:IMAGE?window=64"
+    "sim:underground, strip:IMAGE?width=96, grid:IMAGE?window=64, or path:IMAGE?points=track.csv"
 )
 
 
@@ -75,10 +77,12 @@ def open_source(source: str | Path, size: tuple[int, int] | None = None) -> Trav
             also with `order=`; `demo:road?traverse=0` or 1, the flights of the demo, and `demo:area`;
             `sim:NAME?seed=0&traverse=0&frames=3072`, NAME being aerial, outdoor or underground; or
             `strip:IMAGE?width=96&rows=32:128&halve=1&grey=1`, a window sliding along one long image; or
-            `grid:IMAGE?window=64&stride=8&scale=.5`, windows over a picture of an area, see `Grid`. For all
-            sources, `start=`, `stop=` and `step=` select every step-th of the frames [start, stop), and
-            `coordinates=FILE` tells where they were taken, see `read_coordinates`. `mask=IMAGE` makes what is
-            black in an image black in all frames, then `crop=TOP,BOTTOM,LEFT,RIGHT` removes pixels.
+            `grid:IMAGE?window=64&stride=8&scale=.5`, windows over a picture of an area, see `Grid`; or
+            `path:IMAGE?points=track.csv&window=64&scale=.5`, windows along a path over it, see `read_flight`.
+            For all sources but areas, `start=`, `stop=` and `step=` select every step-th of the frames
+            [start, stop). `coordinates=FILE` tells where frames were taken, see `read_coordinates`.
+            `mask=IMAGE` makes what is black in an image black in all frames, then
+            `crop=TOP,BOTTOM,LEFT,RIGHT` removes pixels.
         size: (height, width) in pixels to resize images and videos to if the source sets neither.
 
     Raises:
@@ -134,8 +138,9 @@ def check_not_read(out: Path, *sources: str | Path | None) -> None:
     sources may be any text."""
     for source in filter(None, sources):
         address, query = _split(str(source))
-        path, read = Path(address.removeprefix("strip:").removeprefix("grid:")), False
-        beside = [Path(file) for name, file in parse_qsl(query) if name in ("coordinates", "mask")]
+        kind = next((kind for kind in PICTURES if address.startswith(kind)), "")
+        path, read = Path(address.removeprefix(kind)), False
+        beside = [Path(file) for name, file in parse_qsl(query) if name in ("coordinates", "mask", "points")]
         with suppress(OSError, ValueError, RuntimeError):  # missing, not a valid path, or a link to itself
             names = [path.with_suffix(".txt")] if path.suffix.lower() == ".npy" else []
             read = any(out.resolve() == file.resolve() for file in (path, *names, *beside)) or out.samefile(

@@ -24,6 +24,7 @@ log = logging.getLogger("dejavu_torch")
 
 
 KEPT = 2**27  # bytes of the frames that are kept of a traverse
+PARTS = "rows=first:stop, columns=first:stop"  # of the picture of an area
 KEPT_FRAMES = 10_000  # longer traverses are read in parts, and again
 
 
@@ -42,8 +43,8 @@ class Part(Traverse):
             for values in (traverse.times, traverse.places)
         )
         if traverse.coordinates is not None:
-            values, degrees = traverse.coordinates
-            self.coordinates = Coordinates(values[torch.as_tensor(frame)], degrees)
+            values = traverse.coordinates.values[torch.as_tensor(frame)]
+            self.coordinates = traverse.coordinates._replace(values=values)
         if isinstance(frame, range) and frame == range(len(traverse)):
             self.area = traverse.area
         if traverse.cut is not None and isinstance(frame, range):
@@ -80,17 +81,19 @@ def frame_range(traverse: Traverse, start: int = 0, stop: int = 0, step: int = 1
     """Every step-th of the frames [start, stop) of a traverse; a stop of 0 is its end.
 
     Raises:
-        InputError: start, stop or step out of range.
+        InputError: start, stop or step out of range, or an area.
 
     Example:
         >>> from dejavu_torch.data.arrays import ArrayTraverse
         >>> frame_range(ArrayTraverse(torch.arange(6.0)[:, None]), start=1, stop=6, step=2)[:].flatten()
         tensor([1., 3., 5.])
     """
+    asked = f"{traverse.name}: start={start}, stop={stop}, step={step}"
+    expect(traverse.area is None, f"{PARTS} or stride=..., as it is an area", asked)
     length = len(traverse)
     if start < 0 or step < 1 or not (stop == 0 or start < stop) or max(start + 1, stop) > length:
         expected = "a step of at least 1" if step < 1 else f"a part of its {length} frames"
-        raise InputError(f"{traverse.name}: start={start}, stop={stop}, step={step}; expected {expected}")
+        raise InputError(f"{asked}; expected {expected}")
     part = Part(traverse, range(start, stop or length, min(step, LARGEST)))
     part.name = f"{traverse.name}[{start}:{stop or ''}{f':{step}' if step > 1 else ''}]"
     return part
@@ -120,9 +123,9 @@ class Chain(Traverse):
             times = zip((traverse.times for traverse in self.traverses), unknown, strict=True)
             self.times = torch.cat([nan if known is None else known for known, nan in times])
         known = [traverse.coordinates for traverse in self.traverses if traverse.coordinates is not None]
-        kinds = {(one.degrees, one.values.shape[1]) for one in known}
+        kinds = {(one[1:], one.values.shape[1]) for one in known}
         if len(known) == len(self.traverses) and len(kinds) == 1:
-            self.coordinates = Coordinates(torch.cat([one.values for one in known]), known[0].degrees)
+            self.coordinates = Coordinates(torch.cat([one.values for one in known]), *known[0][1:])
 
     def __len__(self) -> int:
         return self.starts[-1]
@@ -164,7 +167,7 @@ class Cropped(Part):
         crop: (top, bottom, left, right), pixels to remove. mask: (1,H,W), 0 hides; resized to the frames.
 
     Raises:
-        InputError: no frames, or nothing left of them.
+        InputError: no frames, nothing left of them, or a crop of an area.
     """
 
     def __init__(
@@ -175,6 +178,7 @@ class Cropped(Part):
         fits = len(shape) == 3 and min(crop) >= 0 and top + bottom < shape[1] and left + right < shape[2]
         seen = f"{traverse.name}: crop={','.join(map(str, crop))} of {' x '.join(map(str, shape))}"
         expect(fits, "frames, of which some pixels are left", seen)
+        expect(traverse.area is None or not any(crop), f"{PARTS} and window=..., as it is an area", seen)
         self.box = slice(top, shape[1] - bottom), slice(left, shape[2] - right)
         size = shape[1], shape[2]
         self.mask = None if mask is None else (resize_frames(mask[None], size) >= 0.5).float()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from matplotlib.transforms import Affine2D
 
 from dejavu_torch.data.ground_truth import scored_and_right
 from dejavu_torch.evaluation import plots
@@ -11,6 +12,7 @@ from dejavu_torch.evaluation.localization import Localization
 from dejavu_torch.motion.resampling import source_of
 from dejavu_torch.types import Facts
 
+LONG = 1e5
 LOWEST, HIGHEST = 0.3, 1.5  # height of a picture, relative to its width; axes of other areas are not equal
 
 
@@ -58,10 +60,8 @@ def draw_heat(run: Localization) -> plots.Pictures:
     plane = scores.new_full((area.rows, area.columns), torch.nan)
     plane[cells[:, 0], cells[:, 1]] = scores.masked_fill(scores.isinf(), torch.nan)
     figure, axis = _ground(run)
-    (left, top), (right, bottom) = area.coordinates(torch.tensor([0, area.places - 1])).tolist()
-    image = axis.imshow(
-        plane.numpy(), cmap="gray", extent=(left, right, bottom, top), aspect=axis.get_aspect()
-    )
+    placed = Affine2D.from_values(*area.right, *area.down, *area.first) + axis.transData
+    image = axis.imshow(plane.numpy(), cmap="gray", aspect=axis.get_aspect(), transform=placed)
     plots.colour_bar(figure, image, axis, "score", shrink=0.8)
     index = int(run.scored.index[query])
     style: Facts = {"markerfacecolor": "none", "markersize": 9, "linestyle": "none"}
@@ -79,12 +79,16 @@ def _ground(run: Localization) -> plots.Plot:
     """Axes with the sides of the area."""
     area = run.model.map.area
     assert area is not None
-    corners = area.coordinates(torch.tensor([0, area.places - 1]))
-    (left, top), (right, bottom) = corners.tolist()
+    ends = torch.tensor([[row, column] for row in (0, area.rows - 1) for column in (0, area.columns - 1)])
+    corners = area.coordinates(area.place_at(ends))
+    (left, top), (right, bottom) = corners.amin(0).tolist(), corners.amax(0).tolist()
+    if torch.tensor([area.right, area.down]).det() < 0:  # y grows upwards, as to the north
+        top, bottom = bottom, top
     wide, tall = (max(1e-6, abs(side)) for side in (right - left, bottom - top))
     shape = min(HIGHEST, max(LOWEST, tall / wide))
     figure, axis = plots.canvas(plots.WIDTH * shape + 6 * plots.LINE)
     unit = "metres" if area.unit == "m" else "pixels"
     axis.set(xlim=(left, right), ylim=(bottom, top), aspect="equal" if shape == tall / wide else "auto")
     axis.set(xlabel=f"x ({unit})", ylabel=f"y ({unit})")
+    axis.locator_params(axis="x", nbins=4 if corners.amax() >= LONG else "auto")  # numbers of six digits
     return figure, axis

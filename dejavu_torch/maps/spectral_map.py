@@ -591,7 +591,8 @@ class SpectralMap(PlaceMap):
         route["chunks"] = sum(tensor.nbytes for name, tensor in packed.items() if name not in names)
         covered = int(((self.norms > 0) & self.norms.isfinite()).sum())
         fixed = {"stage": stage} if stage else {}
-        return MapSummary(self.kind, self.places, covered, 0, 0, tuple(chunks), route, fixed, len(self.level))
+        lines, area = len(self.level), None if self.area is None else self.area[:2]
+        return MapSummary(self.kind, self.places, covered, 0, 0, tuple(chunks), route, fixed, lines, area)
 
     def _periods(self, chunk: int) -> tuple[Fraction, ...]:
         """The periods of the strongest lines, sorted, with the cosine and sine of each frequency together; in

@@ -33,7 +33,9 @@ class ChunkSummary(NamedTuple):
     def __str__(self) -> str:
         where, count = f"places {self.start}-{self.stop - 1}", len(self.periods)
         if not self.features:
-            return f"{where}: strongest periods {', '.join(map(_number, self.periods)) or 'none'}"
+            return (
+                f"{where}: strongest periods {', '.join(dict.fromkeys(map(_number, self.periods))) or 'none'}"
+            )
         largest = sorted(range(count), key=lambda j: -self.features[j])[:LAYERS_SHOWN]
         shown = (f"{_number(self.periods[j])} ({self.features[j]} features)" for j in sorted(largest))
         line = f"{where}: {count} layer{'s' * (count > 1)}, periods {', '.join(shown)}"
@@ -51,6 +53,7 @@ class MapSummary:
     Attributes:
         covered: places that at least one layer covers, or with a descriptor. templates: sum of phases.
         template_numbers: sum of phases x features. lines: of a spectral map.
+        area: rows and columns of an area, else None.
         route: bytes by part that grow with the route, such as the templates.
         fixed: other bytes by part, such as the backbone; only the names among them grow with the route.
     """
@@ -64,6 +67,7 @@ class MapSummary:
     route: Mapping[str, int]
     fixed: Mapping[str, int]
     lines: int = 0
+    area: tuple[int, int] | None = None
 
     @property
     def fixed_bytes(self) -> int:
@@ -103,6 +107,8 @@ class MapSummary:
         if self.fixed:
             names = ", with the names of its frames" * ("names" in self.fixed)
             size += f", and {self.fixed_bytes} fixed{names} ({_parts(self.fixed)})"
+        if self.area:
+            lines.insert(0, f"an area of {self.area[0]} x {self.area[1]} windows")
         return "\n".join([*lines, f"{self.covered} of {self.places} places covered; {content}", size])
 
 

@@ -78,6 +78,7 @@ def resampled(
     `step`, that of a map for its queries, a single frame and features are returned unchanged too."""
     if odometry is None or isinstance(traverse, ResampledTraverse):
         return traverse
+    expect(traverse.area is None, "a route, or no --velocity", f"{traverse.name} is an area")
     if step is not None and (len(traverse) == 1 or len(traverse.frame_shape) == 1):
         return traverse
     return ResampledTraverse(traverse, odometry, batch_size, step, progress)

@@ -1,0 +1,190 @@
+"""Pictures of the ground, read and reduced in parts."""
+
+from __future__ import annotations
+
+import copy
+import logging
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+import torch
+from PIL import Image, ImageOps
+from torch import Tensor
+
+from dejavu_torch.area import Ground
+from dejavu_torch.data.files import as_number, reading
+from dejavu_torch.data.folder import as_bytes, formats
+from dejavu_torch.data.geotiff import GeoTiff, has_rasterio
+from dejavu_torch.memory import check_room, without_autocast
+from dejavu_torch.text import printable
+from dejavu_torch.types import Facts, InputError
+
+log = logging.getLogger("dejavu_torch")
+
+BLOCK, HELD = 512, 2**27  # pixels of the file to a side that are read together; bytes of them that are kept
+BYTES_PER_PIXEL = 8.0  # peak while a picture is decoded whole
+TIFF, GEOREFERENCED = {".tif", ".tiff"}, {33550, 34264}  # tags: the size of a pixel, and a matrix
+
+
+class Picture:
+    """A picture that is read where it is indexed, `picture[:, 10:74, 20:84]`, as a tensor (C,H,W) uint8 is.
+
+    Args:
+        shape: (C,H,W) of the file. read: (top, bottom, left, right) -> its pixels (C,h,w) uint8. scale: of
+            its sides, at most 1.
+
+    Convention: reduced as by `resize_frames`, equally whichever part is read. About `BLOCK`^2 pixels of the
+        file are read together; the last ones are kept.
+    """
+
+    ndim, dtype = 3, torch.uint8
+
+    def __init__(
+        self, shape: tuple[int, int, int], read: Callable[[int, int, int, int], Tensor], scale: float = 1.0
+    ) -> None:
+        self.size = shape[1:]
+        self.full = [max(1, round(scale * side)) for side in self.size]
+        self.factor = [one / other for one, other in zip(self.size, self.full, strict=True)]
+        self.shape, self.corner = torch.Size((shape[0], *self.full)), (0, 0)
+        self.side, self.read = max(8, round(BLOCK * scale)), read
+        self._blocks: dict[tuple[int, int], Tensor] = {}
+
+    def __getstate__(self) -> Facts:
+        return self.__dict__ | {"_blocks": {}}
+
+    def part(self, top: int, bottom: int, left: int, right: int) -> Picture:
+        """The pixels of some rows and columns."""
+        other = copy.copy(self)
+        other.corner = self.corner[0] + top, self.corner[1] + left
+        other.shape = torch.Size((self.shape[0], bottom - top, right - left))
+        return other
+
+    def __getitem__(self, index: tuple[slice, slice, slice]) -> Tensor:
+        (top, bottom), (left, right) = (
+            (first + one.start, first + one.stop) for first, one in zip(self.corner, index[1:], strict=True)
+        )
+        out = torch.empty(self.shape[0], bottom - top, right - left, dtype=torch.uint8)
+        for y in range(top - top % self.side, bottom, self.side):
+            for x in range(left - left % self.side, right, self.side):
+                a, b, c, d = max(top, y), min(bottom, y + self.side), max(left, x), min(right, x + self.side)
+                block = self._block(y, x)[:, a - y : b - y, c - x : d - x]
+                out[:, a - top : b - top, c - left : d - left] = block
+        return out
+
+    def _block(self, y: int, x: int) -> Tensor:
+        block = self._blocks.pop((y, x), None)
+        if block is None:
+            (rows, down), (columns, across) = (
+                _means(first, min(first + self.side, full), factor, size)
+                for first, full, factor, size in zip((y, x), self.full, self.factor, self.size, strict=True)
+            )
+            block = self.read(rows.start, rows.stop, columns.start, columns.stop)
+            if self.factor != [1, 1]:
+                block = _reduced(down, block, across)
+            while len(self._blocks) * block.numel() > HELD:
+                del self._blocks[next(iter(self._blocks))]
+        self._blocks[y, x] = block  # the last to go
+        return block
+
+
+def _means(first: int, stop: int, factor: float, size: int) -> tuple[range, Tensor]:
+    """The pixels of a line of `size` whose means the reduced ones [first, stop) are, and their weights (n,m):
+    a triangle over `factor` pixels to both sides."""
+    centre = ((torch.arange(first, stop, dtype=torch.float64) + 0.5) * factor)[:, None]
+    begin, end = int(centre[0] - factor + 0.5), math.ceil(centre[-1] + factor - 0.5)
+    pixels = range(max(0, begin), min(size, end))
+    weight = (1 - (torch.tensor(pixels) + 0.5 - centre).abs() / factor).clamp(min=0)
+    return pixels, (weight / weight.sum(1, keepdim=True)).float()
+
+
+@without_autocast
+def _reduced(down: Tensor, pixels: Tensor, across: Tensor) -> Tensor:
+    return (down @ pixels.float() @ across.T).round().byte()
+
+
+Pixels: TypeAlias = Tensor | Picture  # (C,H,W) uint8
+
+
+def read_picture(
+    path: Path, scale: float = 1.0, rows: str = "", columns: str = ""
+) -> tuple[Pixels, tuple[int, int], Ground]:
+    """The pixels of an image file, the first one's row and column, and where the whole picture lies.
+
+    A TIFF is read in parts if rasterio is installed, others at once. What is transparent is black.
+
+    Args:
+        scale: of the sides. rows, columns: "first:stop" of the pixels to keep after scaling; "" keeps all.
+
+    Raises:
+        InputError: no image, one that does not fit in memory, or options out of range; values outside [0, 1],
+            of parts when they are read.
+    """
+    name = printable(path)
+    if not 0 < scale <= 1:
+        raise InputError(f"{name}: scale is {scale:g}; expected a number above 0, and at most 1")
+    tiff = GeoTiff(path) if path.suffix.lower() in TIFF and has_rasterio() else None
+    in_parts = tiff is not None and tiff.plain
+    picture = (
+        Picture(tiff.shape, tiff, scale) if tiff is not None and in_parts else _decoded(path, scale, tiff)
+    )
+    bounds = (
+        _bounds(name, *one) for one in zip(("rows", "columns"), (rows, columns), picture.full, strict=True)
+    )
+    (top, bottom), (left, right) = bounds
+    part = picture.part(top, bottom, left, right)
+    pixels = part if in_parts else part[:, 0 : bottom - top, 0 : right - left]
+    ground = Ground() if tiff is None or tiff.ground is None else tiff.ground.scaled(*picture.factor[::-1])
+    return pixels, (top, left), ground
+
+
+def _decoded(path: Path, scale: float, tiff: GeoTiff | None) -> Picture:
+    """An image file that Pillow decodes whole."""
+    unread, expected = "cannot be read as an image", "an image such as .png or .jpg"
+    with reading(path, unread, expected), _any_size(), Image.open(path, formats=formats()) as image:
+        width, height = image.size
+        check_room(BYTES_PER_PIXEL * width * height, f"{path} of {width} x {height} pixels")
+        if tiff is None and not GEOREFERENCED.isdisjoint(getattr(image, "tag_v2", ())):
+            _warn_pixels(printable(path))
+        ImageOps.exif_transpose(image, in_place=True)
+        image.load()
+    wide, alpha = image.mode.startswith(("I", "F")), image.has_transparency_data
+    plain = image.mode if wide else "L" if image.mode in ("1", "L", "LA") else "RGB"
+
+    def read(top: int, bottom: int, left: int, right: int) -> Tensor:
+        part = image.crop((left, top, right, bottom))
+        pixels = np.atleast_3d(part if wide else part.convert(plain))
+        if alpha and not wide:
+            pixels = pixels * (np.asarray(part.convert("RGBA"))[..., 3:] > 0)
+        return as_bytes(path, pixels.transpose(2, 0, 1))
+
+    return Picture((3 if plain == "RGB" else 1, image.height, image.width), read, scale)
+
+
+@contextmanager
+def _any_size() -> Iterator[None]:
+    """In the block images may have any number of pixels: they are refused by their bytes."""
+    limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+    try:
+        yield
+    finally:
+        Image.MAX_IMAGE_PIXELS = limit
+
+
+@cache  # a command may open a source several times
+def _warn_pixels(name: str) -> None:
+    log.warning("%s: coordinates are in pixels; pip install 'dejavu_torch[geo]' reads its metres", name)
+
+
+def _bounds(name: str, which: str, text: str, size: int) -> tuple[int, int]:
+    """The first pixel to keep and the first behind it."""
+    if not text:
+        return 0, size
+    first, stop = map(as_number, text.partition(":")[::2])
+    if first is None or stop is None or first % 1 or stop % 1 or not 0 <= first < stop <= size:
+        raise InputError(f"{name}: {which} {text}; expected first:stop inside 0:{size}")
+    return int(first), int(stop)
