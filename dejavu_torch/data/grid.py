@@ -24,9 +24,10 @@ class Grid(Traverse):
     Args:
         picture: (C,H,W) uint8. window: side of a window, pixels. stride: pixels from one to the next, in both
             directions. corner: (row, column) of the picture's first pixel in a larger one, whose pixels are
-            counted for coordinates. name: for messages.
+            counted for coordinates. name: for messages. scale, unit: the side of a pixel, as 0.25 and "m".
 
-    Convention: coordinates are (x, y) of the middle of a window, in pixels from the upper left corner.
+    Convention: coordinates are (x, y) of the middle of a window from the upper left corner, in pixels or the
+        unit.
 
     Raises:
         InputError: not (C,H,W) uint8, or windows that do not fit.
@@ -47,6 +48,8 @@ class Grid(Traverse):
         stride: int,
         corner: tuple[int, int] = (0, 0),
         name: str = "the picture",
+        scale: float = 1.0,
+        unit: str = "px",
     ) -> None:
         seen = f"{name} is {tuple(picture.shape)} {picture.dtype}"
         expect(picture.ndim == 3 and picture.dtype == torch.uint8, "uint8 (C,H,W)", seen)
@@ -57,9 +60,9 @@ class Grid(Traverse):
         self.name = name
         # (C,rows,columns,window,window), a view
         self.windows = picture.unfold(1, window, stride).unfold(2, window, stride)
-        first = corner[1] + window / 2, corner[0] + window / 2
+        x, y, step = (scale * at for at in (corner[1] + window / 2, corner[0] + window / 2, stride))
         down, across = self.windows.shape[1:3]
-        self.area = Area(down, across, first, (float(stride), 0.0), (0.0, float(stride)))
+        self.area = Area(down, across, (x, y), (step, 0.0), (0.0, step), unit)
         self.coordinates = Coordinates(self.area.coordinates(torch.arange(self.area.places)))
 
     def __len__(self) -> int:
