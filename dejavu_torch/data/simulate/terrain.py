@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import NamedTuple
 
 import torch
@@ -39,9 +39,9 @@ LEAST, MOST = 32, 2048  # metres
 ROOM = 40.0  # bytes per pixel while it is painted
 VERGE = 7.0  # pixels of grass beside a road
 DASH = 48.0  # pixels from a lane dash to the next
-SAME = 0.94  # of the fine grain, what all flights share
+SAME = 0.955  # of the fine grain, what all flights share
 BEND = 0.7  # pixels, standard deviation of the error of registration, which is at most three times as much
-NOISE = 0.025  # of the sensor; white is 1
+NOISE = 0.02  # of the sensor; white is 1
 STRIP = 256  # rows that are photographed together
 BLOCKS = ("farm", "farm", "farm", "farm", "village", "village", "wood", "yard")
 PARCELS = ("crop", "crop", "crop", "crop", "meadow", "orchard")
@@ -187,7 +187,7 @@ class Ground:
     def village(self, block: Block, box: Box, turn: float) -> None:
         """A row of equal houses along the upper and the lower road, and their gardens."""
         self.cover(block, box, self.season.grass, 1.12, 0.1)
-        r, wide = self.random, box[2] - box[0]
+        r = self.random
         for road, side in ((block.top, 1), (block.bottom, -1)):
             roof, length, width = r.pick(ROOFS), r.uniform(40, 54), r.uniform(32, 42)
             pitch, back, x = length + r.uniform(28, 48), r.uniform(24, 40), box[0] + r.uniform(40, 70)
@@ -197,7 +197,7 @@ class Ground:
                 if float(block.edge(torch.tensor(x), torch.tensor(y))) < -18:
                     self.tall.append(partial(self.house, x, y, turn, roof, length, width))
                 x += pitch
-        self.scatter(block, box, int(wide / 8), 4, 10)
+        self.scatter(block, box, int((box[2] - box[0]) / 8), 4, 10)
 
     def lot(self, x: float, y: float, turn: float, side: int, pitch: float, deep: float) -> None:
         """A garden with a hedge, a drive, beds and sheds, on a side of a road."""
@@ -229,14 +229,12 @@ class Ground:
             bays = self.canvas.near(x, line, wide)
             marks = (torch.remainder(bays.x, 11) - 5.5).abs() - 0.5
             bays.fill(torch.maximum(marks, bays.box(0, 0, 0.6 * wide, 40)), WHITE, alpha=0.7)
-            for bay in range(round(-0.3 * wide / 11) + 1, round(0.3 * wide / 11)):
-                for lane in (-10, 10):
-                    if self.later.uniform(0, 1) < 0.6:
-                        self.car(self.canvas, x + 11 * bay, line + lane, math.pi / 2, 1)
+            for bay, lane in product(range(round(-0.3 * wide / 11) + 1, round(0.3 * wide / 11)), (-10, 10)):
+                if self.later.uniform(0, 1) < 0.6:
+                    self.car(self.canvas, x + 11 * bay, line + lane, math.pi / 2, 1)
 
     def car(self, canvas: Canvas, x: float, y: float, turn: float, heading: int, lorry: bool = False) -> None:
-        paint = partial(paint_car, lit(canvas, turn), self.later, x, y, heading, lorry, turn)
-        self.tall.append(paint)
+        self.tall.append(partial(paint_car, lit(canvas, turn), self.later, x, y, heading, lorry, turn))
 
     def road(self, canvas: Canvas, road: Road, others: list[Road]) -> None:
         """A road from left to right of a canvas, whose markings end at those it crosses, and its traffic."""
@@ -299,13 +297,12 @@ def paint_ground(seed: int, traverse: int, metres: int) -> Tensor:
     canvas.pixels.mul_(1 + 0.12 * grain)
     ground, across, down = Ground(canvas, season, random, later), roads(random, side), roads(random, side)
     kinds: list[str] = []
-    for top, bottom in pairwise(across):
-        for left, right in pairwise(down):
-            if not kinds:  # every kind, in any order
-                kinds = [BLOCKS[i] for i in torch.randperm(len(BLOCKS), generator=random.generator)]
-            block, box = Block(top, bottom, left, right), (left.at, top.at, right.at, bottom.at)
-            getattr(ground, kinds.pop())(block, box, random.uniform(-0.3, 0.3))
-    canvas.pixels.mul_(1 + 0.15 * random.texture(side, side, 64.0).clamp(-2, 2))
+    for (top, bottom), (left, right) in product(pairwise(across), pairwise(down)):
+        if not kinds:  # every kind, in any order
+            kinds = [BLOCKS[i] for i in torch.randperm(len(BLOCKS), generator=random.generator)]
+        block, box = Block(top, bottom, left, right), (left.at, top.at, right.at, bottom.at)
+        getattr(ground, kinds.pop())(block, box, random.uniform(-0.3, 0.3))
+    canvas.pixels.mul_(1 + 0.18 * random.texture(side, side, 64.0).clamp(-2, 2))
     turned = Canvas(canvas.pixels.transpose(1, 2), grain.T, x, x[:, None], 1, sun[::-1])
     for surface, own, others in ((canvas, across, down), (turned, down, across)):
         for road in own:
