@@ -23,7 +23,7 @@ from dejavu_torch.data.flight import read_flight
 from dejavu_torch.data.folder import IMAGE_SUFFIXES, ImageFolder, natural, read_image
 from dejavu_torch.data.grid import read_grid
 from dejavu_torch.data.h5 import H5_SUFFIXES, DescriptorFile
-from dejavu_torch.data.simulate import SIMULATORS
+from dejavu_torch.data.simulate import SIMULATED
 from dejavu_torch.data.strip import read_strip
 from dejavu_torch.data.traverse import Cropped, Frames, frame_range
 from dejavu_torch.data.video import VIDEO_SUFFIXES, Video
@@ -46,7 +46,8 @@ EVERY = PART | {"coordinates": "", "crop": "", "mask": ""}
 EXPECTED = (
     "a folder of images or a video, such as clip.mp4?width=160, an .npy file of frames or features, an .h5 "
     "file of hloc, demo:road?traverse=0, sim:aerial?seed=0&traverse=0&frames=3072, sim:outdoor, "
-    "sim:underground, strip:IMAGE?width=96, grid:IMAGE?window=64, or path:IMAGE?points=track.csv"
+    "sim:underground, sim:terrain?metres=256, strip:IMAGE?width=96, grid:IMAGE?window=64, or "
+    "path:IMAGE?points=track.csv"
 )
 
 
@@ -75,7 +76,8 @@ def open_source(source: str | Path, size: tuple[int, int] | None = None) -> Trav
             height; an `.npy` file of frames (N,H,W) or (N,H,W,3) uint8, or of features (N,D) float, with the
             names of their images in a `.txt` file next to it; an `.h5` file of hloc's global descriptors,
             also with `order=`; `demo:road?traverse=0` or 1, the flights of the demo, and `demo:area`;
-            `sim:NAME?seed=0&traverse=0&frames=3072`, NAME being aerial, outdoor or underground; or
+            `sim:NAME?seed=0&traverse=0&frames=3072`, NAME being aerial, outdoor or underground;
+            `sim:terrain?seed=0&traverse=0&metres=256&window=64&stride=4`, an area of simulated ground;
             `strip:IMAGE?width=96&rows=32:128&halve=1&grey=1`, a window sliding along one long image; or
             `grid:IMAGE?window=64&stride=8&scale=.5`, windows over a picture of an area, see `Grid`; or
             `path:IMAGE?points=track.csv&window=64&scale=.5`, windows along a path over it, see `read_flight`.
@@ -163,8 +165,8 @@ def _reader(text: str, address: str) -> Callable[..., Traverse]:
     """The function that opens an address with the options as arguments."""
     kind, colon, name = address.partition(":")
     if kind + colon == "sim:":
-        expect(name in SIMULATORS, ", ".join(sorted(SIMULATORS)), f"there is no simulator {name!r}")
-        return SIMULATORS[name]
+        expect(name in SIMULATED, ", ".join(sorted(SIMULATED)), f"there is no simulator {name!r}")
+        return SIMULATED[name]
     if kind + colon == "demo:":
         expect(name in DEMOS, ", ".join(DEMOS), f"there is no demo {name!r}")
         return DEMOS[name]

@@ -322,6 +322,7 @@ in/frames.npy?start=1&stop=9&step=2 in/features.npy in/photos?width=8&height=6 i
 in/clip.mp4?width=8&stop=5 strip:in/strip.png?width=8&rows=2:12&halve=1&grey=1 in/a_file in/empty in/strip.png
 sim:aerial?seed=1&traverse=1&frames=40 sim:outdoor?frames=20&seed=2 sim:underground?frames=20&step=2
 sim:railway?frames=20&traverse=1 sim:aerial?frames=30&start=3&stop=20
+sim:terrain?metres=32&stride=16&traverse=1
 """
 
 

@@ -7,6 +7,7 @@ frames and the chevrons every `CHEVRON_PERIOD`.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import NamedTuple
@@ -48,6 +49,7 @@ class Canvas(NamedTuple):
     x: Tensor
     y: Tensor
     scale: int  # canvas pixels per image pixel
+    sun: tuple[float, float] = SUN
 
     @staticmethod
     def over(pixels: Tensor, scale: int, random: Random) -> Canvas:
@@ -55,15 +57,20 @@ class Canvas(NamedTuple):
         grain = random.texture(len(y), len(x), 5.0 * scale)
         return Canvas(pixels, grain, x, y[:, None] - ROAD, scale)
 
+    @property
+    def top(self) -> float:
+        """The first row's upper edge."""
+        return float(self.y[0]) - 0.5 / self.scale
+
     def near(self, x: float, y: float, reach: float = 45.0, turn: float = 0.0) -> Canvas:
         """The square within reach of (x, y), in coordinates relative to that point, rotated by radians."""
         rows, columns = (
             slice(*(max(0, math.floor((at + side * reach) * self.scale)) for side in (-1, 1)))
-            for at in (y + ROAD, x)
+            for at in (y - self.top, x)
         )
         pixels, grain = self.pixels[:, rows, columns], self.grain[rows, columns]
         dx, dy, c, s = self.x[columns] - x, self.y[rows] - y, math.cos(turn), math.sin(turn)
-        return Canvas(pixels, grain, c * dx + s * dy, c * dy - s * dx, self.scale)
+        return Canvas(pixels, grain, c * dx + s * dy, c * dy - s * dx, self.scale, self.sun)
 
     def fill(self, distance: Tensor, colour: str, shade: Tensor | float = 1.0, alpha: float = 1.0) -> None:
         """Blend in colour * shade at negative distances (in image pixels), antialiased."""
@@ -82,30 +89,59 @@ class Canvas(NamedTuple):
         return torch.hypot(self.x, self.y) - radius * (1 + bumps)
 
 
-def _paint_tree(canvas: Canvas, random: Random, x: float, y: float, radius: float) -> None:
+def paint_tree(
+    canvas: Canvas,
+    random: Random,
+    x: float,
+    y: float,
+    radius: float,
+    leaves: Sequence[str] = LEAVES,
+    cover: float = 1.0,
+) -> None:
+    """A round tree; cover is below 1 with fewer leaves."""
     p, fall = canvas.near(x, y, 2 * radius), 0.75 * radius
-    p.fill(torch.hypot(p.x + fall * SUN[0], p.y + fall * SUN[1]) - radius, DARK, alpha=0.55)
-    light = 1 + 0.38 * (p.x * SUN[0] + p.y * SUN[1]) / radius + 0.22 * p.grain
-    p.fill(p.blob(radius, random), random.pick(LEAVES), light)
+    p.fill(torch.hypot(p.x + fall * p.sun[0], p.y + fall * p.sun[1]) - radius, DARK, alpha=0.55 * cover)
+    light = 1 + 0.38 * (p.x * p.sun[0] + p.y * p.sun[1]) / radius + 0.22 * p.grain
+    p.fill(p.blob(radius, random), random.pick(leaves), light, cover)
 
 
 def _paint_house(canvas: Canvas, random: Random, x: float, y: float) -> None:
-    p, roof = canvas.near(x, y, turn=random.uniform(-0.15, 0.15)), random.pick(ROOFS)
+    turn, roof = random.uniform(-0.15, 0.15), random.pick(ROOFS)
     length, width = random.uniform(30, 46), random.uniform(22, 28)
     chimney = length * random.uniform(-0.35, 0.35)
-    p.fill(p.box(-7 * SUN[0], -7 * SUN[1], length, width), DARK, alpha=0.6)
-    slopes = torch.where(p.y < 0, 1.2, 0.78) + 0.05 * torch.sin(2.6 * p.y) + 0.05 * p.grain
-    p.fill(p.box(0, 0, length, width), roof, slopes)
+    paint_house(canvas.near(x, y, turn=turn), roof, length, width, chimney)
+
+
+def paint_house(
+    p: Canvas,
+    roof: str,
+    length: float,
+    width: float,
+    chimney: float,
+    slopes: tuple[float, float] = (1.2, 0.78),
+) -> None:
+    """A house in the middle of a canvas, along its x; slopes: the light on the two sides of its roof."""
+    p.fill(p.box(-7 * p.sun[0], -7 * p.sun[1], length, width), DARK, alpha=0.6)
+    shade = torch.where(p.y < 0, *slopes) + 0.05 * torch.sin(2.6 * p.y) + 0.05 * p.grain
+    p.fill(p.box(0, 0, length, width), roof, shade)
     p.fill(p.box(0, 0, length, 0.9), roof, 1.45)
     p.fill(p.box(chimney - 2, -2, 5, 3), DARK, alpha=0.5)
     p.fill(p.box(chimney, -4, 3.2, 3.2), GRAVEL)
 
 
-def _paint_car(canvas: Canvas, random: Random, x: float, y: float, heading: int, lorry: bool = False) -> None:
-    """A car or lorry; heading is +1 towards higher columns, else -1."""
-    p, paint = canvas.near(x, y, 26, random.uniform(-0.02, 0.02)), random.pick(PAINTS)
+def paint_car(
+    canvas: Canvas,
+    random: Random,
+    x: float,
+    y: float,
+    heading: int,
+    lorry: bool = False,
+    turn: float = 0.0,
+) -> None:
+    """A car or lorry; heading is +1 towards higher columns, else -1, before the turn in radians."""
+    p, paint = canvas.near(x, y, 26, turn + random.uniform(-0.02, 0.02)), random.pick(PAINTS)
     length, width, fall = (44.0, 9.6, 3.0) if lorry else (random.uniform(16, 20), 7.6, 1.6)
-    p.fill(p.box(-fall * SUN[0], -fall * SUN[1], length + 0.6, width + 0.6, 2), DARK, alpha=0.65)
+    p.fill(p.box(-fall * p.sun[0], -fall * p.sun[1], length + 0.6, width + 0.6, 2), DARK, alpha=0.65)
     if lorry:
         p.fill(p.box(-5 * heading, 0, 34, width, 0.6), random.pick(PAINTS), 1 + 0.05 * p.grain)
         p.fill(p.box(17.5 * heading, 0, 9, width - 0.6, 1.5), paint)
@@ -218,12 +254,12 @@ def paint_route(frames: int, seed: int = 0) -> Tensor:
         for _ in range(count):
             radius = random.uniform(6, 12) if kind == "trees" else random.uniform(2, 4.5)
             across = HALF + 4 + radius + random.uniform(0, 34 - radius)
-            _paint_tree(canvas, random, x + random.uniform(-35, 35), side * across, radius)
+            paint_tree(canvas, random, x + random.uniform(-35, 35), side * across, radius)
         if kind == "house":
             _paint_house(canvas, random, x, side * random.uniform(36, 42))
         if kind == "parking":
             for place in (-14, 12)[: random.pick((1, 2))]:
-                _paint_car(canvas, random, x + place, side * (HALF + 6.5), side)
+                paint_car(canvas, random, x + place, side * (HALF + 6.5), side)
     return F.avg_pool2d(canvas.pixels.clamp(0, 1), scale)
 
 
@@ -302,7 +338,7 @@ class AerialRoad(SimulatedRoute):
             x = random.uniform(0, 200)
             while x < image.shape[2]:
                 y, lorry = heading * LANE + random.uniform(-0.8, 0.8), random.uniform(0, 1) < 0.25
-                _paint_car(canvas, random, x, y, heading, lorry)
+                paint_car(canvas, random, x, y, heading, lorry)
                 x += random.uniform(90, 600)
         return image.clamp_(0, 1)
 
