@@ -72,6 +72,12 @@ class Area(NamedTuple):
         _, size, *_ = _tiles(self.rows, self.columns)
         return [(rows, columns) for rows, columns in size.tolist()]
 
+    @property
+    def corners(self) -> list[tuple[int, int]]:
+        """Row and column of the first window of each tile."""
+        corner, *_ = _tiles(self.rows, self.columns)
+        return [(row, column) for row, column in corner.tolist()]
+
     def columns_from(self, place: int) -> int:
         """The columns of the tile that begins at a place."""
         _, size, start, *_ = _tiles(self.rows, self.columns)

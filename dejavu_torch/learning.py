@@ -69,7 +69,7 @@ class ChunkEncoder:
     def __call__(self, frames: range) -> Chunk:
         """A chunk from these frames; InputError as from `feature_batches` and `encode_chunk`."""
         with torch.no_grad(), in_one_thread():
-            rows = torch.cat(list(self.descriptor.batches(Part(self.traverse, frames))))
+            rows = torch.cat(list(self.descriptor.batches(Part(self.traverse, frames), shared=True)))
             if self.visits is not None:
                 shown = views_of(self.visits, torch.arange(frames.start, frames.stop))
                 rows = averaged(self.descriptor, rows, shown)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from dejavu_torch.area import Area, Ground
 from dejavu_torch.data.picture import Pixels, read_picture
@@ -65,6 +66,18 @@ class Grid(Traverse):
 
     def __len__(self) -> int:
         return self.area.places
+
+    def around(self, first: tuple[int, int], shape: tuple[int, int], margin: int) -> Tensor:
+        """The pixels of some rows and columns of windows from the first one on, and a margin around them,
+        (1,C,H,W) float in [0, 1]. Beyond the picture its border is repeated."""
+        inside, beyond = list[slice](), list[int]()
+        for start, count, side in zip(first, shape, self.picture.shape[1:], strict=True):
+            low = start * self.stride - margin
+            high = low + (count - 1) * self.stride + self.window + 2 * margin
+            inside.append(slice(max(0, low), min(side, high)))
+            beyond = [max(0, -low), max(0, high - side), *beyond]
+        pixels = self.picture[:, inside[0], inside[1]].float() / BYTES
+        return pad(pixels[None], beyond, mode="replicate")
 
     def read(self, frames: range | list[int]) -> Tensor:
         corners = (self.area.cells(torch.as_tensor(frames)) * self.stride).tolist()

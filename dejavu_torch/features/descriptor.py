@@ -16,15 +16,18 @@ from dejavu_torch.features.extract import (
     check_alone,
     feature_batches,
     features_of,
+    in_mode,
     warn_of_bright,
     warn_of_raw,
 )
 from dejavu_torch.features.hog import CELL, HOG
 from dejavu_torch.features.joined import Joined, groups_of
 from dejavu_torch.features.preprocess import BLANK, DEEP, Preprocess, measured_range
+from dejavu_torch.features.shared import Sharing, Windows, windows_of
 from dejavu_torch.features.views import SAMPLE, AugmentedFrames, LabelledFrames, Sample, augmented_route
 from dejavu_torch.features.whitening import INDEPENDENT, MOST_VIEWS, WIDEST, Visits, Whitening
 from dejavu_torch.memory import IN_MEMORY, concatenate
+from dejavu_torch.text import progress_of
 from dejavu_torch.types import BATCH_NUMBERS, BATCH_SIZE, InputError, Traverse, expect
 
 log = logging.getLogger("dejavu_torch")
@@ -76,6 +79,7 @@ class Descriptor(nn.Module):
         self.warned: set[tuple[str, str]] = set()  # (traverse, line) of warnings that were logged
         self.known: dict[object, tuple[object, Tensor]] | None = None  # features, see `remembering`
         self.aside: dict[int, list[Tensor]] = {}  # batches of HOG, see `setting_aside`
+        self.offset: Tensor | float = 0.0  # of features of windows that share them, see `Sharing`
         self.register_buffer("_where", torch.zeros(0), persistent=False)
 
     @property
@@ -112,11 +116,19 @@ class Descriptor(nn.Module):
         progress: bool = False,
         verb: str = "describing",
         on_first: OnFirst | None = None,
+        shared: bool = False,
     ) -> Iterator[Tensor]:
-        """Batches (B,D) of features, without gradients; see `feature_batches`."""
+        """Batches (B,D) of features, without gradients; see `feature_batches`.
+
+        Args:
+            shared: of a picture's windows, by `Sharing`, if it knows these features.
+        """
         height, width = own_size(self.features) or (1, 1)
         size = max(1, min(self.batch_size, BATCH_NUMBERS // (3 * height * width)))
         settings = self.device, progress, verb, on_first, self.describe
+        windows = windows_of(traverse) if shared else None
+        if windows is not None and self.sharing.fits(windows):
+            return self._shared(windows, size, progress, verb, on_first)
         if self.known is None:
             batches = feature_batches(traverse, self, size, *settings)
             return self._set_aside(batches, traverse) if id(traverse) in self.aside else batches
@@ -125,6 +137,23 @@ class Descriptor(nn.Module):
             features = concatenate(feature_batches(traverse, self, size, *settings))
             self.known[key] = traverse, features  # which keeps its id
         return (part.to(self.device) for part in self.known[key][1].split(ROWS))
+
+    @property
+    def sharing(self) -> Sharing:
+        """Describes windows of a picture with what they share."""
+        return Sharing(self.preprocess, self.features, self.device)
+
+    @torch.no_grad()
+    def _shared(
+        self, windows: Windows, size: int, progress: bool, verb: str, on_first: OnFirst | None
+    ) -> Iterator[Tensor]:
+        if on_first is not None:
+            some = Part(windows.grid, windows.frames[:size])
+            on_first(some[:], torch.cat([*self.features_in(some)]))
+        with progress_of(verb, len(windows.frames), progress) as update, in_mode(self.features, False):
+            for batch in self.sharing.batches(windows, self.offset):
+                update(len(batch))
+                yield batch
 
     @contextmanager
     def remembering(self) -> Iterator[None]:
@@ -165,14 +194,16 @@ class Descriptor(nn.Module):
         progress: bool = False,
         verb: str = "describing",
         on_first: OnFirst | None = None,
+        shared: bool = False,
     ) -> Iterator[Tensor]:
         """Batches (B,K) of the descriptors of a traverse, in order, without gradients.
 
         Args:
+            shared: of a reference that is windows of a picture, see `features_in`.
             progress: show a bar on stderr, or lines if it is no terminal. verb: its name.
             on_first: called with the first batch of frames and its features.
         """
-        for features in self.features_in(traverse, progress, verb, on_first):
+        for features in self.features_in(traverse, progress, verb, on_first, shared):
             descriptors = self.whitened(features)
             seen = f"the whitening makes NaN or infinity of the features of {traverse.name}"
             expect(descriptors.isfinite().all(), "a map of such frames", seen)
@@ -220,7 +251,7 @@ class Descriptor(nn.Module):
             whitening = self.whitening
             if whitening is not None and not whitening.fixed:
                 if not (spectral and self._exceeds_memory(traverse)):
-                    features = concatenate(self.features_in(traverse, progress, verb, check_first))
+                    features = concatenate(self.features_in(traverse, progress, verb, check_first, True))
                     if self._mostly_blank(features, traverse):
                         return self.learn(*again)
                     self._learn_whitening(whitening, features, traverse, second, progress)
@@ -230,7 +261,7 @@ class Descriptor(nn.Module):
                 views = second and sample.views(second)
                 self.learn(Part(traverse, sample.frame), views, progress, verb="sampling")
             storage = (DESCRIPTOR_MEMORY, self.whitening is not None) if spectral else ()
-            rows = concatenate(self.batches(traverse, progress, verb, check_first), *storage)
+            rows = concatenate(self.batches(traverse, progress, verb, check_first, True), *storage)
             return self.learn(*again) if self._mostly_blank(rows, traverse) else rows
 
     def _mostly_blank(self, rows: Tensor, traverse: Traverse) -> bool:
@@ -249,6 +280,10 @@ class Descriptor(nn.Module):
         own = self.preprocess
         if not is_ready(traverse):
             self.features = _for_frames(self.features, *traverse.frame_shape[1:])
+        windows = windows_of(traverse)
+        if windows is not None and self.sharing.fits(windows):
+            with torch.no_grad(), in_mode(self.features, False):
+                self.offset = self.sharing.offset(windows)
         if is_ready(traverse) or not (own.range == "auto" or (resumed and own.blank == BLANK)):
             return
         drawn = torch.linspace(0, len(traverse) - 1, min(DRAWN, len(traverse))).round().long()

@@ -96,8 +96,7 @@ def hog(
         rows, columns = gradients(resize_frames(exact, resize))
         histograms = cell_histograms(rows, columns, orientations, cell, bins)
         blocks = histograms.unfold(1, block, 1).unfold(2, block, 1)  # (B,by,bx,O,block,block)
-        blocks = _unit(blocks.permute(0, 1, 2, 4, 5, 3).flatten(3)).clamp(max=0.2)
-        return _unit(blocks).flatten(1).to(part.dtype)
+        return normalised(blocks.permute(0, 1, 2, 4, 5, 3).flatten(3)).flatten(1).to(part.dtype)
 
     return in_parts(described, frames)
 
@@ -171,6 +170,11 @@ def cell_histograms(dy: Tensor, dx: Tensor, orientations: int, cell: int, bins: 
     for slot, share in shares:
         votes = votes.scatter_add(1, slot.add_(first).flatten(1), share.flatten(1))
     return votes.view(batch, ny, nx, orientations) / cell**2
+
+
+def normalised(blocks: Tensor) -> Tensor:
+    """L2-Hys of the histograms of blocks (.., V)."""
+    return _unit(_unit(blocks).clamp(max=0.2))
 
 
 def _unit(blocks: Tensor) -> Tensor:

@@ -1,0 +1,187 @@
+"""Features of windows that overlap: the cells and feature maps that windows share are computed once.
+
+A window is described with what lies around it in place of its border: gradients and convolutions reach over
+it. So the features differ a little from those of the window alone, as queries are described.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from itertools import accumulate
+from typing import NamedTuple, cast
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from dejavu_torch.data.grid import Grid
+from dejavu_torch.data.traverse import Part
+from dejavu_torch.features.distilled import SIZE, STRIDES, WIDEST, Distilled
+from dejavu_torch.features.hog import HOG, cell_histograms, gradients, normalised
+from dejavu_torch.features.joined import Joined
+from dejavu_torch.features.preprocess import Preprocess
+from dejavu_torch.features.views import AugmentedFrames
+from dejavu_torch.resize import resize_frames
+from dejavu_torch.types import BATCH_SIZE, Traverse
+
+REACH = 16  # pixels of Distilled's frames that its convolutions reach over a border
+TILES, BOTH = 8, 2048  # in which some windows are described both ways, and how many
+AT_ONCE = 2**22  # features of windows that are gathered together
+
+
+class Windows(NamedTuple):
+    """The windows of whole tiles of a picture, by their numbers."""
+
+    grid: Grid
+    frames: range
+
+
+def windows_of(traverse: Traverse | AugmentedFrames) -> Windows | None:
+    """The windows that a traverse is, if it is whole tiles of a picture."""
+    grid, frames = traverse, range(len(traverse))
+    if isinstance(traverse, Part) and isinstance(traverse.frame, range):
+        grid, frames = traverse.traverse, traverse.frame
+    if not isinstance(grid, Grid) or frames.step != 1:
+        return None
+    ends = {0, *accumulate(rows * columns for rows, columns in grid.area.tiles)}
+    return Windows(grid, frames) if {frames.start, frames.stop} <= ends else None
+
+
+class Sharing(NamedTuple):
+    """Describes windows of a picture with what they share."""
+
+    preprocess: Preprocess
+    features: nn.Module
+    device: torch.device
+
+    @property
+    def members(self) -> list[nn.Module]:
+        """The features that are joined, or the only ones."""
+        return [*self.features.members] if isinstance(self.features, Joined) else [self.features]
+
+    def fits(self, windows: Windows) -> bool:
+        """Whether the features of these windows are known."""
+        own, window, stride = self.preprocess, windows.grid.window, windows.grid.stride
+        plain = own.channel is None and own.contrast is None and own.span == (0, 1)
+        return plain and all(_shares(member, window, stride) for member in self.members)
+
+    def batches(self, windows: Windows, offset: Tensor | float = 0.0) -> Iterator[Tensor]:
+        """Features (B,D) of windows, in the order of places, 0 for those that show nothing; see `offset`."""
+        grid, place = windows.grid, 0
+        window, stride = grid.window, grid.stride
+        scaled = stride * SIZE[0] // window
+        margin = stride * -(-REACH // scaled)
+        for corner, (rows, columns) in zip(grid.area.corners, grid.area.tiles, strict=True):
+            first, place = place, place + rows * columns
+            if first not in windows.frames:
+                continue
+            pixels = grid.around(corner, (rows, columns), margin).to(self.device)
+            shown = self._shows(pixels[..., margin:-margin, margin:-margin], window, stride).flatten()
+            maps = [
+                _cells(member, pixels, margin, window, stride)
+                if isinstance(member, HOG)
+                else _convolved(cast(Distilled, member), pixels, margin // stride, scaled, (rows, columns))
+                for member in self.members
+            ]
+            size, done = sum(one.shape[2:].numel() for one in maps), 0
+            for some in torch.arange(rows).split(max(1, AT_ONCE // (columns * size))):
+                parts = [one[some[0] : some[-1] + 1, :columns].flatten(0, 1).flatten(1) for one in maps]
+                batch = torch.cat(parts, 1)
+                yield (batch + offset) * shown[done : done + len(batch), None].to(batch)
+                done += len(batch)
+
+    def offset(self, windows: Windows) -> Tensor:
+        """The mean difference (D,) of the features of windows alone to those of `batches`, of some windows of
+        several tiles."""
+        grid = windows.grid
+        ends = [0, *accumulate(rows * columns for rows, columns in grid.area.tiles)]
+        tiles = torch.linspace(0, len(ends) - 2, min(TILES, len(ends) - 1)).round().long().tolist()
+        sums, count = torch.zeros((), device=self.device), 0
+        for tile in tiles:
+            frames = range(ends[tile], ends[tile + 1])
+            some = torch.linspace(0, len(frames) - 1, min(BOTH // len(tiles), len(frames))).round().long()
+            shared = torch.cat([*self.batches(Windows(grid, frames))])[some.to(self.device)]
+            parts = (frames.start + some).split(BATCH_SIZE)
+            alone = torch.cat([self.features(grid[part.tolist()].to(self.device)) for part in parts])
+            shown = shared.any(1, keepdim=True)
+            sums, count = sums + ((alone - shared) * shown).sum(0), count + int(shown.sum())
+        return sums / max(1, count)
+
+    def _shows(self, pixels: Tensor, window: int, stride: int) -> Tensor:
+        """`Preprocess.shows` of the windows of pixels (1,C,H,W), in rows and columns."""
+        mean, square = (
+            F.avg_pool2d(F.avg_pool2d(one, (window, 1), (stride, 1)), (1, window), (1, stride))
+            for one in (pixels, pixels.square())
+        )
+        return (square - mean.square()).amax(1)[0] >= self.preprocess.blank**2
+
+
+def _shares(member: nn.Module, window: int, stride: int) -> bool:
+    if type(member) is HOG:
+        return member.resize is None and bool(member.cell) and window >= (member.cell or 1) * member.block
+    even = stride * SIZE[0] % window == 0 and WIDEST % getattr(member, "grid", 5) == 0
+    return type(member) is Distilled and even
+
+
+def _cells(hog: HOG, pixels: Tensor, margin: int, window: int, stride: int) -> Tensor:
+    """The blocks of HOG of each window, a view of blocks that windows share: (rows, columns, by, bx, ..)."""
+    cell = hog.cell
+    assert cell is not None
+    step = math.gcd(stride, cell)
+    dy, dx = (one[:, margin:-margin, margin:-margin] for one in gradients(pixels))
+    parts = cell_histograms(dy, dx, hog.orientations, step, hog.bins).permute(0, 3, 1, 2)
+    cells = F.avg_pool2d(parts, cell // step, 1)[0]  # (O,y,x), a cell at each step
+    apart, block = cell // step, hog.block
+    count = window // cell - block + 1
+    reach = (block - 1) * apart
+    high, wide = (side - reach for side in cells.shape[1:])
+    stacked = torch.stack(
+        [
+            cells[:, y : y + high, x : x + wide]
+            for y in range(0, reach + 1, apart)
+            for x in range(0, reach + 1, apart)
+        ]
+    )
+    blocks = normalised(stacked.permute(2, 3, 0, 1).flatten(2))  # (y,x,values)
+    return _windows(blocks.permute(2, 0, 1), stride // step, apart, count).permute(0, 1, 3, 4, 2)
+
+
+def _convolved(net: Distilled, pixels: Tensor, strides: int, stride: int, shape: tuple[int, int]) -> Tensor:
+    """The pooled feature maps of each window, a view of maps that windows share: (rows, columns, 40, y, x).
+
+    Args:
+        strides: in the margin. stride: in pixels of the net's frames. shape: rows and columns of windows.
+    """
+    margin = strides * stride
+    height, width = ((count - 1) * stride + SIZE[0] + 2 * margin for count in shape)
+    pixels = pixels if pixels.shape[1] in (1, 3) else pixels.mean(1, True)
+    values = 2 * resize_frames(pixels, (height, width)) - 1
+    layers = dict(net.named_buffers())
+    apart, step, first = 1, 1, 0  # pixels between taps, between values, and before the first value
+    for i, halves in enumerate(STRIDES):
+        weight, bias = (layers[f"{name}{i}"].to(values) for name in ("weight", "bias"))
+        if not i and values.shape[1] == 1:  # see `distilled_maps`
+            weight = weight.sum(1, keepdim=True)
+        next_step = math.gcd(stride, apart * halves)
+        values = F.conv2d(values.relu_() if i else values, weight, bias, next_step // step, 0, apart // step)
+        first += weight.shape[-1] // 2 * apart
+        apart, step = apart * halves, next_step
+    values = values[0, :, (margin - first) // step :, (margin - first) // step :]
+    taps = WIDEST // net.grid
+    spacing = apart // step
+    for axis in (1, 2):  # means of neighbours, as of a grid
+        length = values.shape[axis] - (taps - 1) * spacing
+        values = torch.stack([values.narrow(axis, spacing * k, length) for k in range(taps)]).mean(0)
+    return _windows(values, stride // step, taps * spacing, net.grid)
+
+
+def _windows(maps: Tensor, stride: int, apart: int, count: int) -> Tensor:
+    """Values of each window, `count` x `count` of them `apart`, of maps (C,H,W): (rows, columns, C, y, x)."""
+    maps = maps.contiguous()
+    span = (count - 1) * apart + 1
+    rows, columns = ((side - span) // stride + 1 for side in maps.shape[1:])
+    of_channel, of_row, of_column = maps.stride()
+    shape = (rows, columns, len(maps), count, count)
+    strides = (stride * of_row, stride * of_column, of_channel, apart * of_row, apart * of_column)
+    return maps.as_strided(shape, strides)
