@@ -21,6 +21,9 @@ from dejavu_torch.data.folder import read_image
 QUERIES, SIDE, MARGIN = 500, 64, 46  # images, their sides, and pixels from their middle that they need
 HEADINGS, OF_FLIGHT = (8, 12, 24, 36), 24
 WANDER = 10.0  # degrees from one image of a flight to the next, standard deviation
+NAMES = {"unturned": "north up", "turned": "of any heading, as they are", "known": "with known headings"}
+NAMES |= {str(count): f"`--headings {count}`" for count in HEADINGS}
+NAMES |= {"flight, known": "a flight, known headings", "flight, 24": "a flight, `--headings 24`"}
 FIGURES = ("recall_at_1", "accepted", "accepted_wrong", "ms")
 
 
