@@ -164,11 +164,10 @@ class Localizer:
 
     def _headings(self, descriptors: Tensor, index: Tensor, score: Scoring | None) -> Tensor:
         """The headings (Q,k) of the copies that are most similar to places (Q,k)."""
-        copies, found = self.matching.copies, []
-        if score is None:
-            assert self.place_map is not None
-            score = self.place_map.scores
-        each = whole(SCORES_AT_ONCE // max(1, self.place_map.places if self.place_map else 1), copies)
+        copies, found, place_map = self.matching.copies, [], self.place_map
+        assert place_map is not None
+        score = score or (lambda rows: place_map.scores(rows.to(place_map.device)))
+        each = whole(SCORES_AT_ONCE // place_map.places, copies)
         for rows, places in zip(descriptors.split(each), index.split(each // copies), strict=True):
             scores = score(rows).cpu().view(len(places), copies, -1)
             at = places.clamp(min=0)[:, None].expand(-1, copies, -1)
