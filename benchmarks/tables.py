@@ -18,6 +18,7 @@ from typing import Any
 
 from benchmarks.alike import CAPPED, CHECKED, PRECISIONS, SINGLE, UNCAPPED
 from benchmarks.areas import NAMES as AREA_WAYS
+from benchmarks.headings import NAMES as HEADING_WAYS
 from benchmarks.measure import Row
 from benchmarks.results import FOOTAGE, rounded
 from benchmarks.storage import SHOWN, best, by, families, missed
@@ -339,6 +340,16 @@ def areas() -> str:
     return markdown(table)
 
 
+def headings() -> str:
+    """What is found of images of any heading, by the way they are turned."""
+    shown = {"recall_at_1": "found", "accepted": "accepted", "accepted_wrong": "accepted although wrong"}
+    table = [["images", *shown.values(), "ms per image"]]
+    for row in read("headings")["rows"]:
+        shares = (f"{row[key]:.3f}" for key in shown)
+        table.append([HEADING_WAYS[row["contender"]], *shares, f"{row['ms']:.1f}"])
+    return markdown(table)
+
+
 def features(name: str = "features") -> str:
     """The mean AUC over seeds with further features: of one image, of the null, of the whole drive."""
     found: dict[str, dict[str, list[Row]]] = {}
@@ -435,7 +446,13 @@ TABLES: dict[str, Callable[[], str]] = {
     **{"descriptors": descriptors, "sequences": sequences},
     **{"rejection": rejection, "filtered": filtered, "drives": drives, "driven": driven},
     **{"trainings": trainings, "made drives": made_drives, "storage drives": storage_drives},
-    **{"areas": areas, "large drives": large_drives, "taught drives": taught, "visits": visits},
+    **{
+        "areas": areas,
+        "headings": headings,
+        "large drives": large_drives,
+        "taught drives": taught,
+        "visits": visits,
+    },
     **{name: partial(features, name) for name in ("features", "cells", "copies")},
     **{"alike": lambda: f"{look_alikes()}\n{loops()}"},
     **{f"storage {name}": partial(storage, name) for name in ("aerial", "road1", "road2", "city", "railway")},

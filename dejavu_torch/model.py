@@ -19,6 +19,7 @@ from dejavu_torch import learning, model_file
 from dejavu_torch.area import Area
 from dejavu_torch.data.source import Source, as_traverse
 from dejavu_torch.data.traverse import at_size, resize_like, size_like
+from dejavu_torch.data.turning import Turned, facing_north
 from dejavu_torch.features.descriptor import Descriptor, own_size
 from dejavu_torch.features.extract import features_of
 from dejavu_torch.features.preprocess import Preprocess
@@ -30,10 +31,10 @@ from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.maps.weights import BITS, round_weights
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse, resampled, source_of
-from dejavu_torch.recognition.centring import PRIOR, centred
+from dejavu_torch.recognition.centring import PRIOR, centred, set_apart
 from dejavu_torch.recognition.coarse import searcher
 from dejavu_torch.recognition.filter import PlaceFilter
-from dejavu_torch.recognition.localizer import Localizer, Matching, Scoring
+from dejavu_torch.recognition.localizer import Localizer, Matching, Scoring, whole
 from dejavu_torch.recognition.search import SCORES_AT_ONCE, Scan, Search, Searcher, check_search
 from dejavu_torch.recognition.select import HIGHEST, PROBABLE, Acceptance, check_candidates
 from dejavu_torch.recognition.smoother import PlaceSmoother
@@ -368,6 +369,7 @@ class DejaVu(nn.Module):
         sequence: SequenceModel | Literal["auto"] | None = "auto",
         search: Search | None = None,
         centre: bool | None = None,
+        headings: int = 1,
     ) -> Match:
         """Section III-C: the best place of each query and whether it is accepted (eq. 5, eq. 6).
 
@@ -382,13 +384,20 @@ class DejaVu(nn.Module):
             search: for single queries: "scan" and "exact" score all places; "auto", "coarse" and None take
                 `self.searcher`, by default one that compares all places of a spectral map in 8 bits, or
                 samples of a long one, and scores the best.
+            headings: H, on the map of an area: turns each image evenly over 360 degrees and finds the best of
+                the H copies, whose heading `Match.heading` has. Describing and search take H times as long.
+                With 1, images are turned by their own `Traverse.headings`, if these are known. The
+                descriptors of all turned images are compared first, see `set_apart`: the more there are, up
+                to some 50, the more are found.
 
         Shape: -> Match of (Q,) on the CPU.
 
         Raises:
             InputError: no map, no frames, NaN, or features of another dimension than the map's.
         """
-        return Match.joined(self.matches(queries, progress, sequence, search, centre=centre))
+        return Match.joined(
+            self.matches(queries, progress, sequence, search, centre=centre, headings=headings)
+        )
 
     def localize_descriptors(
         self,
@@ -413,7 +422,7 @@ class DejaVu(nn.Module):
             late = isinstance(smoother, PlaceFilter) and smoother.lag
             return Match.joined([match, localizer.finish()]) if late else match
         matcher = Localizer(None, matching)
-        parts = descriptors.split(max(1, SCORES_AT_ONCE // self.map.places))
+        parts = descriptors.split(whole(SCORES_AT_ONCE // self.map.places, matching.copies))
         with torch.no_grad():
             scores = map(score, with_progress(parts, "localizing", progress))
             return Match.joined(map(matcher.match, scores))
@@ -481,32 +490,37 @@ class DejaVu(nn.Module):
         k: int | None = None,
         apart: int = 5,
         centre: bool | None = None,
+        headings: int = 1,
     ) -> Iterator[Match]:
         """As `localize`, or with k as `candidates`, one batch of queries at a time, in constant memory; with
-        a smoother or centred queries, after the descriptors of all queries."""
+        a smoother, centred or turned queries, after the descriptors of all queries."""
         require_map(self)
         if k is not None:
             check_candidates(k, apart, self.map.places)
         queries = self.at_map_size(as_traverse(queries), self.frame_shape or ())
         if isinstance(sequence, str):
             sequence = PlaceSmoother() if queries.ordered else None
-        matching = self.matching(sequence, search)._replace(k=k, radius=apart)
+        matching = self.matching(sequence, search)._replace(k=k, radius=apart, copies=headings)
         localizer = self.localizer(matching)
         if sequence is not None:
             sequence.check(len(queries), self.map.places)
         if self.step is not None:
             queries = self.resample(queries, self.step, progress, self.frame_shape)
+        queries = facing_north(queries, self.map.area, headings)
         shape, name = queries.frame_shape, queries.name
 
         def on_first(frames: Tensor, features: Tensor) -> None:
             check_queries(self, shape, features.shape[1], name)
             self.descriptor.warn_of_bright(frames, name)
 
-        if not (isinstance(sequence, PlaceSmoother) or centre):
+        turned = isinstance(queries, Turned)
+        if not (isinstance(sequence, PlaceSmoother) or centre or turned):
             yield from map(localizer, self.descriptor.batches(queries, progress, "localizing", on_first))
             return
         descriptors = self.descriptor.all_of(queries, progress, on_first)
-        if self.centres(len(descriptors)) if centre is None else centre:
+        if turned:
+            descriptors = set_apart(descriptors)
+        elif self.centres(len(descriptors)) if centre is None else centre:
             matching = matching._replace(plain=descriptors)
             descriptors = centred(self.map, descriptors)
         yield self.localize_descriptors(descriptors, matching, progress=progress)
@@ -522,11 +536,12 @@ class DejaVu(nn.Module):
         apart: int = 5,
         sequence: SequenceModel | Literal["auto"] | None = "auto",
         search: Search | None = None,
+        headings: int = 1,
     ) -> Match:
         """The k best places of each query; the first is that of `localize`.
 
         Args:
-            queries, sequence, search: see `localize`.
+            queries, sequence, search, headings: see `localize`.
             k: from 1 to the number of places.
             apart: suppression radius in places, at least 0: any two candidates of a query differ by more.
 
@@ -540,7 +555,7 @@ class DejaVu(nn.Module):
             >>> DejaVu().learn(wave).candidates(wave[20:22], k=3).index[:, 0]
             tensor([20, 21])
         """
-        return Match.joined(self.matches(queries, False, sequence, search, k, apart))
+        return Match.joined(self.matches(queries, False, sequence, search, k, apart, headings=headings))
 
     def matching(self, sequence: SequenceModel | None = None, search: Search | None = None) -> Matching:
         """How queries are matched, with probabilities if the map is calibrated for it. Raises InputError if a

@@ -83,6 +83,8 @@ class Traverse(Dataset[Tensor], ABC):
         times: (N,) float64, when each was taken, in seconds; None if unknown.
         places: (N,) float64, the true position of each in reference frames; None if unknown.
         coordinates: where each was taken, see `Coordinates`; None if unknown.
+        headings: (N,) float64, degrees clockwise from north to where the upper side of a camera that looks
+            down points, NaN where that is unknown; None if all are.
         ordered: whether they are known to be consecutive, as in a video; see the filter and sequences.
         sized: whether the user asked for their size, as with `width=` of a video.
         deep: whether its images have more than 8 bits a pixel.
@@ -105,6 +107,7 @@ class Traverse(Dataset[Tensor], ABC):
     times: Tensor | None = None
     places: Tensor | None = None
     coordinates: Coordinates | None = None
+    headings: Tensor | None = None
     ordered: bool = False
     sized: bool = False
     cut: tuple[tuple[int, ...], range] | None = None
@@ -260,6 +263,8 @@ class Match:
             not merged.
         confidence: float, how much worse the best place over 5 places away is, in the unit of the scores; NaN
             for all but the first candidate. None if it was not computed.
+        heading: float, degrees, of the turned copy of the query that was found there, NaN without a place;
+            None unless several headings were tried.
         sequences: by T, matches (Q,) of the same queries in sequences, a filter or a smoother, for reports;
             mostly empty.
     """
@@ -270,11 +275,12 @@ class Match:
     probability: Tensor | None = None
     route: Tensor | None = None
     confidence: Tensor | None = None
+    heading: Tensor | None = None
     sequences: Mapping[Together, Match] = field(default_factory=dict)
 
     @property
     def columns(self) -> dict[str, Tensor]:
-        """Those of the six columns that are known, by name."""
+        """Those of the seven columns that are known, by name."""
         return {name: column for name, column in vars(self).items() if isinstance(column, Tensor)}
 
     def __iter__(self) -> Iterator[Tensor]:

@@ -42,6 +42,7 @@ def run_localize(
     acceptance: options.Acceptance,
     top: int | None = None,
     loops: int | None = None,
+    headings: int = 1,
     pairs: Path | None = None,
     corners: list[list[float]] | None = None,
     sequences: options.Sequences,
@@ -56,11 +57,14 @@ def run_localize(
     Args:
         map: map file
         source: frames to find, as in `dejavu learn`
-        out: csv of query,place,score,accepted[,probability],confidence[,rank][,route],query_name,place_name
+        out: csv of query,place,score,accepted[,probability],confidence[,heading][,rank][,route][,x,y],
+            query_name,place_name
         top: write this many places per query, no two within 5 of each other, each in a row with its rank;
             only the first has a probability
         loops: find where a drive returns to its own places, on a map learned from it; ignore this many frames
             before each frame, and all after it
+        headings: on the map of an area, try so many headings of each image, such as 24, evenly over 360
+            degrees; this takes as many times as long
         pairs: also write lines `query_name place_name` for hloc and COLMAP, one per place
         corners: where this camera sees the patch of ground that the map's --velocity.corners describe
         cluster: divide the map among Ray workers, as in `dejavu learn`; for single queries only
@@ -91,12 +95,13 @@ def run_localize(
     smooths = isinstance(matcher, PlaceSmoother)
     centre = (smooths or matcher is None) and ordering.centring(model, ordered, len(query))
     if loops is not None:
-        sequences.check_loops(loops, top=top, cluster=cluster, centre=ordering.centre)
+        turns = headings != 1 and headings
+        sequences.check_loops(loops, top=top, cluster=cluster, centre=ordering.centre, headings=turns)
         chosen = model.loop_matching(loops, PlaceSmoother() if smooths else None).acceptance
         matches = iter([model.loops(query, loops, smooths, True)])
         matcher = None
     else:
-        matches = model.matches(query, True, matcher, None, top, SUPPRESSION, centre)
+        matches = model.matches(query, True, matcher, None, top, SUPPRESSION, centre, headings)
     if top is not None:
         matches = (part.map(Tensor.flatten) for part in matches)
     counts: Counter[str] = Counter()

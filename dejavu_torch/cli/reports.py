@@ -86,6 +86,7 @@ def run_compare(
     out: Path | None = None,
     open: bool = False,
     loops: int | None = None,
+    headings: int = 1,
     judging: options.EvaluationOptions,
     learning: options.LearningOptions,
     map: Path | None = None,
@@ -102,6 +103,7 @@ def run_compare(
         reference: the visit to learn: a folder of images, a video, or another source of `dejavu learn`
         query: the visit whose frames are found; none with --loops
         loops: find where the reference returns to its own places, as in localize
+        headings: try so many headings of each image on an area, as in localize
         out: folder for report, pictures, matches.csv and map.safetensors; by default dejavu_report, or
             dejavu_report_2 and so on if that exists
         open: show the report in a browser
@@ -156,6 +158,7 @@ def run_compare(
         ordered=ordered,
         centre=None if ordering.centre is None else ordering.centre == "mean",
         loops=loops,
+        headings=headings,
         progress=True,
     )
     on, asked = short_name(reference), None if query is None else short_name(query)

@@ -78,15 +78,17 @@ def coordinates_of(traverses: Sequence[Traverse], kind: Kind) -> list[Tensor]:
     return [own.values[:, :shared] for own in known]
 
 
-def read_coordinates(path: Path, traverse: Traverse) -> Coordinates:
-    """Where the frames of a traverse were taken, from a file of one row a frame, or with names or times.
+def read_coordinates(path: Path, traverse: Traverse) -> tuple[Coordinates, Tensor | None]:
+    """Where the frames of a traverse were taken, from a file of one row a frame, or with names or times; and
+    their headings (N,) in degrees, if there are any.
 
     Args:
         path: a csv whose header has x,y[,z], easting,northing or lat,lon, and may have `name`, of images, or
             `time`; poses of KITTI (12 numbers: the 4th, 8th and 12th), TUM (`time x y z`, a quaternion), or
             EuRoC (the same between commas, in nanoseconds). Times are compared with those of a video, or with
             image names that are times; both in seconds, or in the unit that their size tells. Between rows up
-            to a second apart they are interpolated.
+            to a second apart they are interpolated. A column `heading` has degrees clockwise from north, or
+            from the upper side of a picture.
 
     Raises:
         InputError: another file, or rows that fit no frames.
@@ -97,12 +99,15 @@ def read_coordinates(path: Path, traverse: Traverse) -> Coordinates:
         if not cells[0].startswith("#")
     ]
     expect(rows, EXPECTED, f"{path} has no rows")
-    key, degrees, columns = _columns(path, rows)
+    key, degrees, turns, columns = _columns(path, rows)
     for line, cells in rows:
         seen = f"{path}, line {line}: {len(cells)} columns"
         expect(len(cells) > max(columns), f"{max(columns) + 1} or more", seen)
     values = np.array([[_value(cells[column]) for column in columns] for _, cells in rows])
-    if degrees and not (np.abs(np.nan_to_num(values)) <= (90, 180)).all():
+    if turns:
+        known = ~np.isnan(values[:, -1])  # from one to the next the shorter way around
+        values[known, -1] = np.unwrap(values[known, -1], period=360)
+    if degrees and not (np.abs(np.nan_to_num(values[:, :2])) <= (90, 180)).all():
         raise InputError(f"{path} has latitudes beyond 90 or longitudes beyond 180; expected degrees")
     if key is None:
         seen = f"{path} has {len(values)} rows, {traverse.name} {len(traverse)} frames"
@@ -112,24 +117,28 @@ def read_coordinates(path: Path, traverse: Traverse) -> Coordinates:
         values = np.array([known.get(name, np.full(len(columns), math.nan)) for name in traverse.names])
     else:
         values = _at_times(path, np.array([_value(cells[key[0]]) for _, cells in rows]), values, traverse)
+    headings = torch.from_numpy(values[:, -1].copy() % 360) if turns else None
+    values = values[:, : values.shape[1] - turns]
     missing = int(np.isnan(values).any(1).sum()) if len(values) else len(traverse)
     expect(missing != len(traverse), "its names or times", f"{path} tells of no frame of {traverse.name}")
     if missing:
         log.warning("%s: %d of %d frames have no coordinates", traverse.name, missing, len(traverse))
-    return Coordinates(torch.from_numpy(values), degrees)
+    if headings is not None and (unknown := int(headings.isnan().sum())):
+        log.warning("%s: %d of %d frames have no heading", traverse.name, unknown, len(traverse))
+    return Coordinates(torch.from_numpy(values), degrees), headings
 
 
 def _columns(
     path: Path, rows: list[tuple[int, list[str]]]
-) -> tuple[tuple[int, str] | None, bool, tuple[int, ...]]:
-    """The column of names or times, whether coordinates are degrees, and their columns; a header is removed
-    from the rows."""
+) -> tuple[tuple[int, str] | None, bool, bool, tuple[int, ...]]:
+    """The column of names or times, whether coordinates are degrees, whether headings follow them, and their
+    columns; a header is removed from the rows."""
     first = rows[0][1]
     if not any(math.isnan(_value(cell)) for cell in first):
         if len(first) == 12:  # KITTI
-            return None, False, (3, 7, 11)
+            return None, False, False, (3, 7, 11)
         if len(first) in (8, 17):  # TUM, EuRoC
-            return (0, "time"), False, (1, 2, 3)
+            return (0, "time"), False, False, (1, 2, 3)
         raise InputError(f"{path} has {len(first)} columns without a header; expected {EXPECTED}")
     header = [cell.strip().lower() for cell in rows.pop(0)[1]]
     pair = next((pair for pair in PAIRS if {*pair} <= {*header}), None)
@@ -138,7 +147,9 @@ def _columns(
     degrees = pair[0].startswith("lat")
     names = (*pair, "z") if not degrees and "z" in header else pair
     key = next(((header.index(one), one) for one in ("name", *TIMES) if one in header), None)
-    return key, degrees, tuple(header.index(name) for name in names)
+    turns = "heading" in header
+    names = (*names, "heading") if turns else names
+    return key, degrees, turns, tuple(header.index(name) for name in names)
 
 
 def _value(text: str) -> float:

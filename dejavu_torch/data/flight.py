@@ -55,7 +55,7 @@ class Flight(Traverse):
     ) -> None:
         expect(window >= 1, "at least 1", f"{name}: window={window}")
         self.name, self.picture, points = name, picture, points.double()
-        self.coordinates = Coordinates(points, frame=ground.frame)
+        self.coordinates, self.headings = Coordinates(points, frame=ground.frame), headings
         steps = points.new_tensor([ground.right, ground.down])
         pixel = steps.inverse()
         self.middle = (points - points.new_tensor(ground.first)) @ pixel - 0.5  # column and row

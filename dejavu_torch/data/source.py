@@ -110,7 +110,7 @@ def open_source(source: str | Path, size: tuple[int, int] | None = None) -> Trav
         hidden = read_image(Path(mask)).mean(0, keepdim=True) if mask else None
         traverse = Cropped(traverse, _sides(text, crop), hidden)
     if file:
-        traverse.coordinates = read_coordinates(Path(file), traverse)
+        traverse.coordinates, traverse.headings = read_coordinates(Path(file), traverse)
     return frame_range(traverse, **part) if part else traverse
 
 

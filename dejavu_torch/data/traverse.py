@@ -38,9 +38,9 @@ class Part(Traverse):
     def __init__(self, traverse: Traverse, frame: Tensor | range) -> None:
         self.traverse, self.frame, self.name = traverse, frame, traverse.name
         self.sized, self.ordered = traverse.sized, traverse.ordered
-        self.times, self.places = (
+        self.times, self.places, self.headings = (
             None if values is None else values[torch.as_tensor(frame)]
-            for values in (traverse.times, traverse.places)
+            for values in (traverse.times, traverse.places, traverse.headings)
         )
         if traverse.coordinates is not None:
             values = traverse.coordinates.values[torch.as_tensor(frame)]

@@ -51,7 +51,7 @@ def draw_area(run: Localization) -> plots.Pictures:
 
 def draw_heat(run: Localization) -> plots.Pictures:
     """The scores of one query in the middle at all places."""
-    area, query = run.model.map.area, len(run.query_features) // 2
+    area, query = run.model.map.area, len(run.query_frames) // 2
     assert area is not None
     scores = run.scores(torch.tensor([query]))[0]
     if not scores.isfinite().any():

@@ -27,7 +27,7 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import recipe_of
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.recognition.drive import DriveQuery, localize_drives
-from dejavu_torch.recognition.localizer import SINGLE, Localizer, Matching, Scoring, drive_query
+from dejavu_torch.recognition.localizer import SINGLE, Localizer, Matching, Scoring, drive_query, whole
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.text import with_progress
 from dejavu_torch.types import InputError, Match, Traverse
@@ -76,7 +76,7 @@ def nearest_frames(
     Returns:
         Match of (Q,). Single queries find stored frames only, sequences also frames between these.
     """
-    parts = query.split(max(1, BLOCK_DISTANCES // len(reference)))
+    parts = query.split(whole(BLOCK_DISTANCES // len(reference), matching.copies))
     batches = with_progress(parts, "baselines", progress)
     matcher, (stored, nearest) = Localizer(None, matching, area=area), stored_frames(len(reference), k, area)
     match = Match.joined(map(matcher.match, map(scores_of_stored(reference, k, metric, area), batches)))
@@ -205,7 +205,7 @@ def baselines_of(
         itself = leave_out_match(model, reference, leave_out)
         itself = replace(itself, accepted=itself.score.isfinite())
         found["leave_out"] = Baseline(f"reference on itself, +-{leave_out} left out", itself)
-    pair, batch = (run.reference, run.query), model.batch_size
+    pair, batch = (run.reference, run.asked), model.batch_size
     if not _is_plain_hog(model):
         same = recipe_of(model.preprocess) == recipe_of(Preprocess())
         known = [model.descriptor.hog_of(traverse) for traverse in pair] if same else []

@@ -27,6 +27,7 @@ from dejavu_torch.data.ground_truth import (
 )
 from dejavu_torch.data.source import Source, as_traverse
 from dejavu_torch.data.traverse import fitted, kept
+from dejavu_torch.data.turning import Turned, facing_north
 from dejavu_torch.evaluation.baselines import Baseline, baselines_of, with_drives
 from dejavu_torch.evaluation.contenders import Contender, contend, models_beside
 from dejavu_torch.evaluation.evaluate import RANKS
@@ -45,11 +46,11 @@ from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import DejaVu, check_apart, check_queries, features_per_frame
 from dejavu_torch.motion.resampling import ground_truth_of, resampled, source_of
-from dejavu_torch.recognition.centring import centred
+from dejavu_torch.recognition.centring import centred, set_apart
 from dejavu_torch.recognition.localizer import SINGLE, Matching
 from dejavu_torch.recognition.select import check_candidates
 from dejavu_torch.recognition.smoother import PlaceSmoother
-from dejavu_torch.types import InputError, Match, SequenceModel, Traverse
+from dejavu_torch.types import InputError, Match, SequenceModel, Traverse, expect
 
 log = logging.getLogger("dejavu_torch")
 
@@ -99,6 +100,7 @@ def compare(
     storage_curve: bool = False,
     ordered: bool | None = None,
     loops: int | None = None,
+    headings: int = 1,
     progress: bool = False,
 ) -> Comparison:
     """Learn the reference, localize the queries on it, and compare with other ways to store the route.
@@ -131,6 +133,7 @@ def compare(
             of a smoother, on the map and on all baselines. None: as their source says.
         loops: also the query is the reference: find where it comes back to places of this many places before,
             see `DejaVu.loops`. The baselines are asked for the same.
+        headings: on the map of an area, see `DejaVu.localize`; of all contenders.
         progress: show progress bars on a terminal.
 
     Raises:
@@ -140,6 +143,7 @@ def compare(
     has_map, seconds = model.map.places > 0, dict.fromkeys(("describe", "learn", "localize"), 0.0)
     _check_settings(model, truth, interpolate, tolerance, top, leave_out)
     if loops is not None:
+        expect(headings == 1, "one of them", f"loops {loops} and headings {headings}")
         alone = query is None and leave_out is None and not (distractors or storage_curve or top != 1)
         _check_loops(loops, alone, sequence)
         reference, centre = as_traverse(reference), False  # the mean is that of the map
@@ -148,6 +152,8 @@ def compare(
     query = reference if query is None else query
     reference, query, off = _prepared(model, reference, query, distractors, seconds, progress, loops)
     check_candidates(top, tolerance, len(reference))
+    north = facing_north(query, reference.area, headings)  # pictures show images, not their copies
+    query = north if headings == 1 else query
     area, radius, within, near = reference.area, float(tolerance), tolerance, None
     if area is not None:
         truth, near = _by_distance(truth, query, area, tolerance)
@@ -178,11 +184,12 @@ def compare(
             also = models_beside(causal, beside, len(query), model.map.places, tolerance)
             alike = PlaceSmoother(within=tolerance) if beside and len(query) > 1 else None
             centring = in_order and model.centres(len(query)) if centre is None else centre
-            run = _described(model, reference, query, places, centring, tolerance, progress)
-            run = run._replace(matching=Matching(causal, also, apart=loops), radius=radius)
+            matching = Matching(causal, also, apart=loops, copies=headings)
+            run = _described(model, reference, query, places, centring, tolerance, matching, progress)
+            run = run._replace(radius=radius)
             run, found = _localized(run, smoother is not None, top, progress)
             run, candidates = _smoothed(run, found, smoother, alike, progress)
-        off_map = _match_distractors(model, off, smoother or causal, centring, progress)
+        off_map = _match_distractors(model, off, smoother or causal, centring, headings, progress)
 
         model.cpu()
         if known is not None:
@@ -201,6 +208,7 @@ def compare(
         **facts_of(run, seconds),
         **match_facts(run, found, truth, interpolate, off_map),
         "centred": centring,
+        **({"headings": headings} if headings > 1 else {}),
         **metric_facts(run, truth),
         **({"second": second.placed_facts()} if second is not None and second.placed else {}),
         **{name: dict(picture.numbers) for name, picture in pictures.items() if picture.numbers},
@@ -315,13 +323,16 @@ def _described(
     places: Tensor,
     centring: bool,
     tolerance: int,
+    matching: Matching,
     progress: bool,
 ) -> Localization:
     """The run with the descriptors of its queries, and no answers yet."""
     check_queries(model, query.frame_shape, features_per_frame(model), query.name)
-    queries = places if query is reference else model.descriptor.all_of(query, progress)
-    run = Localization(model, reference, query, places, queries, NOTHING, None, tolerance)
-    if centring:
+    run = Localization(model, reference, query, places, places, NOTHING, None, tolerance, matching)
+    if query is not reference:
+        run = run._replace(query_features=run.described_by(model, progress))
+    queries = run.query_features
+    if centring and not isinstance(run.asked, Turned):
         run = run._replace(query_features=centred(model.map, queries), causal_features=queries)
     return run
 
@@ -336,7 +347,7 @@ def _localized(run: Localization, drive: bool, top: int, progress: bool) -> tupl
     def match(queries: Tensor, how: Matching) -> Match:
         # whose acceptance is not asked for beside a drive
         own = Matching(how.sequence) if drive else model.matching(how.sequence)
-        own = own._replace(also=how.also, k=ranks, radius=run.tolerance, apart=how.apart)
+        own = own._replace(also=how.also, k=ranks, radius=run.tolerance, apart=how.apart, copies=how.copies)
         return model.localize_descriptors(queries, own, progress=progress)
 
     found = run.match_by(match)
@@ -361,6 +372,7 @@ def _smoothed(
         return run, found
     own = model.matching(whole) if apart is None else model.loop_matching(apart, whole)
     own = own._replace(k=found.index.shape[1], radius=run.tolerance, plain=run.causal_features)
+    own = own._replace(copies=run.matching.copies)
     drive = model.localize_descriptors(run.query_features, own, progress=progress)
     best = drive.map(lambda column: column[:, 0])
     if apart is None:
@@ -382,7 +394,7 @@ def _other_contenders(
     found = baselines_of(run, seed, leave_out, progress) if judged or leave_out is not None else {}
     for key, (name, other) in others.items() if judged else ():
         other.learn(run.reference, progress)
-        queries, size = other.descriptor.all_of(run.query, progress), other.summary()
+        queries, size = run.described_by(other, progress), other.summary()
         match = other.localize_descriptors(queries, run.matching, progress=progress)
         beside = copy.deepcopy(run.beside)
         asked = None if beside is None else other.localizer(SINGLE).drive_query(queries, beside)
@@ -416,6 +428,7 @@ def _match_distractors(
     distractors: Sequence[Traverse],
     sequence: SequenceModel | None,
     centring: bool,
+    headings: int,
     progress: bool,
 ) -> dict[str, Tensor]:
     """The probability of the match of each frame of other routes, (n,) by name."""
@@ -425,9 +438,12 @@ def _match_distractors(
         return {}
     probabilities = {}
     for other in distractors:
-        queries = model.descriptor.all_of(other, progress)
-        matching = model.matching(copy.deepcopy(whole) if whole else sequence)
-        if centring and (sequence is None or whole):
+        asked = facing_north(other, model.map.area, headings)
+        queries = model.descriptor.all_of(asked, progress)
+        matching = model.matching(copy.deepcopy(whole) if whole else sequence)._replace(copies=headings)
+        if isinstance(asked, Turned):
+            queries = set_apart(queries)
+        elif centring and (sequence is None or whole):
             matching, queries = matching._replace(plain=queries), centred(model.map, queries)
         match = model.localize_descriptors(queries, matching)
         assert match.probability is not None

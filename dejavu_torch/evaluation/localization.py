@@ -12,12 +12,22 @@ from torch import Tensor
 
 from dejavu_torch.data.ground_truth import GroundTruth
 from dejavu_torch.data.positions import unit_of
+from dejavu_torch.data.turning import Turned, facing_north
 from dejavu_torch.evaluation.contenders import Contender, contend
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.resampling import ResampledTraverse
+from dejavu_torch.recognition.centring import set_apart
 from dejavu_torch.recognition.drive import DriveQuery
 from dejavu_torch.recognition.filter import PlaceFilter
-from dejavu_torch.recognition.localizer import SINGLE, Matching, Scoring, drive_query, earlier
+from dejavu_torch.recognition.localizer import (
+    SINGLE,
+    Matching,
+    Scoring,
+    best_copies,
+    copies_of,
+    drive_query,
+    earlier,
+)
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.types import Match, SequenceModel, Traverse
 
@@ -27,12 +37,13 @@ NOTHING = Match(torch.zeros(0, dtype=torch.int64), torch.zeros(0), torch.zeros(0
 class Localization(NamedTuple):
     """A map, its reference traverse, a query traverse, and the matches.
 
-    reference_features (N,D) and query_features (Q,D) may lie in a file. truth: None if unknown.
-    tolerance: in places, inclusive. matching: for the map and all baselines. causal_features: the queries
-    for sequences and filters, if query_features are centred, which takes all of them. match: the answers.
-    judged: the matches that the scores at top level judge, with those of other models. smoother: of the
-    answers, if they are those of the whole drive. beside: one to compare all contenders by, if any. radius:
-    in an area, the distance within which a match is right, in the unit of its coordinates; tolerance is 0.
+    reference_features (N,D) and query_features (Q,D), or those of all turned copies, may lie in a file.
+    truth: None if unknown. tolerance: in places, inclusive. matching: for the map and all baselines.
+    causal_features: the queries for sequences and filters, if query_features are centred, which takes all
+    of them. match: the answers. judged: the matches that the scores at top level judge, with those of
+    other models. smoother: of the answers, if they are those of the whole drive. beside: one to compare
+    all contenders by, if any. radius: in an area, the distance within which a match is right, in the unit
+    of its coordinates; tolerance is 0.
 
     Convention 11: match and truth count places and queries, pictures show frames of the sources.
     """
@@ -59,6 +70,16 @@ class Localization(NamedTuple):
     def sequence(self) -> SequenceModel | None:
         """The model that scores consecutive queries together, if any."""
         return self.matching.sequence
+
+    @property
+    def asked(self) -> Traverse:
+        """The frames whose descriptors the queries have: all turned copies, if several headings are tried."""
+        return facing_north(self.query, self.model.map.area, self.matching.copies)
+
+    def described_by(self, model: DejaVu, progress: bool = False) -> Tensor:
+        """The descriptors of the queries by a model, those of turned images by `set_apart`."""
+        rows = model.descriptor.all_of(self.asked, progress)
+        return set_apart(rows) if isinstance(self.asked, Turned) else rows
 
     def match_by(self, match: Callable[[Tensor, Matching], Match]) -> Match:
         """The matches of a function of queries and matching, with those of all models in `sequences`."""
@@ -107,7 +128,7 @@ class Localization(NamedTuple):
         """(Q,) the frame of its source that each query shows."""
         if isinstance(self.query, ResampledTraverse):
             return self.query.frame
-        return torch.arange(len(self.query_features))
+        return torch.arange(len(self.query_features) // self.matching.copies)
 
     @property
     def unit(self) -> str:
@@ -142,13 +163,14 @@ class Localization(NamedTuple):
     def scores(self, numbers: Tensor) -> Tensor:
         """Scores of single queries, on the CPU: their indices (B,) -> (B,N)."""
         place_map, apart = self.model.map, self.matching.apart
-        scores = place_map.scores(self.query_features[numbers].to(place_map.device)).float().cpu()
+        rows = self.query_features[copies_of(numbers, self.matching.copies)]
+        scores = best_copies(place_map.scores(rows.to(place_map.device)).float().cpu(), self.matching.copies)
         return scores if apart is None else earlier(scores, numbers, apart)
 
     def example_query(self, start: int, stop: int) -> tuple[int, list[int]]:
         """A query near the middle of a chunk, and its right places there; without truth the middle query."""
         if self.truth is None:
-            return len(self.query_features) // 2, []
+            return len(self.query_frames) // 2, []
         query = nearest_query(self.truth, (start + stop) / 2)
         right = self.truth.positives[query].tolist() if self.truth.judged[query] else []
         return query, [place for place in right if start <= place < stop]

@@ -1,4 +1,4 @@
-"""Matches as a csv: query,place,score,accepted[,probability][,confidence][,rank][,route][,x,y], two names."""
+"""Matches as a csv: query,place,score,accepted, what else is known (see `write_matches`), two names."""
 
 from __future__ import annotations
 
@@ -79,7 +79,11 @@ def write_matches(
     starts = list(itertools.accumulate((route.frames for route in routes), initial=0))
     matches = iter(matches)
     start = next(matches, None)
-    known = [name for name in ("probability", "confidence") if start is not None and name in start.columns]
+    known = [
+        name
+        for name in ("probability", "confidence", "heading")
+        if start is not None and name in start.columns
+    ]
     with ExitStack() as stack:
 
         def opened(path: Path) -> TextIO:
@@ -97,7 +101,9 @@ def write_matches(
             queries = torch.arange(first, total) if query_frames is None else query_frames[first:total]
             places = match.index if frame_of is None else frame_of(match.index)
             rank = torch.arange(each).repeat(len(queries)) + 1
-            right, sure = (match.columns.get(name, match.score) for name in ("probability", "confidence"))
+            right, sure, turn = (
+                match.columns.get(name, match.score) for name in ("probability", "confidence", "heading")
+            )
             route = match.route if routes and match.route is not None else torch.full_like(places, -1)
             cells = (
                 queries.repeat_interleave(each),
@@ -108,8 +114,9 @@ def write_matches(
                 sure,
                 rank,
                 route,
+                turn,
             )
-            for query, place, score, good, p, margin, at, on in zip(
+            for query, place, score, good, p, margin, at, on, north in zip(
                 *(one.tolist() for one in cells), strict=True
             ):
                 row = {
@@ -119,6 +126,7 @@ def write_matches(
                     "accepted": int(good),
                     "probability": "" if math.isnan(p) else f"{p:.6g}",
                     "confidence": "" if math.isnan(margin) else f"{margin:.6g}",
+                    "heading": "" if math.isnan(north) else f"{north:g}",
                     "rank": at,
                     "route": printable(routes[on].name) if on >= 0 else "",
                     "query_name": _name(query_names, query),

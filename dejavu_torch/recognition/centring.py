@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
@@ -10,6 +11,7 @@ from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.recognition.evidence import run_lengths, unchanged
 from dejavu_torch.types import InputError
 
+SHRINKAGE = 0.25  # least share of a covariance of turned queries that is replaced by a multiple of identity
 PRIOR = 50  # queries that the map's own mean counts as; fewer queries are not centred by default
 
 
@@ -29,6 +31,29 @@ def centred(place_map: PlaceMap, queries: Tensor) -> Tensor:
     weight = queries.any(1) / run_lengths(unchanged(queries)).to(queries)
     shift = weight @ (queries - place_map.mean.to(queries))
     return _without(place_map.metric, queries, shift / (weight.sum() + PRIOR))
+
+
+def set_apart(queries: Tensor) -> Tensor:
+    """Queries without what is common among them: (q - m) / C, scaled to length 1, where m is their mean, with
+    50 further queries of 0, and C their covariance about it, of which a share of K / (K + Q), at least 0.25,
+    is replaced by a multiple of the identity.
+
+    Turned images have much in common that north-up windows of a map have not, so whatever place has a little
+    of it is similar to all of them. Of turned copies most show wrong headings: they tell what is common by
+    chance. Queries of 0, as of blank frames, stay 0 and do not count.
+
+    Shape: (Q,K) -> (Q,K).
+    """
+    shows = queries.any(1)
+    known = queries[shows].double().cpu()
+    moved = known - known.sum(0) / (len(known) + PRIOR)
+    covariance = moved.T @ moved / max(1, len(known))
+    few, scale = known.shape[1] / (len(known) + known.shape[1]), covariance.diagonal().mean()
+    share = max(SHRINKAGE, few)
+    covariance = (1 - share) * covariance
+    covariance.diagonal().add_((share * scale).clamp(min=1e-30))
+    apart = F.normalize(torch.linalg.solve(covariance, moved.T).T, dim=1)
+    return torch.zeros_like(queries).masked_scatter(shows[:, None], apart.to(queries))
 
 
 class RunningMean(nn.Module):

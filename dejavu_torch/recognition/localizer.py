@@ -49,6 +49,7 @@ class Matching(NamedTuple):
     search: Search = "auto"  # of single queries, see `DejaVu.localize`
     removed: float = 1.0  # of each place's mean score, by a smoother
     apart: int | None = None  # queries are the places themselves; only those over this many before answer
+    copies: int = 1  # rows of each query, evenly turned: each place has the best score of them
 
 
 SINGLE = Matching()  # each query by itself
@@ -63,7 +64,8 @@ class Localizer:
         searcher: finds the best places of single queries; None is a `Scan`.
         area: of the places, without a map.
 
-    Shape: descriptors (B,K) of the next queries -> Match of (B,), or (B,k), on the CPU, without gradients.
+    Shape: descriptors (B,K) of the next queries, or (B x copies, K) -> Match of (B,), or (B,k), on the CPU,
+        without gradients.
 
     Convention: memory does not grow with the queries. A call that raises leaves the state unchanged.
 
@@ -112,7 +114,7 @@ class Localizer:
         searches = searches and (type(self.searcher) is not Scan or (few and places > SHORT))
         per_number = GROUP if isinstance(self.searcher, RowSearch) else PLACES_PER_NUMBER
         size = max(PER_BEST * n, places // per_number) if searches else places
-        parts = descriptors.split(max(1, min(ROWS, SCORES_AT_ONCE // size)))
+        parts = descriptors.split(whole(min(ROWS, SCORES_AT_ONCE // size), matching.copies))
         moved = (part.to(place_map.device) for part in with_progress(parts, "localizing", progress))
         if searches:
             match = Match.joined(self._search(part, wanted) for part in moved)
@@ -120,20 +122,24 @@ class Localizer:
             match = Match.joined(self.match(place_map.scores(part)) for part in moved)
         # blank frames find nothing by themselves
         if matching.sequence is None and getattr(place_map, "metric", "") == "cosine":
-            shows = descriptors.any(1).cpu()
+            shows = descriptors[:: matching.copies].any(1).cpu()
             match = replace(match, accepted=match.accepted & shows.view(-1, *[1] * (match.accepted.ndim - 1)))
         return match
 
     @torch.no_grad()
     def match(self, scores: Tensor) -> Match:
-        """Match the next queries by their scores: (B,N) -> (B,), or (B,k)."""
+        """Match the next queries by their scores: (B,N), or (B x copies, N) -> (B,), or (B,k)."""
+        turn, copies = None, self.matching.copies
+        if copies > 1:
+            scores, turn = scores.view(-1, copies, scores.shape[1]).min(1)
         if self.matching.apart is not None:
             numbers = self.matched + torch.arange(len(scores))
             scores = earlier(scores, numbers, self.matching.apart)
             self.matched += len(scores)
         parts = scores.split(max(1, CACHED // scores.shape[1]))
         if not self.models:
-            return Match.joined(map(self._alone, parts))
+            turns = [None] * len(parts) if turn is None else turn.split(len(parts[0]))
+            return Match.joined(map(self._alone, parts, turns))
         with in_one_thread(scores.shape[1]):
             return Match.joined(map(self._in_sequence, parts))
 
@@ -155,13 +161,27 @@ class Localizer:
         # whose scores are distances
         if acceptance.threshold is not None and not smoother.is_drive and not asked.checks:
             acceptance = Acceptance(precision=math.exp(-acceptance.threshold))
+        if self.matching.copies > 1:
+            match = replace(match, heading=self._headings(descriptors, match.index, score))
         return self._accepted(match, acceptance)
+
+    def _headings(self, descriptors: Tensor, index: Tensor, score: Scoring | None) -> Tensor:
+        """The headings (Q,k) of the copies that are most similar to places (Q,k)."""
+        copies, found, place_map = self.matching.copies, [], self.place_map
+        assert place_map is not None
+        score = score or (lambda rows: place_map.scores(rows.to(place_map.device)))
+        each = whole(SCORES_AT_ONCE // place_map.places, copies)
+        for rows, places in zip(descriptors.split(each), index.split(each // copies), strict=True):
+            scores = score(rows).cpu().view(len(places), copies, -1)
+            at = places.clamp(min=0)[:, None].expand(-1, copies, -1)
+            found.append(heading_of(scores.gather(2, at).argmin(1), places, copies))
+        return torch.cat(found) if found else index.float()
 
     def drive_query(
         self, descriptors: Tensor, smoother: PlaceSmoother, score: Scoring | None = None
     ) -> DriveQuery:
         """What `drive` matches."""
-        matching, place_map, tiles = self.matching, self.place_map, None
+        matching, place_map, tiles, copies = self.matching, self.place_map, None, self.matching.copies
         if score is None:
             assert place_map is not None
             device, scores, score_blocks = place_map.device, place_map.scores, place_map.score_blocks
@@ -174,7 +194,7 @@ class Localizer:
         smoother.removed = matching.removed
 
         def rows(queries: Tensor) -> Rows:
-            return lambda numbers: score(queries[numbers])
+            return lambda numbers: best_copies(score(queries[copies_of(numbers, copies)]), copies)
 
         def loops(numbers: Tensor) -> Tensor:
             assert matching.apart is not None
@@ -186,7 +206,7 @@ class Localizer:
         if matching.apart is not None:
             return DriveQuery(loops, descriptors, smoother, *settings, checks=True)
         single = None if matching.plain is None else rows(matching.plain)
-        return DriveQuery(rows(descriptors), descriptors, smoother, *settings, single, tiles)
+        return DriveQuery(rows(descriptors), descriptors[::copies], smoother, *settings, single, tiles)
 
     @torch.no_grad()
     def skip(self, queries: int) -> None:
@@ -210,8 +230,12 @@ class Localizer:
         state = self.states.get("filter")
         return state if state is None or state.ndim == 1 else state[0]
 
-    def _alone(self, scores: Tensor) -> Match:
-        return self._answer(self._candidates(scores), best_pair(scores, self.area))
+    def _alone(self, scores: Tensor, turn: Tensor | None = None) -> Match:
+        match = self._candidates(scores)
+        if turn is not None:
+            best = turn.gather(1, match.index.clamp(min=0))
+            match = replace(match, heading=heading_of(best, match.index, self.matching.copies))
+        return self._answer(match, best_pair(scores, self.area))
 
     def _in_sequence(self, scores: Tensor, last: bool = False) -> Match:
         states = self.states or {T: m.start(scores.shape[1]).to(scores) for T, m in self.models.items()}
@@ -268,7 +292,14 @@ class Localizer:
         """Candidates from the lowest scores alone; `wanted` has those of the answer first."""
         assert self.searcher is not None
         score, place = self.searcher(descriptors, wanted)
+        copies, each = self.matching.copies, score.shape[1]
+        # the best of all copies are among the best of each
+        score, place = score.view(-1, copies * each), place.view(-1, copies * each)
         match, pair = (best_candidates(score, *spec, place, self.area) for spec in wanted)
+        if copies > 1:
+            found = (place[:, None] == match.index[..., None]) & (score[:, None] == match.score[..., None])
+            turn = found.byte().argmax(2) // each
+            match = replace(match, heading=heading_of(turn, match.index, copies))
         return self._answer(match, pair)
 
 
@@ -284,6 +315,26 @@ def earlier(scores: Tensor, numbers: Tensor, apart: int) -> Tensor:
     """Scores (B,N) of the places `numbers` (B,) as queries, infinite but for those over `apart` before."""
     place = torch.arange(scores.shape[1], device=scores.device)
     return scores.masked_fill(place >= (numbers[:, None] - apart).to(scores.device), math.inf)
+
+
+def whole(rows: int, copies: int) -> int:
+    """So many rows at a time, but at least one, and all copies of a query together."""
+    return max(1, rows // copies) * copies
+
+
+def copies_of(numbers: Tensor, copies: int) -> Tensor:
+    """The rows of queries, (B,) -> (B x copies,)."""
+    return (numbers[:, None] * copies + torch.arange(copies)).flatten()
+
+
+def best_copies(scores: Tensor, copies: int) -> Tensor:
+    """The best score of each place over all copies of a query, (B x copies, N) -> (B,N)."""
+    return scores if copies == 1 else scores.view(-1, copies, scores.shape[1]).amin(1)
+
+
+def heading_of(turn: Tensor, index: Tensor, copies: int) -> Tensor:
+    """The heading of copies in degrees, NaN where the place `index` is -1."""
+    return (turn * (360 / copies)).float().masked_fill(index < 0, torch.nan)
 
 
 def best_pair(scores: Tensor, area: Area | None = None) -> Match:

@@ -29,7 +29,7 @@ def images(folder, *names):
 
 def values(text, traverse, tmp_path):
     (tmp_path / "where.csv").write_text(text)
-    return read_coordinates(tmp_path / "where.csv", traverse).values.tolist()
+    return read_coordinates(tmp_path / "where.csv", traverse)[0].values.tolist()
 
 
 @pytest.mark.parametrize(
@@ -137,6 +137,6 @@ def test_a_report_tells_errors_in_metres(tmp_path):
     reference, query = ArrayTraverse(rows, "one"), ArrayTraverse(rows.clone(), "two")
     for traverse, y in ((reference, 0), (query, 1)):
         (tmp_path / "w.csv").write_text("x,y\n" + "\n".join(f"{10 * i},{y}" for i in range(60)))
-        traverse.coordinates = read_coordinates(tmp_path / "w.csv", traverse)
+        traverse.coordinates, _ = read_coordinates(tmp_path / "w.csv", traverse)
     facts = compare(reference, query, "metres:2", tolerance=0).report.facts
     assert facts["error_metres"]["all"] == {"0.5": 1.0, "0.9": 1.0, "0.99": 1.0}

@@ -1,0 +1,64 @@
+"""Images of a camera that looks down, turned about their middle so that north is up."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from dejavu_torch.area import Area
+from dejavu_torch.data.traverse import Part
+from dejavu_torch.memory import without_autocast
+from dejavu_torch.types import Traverse, expect
+
+MOST = 360  # headings of an image that are tried
+
+
+@without_autocast
+def turned_north(frames: Tensor, heading: Tensor) -> Tensor:
+    """Frames (B,C,H,W) whose upper side looks towards `heading` (B,), degrees clockwise from north, turned by
+    it about their middle, bilinear. Corners that they do not show are reflected."""
+    angle = heading.to(frames).deg2rad()
+    height, width = frames.shape[-2:]
+    cos, sin, none = angle.cos(), angle.sin(), torch.zeros_like(angle)
+    rows = torch.stack([cos, sin * height / width, none, -sin * width / height, cos, none], 1)
+    grid = F.affine_grid(rows.view(-1, 2, 3), list(frames.shape), align_corners=False)
+    return F.grid_sample(frames, grid, padding_mode="reflection", align_corners=False)
+
+
+class Turned(Part):
+    """Frames turned north, see `turned_north`.
+
+    Args:
+        heading: (n,) degrees; frames whose heading is NaN stay as they are. copies: n is a multiple of it,
+            and each frame follows so many times.
+    """
+
+    def __init__(self, traverse: Traverse, heading: Tensor, copies: int = 1) -> None:
+        every = range(len(traverse))
+        super().__init__(traverse, every if copies == 1 else torch.tensor(every).repeat_interleave(copies))
+        self.heading, self.headings = heading.nan_to_num(), None
+
+    def read(self, frames: range | list[int]) -> Tensor:
+        return turned_north(super().read(frames), self.heading[torch.as_tensor(frames)])
+
+
+def facing_north(traverse: Traverse, area: Area | None, headings: int = 1) -> Traverse:
+    """Queries as the map of an area compares them: turned by their own headings, if these are known, or, for
+    more than one of `headings`, as many copies of each frame, turned evenly over 360 degrees. On a route, and
+    without known headings, they stay as they are.
+
+    Raises:
+        InputError: several headings on a route, of ready features, or out of range.
+    """
+    fits = isinstance(headings, int) and 1 <= headings <= MOST
+    expect(fits, f"a whole number from 1 to {MOST}", headings=headings)
+    if headings > 1:
+        expect(area is not None, "the map of an area, as of grid:PICTURE", f"headings {headings} on a route")
+        seen = f"headings {headings}, and {traverse.name} has ready features"
+        expect(len(traverse.frame_shape) == 3, "images, which can be turned", seen)
+        evenly = (torch.arange(headings) * 360 / headings).repeat(len(traverse))
+        return Turned(traverse, evenly, headings)
+    if area is None or traverse.headings is None or len(traverse.frame_shape) != 3:
+        return traverse
+    return Turned(traverse, traverse.headings)

@@ -1,0 +1,187 @@
+"""Images of any heading on the map of an area: turned by known ones, or as copies of which one is found."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from command_line import fails, rows_of, run, write_images
+from helpers import refused
+from PIL import Image
+
+from dejavu_torch import DejaVu, PlaceSmoother, SpectralMapper, Whitening, compare, open_source
+from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.data.grid import Grid
+from dejavu_torch.data.turning import Turned, facing_north, turned_north
+from dejavu_torch.recognition.centring import set_apart
+from dejavu_torch.recognition.localizer import Localizer, Matching
+from dejavu_torch.recognition.select import best_candidates
+
+
+@pytest.fixture(scope="module")
+def ground():
+    """Windows of a smooth picture of 192 x 224 pixels, in 9 rows and 11 columns."""
+    noise = torch.rand(3, 1, 208, 240, generator=torch.Generator().manual_seed(0))
+    picture = torch.nn.functional.avg_pool2d(noise, 9, 1)[:, 0, :192, :224]
+    picture = (picture - picture.amin()) / (picture.amax() - picture.amin())
+    return Grid((255 * picture).byte(), window=64, stride=16, name="ground")
+
+
+@pytest.fixture(scope="module")
+def model(ground):
+    return DejaVu(mapper=SpectralMapper(8), whitening=Whitening(views=2)).learn(ground)
+
+
+PLACES = torch.arange(2, 99, 4)
+QUARTERS = torch.arange(len(PLACES)) % 4  # of a turn, clockwise
+
+
+@pytest.fixture(scope="module")
+def images(ground):
+    """Windows as a camera with these headings sees them, turned the other way."""
+    each = zip(ground[PLACES], QUARTERS.tolist(), strict=True)
+    return torch.stack([frame.rot90(quarter, (1, 2)) for frame, quarter in each])
+
+
+def test_quarter_turns_are_exact_and_clockwise(images, ground):
+    assert torch.allclose(turned_north(images, 90 * QUARTERS), ground[PLACES], atol=1e-5)
+    wide = torch.rand(1, 3, 20, 40)
+    assert torch.allclose(turned_north(wide, torch.tensor([180.0])), wide.rot90(2, (2, 3)), atol=1e-5)
+    # what is 5 pixels above the middle is 5 pixels right of it, once a camera that looks east is north up
+    dot = torch.zeros(1, 1, 41, 41)
+    dot[0, 0, 15, 20] = 1
+    assert turned_north(dot, torch.tensor([90.0]))[0, 0, 20, 25] > 0.99
+
+
+@pytest.mark.parametrize("search", ["auto", "scan"])
+def test_quarter_turns_are_found_and_their_headings_told(model, images, search):
+    match = model.localize(images, search=search, headings=4)
+    assert match.index.tolist() == PLACES.tolist()
+    assert match.heading.tolist() == (90 * QUARTERS).tolist()
+    several = model.candidates(images, 3, headings=4, search=search)
+    assert torch.equal(several.index[:, 0], match.index)
+    assert torch.equal(several.heading[:, 0], match.heading)
+    assert several.heading.shape == (len(images), 3)
+
+
+def test_the_best_of_all_copies_is_the_minimum_of_their_scores(model, images):
+    rows = model.descriptor(images)[:24]
+    with torch.no_grad():
+        scores = model.map.scores(rows).view(6, 4, -1)
+    expected = best_candidates(scores.amin(1), 4, 2, area=model.map.area)
+    for search in ("auto", "scan"):
+        matching = Matching(k=4, radius=2, copies=4, search=search)
+        match = model.localize_descriptors(rows, matching)
+        assert torch.equal(match.index, expected.index)
+        assert torch.allclose(match.score, expected.score, atol=1e-4)
+        at = expected.index[:, None].expand(-1, 4, -1)
+        assert torch.equal(match.heading, 90.0 * scores.gather(2, at).argmin(1))
+    none = Localizer(None, Matching(copies=2)).match(torch.full((2, 5), math.inf))
+    assert none.index.tolist() == [-1]
+    assert none.heading.isnan().all()
+
+
+def test_one_heading_is_none_bit_by_bit(model, ground):
+    plain, one = model.localize(ground[PLACES]), model.localize(ground[PLACES], headings=1)
+    assert plain.columns.keys() == one.columns.keys()
+    assert "heading" not in one.columns
+    assert all(torch.equal(one.columns[name], column) for name, column in plain.columns.items())
+
+
+def test_known_headings_turn_as_by_hand(model, images, ground):
+    query = ArrayTraverse(images)
+    query.headings = (90 * QUARTERS).double()
+    north = facing_north(query, ground.area)
+    assert isinstance(north, Turned)
+    assert torch.allclose(north[:], ground[PLACES], atol=1e-5)
+    assert facing_north(north, ground.area) is north
+    assert facing_north(query, None) is query  # a car has headings too, and its images look ahead
+    match = model.localize(query)
+    assert match.index.tolist() == PLACES.tolist()
+    by_hand = model.localize_descriptors(set_apart(model.descriptor(turned_north(images, 90 * QUARTERS))))
+    assert torch.equal(match.index, by_hand.index)
+    assert torch.allclose(match.score, by_hand.score, atol=1e-5)
+    query.headings[3] = math.nan
+    assert torch.allclose(facing_north(query, ground.area)[3], images[3], atol=1e-5)
+
+
+def as_pixels(images):
+    return (255 * images).round().byte().permute(0, 2, 3, 1).numpy()
+
+
+@pytest.mark.parametrize("times", [False, True])
+def test_headings_are_read_with_coordinates(tmp_path, times):
+    write_images(tmp_path / "photos", as_pixels(torch.zeros(3, 3, 8, 8)))
+    if times:  # between two rows the shorter way around
+        rows = "time,x,y,heading\n-.5,0,0,330\n.5,1,0,30\n1.5,2,0,50\n2.5,2,0,\n"
+        expected = [0, 40, math.nan]
+    else:
+        rows = "heading,x,y\n350,0,0\n-10,1,0\n361,2,0\n"
+        expected = [350, 350, 1]
+    (tmp_path / "track.csv").write_text(rows)
+    photos = open_source(f"{tmp_path}/photos?coordinates={tmp_path}/track.csv")
+    assert photos.headings.numpy() == pytest.approx(expected, abs=1e-6, nan_ok=True)
+    assert photos.coordinates.values.shape == (3, 2)
+    part = open_source(f"{tmp_path}/photos?coordinates={tmp_path}/track.csv&start=1")
+    assert part.headings[0] == pytest.approx(expected[1])
+
+
+def test_a_flight_is_found_and_its_headings_told(model, ground):
+    path = torch.cat([44 + torch.arange(11), 65 - torch.arange(11)])  # there and back
+    turns = torch.arange(22) // 3 % 4
+    flight = torch.stack([ground[int(p)].rot90(int(t), (1, 2)) for p, t in zip(path, turns, strict=True)])
+    match = model.localize(flight, sequence=PlaceSmoother(), headings=4)
+    assert model.map.area.distance(match.index, path).amax() <= 1
+    exact = match.index == path
+    assert exact.sum() >= 18
+    assert torch.equal(match.heading[exact], 90.0 * turns[exact])
+
+
+def test_what_is_set_apart_has_length_one():
+    rows = torch.randn(300, 8) @ torch.diag(torch.tensor([30.0, 5, 1, 1, 1, 1, 1, 1])) + 4
+    rows[7] = 0
+    apart = set_apart(rows)
+    assert apart.norm(dim=1).sort().values.tolist() == pytest.approx([0] + 299 * [1], abs=1e-5)
+    assert (apart[7] == 0).all()
+    assert apart.std(0)[0] < 2 * apart.std(0)[2:].mean()  # 30 times before
+    assert set_apart(torch.zeros(2, 4)).tolist() == torch.zeros(2, 4).tolist()
+    assert set_apart(torch.zeros(0, 4)).shape == (0, 4)
+
+
+def test_what_cannot_be_turned_is_refused(model, ground, images):
+    with refused("headings is 0; expected a whole number from 1 to 360"):
+        model.localize(images, headings=0)
+    with refused("headings 4 on a route; expected the map of an area, as of grid:PICTURE"):
+        DejaVu().learn(ground[:12]).localize(images, headings=4)
+    rows = model.descriptor.describe(images)
+    with refused("headings 4, and the array has ready features; expected images, which can be turned"):
+        model.localize(rows, headings=4)
+    with refused("loops 3 and headings 4; expected one of them"):
+        compare(ground, None, loops=3, headings=4)
+
+
+def test_commands_try_headings(tmp_path, model, ground, images, capsys):
+    pixels = np.zeros((192, 224, 3), dtype=np.uint8)
+    frames = as_pixels(ground[:])
+    for frame, (row, column) in zip(frames, (16 * ground.area.cells(torch.arange(99))).tolist(), strict=True):
+        pixels[row : row + 64, column : column + 64] = frame
+    Image.fromarray(pixels).save(tmp_path / "ground.png")
+    write_images(tmp_path / "photos", as_pixels(images))
+    lines = (f"{x},{y}" for x, y in ground.area.coordinates(PLACES).tolist())
+    (tmp_path / "track.csv").write_text("\n".join(["x,y", *lines]))
+    area, out = f"grid:{tmp_path}/ground.png?window=64&stride=16", tmp_path / "report"
+    photos, known = f"{tmp_path}/photos?coordinates={tmp_path}/track.csv", tmp_path / "ground.safetensors"
+    model.save(known)
+    words = "--map", known, "--truth", "pixels:4", "--tolerance", "4", "--unordered", "--out", out
+    run("compare", area, photos, *words, "--headings", "4")
+    report = json.loads((out / "report.json").read_text())
+    assert (report["headings"], report["recall_at_1"], report["uncompressed"]["recall_at_1"]) == (4, 1, 1)
+    expected = (90.0 * QUARTERS).tolist()
+    assert [float(row["heading"]) for row in rows_of(out / "matches.csv")] == expected
+    run("localize", known, photos, "--unordered", "--headings", "4", "--out", tmp_path / "matches.csv")
+    assert [float(row["heading"]) for row in rows_of(tmp_path / "matches.csv")] == expected
+    words = known, photos, "--headings", "0", "--out", tmp_path / "matches.csv"
+    assert "headings is 0; expected a whole number" in fails(capsys, "localize", *words)
