@@ -391,7 +391,7 @@ def test_an_area_is_compared_by_distance(pictures, small_tiles, tmp_path, monkey
     long_from(monkeypatch, 200)  # learned tile by tile
     one = f"grid:{pictures}/one.png?window=48&stride=8"
     two = f"grid:{pictures}/two.png?window=48&stride=11&rows=3:180"
-    run("compare", one, two, "--tolerance", "6", "--bytes", "4", "--out", tmp_path / "report")
+    run("compare", one, two, "--tolerance", "6", "--bytes", "2.5", "--out", tmp_path / "report")
     said = capsys.readouterr().out
     assert "within 6 pixels" in said
     assert "every 2nd window" not in said  # twice 6 pixels are one window
@@ -399,9 +399,9 @@ def test_an_area_is_compared_by_distance(pictures, small_tiles, tmp_path, monkey
     own = open_source(two).coordinates.values
     found = torch.tensor([[float(row["x"]), float(row["y"])] for row in rows], dtype=torch.float64)
     right = (found - own).norm(dim=1) <= 6
-    report = compare(one, two, tolerance=6, model=DejaVu(mapper=SpectralMapper(4.0))).report.as_json()
+    report = compare(one, two, tolerance=6, model=DejaVu(mapper=SpectralMapper(2.5))).report.as_json()
     assert report["recall_at_1"] == pytest.approx(float(right.double().mean()))
-    assert report["recall_at_1"] > 0.7
+    assert report["recall_at_1"] > 0.4
     assert report["null"]["recall_at_1"] < 0.95 * report["recall_at_1"]
     assert report["area"] == {"rows": 19, "columns": 19}
     assert report["error_pixels"]["all"]["0.5"] < 6
