@@ -14,7 +14,7 @@ from torch import Tensor
 from benchmarks.front import summarised
 from benchmarks.measure import Row, write_bench
 from benchmarks.quantisers import Quantiser
-from dejavu_torch import DejaVu, PlaceSmoother, SpectralMapper, Whitening
+from dejavu_torch import DejaVu, PlaceFilter, PlaceSmoother, SpectralMapper, Whitening
 from dejavu_torch.area import Area
 from dejavu_torch.data.demo import open_area
 from dejavu_torch.evaluation.baselines import as_int8, scores_of_stored, stored_frames
@@ -23,7 +23,7 @@ from dejavu_torch.evaluation.controls import shuffled
 from dejavu_torch.evaluation.plots import Plot, legend
 from dejavu_torch.evaluation.quantiser import product_quantised
 from dejavu_torch.recognition.drive import localize_drive
-from dejavu_torch.recognition.localizer import Scoring, drive_query
+from dejavu_torch.recognition.localizer import Localizer, Matching, Scoring, drive_query
 
 SEEDS = (1, 2, 3)  # of whitening, queries, codebooks and the order of the control; settings were chosen on 0
 STRIDE, QUERIES = 4, 1500  # pixels of 12.5 cm; queries at any offset
@@ -35,7 +35,7 @@ SKIPPED = int(
 )  # windows from one that is stored to the next: as many as the radius allows
 BYTES = (0.3, 0.42, 1.0, 2.2, 4.0)
 CODES = (1, 2, 4)
-FLIGHT = ("flight", "flight_accepted_wrong")
+FLIGHT = ("flight", "flight_accepted_wrong", "flight_on_the_way")
 NAMES = {
     "map": "this map, both directions",
     "rows": "maps of its rows",
@@ -110,8 +110,11 @@ def measured(seed: int) -> list[Row]:
             found = localize_drive(drive)
             right = (where.values[found.index[:, 0]] - own.values[path]).norm(dim=1) <= RADIUS
             sure = found.probability[:, 0] >= 0.5 if found.probability is not None else right
-            rows[-1] |= {"flight": float(right.double().mean())}
-            rows[-1] |= {"flight_accepted_wrong": float((sure & ~right).double().mean())}
+            matcher = Localizer(None, Matching(PlaceFilter()), area=reference.area)
+            live = matcher.match(torch.cat([score(part) for part in flown.split(64)])).index
+            on_the_way = (where.values[live] - own.values[path]).norm(dim=1) <= RADIUS
+            shares = right, sure & ~right, on_the_way
+            rows[-1] |= {key: float(one.double().mean()) for key, one in zip(FLIGHT, shares, strict=True)}
     return rows
 
 
@@ -152,9 +155,9 @@ def run_areas(*, out: Path) -> list[str]:
     """
     means = summarised([row for seed in SEEDS for row in measured(seed)], ("recall_at_1", *FLIGHT))
     write_bench(out, means, plot_areas(means), seeds=list(SEEDS), radius=RADIUS)
-    lines = [f"{'':<38}{'bytes':>8}{'one image':>11}{'flight':>8}"]
+    lines = [f"{'':<38}{'bytes':>8}{'one image':>11}{'flight':>8}{'on the way':>12}"]
     for row in means:
         name = NAMES[row["contender"]]
-        whole = f"{row['flight']:>8.3f}" if "flight" in row else ""
+        whole = "".join(f"{row[key]:>{8 + 4 * (key == FLIGHT[2])}.3f}" for key in FLIGHT[::2] if key in row)
         lines.append(f"{name:<38}{row['bytes_per_place']:>8}{row['recall_at_1']:>11.3f}{whole}")
     return [*lines, f"means of {len(SEEDS)} seeds"]

@@ -1,4 +1,4 @@
-"""`benchmarks terrain`: a square kilometre of simulated ground, a window at each metre, in bytes and seconds."""
+"""`benchmarks terrain`: a square kilometre of simulated ground, a window each metre, in bytes and seconds."""
 
 from __future__ import annotations
 

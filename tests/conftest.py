@@ -16,6 +16,7 @@ from PIL import Image
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
+import dejavu_torch.area as areas
 from dejavu_torch.data.simulate.route import SimulatedRoute
 from dejavu_torch.features import distilled
 from dejavu_torch.maps import compiling
@@ -160,3 +161,12 @@ class LargestTensor(TorchDispatchMode):
 def largest_tensor():
     """`with largest_tensor() as seen: ...` and then `seen.numel`."""
     return LargestTensor
+
+
+@pytest.fixture
+def small_tiles(monkeypatch):
+    """Areas have tiles of about six windows to a side."""
+    areas._cached_tiles.cache_clear()
+    monkeypatch.setattr(areas, "SIDE", 6)
+    yield
+    areas._cached_tiles.cache_clear()

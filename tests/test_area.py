@@ -46,15 +46,6 @@ from dejavu_torch.types import Match
 SIDES = st.integers(1, 40)
 
 
-@pytest.fixture
-def small_tiles(monkeypatch):
-    """Tiles of about six windows to a side."""
-    areas._cached_tiles.cache_clear()
-    monkeypatch.setattr(areas, "SIDE", 6)
-    yield
-    areas._cached_tiles.cache_clear()
-
-
 def smooth(rows, columns, dimension=12, seed=0):
     """Descriptors (rows x columns, K) that change slowly in both directions, row by row."""
     draw = torch.Generator().manual_seed(seed)

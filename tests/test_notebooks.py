@@ -11,6 +11,7 @@ import pytest
 
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
 SHORTER = {
+    "a_map_of_the_ground": {"metres=256": "metres=48"},
     "a_frame_a_drive_a_map_that_learns": {'width=64"': 'width=64&frames=800"'},
     "the_paper_in_ten_cells": {},
     "two_drives_of_your_own": {"step=4": "step=4&stop=500", "start=500": "start=100&stop=500"},
