@@ -16,6 +16,7 @@ from torch import Tensor
 from dejavu_torch.area import Area
 from dejavu_torch.data.traverse import Part
 from dejavu_torch.features.descriptor import Descriptor
+from dejavu_torch.features.shared import Blocks
 from dejavu_torch.features.views import (
     LEAST,
     SAMPLE,
@@ -169,7 +170,12 @@ def fit(
     """A map without places, but with whitening, mean and step from the sample of a long traverse."""
     sample = Sample.of(len(traverse), mapper.chunk, traverse.area)
     views = second and sample.views(second)
-    rows = descriptor.learn(Part(traverse, sample.frame), views, progress, verb="sampling")
+    frames = Blocks(traverse, sample.frame, sample.sizes)
+    rows = descriptor.learn(frames, views, progress, verb="sampling")
+    if traverse.area is not None:
+        sample = Sample.of_tiles(traverse.area)
+        frames = Blocks(traverse, sample.frame, sample.sizes)
+        rows = torch.cat([*descriptor.batches(frames, progress, "sampling", shared=True)])
     if visits is not None:
         rows = averaged(descriptor, rows, views_of(visits, sample.frame), progress)
     # the sample is charged its share of the fixed bytes

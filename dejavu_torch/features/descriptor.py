@@ -9,6 +9,7 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor, nn
 
+from dejavu_torch.data.grid import Grid
 from dejavu_torch.data.traverse import Part
 from dejavu_torch.features.distilled import Distilled
 from dejavu_torch.features.extract import (
@@ -23,7 +24,7 @@ from dejavu_torch.features.extract import (
 from dejavu_torch.features.hog import CELL, HOG
 from dejavu_torch.features.joined import Joined, groups_of
 from dejavu_torch.features.preprocess import BLANK, DEEP, Preprocess, measured_range
-from dejavu_torch.features.shared import Sharing, Windows, windows_of
+from dejavu_torch.features.shared import Sharing, Windows
 from dejavu_torch.features.views import SAMPLE, AugmentedFrames, LabelledFrames, Sample, augmented_route
 from dejavu_torch.features.whitening import INDEPENDENT, MOST_VIEWS, WIDEST, Visits, Whitening
 from dejavu_torch.memory import IN_MEMORY, concatenate
@@ -126,9 +127,9 @@ class Descriptor(nn.Module):
         height, width = own_size(self.features) or (1, 1)
         size = max(1, min(self.batch_size, BATCH_NUMBERS // (3 * height * width)))
         settings = self.device, progress, verb, on_first, self.describe
-        windows = windows_of(traverse) if shared else None
-        if windows is not None and self.sharing.fits(windows):
-            return self._shared(windows, size, progress, verb, on_first)
+        windows = Windows.of(traverse) if shared else None
+        if windows is not None and self.sharing.fits(windows.grid):
+            return self._shared(windows, traverse, size, progress, verb, on_first)
         if self.known is None:
             batches = feature_batches(traverse, self, size, *settings)
             return self._set_aside(batches, traverse) if id(traverse) in self.aside else batches
@@ -145,12 +146,18 @@ class Descriptor(nn.Module):
 
     @torch.no_grad()
     def _shared(
-        self, windows: Windows, size: int, progress: bool, verb: str, on_first: OnFirst | None
+        self,
+        windows: Windows,
+        traverse: Traverse | AugmentedFrames,
+        size: int,
+        progress: bool,
+        verb: str,
+        on_first: OnFirst | None,
     ) -> Iterator[Tensor]:
         if on_first is not None:
-            some = Part(windows.grid, windows.frames[:size])
+            some = Part(windows.grid, range(min(size, len(windows.grid))))
             on_first(some[:], torch.cat([*self.features_in(some)]))
-        with progress_of(verb, len(windows.frames), progress) as update, in_mode(self.features, False):
+        with progress_of(verb, len(traverse), progress) as update, in_mode(self.features, False):
             for batch in self.sharing.batches(windows, self.offset):
                 update(len(batch))
                 yield batch
@@ -280,10 +287,9 @@ class Descriptor(nn.Module):
         own = self.preprocess
         if not is_ready(traverse):
             self.features = _for_frames(self.features, *traverse.frame_shape[1:])
-        windows = windows_of(traverse)
-        if windows is not None and self.sharing.fits(windows):
+        if isinstance(traverse, Grid) and self.sharing.fits(traverse):
             with torch.no_grad(), in_mode(self.features, False):
-                self.offset = self.sharing.offset(windows)
+                self.offset = self.sharing.offset(traverse)
         if is_ready(traverse) or not (own.range == "auto" or (resumed and own.blank == BLANK)):
             return
         drawn = torch.linspace(0, len(traverse) - 1, min(DRAWN, len(traverse))).round().long()

@@ -7,7 +7,7 @@ it. So the features differ a little from those of the window alone, as queries a
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import accumulate
 from typing import NamedTuple, cast
 
@@ -30,22 +30,45 @@ TILES, BOTH = 8, 2048  # in which some windows are described both ways, and how 
 AT_ONCE = 2**22  # features of windows that are gathered together
 
 
+Cells = tuple[int, int]
+Block = tuple[Cells, Cells]  # row and column of its first window, and how many rows and columns
+
+
 class Windows(NamedTuple):
-    """The windows of whole tiles of a picture, by their numbers."""
+    """Windows of a picture: blocks of rows and columns, one after another, and row by row."""
 
     grid: Grid
-    frames: range
+    blocks: Sequence[Block]
+
+    @classmethod
+    def of(cls, traverse: Traverse | AugmentedFrames) -> Windows | None:
+        """Those that a traverse is, if it is a picture, whole tiles of one, or `Blocks`."""
+        grid, frames = traverse, range(len(traverse))
+        if isinstance(traverse, Part):
+            grid = traverse.traverse
+        if not isinstance(grid, Grid):
+            return None
+        if isinstance(traverse, Blocks):
+            starts = [*accumulate((rows * columns for rows, columns in traverse.sizes[:-1]), initial=0)]
+            corners = grid.area.cells(torch.as_tensor(traverse.frame)[starts]).tolist()
+            return cls(grid, [((y, x), size) for (y, x), size in zip(corners, traverse.sizes, strict=True)])
+        if isinstance(traverse, Part):
+            if not isinstance(traverse.frame, range) or traverse.frame.step != 1:
+                return None
+            frames = traverse.frame
+        ends = [*accumulate((rows * columns for rows, columns in grid.area.tiles), initial=0)]
+        if not {frames.start, frames.stop} <= {*ends}:
+            return None
+        tiles = [*zip(grid.area.corners, grid.area.tiles, strict=True)]
+        return cls(grid, tiles[ends.index(frames.start) : ends.index(frames.stop)])
 
 
-def windows_of(traverse: Traverse | AugmentedFrames) -> Windows | None:
-    """The windows that a traverse is, if it is whole tiles of a picture."""
-    grid, frames = traverse, range(len(traverse))
-    if isinstance(traverse, Part) and isinstance(traverse.frame, range):
-        grid, frames = traverse.traverse, traverse.frame
-    if not isinstance(grid, Grid) or frames.step != 1:
-        return None
-    ends = {0, *accumulate(rows * columns for rows, columns in grid.area.tiles)}
-    return Windows(grid, frames) if {frames.start, frames.stop} <= ends else None
+class Blocks(Part):
+    """Frames that are blocks of an area one after another, each row by row. sizes: their rows and columns."""
+
+    def __init__(self, traverse: Traverse, frame: Tensor, sizes: Sequence[Cells]) -> None:
+        super().__init__(traverse, frame)
+        self.sizes = sizes
 
 
 class Sharing(NamedTuple):
@@ -60,22 +83,18 @@ class Sharing(NamedTuple):
         """The features that are joined, or the only ones."""
         return [*self.features.members] if isinstance(self.features, Joined) else [self.features]
 
-    def fits(self, windows: Windows) -> bool:
+    def fits(self, grid: Grid) -> bool:
         """Whether the features of these windows are known."""
-        own, window, stride = self.preprocess, windows.grid.window, windows.grid.stride
+        own = self.preprocess
         plain = own.channel is None and own.contrast is None and own.span == (0, 1)
-        return plain and all(_shares(member, window, stride) for member in self.members)
+        return plain and all(_shares(member, grid.window, grid.stride) for member in self.members)
 
     def batches(self, windows: Windows, offset: Tensor | float = 0.0) -> Iterator[Tensor]:
         """Features (B,D) of windows, in the order of places, 0 for those that show nothing; see `offset`."""
-        grid, place = windows.grid, 0
-        window, stride = grid.window, grid.stride
+        grid, window, stride = windows.grid, windows.grid.window, windows.grid.stride
         scaled = stride * SIZE[0] // window
         margin = stride * -(-REACH // scaled)
-        for corner, (rows, columns) in zip(grid.area.corners, grid.area.tiles, strict=True):
-            first, place = place, place + rows * columns
-            if first not in windows.frames:
-                continue
+        for corner, (rows, columns) in windows.blocks:
             pixels = grid.around(corner, (rows, columns), margin).to(self.device)
             shown = self._shows(pixels[..., margin:-margin, margin:-margin], window, stride).flatten()
             maps = [
@@ -91,18 +110,18 @@ class Sharing(NamedTuple):
                 yield (batch + offset) * shown[done : done + len(batch), None].to(batch)
                 done += len(batch)
 
-    def offset(self, windows: Windows) -> Tensor:
+    def offset(self, grid: Grid) -> Tensor:
         """The mean difference (D,) of the features of windows alone to those of `batches`, of some windows of
         several tiles."""
-        grid = windows.grid
-        ends = [0, *accumulate(rows * columns for rows, columns in grid.area.tiles)]
-        tiles = torch.linspace(0, len(ends) - 2, min(TILES, len(ends) - 1)).round().long().tolist()
+        tiles = [*zip(grid.area.corners, grid.area.tiles, strict=True)]
+        drawn = torch.linspace(0, len(tiles) - 1, min(TILES, len(tiles))).round().long().tolist()
         sums, count = torch.zeros((), device=self.device), 0
-        for tile in tiles:
-            frames = range(ends[tile], ends[tile + 1])
-            some = torch.linspace(0, len(frames) - 1, min(BOTH // len(tiles), len(frames))).round().long()
-            shared = torch.cat([*self.batches(Windows(grid, frames))])[some.to(self.device)]
-            parts = (frames.start + some).split(BATCH_SIZE)
+        for corner, (rows, columns) in (tiles[i] for i in drawn):
+            few = min(BOTH // len(drawn), rows * columns)
+            some = torch.linspace(0, rows * columns - 1, few).round().long()
+            block = Windows(grid, [(corner, (rows, columns))])
+            shared = torch.cat([*self.batches(block)])[some.to(self.device)]
+            parts = (grid.area.place_at(torch.tensor(corner)) + some).split(BATCH_SIZE)
             alone = torch.cat([self.features(grid[part.tolist()].to(self.device)) for part in parts])
             shown = shared.any(1, keepdim=True)
             sums, count = sums + ((alone - shared) * shown).sum(0), count + int(shown.sum())

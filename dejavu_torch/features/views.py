@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import accumulate
 from typing import NamedTuple, cast
 
 import torch
@@ -16,6 +17,7 @@ from dejavu_torch.features.preprocess import spread
 from dejavu_torch.types import Facts, InputError, Traverse, expect
 
 SAMPLE = 10_000  # frames that a longer route is fitted on
+TILES = 4  # of an area that the step is chosen in
 MIN_SEGMENTS = 4  # of a sample
 BLOCK = 64  # frames augmented together
 SEGMENT, EVERY = 20, 10  # frames of a segment; every 10th segment is used
@@ -62,6 +64,14 @@ class Sample(NamedTuple):
         inside = torch.cartesian_prod(torch.arange(tall), torch.arange(wide)).view(-1, 2)
         places = area.place_at(corner[:, None] + inside).flatten()
         return cls(places, tall * wide, [(tall, wide)] * len(drawn))
+
+    @classmethod
+    def of_tiles(cls, area: Area) -> Sample:
+        """Whole tiles of an area: blocks are coded in more bytes."""
+        starts = [*accumulate((rows * columns for rows, columns in area.tiles), initial=0)]
+        drawn = torch.linspace(0, len(starts) - 2, min(TILES, len(starts) - 1)).round().long().tolist()
+        places = torch.cat([torch.arange(starts[i], starts[i + 1]) for i in drawn])
+        return cls(places, starts[1], [area.tiles[i] for i in drawn])
 
     def views(self, second: LabelledFrames) -> LabelledFrames:
         """The views of the sample in a second traverse; InputError if there are none."""

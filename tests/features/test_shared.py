@@ -12,7 +12,7 @@ from dejavu_torch.data.traverse import Part
 from dejavu_torch.features.descriptor import Descriptor
 from dejavu_torch.features.distilled import Distilled
 from dejavu_torch.features.joined import Joined
-from dejavu_torch.features.shared import Sharing, Windows, windows_of
+from dejavu_torch.features.shared import Sharing, Windows
 
 CPU = torch.device("cpu")
 
@@ -28,7 +28,7 @@ def ground(height=150, width=190, channels=3, seed=0):
 def both(features, grid, preprocess=None):
     """Features of all windows together, and of each alone."""
     sharing = Sharing(preprocess or Preprocess(), features, CPU)
-    windows = windows_of(grid)
+    windows = Windows.of(grid)
     assert windows is not None
     assert sharing.fits(windows)
     with torch.no_grad():
@@ -87,15 +87,15 @@ def test_tiles_of_a_picture_are_described_alike_by_themselves(small_tiles):
     sharing = Sharing(Preprocess(), Joined([HOG(), Distilled()]), CPU)
     whole = torch.cat([*sharing.batches(Windows(grid, range(len(grid))))])
     rows, columns = grid.area.tiles[0]
-    part = windows_of(Part(grid, range(rows * columns, len(grid))))
+    part = Windows.of(Part(grid, range(rows * columns, len(grid))))
     assert part is not None
     torch.testing.assert_close(torch.cat([*sharing.batches(part)]), whole[rows * columns :])
-    assert windows_of(Part(grid, range(1, len(grid)))) is None  # no whole tile
-    assert windows_of(Part(grid, torch.arange(len(grid)))) is None
+    assert Windows.of(Part(grid, range(1, len(grid)))) is None  # no whole tile
+    assert Windows.of(Part(grid, torch.arange(len(grid)))) is None
 
 
 def test_other_features_and_strides_are_described_alone(small_tiles):
-    grid = windows_of(Grid(ground(), 64, 5))
+    grid = Windows.of(Grid(ground(), 64, 5))
     assert grid is not None
     assert not Sharing(Preprocess(), Distilled(), CPU).fits(grid)  # 7.5 pixels of the network's frames
     assert Sharing(Preprocess(), HOG(), CPU).fits(grid)
