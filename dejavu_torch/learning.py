@@ -18,6 +18,7 @@ from dejavu_torch.data.traverse import Part
 from dejavu_torch.features.descriptor import Descriptor
 from dejavu_torch.features.shared import Blocks
 from dejavu_torch.features.views import (
+    LARGE,
     LEAST,
     SAMPLE,
     SEGMENT,
@@ -155,7 +156,7 @@ class Checkpoint:
 
 def is_long(traverse: Traverse, chunk: int) -> bool:
     """Whether a route with chunks of this many places is learned from a sample, chunk by chunk."""
-    return len(traverse) > max(SAMPLE, chunk if traverse.area is None else 0)
+    return len(traverse) > (max(SAMPLE, chunk) if traverse.area is None else LARGE)
 
 
 @in_one_thread()

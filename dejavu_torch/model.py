@@ -421,7 +421,7 @@ class DejaVu(nn.Module):
             match = localizer(descriptors, progress)
             late = isinstance(smoother, PlaceFilter) and smoother.lag
             return Match.joined([match, localizer.finish()]) if late else match
-        matcher = Localizer(None, matching)
+        matcher = Localizer(None, matching, area=self.map.area)
         parts = descriptors.split(whole(SCORES_AT_ONCE // self.map.places, matching.copies))
         with torch.no_grad():
             scores = map(score, with_progress(parts, "localizing", progress))

@@ -38,6 +38,8 @@ def long_from(monkeypatch, frames):
     """Routes of more frames are learned from a sample, chunk by chunk."""
     for module in (views, descriptor, learning):
         monkeypatch.setattr(module, "SAMPLE", frames)
+    monkeypatch.setattr(views, "OF_AREA", frames)
+    monkeypatch.setattr(learning, "LARGE", frames)
 
 
 def all_of(traverse, batch=64):

@@ -9,7 +9,6 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor, nn
 
-from dejavu_torch.data.grid import Grid
 from dejavu_torch.data.traverse import Part
 from dejavu_torch.features.distilled import Distilled
 from dejavu_torch.features.extract import (
@@ -24,7 +23,7 @@ from dejavu_torch.features.extract import (
 from dejavu_torch.features.hog import CELL, HOG
 from dejavu_torch.features.joined import Joined, groups_of
 from dejavu_torch.features.preprocess import BLANK, DEEP, Preprocess, measured_range
-from dejavu_torch.features.shared import Sharing, Windows
+from dejavu_torch.features.shared import Blocks, Sharing, Windows
 from dejavu_torch.features.views import SAMPLE, AugmentedFrames, LabelledFrames, Sample, augmented_route
 from dejavu_torch.features.whitening import INDEPENDENT, MOST_VIEWS, WIDEST, Visits, Whitening
 from dejavu_torch.memory import IN_MEMORY, concatenate
@@ -62,6 +61,7 @@ class Descriptor(nn.Module):
     """
 
     _where: Tensor
+    offset: Tensor
 
     def __init__(
         self,
@@ -80,8 +80,9 @@ class Descriptor(nn.Module):
         self.warned: set[tuple[str, str]] = set()  # (traverse, line) of warnings that were logged
         self.known: dict[object, tuple[object, Tensor]] | None = None  # features, see `remembering`
         self.aside: dict[int, list[Tensor]] = {}  # batches of HOG, see `setting_aside`
-        self.offset: Tensor | float = 0.0  # of features of windows that share them, see `Sharing`
         self.register_buffer("_where", torch.zeros(0), persistent=False)
+        # of features of windows that share them, see `Sharing`; empty before it is known
+        self.register_buffer("offset", torch.zeros(0), persistent=False)
 
     @property
     def device(self) -> torch.device:
@@ -158,7 +159,8 @@ class Descriptor(nn.Module):
             some = Part(windows.grid, range(min(size, len(windows.grid))))
             on_first(some[:], torch.cat([*self.features_in(some)]))
         with progress_of(verb, len(traverse), progress) as update, in_mode(self.features, False):
-            for batch in self.sharing.batches(windows, self.offset):
+            offset = self.offset if len(self.offset) else 0.0
+            for batch in self.sharing.batches(windows, offset):
                 update(len(batch))
                 yield batch
 
@@ -287,9 +289,10 @@ class Descriptor(nn.Module):
         own = self.preprocess
         if not is_ready(traverse):
             self.features = _for_frames(self.features, *traverse.frame_shape[1:])
-        if isinstance(traverse, Grid) and self.sharing.fits(traverse):
+        windows = Windows.of(traverse)
+        if windows is not None and not isinstance(traverse, Blocks) and self.sharing.fits(windows.grid):
             with torch.no_grad(), in_mode(self.features, False):
-                self.offset = self.sharing.offset(traverse)
+                self.offset = self.sharing.offset(windows.grid)
         if is_ready(traverse) or not (own.range == "auto" or (resumed and own.blank == BLANK)):
             return
         drawn = torch.linspace(0, len(traverse) - 1, min(DRAWN, len(traverse))).round().long()
@@ -356,13 +359,13 @@ class Descriptor(nn.Module):
     def unchanged_by_errors(self) -> Iterator[None]:
         """Restores the whitening and what the preprocessing adapts if the block raises."""
         adapted = self.preprocess.range, self.preprocess.blank
-        features = self.features
+        features, offset = self.features, self.offset
         before = self.whitening, self.reduces, None if self.whitening is None else self.whitening.state_dict()
         try:
             yield
         except BaseException:
             self.preprocess.range, self.preprocess.blank = adapted
-            self.features = features
+            self.features, self.offset = features, offset
             self.whitening, self.reduces, state = before
             if self.whitening is not None and state is not None:
                 self.whitening.load_state_dict(state)

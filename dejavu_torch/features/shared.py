@@ -16,18 +16,18 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from dejavu_torch.data.grid import Grid
-from dejavu_torch.data.traverse import Part
+from dejavu_torch.data.traverse import Kept, Part
 from dejavu_torch.features.distilled import SIZE, STRIDES, WIDEST, Distilled
 from dejavu_torch.features.hog import HOG, cell_histograms, gradients, normalised
 from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import AugmentedFrames
 from dejavu_torch.resize import resize_frames
-from dejavu_torch.types import BATCH_SIZE, Traverse
+from dejavu_torch.types import Traverse
 
 REACH = 16  # pixels of Distilled's frames that its convolutions reach over a border
-TILES, BOTH = 8, 2048  # in which some windows are described both ways, and how many
-AT_ONCE = 2**22  # features of windows that are gathered together
+PIXELS, WINDOWS = 2**22, 2**13  # that are described together
+SIDE, BLOCKS, ALONE = 16, 4, 32  # of blocks to a side whose windows are described both ways, so many of each
 
 
 Cells = tuple[int, int]
@@ -44,8 +44,8 @@ class Windows(NamedTuple):
     def of(cls, traverse: Traverse | AugmentedFrames) -> Windows | None:
         """Those that a traverse is, if it is a picture, whole tiles of one, or `Blocks`."""
         grid, frames = traverse, range(len(traverse))
-        if isinstance(traverse, Part):
-            grid = traverse.traverse
+        if type(traverse) in (Part, Kept, Blocks):  # others change frames
+            grid = cast(Part, traverse).traverse
         if not isinstance(grid, Grid):
             return None
         if isinstance(traverse, Blocks):
@@ -91,49 +91,63 @@ class Sharing(NamedTuple):
 
     def batches(self, windows: Windows, offset: Tensor | float = 0.0) -> Iterator[Tensor]:
         """Features (B,D) of windows, in the order of places, 0 for those that show nothing; see `offset`."""
-        grid, window, stride = windows.grid, windows.grid.window, windows.grid.stride
-        scaled = stride * SIZE[0] // window
-        margin = stride * -(-REACH // scaled)
         for corner, (rows, columns) in windows.blocks:
-            pixels = grid.around(corner, (rows, columns), margin).to(self.device)
-            shown = self._shows(pixels[..., margin:-margin, margin:-margin], window, stride).flatten()
-            maps = [
-                _cells(member, pixels, margin, window, stride)
-                if isinstance(member, HOG)
-                else _convolved(cast(Distilled, member), pixels, margin // stride, scaled, (rows, columns))
-                for member in self.members
-            ]
-            size, done = sum(one.shape[2:].numel() for one in maps), 0
-            for some in torch.arange(rows).split(max(1, AT_ONCE // (columns * size))):
-                parts = [one[some[0] : some[-1] + 1, :columns].flatten(0, 1).flatten(1) for one in maps]
-                batch = torch.cat(parts, 1)
-                yield (batch + offset) * shown[done : done + len(batch), None].to(batch)
-                done += len(batch)
+            for band in self._bands(windows.grid, corner, rows, columns):
+                batch, shown = self._described(windows.grid, *band)
+                yield (batch + offset) * shown[:, None].to(batch)
+
+    def _bands(self, grid: Grid, corner: Cells, rows: int, columns: int) -> Iterator[Block]:
+        """A block in parts of a few rows, whose cells, maps and features fit into memory."""
+        (top, left), stride = corner, grid.stride
+        width = (columns - 1) * stride + grid.window
+        # a cell of HOG is computed every `step` pixels
+        step = min([4, *(math.gcd(stride, one.cell or 1) for one in self.members if isinstance(one, HOG))])
+        height = max(2 * grid.window, PIXELS // 4 * step // width)
+        count = max(1, min((height - grid.window) // stride + 1, WINDOWS // columns))
+        for first in range(0, rows, count):
+            yield (top + first, left), (min(count, rows - first), columns)
+
+    def _described(self, grid: Grid, corner: Cells, shape: Cells) -> tuple[Tensor, Tensor]:
+        """Features of rows and columns of windows, (B,D), and which show something, (B,)."""
+        (rows, columns), window, stride = shape, grid.window, grid.stride
+        scaled = stride * SIZE[0] // window  # in the frames of Distilled
+        strides = -(-REACH // scaled)
+        margin = strides * stride
+        pixels = grid.around(corner, shape, margin).to(self.device)
+        shown = self._shows(pixels[..., margin:-margin, margin:-margin], window, stride)
+        maps = [
+            _cells(member, pixels, margin, window, stride)
+            if isinstance(member, HOG)
+            else _convolved(cast(Distilled, member), pixels, strides, scaled, shape)
+            for member in self.members
+        ]
+        parts = [one[:rows, :columns].flatten(0, 1).flatten(1) for one in maps]
+        return torch.cat(parts, 1), shown.flatten()
 
     def offset(self, grid: Grid) -> Tensor:
-        """The mean difference (D,) of the features of windows alone to those of `batches`, of some windows of
-        several tiles."""
-        tiles = [*zip(grid.area.corners, grid.area.tiles, strict=True)]
-        drawn = torch.linspace(0, len(tiles) - 1, min(TILES, len(tiles))).round().long().tolist()
-        sums, count = torch.zeros((), device=self.device), 0
-        for corner, (rows, columns) in (tiles[i] for i in drawn):
-            few = min(BOTH // len(drawn), rows * columns)
-            some = torch.linspace(0, rows * columns - 1, few).round().long()
-            block = Windows(grid, [(corner, (rows, columns))])
-            shared = torch.cat([*self.batches(block)])[some.to(self.device)]
-            parts = (grid.area.place_at(torch.tensor(corner)) + some).split(BATCH_SIZE)
-            alone = torch.cat([self.features(grid[part.tolist()].to(self.device)) for part in parts])
-            shown = shared.any(1, keepdim=True)
-            sums, count = sums + ((alone - shared) * shown).sum(0), count + int(shown.sum())
-        return sums / max(1, count)
+        """The mean difference (D,) of features of windows alone to those of `batches`, of some all over
+        the picture."""
+        rows, columns = grid.area.rows, grid.area.columns
+        tall, wide = min(SIDE, rows), min(SIDE, columns)
+        tops = torch.linspace(0, rows - tall, min(BLOCKS, rows // tall)).round().long()
+        lefts = torch.linspace(0, columns - wide, min(BLOCKS, columns // wide)).round().long()
+        inside = torch.cartesian_prod(torch.arange(tall), torch.arange(wide)).view(-1, 2)
+        every, differences, shows = max(1, len(inside) // ALONE), [], []
+        for top, left in torch.cartesian_prod(tops, lefts).view(-1, 2).tolist():
+            shared, shown = self._described(grid, (top, left), (tall, wide))
+            places = grid.area.place_at(torch.tensor([top, left]) + inside[::every])
+            differences.append(self.features(grid[places.tolist()].to(self.device)) - shared[::every])
+            shows.append(shown[::every])
+        shown = torch.cat(shows)
+        return torch.cat(differences)[shown if shown.any() else ~shown].mean(0)
 
     def _shows(self, pixels: Tensor, window: int, stride: int) -> Tensor:
         """`Preprocess.shows` of the windows of pixels (1,C,H,W), in rows and columns."""
         mean, square = (
             F.avg_pool2d(F.avg_pool2d(one, (window, 1), (stride, 1)), (1, window), (1, stride))
-            for one in (pixels, pixels.square())
+            for one in (pixels.double(), pixels.double().square())
         )
-        return (square - mean.square()).amax(1)[0] >= self.preprocess.blank**2
+        return (square - mean.square()).clamp(min=0).amax(1)[0] >= self.preprocess.blank**2
 
 
 def _shares(member: nn.Module, window: int, stride: int) -> bool:

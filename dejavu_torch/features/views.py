@@ -17,6 +17,7 @@ from dejavu_torch.features.preprocess import spread
 from dejavu_torch.types import Facts, InputError, Traverse, expect
 
 SAMPLE = 10_000  # frames that a longer route is fitted on
+OF_AREA, LARGE = 2**14, 2**15  # windows likewise, of an area of more than so many
 TILES = 4  # of an area that the step is chosen in
 MIN_SEGMENTS = 4  # of a sample
 BLOCK = 64  # frames augmented together
@@ -51,8 +52,8 @@ class Sample(NamedTuple):
 
     @classmethod
     def of_area(cls, area: Area) -> Sample:
-        """Evenly spaced blocks of an area, with about as many frames as the segments of a route."""
-        size = SAMPLE // MIN_SEGMENTS
+        """Evenly spaced blocks of an area: of few large ones more is learned than of many."""
+        size = OF_AREA // MIN_SEGMENTS
         side = round(size**0.5)
         tall = min(area.rows, max(side, size // min(area.columns, side)))
         wide = min(area.columns, size // tall)

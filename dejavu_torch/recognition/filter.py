@@ -52,11 +52,11 @@ class PlaceFilter(SequenceModel):
     Args:
         moves: probabilities of moving by 0, 1, .., V places from one query to the next; they add up to 1.
             Moving past the end of the map leaves it. In an area, weights of the windows so many rows or
-            columns away, whichever are more; from there on the moves of the latest queries count. None is
-            (0.2, 0.6, 0.2), in an area the same for windows up to 5 away.
+            columns away, whichever are more; from there on the moves of the latest queries count. The
+            default is replaced there by equal weights of windows up to 5 away.
         jump: probability of being anywhere on the map next. leave, enter: of leaving and entering the map.
-        sharpness: nats per standard deviation; low, since consecutive frames are similar. None is 1, in an
-            area 2.
+        sharpness: nats per standard deviation; low, since consecutive frames are similar. The default is
+            replaced by 2 in an area.
         off_map: standard deviations; a query with no place further below the mean suggests being off the map.
         within: places; the score of a place includes its neighbours up to this distance, with weights that
             decrease with it.
@@ -95,11 +95,11 @@ class PlaceFilter(SequenceModel):
 
     def __init__(
         self,
-        moves: Sequence[float] | None = None,
+        moves: Sequence[float] = MOVES,
         jump: float = 0.001,
         leave: float = 0.001,
         enter: float = 0.01,
-        sharpness: float | None = None,
+        sharpness: float = 1.0,
         off_map: float = 1.25,
         within: int = 5,
         threshold: float | None = None,
@@ -107,9 +107,7 @@ class PlaceFilter(SequenceModel):
         learns: bool = False,
     ) -> None:
         super().__init__()
-        self.given = moves is not None, sharpness is not None
-        moves = checked_rates(MOVES if moves is None else moves, jump, leave, enter)
-        sharpness = 1.0 if sharpness is None else sharpness
+        moves = checked_rates(moves, jump, leave, enter)
         fits = 0 < sharpness < math.inf and math.isfinite(off_map)
         expect(fits, "finite numbers, the sharpness above 0", f"sharpness {sharpness}, off_map {off_map}")
         expect(isinstance(within, int) and within >= 0, "a whole number, at least 0", within=within)
@@ -124,13 +122,15 @@ class PlaceFilter(SequenceModel):
         self.area: Area | None = None  # of the places, which a `Localizer` sets
 
     def over(self, area: Area | None) -> PlaceFilter:
-        """A copy for the places of an area, or of a route."""
+        """A copy for the places of an area, or of a route; moves and sharpness of an area replace those of a
+        route by default."""
         copied = copy.deepcopy(self)
         copied.area = area
-        if area is not None and not self.given[0]:
-            copied.move_logits = nn.Parameter(logits(*PLANE_MOVES).to(self.off_map.device))
-        if area is not None and not self.given[1]:
-            copied.log_sharpness.data.fill_(math.log(PLANE_SHARPNESS))
+        if area is not None and self.area is None:
+            if torch.equal(self.move_logits.cpu(), logits(*MOVES)):
+                copied.move_logits = nn.Parameter(logits(*PLANE_MOVES).to(self.off_map.device))
+            if float(self.log_sharpness) == 0:
+                copied.log_sharpness.data.fill_(math.log(PLANE_SHARPNESS))
         return copied
 
     def start(self, places: int, fixed: bool = False) -> Tensor:

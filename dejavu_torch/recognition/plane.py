@@ -13,10 +13,8 @@ from dejavu_torch.area import Area
 from dejavu_torch.recognition.motion import MIN_PROBABILITY, Counts, Rates
 
 SHARP = 2  # windows around a place whose mass an answer is chosen by
-KEPT, MOVES_GIVEN = (
-    0.95,
-    5.0,
-)  # of learned moves from one query to the next; queries that those given count as
+KEPT = 0.95  # of learned moves from one query to the next
+MOVES_GIVEN = 5.0  # queries that the given moves count as
 
 
 class Steps(NamedTuple):
