@@ -18,7 +18,8 @@ from dejavu_torch.data.folder import as_bytes
 from dejavu_torch.types import Facts, expect
 
 UNREAD, EXPECTED = "cannot be read as a TIFF", "a GeoTIFF of grey, RGB or more bands"
-DEGREES, WEB_MERCATOR = "EPSG:4326", 3857  # whose metres are longer than those of the ground
+DEGREES = "EPSG:4326"
+STRETCHED = 0.01  # by how much a metre of a map may differ from one on the ground
 KIND = "IMAGE_STRUCTURE"
 CACHE = 2**28  # bytes of decoded blocks that GDAL keeps
 BENT = 1.0  # metres, or pixels if these are larger, by which rows may differ from a straight line
@@ -38,7 +39,8 @@ class GeoTiff:
 
     Attributes:
         shape: (C,H,W). ground: where they lie; None without coordinates. plain: whether its pixels are values
-            of grey or colours, not single bits, or numbers of a palette.
+            of grey or colours, not single bits, or numbers of a palette. mirrored: whether the file's
+            last row is the first here, as the ground would be mirrored otherwise.
 
     Convention: the first three bands are colours; of fewer, the first is grey.
 
@@ -54,6 +56,9 @@ class GeoTiff:
             kind = {*file.tags(ns=KIND), *file.tags(1, ns=KIND), file.colorinterp[0].name}
             self.plain = kind.isdisjoint({"NBITS", "MINISWHITE", "palette"})
             self.ground = None if file.crs is None or file.transform.is_identity else _ground(path, file)
+            self.mirrored = self.ground is not None and file.transform.determinant > 0
+            if self.ground is not None and self.mirrored:
+                self.ground = self.ground.flipped(file.height)
 
     def __getstate__(self) -> Facts:
         return self.__dict__ | {"_file": None}
@@ -72,19 +77,18 @@ class GeoTiff:
                 raise (error.__cause__ or error) from None  # it says no more than that reading failed
 
     def __call__(self, top: int, bottom: int, left: int, right: int) -> Tensor:
+        if self.mirrored:
+            top, bottom = self.shape[1] - bottom, self.shape[1] - top
         part = {"window": ((top, bottom), (left, right))}
         with self._opened() as file:
             seen = file.dataset_mask(**part) > 0
-            return as_bytes(self.path, np.where(seen, file.read(self.bands, **part), 0))
+            pixels = np.where(seen, file.read(self.bands, **part), 0)
+        return as_bytes(self.path, pixels[:, ::-1] if self.mirrored else pixels)
 
 
 def _ground(path: Path, file: Any) -> Ground:
     """The coordinates of the file, if they are metres on the ground; else those of its zone of UTM."""
     crs, corner, code = file.crs, file.transform, file.crs.to_epsg()
-    metres = crs.is_projected and crs.linear_units_factor[1] == 1 and code != WEB_MERCATOR
-    if metres:
-        frame = f"EPSG:{code}" if code else crs.to_wkt()
-        return Ground((corner.c, corner.f), (corner.a, corner.d), (corner.b, corner.e), "m", frame)
     convert = import_module("rasterio.warp").transform
     at = np.array([(x * file.width, y * file.height) for x in (0, 0.5, 1) for y in (0, 0.5, 1)])
     points = at @ [[corner.a, corner.d], [corner.b, corner.e]] + [corner.c, corner.f]
@@ -93,6 +97,11 @@ def _ground(path: Path, file: Any) -> Ground:
     known = np.array(convert(crs, zone, *points.T.tolist())).T
     known, origin, terms = known - known[4], known[4], np.column_stack([at, np.ones(len(at))])
     fit = np.linalg.lstsq(terms, known, rcond=None)[0]
+    pixel = np.hypot([corner.a, corner.b], [corner.d, corner.e])
+    metres = crs.is_projected and crs.linear_units_factor[1] == 1
+    if metres and (np.abs(np.hypot(*fit[:2].T) / pixel - 1) <= STRETCHED).all():
+        frame = f"EPSG:{code}" if code else crs.to_wkt()
+        return Ground((corner.c, corner.f), (corner.a, corner.d), (corner.b, corner.e), "m", frame)
     bent = np.abs(terms @ fit - known).max()
     seen = f"{path} has coordinates of {f'EPSG:{code}' if code else 'a system'} that bend by {bent:.3g} m"
     expect(bent <= max(BENT, np.hypot(*fit[0])), f"metres, as by gdalwarp -t_srs {zone}", seen)

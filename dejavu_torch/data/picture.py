@@ -6,7 +6,7 @@ import copy
 import logging
 import math
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import TypeAlias
@@ -28,7 +28,8 @@ log = logging.getLogger("dejavu_torch")
 
 BLOCK, HELD = 512, 2**27  # pixels of the file to a side that are read together; bytes of them that are kept
 BYTES_PER_PIXEL = 8.0  # peak while a picture is decoded whole
-TIFF, GEOREFERENCED = {".tif", ".tiff"}, {33550, 34264}  # tags: the size of a pixel, and a matrix
+TIFF = {".tif", ".tiff"}
+GEOREFERENCED, ORIENTATION = {33550, 34264}, 274  # tags: the size of a pixel, and a matrix
 
 
 class Picture:
@@ -86,7 +87,7 @@ class Picture:
             block = self.read(rows.start, rows.stop, columns.start, columns.stop)
             if self.factor != [1, 1]:
                 block = _reduced(down, block, across)
-            while len(self._blocks) * block.numel() > HELD:
+            while len(self._blocks) * self.shape[0] * self.side**2 > HELD:
                 del self._blocks[next(iter(self._blocks))]
         self._blocks[y, x] = block  # the last to go
         return block
@@ -127,8 +128,9 @@ def read_picture(
     name = printable(path)
     if not 0 < scale <= 1:
         raise InputError(f"{name}: scale is {scale:g}; expected a number above 0, and at most 1")
-    tiff = GeoTiff(path) if path.suffix.lower() in TIFF and has_rasterio() else None
-    in_parts = tiff is not None and tiff.plain
+    orientation = _orientation(path) if path.suffix.lower() in TIFF and has_rasterio() else 0
+    tiff = GeoTiff(path) if orientation else None
+    in_parts = tiff is not None and tiff.plain and (tiff.ground is not None or orientation == 1)
     picture = (
         Picture(tiff.shape, tiff, scale) if tiff is not None and in_parts else _decoded(path, scale, tiff)
     )
@@ -142,6 +144,18 @@ def read_picture(
     return pixels, (top, left), ground
 
 
+def _orientation(path: Path) -> int:
+    """The tag of a TIFF, 1 if its pixels are stored upright; 0 of an image of another format."""
+    with (
+        suppress(InputError),
+        reading(path, "", ""),
+        _any_size(),
+        Image.open(path, formats=formats()) as image,
+    ):
+        return int(image.getexif().get(ORIENTATION, 1)) if image.format == "TIFF" else 0
+    return 1  # rasterio reads what Pillow does not
+
+
 def _decoded(path: Path, scale: float, tiff: GeoTiff | None) -> Picture:
     """An image file that Pillow decodes whole."""
     unread, expected = "cannot be read as an image", "an image such as .png or .jpg"
@@ -150,8 +164,11 @@ def _decoded(path: Path, scale: float, tiff: GeoTiff | None) -> Picture:
         check_room(BYTES_PER_PIXEL * width * height, f"{path} of {width} x {height} pixels")
         if tiff is None and not GEOREFERENCED.isdisjoint(getattr(image, "tag_v2", ())):
             _warn_pixels(printable(path))
-        ImageOps.exif_transpose(image, in_place=True)
+        if tiff is None or tiff.ground is None:
+            ImageOps.exif_transpose(image, in_place=True)
         image.load()
+    if tiff is not None and tiff.mirrored:
+        image = ImageOps.flip(image)
     wide, alpha = image.mode.startswith(("I", "F")), image.has_transparency_data
     plain = image.mode if wide else "L" if image.mode in ("1", "L", "LA") else "RGB"
 
