@@ -32,11 +32,6 @@ class Ground(NamedTuple):
         (a, b), (c, d) = self.right, self.down
         return self._replace(right=(a * across, b * across), down=(c * down, d * down))
 
-    def flipped(self, rows: int) -> Ground:
-        """That of the same rows, the last one first."""
-        (x, y), (a, b) = self.first, self.down
-        return self._replace(first=(x + rows * a, y + rows * b), down=(-a, -b))
-
     def at(self, pixels: Tensor) -> Tensor:
         """(x, y) of points (column, row) in pixels from the corner, (...,2) float64."""
         return pixels @ pixels.new_tensor([self.right, self.down]) + pixels.new_tensor(self.first)

@@ -18,8 +18,7 @@ from dejavu_torch.data.folder import as_bytes
 from dejavu_torch.types import Facts, expect
 
 UNREAD, EXPECTED = "cannot be read as a TIFF", "a GeoTIFF of grey, RGB or more bands"
-DEGREES = "EPSG:4326"
-STRETCHED = 0.01  # by how much a metre of a map may differ from one on the ground
+DEGREES, STRETCHED = "EPSG:4326", 0.01  # by how much metres of a map may differ from those on the ground
 KIND = "IMAGE_STRUCTURE"
 CACHE = 2**28  # bytes of decoded blocks that GDAL keeps
 BENT = 1.0  # metres, or pixels if these are larger, by which rows may differ from a straight line
@@ -39,8 +38,7 @@ class GeoTiff:
 
     Attributes:
         shape: (C,H,W). ground: where they lie; None without coordinates. plain: whether its pixels are values
-            of grey or colours, not single bits, or numbers of a palette. mirrored: whether the file's
-            last row is the first here, as the ground would be mirrored otherwise.
+            of grey or colours, not single bits, or numbers of a palette.
 
     Convention: the first three bands are colours; of fewer, the first is grey.
 
@@ -56,9 +54,6 @@ class GeoTiff:
             kind = {*file.tags(ns=KIND), *file.tags(1, ns=KIND), file.colorinterp[0].name}
             self.plain = kind.isdisjoint({"NBITS", "MINISWHITE", "palette"})
             self.ground = None if file.crs is None or file.transform.is_identity else _ground(path, file)
-            self.mirrored = self.ground is not None and file.transform.determinant > 0
-            if self.ground is not None and self.mirrored:
-                self.ground = self.ground.flipped(file.height)
 
     def __getstate__(self) -> Facts:
         return self.__dict__ | {"_file": None}
@@ -77,13 +72,10 @@ class GeoTiff:
                 raise (error.__cause__ or error) from None  # it says no more than that reading failed
 
     def __call__(self, top: int, bottom: int, left: int, right: int) -> Tensor:
-        if self.mirrored:
-            top, bottom = self.shape[1] - bottom, self.shape[1] - top
         part = {"window": ((top, bottom), (left, right))}
         with self._opened() as file:
             seen = file.dataset_mask(**part) > 0
-            pixels = np.where(seen, file.read(self.bands, **part), 0)
-        return as_bytes(self.path, pixels[:, ::-1] if self.mirrored else pixels)
+            return as_bytes(self.path, np.where(seen, file.read(self.bands, **part), 0))
 
 
 def _ground(path: Path, file: Any) -> Ground:
@@ -97,9 +89,9 @@ def _ground(path: Path, file: Any) -> Ground:
     known = np.array(convert(crs, zone, *points.T.tolist())).T
     known, origin, terms = known - known[4], known[4], np.column_stack([at, np.ones(len(at))])
     fit = np.linalg.lstsq(terms, known, rcond=None)[0]
-    pixel = np.hypot([corner.a, corner.b], [corner.d, corner.e])
+    longer = np.hypot(*fit[:2].T) / np.hypot([corner.a, corner.b], [corner.d, corner.e])
     metres = crs.is_projected and crs.linear_units_factor[1] == 1
-    if metres and (np.abs(np.hypot(*fit[:2].T) / pixel - 1) <= STRETCHED).all():
+    if metres and (np.abs(longer - 1) <= STRETCHED).all():
         frame = f"EPSG:{code}" if code else crs.to_wkt()
         return Ground((corner.c, corner.f), (corner.a, corner.d), (corner.b, corner.e), "m", frame)
     bent = np.abs(terms @ fit - known).max()

@@ -163,11 +163,10 @@ def rings(reach: int) -> Tensor:
 
 def as_plane(values: Tensor, area: Area) -> Tensor:
     """Values by place, (T,N) -> (T,R,C)."""
-    order, _ = area.orders()
-    return values.index_select(1, order.to(values.device)).view(len(values), area.rows, area.columns)
+    order = area.orders()[0].to(values.device)
+    return values.index_select(1, order).view(len(values), area.rows, area.columns)
 
 
 def by_place(values: Tensor, area: Area) -> Tensor:
     """Values of a plane by place, (T,R,C) -> (T,N)."""
-    _, order = area.orders()
-    return values.flatten(1).index_select(1, order.to(values.device))
+    return values.flatten(1).index_select(1, area.orders()[1].to(values.device))
