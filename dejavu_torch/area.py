@@ -78,6 +78,11 @@ class Area(NamedTuple):
         corner, *_ = _tiles(self.rows, self.columns)
         return [(row, column) for row, column in corner.tolist()]
 
+    def orders(self) -> tuple[Tensor, Tensor]:
+        """The places row by row, and the number of each place row by row, (N,) int64."""
+        with torch.inference_mode(False):  # as `_tiles`
+            return _cached_orders(self.rows, self.columns, SIDE)
+
     def columns_from(self, place: int) -> int:
         """The columns of the tile that begins at a place."""
         _, size, start, *_ = _tiles(self.rows, self.columns)
@@ -86,7 +91,7 @@ class Area(NamedTuple):
     def cells(self, places: Tensor) -> Tensor:
         """Row and column of places, int64 of any shape -> (..., 2)."""
         corner, size, start, *_ = (table.to(places.device) for table in _tiles(self.rows, self.columns))
-        tile = torch.bucketize(places, start, right=True) - 1
+        tile = torch.bucketize(places.contiguous(), start, right=True) - 1
         inside, width = places - start[tile], size[tile, 1]
         return corner[tile] + torch.stack([inside // width, inside % width], -1)
 
@@ -153,6 +158,13 @@ def _cached_tiles(rows: int, columns: int) -> Tables:
     size = torch.cartesian_prod(down.diff(), across.diff()).view(-1, 2)
     start = torch.cat([size.new_zeros(1), size.prod(1).cumsum(0)[:-1]])
     return corner, size, start, down[:-1].contiguous(), across[:-1].contiguous()
+
+
+@lru_cache(2)  # of 16 bytes a window
+def _cached_orders(rows: int, columns: int, side: int) -> tuple[Tensor, Tensor]:
+    cells = torch.cartesian_prod(torch.arange(rows), torch.arange(columns)).view(-1, 2)
+    order = Area(rows, columns).place_at(cells)
+    return order, order.argsort()
 
 
 def _edges(count: int, most: int) -> Tensor:

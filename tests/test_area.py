@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import warnings
 
 import numpy as np
 import pytest
@@ -36,7 +37,7 @@ from dejavu_torch.recognition import flight as flights
 from dejavu_torch.recognition.coarse import CoarseSearch, SamplingPlan
 from dejavu_torch.recognition.evidence import RankTable, standardised
 from dejavu_torch.recognition.motion import Rates
-from dejavu_torch.recognition.plane import Followed, PlaneMotion
+from dejavu_torch.recognition.plane import Followed, PlaneMotion, as_plane, by_place
 from dejavu_torch.recognition.samples import RowSearch
 from dejavu_torch.recognition.search import Scan
 from dejavu_torch.recognition.select import best_candidates
@@ -81,6 +82,42 @@ def test_every_window_is_one_place_and_a_tile_is_a_run_of_places(rows, columns, 
     finally:
         areas.SIDE = before
         areas._cached_tiles.cache_clear()
+
+
+@given(rows=SIDES, columns=SIDES, side=st.integers(1, 9))
+def test_values_by_place_are_a_plane_row_by_row(rows, columns, side):
+    areas._cached_tiles.cache_clear()
+    before, areas.SIDE = areas.SIDE, side
+    try:
+        area, values = Area(rows, columns), torch.randn(2, rows * columns)
+        plane = as_plane(values, area)
+        cells = area.cells(torch.arange(area.places))
+        assert torch.equal(plane[:, cells[:, 0], cells[:, 1]], values)
+        assert torch.equal(by_place(plane, area), values)
+    finally:
+        areas.SIDE = before
+        areas._cached_tiles.cache_clear()
+
+
+def test_orders_from_inference_serve_training():
+    areas._cached_orders.cache_clear()
+    area, values = Area(7, 5), torch.randn(1, 35, requires_grad=True)
+    with torch.inference_mode():
+        as_plane(values.detach(), area)
+    by_place(as_plane(values, area).square(), area).sum().backward()
+    torch.testing.assert_close(values.grad, 2 * values.detach())
+
+
+def test_columns_of_candidates_have_coordinates_without_a_warning():
+    index, area = torch.arange(20).view(10, 2), Area(3, 8)
+    torch.set_warn_always(True)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            found = area.coordinates(index[:, 0])
+    finally:
+        torch.set_warn_always(False)
+    assert torch.equal(found, area.coordinates(index)[:, 0])
 
 
 def test_neighbours_are_those_in_the_plane(small_tiles):

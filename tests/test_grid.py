@@ -123,11 +123,11 @@ def test_coordinates_are_those_of_the_map(geotiff, turned):
     assert grid.coordinates.values[place].tolist() == pytest.approx([x, y], abs=1e-3)
 
 
-@pytest.mark.parametrize("crs", ["EPSG:4326", "EPSG:3857", "EPSG:25832"])
+@pytest.mark.parametrize("crs", ["EPSG:4326", "EPSG:3857", "EPSG:900913", "EPSG:3395", "EPSG:25832"])
 def test_other_coordinates_become_metres_on_the_ground(geotiff, crs):
     from rasterio.warp import transform
 
-    metre = {"EPSG:4326": 1e-5, "EPSG:3857": 1.5, "EPSG:25832": 1.0}[crs]
+    metre = {"EPSG:4326": 1e-5, "EPSG:25832": 1.0}.get(crs, 1.5)
     (x,), (y,) = transform("EPSG:32633", crs, [400_000], [5_300_000])
     grid = open_source(
         f"grid:{geotiff(ground(100, 140), crs=crs, at=(x, y), size=metre)}?window=20&stride=20"
@@ -162,6 +162,49 @@ def test_two_geotiffs_are_compared_in_metres(geotiff):
         coordinates_of([reference, plain], "metres")
 
 
+@pytest.mark.parametrize("palette", [False, True])
+def test_a_picture_that_is_stored_from_below_is_read_from_above(geotiff, tmp_path, palette):
+    rasterio = pytest.importorskip("rasterio")
+    pixels = ground(120, 150, 1 if palette else 3)
+    above = geotiff(pixels, "above.tif", size=1.0)
+    from_below = rasterio.Affine(1, 0, 500_000, 0, 1, 5_300_000 - 120)
+    below = geotiff(pixels.flip(1), "below.tif", transform=from_below)
+    if palette:
+        with rasterio.open(below, "r+") as file:
+            file.write_colormap(1, {i: (i, i, i, 255) for i in range(256)})
+    options = "window=32&stride=16&rows=10:110"
+    one, other = (open_source(f"grid:{path}?{options}") for path in (above, below))
+    assert torch.equal(one[:].expand_as(other[:]), other[:])
+    assert one.area == other.area
+    (tmp_path / "track.csv").write_text("x,y,heading\n500080,5299940,0\n")
+    flight = open_source(f"path:{below}?points={tmp_path}/track.csv&window=40")
+    upright = pixels[:, 40:80, 60:100].float() / 255
+    torch.testing.assert_close(flight[0], upright.expand_as(flight[0]), rtol=0, atol=1e-5)
+
+
+def test_turned_and_misnamed_files_are_read_alike_without_rasterio(geotiff, monkeypatch):
+    path = geotiff(ground(70, 80))
+    image = Image.fromarray(ground(70, 80).permute(1, 2, 0).numpy())
+    exif = Image.Exif()
+    exif[274] = 6
+    image.save(path.with_name("turned.tif"), exif=exif)
+    image.save(path.with_name("png.tif"), format="PNG")
+    files = [path.with_name(name) for name in ("turned.tif", "png.tif")]
+    seen = [read_picture(file)[0] for file in files]
+    assert torch.equal(seen[0], torch.rot90(seen[1], -1, (1, 2)))
+    monkeypatch.setitem(sys.modules, "rasterio", None)
+    assert all(torch.equal(read_picture(file)[0], one) for file, one in zip(files, seen, strict=True))
+
+
+def test_blocks_at_a_border_count_as_whole_ones(monkeypatch):
+    monkeypatch.setattr(pictures, "BLOCK", 64)
+    monkeypatch.setattr(pictures, "HELD", 3 * 64 * 64 * 4)
+    pixels = ground(65, 640)
+    picture = Picture((3, 65, 640), lambda a, b, c, d: pixels[:, a:b, c:d])
+    assert torch.equal(picture[:, 0:65, 0:640], pixels)
+    assert len(picture._blocks) <= 4 + 1
+
+
 def test_pixels_of_every_kind(geotiff):
     colours = ground(70, 80)
 
@@ -194,6 +237,8 @@ def test_pixels_of_every_kind(geotiff):
         assert where == Ground()
     with refused("complex64"):
         read(colours[:1].numpy().astype(np.complex64))
+    with refused("pixels of int8", "expected uint8"):
+        read((colours[:1] // 2).numpy().astype(np.int8))
     path.write_bytes(b"II*\0")
     with refused("a.tif cannot be read as a TIFF"):
         read_picture(path)
@@ -296,7 +341,8 @@ def test_a_flight_over_a_later_picture_needs_no_truth(tmp_path):
         ("?points={}&window=0", "x,y\n80,80\n", ("window=0",)),
         ("?points={}", "x,y,heading\n80,80,north\n", ("line 2: 80, 80, north", "expected numbers")),
         ("?points={}", "lat,lon\n80,80\n", ("columns lat, lon", "x,y")),
-        ("?points={}", "x,y\n", ("x,y",)),
+        ("?points={}", "x,y\n", ("the columns x, y",)),
+        ("?points={}", "", ("track.csv has no rows",)),
         ("?points=nowhere.csv", "", ("nowhere.csv is not there",)),
         ("?points={}&stride=4", "x,y\n80,80\n", ("unknown 'stride'", "points, window, scale")),
     ],

@@ -104,7 +104,7 @@ def read_flight(path: Path, points: str = "", window: int = 64, scale: float = 1
     expect(points, "points=FILE", f"{name}: points is missing")
     rows = read_rows(Path(points), EXPECTED)
     header = [cell.lower() for cell in rows[0][1]] if rows else []
-    seen = f"{points} has the columns {', '.join(header) or 'of no rows'}"
+    seen = f"{points} has " + (f"the columns {', '.join(header)}" if rows else "no rows")
     expect({"x", "y"} <= {*header} and len(rows) > 1, EXPECTED, seen)
     columns = [header.index(one) for one in ("x", "y", "heading") if one in header]
     lines = [f"{points}, line {line}" for line, _ in rows[1:]]

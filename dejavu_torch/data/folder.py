@@ -296,7 +296,8 @@ def _levels(path: Path, pixels: np.ndarray) -> Tensor:
 
 def as_bytes(path: Path, pixels: np.ndarray) -> Tensor:
     """Pixels of 8 or 16 bits, or floats in [0, 1], as uint8 of the same shape; InputError for others."""
-    expect(pixels.dtype.kind in "uif", "8 or 16 bits, or floats", f"{path} has pixels of {pixels.dtype}")
+    known = pixels.dtype.kind in "uif" and pixels.dtype != np.int8
+    expect(known, "uint8, 16 bits, or floats", f"{path} has pixels of {pixels.dtype}")
     if pixels.dtype == np.uint8:
         return torch.from_numpy(np.array(pixels, order="C"))
     return (_levels(path, pixels) * 255).round().byte()

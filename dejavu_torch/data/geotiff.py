@@ -18,7 +18,7 @@ from dejavu_torch.data.folder import as_bytes
 from dejavu_torch.types import Facts, expect
 
 UNREAD, EXPECTED = "cannot be read as a TIFF", "a GeoTIFF of grey, RGB or more bands"
-DEGREES, WEB_MERCATOR = "EPSG:4326", 3857  # whose metres are longer than those of the ground
+DEGREES, STRETCHED = "EPSG:4326", 0.01  # by how much metres of a map may differ from those on the ground
 KIND = "IMAGE_STRUCTURE"
 CACHE = 2**28  # bytes of decoded blocks that GDAL keeps
 BENT = 1.0  # metres, or pixels if these are larger, by which rows may differ from a straight line
@@ -81,10 +81,6 @@ class GeoTiff:
 def _ground(path: Path, file: Any) -> Ground:
     """The coordinates of the file, if they are metres on the ground; else those of its zone of UTM."""
     crs, corner, code = file.crs, file.transform, file.crs.to_epsg()
-    metres = crs.is_projected and crs.linear_units_factor[1] == 1 and code != WEB_MERCATOR
-    if metres:
-        frame = f"EPSG:{code}" if code else crs.to_wkt()
-        return Ground((corner.c, corner.f), (corner.a, corner.d), (corner.b, corner.e), "m", frame)
     convert = import_module("rasterio.warp").transform
     at = np.array([(x * file.width, y * file.height) for x in (0, 0.5, 1) for y in (0, 0.5, 1)])
     points = at @ [[corner.a, corner.d], [corner.b, corner.e]] + [corner.c, corner.f]
@@ -93,6 +89,11 @@ def _ground(path: Path, file: Any) -> Ground:
     known = np.array(convert(crs, zone, *points.T.tolist())).T
     known, origin, terms = known - known[4], known[4], np.column_stack([at, np.ones(len(at))])
     fit = np.linalg.lstsq(terms, known, rcond=None)[0]
+    longer = np.hypot(*fit[:2].T) / np.hypot([corner.a, corner.b], [corner.d, corner.e])
+    metres = crs.is_projected and crs.linear_units_factor[1] == 1
+    if metres and (np.abs(longer - 1) <= STRETCHED).all():
+        frame = f"EPSG:{code}" if code else crs.to_wkt()
+        return Ground((corner.c, corner.f), (corner.a, corner.d), (corner.b, corner.e), "m", frame)
     bent = np.abs(terms @ fit - known).max()
     seen = f"{path} has coordinates of {f'EPSG:{code}' if code else 'a system'} that bend by {bent:.3g} m"
     expect(bent <= max(BENT, np.hypot(*fit[0])), f"metres, as by gdalwarp -t_srs {zone}", seen)

@@ -6,8 +6,8 @@ import copy
 import logging
 import math
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from functools import cache
+from contextlib import contextmanager, suppress
+from functools import cache, partial
 from pathlib import Path
 from typing import TypeAlias
 
@@ -28,7 +28,9 @@ log = logging.getLogger("dejavu_torch")
 
 BLOCK, HELD = 512, 2**27  # pixels of the file to a side that are read together; bytes of them that are kept
 BYTES_PER_PIXEL = 8.0  # peak while a picture is decoded whole
-TIFF, GEOREFERENCED = {".tif", ".tiff"}, {33550, 34264}  # tags: the size of a pixel, and a matrix
+TIFF, ORIENTATION, GEOREFERENCED = {".tif", ".tiff"}, 274, {33550, 34264}  # tags; size of a pixel, a matrix
+
+Read: TypeAlias = Callable[[int, int, int, int], Tensor]
 
 
 class Picture:
@@ -44,9 +46,7 @@ class Picture:
 
     ndim, dtype = 3, torch.uint8
 
-    def __init__(
-        self, shape: tuple[int, int, int], read: Callable[[int, int, int, int], Tensor], scale: float = 1.0
-    ) -> None:
+    def __init__(self, shape: tuple[int, int, int], read: Read, scale: float = 1.0) -> None:
         self.size = shape[1:]
         self.full = [max(1, round(scale * side)) for side in self.size]
         self.factor = [one / other for one, other in zip(self.size, self.full, strict=True)]
@@ -86,7 +86,7 @@ class Picture:
             block = self.read(rows.start, rows.stop, columns.start, columns.stop)
             if self.factor != [1, 1]:
                 block = _reduced(down, block, across)
-            while len(self._blocks) * block.numel() > HELD:
+            while len(self._blocks) * self.shape[0] * self.side**2 > HELD:
                 del self._blocks[next(iter(self._blocks))]
         self._blocks[y, x] = block  # the last to go
         return block
@@ -115,7 +115,8 @@ def read_picture(
 ) -> tuple[Pixels, tuple[int, int], Ground]:
     """The pixels of an image file, the first one's row and column, and where the whole picture lies.
 
-    A TIFF is read in parts if rasterio is installed, others at once. What is transparent is black.
+    A TIFF is read in parts if rasterio is installed, others at once. What is transparent is black. Rows on
+    the ground are in the order that does not mirror it.
 
     Args:
         scale: of the sides. rows, columns: "first:stop" of the pixels to keep after scaling; "" keeps all.
@@ -127,37 +128,52 @@ def read_picture(
     name = printable(path)
     if not 0 < scale <= 1:
         raise InputError(f"{name}: scale is {scale:g}; expected a number above 0, and at most 1")
-    tiff = GeoTiff(path) if path.suffix.lower() in TIFF and has_rasterio() else None
-    in_parts = tiff is not None and tiff.plain
-    picture = (
-        Picture(tiff.shape, tiff, scale) if tiff is not None and in_parts else _decoded(path, scale, tiff)
-    )
+    orientation = _orientation(path) if path.suffix.lower() in TIFF and has_rasterio() else 0
+    tiff = GeoTiff(path) if orientation else None
+    in_parts = tiff if tiff and tiff.plain and (tiff.ground or orientation == 1) else None
+    picture = Picture(in_parts.shape, in_parts, scale) if in_parts else _decoded(path, scale, tiff)
+    ground = tiff.ground.scaled(*picture.factor[::-1]) if tiff and tiff.ground else Ground()
+    (x, y), (a, b), (c, d), unit, _ = ground
+    if unit == "m" and a * d > b * c:  # its first row is below
+        high = picture.full[0]
+        ground = ground._replace(first=(x + high * c, y + high * d), down=(-c, -d))
+        picture.read = partial(_from_below, picture.read, picture.size[0])
     bounds = (
         _bounds(name, *one) for one in zip(("rows", "columns"), (rows, columns), picture.full, strict=True)
     )
     (top, bottom), (left, right) = bounds
     part = picture.part(top, bottom, left, right)
     pixels = part if in_parts else part[:, 0 : bottom - top, 0 : right - left]
-    ground = Ground() if tiff is None or tiff.ground is None else tiff.ground.scaled(*picture.factor[::-1])
     return pixels, (top, left), ground
+
+
+def _from_below(read: Read, height: int, top: int, bottom: int, left: int, right: int) -> Tensor:
+    return read(height - bottom, height - top, left, right).flip(1)
+
+
+def _orientation(path: Path) -> int:
+    """The tag of a TIFF, 1 if its pixels are stored upright; 0 of an image of another format."""
+    with suppress(InputError), _opened(path) as image:
+        return int(image.getexif().get(ORIENTATION, 1)) if image.format == "TIFF" else 0
+    return 1  # rasterio reads what Pillow does not
 
 
 def _decoded(path: Path, scale: float, tiff: GeoTiff | None) -> Picture:
     """An image file that Pillow decodes whole."""
-    unread, expected = "cannot be read as an image", "an image such as .png or .jpg"
-    with reading(path, unread, expected), _any_size(), Image.open(path, formats=formats()) as image:
+    with _opened(path) as image:
         width, height = image.size
         check_room(BYTES_PER_PIXEL * width * height, f"{path} of {width} x {height} pixels")
         if tiff is None and not GEOREFERENCED.isdisjoint(getattr(image, "tag_v2", ())):
             _warn_pixels(printable(path))
-        ImageOps.exif_transpose(image, in_place=True)
+        if tiff is None or tiff.ground is None:
+            ImageOps.exif_transpose(image, in_place=True)
         image.load()
     wide, alpha = image.mode.startswith(("I", "F")), image.has_transparency_data
     plain = image.mode if wide else "L" if image.mode in ("1", "L", "LA") else "RGB"
 
     def read(top: int, bottom: int, left: int, right: int) -> Tensor:
         part = image.crop((left, top, right, bottom))
-        pixels = np.atleast_3d(part if wide else part.convert(plain))
+        pixels = np.atleast_3d(np.asarray(part if wide else part.convert(plain)))
         if alpha and not wide:
             pixels = pixels * (np.asarray(part.convert("RGBA"))[..., 3:] > 0)
         return as_bytes(path, pixels.transpose(2, 0, 1))
@@ -166,11 +182,13 @@ def _decoded(path: Path, scale: float, tiff: GeoTiff | None) -> Picture:
 
 
 @contextmanager
-def _any_size() -> Iterator[None]:
-    """In the block images may have any number of pixels: they are refused by their bytes."""
+def _opened(path: Path) -> Iterator[Image.Image]:
+    """An image of any number of pixels: they are refused by their bytes."""
+    unread, expected = "cannot be read as an image", "an image such as .png or .jpg"
     limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
     try:
-        yield
+        with reading(path, unread, expected), Image.open(path, formats=formats()) as image:
+            yield image
     finally:
         Image.MAX_IMAGE_PIXELS = limit
 

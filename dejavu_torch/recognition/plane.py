@@ -159,17 +159,12 @@ def rings(reach: int) -> Tensor:
     return torch.maximum(away[:, None], away)
 
 
-def _rows_first(area: Area) -> Tensor:
-    """The places of an area row by row, (N,) int64."""
-    cells = torch.cartesian_prod(torch.arange(area.rows), torch.arange(area.columns))
-    return area.place_at(cells.view(-1, 2))
-
-
 def as_plane(values: Tensor, area: Area) -> Tensor:
     """Values by place, (T,N) -> (T,R,C)."""
-    return values[:, _rows_first(area)].view(len(values), area.rows, area.columns)
+    order = area.orders()[0].to(values.device)
+    return values.index_select(1, order).view(len(values), area.rows, area.columns)
 
 
 def by_place(values: Tensor, area: Area) -> Tensor:
     """Values of a plane by place, (T,R,C) -> (T,N)."""
-    return values.flatten(1)[:, _rows_first(area).argsort()]
+    return values.flatten(1).index_select(1, area.orders()[1].to(values.device))

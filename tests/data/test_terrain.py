@@ -66,6 +66,13 @@ def test_bad_options_are_refused(options, words):
         open_source(f"sim:terrain?{options}")
 
 
+def test_a_ground_that_does_not_fit_in_memory_is_refused(monkeypatch):
+    monkeypatch.setattr("dejavu_torch.memory.free_memory", lambda: 8e7)
+    assert len(open_source("sim:terrain?metres=40&stride=64")) == 4
+    with refused("metres=256", "takes 91.9 MB", "at most the 80 MB free"):
+        open_source("sim:terrain?metres=256")
+
+
 def test_flights_are_compared_in_metres(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("dejavu_torch.evaluation.compare.draw_pictures", lambda *_: {})
     pair = ("sim:terrain?metres=40&stride=16", "sim:terrain?metres=40&traverse=1&stride=19")

@@ -37,7 +37,7 @@ from dejavu_torch.types import expect
 
 PIXELS = 4  # per metre
 LEAST, MOST = 32, 2048  # metres
-ROOM = 40.0  # bytes per pixel while it is painted
+ROOM, ROOM_OF_BLOCK = 40.0, 5e7  # bytes per pixel while it is painted, and those of one block between roads
 VERGE = 7.0  # pixels of grass beside a road
 DASH = 48.0  # pixels from a lane dash to the next
 SAME = 0.955  # of the fine grain, what all flights share
@@ -352,6 +352,6 @@ def open_terrain(
     expect(LEAST <= metres <= MOST, f"{LEAST} <= metres <= {MOST}", name)
     name += f"&window={window}&stride={stride}"
     expect(1 <= stride <= window <= side, f"1 <= stride <= window <= {side} pixels", name)
-    check_room(ROOM * side**2, name)
+    check_room(ROOM * side**2 + ROOM_OF_BLOCK, name)
     where = area.Ground(unit="m", frame=f"sim:terrain?seed={seed}").scaled(1 / PIXELS, 1 / PIXELS)
     return Grid(paint_ground(seed, traverse, metres), window, stride, name=name, ground=where)
