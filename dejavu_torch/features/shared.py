@@ -26,7 +26,9 @@ from dejavu_torch.resize import resize_frames
 from dejavu_torch.types import Traverse
 
 REACH = 16  # pixels of Distilled's frames that its convolutions reach over a border
-PIXELS, WINDOWS = 2**22, 2**13  # that are described together
+PIXELS, WINDOWS = 2**22, 2**12  # that are described together
+OVERLAP = 6  # strides of a window from which on this is faster
+MOST = 7  # values of a feature map in a stride, likewise
 SIDE, BLOCKS, ALONE = 16, 4, 32  # of blocks to a side whose windows are described both ways, so many of each
 
 
@@ -151,10 +153,13 @@ class Sharing(NamedTuple):
 
 
 def _shares(member: nn.Module, window: int, stride: int) -> bool:
+    if window < OVERLAP * stride:
+        return False
     if type(member) is HOG:
         return member.resize is None and bool(member.cell) and window >= (member.cell or 1) * member.block
-    even = stride * SIZE[0] % window == 0 and WIDEST % getattr(member, "grid", 5) == 0
-    return type(member) is Distilled and even
+    scaled, rest = divmod(stride * SIZE[0], window)
+    few = scaled // math.gcd(scaled, math.prod(STRIDES)) <= MOST
+    return type(member) is Distilled and rest == 0 and few and WIDEST % member.grid == 0
 
 
 def _cells(hog: HOG, pixels: Tensor, margin: int, window: int, stride: int) -> Tensor:

@@ -38,7 +38,7 @@ def both(features, grid, preprocess=None):
         return torch.cat([*sharing.batches(windows)]), features(grid[:])
 
 
-@pytest.mark.parametrize("stride", [3, 4, 8, 12])
+@pytest.mark.parametrize("stride", [3, 4, 8])
 @pytest.mark.parametrize("bins", ["hard", "linear"])
 def test_inner_cells_of_hog_are_those_of_windows_alone(small_tiles, stride, bins):
     hog = HOG(orientations=5, block=1, bins=bins)
@@ -55,7 +55,7 @@ def test_inner_blocks_are_in_the_order_of_hog(small_tiles):
     torch.testing.assert_close(together[:, 1:-1, 1:-1], alone[:, 1:-1, 1:-1], rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.parametrize(("window", "stride"), [(64, 4), (64, 8), (64, 2), (96, 1), (96, 7), (128, 4)])
+@pytest.mark.parametrize(("window", "stride"), [(64, 4), (64, 8), (64, 2), (96, 1), (96, 7), (128, 16)])
 @pytest.mark.parametrize("channels", [1, 3])
 def test_inner_features_of_the_network_are_those_of_windows_alone(small_tiles, window, stride, channels):
     grid = Grid(ground(window + 5 * stride, window + 9 * stride, channels), window, stride)
