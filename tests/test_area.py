@@ -296,6 +296,16 @@ def test_a_filter_finds_a_flight_on_the_way(small_tiles):
     assert near(later) >= near(found)
 
 
+def test_a_filter_learns_the_course_of_a_flight():
+    model, own, _ = flown(step=0.01)
+    course = model.map.area.place_at(torch.stack([torch.arange(5, 25), torch.arange(0, 40, 2)], 1))
+    localizer = model.localizer(model.matching(PlaceFilter()))
+    localizer(own[course])
+    learned = localizer.matching.sequence._parts(localizer.states["filter"])[2].moves.view(11, 11)
+    assert divmod(int(learned.argmax()), 11) == (5 + 1, 5 + 2)  # a row and two columns
+    assert 5 < float(learned.sum()) < 20  # early moves are forgotten
+
+
 def test_a_sweep_gives_the_masses_of_the_model(small_tiles):
     """Against matrices of all transitions between the windows, and the state off the area."""
     area, queries = Area(4, 5), 5

@@ -935,4 +935,25 @@ MUTANTS = [
         "smoother.is_drive = True",
         ("tests/test_area.py::-k flight_is_found",),
     ),
+    Mutant(
+        "Pictures with a mask are described with it.",
+        "dejavu_torch/features/shared.py",
+        "type(traverse) in (Part, Kept, Blocks)",
+        "isinstance(traverse, Part)",
+        ("tests/features/test_shared.py::-k changed_are_described_alone",),
+    ),
+    Mutant(
+        "Windows that are described together have the mean of windows alone.",
+        "dejavu_torch/features/shared.py",
+        "yield (batch + offset)",
+        "yield batch",
+        ("tests/features/test_shared.py::-k mean_is_that",),
+    ),
+    Mutant(
+        "A filter over an area follows the moves of the camera.",
+        "dejavu_torch/recognition/plane.py",
+        "return Followed(KEPT * self.moves + moves)",
+        "return self",
+        ("tests/test_area.py::-k learns_the_course",),
+    ),
 ]
