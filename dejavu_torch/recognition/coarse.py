@@ -51,6 +51,7 @@ DECODED = 2**24  # numbers of a chunk that are decoded at a time, at most
 SPACINGS = (32, 16, 12, 8, 6, 4, 3, 2)  # places from one sample to the next
 COARSE, FINE = 0.93, 0.98  # shares of the lines' energy that coarse and fine samples should hold
 REFINED = 32  # best groups of a query that are refined; 4 times as many if the samples hold less than COARSE
+PEAKS = 4  # of an area, around which more windows are scored, and one for each candidate
 EXTRA_WINDOWS = 3  # further windows of a query that are scored if they are nearly as good
 NEARLY = 0.02  # difference in cosine that counts as nearly as good
 MIN_COSINE = 0.02  # a query whose best cosine is lower is scanned: places of norm 0 have cosine 0
@@ -198,9 +199,14 @@ class CoarseSearch(Scan):
         count = max(k for k, _ in wanted)
         group, best = topk_groups(best, max(plan.refined, 2 * count))
         if (area := self.place_map.area) is not None:
-            reach = plan.coarse // 2 + 1 + max((k > 1) * radius for k, radius in wanted)
-            near = area.around(self.coarse.place[GROUP * group + best % GROUP].flatten(), reach)
-            place = near.view(len(group), -1).sort(1).values
+            best, order = best.sort(1, descending=True)
+            middle = self.coarse.place[GROUP * group.gather(1, order) + best % GROUP]
+            # further candidates lie around the highest peaks
+            peaks, reach = PEAKS + count, plan.coarse // 2 + 1
+            wide = reach + max((k > 1) * radius for k, radius in wanted)
+            parts = (middle[:, :peaks], wide), (middle[:, peaks:], reach)
+            near = [area.around(some.flatten(), far).view(*some.shape, -1).flatten(1) for some, far in parts]
+            place = torch.cat(near, 1).sort(1).values
             return place.masked_fill(F.pad(place[:, 1:] == place[:, :-1], (0, 1)), -1)
         reach = -(-plan.coarse // (2 * plan.fine))
         offsets = torch.arange(-reach, reach + 1, device=group.device)
