@@ -13,10 +13,14 @@ from helpers import refused
 from PIL import Image
 
 from dejavu_torch import DejaVu, PlaceSmoother, SpectralMapper, Whitening, compare, open_source
+from dejavu_torch.area import Area
 from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.data.flight import Flight
 from dejavu_torch.data.grid import Grid
+from dejavu_torch.data.traverse import Part
 from dejavu_torch.data.turning import Turned, facing_north, turned_north
-from dejavu_torch.recognition.centring import set_apart
+from dejavu_torch.maps.spectral_map import SpectralMap
+from dejavu_torch.recognition.centring import learn_turned, set_apart
 from dejavu_torch.recognition.localizer import Localizer, Matching
 from dejavu_torch.recognition.select import best_candidates
 
@@ -101,7 +105,8 @@ def test_known_headings_turn_as_by_hand(model, images, ground):
     assert facing_north(query, None) is query  # a car has headings too, and its images look ahead
     match = model.localize(query)
     assert match.index.tolist() == PLACES.tolist()
-    by_hand = model.localize_descriptors(set_apart(model.descriptor(turned_north(images, 90 * QUARTERS))))
+    rows = model.descriptor(turned_north(images, 90 * QUARTERS))
+    by_hand = model.localize_descriptors(set_apart(model.map, rows))
     assert torch.equal(match.index, by_hand.index)
     assert torch.allclose(match.score, by_hand.score, atol=1e-5)
     query.headings[3] = math.nan
@@ -143,12 +148,57 @@ def test_a_flight_is_found_and_its_headings_told(model, ground):
 def test_what_is_set_apart_has_length_one():
     rows = torch.randn(300, 8) @ torch.diag(torch.tensor([30.0, 5, 1, 1, 1, 1, 1, 1])) + 4
     rows[7] = 0
-    apart = set_apart(rows)
+    place_map = SpectralMap(torch.zeros(1, 8))
+    assert set_apart(place_map, rows) is rows  # nothing is known of turned images
+    learn_turned(place_map, rows)
+    apart = set_apart(place_map, rows)
     assert apart.norm(dim=1).sort().values.tolist() == pytest.approx([0] + 299 * [1], abs=1e-5)
     assert (apart[7] == 0).all()
     assert apart.std(0)[0] < 2 * apart.std(0)[2:].mean()  # 30 times before
-    assert set_apart(torch.zeros(2, 4)).tolist() == torch.zeros(2, 4).tolist()
-    assert set_apart(torch.zeros(0, 4)).shape == (0, 4)
+    assert set_apart(place_map, rows[:0]).shape == (0, 8)
+    learn_turned(place_map, torch.zeros(2, 8))  # a black picture
+    place_map.check()
+    place_map.turned_mean = torch.ones(7).bfloat16()
+    with refused("turned images of mean [1.0, 1.0, 1.0"):
+        place_map.check()
+
+
+def hovering(ground, place=60, count=20):
+    """Images of a camera over one place, which turns and moves a little, and their headings."""
+    middle = ground.area.coordinates(torch.tensor([place])) + torch.randn(count, 2).double()
+    headings = 120 + torch.arange(count).double()
+    return Flight(ground.picture, middle.expand(count, 2), headings, ground.window)
+
+
+def test_what_an_image_is_compared_with_does_not_depend_on_other_images(model, ground):
+    torch.manual_seed(0)
+    hover = hovering(ground)
+    match = model.localize(hover, sequence=None)
+    assert (match.index == 60).float().mean() >= 0.9
+    alone = model.localize(Part(hover, range(3, 4)))
+    assert alone.index[0] == match.index[3]
+    assert alone.score[0] == pytest.approx(float(match.score[3]), abs=1e-5)
+    several = model.localize(ArrayTraverse(hover[:6]), headings=24)
+    assert (several.index == 60).float().mean() >= 0.5
+    one = model.localize(ArrayTraverse(hover[:1]), headings=24)
+    assert (one.index, one.heading) == (several.index[0], several.heading[0])
+
+
+def test_what_turned_images_have_in_common_is_in_the_file(tmp_path, model, ground):
+    hover = hovering(ground)
+    model.save(tmp_path / "map.safetensors")
+    loaded = DejaVu.load(tmp_path / "map.safetensors")
+    assert torch.equal(loaded.map.turned, model.map.turned)
+    assert torch.equal(loaded.localize(hover).score, model.localize(hover).score)
+    size = model.map.dimension
+    assert model.summary().fixed["turned images"] == size * size + 2 * size
+    tensors, extra = model.map.packed(), model.map.get_extra_state()
+    older = DejaVu.load(tmp_path / "map.safetensors")
+    older.map.load_packed({n: t for n, t in tensors.items() if not n.startswith("turned")}, extra)
+    assert not len(older.map.turned)
+    rows = model.descriptor(turned_north(hover[:], hover.headings))
+    assert torch.allclose(older.localize(hover).score, older.localize_descriptors(rows).score, atol=1e-5)
+    assert not len(DejaVu().learn_features(rows, area=Area(4, 5)).map.turned)
 
 
 def test_what_cannot_be_turned_is_refused(model, ground, images):

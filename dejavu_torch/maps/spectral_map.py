@@ -45,10 +45,13 @@ FILE = {  # dtype and dimensions of the tensors of a file
     "drives": (torch.int32, 1),
     "links": (torch.int32, 2),
     "columns": (torch.int32, 1),
+    "turned": (torch.int8, 2),
+    "turned_mean": (torch.bfloat16, 1),
 }
 LINK_SHARES = 1000  # the probability of a link is stored in thousandths
 STAGE = ("stage", "stage_scale", "drives")
-RARE = (*STAGE, "links", "columns")  # files of maps without them lack these
+TURNED = ("turned", "turned_mean")
+RARE = (*STAGE, *TURNED, "links", "columns")  # files of maps without them lack these
 CHUNK_BYTES = 8 + 4 + 8 + 8  # a chunk's length, step, stream length and checksum in a file
 
 
@@ -86,6 +89,8 @@ class SpectralMap(PlaceMap):
             descriptors are compared after it, see `refined`. drives: (1,) int32, how many, and those that
             taught the whitening without being told where they are. Empty without.
         columns: (G,) int32, of the tiles of an area, see `lines_of`; empty for a route.
+        turned, turned_mean: (K,K) int8 and (K,) bfloat16, the inverse covariance, up to a factor, and the
+            mean of turned images of an area, see `set_apart`. Empty if unknown, as for a route.
         links: (L,3) int32, steps from a place of a route to one of another, and their probability in
             thousandths; see `connections`.
     Buffers derived from these:
@@ -112,7 +117,7 @@ class SpectralMap(PlaceMap):
     """
 
     kind = "spectral"
-    kept = ("positions", "steps", "means", "norms", "stage_scale")
+    kept = ("positions", "steps", "means", "norms", "stage_scale", "turned_mean")
     optional = {  # noqa: RUF012
         "visits": (0, 2),
         "stage": (0, 0),
@@ -120,6 +125,8 @@ class SpectralMap(PlaceMap):
         "drives": (0,),
         "links": (0, 3),
         "columns": (0,),
+        "turned": (0, 0),
+        "turned_mean": (0,),
     }
 
     lengths: Tensor
@@ -132,6 +139,8 @@ class SpectralMap(PlaceMap):
     drives: Tensor
     links: Tensor
     columns: Tensor
+    turned: Tensor
+    turned_mean: Tensor
     counts: Tensor
     feature: Tensor
     level: Tensor
@@ -279,9 +288,9 @@ class SpectralMap(PlaceMap):
         return place_map
 
     def _without_places(self, means: Tensor) -> SpectralMap:
-        """A map without places, with this one's settings and stage."""
+        """A map without places, with this one's settings, stage and statistics of turned images."""
         place_map = SpectralMap(means, **self.settings())
-        for name in STAGE:
+        for name in (*STAGE, *TURNED):
             setattr(place_map, name, getattr(self, name))
         return place_map
 
@@ -555,6 +564,10 @@ class SpectralMap(PlaceMap):
             wanted = f"those of {self.area.rows} x {self.area.columns}"
             require(tiles == self.area.tiles[: len(tiles)], f"tiles {tiles!s:.100}; expected {wanted}")
         require(bool(self.stage_scale.isfinite().all()), "a stage that is not finite")
+        turned, mean = self.turned, self.turned_mean
+        fits = turned.shape == 2 * mean.shape and mean.numel() in (0, self.dimension)
+        seen = f"turned images of mean {mean.tolist()!s:.100}"
+        require(fits and bool(mean.isfinite().all()), f"{seen}; expected {self.dimension} finite numbers")
         links, most = self.links, self.links.new_tensor([self.places - 1, self.places - 1, LINK_SHARES])
         row = f"rows of two places, and a number up to {LINK_SHARES}"
         fits = bool(((links >= 0) & (links <= most)).all())
@@ -585,12 +598,15 @@ class SpectralMap(PlaceMap):
         chunks = [ChunkSummary(start, stop, self._periods(g)) for g, (start, stop) in enumerate(self.chunks)]
         packed = self.packed() if self.places else {}
         names = {"streams": "lines", "means": "mean", "positions": "positions", "visits": "visits"}
-        stage = sum(packed.pop(name).nbytes for name in STAGE if name in packed)  # with the count of drives
+        fixed = {  # the stage with the count of drives
+            part: sum(packed.pop(name).nbytes for name in own if name in packed)
+            for part, own in (("stage", STAGE), ("turned images", TURNED))
+        }
         route = {part: packed[name].nbytes for name, part in names.items() if name in packed}
         route = {name: size for name, size in route.items() if size}
         route["chunks"] = sum(tensor.nbytes for name, tensor in packed.items() if name not in names)
         covered = int(((self.norms > 0) & self.norms.isfinite()).sum())
-        fixed = {"stage": stage} if stage else {}
+        fixed = {part: size for part, size in fixed.items() if size}
         lines, area = len(self.level), None if self.area is None else self.area[:2]
         return MapSummary(self.kind, self.places, covered, 0, 0, tuple(chunks), route, fixed, lines, area)
 

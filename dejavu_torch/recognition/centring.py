@@ -11,7 +11,7 @@ from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.recognition.evidence import run_lengths, unchanged
 from dejavu_torch.types import InputError
 
-SHRINKAGE = 0.25  # least share of a covariance of turned queries that is replaced by a multiple of identity
+SHRINKAGE = 0.25  # least share of a covariance of turned images that is replaced by a multiple of identity
 PRIOR = 50  # queries that the map's own mean counts as; fewer queries are not centred by default
 
 
@@ -33,27 +33,37 @@ def centred(place_map: PlaceMap, queries: Tensor) -> Tensor:
     return _without(place_map.metric, queries, shift / (weight.sum() + PRIOR))
 
 
-def set_apart(queries: Tensor) -> Tensor:
-    """Queries without what is common among them: (q - m) / C, scaled to length 1, where m is their mean, with
-    50 further queries of 0, and C their covariance about it, of which a share of K / (K + Q), at least 0.25,
-    is replaced by a multiple of the identity.
-
-    Turned images have much in common that north-up windows of a map have not, so whatever place has a little
-    of it is similar to all of them. Of turned copies most show wrong headings: they tell what is common by
-    chance. Queries of 0, as of blank frames, stay 0 and do not count.
-
-    Shape: (Q,K) -> (Q,K).
-    """
-    shows = queries.any(1)
-    known = queries[shows].double().cpu()
-    moved = known - known.sum(0) / (len(known) + PRIOR)
-    covariance = moved.T @ moved / max(1, len(known))
+@torch.no_grad()
+def learn_turned(place_map: SpectralMap, rows: Tensor) -> None:
+    """Let the map of an area know the mean of turned images, by descriptors (n,K), and their covariance C, as
+    its inverse in 8 bits. Of C a share of K / (K + n), at least 0.25, is replaced by a multiple of the
+    identity. Descriptors of 0 do not count."""
+    known = rows[rows.any(1)].double().cpu()
+    mean = known.sum(0) / max(1, len(known))
+    covariance = (known - mean).T @ (known - mean) / max(1, len(known))
     few, scale = known.shape[1] / (len(known) + known.shape[1]), covariance.diagonal().mean()
     share = max(SHRINKAGE, few)
     covariance = (1 - share) * covariance
     covariance.diagonal().add_((share * scale).clamp(min=1e-30))
-    apart = F.normalize(torch.linalg.solve(covariance, moved.T).T, dim=1)
-    return torch.zeros_like(queries).masked_scatter(shows[:, None], apart.to(queries))
+    inverse = covariance.inverse()
+    place_map.turned = (127 * inverse / inverse.abs().max()).round().to(place_map.device, torch.int8)
+    place_map.turned_mean = mean.to(place_map.device, torch.bfloat16)
+
+
+def set_apart(place_map: PlaceMap, queries: Tensor) -> Tensor:
+    """Queries of turned images without what these have in common: (q - m) / C, scaled to length 1, where m is
+    the mean of turned images of the area and C their covariance, see `learn_turned`. Without these, queries
+    stay as they are.
+
+    Corners of turned images are reflected, which the map's windows know nothing of: whatever place has a
+    little of that is similar to all of them. Queries of 0, as of blank frames, stay 0.
+
+    Shape: (Q,K) -> (Q,K).
+    """
+    if not isinstance(place_map, SpectralMap) or not len(place_map.turned):
+        return queries
+    moved = (queries - place_map.turned_mean.to(queries)) * queries.any(1, keepdim=True).to(queries)
+    return F.normalize(moved @ place_map.turned.to(queries), dim=1)
 
 
 class RunningMean(nn.Module):
