@@ -248,13 +248,9 @@ def count_drives(place_map: PlaceMap, second: LabelledFrames | None) -> None:
         place_map.drives = place_map.steps.new_tensor([second.drives]).int()
 
 
-def turn_windows(place_map: PlaceMap, descriptor: Descriptor, traverse: Traverse | None) -> None:
-    """Let the map of an area, by cosine, know what turned images have in common, by windows of it. Each is
-    turned twice: by the heading of a camera, and by one that it may be compared with."""
-    if not isinstance(place_map, SpectralMap) or place_map.area is None or place_map.metric != "cosine":
-        return
-    if traverse is None or len(traverse.frame_shape) != 3:
-        return
+def turn_windows(place_map: SpectralMap, descriptor: Descriptor, traverse: Traverse) -> None:
+    """Let the map of an area know turned images, by windows of it. Each is turned twice: by the heading of a
+    camera, and by one that it may be compared with."""
     count = min(TURNED, TURNS * len(traverse))
     windows = Part(traverse, torch.arange(count) * len(traverse) // count)
     one, other = 360 * torch.rand(2, count, generator=torch.Generator().manual_seed(0))

@@ -27,6 +27,7 @@ from dejavu_torch.features.views import LabelledFrames
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.maps.place_map import Mapper, PlaceMap
 from dejavu_torch.maps.spectral import SpectralMapper
+from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.maps.weights import BITS, round_weights
 from dejavu_torch.motion.odometry import GroundOdometry
@@ -239,7 +240,6 @@ class DejaVu(nn.Module):
             if counts is not None:
                 learned.count_visits(learned.visit_counts + counts.to(learned.device))
             learning.count_drives(learned, second)
-            learning.turn_windows(learned, descriptor, traverse)
         return self.replace_map(learned, _state_of(self, learned, traverse))
 
     def learn_features(
@@ -261,7 +261,6 @@ class DejaVu(nn.Module):
         area = area if traverse is None or traverse.area is None else traverse.area
         learned = learning.learn_descriptors(self.mapper, features, area)
         learning.count_drives(learned, second)
-        learning.turn_windows(learned, self.descriptor, traverse)
         return self.replace_map(learned, _state_of(self, learned, traverse))
 
     def resample(
@@ -641,6 +640,8 @@ def _state_of(model: DejaVu, place_map: PlaceMap, traverse: Traverse | None) -> 
         log.warning(line, place_map.dimension)
     if len(shape) == 1 and (model.preprocess.channel or model.preprocess.contrast):
         log.warning("these are ready features: channel and contrast have no effect")
+    if isinstance(place_map, SpectralMap) and place_map.area is not None and len(shape) == 3:
+        learning.turn_windows(place_map, model.descriptor, traverse)
     if len(positions):
         place_map.positions = positions.to(place_map.device)
         place_map.check()

@@ -46,12 +46,10 @@ FILE = {  # dtype and dimensions of the tensors of a file
     "links": (torch.int32, 2),
     "columns": (torch.int32, 1),
     "turned": (torch.int8, 2),
-    "turned_mean": (torch.bfloat16, 1),
 }
 LINK_SHARES = 1000  # the probability of a link is stored in thousandths
 STAGE = ("stage", "stage_scale", "drives")
-TURNED = ("turned", "turned_mean")
-RARE = (*STAGE, *TURNED, "links", "columns")  # files of maps without them lack these
+RARE = (*STAGE, "links", "columns", "turned")  # files of maps without them lack these
 CHUNK_BYTES = 8 + 4 + 8 + 8  # a chunk's length, step, stream length and checksum in a file
 
 
@@ -89,8 +87,7 @@ class SpectralMap(PlaceMap):
             descriptors are compared after it, see `refined`. drives: (1,) int32, how many, and those that
             taught the whitening without being told where they are. Empty without.
         columns: (G,) int32, of the tiles of an area, see `lines_of`; empty for a route.
-        turned, turned_mean: (K,K) int8 and (K,) bfloat16, the inverse covariance, up to a factor, and the
-            mean of turned images of an area, see `set_apart`. Empty if unknown, as for a route.
+        turned: (K,K) int8, of turned images of an area, see `learn_turned`; empty if unknown.
         links: (L,3) int32, steps from a place of a route to one of another, and their probability in
             thousandths; see `connections`.
     Buffers derived from these:
@@ -117,7 +114,7 @@ class SpectralMap(PlaceMap):
     """
 
     kind = "spectral"
-    kept = ("positions", "steps", "means", "norms", "stage_scale", "turned_mean")
+    kept = ("positions", "steps", "means", "norms", "stage_scale")
     optional = {  # noqa: RUF012
         "visits": (0, 2),
         "stage": (0, 0),
@@ -126,7 +123,6 @@ class SpectralMap(PlaceMap):
         "links": (0, 3),
         "columns": (0,),
         "turned": (0, 0),
-        "turned_mean": (0,),
     }
 
     lengths: Tensor
@@ -140,7 +136,6 @@ class SpectralMap(PlaceMap):
     links: Tensor
     columns: Tensor
     turned: Tensor
-    turned_mean: Tensor
     counts: Tensor
     feature: Tensor
     level: Tensor
@@ -288,9 +283,9 @@ class SpectralMap(PlaceMap):
         return place_map
 
     def _without_places(self, means: Tensor) -> SpectralMap:
-        """A map without places, with this one's settings, stage and statistics of turned images."""
+        """A map without places, with this one's settings, stage and `turned`."""
         place_map = SpectralMap(means, **self.settings())
-        for name in (*STAGE, *TURNED):
+        for name in (*STAGE, "turned"):
             setattr(place_map, name, getattr(self, name))
         return place_map
 
@@ -564,10 +559,8 @@ class SpectralMap(PlaceMap):
             wanted = f"those of {self.area.rows} x {self.area.columns}"
             require(tiles == self.area.tiles[: len(tiles)], f"tiles {tiles!s:.100}; expected {wanted}")
         require(bool(self.stage_scale.isfinite().all()), "a stage that is not finite")
-        turned, mean = self.turned, self.turned_mean
-        fits = turned.shape == 2 * mean.shape and mean.numel() in (0, self.dimension)
-        seen = f"turned images of mean {mean.tolist()!s:.100}"
-        require(fits and bool(mean.isfinite().all()), f"{seen}; expected {self.dimension} finite numbers")
+        turned, square = tuple(self.turned.shape), 2 * (self.dimension,)
+        require(turned in ((0, 0), square), f"turned images {turned}; expected {square}")
         links, most = self.links, self.links.new_tensor([self.places - 1, self.places - 1, LINK_SHARES])
         row = f"rows of two places, and a number up to {LINK_SHARES}"
         fits = bool(((links >= 0) & (links <= most)).all())
@@ -598,15 +591,13 @@ class SpectralMap(PlaceMap):
         chunks = [ChunkSummary(start, stop, self._periods(g)) for g, (start, stop) in enumerate(self.chunks)]
         packed = self.packed() if self.places else {}
         names = {"streams": "lines", "means": "mean", "positions": "positions", "visits": "visits"}
-        fixed = {  # the stage with the count of drives
-            part: sum(packed.pop(name).nbytes for name in own if name in packed)
-            for part, own in (("stage", STAGE), ("turned images", TURNED))
-        }
+        stage = sum(packed.pop(name).nbytes for name in STAGE if name in packed)  # with the count of drives
+        turned = packed.pop("turned", self.turned).nbytes
         route = {part: packed[name].nbytes for name, part in names.items() if name in packed}
         route = {name: size for name, size in route.items() if size}
         route["chunks"] = sum(tensor.nbytes for name, tensor in packed.items() if name not in names)
         covered = int(((self.norms > 0) & self.norms.isfinite()).sum())
-        fixed = {part: size for part, size in fixed.items() if size}
+        fixed = {part: size for part, size in (("stage", stage), ("turned", turned)) if size}
         lines, area = len(self.level), None if self.area is None else self.area[:2]
         return MapSummary(self.kind, self.places, covered, 0, 0, tuple(chunks), route, fixed, lines, area)
 
