@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -65,6 +66,13 @@ class Area(NamedTuple):
     def places(self) -> int:
         """N, the number of windows."""
         return self.rows * self.columns
+
+    @property
+    def north(self) -> float:
+        """Degrees clockwise from the upper side of the picture to north, where y grows (in pixels: falls)."""
+        (a, b), (c, d) = self.right, self.down
+        sign = (a * d - b * c) * (-1 if self.unit == "m" else 1)
+        return math.degrees(math.atan2(sign * c, sign * a))
 
     @property
     def tiles(self) -> list[tuple[int, int]]:

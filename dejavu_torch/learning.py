@@ -15,6 +15,7 @@ from torch import Tensor
 
 from dejavu_torch.area import Area
 from dejavu_torch.data.traverse import Part
+from dejavu_torch.data.turning import Turned
 from dejavu_torch.features.descriptor import Descriptor
 from dejavu_torch.features.shared import Blocks
 from dejavu_torch.features.views import (
@@ -38,6 +39,7 @@ from dejavu_torch.maps.spectrum import Transform
 from dejavu_torch.memory import concatenate, in_one_thread
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.recognition.calibration import Calibration, calibrated
+from dejavu_torch.recognition.centring import learn_turned
 from dejavu_torch.text import progress_of
 from dejavu_torch.types import Facts, InputError, Traverse, expect
 
@@ -46,6 +48,7 @@ SEGMENT_SCORES = 2**22  # maximum, queries of a segment x places
 OWN = 300  # frames of the reference whose look-alikes are asked for
 CALIBRATION_SCORES = 2**30  # maximum, frames of a calibration x places
 SAVE_INTERVAL = 60  # seconds between two versions of a partial map
+TURNED, TURNS = 4000, 4  # windows of an area that are turned, at most, and each of them
 
 
 # `map`, or what does the same elsewhere: encoded chunks in the order of the tasks, as they are ready
@@ -244,6 +247,16 @@ def count_drives(place_map: PlaceMap, second: LabelledFrames | None) -> None:
     """Let a map know how many drives, whose places nobody told, have taught its whitening."""
     if second is not None and second.drives and isinstance(place_map, SpectralMap):
         place_map.drives = place_map.steps.new_tensor([second.drives]).int()
+
+
+def turn_windows(place_map: SpectralMap, descriptor: Descriptor, traverse: Traverse) -> None:
+    """Let the map of an area know turned images, by windows of it. Each is turned twice: by the heading of a
+    camera, and by one that it may be compared with."""
+    count = min(TURNED, TURNS * len(traverse))
+    windows = Part(traverse, torch.arange(count) * len(traverse) // count)
+    one, other = 360 * torch.rand(2, count, generator=torch.Generator().manual_seed(0))
+    with in_one_thread():
+        learn_turned(place_map, descriptor.all_of(Turned(Turned(windows, one), other)))
 
 
 @torch.no_grad()

@@ -27,6 +27,7 @@ from dejavu_torch.features.views import LabelledFrames
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.maps.place_map import Mapper, PlaceMap
 from dejavu_torch.maps.spectral import SpectralMapper
+from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.maps.weights import BITS, round_weights
 from dejavu_torch.motion.odometry import GroundOdometry
@@ -386,9 +387,8 @@ class DejaVu(nn.Module):
                 samples of a long one, and scores the best.
             headings: H, on the map of an area: turns each image evenly over 360 degrees and finds the best of
                 the H copies, whose heading `Match.heading` has. Describing and search take H times as long.
-                With 1, images are turned by their own `Traverse.headings`, if these are known. The
-                descriptors of all turned images are compared first, see `set_apart`: the more there are, up
-                to some 50, the more are found.
+                With 1, images are turned by their own `Traverse.headings`, if these are known. What
+                turned images have in common is removed, see `set_apart`.
 
         Shape: -> Match of (Q,) on the CPU.
 
@@ -493,7 +493,7 @@ class DejaVu(nn.Module):
         headings: int = 1,
     ) -> Iterator[Match]:
         """As `localize`, or with k as `candidates`, one batch of queries at a time, in constant memory; with
-        a smoother, centred or turned queries, after the descriptors of all queries."""
+        a smoother, centred queries or several headings, after the descriptors of all queries."""
         require_map(self)
         if k is not None:
             check_candidates(k, apart, self.map.places)
@@ -514,12 +514,13 @@ class DejaVu(nn.Module):
             self.descriptor.warn_of_bright(frames, name)
 
         turned = isinstance(queries, Turned)
-        if not (isinstance(sequence, PlaceSmoother) or centre or turned):
-            yield from map(localizer, self.descriptor.batches(queries, progress, "localizing", on_first))
+        if not (isinstance(sequence, PlaceSmoother) or (centre and not turned) or headings > 1):
+            batches = self.descriptor.batches(queries, progress, "localizing", on_first)
+            yield from map(localizer, (set_apart(self.map, rows) if turned else rows for rows in batches))
             return
         descriptors = self.descriptor.all_of(queries, progress, on_first)
         if turned:
-            descriptors = set_apart(descriptors)
+            descriptors = set_apart(self.map, descriptors)
         elif self.centres(len(descriptors)) if centre is None else centre:
             matching = matching._replace(plain=descriptors)
             descriptors = centred(self.map, descriptors)
@@ -639,6 +640,8 @@ def _state_of(model: DejaVu, place_map: PlaceMap, traverse: Traverse | None) -> 
         log.warning(line, place_map.dimension)
     if len(shape) == 1 and (model.preprocess.channel or model.preprocess.contrast):
         log.warning("these are ready features: channel and contrast have no effect")
+    if isinstance(place_map, SpectralMap) and place_map.area is not None and len(shape) == 3:
+        learning.turn_windows(place_map, model.descriptor, traverse)
     if len(positions):
         place_map.positions = positions.to(place_map.device)
         place_map.check()

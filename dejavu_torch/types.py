@@ -263,8 +263,8 @@ class Match:
             not merged.
         confidence: float, how much worse the best place over 5 places away is, in the unit of the scores; NaN
             for all but the first candidate. None if it was not computed.
-        heading: float, degrees, of the turned copy of the query that was found there, NaN without a place;
-            None unless several headings were tried.
+        heading: float, degrees from north, of the turned copy of the query that was found there, NaN without
+            a place; None unless several headings were tried.
         sequences: by T, matches (Q,) of the same queries in sequences, a filter or a smoother, for reports;
             mostly empty.
     """

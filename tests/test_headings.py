@@ -12,11 +12,16 @@ from command_line import fails, rows_of, run, write_images
 from helpers import refused
 from PIL import Image
 
-from dejavu_torch import DejaVu, PlaceSmoother, SpectralMapper, Whitening, compare, open_source
+from dejavu_torch import DejaVu, PlaceFilter, PlaceSmoother, SpectralMapper, Whitening, compare, open_source
+from dejavu_torch.area import Area
 from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.data.coordinates import read_coordinates
+from dejavu_torch.data.flight import Flight
 from dejavu_torch.data.grid import Grid
+from dejavu_torch.data.traverse import Chain, Part
 from dejavu_torch.data.turning import Turned, facing_north, turned_north
-from dejavu_torch.recognition.centring import set_apart
+from dejavu_torch.maps.spectral_map import SpectralMap
+from dejavu_torch.recognition.centring import learn_turned, set_apart
 from dejavu_torch.recognition.localizer import Localizer, Matching
 from dejavu_torch.recognition.select import best_candidates
 
@@ -101,7 +106,8 @@ def test_known_headings_turn_as_by_hand(model, images, ground):
     assert facing_north(query, None) is query  # a car has headings too, and its images look ahead
     match = model.localize(query)
     assert match.index.tolist() == PLACES.tolist()
-    by_hand = model.localize_descriptors(set_apart(model.descriptor(turned_north(images, 90 * QUARTERS))))
+    rows = model.descriptor(turned_north(images, 90 * QUARTERS))
+    by_hand = model.localize_descriptors(set_apart(model.map, rows))
     assert torch.equal(match.index, by_hand.index)
     assert torch.allclose(match.score, by_hand.score, atol=1e-5)
     query.headings[3] = math.nan
@@ -143,12 +149,56 @@ def test_a_flight_is_found_and_its_headings_told(model, ground):
 def test_what_is_set_apart_has_length_one():
     rows = torch.randn(300, 8) @ torch.diag(torch.tensor([30.0, 5, 1, 1, 1, 1, 1, 1])) + 4
     rows[7] = 0
-    apart = set_apart(rows)
+    place_map = SpectralMap(torch.zeros(1, 8))
+    assert set_apart(place_map, rows) is rows  # nothing is known of turned images
+    learn_turned(place_map, rows)
+    apart = set_apart(place_map, rows)
     assert apart.norm(dim=1).sort().values.tolist() == pytest.approx([0] + 299 * [1], abs=1e-5)
     assert (apart[7] == 0).all()
     assert apart.std(0)[0] < 2 * apart.std(0)[2:].mean()  # 30 times before
-    assert set_apart(torch.zeros(2, 4)).tolist() == torch.zeros(2, 4).tolist()
-    assert set_apart(torch.zeros(0, 4)).shape == (0, 4)
+    assert set_apart(place_map, rows[:0]).shape == (0, 8)
+    learn_turned(place_map, torch.zeros(2, 8))  # a black picture
+    place_map.check()
+    place_map.turned = torch.ones(7, 8).to(torch.int8)
+    with refused("turned images (7, 8); expected (8, 8)"):
+        place_map.check()
+
+
+def hovering(ground, place=60, count=20):
+    """Images of a camera over one place, which turns and moves a little, and their headings."""
+    middle = ground.area.coordinates(torch.tensor([place])) + torch.randn(count, 2).double()
+    headings = 120 + torch.arange(count).double()
+    return Flight(ground.picture, middle.expand(count, 2), headings, ground.window)
+
+
+def test_what_an_image_is_compared_with_does_not_depend_on_other_images(model, ground):
+    torch.manual_seed(0)
+    hover = hovering(ground)
+    match = model.localize(hover, sequence=None)
+    assert (match.index == 60).float().mean() >= 0.9
+    alone = model.localize(Part(hover, range(3, 4)))
+    assert alone.index[0] == match.index[3]
+    assert alone.score[0] == pytest.approx(float(match.score[3]), abs=1e-5)
+    several = model.localize(ArrayTraverse(hover[:6]), headings=24)
+    assert (several.index == 60).float().mean() >= 0.5
+    one = model.localize(ArrayTraverse(hover[:1]), headings=24)
+    assert (one.index, one.heading) == (several.index[0], several.heading[0])
+
+
+def test_what_turned_images_have_in_common_is_in_the_file(tmp_path, model, ground):
+    hover = hovering(ground)
+    model.save(tmp_path / "map.safetensors")
+    loaded = DejaVu.load(tmp_path / "map.safetensors")
+    assert torch.equal(loaded.map.turned, model.map.turned)
+    assert torch.equal(loaded.localize(hover).score, model.localize(hover).score)
+    assert model.summary().fixed["turned"] == model.map.dimension**2
+    tensors, extra = model.map.packed(), model.map.get_extra_state()
+    older = DejaVu.load(tmp_path / "map.safetensors")
+    older.map.load_packed({n: t for n, t in tensors.items() if n != "turned"}, extra)
+    assert not len(older.map.turned)
+    rows = model.descriptor(turned_north(hover[:], hover.headings))
+    assert torch.allclose(older.localize(hover).score, older.localize_descriptors(rows).score, atol=1e-5)
+    assert not len(DejaVu().learn_features(rows, area=Area(4, 5)).map.turned)
 
 
 def test_what_cannot_be_turned_is_refused(model, ground, images):
@@ -185,3 +235,68 @@ def test_commands_try_headings(tmp_path, model, ground, images, capsys):
     assert [float(row["heading"]) for row in rows_of(tmp_path / "matches.csv")] == expected
     words = known, photos, "--headings", "0", "--out", tmp_path / "matches.csv"
     assert "headings is 0; expected a whole number" in fails(capsys, "localize", *words)
+
+
+ROTATED = Area(
+    9, 11, right=(0.5, 0.3), down=(0.3, -0.5), unit="m"
+)  # a picture that is turned by 30.96 degrees
+
+
+def test_headings_count_from_north_not_from_the_picture(model, images, ground):
+    assert Area(2, 2).north == 0
+    assert Area(2, 2, right=(0.5, 0.0), down=(0.0, -0.5), unit="m").north == 0
+    assert Area(2, 2, right=(0.0, 1.0), down=(-1.0, 0.0)).north == pytest.approx(-90)  # its right is south
+    # where rows rise to the right, north is to the right of up by as much
+    north = math.degrees(math.atan2(0.3, 0.5))
+    x, y = math.sin(math.radians(north)), -math.cos(math.radians(north))
+    assert x * 0.5 + y * 0.3 == pytest.approx(0)
+    assert x * 0.3 - y * 0.5 > 0
+    assert ROTATED.north == pytest.approx(north)
+    turned = DejaVu(mapper=SpectralMapper(8), whitening=model.whitening)
+    turned.replace_map(model.map._sharing(), model.state)
+    turned.map.area = ROTATED
+    match = turned.localize(images, headings=4)
+    assert match.index.tolist() == PLACES.tolist()
+    assert torch.allclose(match.heading, ((90 * QUARTERS - north) % 360).float())
+    query = ArrayTraverse(images)
+    query.headings = (90 * QUARTERS - north).double()
+    assert torch.allclose(facing_north(query, ROTATED)[:], ground[PLACES], atol=1e-5)
+
+
+def test_a_filter_tells_headings(model, ground):
+    path, turns = torch.arange(44, 55), torch.arange(11) % 4
+    flight = torch.stack([ground[int(p)].rot90(int(t), (1, 2)) for p, t in zip(path, turns, strict=True)])
+    match = model.localize(flight, sequence=PlaceFilter(), headings=4)
+    exact = match.index == path
+    assert exact.sum() >= 8
+    assert torch.equal(match.heading[exact], 90.0 * turns[exact])
+
+
+def test_frames_are_turned_as_they_come(tmp_path, model, ground, images, capsys):
+    write_images(tmp_path / "photos", as_pixels(images))
+    rows = zip(ground.area.coordinates(PLACES).tolist(), (90 * QUARTERS).tolist(), strict=True)
+    (tmp_path / "track.csv").write_text("\n".join(["x,y,heading", *(f"{x},{y},{h}" for (x, y), h in rows)]))
+    photos = f"{tmp_path}/photos?coordinates={tmp_path}/track.csv"
+    model.save(tmp_path / "map.safetensors")
+    run("live", tmp_path / "map.safetensors", photos, "--match", "single")
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines() if line.startswith("{")]
+    expected = model.localize(photos, sequence=None)
+    assert [line["place"] for line in lines] == expected.index.tolist() == PLACES.tolist()
+    assert [line["score"] for line in lines] == pytest.approx(expected.score.tolist(), abs=1e-3)
+
+
+def test_headings_that_are_not_known_are_none(tmp_path, ground):
+    Image.fromarray(ground.picture.permute(1, 2, 0).numpy()).save(tmp_path / "ground.png")
+    (tmp_path / "points.csv").write_text("x,y,heading\n90,90,30\n100,90,60\n")
+    (tmp_path / "plain.csv").write_text("x,y\n1,2\n3,4\n")
+    (tmp_path / "none.csv").write_text("x,y,heading\n1,2,\n3,4,\n")
+    flight = f"path:{tmp_path}/ground.png?points={tmp_path}/points.csv"
+    for name in ("plain", "none"):
+        source = open_source(f"{flight}&coordinates={tmp_path}/{name}.csv")
+        assert source.headings.tolist() == [30, 60]
+        assert source.coordinates.values.tolist() == [[1, 2], [3, 4]]
+    plain = ArrayTraverse(torch.zeros(2, 3, 64, 64))
+    assert read_coordinates(tmp_path / "none.csv", plain)[1] is None
+    chain = Chain([open_source(flight), plain])
+    assert chain.headings.numpy() == pytest.approx([30, 60, math.nan, math.nan], nan_ok=True)
+    assert Chain([plain, plain]).headings is None

@@ -16,6 +16,7 @@ import numpy as np
 from dejavu_torch.cli.process import interrupts_raise, output_problem
 from dejavu_torch.data.camera import Camera, Frame, is_stream, shots_of, stretched
 from dejavu_torch.data.source import open_source
+from dejavu_torch.data.turning import Turned, facing_north
 from dejavu_torch.live.feed import FrameReader, in_real_time
 from dejavu_torch.live.localizer import LiveLocalizer, LiveMatch
 from dejavu_torch.live.page import Page, ReferencePictures, Snapshot, without_nan
@@ -48,9 +49,9 @@ def follow(
     Raises:
         InputError: the source fails; the lines and the summary of earlier frames are printed first.
     """
-    localizer = LiveLocalizer(model, sequence, port is not None, centre)
+    frames, newest, name, turned = frames_from(source, model, realtime, port is not None)
+    localizer = LiveLocalizer(model, sequence, port is not None, centre, turned)
     title += f"; answers come {localizer.lag} frames later and use these" if localizer.lag else ""
-    frames, newest, name = frames_from(source, model, realtime, port is not None)
     recent: deque[float] = deque(maxlen=RECENT)  # milliseconds
     waiting: deque[Frame] = deque()  # for their answers
     count = 0
@@ -116,8 +117,8 @@ def _stay(url: str) -> None:
 
 def frames_from(
     source: str, model: DejaVu, realtime: bool, shown: bool = False
-) -> tuple[Iterable[Frame], bool, str]:
-    """The frames of a source, whether older ones are dropped for the newest, and its name.
+) -> tuple[Iterable[Frame], bool, str, bool]:
+    """The frames of a source, whether older ones are dropped, its name, and whether they are turned north.
 
     Args:
         shown: on a page, for which a file is played in real time.
@@ -127,16 +128,17 @@ def frames_from(
     if is_stream(source):
         camera = Camera(source, size)
         expect(not realtime, "a video file with it", f"--realtime: {camera.name} is live already")
-        return _with_warning(camera), True, camera.name
+        return _with_warning(camera), True, camera.name, False
     own, traverse = open_source(source).frame_shape, open_source(source, size)
     if traverse.frame_shape != own and size is not None:
         note = stretched(traverse.name, (own[1], own[2]), size)
         if note:
             log.warning("%s", note)
+    traverse = facing_north(traverse, model.map.area)
     frames = shots_of(traverse)
     if realtime or shown:
         frames = in_real_time(frames, traverse.name, None if realtime else RATE)
-    return frames, realtime, traverse.name
+    return frames, realtime, traverse.name, isinstance(traverse, Turned)
 
 
 def _with_warning(camera: Camera) -> Iterable[Frame]:

@@ -125,6 +125,7 @@ def read_coordinates(path: Path, traverse: Traverse) -> tuple[Coordinates, Tenso
         log.warning("%s: %d of %d frames have no coordinates", traverse.name, missing, len(traverse))
     if headings is not None and (unknown := int(headings.isnan().sum())):
         log.warning("%s: %d of %d frames have no heading", traverse.name, unknown, len(traverse))
+        headings = None if unknown == len(headings) else headings
     return Coordinates(torch.from_numpy(values), degrees), headings
 
 

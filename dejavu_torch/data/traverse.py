@@ -118,10 +118,13 @@ class Chain(Traverse):
         self.sized = any(traverse.sized for traverse in self.traverses)
         self.ordered = all(traverse.ordered for traverse in self.traverses)
         self.starts = list(accumulate(map(len, self.traverses), initial=0))
-        if any(traverse.times is not None for traverse in self.traverses):
-            unknown = (torch.full((n,), torch.nan, dtype=torch.float64) for n in map(len, self.traverses))
-            times = zip((traverse.times for traverse in self.traverses), unknown, strict=True)
-            self.times = torch.cat([nan if known is None else known for known, nan in times])
+        for name in ("times", "headings"):
+            each = [getattr(traverse, name) for traverse in self.traverses]
+            if any(values is not None for values in each):
+                nan = [torch.full((len(one),), torch.nan, dtype=torch.float64) for one in self.traverses]
+                setattr(
+                    self, name, torch.cat([b if a is None else a for a, b in zip(each, nan, strict=True)])
+                )
         known = [traverse.coordinates for traverse in self.traverses if traverse.coordinates is not None]
         kinds = {(one[1:], one.values.shape[1]) for one in known}
         if len(known) == len(self.traverses) and len(kinds) == 1:

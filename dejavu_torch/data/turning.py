@@ -61,4 +61,4 @@ def facing_north(traverse: Traverse, area: Area | None, headings: int = 1) -> Tr
         return Turned(traverse, evenly, headings)
     if area is None or traverse.headings is None or len(traverse.frame_shape) != 3:
         return traverse
-    return Turned(traverse, traverse.headings)
+    return Turned(traverse, traverse.headings + area.north)

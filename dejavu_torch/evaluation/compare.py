@@ -341,7 +341,7 @@ def _localized(run: Localization, drive: bool, top: int, progress: bool) -> tupl
     """The run, and the best places of each query as far as recall@N or `top` needs."""
     model = run.model
     if run.sequence is not None:
-        run.sequence.check(len(run.query_features), model.map.places)
+        run.sequence.check(len(run.query), model.map.places)
     ranks = max(top, min(max(RANKS), model.map.places))
 
     def match(queries: Tensor, how: Matching) -> Match:
@@ -442,7 +442,7 @@ def _match_distractors(
         queries = model.descriptor.all_of(asked, progress)
         matching = model.matching(copy.deepcopy(whole) if whole else sequence)._replace(copies=headings)
         if isinstance(asked, Turned):
-            queries = set_apart(queries)
+            queries = set_apart(model.map, queries)
         elif centring and (sequence is None or whole):
             matching, queries = matching._replace(plain=queries), centred(model.map, queries)
         match = model.localize_descriptors(queries, matching)

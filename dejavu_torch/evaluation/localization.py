@@ -79,7 +79,7 @@ class Localization(NamedTuple):
     def described_by(self, model: DejaVu, progress: bool = False) -> Tensor:
         """The descriptors of the queries by a model, those of turned images by `set_apart`."""
         rows = model.descriptor.all_of(self.asked, progress)
-        return set_apart(rows) if isinstance(self.asked, Turned) else rows
+        return set_apart(model.map, rows) if isinstance(self.asked, Turned) else rows
 
     def match_by(self, match: Callable[[Tensor, Matching], Match]) -> Match:
         """The matches of a function of queries and matching, with those of all models in `sequences`."""

@@ -17,7 +17,7 @@ from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.memory import in_one_thread
 from dejavu_torch.model import DejaVu, check_queries
-from dejavu_torch.recognition.centring import running_mean
+from dejavu_torch.recognition.centring import running_mean, set_apart
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.types import InputError, Match, SequenceModel, check_shape, expect
 
@@ -52,6 +52,7 @@ class LiveLocalizer:
         sequence: "filter" is a `PlaceFilter`; None matches each frame by itself.
         keep_scores: keep the scores of all places; otherwise single frames are searched as in `localize`.
         centre: remove the mean of the frames so far from each, see `RunningMean`.
+        turned: the frames are turned north, on the map of an area; see `set_apart`.
 
     Shape: a frame (H,W), (H,W,3) or (C,H,W), tensor or array, uint8 or float in [0, 1] -> `LiveMatch`.
 
@@ -81,13 +82,15 @@ class LiveLocalizer:
         sequence: SequenceModel | Literal["filter"] | None = "filter",
         keep_scores: bool = True,
         centre: bool = False,
+        turned: bool = False,
     ) -> None:
         if model.step is not None and model.velocity is not None:
             seen = "the map's places are even steps along the ground, which only a whole traverse shows"
             raise InputError(f"{seen}; expected a map without --velocity, or unchanged frames (--as_is)")
         fits = sequence in (None, "filter") or isinstance(sequence, SequenceModel)
         expect(fits, "a SequenceModel such as PlaceFilter, 'filter' or None", f"the sequence is {sequence!r}")
-        self.keep_scores, self.centring = keep_scores, running_mean(model.map) if centre else None
+        self.keep_scores, self.turned = keep_scores, turned
+        self.centring = running_mean(model.map) if centre and not turned else None
         self.model, self.sequence = model, PlaceFilter() if isinstance(sequence, str) else sequence
         self._shape: tuple[int, ...] | None = None  # of the latest valid frame
         whitening = model.whitening
@@ -119,6 +122,8 @@ class LiveLocalizer:
         batch = as_batch(frame, self.model.map.device)
         with in_one_thread(batch.numel() if self._small else math.inf):
             descriptor = self._describe(batch)
+        if self.turned:
+            descriptor = set_apart(self.model.map, descriptor)
         if self.centring is not None:
             descriptor, mean = self.centring(descriptor, mean)
         with in_one_thread(self.model.map.places):

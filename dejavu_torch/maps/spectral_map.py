@@ -45,10 +45,11 @@ FILE = {  # dtype and dimensions of the tensors of a file
     "drives": (torch.int32, 1),
     "links": (torch.int32, 2),
     "columns": (torch.int32, 1),
+    "turned": (torch.int8, 2),
 }
 LINK_SHARES = 1000  # the probability of a link is stored in thousandths
 STAGE = ("stage", "stage_scale", "drives")
-RARE = (*STAGE, "links", "columns")  # files of maps without them lack these
+RARE = (*STAGE, "links", "columns", "turned")  # files of maps without them lack these
 CHUNK_BYTES = 8 + 4 + 8 + 8  # a chunk's length, step, stream length and checksum in a file
 
 
@@ -86,6 +87,7 @@ class SpectralMap(PlaceMap):
             descriptors are compared after it, see `refined`. drives: (1,) int32, how many, and those that
             taught the whitening without being told where they are. Empty without.
         columns: (G,) int32, of the tiles of an area, see `lines_of`; empty for a route.
+        turned: (K,K) int8, of turned images of an area, see `learn_turned`; empty if unknown.
         links: (L,3) int32, steps from a place of a route to one of another, and their probability in
             thousandths; see `connections`.
     Buffers derived from these:
@@ -120,6 +122,7 @@ class SpectralMap(PlaceMap):
         "drives": (0,),
         "links": (0, 3),
         "columns": (0,),
+        "turned": (0, 0),
     }
 
     lengths: Tensor
@@ -132,6 +135,7 @@ class SpectralMap(PlaceMap):
     drives: Tensor
     links: Tensor
     columns: Tensor
+    turned: Tensor
     counts: Tensor
     feature: Tensor
     level: Tensor
@@ -279,9 +283,9 @@ class SpectralMap(PlaceMap):
         return place_map
 
     def _without_places(self, means: Tensor) -> SpectralMap:
-        """A map without places, with this one's settings and stage."""
+        """A map without places, with this one's settings, stage and `turned`."""
         place_map = SpectralMap(means, **self.settings())
-        for name in STAGE:
+        for name in (*STAGE, "turned"):
             setattr(place_map, name, getattr(self, name))
         return place_map
 
@@ -555,6 +559,8 @@ class SpectralMap(PlaceMap):
             wanted = f"those of {self.area.rows} x {self.area.columns}"
             require(tiles == self.area.tiles[: len(tiles)], f"tiles {tiles!s:.100}; expected {wanted}")
         require(bool(self.stage_scale.isfinite().all()), "a stage that is not finite")
+        turned, square = tuple(self.turned.shape), 2 * (self.dimension,)
+        require(turned in ((0, 0), square), f"turned images {turned}; expected {square}")
         links, most = self.links, self.links.new_tensor([self.places - 1, self.places - 1, LINK_SHARES])
         row = f"rows of two places, and a number up to {LINK_SHARES}"
         fits = bool(((links >= 0) & (links <= most)).all())
@@ -586,11 +592,12 @@ class SpectralMap(PlaceMap):
         packed = self.packed() if self.places else {}
         names = {"streams": "lines", "means": "mean", "positions": "positions", "visits": "visits"}
         stage = sum(packed.pop(name).nbytes for name in STAGE if name in packed)  # with the count of drives
+        turned = packed.pop("turned", self.turned).nbytes
         route = {part: packed[name].nbytes for name, part in names.items() if name in packed}
         route = {name: size for name, size in route.items() if size}
         route["chunks"] = sum(tensor.nbytes for name, tensor in packed.items() if name not in names)
         covered = int(((self.norms > 0) & self.norms.isfinite()).sum())
-        fixed = {"stage": stage} if stage else {}
+        fixed = {part: size for part, size in (("stage", stage), ("turned", turned)) if size}
         lines, area = len(self.level), None if self.area is None else self.area[:2]
         return MapSummary(self.kind, self.places, covered, 0, 0, tuple(chunks), route, fixed, lines, area)
 

@@ -11,7 +11,7 @@ from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.recognition.evidence import run_lengths, unchanged
 from dejavu_torch.types import InputError
 
-SHRINKAGE = 0.25  # least share of a covariance of turned queries that is replaced by a multiple of identity
+SHRINKAGE = 0.25  # least share of the second moment of turned images that a multiple of identity replaces
 PRIOR = 50  # queries that the map's own mean counts as; fewer queries are not centred by default
 
 
@@ -33,27 +33,29 @@ def centred(place_map: PlaceMap, queries: Tensor) -> Tensor:
     return _without(place_map.metric, queries, shift / (weight.sum() + PRIOR))
 
 
-def set_apart(queries: Tensor) -> Tensor:
-    """Queries without what is common among them: (q - m) / C, scaled to length 1, where m is their mean, with
-    50 further queries of 0, and C their covariance about it, of which a share of K / (K + Q), at least 0.25,
-    is replaced by a multiple of the identity.
+def learn_turned(place_map: SpectralMap, rows: Tensor) -> None:
+    """Let the map of an area know turned images by descriptors (n,K), of which those of 0 do not count: their
+    second moment about the map's mean, as its inverse in 8 bits. A share of it, K / (K + n) but at least
+    0.25, is replaced by a multiple of the identity."""
+    moved = rows[rows.any(1)].double().cpu() - place_map.mean.double().cpu()
+    moment, (count, size) = moved.T @ moved / max(1, len(moved)), moved.shape
+    even = torch.eye(size).to(moment) * moment.diagonal().mean().clamp(min=1e-30)
+    inverse = moment.lerp(even, max(SHRINKAGE, size / (count + size))).inverse()
+    place_map.turned = (127 * inverse / inverse.abs().max()).round().to(place_map.device, torch.int8)
 
-    Turned images have much in common that north-up windows of a map have not, so whatever place has a little
-    of it is similar to all of them. Of turned copies most show wrong headings: they tell what is common by
-    chance. Queries of 0, as of blank frames, stay 0 and do not count.
+
+def set_apart(place_map: PlaceMap, queries: Tensor) -> Tensor:
+    """Queries of turned images without what these have in common: (q - m) / C, scaled to length 1, where m is
+    the map's mean and C as in `learn_turned`; as they are if the map does not know C. Queries of 0 stay 0.
+
+    Their corners are reflected, and a place that looks a little like that is similar to all of them.
 
     Shape: (Q,K) -> (Q,K).
     """
-    shows = queries.any(1)
-    known = queries[shows].double().cpu()
-    moved = known - known.sum(0) / (len(known) + PRIOR)
-    covariance = moved.T @ moved / max(1, len(known))
-    few, scale = known.shape[1] / (len(known) + known.shape[1]), covariance.diagonal().mean()
-    share = max(SHRINKAGE, few)
-    covariance = (1 - share) * covariance
-    covariance.diagonal().add_((share * scale).clamp(min=1e-30))
-    apart = F.normalize(torch.linalg.solve(covariance, moved.T).T, dim=1)
-    return torch.zeros_like(queries).masked_scatter(shows[:, None], apart.to(queries))
+    if not isinstance(place_map, SpectralMap) or not len(place_map.turned):
+        return queries
+    moved = (queries - place_map.mean.to(queries)) * queries.any(1, keepdim=True).to(queries)
+    return F.normalize(moved @ place_map.turned.to(queries), dim=1)
 
 
 class RunningMean(nn.Module):

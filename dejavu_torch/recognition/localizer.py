@@ -137,11 +137,11 @@ class Localizer:
             scores = earlier(scores, numbers, self.matching.apart)
             self.matched += len(scores)
         parts = scores.split(max(1, CACHED // scores.shape[1]))
+        turns = [None] * len(parts) if turn is None else turn.split(len(parts[0]))
         if not self.models:
-            turns = [None] * len(parts) if turn is None else turn.split(len(parts[0]))
             return Match.joined(map(self._alone, parts, turns))
         with in_one_thread(scores.shape[1]):
-            return Match.joined(map(self._in_sequence, parts))
+            return Match.joined(map(self._in_sequence, parts, turns))
 
     def drive(
         self,
@@ -174,8 +174,13 @@ class Localizer:
         for rows, places in zip(descriptors.split(each), index.split(each // copies), strict=True):
             scores = score(rows).cpu().view(len(places), copies, -1)
             at = places.clamp(min=0)[:, None].expand(-1, copies, -1)
-            found.append(heading_of(scores.gather(2, at).argmin(1), places, copies))
+            found.append(self._heading_of(scores.gather(2, at).argmin(1), places))
         return torch.cat(found) if found else index.float()
+
+    def _heading_of(self, turn: Tensor, index: Tensor) -> Tensor:
+        """The heading of copies in degrees, NaN where the place `index` is -1."""
+        heading = turn * (360 / self.matching.copies) - (0 if self.area is None else self.area.north)
+        return (heading % 360).float().masked_fill(index < 0, torch.nan)
 
     def drive_query(
         self, descriptors: Tensor, smoother: PlaceSmoother, score: Scoring | None = None
@@ -230,14 +235,10 @@ class Localizer:
         state = self.states.get("filter")
         return state if state is None or state.ndim == 1 else state[0]
 
-    def _alone(self, scores: Tensor, turn: Tensor | None = None) -> Match:
-        match = self._candidates(scores)
-        if turn is not None:
-            best = turn.gather(1, match.index.clamp(min=0))
-            match = replace(match, heading=heading_of(best, match.index, self.matching.copies))
-        return self._answer(match, best_pair(scores, self.area))
+    def _alone(self, scores: Tensor, turn: Tensor | None) -> Match:
+        return self._answer(self._candidates(scores, turn), best_pair(scores, self.area))
 
-    def _in_sequence(self, scores: Tensor, last: bool = False) -> Match:
+    def _in_sequence(self, scores: Tensor, turn: Tensor | None = None, last: bool = False) -> Match:
         states = self.states or {T: m.start(scores.shape[1]).to(scores) for T, m in self.models.items()}
         steps = {T: m.step(scores, states[T], self.route_starts) for T, m in self.models.items()}
         filter, single = self.matching.sequence, self.matching.sequence is None
@@ -245,20 +246,22 @@ class Localizer:
             if last:
                 steps[self.own] = filter.finish(states[self.own], self.route_starts)
             answered = torch.cat([filter.waiting(states[self.own]), scores])
-            scores = answered[: len(steps[self.own][0])]
+            scores, turn = answered[: len(steps[self.own][0])], None  # not those of the queries answered
         final = scores if single else steps[self.own][0]
         pair, confidence = best_pair(final, self.area), None
         if self.matching.platt is not None and not single:
             confidence = self.track(final, scores)
-        match = self._answer(self._candidates(final), pair, confidence)
+        match = self._answer(self._candidates(final, turn), pair, confidence)
         self.states = {T: state for T, (_, state) in steps.items()}
         sequences = {T: best_match(steps[T][0]).map(Tensor.cpu) for T in self.matching.also}
         return replace(match, sequences=sequences)
 
-    def _candidates(self, scores: Tensor) -> Match:
+    def _candidates(self, scores: Tensor, turn: Tensor | None = None) -> Match:
         if self.matching.callback is not None:
             self.matching.callback(scores)
-        return best_candidates(scores, self.matching.k or 1, self.matching.radius, area=self.area)
+        match = best_candidates(scores, self.matching.k or 1, self.matching.radius, area=self.area)
+        best = None if turn is None else turn.gather(1, match.index.clamp(min=0))
+        return match if best is None else replace(match, heading=self._heading_of(best, match.index))
 
     def _answer(self, match: Match, pair: Match, confidence: Tensor | None = None) -> Match:
         """Candidates (B,k) with all that is known of them.
@@ -299,7 +302,7 @@ class Localizer:
         if copies > 1:
             found = (place[:, None] == match.index[..., None]) & (score[:, None] == match.score[..., None])
             turn = found.byte().argmax(2) // each
-            match = replace(match, heading=heading_of(turn, match.index, copies))
+            match = replace(match, heading=self._heading_of(turn, match.index))
         return self._answer(match, pair)
 
 
@@ -330,11 +333,6 @@ def copies_of(numbers: Tensor, copies: int) -> Tensor:
 def best_copies(scores: Tensor, copies: int) -> Tensor:
     """The best score of each place over all copies of a query, (B x copies, N) -> (B,N)."""
     return scores if copies == 1 else scores.view(-1, copies, scores.shape[1]).amin(1)
-
-
-def heading_of(turn: Tensor, index: Tensor, copies: int) -> Tensor:
-    """The heading of copies in degrees, NaN where the place `index` is -1."""
-    return (turn * (360 / copies)).float().masked_fill(index < 0, torch.nan)
 
 
 def best_pair(scores: Tensor, area: Area | None = None) -> Match:
