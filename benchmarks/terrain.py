@@ -19,7 +19,7 @@ from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.types import Match
 
 SIZES = (0.3, 1.0)  # bytes of the lines per place
-QUERIES, FLOWN = 1000, 100  # single images, and images of a flight, of the other traverse
+QUERIES, FLOWN = 1000, 60  # single images, and images of a flight, of the other traverse
 RADII = (1, 2, 5)  # metres
 ALONE = 100  # images that are searched one by one
 
