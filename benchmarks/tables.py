@@ -332,7 +332,7 @@ def areas() -> str:
     """Recall@1 of one image on an area by ways to store it, over their bytes."""
     found: dict[str, dict[float, str]] = {}
     for row in read("areas")["rows"]:
-        whole = f" / {row['flight']:.3f}" if "flight" in row else ""
+        whole = "".join(f" / {row[key]:.3f}" for key in ("flight_on_the_way", "flight") if key in row)
         found.setdefault(row["contender"], {})[row["bytes_per_place"]] = f"{row['recall_at_1']:.3f}{whole}"
     sizes = sorted({each for own in found.values() for each in own})
     table = [["bytes per window", *(f"{each:g}" for each in sizes)]]
@@ -347,6 +347,22 @@ def headings() -> str:
     for row in read("headings")["rows"]:
         shares = (f"{row[key]:.3f}" for key in shown)
         table.append([HEADING_WAYS[row["contender"]], *shares, f"{row['ms']:.1f}"])
+    return markdown(table)
+
+
+def terrain() -> str:
+    """Time, bytes and what is found on a large area, by bytes per place."""
+    rows = read("terrain")["rows"]
+    table = [["bytes per window", *(f"{row['bytes_per_place']:.2f}" for row in rows)]]
+    table += [["learned in", *(f"{row['learn_seconds']:.0f} s" for row in rows)]]
+    table += [["map file", *(f"{row['bytes'] / 1e6:.2f} MB" for row in rows)]]
+    table += [["one query", *(f"{row['ms']:.1f} ms" for row in rows)]]
+    for name, key in (("one image", ""), ("a flight of 60 images", "flight_")):
+        found = (" / ".join(f"{row[f'{key}recall_{metres}m']:.3f}" for metres in (1, 2, 5)) for row in rows)
+        table.append([f"{name}, within 1 / 2 / 5 m", *found])
+        table.append(
+            [f"{name}, accepted although wrong", *(f"{row[f'{key}accepted_wrong']:.3f}" for row in rows)]
+        )
     return markdown(table)
 
 
@@ -449,6 +465,7 @@ TABLES: dict[str, Callable[[], str]] = {
     **{
         "areas": areas,
         "headings": headings,
+        "terrain": terrain,
         "large drives": large_drives,
         "taught drives": taught,
         "visits": visits,
