@@ -360,9 +360,6 @@ def terrain() -> str:
     for name, key in (("one image", ""), ("a flight of 60 images", "flight_")):
         found = (" / ".join(f"{row[f'{key}recall_{metres}m']:.3f}" for metres in (1, 2, 5)) for row in rows)
         table.append([f"{name}, within 1 / 2 / 5 m", *found])
-        table.append(
-            [f"{name}, accepted although wrong", *(f"{row[f'{key}accepted_wrong']:.3f}" for row in rows)]
-        )
     return markdown(table)
 
 
