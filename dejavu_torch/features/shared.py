@@ -1,7 +1,7 @@
 """Features of windows that overlap: the cells and feature maps that windows share are computed once.
 
-A window is described with what lies around it in place of its border: gradients and convolutions reach over
-it. So the features differ a little from those of the window alone, as queries are described.
+A window is described with what lies around it: gradients and convolutions reach over its border. Queries are
+windows alone, whose features differ there; the mean difference is added, see `Sharing.offset`.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ class Sharing(NamedTuple):
         """Features of rows and columns of windows, (B,D), and which show something, (B,)."""
         (rows, columns), window, stride = shape, grid.window, grid.stride
         scaled = stride * SIZE[0] // window  # in the frames of Distilled
-        strides = -(-REACH // scaled)
+        strides = -(-REACH * window // (stride * SIZE[0]))
         margin = strides * stride
         pixels = grid.around(corner, shape, margin).to(self.device)
         shown = self._shows(pixels[..., margin:-margin, margin:-margin], window, stride)

@@ -49,8 +49,9 @@ def test_inner_cells_of_hog_are_those_of_windows_alone(small_tiles, stride, bins
     assert not torch.allclose(together[:, 0], alone[:, 0], atol=1e-3)  # gradients reach over the border
 
 
-def test_inner_blocks_are_in_the_order_of_hog(small_tiles):
-    hog, grid = HOG(cell=8, block=2), Grid(ground(), 56, 4)
+@pytest.mark.parametrize("stride", [4, 1])
+def test_inner_blocks_are_in_the_order_of_hog(small_tiles, stride):
+    hog, grid = HOG(cell=8, block=2), Grid(ground(56 + 5 * stride, 56 + 8 * stride), 56, stride)
     together, alone = (one.view(len(grid), 6, 6, 36) for one in both(hog, grid))
     torch.testing.assert_close(together[:, 1:-1, 1:-1], alone[:, 1:-1, 1:-1], rtol=1e-4, atol=1e-4)
 
@@ -127,6 +128,9 @@ def test_other_features_and_strides_are_described_alone(small_tiles):
     grid = Grid(ground(), 64, 5)
     assert not Sharing(Preprocess(), Distilled(), CPU).fits(grid)  # 7.5 pixels of the network's frames
     assert Sharing(Preprocess(), HOG(), CPU).fits(grid)
+    finest = Windows.of(Grid(ground(130, 131), 128, 1))
+    assert finest is not None
+    assert sum(map(len, Sharing(Preprocess(), HOG(), CPU).batches(finest))) == 3 * 4
     assert not Sharing(Preprocess(contrast="patch"), HOG(), CPU).fits(grid)
     assert not Sharing(Preprocess(), HOG(resize=(32, 32)), CPU).fits(grid)
     assert not Sharing(Preprocess(), nn.Flatten(), CPU).fits(grid)
