@@ -443,6 +443,8 @@ def test_an_area_is_compared_by_distance(pictures, small_tiles, tmp_path, monkey
     assert report["null"]["recall_at_1"] < 0.95 * report["recall_at_1"]
     assert report["area"] == {"rows": 19, "columns": 19}
     assert report["error_pixels"]["all"]["0.5"] < 6
+    within = [float(((found - own).norm(dim=1) <= 8 * n).double().mean()) for n in (1, 2, 5)]
+    assert report["recall_within"] == pytest.approx(dict(zip(("8", "16", "40"), within, strict=True)))
     run("localize", tmp_path / "report" / "map.safetensors", two, "--out", tmp_path / "m.csv")
     assert f"{len(own)} queries" in capsys.readouterr().out
     again = [*csv.DictReader((tmp_path / "m.csv").open())]

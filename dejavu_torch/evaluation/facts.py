@@ -25,6 +25,7 @@ from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.types import Facts, Match
 
 QUANTILES = 0.5, 0.9, 0.99  # of errors in metres
+WINDOWS = 1, 2, 5  # or metres, within which answers are counted
 STANDING, FAR = 0.01, 256  # of the distance between places drawn at random: a camera that stands still
 
 
@@ -111,7 +112,8 @@ def match_facts(
 
 def metric_facts(run: Localization, truth: Truth | None) -> Facts:
     """The entry `error_metres` or `error_pixels` of report.json: quantiles of the distances between queries
-    and the places reported for them, where the truth is by coordinates."""
+    and the places reported for them, where the truth is by coordinates. In an area also `recall_within`, the
+    share of the queries with coordinates within 1, 2 and 5 metres, or windows."""
     parsed = None if truth is None else check_ground_truth(truth)
     if not isinstance(parsed, Near):
         return {}
@@ -126,7 +128,13 @@ def metric_facts(run: Localization, truth: Truth | None) -> Facts:
         if chosen.any():
             quantiles = distance[chosen].quantile(torch.tensor(QUANTILES, dtype=torch.float64)).tolist()
             facts[name] = {f"{share:g}": round(at, 3) for share, at in zip(QUANTILES, quantiles, strict=True)}
-    return {f"error_{parsed.kind if parsed.kind == 'pixels' else 'metres'}": facts}
+    shares: Facts = {}
+    if (area := run.model.map.area) is not None:
+        each = 1.0 if area.unit == "m" else math.hypot(*area.right)
+        asked_of, found = asked[run.query_frames].isfinite().all(1), distance.masked_fill(~known, math.inf)
+        near = {f"{each * n:g}": float((found[asked_of] <= each * n).double().mean()) for n in WINDOWS}
+        shares = {"recall_within": near} if asked_of.any() else {}
+    return {f"error_{parsed.kind if parsed.kind == 'pixels' else 'metres'}": facts} | shares
 
 
 def _gap_facts(run: Localization) -> Facts:
