@@ -332,7 +332,7 @@ def areas() -> str:
     """Recall@1 of one image on an area by ways to store it, over their bytes."""
     found: dict[str, dict[float, str]] = {}
     for row in read("areas")["rows"]:
-        whole = "".join(f" / {row[key]:.3f}" for key in ("flight_on_the_way", "flight") if key in row)
+        whole = "".join(f"/{row[key]:.3f}" for key in ("flight_on_the_way", "flight") if key in row)
         found.setdefault(row["contender"], {})[row["bytes_per_place"]] = f"{row['recall_at_1']:.3f}{whole}"
     sizes = sorted({each for own in found.values() for each in own})
     table = [["bytes per window", *(f"{each:g}" for each in sizes)]]
@@ -358,8 +358,8 @@ def terrain() -> str:
     table += [["map file", *(f"{row['bytes'] / 1e6:.2f} MB" for row in rows)]]
     table += [["one query", *(f"{row['ms']:.1f} ms" for row in rows)]]
     for name, key in (("one image", ""), ("a flight of 60 images", "flight_")):
-        found = (" / ".join(f"{row[f'{key}recall_{metres}m']:.3f}" for metres in (1, 2, 5)) for row in rows)
-        table.append([f"{name}, within 1 / 2 / 5 m", *found])
+        found = ("/".join(f"{row[f'{key}recall_{metres}m']:.3f}" for metres in (1, 2, 5)) for row in rows)
+        table.append([f"{name}, within 1/2/5 m", *found])
     return markdown(table)
 
 

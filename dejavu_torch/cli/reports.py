@@ -103,11 +103,11 @@ def run_compare(
         reference: the visit to learn: a folder of images, a video, or another source of `dejavu learn`
         query: the visit whose frames are found; none with --loops
         loops: find where the reference returns to its own places, as in localize
-        headings: try so many headings of each image on an area, as in localize
+        headings: tried per image, see localize
         out: folder for report, pictures, matches.csv and map.safetensors; by default dejavu_report, or
             dejavu_report_2 and so on if that exists
         open: show the report in a browser
-        map: evaluate this map of the reference instead of learning one
+        map: evaluate this map of the reference
     """
     from dejavu_torch.evaluation.compare import compare
 

@@ -40,8 +40,8 @@ class Picture:
         shape: (C,H,W) of the file. read: (top, bottom, left, right) -> its pixels (C,h,w) uint8. scale: of
             its sides, at most 1.
 
-    Convention: reduced as by `resize_frames`, equally whichever part is read. About `BLOCK`^2 pixels of the
-        file are read together; the last ones are kept.
+    Convention: reduced as by `resize_frames`, equally whichever part is read. About `BLOCK` x `BLOCK` pixels
+        of the file are read together; the last ones are kept.
     """
 
     ndim, dtype = 3, torch.uint8
