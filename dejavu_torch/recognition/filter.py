@@ -129,7 +129,7 @@ class PlaceFilter(SequenceModel):
         if area is not None and self.area is None:
             if torch.equal(self.move_logits.cpu(), logits(*MOVES)):
                 copied.move_logits = nn.Parameter(logits(*PLANE_MOVES).to(self.off_map.device))
-            if float(self.log_sharpness) == 0:
+            if float(self.log_sharpness.detach()) == 0:
                 copied.log_sharpness.data.fill_(math.log(PLANE_SHARPNESS))
         return copied
 
