@@ -105,9 +105,8 @@ def measured(seed: int) -> list[Row]:
         row: Row = {"seed": seed, "contender": key, "bytes_per_place": size}
         rows.append(row | {"recall_at_1": float(right.double().mean())})
         if key in FLOWN:
-            drive = drive_query(flown, PlaceSmoother(within=round(RADIUS / STRIDE)), score)
-            drive.smoother.area = reference.area
-            found = localize_drive(drive)
+            smoother = PlaceSmoother(within=round(RADIUS / STRIDE))
+            found = localize_drive(drive_query(flown, smoother, score, area=reference.area))
             right = (where.values[found.index[:, 0]] - own.values[path]).norm(dim=1) <= RADIUS
             sure = found.probability[:, 0] >= 0.5 if found.probability is not None else right
             matcher = Localizer(None, Matching(PlaceFilter()), area=reference.area)

@@ -63,8 +63,8 @@ def run_localize(
             only the first has a probability
         loops: find where a drive returns to its own places, on a map learned from it; ignore this many frames
             before each frame, and all after it
-        headings: on the map of an area, try so many headings of each image, such as 24, evenly over 360
-            degrees; this takes as many times as long
+        headings: on the map of an area, try this many headings of each image, evenly over 360 degrees, such
+            as 24, which takes 24 times as long
         pairs: also write lines `query_name place_name` for hloc and COLMAP, one per place
         corners: where this camera sees the patch of ground that the map's --velocity.corners describe
         cluster: divide the map among Ray workers, as in `dejavu learn`; for single queries only

@@ -95,7 +95,8 @@ class Localization(NamedTuple):
         """The queries as a drive with the scores of another map, if a smoother is compared."""
         if self.beside is None:
             return None
-        return drive_query(self.query_features, self.beside, score, self.causal_features)
+        area = self.model.map.area
+        return drive_query(self.query_features, self.beside, score, self.causal_features, area)
 
     @property
     def coarsest(self) -> int:

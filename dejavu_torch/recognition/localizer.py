@@ -307,11 +307,19 @@ class Localizer:
 
 
 def drive_query(
-    queries: Tensor, smoother: PlaceSmoother, score: Scoring, plain: Tensor | None = None
+    queries: Tensor,
+    smoother: PlaceSmoother,
+    score: Scoring,
+    plain: Tensor | None = None,
+    area: Area | None = None,
 ) -> DriveQuery:
-    """Queries (Q,K) as a drive with scores of any kind, for a smoother like this one; see `Matching`."""
+    """Queries (Q,K) as a drive with scores of any kind, for a smoother like this one; see `Matching`.
+
+    Args:
+        area: of the places; None along a route.
+    """
     matching = Matching(plain=plain, removed=smoother.removed)
-    return Localizer(None, matching).drive_query(queries, copy.deepcopy(smoother), score)
+    return Localizer(None, matching, area=area).drive_query(queries, copy.deepcopy(smoother), score)
 
 
 def earlier(scores: Tensor, numbers: Tensor, apart: int) -> Tensor:
