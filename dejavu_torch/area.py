@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 SIDE = 128  # windows of a tile to a side
-Tables = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+GAP = 64  # rows between areas that are not of one ground: more than a camera moves from image to image
+
+
+class Tables(NamedTuple):
+    """The first cell of each tile (T,2), its rows and columns (T,2), and its first place (T,)."""
+
+    corner: Tensor
+    size: Tensor
+    start: Tensor
 
 
 class Ground(NamedTuple):
@@ -43,7 +52,10 @@ class Area(NamedTuple):
 
     Args:
         rows, columns: of windows. first: (x, y) of the middle of the first window. right, down: (x, y) from a
-            window to the next of its row, and of its column. unit: of these, "px" or "m".
+            window to the next of its row, and of its column. unit: of these, "px" or "m". frame: of the
+            coordinates, see `Coordinates`, "" if unknown. corner: row and column of the first window in an
+            area of several `parts`, whose places follow each other; not all rows and columns of their bounds
+            are windows.
 
     Convention: places are numbered tile by tile and in a tile row by row, so that a tile is a run of places.
         Tiles are as equal as possible and have about `SIDE`^2 windows, `SIDE` to a side unless the area is
@@ -61,11 +73,31 @@ class Area(NamedTuple):
     right: tuple[float, float] = (1.0, 0.0)
     down: tuple[float, float] = (0.0, 1.0)
     unit: str = "px"
+    frame: str = ""
+    corner: tuple[int, int] = (0, 0)
+    parts: tuple[Area, ...] = ()
+
+    @classmethod
+    def of(cls, parts: Sequence[Area]) -> Area:
+        """The area of several parts, whose corners may be negative; places of one part after those of the
+        other."""
+        top, left = (min(part.corner[axis] for part in parts) for axis in (0, 1))
+        moved = [part._replace(corner=(part.corner[0] - top, part.corner[1] - left)) for part in parts]
+        if len(moved) == 1:
+            return moved[0]
+        rows = max(part.corner[0] + part.rows for part in moved)
+        columns = max(part.corner[1] + part.columns for part in moved)
+        return moved[0]._replace(rows=rows, columns=columns, corner=(0, 0), parts=(*moved,))
+
+    @property
+    def rectangles(self) -> tuple[Area, ...]:
+        """The parts, or itself."""
+        return self.parts or (self,)
 
     @property
     def places(self) -> int:
         """N, the number of windows."""
-        return self.rows * self.columns
+        return sum(part.rows * part.columns for part in self.rectangles)
 
     @property
     def north(self) -> float:
@@ -77,46 +109,69 @@ class Area(NamedTuple):
     @property
     def tiles(self) -> list[tuple[int, int]]:
         """Rows and columns of each tile."""
-        _, size, *_ = _tiles(self.rows, self.columns)
-        return [(rows, columns) for rows, columns in size.tolist()]
+        return [(rows, columns) for rows, columns in _tables(self).size.tolist()]
 
     @property
     def corners(self) -> list[tuple[int, int]]:
         """Row and column of the first window of each tile."""
-        corner, *_ = _tiles(self.rows, self.columns)
-        return [(row, column) for row, column in corner.tolist()]
+        return [(row, column) for row, column in _tables(self).corner.tolist()]
+
+    @property
+    def inside(self) -> Tensor | None:
+        """Which rows and columns are windows, (R,C) float32; None if all are."""
+        order = self.orders()[0]
+        return (order < self.places).float().view(self.rows, self.columns) if self.parts else None
 
     def orders(self) -> tuple[Tensor, Tensor]:
-        """The places row by row, and the number of each place row by row, (N,) int64."""
-        with torch.inference_mode(False):  # as `_tiles`
-            return _cached_orders(self.rows, self.columns, SIDE)
+        """The places row by row, (R C,), N where there is none, and the number of each place row by row,
+        (N,), int64."""
+        with torch.inference_mode(False):  # cached tensors are also used with gradients
+            return _cached_orders(self, SIDE)
 
     def columns_from(self, place: int) -> int:
         """The columns of the tile that begins at a place."""
-        _, size, start, *_ = _tiles(self.rows, self.columns)
-        return int(size[int((start == place).nonzero()[0]), 1])
+        tables = _tables(self)
+        return int(tables.size[int((tables.start == place).nonzero()[0]), 1])
 
     def cells(self, places: Tensor) -> Tensor:
         """Row and column of places, int64 of any shape -> (..., 2)."""
-        corner, size, start, *_ = (table.to(places.device) for table in _tiles(self.rows, self.columns))
+        corner, size, start = (table.to(places.device) for table in _tables(self))
         tile = torch.bucketize(places.contiguous(), start, right=True) - 1
         inside, width = places - start[tile], size[tile, 1]
         return corner[tile] + torch.stack([inside // width, inside % width], -1)
 
     def place_at(self, cells: Tensor) -> Tensor:
-        """The places of rows and columns inside the area, (..., 2) -> (...)."""
-        tables = (table.to(cells.device) for table in _tiles(self.rows, self.columns))
-        corner, size, start, tops, lefts = tables
-        row = torch.bucketize(cells[..., 0].contiguous(), tops, right=True) - 1
-        column = torch.bucketize(cells[..., 1].contiguous(), lefts, right=True) - 1
-        tile = row * len(lefts) + column
-        inside = cells - corner[tile]
-        return start[tile] + inside[..., 0] * size[tile, 1] + inside[..., 1]
+        """The places of rows and columns, (..., 2) -> (...); -1 where no window is."""
+        found, before = cells.new_full(cells.shape[:-1], -1), 0
+        for part in self.rectangles:
+            own = cells - cells.new_tensor(part.corner)
+            most = own.new_tensor([part.rows - 1, part.columns - 1])
+            within = torch.minimum(own.clamp(min=0), most)
+            found = torch.where((own == within).all(-1), before + part._numbered(within), found)
+            before += part.places
+        return found
+
+    def _numbered(self, cells: Tensor) -> Tensor:
+        """The places of rows and columns of a rectangle, from its first."""
+        down, across = (edges.to(cells.device) for edges in _cached_edges(self.rows, self.columns, SIDE))
+        row = torch.bucketize(cells[..., 0].contiguous(), down[1:-1], right=True)
+        column = torch.bucketize(cells[..., 1].contiguous(), across[1:-1], right=True)
+        tall, left, wide = down[row + 1] - down[row], across[column], across[column + 1] - across[column]
+        inside = (cells[..., 0] - down[row]) * wide + cells[..., 1] - left
+        return down[row] * self.columns + tall * left + inside
 
     def coordinates(self, places: Tensor) -> Tensor:
         """(x, y) of the middle of windows, int64 (...) -> (..., 2) float64."""
-        steps = torch.tensor([self.down, self.right], dtype=torch.float64, device=places.device)
-        return self.cells(places).double() @ steps + steps.new_tensor(self.first)
+        cells = self.cells(places)
+        found = torch.zeros(cells.shape, dtype=torch.float64, device=places.device)
+        before = 0
+        for part in self.rectangles:
+            own = ((places >= before) & (places < before + part.places))[..., None]
+            before += part.places
+            steps = found.new_tensor([part.down, part.right])
+            at = (cells - cells.new_tensor(part.corner)).double() @ steps + found.new_tensor(part.first)
+            found = torch.where(own, at, found)
+        return found
 
     def distance(self, one: Tensor, other: Tensor) -> Tensor:
         """The larger of the distances in rows and columns, int64."""
@@ -128,13 +183,37 @@ class Area(NamedTuple):
         offset = torch.arange(-radius, radius + 1, device=places.device)
         cells = self.cells(places)[:, None] + torch.cartesian_prod(offset, offset)
         most = torch.tensor([self.rows - 1, self.columns - 1], device=places.device)
-        return self.place_at(torch.minimum(cells.clamp(min=0), most))
+        near = self.place_at(torch.minimum(cells.clamp(min=0), most))
+        return torch.where(near < 0, places[:, None], near) if self.parts else near
+
+    def between(self, start: int, stop: int) -> Area:
+        """The area of some of the parts: those of the places [start, stop)."""
+        first = accumulate((part.places for part in self.rectangles), initial=0)
+        return Area.of([part for part, at in zip(self.rectangles, first, strict=False) if start <= at < stop])
+
+
+def apart(areas: Sequence[Area]) -> Area:
+    """The area of several that are not of one ground: none of their windows are near those of another."""
+    parts, top = list[Area](), 0
+    for area in areas:
+        parts += [part._replace(corner=(top + part.corner[0], part.corner[1])) for part in area.rectangles]
+        top += area.rows + GAP
+    return Area.of(parts)
 
 
 def area_of(stored: Mapping[str, Any]) -> Area:
-    """An area from the values of `_asdict`, as JSON keeps them."""
+    """An area from the values of `Area.stored`, as JSON keeps them."""
     points: dict[str, Any] = {name: tuple(stored[name]) for name in ("first", "right", "down")}
-    return Area(**{**stored, **points})
+    corner, parts = tuple(stored.get("corner", (0, 0))), tuple(map(area_of, stored.get("parts", ())))
+    return Area(**{**stored, **points, "corner": corner, "parts": parts})
+
+
+def stored_area(area: Area) -> dict[str, Any]:
+    """An area as JSON keeps it; parts only where there are several."""
+    stored = area._asdict()
+    parts = [stored_area(part) | {"corner": part.corner} for part in stored.pop("parts")]
+    del stored["corner"]
+    return stored | {"parts": parts} if parts else stored
 
 
 def distance(one: Tensor, other: Tensor, area: Area | None) -> Tensor:
@@ -151,28 +230,36 @@ def around(places: Tensor, radius: int, count: int, area: Area | None) -> Tensor
     return (places[:, None] + offset).clamp(0, count - 1)
 
 
-def _tiles(rows: int, columns: int) -> Tables:
-    """The first cell of each tile (T,2), its rows and columns (T,2), and its first place (T,); the first rows
-    of tiles, and the first columns."""
+def _tables(area: Area) -> Tables:
     with torch.inference_mode(False):  # cached tensors are also used with gradients
-        return _cached_tiles(rows, columns)
+        return _cached_tables(area, SIDE)
 
 
 @lru_cache(16)
-def _cached_tiles(rows: int, columns: int) -> Tables:
-    down = _edges(rows, max(SIDE, SIDE * SIDE // columns))
-    across = _edges(columns, SIDE * SIDE // int(down.diff().max()))
-    corner = torch.cartesian_prod(down[:-1], across[:-1]).view(-1, 2)
-    size = torch.cartesian_prod(down.diff(), across.diff()).view(-1, 2)
-    start = torch.cat([size.new_zeros(1), size.prod(1).cumsum(0)[:-1]])
-    return corner, size, start, down[:-1].contiguous(), across[:-1].contiguous()
+def _cached_tables(area: Area, side: int) -> Tables:
+    corners, sizes = list[Tensor](), list[Tensor]()
+    for part in area.rectangles:
+        down, across = _cached_edges(part.rows, part.columns, side)
+        corners.append(torch.cartesian_prod(down[:-1], across[:-1]).view(-1, 2) + torch.tensor(part.corner))
+        sizes.append(torch.cartesian_prod(down.diff(), across.diff()).view(-1, 2))
+    size = torch.cat(sizes)
+    return Tables(torch.cat(corners), size, torch.cat([size.new_zeros(1), size.prod(1).cumsum(0)[:-1]]))
+
+
+@lru_cache(64)
+def _cached_edges(rows: int, columns: int, side: int) -> tuple[Tensor, Tensor]:
+    """The borders of tiles, rows and columns."""
+    down = _edges(rows, max(side, side * side // columns))
+    return down, _edges(columns, side * side // int(down.diff().max()))
 
 
 @lru_cache(2)  # of 16 bytes a window
-def _cached_orders(rows: int, columns: int, side: int) -> tuple[Tensor, Tensor]:
-    cells = torch.cartesian_prod(torch.arange(rows), torch.arange(columns)).view(-1, 2)
-    order = Area(rows, columns).place_at(cells)
-    return order, order.argsort()
+def _cached_orders(area: Area, side: int) -> tuple[Tensor, Tensor]:
+    cells = area.cells(torch.arange(area.places))
+    rank = cells[:, 0] * area.columns + cells[:, 1]
+    order = torch.full((area.rows * area.columns,), area.places)
+    order[rank] = torch.arange(area.places)
+    return order, rank
 
 
 def _edges(count: int, most: int) -> Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import logging
+import math
 from collections.abc import Container, Sequence
 from itertools import accumulate, count
 
@@ -12,6 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dejavu_torch import learning
+from dejavu_torch.area import Area
 from dejavu_torch.data.ground_truth import find_ground_truth
 from dejavu_torch.data.positions import positions_behind
 from dejavu_torch.data.source import Source, as_traverse
@@ -30,6 +32,8 @@ from dejavu_torch.types import InputError, Traverse, expect
 log = logging.getLogger("dejavu_torch")
 
 EXACT = 2**24  # maximum number of even steps, with exact positions in float32
+SPARSE = 4  # a grown area may span so many times as many rows x columns as it has windows
+NORTH = 1.0  # degrees that areas of one map may differ by
 
 
 @torch.no_grad()
@@ -74,11 +78,13 @@ def append(
     places = len(added)
     positions = learning.positions_of(added).to(place_map.device)
     _check_count(place_map.places + places, model.step is not None)
+    area = continued(place_map.area, added.area, added.name)
     counts = None
     if visits is not None:
         _check_compatible(model, visits.traverse)
         counts = learning.observation_counts(visits, places)
     grown = copy.deepcopy(place_map)
+    grown.area = area
     grown.positions = place_map.positions[:0]  # set when all places are appended
     if checkpoint is not None:
         base = digests(base=checksums(place_map.packed(), place_map.get_extra_state()))
@@ -160,10 +166,11 @@ def average(model: DejaVu, visits: LabelledFrames, progress: bool = False) -> in
             return chunk
         rows = descriptors[inside].to(place_map.device)
         means = learning.with_visits(place_map.decode(g), counts[start:stop], rows, places[inside] - start)
-        return encode_chunk(means, place_map.means[0], chunk.step, place_map.transform, place_map.resolution)
+        settings = place_map.transform, place_map.resolution, chunk.columns
+        return encode_chunk(means, place_map.means[0], chunk.step, *settings)
 
     mean = place_map.of_chunks(averaged(g, chunk) for g, chunk in enumerate(place_map.coded()))
-    mean.positions = place_map.positions
+    mean.positions, mean.area = place_map.positions, place_map.area
     mean.count_visits((counts + seen).to(place_map.visits.device))
     mean.check()
     model.replace_map(mean)
@@ -316,7 +323,8 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
         if not isinstance(place_map, SpectralMap) or not place_map.places:
             seen = f"a map of kind {place_map.kind!r}" if place_map.places else "no map"
             raise InputError(f"{name} is {seen}; expected one of kind {SpectralMap.kind!r} to merge")
-        expect(place_map.area is None, "maps of routes to merge", f"{name} is the map of an area")
+        seen = f"{name} is the map of {_kind(place_map.area)}, {names[0]} of {_kind(first.map.area)}"
+        expect((place_map.area is None) == (first.map.area is None), "all of routes or of areas", seen)
         if problem := _difference(first, model):
             raise InputError(f"{names[0]} and {name} cannot be merged: {problem}")
         maps = [(route.name, place_map.part(route.name)) for route in place_map.routes] or [(name, place_map)]
@@ -382,6 +390,14 @@ def _difference(first: DejaVu, other: DejaVu) -> str:
         return (
             "different drives have refined them; expected maps that no drive refined, or that share a stage"
         )
+    if first.map.area is not None and other.map.area is not None:
+        mine, yours = first.map.area, other.map.area
+        if mine[5:7] != yours[5:7]:
+            seen = f"{mine.unit} ({mine.frame}) and {yours.unit} ({yours.frame})"
+            return f"their coordinates are in {seen}; expected the same"
+        norths = mine.north, yours.north
+        if abs((norths[0] - norths[1] + 180) % 360 - 180) > NORTH:
+            return f"north is {norths[0]:g} and {norths[1]:g} degrees from up; expected the same"
     shapes = first.frame_shape, other.frame_shape
     if None not in shapes and not _compatible(first, *shapes):  # type: ignore[arg-type]
         sizes = " and ".join(" x ".join(map(str, shape or ())) for shape in shapes)
@@ -394,6 +410,43 @@ def joined_names(parts: list[list[str]], frames: list[int]) -> list[str]:
     if not any(parts):
         return []
     return [name for part, count in zip(parts, frames, strict=True) for name in part or [""] * count]
+
+
+def continued(area: Area | None, other: Area | None, name: str) -> Area | None:
+    """The area of a map and more windows of the same ground, where their coordinates put them; None of a
+    route.
+
+    Args:
+        other: of a traverse. name: of it, for messages.
+
+    Raises:
+        InputError: a route and an area, other distances between windows, windows of both at one place, or
+            areas far apart.
+    """
+    if area is None or other is None:
+        seen = f"{name} is {_kind(other)}, the map is of {_kind(area)}"
+        expect(area is other, "two of a kind", seen)
+        return None
+    steps, theirs = (torch.tensor([one.down, one.right]).double() for one in (area, other))
+    seen = f"windows of {name} are {math.hypot(*other.right):g} {other.unit} apart"
+    seen += f", those of the map {math.hypot(*area.right):g} {area.unit}"
+    alike = area.unit == other.unit and torch.allclose(steps, theirs, rtol=1e-4)
+    expect(alike, "the same scale and stride, or a map of its own to merge", seen)
+    own = area.rectangles[0]
+    away = torch.tensor(other.first).double() - torch.tensor(own.first).double()
+    row, column = (torch.linalg.solve(steps.T, away).round().long() + torch.tensor(own.corner)).tolist()
+    for (top, left), rows, columns in ((part.corner, part.rows, part.columns) for part in area.rectangles):
+        tall = min(row + other.rows, top + rows) - max(row, top)
+        wide = min(column + other.columns, left + columns) - max(column, left)
+        expect(min(tall, wide) <= 0, "other ground", f"{tall} x {wide} windows of {name} are in the map")
+    joined = Area.of([*area.rectangles, other._replace(corner=(row, column))])
+    seen = f"{name} and the map lie in {joined.rows} x {joined.columns} windows, of which they have few"
+    expect(joined.rows * joined.columns <= SPARSE * joined.places, "areas nearby, or maps to merge", seen)
+    return joined
+
+
+def _kind(area: Area | None) -> str:
+    return "a route" if area is None else "an area"
 
 
 def _check_count(places: int, resampled: bool) -> None:

@@ -650,9 +650,7 @@ def _state_of(model: DejaVu, place_map: PlaceMap, traverse: Traverse | None) -> 
 
 
 def require_map(model: DejaVu, purpose: str = "") -> None:
-    """Refuse a model without a map; `purpose` is for the message, such as " to append to", for which a map
-    of an area is refused too."""
-    expect(not purpose or model.map.area is None, "that of a route", f"this is the map of an area{purpose}")
+    """Refuse a model without a map; `purpose` is for the message, such as " to append to"."""
     if not model.map.places:
         expect(model.trained is not None, "learn(...) or load(...) first", f"there is no map yet{purpose}")
         seen = f"this is a descriptor without a map{purpose}"

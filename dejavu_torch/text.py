@@ -23,6 +23,12 @@ def printable(text: object) -> str:
     return "".join(c if c.isprintable() or category(c) == "Zs" else ascii(c)[1:-1] for c in str(text))
 
 
+def plain_number(number: object) -> int | float:
+    """A number as in JSON, whole if it is."""
+    value = float(number)  # type: ignore[arg-type]
+    return int(value) if value.is_integer() else value
+
+
 def one_line(text: object) -> str:
     """The text without line breaks; every run of blanks becomes one space."""
     return " ".join(str(text).split())

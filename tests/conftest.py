@@ -166,7 +166,4 @@ def largest_tensor():
 @pytest.fixture
 def small_tiles(monkeypatch):
     """Areas have tiles of about six windows to a side."""
-    areas._cached_tiles.cache_clear()
     monkeypatch.setattr(areas, "SIDE", 6)
-    yield
-    areas._cached_tiles.cache_clear()

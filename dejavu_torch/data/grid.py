@@ -60,7 +60,7 @@ class Grid(Traverse):
         x, y = ground.at(middle).tolist()
         steps = ground.scaled(stride, stride)
         down, across = ((side - window) // stride + 1 for side in (height, width))
-        self.area = Area(down, across, (x, y), steps.right, steps.down, ground.unit)
+        self.area = Area(down, across, (x, y), steps.right, steps.down, ground.unit, ground.frame)
         every = self.area.coordinates(torch.arange(self.area.places))
         self.coordinates = Coordinates(every, frame=ground.frame)
 

@@ -299,6 +299,9 @@ def _prepared(
         check_apart(loops, len(reference))
     if has_map:
         check_places(model, len(reference), reference.name)
+        areas = [area and area._replace(frame="") for area in (model.map.area, reference.area)]
+        expected = "that of the map alone; a csv of localize is scored by `dejavu evaluate --map`"
+        expect(areas[0] == areas[1], expected, f"{reference.name} is not the area of the map")
         check_queries(model, reference.frame_shape, features, reference.name)
     return reference, query, [even(other, step=step) for other in off]
 

@@ -13,6 +13,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from dejavu_torch.area import Area
+from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.coordinates import Near
 from dejavu_torch.data.ground_truth import (
     GroundTruth,
@@ -37,8 +39,8 @@ from dejavu_torch.evaluation.report import Report
 from dejavu_torch.evaluation.score_plots import draw_curves
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.model_file import read_place_map
-from dejavu_torch.text import printable
-from dejavu_torch.types import Facts, InputError, Match, Traverse, expect
+from dejavu_torch.text import plain_number, printable
+from dejavu_torch.types import Coordinates, Facts, InputError, Match, Traverse, expect
 from dejavu_torch.version import __version__
 
 RANKS = (5, 10)  # the N of recall@N
@@ -97,16 +99,19 @@ def evaluate_file(
         check_ground_truth(truth, interpolate)
     place_map = None if map is None else read_place_map(map)
     area = reference.area if reference is not None else None if place_map is None else place_map.area
+    parsed = None if area is None or truth is None else check_ground_truth(truth, interpolate)
+    near = parsed if isinstance(parsed, Near) else None
     if area is not None and tolerance:  # numbers of places tell no distance there
-        by_distance = truth is not None and isinstance(check_ground_truth(truth, interpolate), Near)
         expected = "--tolerance 0, or the distance in the truth, such as --truth pixels:10"
-        expect(by_distance, expected, f"the places are those of an area, the tolerance is {tolerance} places")
+        expect(near, expected, f"the places are those of an area, the tolerance is {tolerance} places")
         tolerance = 0
     if isinstance(place_map, SpectralMap) and place_map.routes:
         if route is None:
             names = ", ".join(part.name for part in place_map.routes)
             raise InputError(f"{map} has the routes {names}; expected --route with the one of the truth")
         place_map = place_map.part(route)
+    if reference is None and place_map is not None and place_map.area is not None:
+        reference = _windows(place_map.area, str(map))
     positions = torch.zeros(0, dtype=torch.float32) if place_map is None else place_map.positions
     resampled = len(positions) > 0
     frames = places = None if reference is None else len(reference)
@@ -136,6 +141,9 @@ def evaluate_file(
     match = replace(match, index=candidates[:, 0])
     described = describe_ground_truth(truth, interpolate, carried)
     facts = evaluation_facts(match, candidates, known, tolerance, positions, described) | alone
+    if near is not None:
+        unit = "pixels" if near.kind == "pixels" else "metres"
+        facts |= {"tolerance": plain_number(near.radius), "unit": unit}
     accepted = facts["accepted"]
     facts["accepted_precision"] = facts["accepted_right"] / accepted if accepted else None
     facts |= {"matches": str(matches), "places": places}
@@ -148,10 +156,17 @@ def evaluate_file(
         log.warning("right answers have higher scores than wrong ones; for similarities: --higher_is_better")
     seen = places or 1 + max(int(table.max()) for table in (here.index, known.positives))
     borders = torch.tensor([seen]) if place_map is None else place_map.table.borders
-    pictures = draw_curves({"map": ours}, f"{tolerance} {facts['unit']}")
+    pictures = draw_curves({"map": ours}, f"{facts['tolerance']} {facts['unit']}")
     pictures |= draw_coverage(here, known, tolerance, borders, queries, facts["unit"])
     pictures |= draw_reliability(match, known, tolerance)
     return Evaluation(Report(ours, {}, facts), queries, match, known, pictures)
+
+
+def _windows(area: Area, name: str) -> Traverse:
+    """The places of a map as a traverse with their coordinates."""
+    windows = ArrayTraverse(torch.zeros(area.places, 1), name)
+    windows.coordinates = Coordinates(area.coordinates(torch.arange(area.places)), frame=area.frame)
+    return windows
 
 
 def _look_similar(match: Match, truth: GroundTruth, tolerance: int) -> bool:

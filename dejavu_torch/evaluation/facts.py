@@ -22,6 +22,7 @@ from dejavu_torch.motion.resampling import ResampledTraverse, source_of
 from dejavu_torch.periods.spectrogram import BACKEND
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.sequence import SequenceMatcher
+from dejavu_torch.text import plain_number
 from dejavu_torch.types import Facts, Match
 
 QUANTILES = 0.5, 0.9, 0.99  # of errors in metres
@@ -178,9 +179,3 @@ def count_standing(descriptors: Tensor) -> int:
     far = float((some - some.flip(0)).square().sum(1).median())
     steps = descriptors.float().diff(dim=0).square().sum(1)
     return int((steps < STANDING * far).sum())
-
-
-def plain_number(period: object) -> int | float:
-    """An exact period as a JSON number."""
-    value = float(period)  # type: ignore[arg-type]
-    return int(value) if value.is_integer() else value

@@ -16,7 +16,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.area import Area, area_of
+from dejavu_torch.area import Area, apart, area_of, stored_area
 from dejavu_torch.maps.codec import Stream, decode
 from dejavu_torch.maps.frame_table import Link, Route
 from dejavu_torch.maps.place_map import PlaceMap, ScoreBlocks, one_of, require
@@ -349,6 +349,12 @@ class SpectralMap(PlaceMap):
         place_map = parts[0]._without_places(torch.cat([part.means for part in parts]))
         sizes = ((part.places, part.table.frames) for part in parts)
         place_map.routes = tuple(Route(name, *size) for name, size in zip(names, sizes, strict=True))
+        areas = [part.area for part in parts if part.area is not None]
+        if areas:
+            place_map.area = apart(areas)
+            known = [part.turned for part in parts if len(part.turned)]
+            if known:
+                place_map.turned = torch.stack(known).float().mean(0).round().to(torch.int8)
         place_map.extend(chunk for part in parts for chunk in part.coded())
         place_map.positions = torch.cat([part.positions for part in parts])
         place_map.count_visits(torch.cat([part.visit_counts for part in parts]))
@@ -365,6 +371,7 @@ class SpectralMap(PlaceMap):
         starts = [first for first, _ in self.chunks]
         part = self.between(bisect.bisect_left(starts, start), bisect.bisect_left(starts, start + places))
         part.routes = ()
+        part.area = None if self.area is None else self.area.between(start, start + places)
         part.positions = self.positions[frame : frame + frames]
         part.count_visits(self.visit_counts[start : start + places])
         return part
@@ -470,10 +477,13 @@ class SpectralMap(PlaceMap):
         first, last = self.chunks[chunks.start][0], self.chunks[chunks.stop - 1][1]
         count, length = len(chunks), (last - first) // len(chunks)
         some = slice(self._bounds[chunks.start], self._bounds[chunks.stop])
+        means = queries @ self.means.to(queries).T  # (Q,R)
+        if self.routes:
+            means = means[:, self._routes_of(chunks)]
         if (columns := self.width_of(chunks.start)) > 1:
             lines = sparse_products(queries, self.counts[first:last], self.feature[some], self.level[some])
             lines = lines.unflatten(1, (count, length)) * self.steps[chunks.start : chunks.stop, None]
-            lines[..., 0] += (queries @ self.means.to(queries).T) * math.sqrt(length)
+            lines[..., 0] += means * math.sqrt(length)
             return from_lines(lines, columns, self.transform).flatten(1)
         slot, factor = slots(length, self.transform, queries.dtype, queries.device)
         counts = self.counts[first:last].view(count, length)
@@ -481,9 +491,6 @@ class SpectralMap(PlaceMap):
         lines = sparse_products(queries, rows, self.feature[some], self.level[some])
         lines = lines.unflatten(1, (count, len(factor)))
         lines = lines * (self.steps[chunks.start : chunks.stop, None].to(factor) * factor)
-        means = queries @ self.means.to(queries).T  # (Q,R)
-        if self.routes:
-            means = means[:, self._routes_of(chunks)]
         lines[..., 0] += means * (math.sqrt(length) * factor[0])
         return from_slots(lines, length, self.transform).flatten(1)
 
@@ -532,7 +539,7 @@ class SpectralMap(PlaceMap):
 
     def get_extra_state(self) -> Facts:
         state = {**super().get_extra_state(), "routes": [route._asdict() for route in self.routes]}
-        return state if self.area is None else state | {"area": self.area._asdict()}
+        return state if self.area is None else state | {"area": stored_area(self.area)}
 
     def set_extra_state(self, state: Facts) -> None:
         super().set_extra_state(state)
@@ -556,7 +563,7 @@ class SpectralMap(PlaceMap):
         require(fits, f"tiles of {columns!s:.100} columns; expected divisors of {lengths!s:.100}")
         if self.area is not None:
             tiles = [(places // width, width) for places, width in zip(lengths, columns, strict=True)]
-            wanted = f"those of {self.area.rows} x {self.area.columns}"
+            wanted = f"those of {' and '.join(f'{one.rows} x {one.columns}' for one in self.area.rectangles)}"
             require(tiles == self.area.tiles[: len(tiles)], f"tiles {tiles!s:.100}; expected {wanted}")
         require(bool(self.stage_scale.isfinite().all()), "a stage that is not finite")
         turned, square = tuple(self.turned.shape), 2 * (self.dimension,)
@@ -598,8 +605,9 @@ class SpectralMap(PlaceMap):
         route["chunks"] = sum(tensor.nbytes for name, tensor in packed.items() if name not in names)
         covered = int(((self.norms > 0) & self.norms.isfinite()).sum())
         fixed = {part: size for part, size in (("stage", stage), ("turned", turned)) if size}
-        lines, area = len(self.level), None if self.area is None else self.area[:2]
-        return MapSummary(self.kind, self.places, covered, 0, 0, tuple(chunks), route, fixed, lines, area)
+        parts = () if self.area is None else self.area.rectangles
+        sizes = len(self.level), tuple((part.rows, part.columns) for part in parts)
+        return MapSummary(self.kind, self.places, covered, 0, 0, tuple(chunks), route, fixed, *sizes)
 
     def _periods(self, chunk: int) -> tuple[Fraction, ...]:
         """The periods of the strongest lines, sorted, with the cosine and sine of each frequency together; in

@@ -53,7 +53,7 @@ class MapSummary:
     Attributes:
         covered: places that at least one layer covers, or with a descriptor. templates: sum of phases.
         template_numbers: sum of phases x features. lines: of a spectral map.
-        area: rows and columns of an area, else None.
+        areas: rows and columns of each part of an area.
         route: bytes by part that grow with the route, such as the templates.
         fixed: other bytes by part, such as the backbone; only the names among them grow with the route.
     """
@@ -67,7 +67,7 @@ class MapSummary:
     route: Mapping[str, int]
     fixed: Mapping[str, int]
     lines: int = 0
-    area: tuple[int, int] | None = None
+    areas: tuple[tuple[int, int], ...] = ()
 
     @property
     def fixed_bytes(self) -> int:
@@ -107,8 +107,10 @@ class MapSummary:
         if self.fixed:
             names = ", with the names of its frames" * ("names" in self.fixed)
             size += f", and {self.fixed_bytes} fixed{names} ({_parts(self.fixed)})"
-        if self.area:
-            lines.insert(0, f"an area of {self.area[0]} x {self.area[1]} windows")
+        if self.areas:
+            sizes = [f"{rows} x {columns}" for rows, columns in self.areas[:CHUNKS_SHOWN]]
+            more = [f"{len(self.areas) - CHUNKS_SHOWN} more parts"] * (len(self.areas) > CHUNKS_SHOWN)
+            lines.insert(0, f"an area of {' and '.join(sizes + more)} windows")
         return "\n".join([*lines, f"{self.covered} of {self.places} places covered; {content}", size])
 
 

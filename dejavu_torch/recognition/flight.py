@@ -102,8 +102,10 @@ def _sweep(
     log = log_likelihood(values, std, weight, separation, smoother.tempering)
     seen = as_plane(log.exp(), area)
     _, jump, leave = smoother.rate_logits.softmax(0)
-    steps = Steps((1 - jump - leave) * kernel, jump, leave, smoother.enter_logit.sigmoid())
-    belief, off, total = seen.new_full(seen.shape[1:], 0.5 / area.places), seen.new_tensor(0.5), 0.0
+    inside = None if area.inside is None else area.inside.to(seen)
+    steps = Steps((1 - jump - leave) * kernel, jump, leave, smoother.enter_logit.sigmoid(), inside)
+    off, total = seen.new_tensor(0.5), 0.0
+    belief = 0.5 * steps.even(seen[0]).expand(seen.shape[1:])
     before, after = torch.empty_like(seen), torch.empty_like(seen)  # beliefs without and with each query
     outside = seen.new_zeros(len(seen), 2)
     for t, likely in enumerate(seen):

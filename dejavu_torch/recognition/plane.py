@@ -21,26 +21,28 @@ class Steps(NamedTuple):
     """A step over an area, and its transpose, of the mass of windows (R,C) and that of being off it ().
 
     kernel: (2 V + 1, 2 V + 1), probabilities of a move by rows and columns, `jump` and `leave` taken off.
-    jump, leave, enter: see `Motion`; a move over the border leaves the area.
+    jump, leave, enter: see `Motion`; a move over the border leaves the area. inside: (R,C), see `Area`.
     """
 
     kernel: Tensor
     jump: Tensor
     leave: Tensor
     enter: Tensor
+    inside: Tensor | None = None
 
     def moved(self, on: Tensor, off: Tensor) -> tuple[Tensor, Tensor]:
         """The belief before the next query."""
         total = on.sum()
         goes = F.conv2d(on[None, None], self.kernel.flip(0, 1)[None, None], padding=self.reach)[0, 0]
+        goes = goes if self.inside is None else goes * self.inside
         lost = self.kernel.sum() * total - goes.sum()
-        anywhere = (self.jump * total + self.enter * off) / on.numel()
+        anywhere = (self.jump * total + self.enter * off) * self.even(on)
         return goes + anywhere, (1 - self.enter) * off + self.leave * total + lost
 
     def expected(self, on: Tensor, off: Tensor) -> tuple[Tensor, Tensor]:
         """What a message of the next query says of the state before."""
         goes = F.conv2d(self._bordered(on, off), self.kernel[None, None])[0, 0]
-        anywhere = on.mean()
+        anywhere = (on * self.even(on)).sum()
         back = goes + self.jump * anywhere + self.leave * off
         return back, self.enter * anywhere + (1 - self.enter) * off
 
@@ -54,8 +56,13 @@ class Steps(NamedTuple):
         """V."""
         return len(self.kernel) // 2
 
+    def even(self, on: Tensor) -> Tensor:
+        """The mass of each window if all have the same, (R,C), or () if all rows and columns are windows."""
+        return on.new_tensor(1 / on.numel()) if self.inside is None else self.inside / self.inside.sum()
+
     def _bordered(self, on: Tensor, off: Tensor) -> Tensor:
         """A message, with that of being off the area around it, (1, 1, R + 2 V, C + 2 V)."""
+        on = on if self.inside is None else torch.where(self.inside > 0, on, off)
         around = off.expand(tuple(side + 2 * self.reach for side in on.shape)).clone()
         around[self.reach : self.reach + len(on), self.reach : self.reach + on.shape[1]] = on
         return around[None, None]
@@ -103,7 +110,8 @@ class PlaneMotion:
         self.area, self.rates = area, rates
         side = math.isqrt(len(rates.moves))
         kernel = (1 - rates.jump - rates.leave) * rates.moves.view(side, side)
-        self.steps = Steps(kernel, rates.jump, rates.leave, rates.enter)
+        inside = None if area.inside is None else area.inside.to(kernel)
+        self.steps = Steps(kernel, rates.jump, rates.leave, rates.enter, inside)
 
     def moved(self, belief: Tensor) -> Tensor:
         """The belief before the next query."""
@@ -123,7 +131,7 @@ class PlaneMotion:
         """Expected numbers of steps, see `Motion.counts`, of one step: (1,N+1)."""
         (on, off), (later, absent) = self._split(before[0]), self._split(after[0])
         _, jump, leave, enter = self.rates
-        total, mean = on.sum(), later.mean()
+        total, mean = on.sum(), (later * self.steps.even(later)).sum()
         rest = [jump * total * mean, leave * total * absent, enter * off * mean, (1 - enter) * off * absent]
         each = torch.cat([self.steps.pairs(on, later, absent).flatten(), torch.stack(rest)])
         each = each / each.sum().clamp(min=MIN_PROBABILITY)
@@ -142,8 +150,9 @@ def near_in_plane(mass: Tensor, radius: int, area: Area, weighted: bool = False)
     plane = as_plane(mass, area)
     if not weighted:
         return by_place(boxes(plane, radius), area).clamp(0, 1)
-    half = max(1, radius // 2)  # two boxes make a pyramid
-    return by_place(boxes(boxes(plane, half), half) / (2 * half + 1) ** 2, area).clamp(0, 1)
+    half = max(1, radius // 2)  # two boxes make a pyramid, whole also at a border
+    pyramid = boxes(boxes(F.pad(plane, 4 * (half,)), half), half)[:, half:-half, half:-half]
+    return by_place(pyramid / (2 * half + 1) ** 2, area).clamp(0, 1)
 
 
 def boxes(mass: Tensor, radius: int) -> Tensor:
@@ -160,8 +169,9 @@ def rings(reach: int) -> Tensor:
 
 
 def as_plane(values: Tensor, area: Area) -> Tensor:
-    """Values by place, (T,N) -> (T,R,C)."""
+    """Values by place, (T,N) -> (T,R,C), 0 where there is none."""
     order = area.orders()[0].to(values.device)
+    values = F.pad(values, (0, 1)) if area.parts else values
     return values.index_select(1, order).view(len(values), area.rows, area.columns)
 
 

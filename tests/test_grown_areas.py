@@ -1,0 +1,205 @@
+"""Maps of areas that grow: more windows of the same ground, further visits, and several areas in one map."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+from command_line import fails, run
+from helpers import refused
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+from test_area import ground
+
+import dejavu_torch.area as areas
+from dejavu_torch import DejaVu, PlaceFilter, PlaceSmoother, SpectralMapper, open_source
+from dejavu_torch.area import Area, apart, area_of, around, distance, stored_area
+from dejavu_torch.growth import append, associate, average, merge
+from dejavu_torch.maps.spectral_map import SpectralMap
+from dejavu_torch.recognition.plane import as_plane, by_place
+
+WINDOWS = "window=48&stride=16"
+
+
+@pytest.fixture
+def picture(tmp_path):
+    """A picture of the ground, and a part of it as a source."""
+    Image.fromarray(ground(240)).save(tmp_path / "ground.png")
+
+    def source(rows="", columns="", name="ground.png", options=WINDOWS):
+        return f"grid:{tmp_path / name}?{options}" + "".join(
+            f"&{key}={part}" for key, part in (("rows", rows), ("columns", columns)) if part
+        )
+
+    return source
+
+
+def learn(source, whitening=None):
+    """A map with fine steps; a given whitening makes the same descriptors."""
+    model = DejaVu(mapper=SpectralMapper(step=0.02), whitening=whitening or "none")
+    return model.learn(source)
+
+
+@st.composite
+def several(draw):
+    """An area of several rectangles of one ground that do not overlap."""
+    found, row = [], 0
+    for _ in range(draw(st.integers(1, 4))):
+        part = Area(draw(st.integers(1, 9)), draw(st.integers(1, 9)), first=(float(row), 3.0))
+        found.append(part._replace(corner=(row, draw(st.integers(-5, 5)))))
+        row += part.rows + draw(st.integers(0, 3))
+    return Area.of(found[::-1])
+
+
+@given(area=several())
+def test_every_window_has_one_place(area):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(areas, "SIDE", 3)
+        places = torch.arange(area.places)
+        cells = area.cells(places)
+        assert torch.equal(area.place_at(cells), places)
+        assert len({*map(tuple, cells.tolist())}) == area.places
+        assert cells.amin(0).tolist() == [0, 0]
+        assert cells.amax(0).tolist() == [area.rows - 1, area.columns - 1]
+        lattice = torch.cartesian_prod(torch.arange(-1, area.rows + 1), torch.arange(-1, area.columns + 1))
+        known = area.place_at(lattice) >= 0
+        assert int(known.sum()) == area.places
+        values = torch.randn(2, area.places)
+        assert torch.equal(by_place(as_plane(values, area), area), values)
+        for one, near in zip(places, around(places, 2, area.places, area), strict=True):
+            assert {*near.tolist()} == {*places[distance(places, one, area) <= 2].tolist()}
+        sizes = [part.places for part in area.rectangles]
+        for part, own in zip(area.rectangles, places.split(sizes), strict=True):
+            alone = part._replace(corner=(0, 0))
+            assert torch.equal(area.coordinates(own), alone.coordinates(torch.arange(len(own))))
+            assert area.between(int(own[0]), int(own[-1]) + 1) == alone
+        assert area_of(json.loads(json.dumps(stored_area(area)))) == area
+
+
+def test_areas_that_are_apart_are_not_near():
+    one, two = Area(4, 5, first=(7.0, 8.0)), Area.of([Area(2, 3), Area(2, 2, corner=(2, 0))])
+    both = apart([one, two, one])
+    assert both.places == 2 * one.places + two.places
+    assert int(both.distance(torch.tensor(19), torch.tensor(20))) > areas.GAP
+    assert both.between(20, 30) == two
+    assert both.between(30, 50) == one
+    assert torch.equal(both.coordinates(torch.arange(30, 50)), one.coordinates(torch.arange(20)))
+
+
+def test_an_area_grows_by_windows_of_the_same_ground(picture, small_tiles, tmp_path):
+    whole, left = open_source(picture()), learn(picture(columns="0:128"))
+    separate = learn(picture(columns="96:240"))
+    grown = append(learn(picture(columns="0:128")), open_source(picture(columns="96:240")))
+    area = grown.map.area
+    assert area is not None
+    assert (area.rows, area.columns, area.places) == (*whole.area[:2], whole.area.places)
+    cells = area.cells(torch.arange(area.places))
+    at = whole.area.place_at(cells)
+    assert torch.equal(area.coordinates(torch.arange(area.places)), whole.coordinates.values[at])
+    queries = grown.descriptor.all_of(whole)[at]
+    scores = grown.map.scores(queries)
+    torch.testing.assert_close(scores[:, : left.map.places], left.map.scores(queries))
+    found = grown.localize_descriptors(queries)
+    assert float((found.index == torch.arange(area.places)).double().mean()) > 0.95
+    grown.save(tmp_path / "grown.safetensors")
+    again = DejaVu.load(tmp_path / "grown.safetensors")
+    assert again.map.area == area
+    assert torch.equal(again.map.scores(queries), scores)
+    assert "and 13 x" in repr(again.summary())
+    # a flight crosses the seam
+    course = area.place_at(torch.stack([torch.arange(30) % 3 + 4, torch.arange(30) * 12 // 29], 1))
+    for sequence in (PlaceSmoother(), PlaceFilter()):
+        match = grown.localize_descriptors(queries[course], sequence)
+        off = distance(match.index.clamp(min=0), course, area)
+        assert float((off <= 1).double().mean()) > 0.9
+    assert separate.map.places + left.map.places == area.places
+
+
+def test_areas_are_merged_like_routes(picture, small_tiles, tmp_path):
+    left, right = learn(picture(columns="0:128")), learn(picture(columns="128:240"))
+    merged = merge([left, right, left], ["left", "right", "left"])
+    assert isinstance(merged.map, SpectralMap)
+    assert [route.name for route in merged.map.routes] == ["left", "right", "left-2"]
+    queries = torch.cat([model.descriptor.all_of(open_source(picture())) for model in (left,)])
+    scores = torch.cat([model.map.scores(queries) for model in (left, right, left)], 1)
+    torch.testing.assert_close(merged.map.scores(queries), scores, rtol=1e-4, atol=1e-5)
+    merged.save(tmp_path / "merged.safetensors")
+    part = DejaVu.load(tmp_path / "merged.safetensors").map.part("right")
+    assert part.area == right.map.area
+    torch.testing.assert_close(part.scores(queries), right.map.scores(queries))
+    turned = torch.stack([model.map.turned.double() for model in (left, right, left)]).mean(0)
+    torch.testing.assert_close(merged.map.turned.double(), turned, atol=0.5, rtol=0)
+    grown = append(learn(picture(columns="0:128")), open_source(picture(columns="128:240")))
+    assert merge([grown, right], ["grown", "right"]).map.part("grown").area == grown.map.area
+
+
+def test_a_further_visit_is_averaged_into_an_area(picture, small_tiles, tmp_path):
+    noise = torch.randint(-60, 60, (240, 240, 3), generator=torch.Generator().manual_seed(0)).numpy()
+    changed = (ground(240).astype(int) + noise).clip(0, 255).astype("uint8")
+    Image.fromarray(changed).save(tmp_path / "later.png")
+    later, model = open_source(picture(name="later.png")), learn(picture())
+    assert average(model, associate(model, None, later)) == model.map.places
+    rows = (model.descriptor.all_of(one) for one in (open_source(picture()), later))
+    mean = torch.nn.functional.normalize(sum(rows) / 2, dim=1)
+    own = torch.nn.functional.normalize(torch.cat([*map(model.map.decode, range(len(model.map.chunks)))]))
+    assert float((mean * own).sum(1).mean()) > 0.99
+    assert model.map.visit_counts.tolist() == [2] * model.map.places
+    assert model.map.area == open_source(picture()).area
+
+
+def test_csv_of_a_grown_area_are_judged_by_its_map(picture, tmp_path, capsys):
+    (tmp_path / "track.csv").write_text(
+        "x,y\n" + "".join(f"{24 + 16 * (i % 13)},{24 + 16 * (i // 13)}\n" for i in range(40))
+    )
+    flight = f"path:{tmp_path}/ground.png?window=48&points={tmp_path}/track.csv"
+    left, both = tmp_path / "left.safetensors", tmp_path / "both.safetensors"
+    run("learn", picture(columns="0:128"), "--map", left)
+    run("learn", picture(columns="96:240"), "--append", left, "--map", both)
+    assert "an area of 13 x 6 and 13 x 7 windows" in capsys.readouterr().out
+    run("localize", both, flight, "--out", tmp_path / "m.csv")
+    judged = ("--map", both, "--query", flight, "--truth", "pixels:12", "--tolerance", "0")
+    run("evaluate", tmp_path / "m.csv", *judged, "--out", tmp_path / "scores")
+    report = json.loads((tmp_path / "scores" / "report.json").read_text())
+    assert report["recall_at_1"] > 0.95
+    assert (report["tolerance"], report["unit"]) == (12, "pixels")
+    told = fails(capsys, "compare", picture(), flight, "--map", both, "--out", tmp_path / "report")
+    assert "not the area of the map" in told
+
+
+def test_what_does_not_fit_an_area_is_refused(picture, small_tiles, tmp_path, capsys):
+    def model():
+        return learn(picture(columns="0:128"))
+
+    with refused("13 x 3 windows", "are in the map", "other ground"):
+        append(model(), open_source(picture(columns="48:160")))
+    with refused("24 px apart", "16 px", "same scale and stride"):
+        append(model(), open_source(picture(columns="128:240", options="window=48&stride=24")))
+    far = open_source(picture(columns="128:240"))
+    far.area = far.area._replace(first=(9e5, 24.0))
+    with refused("13 x 5", "areas nearby", "merge"):
+        append(model(), far)
+    frames = torch.rand(20, 3, 48, 48)
+    with refused("is a route", "of an area", "two of a kind"):
+        append(model(), frames)
+    with refused("is an area", "of a route", "two of a kind"):
+        append(learn(frames), open_source(picture()))
+    with refused("b is the map of a route", "a of an area"):
+        merge([model(), learn(frames)], ["a", "b"])
+    metres, turned = model(), model()
+    metres.map.area = metres.map.area._replace(unit="m", frame="EPSG:32632")
+    with refused("px", "m (EPSG:32632)", "expected the same"):
+        merge([model(), metres], ["a", "b"])
+    turned.map.area = turned.map.area._replace(right=(0.0, 16.0), down=(-16.0, 0.0))
+    with refused("north", "90 degrees"):
+        merge([model(), turned], ["a", "b"])
+    told = fails(
+        capsys,
+        "learn",
+        picture(columns="0:128"),
+        picture(columns="128:240"),
+        "--map",
+        tmp_path / "m.safetensors",
+    )
+    assert "--append" in told
