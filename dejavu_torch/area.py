@@ -147,18 +147,21 @@ class Area(NamedTuple):
             own = cells - cells.new_tensor(part.corner)
             most = own.new_tensor([part.rows - 1, part.columns - 1])
             within = torch.minimum(own.clamp(min=0), most)
-            found = torch.where((own == within).all(-1), before + part._numbered(within), found)
+            number = before + part._numbered(within[..., 0], within[..., 1])
+            found = torch.where((own == within).all(-1), number, found)
             before += part.places
         return found
 
-    def _numbered(self, cells: Tensor) -> Tensor:
-        """The places of rows and columns of a rectangle, from its first."""
-        down, across = (edges.to(cells.device) for edges in _cached_edges(self.rows, self.columns, SIDE))
-        row = torch.bucketize(cells[..., 0].contiguous(), down[1:-1], right=True)
-        column = torch.bucketize(cells[..., 1].contiguous(), across[1:-1], right=True)
-        tall, left, wide = down[row + 1] - down[row], across[column], across[column + 1] - across[column]
-        inside = (cells[..., 0] - down[row]) * wide + cells[..., 1] - left
-        return down[row] * self.columns + tall * left + inside
+    def _numbered(self, row: Tensor, column: Tensor) -> Tensor:
+        """The places of rows and columns inside a rectangle, which may be broadcast, from its first."""
+        down, across = (edges.to(row.device) for edges in _cached_edges(self.rows, self.columns, SIDE))
+        at, beside = (
+            torch.bucketize(cells.contiguous(), edges[1:-1], right=True)
+            for cells, edges in ((row, down), (column, across))
+        )
+        top, left = down[at], across[beside]
+        before = top * self.columns + (down[at + 1] - top) * left
+        return before + (row - top) * (across[beside + 1] - left) + (column - left)
 
     def coordinates(self, places: Tensor) -> Tensor:
         """(x, y) of the middle of windows, int64 (...) -> (..., 2) float64."""
@@ -181,10 +184,12 @@ class Area(NamedTuple):
         """The windows up to a radius in rows and columns, (n,) -> (n, (2 radius + 1)^2); those beyond a
         border are others of them."""
         offset = torch.arange(-radius, radius + 1, device=places.device)
-        cells = self.cells(places)[:, None] + torch.cartesian_prod(offset, offset)
-        most = torch.tensor([self.rows - 1, self.columns - 1], device=places.device)
-        near = self.place_at(torch.minimum(cells.clamp(min=0), most))
-        return torch.where(near < 0, places[:, None], near) if self.parts else near
+        row, column = (self.cells(places)[:, None] + offset[:, None]).unbind(-1)
+        row, column = row.clamp(0, self.rows - 1), column.clamp(0, self.columns - 1)
+        if not self.parts:
+            return self._numbered(row[:, :, None], column[:, None]).flatten(1)
+        near = self.place_at(torch.stack(torch.broadcast_tensors(row[:, :, None], column[:, None]), -1))
+        return torch.where(near < 0, places[:, None, None], near).flatten(1)
 
     def between(self, start: int, stop: int) -> Area:
         """The area of some of the parts: those of the places [start, stop)."""

@@ -202,7 +202,7 @@ class CoarseSearch(Scan):
             best, order = best.sort(1, descending=True)
             middle = self.coarse.place[GROUP * group.gather(1, order) + best % GROUP]
             # further candidates lie around the highest peaks
-            peaks, reach = PEAKS + count, plan.coarse // 2 + 1
+            peaks, reach = PEAKS + count, plan.coarse // 2
             wide = reach + max((k > 1) * radius for k, radius in wanted)
             parts = (middle[:, :peaks], wide), (middle[:, peaks:], reach)
             near = [area.around(some.flatten(), far).view(*some.shape, -1).flatten(1) for some, far in parts]
