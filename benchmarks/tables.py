@@ -24,6 +24,7 @@ from benchmarks.results import FOOTAGE, rounded
 from benchmarks.storage import SHOWN, best, by, families, missed
 from benchmarks.storage_drives import drive_table
 from benchmarks.teaching import COPIES, PLACED, REFINED, TOLD
+from benchmarks.terrain import NAMES as TERRAIN_WAYS
 from dejavu_torch.evaluation.contenders import LENGTHS
 
 FOLDER, DOCS = Path(__file__).parent / "results", Path(__file__).parents[1] / "docs"
@@ -352,14 +353,26 @@ def headings() -> str:
 
 def terrain() -> str:
     """Time, bytes and what is found on a large area, by bytes per place."""
-    rows = read("terrain")["rows"]
-    table = [["bytes per window", *(f"{row['bytes_per_place']:.2f}" for row in rows)]]
-    table += [["learned in", *(f"{row['learn_seconds']:.0f} s" for row in rows)]]
-    table += [["map file", *(f"{row['bytes'] / 1e6:.2f} MB" for row in rows)]]
-    table += [["one query", *(f"{row['ms']:.1f} ms" for row in rows)]]
-    for name, key in (("one image", ""), ("a flight of 60 images", "flight_")):
-        found = ("/".join(f"{row[f'{key}recall_{metres}m']:.3f}" for metres in (1, 2, 5)) for row in rows)
-        table.append([f"{name}, within 1/2/5 m", *found])
+    found: dict[str, dict[float, Row]] = {}
+    for row in read("terrain")["rows"]:
+        found.setdefault(row["contender"], {})[row["bytes_per_place"]] = row
+    sizes = sorted({each for own in found.values() for each in own})
+    table = [["found within 1/2/5 m, by bytes per window", *(f"{each:g}" for each in sizes)]]
+    for contender, name in TERRAIN_WAYS.items():
+        for way, kind in (("one image", ""), ("a flight of 60 images", "flight_")):
+            cells = []
+            for each in sizes:
+                row = found[contender].get(each, {})
+                shares = [f"{row[f'{kind}recall_{metres}m']:.3f}" for metres in (1, 2, 5) if row]
+                cells.append("/".join(shares))
+            table.append([f"{name}: {way}", *cells])
+    own = [found["map"].get(each, {}) for each in sizes]
+    for name, key, scale in (
+        ("learned in, s", "learn_seconds", 1),
+        ("map file, MB", "bytes", 1e6),
+        ("one query, ms", "ms", 1),
+    ):
+        table.append([name, *(rounded(row[key] / scale) if key in row else "" for row in own)])
     return markdown(table)
 
 
