@@ -372,7 +372,7 @@ def terrain() -> str:
         ("map file, MB", "bytes", 1e6),
         ("one query, ms", "ms", 1),
     ):
-        table.append([name, *(rounded(row[key] / scale) if key in row else "" for row in own)])
+        table.append([name, *(f"{row[key] / scale:.3g}" if key in row else "" for row in own)])
     return markdown(table)
 
 

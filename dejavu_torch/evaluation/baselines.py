@@ -169,7 +169,7 @@ def baselines_of(
         match = run.match_by(
             lambda *how: nearest_frames(stored, how[0], stride, metric, progress, how[1], area)
         )
-        asked = run.drive_query(scores_of_stored(stored, stride, metric))
+        asked = run.drive_query(scores_of_stored(stored, stride, metric, area))
         return Baseline(name, match, bytes + fixed + more, k, fixed + more, asked)
 
     size, own = partial(stride_bytes, frames, dimension, area=area), reference.element_size()
@@ -244,7 +244,8 @@ def _as_given(run: Localization, code: int, seed: int, one: str, progress: bool)
         match = nearest_frames(rows, queries, 1, "cosine", progress, run.matching)
         asked = None
         if run.beside is not None:
-            asked = drive_query(queries, run.beside, scores_of_stored(rows, 1, "cosine"))
+            score = scores_of_stored(rows, 1, "cosine")
+            asked = drive_query(queries, run.beside, score, area=run.model.map.area)
         return Baseline(f"your descriptors, {name}", match, bytes + fixed, 1, fixed, asked)
 
     return {
@@ -384,7 +385,8 @@ def _described_baselines(
 
     def baseline(name: str, k: int) -> Baseline:
         match = nearest_frames(stored, queries, k, "l1", progress, matching, area)
-        asked = None if smoother is None else drive_query(queries, smoother, scores_of_stored(stored, k))
+        score = scores_of_stored(stored, k, area=area)
+        asked = None if smoother is None else drive_query(queries, smoother, score, area=area)
         return Baseline(name, match, size(k), k, asked=asked)
 
     return {key: baseline(name, k) for key, (name, k) in names.items()}

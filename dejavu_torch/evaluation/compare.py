@@ -56,7 +56,8 @@ log = logging.getLogger("dejavu_torch")
 
 SAMPLED = 256  # reference frames that a given map is checked with
 NEAR = 10  # places within which the map should find them, at least
-MAX_FILTERED = 2**25  # scores up to which ordered queries are also filtered by default
+# scores up to which ordered queries are also filtered and smoothed by default, on a route and over an area
+MAX_FILTERED, MAX_FLOWN = 2**25, 2**23
 
 Seconds = dict[str, float]  # that each stage took
 OtherModels = Mapping[str, tuple[str, DejaVu]]  # their names and models, by their keys in report.json
@@ -179,10 +180,11 @@ def compare(
                 calibrate_if_possible(model, reference, calibration, progress=progress)
         with timed(seconds, "localize"):
             beside = in_order and known is not None and not itself  # without truth they have no scores
-            beside = beside and area is None  # where they would take minutes
-            beside = beside and (ordered is not None or len(query) * model.map.places <= MAX_FILTERED)
-            also = models_beside(causal, beside, len(query), model.map.places, tolerance)
-            alike = PlaceSmoother(within=tolerance) if beside and len(query) > 1 else None
+            beside = beside and headings == 1
+            most = MAX_FILTERED if area is None else MAX_FLOWN
+            beside = beside and (ordered is not None or len(query) * model.map.places <= most)
+            also = models_beside(causal, beside, len(query), model.map.places, within)
+            alike = PlaceSmoother(within=within) if beside and len(query) > 1 else None
             centring = in_order and model.centres(len(query)) if centre is None else centre
             matching = Matching(causal, also, apart=loops, copies=headings)
             run = _described(model, reference, query, places, centring, tolerance, matching, progress)

@@ -86,10 +86,14 @@ class Localizer:
     ) -> None:
         # of the places; None along a route
         self.area = area if place_map is None else place_map.area
+        in_area = {
+            T: one.over(self.area) if isinstance(one, PlaceFilter) else one
+            for T, one in matching.also.items()
+        }
         sequence = matching.sequence
         if isinstance(sequence, PlaceFilter):
             sequence = sequence.over(self.area)
-            matching = matching._replace(sequence=sequence)
+        matching = matching._replace(sequence=sequence, also=in_area)
         self.place_map, self.matching, self.track = place_map, matching, Track(self.area)
         self.searcher = Scan(place_map) if searcher is None and place_map is not None else searcher
         self.own: Together = sequence.length if isinstance(sequence, SequenceMatcher) else "filter"
