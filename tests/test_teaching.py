@@ -184,14 +184,14 @@ def test_a_report_and_the_command_tell_how_many_frames_teach(road, drive, tmp_pa
         pixels = frames.mul(255).round().byte().permute(0, 2, 3, 1).numpy()
         np.save(tmp_path / f"{name}.npy", pixels)
     pair = (tmp_path / "road.npy", tmp_path / "query.npy")
-    words = "--second", tmp_path / "drive.npy", "--calibration", "none"
+    words = "--second", tmp_path / "drive.npy", "--calibration", "none", "--whitening.views", "2"
     run("compare", *pair, *words, "--out", tmp_path / "report")
     second, out = report_of(tmp_path / "report")["second"], capsys.readouterr().out
     assert f"{second['placed']} of 120 frames of {tmp_path / 'drive.npy'} placed; " in out
     assert second["of"] == 120
     assert second["placed"] > 60
     assert second["probability"] == SURE
-    run("learn", pair[0], "--second", tmp_path / "drive.npy", "--map", tmp_path / "m.safetensors")
+    run("learn", pair[0], *words, "--map", tmp_path / "m.safetensors")
     assert "frames of" in capsys.readouterr().out
     plain = compare(road, ArrayTraverse(frames_of(2), "query"), "0", fresh(), calibration="none").report
     assert "second" not in plain.facts

@@ -16,7 +16,7 @@ from benchmarks.teaching import COPIES, PLACED, REFINED, TASKS, TOLD, Task, righ
 from benchmarks.train import Rung
 from benchmarks.trainings import Route
 from benchmarks.visits import ANEW, UPDATED, Visits, curves, run_visits
-from dejavu_torch import open_source
+from dejavu_torch import DejaVu, Whitening, open_source
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import as_ground_truth
 from dejavu_torch.evaluation.paper_tables import PUBLISHED
@@ -30,8 +30,10 @@ def rows_of(out):
 
 
 @pytest.fixture
-def films(tmp_path):
-    """A folder of two drives along a road, and of the truth of a second."""
+def films(tmp_path, monkeypatch):
+    """A folder of two drives along a road, and of the truth of a second; models learn from few copies."""
+    for bench in (alike, teaching, visits):
+        monkeypatch.setattr(bench, "DejaVu", lambda: DejaVu(whitening=Whitening(views=2)))
     for name, traverse in (("road", 0), ("drive", 1)):
         frames = torch.cat(list(open_source(f"sim:aerial?frames=120&traverse={traverse}").batches(120)))
         np.save(tmp_path / f"{name}.npy", frames[..., ::2, ::2].mul(255).byte().permute(0, 2, 3, 1).numpy())
