@@ -176,6 +176,17 @@ class Area(NamedTuple):
             found = torch.where(own, at, found)
         return found
 
+    def place_near(self, points: Tensor) -> Tensor:
+        """The places whose middles are nearest to (x, y), (n,2) -> (n,); -1 for over half a step away."""
+        found, before = torch.full((len(points),), -1), 0
+        for part in self.rectangles:
+            steps = torch.tensor([part.down, part.right], dtype=torch.float64)
+            cells = (points.double() - torch.tensor(part.first).double()) @ steps.inverse()
+            place = part._replace(corner=(0, 0)).place_at(cells.nan_to_num(-1).round().long())
+            found = torch.where(place >= 0, before + place, found)
+            before += part.places
+        return found
+
     def distance(self, one: Tensor, other: Tensor) -> Tensor:
         """The larger of the distances in rows and columns, int64."""
         return (self.cells(one) - self.cells(other)).abs().amax(-1)

@@ -184,8 +184,9 @@ def associate(
 
     Args:
         reference: the result of `DejaVu.resample`; None is the model's map, of one route.
-        truth: the reference frames of each frame, see `find_ground_truth`; None is place i for frame i of a
-            traverse of the same length. The first counts if there are several; frames without one get -1.
+        truth: the reference frames of each frame, see `find_ground_truth`; None is the nearest window in an
+            area, if the traverse has coordinates, else place i for frame i of a traverse of the same length.
+            The first counts if there are several; frames without one get -1.
 
     Raises:
         InputError: nothing says which places it shows, or it shows none.
@@ -202,19 +203,25 @@ def _known_places(
     """As `associate`: the traverse at the map's steps and its places; None where nothing says them, with what
     was seen."""
     if reference is None:
-        table, shape, step = one_route(model, "average visits into").table, model.frame_shape, model.step
-        name, source = "the map", None
+        place_map, shape, step = one_route(model, "average visits into"), model.frame_shape, model.step
+        table, area, name, source = place_map.table, place_map.area, "the map", None
     else:
         table = FrameTable(len(reference), learning.positions_of(reference))
         shape = model.at_map_size(reference, model.frame_shape if model.map.places else None).frame_shape
         step, name, source = getattr(reference, "step", None), reference.name, source_of(reference)
+        area = reference.area
     second = model.resample(second, step, shape=shape)
     frames = len(second)
     numbers = second.frame if isinstance(second, ResampledTraverse) else frames
     ground_truth = find_ground_truth(
         truth, source, source_of(second), table.frames, numbers, resampled=step is not None, aligned=True
     )
-    if ground_truth is not None:
+    shown = source_of(second).coordinates
+    if truth is None and area is not None and shown is not None and not shown.degrees:
+        seen = f"coordinates of {second.name} in {shown.frame} and of {name} in {area.frame}"
+        expect("" in (shown.frame, area.frame) or shown.frame == area.frame, "one system", seen)
+        places = area.place_near(shown.values[:, :2])
+    elif ground_truth is not None:
         places = table.place_of(ground_truth.positives[:, 0])
     elif reference is None and step is None and table.frames == frames:
         places = torch.arange(frames)

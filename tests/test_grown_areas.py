@@ -147,6 +147,22 @@ def test_a_further_visit_is_averaged_into_an_area(picture, small_tiles, tmp_path
     assert float((mean * own).sum(1).mean()) > 0.99
     assert model.map.visit_counts.tolist() == [2] * model.map.places
     assert model.map.area == open_source(picture()).area
+    # on a grown map, the places of a visit are those of its coordinates
+    grown = append(learn(picture(columns="96:240")), open_source(picture(columns="0:128")))
+    seen = associate(grown, None, open_source(picture(columns="16:160"))).places
+    assert torch.equal(
+        grown.map.area.coordinates(seen), open_source(picture(columns="16:160")).coordinates.values
+    )
+    off = associate(grown, None, open_source(picture(rows="7:240"))).places
+    area = open_source(picture()).area
+    assert area.place_near(
+        torch.tensor([[31.0, 33.0], [33.0, 33.0], [15.0, 24.0], [torch.nan, 24.0]])
+    ).tolist() == [*area.place_at(torch.tensor([[1, 0], [1, 1]])).tolist(), -1, -1]
+    assert int((off >= 0).sum()) == len(off)
+    far = open_source(picture())
+    far.coordinates = far.coordinates._replace(frame="EPSG:32632")
+    with refused("EPSG:32632", "pixels", "one system"):
+        associate(grown, None, far)
 
 
 def test_csv_of_a_grown_area_are_judged_by_its_map(picture, tmp_path, capsys):
