@@ -131,7 +131,8 @@ def run_localize(
     if counts:
         steps = next_steps(matcher is not None, chosen.given)
         say(describe_probable(counts, total) + (f"; next: {'; '.join(steps)}" if steps else ""))
-    table: tuple[str | Path, ...] = () if model.step is None else ("--map", map)
+    needed = model.step is not None or model.map.area is not None
+    table: tuple[str | Path, ...] = ("--map", map) if needed else ()
     table += ("--route", "ROUTE") if model.map.routes else ()
     print_next("evaluate", out, "--truth", "TRUTH", *table, "--out", "scores")
 

@@ -155,22 +155,17 @@ def compare(
     check_candidates(top, tolerance, len(reference))
     north = facing_north(query, reference.area, headings)  # pictures show images, not their copies
     query = north if headings == 1 else query
-    area, radius, within, near = reference.area, float(tolerance), tolerance, None
-    if area is not None:
-        truth, near = _by_distance(truth, query, area, tolerance)
-        radius = radius if near is None else near.radius
-        within = round(radius / math.hypot(*area.right))
-        tolerance = 0  # all windows within the radius are right
+    truth, near, tolerance, within, radius = _reach(truth, query, reference.area, tolerance)
     in_order = source_of(query).ordered if ordered is None else ordered
     smoother, causal = _ways(sequence, in_order and len(query) > 1, within)
-    if smoother is not None and area is not None:
+    if smoother is not None and reference.area is not None:
         smoother.within = within
     if causal is not None:
         causal.check(None, len(reference))
     # without a given truth, each place would be its own answer
     known = None if itself and truth is None else ground_truth_of(truth, reference, query, interpolate)
-    if area is not None and known is not None and near is None:
-        known = widened(known, area, within)
+    if reference.area is not None and known is not None and near is None:
+        known = widened(known, reference.area, within)
 
     rivals = () if known is None else (reference, query)  # of HOG, for its baseline
     with model.descriptor.setting_aside(*rivals):
@@ -179,10 +174,9 @@ def compare(
             if isinstance(calibration, LabelledFrames) or (calibration is None and not has_map):
                 calibrate_if_possible(model, reference, calibration, progress=progress)
         with timed(seconds, "localize"):
+            most = math.inf if ordered is not None else MAX_FILTERED if reference.area is None else MAX_FLOWN
             beside = in_order and known is not None and not itself  # without truth they have no scores
-            beside = beside and headings == 1
-            most = MAX_FILTERED if area is None else MAX_FLOWN
-            beside = beside and (ordered is not None or len(query) * model.map.places <= most)
+            beside = beside and headings == 1 and len(query) * model.map.places <= most
             also = models_beside(causal, beside, len(query), model.map.places, within)
             alike = PlaceSmoother(within=within) if beside and len(query) > 1 else None
             centring = in_order and model.centres(len(query)) if centre is None else centre
@@ -220,14 +214,19 @@ def compare(
     return Comparison(Report(ours, contenders, facts), pictures, run, candidates)
 
 
-def _by_distance(
-    truth: Truth | None, query: Traverse, area: Area, tolerance: int
-) -> tuple[Truth | None, Near | None]:
-    """The truth of queries in an area, by coordinates if none is given, and the same if it is by distance."""
+def _reach(
+    truth: Truth | None, query: Traverse, area: Area | None, tolerance: int
+) -> tuple[Truth | None, Near | None, int, int, float]:
+    """The truth, in an area by coordinates if none is given; the same if it is by distance; the tolerance of
+    places; within how many of them, and which distance, an answer is right."""
+    if area is None:
+        return truth, None, tolerance, tolerance, float(tolerance)
     if truth is None and query.coordinates is not None:
         truth = f"{'metres' if area.unit == 'm' else 'pixels'}:{tolerance}"
     parsed = None if truth is None else check_ground_truth(truth)
-    return truth, parsed if isinstance(parsed, Near) else None
+    near = parsed if isinstance(parsed, Near) else None
+    radius = float(tolerance) if near is None else near.radius
+    return truth, near, 0, round(radius / math.hypot(*area.right)), radius  # all windows within it are right
 
 
 def _check_settings(

@@ -37,6 +37,7 @@ from dejavu_torch.evaluation.plots import Pictures
 from dejavu_torch.evaluation.rejection import draw_reliability, rejection_facts
 from dejavu_torch.evaluation.report import Report
 from dejavu_torch.evaluation.score_plots import draw_curves
+from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.model_file import read_place_map
 from dejavu_torch.text import plain_number, printable
@@ -95,21 +96,14 @@ def evaluate_file(
     """
     if tolerance < 0:
         raise InputError(f"the tolerance is {tolerance}; expected at least 0")
-    if truth is not None:
-        check_ground_truth(truth, interpolate)
-    place_map = None if map is None else read_place_map(map)
+    parsed = None if truth is None else check_ground_truth(truth, interpolate)
+    place_map = None if map is None else _map_of(map, route)
     area = reference.area if reference is not None else None if place_map is None else place_map.area
-    parsed = None if area is None or truth is None else check_ground_truth(truth, interpolate)
-    near = parsed if isinstance(parsed, Near) else None
+    near = parsed if area is not None and isinstance(parsed, Near) else None
     if area is not None and tolerance:  # numbers of places tell no distance there
         expected = "--tolerance 0, or the distance in the truth, such as --truth pixels:10"
         expect(near, expected, f"the places are those of an area, the tolerance is {tolerance} places")
         tolerance = 0
-    if isinstance(place_map, SpectralMap) and place_map.routes:
-        if route is None:
-            names = ", ".join(part.name for part in place_map.routes)
-            raise InputError(f"{map} has the routes {names}; expected --route with the one of the truth")
-        place_map = place_map.part(route)
     if reference is None and place_map is not None and place_map.area is not None:
         reference = _windows(place_map.area, str(map))
     positions = torch.zeros(0, dtype=torch.float32) if place_map is None else place_map.positions
@@ -160,6 +154,16 @@ def evaluate_file(
     pictures |= draw_coverage(here, known, tolerance, borders, queries, facts["unit"])
     pictures |= draw_reliability(match, known, tolerance)
     return Evaluation(Report(ours, {}, facts), queries, match, known, pictures)
+
+
+def _map_of(map: Path, route: str | None) -> PlaceMap:
+    """The map of a file, or that of one of its routes."""
+    place_map = read_place_map(map)
+    if not isinstance(place_map, SpectralMap) or not place_map.routes:
+        return place_map
+    names = ", ".join(part.name for part in place_map.routes)
+    expect(route, "--route with the one of the truth", f"{map} has the routes {names}")
+    return place_map.part(str(route))
 
 
 def _windows(area: Area, name: str) -> Traverse:

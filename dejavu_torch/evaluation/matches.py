@@ -105,41 +105,38 @@ def write_matches(
                 match.columns.get(name, match.score) for name in ("probability", "confidence", "heading")
             )
             route = match.route if routes and match.route is not None else torch.full_like(places, -1)
-            cells = (
-                queries.repeat_interleave(each),
-                places,
-                match.score,
-                match.accepted,
-                right,
-                sure,
-                rank,
-                route,
-                turn,
-            )
-            for query, place, score, good, p, margin, at, on, north in zip(
-                *(one.tolist() for one in cells), strict=True
+            nowhere = torch.full((*places.shape, 2), math.nan)
+            at = nowhere if area is None else area.coordinates(places.clamp(min=0))
+            whole = queries.repeat_interleave(each), places, match.accepted, rank, route
+            parts = match.score, right, sure, turn, *at.masked_fill((places < 0)[:, None], math.nan).unbind(1)
+            for (query, place, good, order, on), (score, chance, margin, north, x, y) in zip(
+                *(zip(*(column.tolist() for column in columns), strict=True) for columns in (whole, parts)),
+                strict=True,
             ):
                 row = {
                     "query": query,
                     "place": place - starts[on] if on >= 0 else place,
                     "score": f"{score:.{digits}g}",
                     "accepted": int(good),
-                    "probability": "" if math.isnan(p) else f"{p:.6g}",
-                    "confidence": "" if math.isnan(margin) else f"{margin:.6g}",
-                    "heading": "" if math.isnan(north) else f"{north:g}",
-                    "rank": at,
+                    "probability": _number(chance),
+                    "confidence": _number(margin),
+                    "heading": _number(north),
+                    "rank": order,
                     "route": printable(routes[on].name) if on >= 0 else "",
+                    "x": _number(x, 9),
+                    "y": _number(y, 9),
                     "query_name": _name(query_names, query),
                     "place_name": _name(place_names, place),
                 }
-                if area is not None and place >= 0:
-                    x, y = area.coordinates(torch.tensor(place)).tolist()
-                    row |= {"x": f"{x:.9g}", "y": f"{y:.9g}"}
                 writer.writerow(row)
                 if paired and place >= 0:
                     paired.write(f"{row['query_name']} {row['place_name']}\n")
-                accepted += good and at == 1
+                accepted += good and order == 1
     return total, accepted
+
+
+def _number(value: float, digits: int = 6) -> str:
+    return "" if math.isnan(value) else f"{value:.{digits}g}"
 
 
 def check_pair_names(names: Sequence[str], whose: str) -> None:
