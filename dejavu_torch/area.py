@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 SIDE = 128  # windows of a tile to a side
-GAP = 64  # rows between areas that are not of one ground: more than a camera moves from image to image
+GAP = 16  # windows between areas that are not of one ground: more than a camera moves from image to image
 
 
 class Tables(NamedTuple):
@@ -82,7 +82,10 @@ class Area(NamedTuple):
         """The area of several parts, whose corners may be negative; places of one part after those of the
         other."""
         top, left = (min(part.corner[axis] for part in parts) for axis in (0, 1))
-        moved = [part._replace(corner=(part.corner[0] - top, part.corner[1] - left)) for part in parts]
+        frame = next((part.frame for part in parts if part.frame), "")
+        moved = [
+            part._replace(corner=(part.corner[0] - top, part.corner[1] - left), frame=frame) for part in parts
+        ]
         if len(moved) == 1:
             return moved[0]
         rows = max(part.corner[0] + part.rows for part in moved)
@@ -98,6 +101,17 @@ class Area(NamedTuple):
     def places(self) -> int:
         """N, the number of windows."""
         return sum(part.rows * part.columns for part in self.rectangles)
+
+    @property
+    def fits(self) -> bool:
+        """Whether the parts lie within the bounds, and none on another."""
+        if not self.parts:
+            return True
+        used = torch.zeros(self.rows, self.columns, dtype=torch.bool)
+        for part in self.parts:
+            (top, left), rows, columns = part.corner, part.rows, part.columns
+            used[top : top + rows, left : left + columns] = True
+        return Area.of(self.parts) == self and int(used.sum()) == self.places
 
     @property
     def north(self) -> float:
@@ -142,19 +156,16 @@ class Area(NamedTuple):
 
     def place_at(self, cells: Tensor) -> Tensor:
         """The places of rows and columns, (..., 2) -> (...); -1 where no window is."""
-        found, before = cells.new_full(cells.shape[:-1], -1), 0
-        for part in self.rectangles:
-            own = cells - cells.new_tensor(part.corner)
-            most = own.new_tensor([part.rows - 1, part.columns - 1])
-            within = torch.minimum(own.clamp(min=0), most)
-            number = before + part._numbered(within[..., 0], within[..., 1])
-            found = torch.where((own == within).all(-1), number, found)
-            before += part.places
-        return found
+        row, column = cells[..., 0].clamp(0, self.rows - 1), cells[..., 1].clamp(0, self.columns - 1)
+        found = self._numbered(row, column)
+        return torch.where((cells[..., 0] == row) & (cells[..., 1] == column), found, -1)
 
     def _numbered(self, row: Tensor, column: Tensor) -> Tensor:
-        """The places of rows and columns inside a rectangle, which may be broadcast, from its first."""
-        down, across = (edges.to(row.device) for edges in _cached_edges(self.rows, self.columns, SIDE))
+        """The places of rows and columns within the bounds, which may be broadcast; -1 for none."""
+        if self.parts:
+            found = self.orders()[0].to(row.device)[row * self.columns + column]
+            return found.masked_fill(found == self.places, -1)
+        down, across = (edges.to(row.device) for edges in _borders(self.rows, self.columns))
         at, beside = (
             torch.bucketize(cells.contiguous(), edges[1:-1], right=True)
             for cells, edges in ((row, down), (column, across))
@@ -180,8 +191,8 @@ class Area(NamedTuple):
         """The places whose middles are nearest to (x, y), (n,2) -> (n,); -1 for over half a step away."""
         found, before = torch.full((len(points),), -1), 0
         for part in self.rectangles:
-            steps = torch.tensor([part.down, part.right], dtype=torch.float64)
-            cells = (points.double() - torch.tensor(part.first).double()) @ steps.inverse()
+            first, *steps = torch.tensor([part.first, part.down, part.right], dtype=torch.float64)
+            cells = (points.double() - first) @ torch.stack(steps).inverse()
             place = part._replace(corner=(0, 0)).place_at(cells.nan_to_num(-1).round().long())
             found = torch.where(place >= 0, before + place, found)
             before += part.places
@@ -197,10 +208,8 @@ class Area(NamedTuple):
         offset = torch.arange(-radius, radius + 1, device=places.device)
         row, column = (self.cells(places)[:, None] + offset[:, None]).unbind(-1)
         row, column = row.clamp(0, self.rows - 1), column.clamp(0, self.columns - 1)
-        if not self.parts:
-            return self._numbered(row[:, :, None], column[:, None]).flatten(1)
-        near = self.place_at(torch.stack(torch.broadcast_tensors(row[:, :, None], column[:, None]), -1))
-        return torch.where(near < 0, places[:, None, None], near).flatten(1)
+        near = self._numbered(row[:, :, None], column[:, None]).flatten(1)
+        return torch.where(near < 0, places[:, None], near) if self.parts else near
 
     def between(self, start: int, stop: int) -> Area:
         """The area of some of the parts: those of the places [start, stop)."""
@@ -210,15 +219,20 @@ class Area(NamedTuple):
 
 def apart(areas: Sequence[Area]) -> Area:
     """The area of several that are not of one ground: none of their windows are near those of another."""
-    parts, top = list[Area](), 0
-    for area in areas:
-        parts += [part._replace(corner=(top + part.corner[0], part.corner[1])) for part in area.rectangles]
-        top += area.rows + GAP
-    return Area.of(parts)
+
+    def along(down: int, across: int) -> Area:
+        parts, top, left = list[Area](), 0, 0
+        for area in areas:
+            for part in area.rectangles:
+                parts.append(part._replace(corner=(top + part.corner[0], left + part.corner[1])))
+            top, left = top + down * (area.rows + GAP), left + across * (area.columns + GAP)
+        return Area.of(parts)
+
+    return min(along(1, 0), along(0, 1), key=lambda area: area.rows * area.columns)
 
 
 def area_of(stored: Mapping[str, Any]) -> Area:
-    """An area from the values of `Area.stored`, as JSON keeps them."""
+    """An area from the values of `stored_area`, as JSON keeps them."""
     points: dict[str, Any] = {name: tuple(stored[name]) for name in ("first", "right", "down")}
     corner, parts = tuple(stored.get("corner", (0, 0))), tuple(map(area_of, stored.get("parts", ())))
     return Area(**{**stored, **points, "corner": corner, "parts": parts})
@@ -230,6 +244,24 @@ def stored_area(area: Area) -> dict[str, Any]:
     parts = [stored_area(part) | {"corner": part.corner} for part in stored.pop("parts")]
     del stored["corner"]
     return stored | {"parts": parts} if parts else stored
+
+
+def agree(one: str, other: str) -> bool:
+    """Whether two frames of coordinates may be the same; "" is unknown."""
+    return "" in (one, other) or one == other
+
+
+def same_windows(one: Area | None, other: Area | None) -> bool:
+    """Whether two areas number their places alike and, if both know their frames, these lie where the other's
+    do; also two routes."""
+    if one is None or other is None:
+        return one is other
+    known = bool(one.frame and other.frame)
+    mine, yours = (
+        [(part.corner, part.rows, part.columns, known and part[2:7]) for part in area.rectangles]
+        for area in (one, other)
+    )
+    return mine == yours
 
 
 def distance(one: Tensor, other: Tensor, area: Area | None) -> Tensor:
@@ -255,16 +287,21 @@ def _tables(area: Area) -> Tables:
 def _cached_tables(area: Area, side: int) -> Tables:
     corners, sizes = list[Tensor](), list[Tensor]()
     for part in area.rectangles:
-        down, across = _cached_edges(part.rows, part.columns, side)
+        down, across = _borders(part.rows, part.columns)
         corners.append(torch.cartesian_prod(down[:-1], across[:-1]).view(-1, 2) + torch.tensor(part.corner))
         sizes.append(torch.cartesian_prod(down.diff(), across.diff()).view(-1, 2))
     size = torch.cat(sizes)
     return Tables(torch.cat(corners), size, torch.cat([size.new_zeros(1), size.prod(1).cumsum(0)[:-1]]))
 
 
-@lru_cache(64)
-def _cached_edges(rows: int, columns: int, side: int) -> tuple[Tensor, Tensor]:
+def _borders(rows: int, columns: int) -> tuple[Tensor, Tensor]:
     """The borders of tiles, rows and columns."""
+    with torch.inference_mode(False):
+        return _cached_borders(rows, columns, SIDE)
+
+
+@lru_cache(64)
+def _cached_borders(rows: int, columns: int, side: int) -> tuple[Tensor, Tensor]:
     down = _edges(rows, max(side, side * side // columns))
     return down, _edges(columns, side * side // int(down.diff().max()))
 

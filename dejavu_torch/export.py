@@ -174,6 +174,8 @@ def export_onnx(
         raise InputError("the map does not know its frames; expected a map learned from a source")
     if sequence is not None:
         sequence.check(None, model.map.places)
+        seen = f"the map of an area, and {type(sequence).__name__}"
+        expect(model.map.area is None, "single queries to export", seen)
     if isinstance(sequence, PlaceFilter) and sequence.lag:
         seen = f"a filter with a lag of {sequence.lag}"
         raise InputError(f"{seen}; expected one without: an ONNX file answers each frame at once")

@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dejavu_torch import learning
-from dejavu_torch.area import Area
+from dejavu_torch.area import Area, agree
 from dejavu_torch.data.ground_truth import find_ground_truth
 from dejavu_torch.data.positions import positions_behind
 from dejavu_torch.data.source import Source, as_traverse
@@ -33,7 +33,7 @@ log = logging.getLogger("dejavu_torch")
 
 EXACT = 2**24  # maximum number of even steps, with exact positions in float32
 SPARSE = 4  # a grown area may span so many times as many rows x columns as it has windows
-NORTH = 1.0  # degrees that areas of one map may differ by
+NORTH, STRIDE = 1.0, 1e-3  # degrees that areas of one map may differ by, and share of a step
 
 
 @torch.no_grad()
@@ -79,6 +79,9 @@ def append(
     positions = learning.positions_of(added).to(place_map.device)
     _check_count(place_map.places + places, model.step is not None)
     area = continued(place_map.area, added.area, added.name)
+    if area is not None and model.frame_shape not in (None, added.frame_shape):
+        seen, own = (" x ".join(map(str, shape or ())) for shape in (added.frame_shape, model.frame_shape))
+        raise InputError(f"{added.name} has windows of {seen}; expected {own}, as the map's")
     counts = None
     if visits is not None:
         _check_compatible(model, visits.traverse)
@@ -219,7 +222,7 @@ def _known_places(
     shown = source_of(second).coordinates
     if truth is None and area is not None and shown is not None and not shown.degrees:
         seen = f"coordinates of {second.name} in {shown.frame} and of {name} in {area.frame}"
-        expect("" in (shown.frame, area.frame) or shown.frame == area.frame, "one system", seen)
+        expect(agree(shown.frame, area.frame), "one system", seen)
         places = area.place_near(shown.values[:, :2])
     elif ground_truth is not None:
         places = table.place_of(ground_truth.positives[:, 0])
@@ -399,12 +402,8 @@ def _difference(first: DejaVu, other: DejaVu) -> str:
         )
     if first.map.area is not None and other.map.area is not None:
         mine, yours = first.map.area, other.map.area
-        if mine[5:7] != yours[5:7]:
-            seen = f"{mine.unit} ({mine.frame}) and {yours.unit} ({yours.frame})"
-            return f"their coordinates are in {seen}; expected the same"
-        norths = mine.north, yours.north
-        if abs((norths[0] - norths[1] + 180) % 360 - 180) > NORTH:
-            return f"north is {norths[0]:g} and {norths[1]:g} degrees from up; expected the same"
+        if seen := _unlike(mine, yours):
+            return f"{seen}; expected the same"
     shapes = first.frame_shape, other.frame_shape
     if None not in shapes and not _compatible(first, *shapes):  # type: ignore[arg-type]
         sizes = " and ".join(" x ".join(map(str, shape or ())) for shape in shapes)
@@ -432,24 +431,38 @@ def continued(area: Area | None, other: Area | None, name: str) -> Area | None:
     """
     if area is None or other is None:
         seen = f"{name} is {_kind(other)}, the map is of {_kind(area)}"
-        expect(area is other, "two of a kind", seen)
+        expect(area is other, "a route for a route, an area for an area", seen)
         return None
-    steps, theirs = (torch.tensor([one.down, one.right]).double() for one in (area, other))
-    seen = f"windows of {name} are {math.hypot(*other.right):g} {other.unit} apart"
-    seen += f", those of the map {math.hypot(*area.right):g} {area.unit}"
-    alike = area.unit == other.unit and torch.allclose(steps, theirs, rtol=1e-4)
-    expect(alike, "the same scale and stride, or a map of its own to merge", seen)
+    seen = _unlike(area, other)
+    expect(not seen, "the same", f"{name} does not continue the map: {seen}")
     own = area.rectangles[0]
-    away = torch.tensor(other.first).double() - torch.tensor(own.first).double()
+    steps, ends = (
+        torch.tensor(pair, dtype=torch.float64) for pair in ((own.down, own.right), (own.first, other.first))
+    )
+    away = ends[1] - ends[0]
     row, column = (torch.linalg.solve(steps.T, away).round().long() + torch.tensor(own.corner)).tolist()
     for (top, left), rows, columns in ((part.corner, part.rows, part.columns) for part in area.rectangles):
         tall = min(row + other.rows, top + rows) - max(row, top)
         wide = min(column + other.columns, left + columns) - max(column, left)
-        expect(min(tall, wide) <= 0, "other ground", f"{tall} x {wide} windows of {name} are in the map")
+        seen = f"{name} and the map share {tall} x {wide} windows"
+        expect(min(tall, wide) <= 0, "ground that the map lacks", seen)
     joined = Area.of([*area.rectangles, other._replace(corner=(row, column))])
     seen = f"{name} and the map lie in {joined.rows} x {joined.columns} windows, of which they have few"
     expect(joined.rows * joined.columns <= SPARSE * joined.places, "areas nearby, or maps to merge", seen)
     return joined
+
+
+def _unlike(one: Area, other: Area) -> str:
+    """Why windows of two areas cannot be in one map; "" if they can."""
+    if one.unit != other.unit or not agree(one.frame, other.frame):
+        return f"coordinates are in {one.frame or one.unit} and {other.frame or other.unit}"
+    for way in ("right", "down"):
+        mine, yours = (math.hypot(*getattr(area, way)) for area in (one, other))
+        if abs(mine - yours) > STRIDE * mine:
+            return f"windows are {mine:g} and {yours:g} {one.unit} apart"
+    if abs((one.north - other.north + 180) % 360 - 180) > NORTH:
+        return f"north is {one.north:g} and {other.north:g} degrees from up"
+    return ""
 
 
 def _kind(area: Area | None) -> str:

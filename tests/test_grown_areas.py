@@ -16,7 +16,7 @@ from test_area import ground
 import dejavu_torch.area as areas
 from dejavu_torch import DejaVu, PlaceFilter, PlaceSmoother, SpectralMapper, open_source
 from dejavu_torch.area import Area, apart, area_of, around, distance, stored_area
-from dejavu_torch.growth import append, associate, average, merge
+from dejavu_torch.growth import append, associate, average, continued, merge
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.recognition.plane import as_plane, by_place
 
@@ -117,12 +117,45 @@ def test_an_area_grows_by_windows_of_the_same_ground(picture, small_tiles, tmp_p
     assert separate.map.places + left.map.places == area.places
 
 
+def test_coordinates_of_metres_are_exact():
+    """Northings of millions, and windows closer than the steps of float32 there."""
+    steps = {"right": (0.16, 1e-5), "down": (1e-5, -0.16), "unit": "m", "frame": "EPSG:32632"}
+    area = Area(40, 50, first=(691_000.1, 5_334_000.3), **steps)
+    places = torch.arange(area.places)
+    assert torch.equal(area.place_near(area.coordinates(places)), places)
+    for row, column in ((40, 3), (-7, 50), (0, -40)):
+        first = torch.tensor(area.first, dtype=torch.float64)
+        first += torch.tensor([[row, column]]).double()[0] @ torch.tensor([area.down, area.right]).double()
+        other = Area(7, 40, first=tuple(first.tolist()), **{**steps, "right": (0.16, 2e-5)})
+        grown = continued(area, other, "more")
+        assert grown is not None
+        own, added = grown.rectangles
+        assert (added.corner[0] - own.corner[0], added.corner[1] - own.corner[1]) == (row, column)
+    for other, words in (
+        (area._replace(frame="EPSG:32633"), ("EPSG:32632 and EPSG:32633",)),
+        (area._replace(right=(0.32, 0.0)), ("0.16 and 0.32 m apart",)),
+        (area._replace(right=(0.0, 0.16), down=(0.16, 0.0)), ("north is 0",)),
+    ):
+        with refused(*words):
+            continued(area, other, "more")
+    assert (
+        continued(area._replace(frame=""), other._replace(**steps, first=(691_000.1, 5_334_010.3)), "")
+        is not None
+    )
+
+
+@pytest.mark.parametrize("strip", [Area(3, 36), Area(36, 3)])
+def test_long_areas_follow_each_other(strip):
+    both = apart([strip] * 14)
+    assert both.rows * both.columns < 2 * both.places == 2 * 14 * strip.places
+
+
 def test_areas_are_merged_like_routes(picture, small_tiles, tmp_path):
     left, right = learn(picture(columns="0:128")), learn(picture(columns="128:240"))
     merged = merge([left, right, left], ["left", "right", "left"])
     assert isinstance(merged.map, SpectralMap)
     assert [route.name for route in merged.map.routes] == ["left", "right", "left-2"]
-    queries = torch.cat([model.descriptor.all_of(open_source(picture())) for model in (left,)])
+    queries = left.descriptor.all_of(open_source(picture()))
     scores = torch.cat([model.map.scores(queries) for model in (left, right, left)], 1)
     torch.testing.assert_close(merged.map.scores(queries), scores, rtol=1e-4, atol=1e-5)
     merged.save(tmp_path / "merged.safetensors")
@@ -181,31 +214,39 @@ def test_csv_of_a_grown_area_are_judged_by_its_map(picture, tmp_path, capsys):
     assert report["recall_at_1"] > 0.95
     assert (report["tolerance"], report["unit"]) == (12, "pixels")
     told = fails(capsys, "compare", picture(), flight, "--map", both, "--out", tmp_path / "report")
-    assert "not the area of the map" in told
+    assert "is another area" in told
+    told = fails(
+        capsys, "evaluate", tmp_path / "m.csv", *judged, "--reference", picture(), "--out", tmp_path / "no"
+    )
+    assert "is not the area of" in told
+    unit = (*judged[:5], "metres:12")
+    assert "the same unit" in fails(capsys, "evaluate", tmp_path / "m.csv", *unit, "--out", tmp_path / "no")
+    told = fails(capsys, "export", both, "--match", "filter", "--onnx", tmp_path / "m.onnx")
+    assert "single queries to export" in told
 
 
 def test_what_does_not_fit_an_area_is_refused(picture, small_tiles, tmp_path, capsys):
     def model():
         return learn(picture(columns="0:128"))
 
-    with refused("13 x 3 windows", "are in the map", "other ground"):
+    with refused("share 13 x 3 windows", "ground that the map lacks"):
         append(model(), open_source(picture(columns="48:160")))
-    with refused("24 px apart", "16 px", "same scale and stride"):
+    with refused("16 and 24 px apart", "does not continue the map"):
         append(model(), open_source(picture(columns="128:240", options="window=48&stride=24")))
     far = open_source(picture(columns="128:240"))
     far.area = far.area._replace(first=(9e5, 24.0))
     with refused("13 x 5", "areas nearby", "merge"):
         append(model(), far)
     frames = torch.rand(20, 3, 48, 48)
-    with refused("is a route", "of an area", "two of a kind"):
+    with refused("is a route", "of an area", "an area for an area"):
         append(model(), frames)
-    with refused("is an area", "of a route", "two of a kind"):
+    with refused("is an area", "of a route", "a route for a route"):
         append(learn(frames), open_source(picture()))
     with refused("b is the map of a route", "a of an area"):
         merge([model(), learn(frames)], ["a", "b"])
     metres, turned = model(), model()
     metres.map.area = metres.map.area._replace(unit="m", frame="EPSG:32632")
-    with refused("px", "m (EPSG:32632)", "expected the same"):
+    with refused("in pixels and EPSG:32632", "expected the same"):
         merge([model(), metres], ["a", "b"])
     turned.map.area = turned.map.area._replace(right=(0.0, 16.0), down=(-16.0, 0.0))
     with refused("north", "90 degrees"):

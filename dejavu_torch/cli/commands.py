@@ -78,7 +78,11 @@ def run_learn(
     growing.check(sources, learning.calibration)
     traverse: Traverse | None = None
     if sources:
-        chain = chained([open_source(one) for one in sources])
+        opened = [open_source(one) for one in sources]
+        for one in opened if len(opened) > 1 else ():
+            expected = "one area alone, of which --append adds more to its map"
+            expect(one.area is None, expected, f"{one.name} is an area, one of {len(opened)} sources")
+        chain = chained(opened)
         traverse = model.resample(chain, model.step, True, model.frame_shape)
         print_steps(traverse)
     visits = None if growing.average is None else growing.visits(model, traverse)

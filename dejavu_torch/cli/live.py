@@ -13,6 +13,7 @@ from contextlib import ExitStack, suppress
 
 import numpy as np
 
+from dejavu_torch.area import same_windows
 from dejavu_torch.cli.process import interrupts_raise, output_problem
 from dejavu_torch.data.camera import Camera, Frame, is_stream, shots_of, stretched
 from dejavu_torch.data.source import open_source
@@ -63,7 +64,10 @@ def follow(
                 seen = f"--reference {reference}: the map has {len(model.map.routes)} routes"
                 expect(not model.map.routes, "the map of one route, or no --reference", seen)
                 shown = len(model.map.positions) or model.map.places
-                pictures = stack.enter_context(ReferencePictures(open_source(reference), shown))
+                source_of_map = open_source(reference)
+                same = same_windows(model.map.area, source_of_map.area)
+                expect(same, "the area of the map", f"--reference {reference} is another one")
+                pictures = stack.enter_context(ReferencePictures(source_of_map, shown))
             page = stack.enter_context(Page(port, title, pictures))
             _log(f"the page is at {page.url}")
         reader = stack.enter_context(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections import Counter
 from collections.abc import Iterator
@@ -131,10 +132,13 @@ def run_localize(
     if counts:
         steps = next_steps(matcher is not None, chosen.given)
         say(describe_probable(counts, total) + (f"; next: {'; '.join(steps)}" if steps else ""))
-    needed = model.step is not None or model.map.area is not None
-    table: tuple[str | Path, ...] = ("--map", map) if needed else ()
+    area, truth = model.map.area, "TRUTH"
+    table: tuple[str | Path, ...] = ("--map", map) if model.step is not None or area is not None else ()
+    if area is not None and query.coordinates is not None:
+        truth = f"{'metres' if area.unit == 'm' else 'pixels'}:{2 * math.hypot(*area.right):g}"
+        table += "--query", source
     table += ("--route", "ROUTE") if model.map.routes else ()
-    print_next("evaluate", out, "--truth", "TRUTH", *table, "--out", "scores")
+    print_next("evaluate", out, "--truth", truth, *table, "--out", "scores")
 
 
 def _check_written(out: Path, pairs: Path | None, *read: str | Path) -> None:

@@ -183,6 +183,12 @@ def near_truth(reference: Tensor, query: Tensor, radius: float) -> Tensor:
     return padded(rows)
 
 
+def check_unit(near: Near, area: Area) -> None:
+    """Refuse a distance in pixels for an area in metres, and the reverse."""
+    seen = f"truth {near.kind}:{near.radius:g}, and coordinates of the area in {area.frame or area.unit}"
+    expect((near.kind == "pixels") == (area.unit == "px"), "the same unit", seen)
+
+
 def widened(truth: GroundTruth, area: Area, radius: int) -> GroundTruth:
     """A ground truth of which all windows up to a radius from a right one are right."""
     known = truth.positives.clamp(min=0).flatten()
@@ -321,7 +327,8 @@ def find_ground_truth(
         ground_truth = all_judged(offset_truth(numbers, frames, parsed))
     elif isinstance(parsed, Near):
         if reference is None or query is None:
-            raise InputError(f"truth {truth} reads the names of images; expected reference and query")
+            seen = f"truth {truth} compares coordinates, which the sources carry or names of images tell"
+            raise InputError(f"{seen}; expected reference and query")
         stored, asked = coordinates_of([reference, query], parsed.kind)
         asked = _rows_of(asked, numbers)
         ground_truth = all_judged(near_truth(stored, asked, parsed.radius))

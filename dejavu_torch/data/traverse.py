@@ -111,8 +111,6 @@ class Chain(Traverse):
         expect(self.traverses, "at least one", "a chain of no traverses")
         first = self.traverses[0]
         for other in self.traverses:
-            expected = "one alone; --append adds more of it to its map"
-            expect(other.area is None, expected, f"{other.name} is an area, one of {len(self.traverses)}")
             if other.frame_shape != first.frame_shape:
                 seen, expected = (" x ".join(map(str, traverse.frame_shape)) for traverse in (other, first))
                 raise InputError(f"{other.name} has frames of {seen}; expected {expected} like {first.name}")

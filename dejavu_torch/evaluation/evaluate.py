@@ -13,12 +13,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.area import Area
+from dejavu_torch.area import Area, same_windows
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.coordinates import Near
 from dejavu_torch.data.ground_truth import (
     GroundTruth,
     check_ground_truth,
+    check_unit,
     counted,
     describe_ground_truth,
     find_ground_truth,
@@ -100,11 +101,16 @@ def evaluate_file(
     place_map = None if map is None else _map_of(map, route)
     area = reference.area if reference is not None else None if place_map is None else place_map.area
     near = parsed if area is not None and isinstance(parsed, Near) else None
+    if area is not None and near is not None:
+        check_unit(near, area)
     if area is not None and tolerance:  # numbers of places tell no distance there
         expected = "--tolerance 0, or the distance in the truth, such as --truth pixels:10"
         expect(near, expected, f"the places are those of an area, the tolerance is {tolerance} places")
         tolerance = 0
-    if reference is None and place_map is not None and place_map.area is not None:
+    if place_map is not None and place_map.area is not None:
+        expected = "the source that the map was learned from, or none"
+        own = reference is None or same_windows(reference.area, place_map.area)
+        expect(own, expected, f"{reference and reference.name} is not the area of {map}")
         reference = _windows(place_map.area, str(map))
     positions = torch.zeros(0, dtype=torch.float32) if place_map is None else place_map.positions
     resampled = len(positions) > 0
@@ -135,9 +141,8 @@ def evaluate_file(
     match = replace(match, index=candidates[:, 0])
     described = describe_ground_truth(truth, interpolate, carried)
     facts = evaluation_facts(match, candidates, known, tolerance, positions, described) | alone
-    if near is not None:
-        unit = "pixels" if near.kind == "pixels" else "metres"
-        facts |= {"tolerance": plain_number(near.radius), "unit": unit}
+    if near is not None and area is not None:
+        facts |= {"tolerance": plain_number(near.radius), "unit": "pixels" if area.unit == "px" else "metres"}
     accepted = facts["accepted"]
     facts["accepted_precision"] = facts["accepted_right"] / accepted if accepted else None
     facts |= {"matches": str(matches), "places": places}

@@ -564,6 +564,7 @@ class SpectralMap(PlaceMap):
         if self.area is not None:
             tiles = [(places // width, width) for places, width in zip(lengths, columns, strict=True)]
             wanted = f"those of {' and '.join(f'{one.rows} x {one.columns}' for one in self.area.rectangles)}"
+            require(self.area.fits, "parts of an area that do not lie beside each other")
             require(tiles == self.area.tiles[: len(tiles)], f"tiles {tiles!s:.100}; expected {wanted}")
         require(bool(self.stage_scale.isfinite().all()), "a stage that is not finite")
         turned, square = tuple(self.turned.shape), 2 * (self.dimension,)

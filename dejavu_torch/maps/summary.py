@@ -109,8 +109,8 @@ class MapSummary:
             size += f", and {self.fixed_bytes} fixed{names} ({_parts(self.fixed)})"
         if self.areas:
             sizes = [f"{rows} x {columns}" for rows, columns in self.areas[:CHUNKS_SHOWN]]
-            more = [f"{len(self.areas) - CHUNKS_SHOWN} more parts"] * (len(self.areas) > CHUNKS_SHOWN)
-            lines.insert(0, f"an area of {' and '.join(sizes + more)} windows")
+            more = f", and {len(self.areas) - CHUNKS_SHOWN} more parts" * (len(self.areas) > CHUNKS_SHOWN)
+            lines.insert(0, f"an area of {' and '.join(sizes)} windows{more}")
         return "\n".join([*lines, f"{self.covered} of {self.places} places covered; {content}", size])
 
 

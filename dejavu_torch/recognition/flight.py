@@ -55,7 +55,8 @@ def place_flight(smoother: PlaceSmoother, rows: Rows, queries: int, area: Area, 
     Raises:
         InputError: more queries and windows than fit into memory.
     """
-    check_room(BYTES * queries * area.places, f"a drive of {queries} images over {area.places} windows")
+    cells = area.rows * area.columns
+    check_room(BYTES * queries * cells, f"a drive of {queries} images over {cells} rows x columns")
     scores = rows(torch.arange(queries)).float().cpu()
     weight = spacing.weight.to(scores)
     means = smoother.removed * place_means(scores, weight)
