@@ -36,6 +36,7 @@ from dejavu_torch.maps.spectrum import by_frequency, frequencies, from_lines, li
 from dejavu_torch.recognition import flight as flights
 from dejavu_torch.recognition.coarse import CoarseSearch, SamplingPlan
 from dejavu_torch.recognition.evidence import RankTable, standardised
+from dejavu_torch.recognition.localizer import Matching
 from dejavu_torch.recognition.motion import Rates
 from dejavu_torch.recognition.plane import Followed, PlaneMotion, as_plane, by_place, near_in_plane
 from dejavu_torch.recognition.samples import RowSearch
@@ -282,6 +283,8 @@ def test_a_filter_finds_a_flight_on_the_way(small_tiles):
 
     found = model.localize_descriptors(queries, filter)
     assert filter.area is None  # of a filter that may belong to several maps
+    beside = model.localize_descriptors(queries, Matching(also={"filter": filter}))
+    assert torch.equal(beside.sequences["filter"].index, found.index)
     assert near(found) > near(model.localize_descriptors(queries)) + 0.05
     localizer = model.localizer(model.matching(PlaceFilter(lag=5, learns=True)))
     answers = [localizer(queries[t : t + 1]) for t in range(90)]

@@ -168,6 +168,20 @@ def test_areas_are_merged_like_routes(picture, small_tiles, tmp_path):
     assert merge([grown, right], ["grown", "right"]).map.part("grown").area == grown.map.area
 
 
+def test_each_of_merged_areas_has_its_own_mean(small_tiles):
+    rows = torch.rand(2, 36, 8, generator=torch.Generator().manual_seed(0)) + torch.tensor([0.0, 2.0]).view(
+        2, 1, 1
+    )
+    models = [
+        DejaVu(mapper=SpectralMapper(step=0.01), whitening="none").learn_features(own, area=Area(6, 6))
+        for own in rows
+    ]
+    merged = merge(models, ["low", "high"])
+    assert float(merged.map.means.diff(dim=0).abs().mean()) > 1
+    alone = torch.cat([model.map.scores(rows[0]) for model in models], 1)
+    torch.testing.assert_close(merged.map.scores(rows[0]), alone)
+
+
 def test_a_further_visit_is_averaged_into_an_area(picture, small_tiles, tmp_path):
     noise = torch.randint(-60, 60, (240, 240, 3), generator=torch.Generator().manual_seed(0)).numpy()
     changed = (ground(240).astype(int) + noise).clip(0, 255).astype("uint8")
