@@ -220,7 +220,7 @@ def _known_places(
         truth, source, source_of(second), table.frames, numbers, resampled=step is not None, aligned=True
     )
     shown = source_of(second).coordinates
-    if truth is None and area is not None and shown is not None and not shown.degrees:
+    if truth is None and area is not None and area.frame and shown is not None and not shown.degrees:
         seen = f"coordinates of {second.name} in {shown.frame} and of {name} in {area.frame}"
         expect(agree(shown.frame, area.frame), "one system", seen)
         places = area.place_near(shown.values[:, :2])

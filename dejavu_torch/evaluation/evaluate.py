@@ -108,10 +108,9 @@ def evaluate_file(
         expect(near, expected, f"the places are those of an area, the tolerance is {tolerance} places")
         tolerance = 0
     if place_map is not None and place_map.area is not None:
-        expected = "the source that the map was learned from, or none"
-        own = reference is None or same_windows(reference.area, place_map.area)
-        expect(own, expected, f"{reference and reference.name} is not the area of {map}")
-        reference = _windows(place_map.area, str(map))
+        reference = reference or _windows(place_map.area, str(map))
+        own = same_windows(reference.area, place_map.area)
+        expect(own, "that of the map, or no reference", f"{reference.name} is not the area of {map}")
     positions = torch.zeros(0, dtype=torch.float32) if place_map is None else place_map.positions
     resampled = len(positions) > 0
     frames = places = None if reference is None else len(reference)
@@ -175,6 +174,7 @@ def _windows(area: Area, name: str) -> Traverse:
     """The places of a map as a traverse with their coordinates."""
     windows = ArrayTraverse(torch.zeros(area.places, 1), name)
     windows.coordinates = Coordinates(area.coordinates(torch.arange(area.places)), frame=area.frame)
+    windows.area = area
     return windows
 
 
