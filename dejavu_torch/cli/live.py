@@ -31,6 +31,16 @@ RATE = 10  # frames per second on the page, for a source without times
 log = logging.getLogger("dejavu_torch")
 
 
+def _pictures_of(model: DejaVu, reference: str) -> ReferencePictures:
+    """The pictures of the map's reference, or an InputError."""
+    seen = f"--reference {reference}: the map has {len(model.map.routes)} routes"
+    expect(not model.map.routes, "the map of one route, or no --reference", seen)
+    traverse = open_source(reference)
+    same = same_windows(model.map.area, traverse.area)
+    expect(same, "the area of the map", f"--reference {reference} is another one")
+    return ReferencePictures(traverse, len(model.map.positions) or model.map.places)
+
+
 def follow(
     model: DejaVu,
     sequence: SequenceModel | None,
@@ -61,13 +71,7 @@ def follow(
         if port is not None:
             pictures = None
             if reference is not None:
-                seen = f"--reference {reference}: the map has {len(model.map.routes)} routes"
-                expect(not model.map.routes, "the map of one route, or no --reference", seen)
-                shown = len(model.map.positions) or model.map.places
-                source_of_map = open_source(reference)
-                same = same_windows(model.map.area, source_of_map.area)
-                expect(same, "the area of the map", f"--reference {reference} is another one")
-                pictures = stack.enter_context(ReferencePictures(source_of_map, shown))
+                pictures = stack.enter_context(_pictures_of(model, reference))
             page = stack.enter_context(Page(port, title, pictures))
             _log(f"the page is at {page.url}")
         reader = stack.enter_context(

@@ -132,13 +132,18 @@ def run_localize(
     if counts:
         steps = next_steps(matcher is not None, chosen.given)
         say(describe_probable(counts, total) + (f"; next: {'; '.join(steps)}" if steps else ""))
+    _print_evaluate(out, model, map, source if query.coordinates is not None else "SOURCE")
+
+
+def _print_evaluate(out: Path, model: DejaVu, map: Path, source: str) -> None:
+    """The command that scores the matches of a source with coordinates."""
     area, truth = model.map.area, "TRUTH"
-    table: tuple[str | Path, ...] = ("--map", map) if model.step is not None or area is not None else ()
-    if area is not None and query.coordinates is not None:
+    needed: tuple[str | Path, ...] = ("--map", map) if model.step is not None or area is not None else ()
+    if area is not None:
         truth = f"{'metres' if area.unit == 'm' else 'pixels'}:{2 * math.hypot(*area.right):g}"
-        table += "--query", source
-    table += ("--route", "ROUTE") if model.map.routes else ()
-    print_next("evaluate", out, "--truth", truth, *table, "--out", "scores")
+        needed += "--query", source
+    needed += ("--route", "ROUTE") if model.map.routes else ()
+    print_next("evaluate", out, "--truth", truth, *needed, "--out", "scores")
 
 
 def _check_written(out: Path, pairs: Path | None, *read: str | Path) -> None:

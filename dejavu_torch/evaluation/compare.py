@@ -51,7 +51,7 @@ from dejavu_torch.recognition.centring import centred, set_apart
 from dejavu_torch.recognition.localizer import SINGLE, Matching
 from dejavu_torch.recognition.select import check_candidates
 from dejavu_torch.recognition.smoother import PlaceSmoother
-from dejavu_torch.types import InputError, Match, SequenceModel, Traverse, expect
+from dejavu_torch.types import InputError, Match, SequenceModel, Together, Traverse, expect
 
 log = logging.getLogger("dejavu_torch")
 
@@ -175,13 +175,10 @@ def compare(
             if isinstance(calibration, LabelledFrames) or (calibration is None and not has_map):
                 calibrate_if_possible(model, reference, calibration, progress=progress)
         with timed(seconds, "localize"):
-            most = math.inf if ordered is not None else MAX_FILTERED if reference.area is None else MAX_FLOWN
-            beside = in_order and known is not None and not itself  # without truth they have no scores
-            beside = beside and headings == 1 and len(query) * model.map.places <= most
-            also = models_beside(causal, beside, len(query), model.map.places, within)
-            if reference.area is not None:  # sequences follow the numbers of places
-                also = {way: one for way, one in also.items() if way == "filter"}
-            alike = PlaceSmoother(within=within) if beside and len(query) > 1 else None
+            # without truth they have no scores
+            beside = in_order and known is not None and not itself and headings == 1
+            sizes = (len(query), model.map.places, within)
+            also, alike = _beside(causal, beside, ordered is not None, *sizes, reference.area)
             centring = in_order and model.centres(len(query)) if centre is None else centre
             matching = Matching(causal, also, apart=loops, copies=headings)
             run = _described(model, reference, query, places, centring, tolerance, matching, progress)
@@ -270,6 +267,24 @@ def _ways(
     if isinstance(sequence, str):
         sequence = PlaceSmoother(within=tolerance) if drive else None
     return (sequence, None) if isinstance(sequence, PlaceSmoother) else (None, sequence)
+
+
+def _beside(
+    causal: SequenceModel | None,
+    beside: bool,
+    asked: bool,
+    queries: int,
+    places: int,
+    within: int,
+    area: Area | None,
+) -> tuple[dict[Together, SequenceModel], PlaceSmoother | None]:
+    """The sequence models and the smoother that are compared; `asked`: however long they take."""
+    most = math.inf if asked else MAX_FILTERED if area is None else MAX_FLOWN
+    beside = beside and queries * places <= most
+    also = models_beside(causal, beside, queries, places, within)
+    if area is not None:  # sequences follow the numbers of places
+        also = {way: one for way, one in also.items() if way == "filter"}
+    return also, PlaceSmoother(within=within) if beside and queries > 1 else None
 
 
 def _prepared(
