@@ -29,7 +29,7 @@ ARROWS = {
     "model_file": "text version types memory data features periods maps recognition motion",
     "model": "area text types resize data features maps recognition motion learning model_file",
     "teaching": "types memory data features maps recognition model",
-    "growth": "types data features maps motion learning model_file model teaching",
+    "growth": "area types data features maps motion learning model_file model teaching",
     "updating": "types data maps motion recognition model teaching growth",
     "cluster": "text types maps recognition",
     "live": "types memory data features recognition model",
@@ -38,7 +38,7 @@ ARROWS = {
     "export": "text version types data features maps recognition model",
     "training": "lazy text types memory resize data features periods maps recognition "
     "motion model_file model evaluation",
-    "cli": "text types data features periods maps recognition motion learning model_file model "
+    "cli": "area text types data features periods maps recognition motion learning model_file model "
     "growth teaching updating cluster live export evaluation training",
 }
 
