@@ -363,7 +363,8 @@ def terrain() -> str:
             cells = []
             for each in sizes:
                 row = found[contender].get(each, {})
-                shares = [f"{row[f'{kind}recall_{metres}m']:.3f}" for metres in (1, 2, 5) if row]
+                keys = [f"{kind}recall_{metres}m" for metres in (1, 2, 5)]
+                shares = [f"{row[key]:.3f}" for key in keys if key in row]
                 cells.append("/".join(shares))
             table.append([f"{name}: {way}", *cells])
     own = [found["map"].get(each, {}) for each in sizes]
