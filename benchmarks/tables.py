@@ -351,29 +351,25 @@ def headings() -> str:
     return markdown(table)
 
 
-def terrain() -> str:
+def terrain(name: str = "terrain") -> str:
     """Time, bytes and what is found on a large area, by bytes per place."""
     found: dict[str, dict[float, Row]] = {}
-    for row in read("terrain")["rows"]:
-        found.setdefault(row["contender"], {})[row["bytes_per_place"]] = row
+    for row in read(name)["rows"]:
+        found.setdefault(row.get("contender", "map"), {})[round(row["bytes_per_place"], 2)] = row
     sizes = sorted({each for own in found.values() for each in own})
     table = [["found within 1/2/5 m, by bytes per window", *(f"{each:g}" for each in sizes)]]
-    for contender, name in TERRAIN_WAYS.items():
+    for contender, of in found.items():
         for way, kind in (("one image", ""), ("a flight of 60 images", "flight_")):
             cells = []
             for each in sizes:
-                row = found[contender].get(each, {})
+                row = of.get(each, {})
                 keys = [f"{kind}recall_{metres}m" for metres in (1, 2, 5)]
-                shares = [f"{row[key]:.3f}" for key in keys if key in row]
-                cells.append("/".join(shares))
-            table.append([f"{name}: {way}", *cells])
-    own = [found["map"].get(each, {}) for each in sizes]
-    for name, key, scale in (
-        ("learned in, s", "learn_seconds", 1),
-        ("map file, MB", "bytes", 1e6),
-        ("one query, ms", "ms", 1),
-    ):
-        table.append([name, *(f"{row[key] / scale:.3g}" if key in row else "" for row in own)])
+                cells.append("/".join(f"{row[key]:.3f}" for key in keys if key in row))
+            table.append([f"{TERRAIN_WAYS[contender]}: {way}", *cells])
+    rows = [found["map"].get(each, {}) for each in sizes]
+    told = (("learned in, s", "learn_seconds", 1), ("map file, MB", "bytes", 1e6), ("one query, ms", "ms", 1))
+    for title, key, scale in told:
+        table.append([title, *(f"{row[key] / scale:.3g}" if key in row else "" for row in rows)])
     return markdown(table)
 
 
@@ -477,6 +473,7 @@ TABLES: dict[str, Callable[[], str]] = {
         "areas": areas,
         "headings": headings,
         "terrain": terrain,
+        "terrain_400": partial(terrain, "terrain_400"),
         "large drives": large_drives,
         "taught drives": taught,
         "visits": visits,
