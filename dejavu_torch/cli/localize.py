@@ -136,7 +136,7 @@ def run_localize(
 
 
 def _print_evaluate(out: Path, model: DejaVu, map: Path, source: str) -> None:
-    """The command that scores the matches of a source with coordinates."""
+    """Print the command that scores the matches; in an area, of a source with coordinates."""
     area, truth = model.map.area, "TRUTH"
     needed: tuple[str | Path, ...] = ("--map", map) if model.step is not None or area is not None else ()
     if area is not None:

@@ -271,16 +271,17 @@ def _ways(
 
 def _beside(
     causal: SequenceModel | None,
-    beside: bool,
+    wanted: bool,
     asked: bool,
     queries: int,
     places: int,
     within: int,
     area: Area | None,
 ) -> tuple[dict[Together, SequenceModel], PlaceSmoother | None]:
-    """The sequence models and the smoother that are compared; `asked`: however long they take."""
+    """The sequence models and the smoother that are compared, if they are `wanted`: on few scores, or, if the
+    user has `asked` for them, on any number."""
     most = math.inf if asked else MAX_FILTERED if area is None else MAX_FLOWN
-    beside = beside and queries * places <= most
+    beside = wanted and queries * places <= most
     also = models_beside(causal, beside, queries, places, within)
     if area is not None:  # sequences follow the numbers of places
         also = {way: one for way, one in also.items() if way == "filter"}
