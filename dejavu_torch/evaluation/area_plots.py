@@ -5,10 +5,9 @@ from __future__ import annotations
 import torch
 from matplotlib.transforms import Affine2D
 
-from dejavu_torch.data.ground_truth import scored_and_right
 from dejavu_torch.evaluation import plots
 from dejavu_torch.evaluation.contenders import COLOURS
-from dejavu_torch.evaluation.localization import Localization
+from dejavu_torch.evaluation.localization import Localization, faults
 from dejavu_torch.motion.resampling import source_of
 from dejavu_torch.types import Facts
 
@@ -31,12 +30,12 @@ def draw_area(run: Localization) -> plots.Pictures:
             (found & match.accepted, COLOURS["map"], "accepted"),
         ]
     else:
-        scored, right = scored_and_right(match.index, run.truth, run.tolerance)
-        wrong = scored & found & ~right
+        scored, wrong = faults(match, run.truth, run.tolerance)
+        right = scored & ~wrong
         groups = [
-            (wrong & ~match.accepted, plots.PALE_WRONG, "wrong, not accepted"),
             (right & ~match.accepted, plots.PALE_RIGHT, "right, not accepted"),
             (right & match.accepted, plots.RIGHT, "right, accepted"),
+            (wrong & ~match.accepted, plots.PALE_WRONG, "wrong, not accepted"),
             (wrong & match.accepted, plots.WRONG, "wrong, accepted"),
         ]
         if own is not None:
@@ -44,8 +43,13 @@ def draw_area(run: Localization) -> plots.Pictures:
             axis.plot(*ends.permute(2, 1, 0), color=plots.WRONG, linewidth=0.4, alpha=0.5)
     for which, colour, name in groups:
         if which.any():
-            axis.plot(*at[which].T, ".", color=colour, markersize=3, label=f"{int(which.sum())} {name}")
-    plots.legend(figure, ncols=2, markerscale=3)
+            size = 6 if "wrong" in name else 3
+            axis.plot(*at[which].T, ".", color=colour, markersize=size, label=f"{int(which.sum())} {name}")
+    if run.answers == "drive":
+        single = run.by_one
+        missed = faults(single, run.truth, run.tolerance)[1]
+        plots.show_wrong(axis, *area.coordinates(single.index[missed]).T)
+    plots.legend(figure, ncols=2, markerscale=2)
     return plots.picture("coverage", (figure, axis), truth=run.truth, area=True, lines=own is not None)
 
 

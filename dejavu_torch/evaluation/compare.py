@@ -371,7 +371,8 @@ def _localized(run: Localization, drive: bool, top: int, progress: bool) -> tupl
 
     def match(queries: Tensor, how: Matching) -> Match:
         # whose acceptance is not asked for beside a drive
-        own = Matching(how.sequence) if drive else model.matching(how.sequence)
+        platt = model.calibration and model.calibration.of(how.sequence)
+        own = Matching(how.sequence, platt=platt) if drive else model.matching(how.sequence)
         own = own._replace(also=how.also, k=ranks, radius=run.tolerance, apart=how.apart, copies=how.copies)
         return model.localize_descriptors(queries, own, progress=progress)
 

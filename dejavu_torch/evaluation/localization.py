@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.ground_truth import GroundTruth
+from dejavu_torch.data.ground_truth import GroundTruth, scored_and_right
 from dejavu_torch.data.positions import unit_of
 from dejavu_torch.data.turning import Turned, facing_north
 from dejavu_torch.evaluation.contenders import Contender, contend
@@ -120,6 +120,12 @@ class Localization(NamedTuple):
         return self.match.renumbered(self.model.map.table.scored)
 
     @property
+    def by_one(self) -> Match:
+        """As `scored`; where a drive answers, the answers by one image, of which all are accepted."""
+        match = self.judged if self.answers == "drive" else self.match
+        return match.renumbered(self.model.map.table.scored)
+
+    @property
     def borders(self) -> Tensor:
         """(N+1,) the first reference frame of each place, and the number of frames."""
         return self.model.map.table.borders.cpu()
@@ -175,6 +181,13 @@ class Localization(NamedTuple):
         query = nearest_query(self.truth, (start + stop) / 2)
         right = self.truth.positives[query].tolist() if self.truth.judged[query] else []
         return query, [place for place in right if start <= place < stop]
+
+
+def faults(match: Match, truth: GroundTruth | None, tolerance: int) -> tuple[Tensor, Tensor]:
+    """Which answers are judged, without truth all, and which of these are wrong: two (Q,) bool."""
+    told = match.index >= 0
+    scored, right = (told, told) if truth is None else scored_and_right(match.index, truth, tolerance)
+    return told & scored, told & scored & ~right
 
 
 def nearest_query(truth: GroundTruth, place: float) -> int:

@@ -16,7 +16,7 @@ from dejavu_torch.data.ground_truth import GroundTruth, scored_and_right
 from dejavu_torch.data.positions import look_up
 from dejavu_torch.evaluation import plots
 from dejavu_torch.evaluation.contenders import COLOURS
-from dejavu_torch.evaluation.localization import Localization, frame_at, nearest_query
+from dejavu_torch.evaluation.localization import Localization, faults, frame_at, nearest_query
 from dejavu_torch.motion.resampling import source_of
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.types import Facts, Match, Traverse
@@ -28,6 +28,7 @@ MIN_PROBABILITY = 1e-6  # lower ones are drawn as this
 LINES = 8  # right places drawn for each query, about
 BLOCK_SCORES = 2**22  # of Q x N, computed at a time
 ALONG, COLUMNS = 12, 4  # queries shown along a drive, and how many side by side
+PAIRS, APART = 6, 5  # answers shown with their frames, and queries between two of them, at least
 EXAMPLES = 4  # places at which frames of both traverses are shown
 
 
@@ -64,59 +65,61 @@ def draw_examples(run: Localization) -> plots.Pictures:
 
 
 def draw_pairs(run: Localization) -> plots.Pictures:
-    """Example queries with the frames reported for them; empty for ready features, or if none is reported."""
-    examples = example_queries(run.scored, run.truth, run.tolerance) if run.has_frames else {}
-    if not examples:
+    """The worst answers by one image with their frames; empty for ready features, or if none is reported."""
+    match, truth = run.by_one, run.truth
+    judged, wrong = faults(match, truth, run.tolerance)
+    worst = worst_answers(match, judged, wrong, max(APART, 2 * run.tolerance)) if run.has_frames else []
+    if not worst:
         return {}
 
     def named(role: str, traverse: Traverse, frame: Tensor) -> str:
         names = source_of(traverse).names
-        name = names[int(frame)] if names else ""
-        return f"{role}:\n{plots.label(f'frame {frame} {name}'.strip())}"
+        return plots.label(f"{role} {frame} {names[int(frame)] if names else ''}".strip())
 
-    rows = []
-    for query, why in examples.items():
-        place, right = int(run.scored.index[query]), torch.empty(0)
+    rows, colours = [], []
+    for query in worst:
+        place, sure = int(match.index[query]), f"score {float(match.score[query]):.3g}"
         frames: dict[str, Tensor | None] = {
             named("query", run.query, run.query_frames[query]): frame_at(run.query, query),
             named("reported", run.reference, run.borders[place]): frame_at(run.reference, place),
         }
-        if run.truth is not None:
-            right = run.truth.positives[query]
-            right = right[(right >= 0) & run.truth.judged[query]]
-        if len(right):
+        if match.probability is not None:
+            sure = f"probability {float(match.probability[query]):.2f}"
+        told, colour = ("wrong, ", plots.WRONG) if wrong[query] else ("right, ", plots.RIGHT)
+        if truth is None:
+            told, colour, frames[""] = "", plots.GREY, None  # as wide as with right ones
+        elif len(right := truth.positives[query][truth.positives[query] >= 0]):
             nearest = int(right[(right - place).abs().argmin()])
-            title = named("right", run.reference, run.borders[nearest])
-            frames[title] = frame_at(run.reference, nearest)
-        elif run.truth is not None:
-            frames["right:\nunknown or none"] = None
-        rows.append((f"{why}, score {float(run.match.score[query]):.3g}", frames))
-    rejected = any("not accepted" in why for why in examples.values())
-    return plots.picture("pairs", plot_rows(rows), truth=run.truth, rejected=rejected)
+            frames[named("right", run.reference, run.borders[nearest])] = frame_at(run.reference, nearest)
+        else:
+            frames["right: none"] = None
+        rows.append((told + sure, frames))
+        colours.append(colour)
+    figure, axes = plot_rows(rows)
+    for row, colour in zip(axes, colours, strict=True):
+        for axis in row[:2]:
+            plots.frame_axis(axis, colour)
+    facts: Facts = {"truth": truth, "judged": int(judged.sum()), "wrong": int(wrong.sum())}
+    facts |= {"shown": len(worst), "shown_wrong": int(wrong[worst].sum()), "answers": run.answers}
+    facts |= {"accepted": int((wrong & match.accepted).sum()), "probable": match.probability is not None}
+    return plots.picture("pairs", (figure, axes), **facts)
 
 
-def example_queries(match: Match, truth: GroundTruth | None, tolerance: int) -> dict[int, str]:
-    """The queries that a report shows, with the reason: the surest right and wrong ones (without truth, the
-    surest), and the surest one that is not accepted (if all are, the least sure).
-    """
-    reported = match.index >= 0
-    rejected = reported & ~match.accepted
-    if truth is None:
-        groups = {"surest answer": reported}
-    else:
-        scored, right = scored_and_right(match.index, truth, tolerance)
-        groups = {"surest right answer": right, "surest wrong answer": reported & scored & ~right}
-    if rejected.any():
-        groups["surest not accepted"] = rejected
-    else:
-        groups["least sure answer"] = reported
-    reasons: dict[int, str] = {}
-    for why, group in groups.items():
-        if group.any():
-            score = -match.score if why.startswith("least") else match.score
-            query = int(torch.where(group, score, torch.inf).argmin())
-            reasons[query] = f"{reasons[query]}, {why}" if query in reasons else why
-    return reasons
+def worst_answers(match: Match, judged: Tensor, wrong: Tensor, apart: int) -> list[int]:
+    """The queries of `PAIRS` judged answers: the surest wrong ones, then the least sure; while there are
+    others, none within `apart` queries of a worse one, as neighbours share a mistake."""
+    known = (match.probability, match.confidence, -match.score)
+    sure = next(one for one in known if one is not None)
+    mistakes, others = (which.nonzero()[:, 0] for which in (wrong, judged & ~wrong))
+    falling, rising = sure[mistakes].argsort(descending=True), sure[others].argsort()
+    order: list[int] = torch.cat([mistakes[falling], others[rising]]).tolist()
+    chosen: list[int] = []
+    near: list[int] = []
+    for query in order:
+        if len(chosen) < PAIRS:
+            close = any(abs(query - other) <= apart for other in chosen)
+            (near if close else chosen).append(query)
+    return sorted((chosen + near)[:PAIRS], key=order.index)
 
 
 def draw_frames(run: Localization) -> plots.Pictures:
@@ -159,9 +162,16 @@ def plot_rows(rows: Sequence[tuple[str, Mapping[str, Tensor | None]]]) -> plots.
 
 
 def draw_coverage(
-    match: Match, truth: GroundTruth | None, tolerance: int, borders: Tensor, queries: Tensor, unit: str
+    match: Match,
+    truth: GroundTruth | None,
+    tolerance: int,
+    borders: Tensor,
+    queries: Tensor,
+    unit: str,
+    by_one: Match | None = None,
 ) -> plots.Pictures:
-    """The place reported for each query, right or wrong (coverage plot of the paper, figure 9)."""
+    """The place reported for each query, right or wrong (coverage plot of the paper, figure 9), and the wrong
+    ones of other answers `by_one` image, if any."""
     figure, axis = plots.canvas(3.8)
     reported, frames = match.index >= 0, int(borders[-1])
     shown = borders[match.index] if len(borders) > 1 else match.index
@@ -169,11 +179,10 @@ def draw_coverage(
     missing, groups = ~reported, []
     if truth is not None:
         scored, right = scored_and_right(match.index, truth, tolerance)
-        wrong = scored & reported & ~right
         groups.append((reported & ~scored, plots.GREY, 3, f"{(~scored).sum()} not scored"))
-        for which, colours, size, what in (
-            (wrong, (plots.PALE_WRONG, plots.WRONG), 3, "wrong"),
+        for which, colours, size, what in (  # errors on top
             (right, (plots.PALE_RIGHT, plots.RIGHT), 4, "right"),
+            (scored & reported & ~right, (plots.PALE_WRONG, plots.WRONG), 6, "wrong"),
         ):
             kept = which & match.accepted
             groups.append((which & ~kept, colours[0], size, f"{(which & ~kept).sum()} {what}, not accepted"))
@@ -191,6 +200,9 @@ def draw_coverage(
     for which, colour, size, name in groups:
         if which.any():
             axis.plot(queries[which], shown[which], ".", color=colour, markersize=size, label=name)
+    if by_one is not None:
+        wrong = faults(by_one, truth, tolerance)[1]
+        plots.show_wrong(axis, queries[wrong], borders[by_one.index[wrong]])
     if missing.any():
         where = queries[missing]
         axis.plot(where, torch.zeros(len(where)), "|", color=plots.DARK, label=f"{len(where)} not reported")
@@ -198,7 +210,7 @@ def draw_coverage(
     axis.set(xlabel=plots.QUERY, ylabel=f"reported {plots.PLACE}")
     axis.set(xlim=(first, max(last, first + 1)), ylim=(-0.01 * frames, frames))
     if axis.get_legend_handles_labels()[0]:
-        plots.legend(figure, ncols=2, markerscale=3)
+        plots.legend(figure, ncols=2, markerscale=2)
     return plots.picture("coverage", (figure, axis), truth=truth, probable=probability is not None)
 
 
@@ -221,8 +233,7 @@ def draw_scores(run: Localization, cells: int = CELLS) -> plots.Pictures:
     bar = figure.colorbar(image, ax=axis, pad=0.01, aspect=30, ticks=[0, 1], label="score of the query")
     bar.ax.set_yticklabels(["best", "median"])
     handles, names = axis.get_legend_handles_labels()
-    style: Facts = {"markerscale": 4, "handlelength": 1.5, "columnspacing": 1}
-    plots.legend(figure, handles, names, ncols=len(names), **style)
+    plots.legend(figure, handles, names, ncols=len(names), markerscale=4)
     shown = []
     if len(chosen) < len(queries):
         shown.append(f"{len(chosen)} of {len(queries)} queries")

@@ -37,7 +37,8 @@ def draw_pictures(
         pictures |= draw_area(run) | draw_heat(run)
     else:
         seen = run.borders, run.query_frames, run.unit
-        pictures |= draw_coverage(run.scored, run.truth, run.tolerance, *seen)
+        by_one = run.by_one if run.answers == "drive" else None
+        pictures |= draw_coverage(run.scored, run.truth, run.tolerance, *seen, by_one)
         pictures |= draw_scores(run) | draw_posterior(run)
     pictures |= draw_curves(contenders, tolerance)
     pictures |= draw_storage(contenders, storage, tolerance)

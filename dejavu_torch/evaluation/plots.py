@@ -28,7 +28,7 @@ LINE, LETTERS = 0.18, 54  # height of a line of text in inches, and letters of 9
 QUERY, PLACE = "query (frame)", "place (frame)"  # axes, named as the columns of matches.csv
 DARK, GREY = "#333333", "#bbbbbb"
 RIGHT, WRONG = "#2f9463", "#9e1b32"
-PALE_RIGHT, PALE_WRONG = "#a9dcc0", "#e3a5b0"  # of answers that are not accepted
+PALE_RIGHT, PALE_WRONG = "#a9dcc0", "#f4566a"  # of answers that are not accepted
 LAYERS = ("#b35806", "#542788")  # the two layers that several pictures show
 PHOTOS = ("examples", "pairs", "frames", "ground", "features")
 LABELLED = 8  # chunks along a route, beyond which their numbers do not fit
@@ -80,12 +80,20 @@ def set_title(axis: Any, text: str) -> None:
 
 def legend(owner: Any, *names: Any, loc: str = "outside lower left", **settings: Any) -> None:
     """The legend of a figure, below it, or of axes."""
-    owner.legend(*names, loc=loc, frameon=False, fontsize=9, **settings)
+    narrow = {"handlelength": 1.2, "handletextpad": 0.5, "columnspacing": 1}
+    owner.legend(*names, loc=loc, frameon=False, fontsize=9, **narrow, **settings)
 
 
 def colour_bar(figure: Figure, image: Any, axis: Any, label: str, **settings: Any) -> Any:
     """A thin bar of the colours of an image, beside its axes."""
     return figure.colorbar(image, ax=axis, label=label, pad=0.01, aspect=30, **settings)
+
+
+def show_wrong(axis: Any, x: Tensor, y: Tensor) -> None:
+    """Draw wrong answers by one image over those of the whole drive."""
+    if len(x):
+        name = f"{len(x)} wrong by one image"
+        axis.plot(x, y, "x", color=WRONG, markersize=3, markeredgewidth=0.7, label=name)
 
 
 def show_frame(axis: Any, frame: Tensor | None, text: str) -> None:

@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from drawn import matched, run_of, texts
 from matplotlib.colors import to_hex
 from torch import nn
 
-from dejavu_torch import DejaVu, PlaceFilter
+from dejavu_torch import DejaVu, PlaceFilter, PlaceSmoother
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth
 from dejavu_torch.evaluation import plots
 from dejavu_torch.evaluation.contenders import COLOURS
-from dejavu_torch.evaluation.localization import Localization
+from dejavu_torch.evaluation.localization import Localization, faults
 from dejavu_torch.evaluation.match_plots import (
     draw_coverage,
     draw_examples,
+    draw_pairs,
     draw_posterior,
     draw_scores,
-    example_queries,
+    worst_answers,
 )
+from dejavu_torch.evaluation.pictures import draw_pictures
 from dejavu_torch.types import Match
 
 
@@ -37,20 +41,98 @@ def image(axis):
     return torch.as_tensor(axis.images[0].get_array().filled(torch.nan)).T  # type: ignore[attr-defined]
 
 
-def test_examples_are_the_surest_right_the_surest_wrong_and_one_at_the_border():
-    score = torch.tensor([0.3, 0.2, 0.1, 0.25, 0.9, torch.inf])
-    match = Match(torch.tensor([0, 9, 7, 3, 4, -1]), score, score < 10)
-    truth = torch.arange(6)[:, None]
-    known = torch.tensor([True, True, False, True, True, True])  # query 2, the surest, is not judged
-    judged = GroundTruth(truth, known, truth[:, :0])
-    answers = {3: "surest right answer", 1: "surest wrong answer", 4: "least sure answer"}
-    assert example_queries(match, judged, 0) == answers
-    strict = Match(match.index, score, score < 0.25)
-    assert example_queries(strict, judged, 0) == {
-        3: "surest right answer, surest not accepted",
-        1: answers[1],
-    }
-    assert example_queries(match, None, 0) == {2: "surest answer", 4: answers[4]}
+def answered(index, sure):
+    """A match with probabilities, a truth in which query i shows place i, and a run of both."""
+    index, sure = torch.tensor(index), torch.tensor(sure).double()
+    match = Match(index, 1 - sure.float(), sure >= 0.5, sure)
+    right = torch.arange(len(index))[:, None]
+    return match, GroundTruth(right, torch.ones(len(index)).bool(), right[:, :0])
+
+
+def run_on_frames(match, truth, **more):
+    frames = torch.rand(len(match), 1, 8, 8)
+    model = DejaVu(features=nn.Flatten(), whitening="none").learn(frames)
+    traverse, rows = ArrayTraverse(frames), frames.flatten(1)
+    return Localization(model, traverse, traverse, rows, rows, match, truth, 0, **more)
+
+
+def spines(row):
+    return [to_hex(axis.spines["left"].get_edgecolor()) for axis in row if axis.axison]
+
+
+def worst(match, truth, apart=0):
+    return worst_answers(match, *faults(match, truth, 0), apart)
+
+
+def test_the_worst_answers_are_the_surest_wrong_ones_and_then_the_least_sure():
+    index = [9, 1, 0, 3, 4, 5, 0, 7, -1]  # query 0, 2 and 6 are wrong, 8 has no answer
+    match, truth = answered(index, [0.2, 0.6, 0.8, 0.3, 0.4, 0.9, 0.7, 0.5, 0.0])
+    assert worst(match, truth) == [2, 6, 0, 3, 4, 7]
+    unknown = truth._replace(judged=torch.arange(9) != 2)
+    assert worst(match, unknown) == [6, 0, 3, 4, 7, 1]
+    assert worst(match, None) == [0, 3, 4, 7, 1, 6]
+    plain = replace(match, probability=None)
+    assert worst(plain, truth) == [2, 6, 0, 3, 4, 7]  # by rising score, then by falling
+    assert worst(replace(plain, confidence=match.score), truth)[:3] == [0, 6, 2]
+    assert worst(match[8:], None) == []
+
+
+def test_neighbours_of_a_mistake_are_shown_only_where_there_are_no_others():
+    match, truth = answered([99] * 10 + [*range(10, 70)], [*torch.linspace(0.9, 0.5, 70).tolist()])
+    assert worst(match, truth, 5) == [0, 6, 69, 63, 57, 51]
+    few = GroundTruth(*(part[:14] for part in truth))
+    assert worst(match[:14], few, 5) == [0, 1, 2, 3, 6, 13]
+
+
+def test_pairs_have_red_frames_where_one_image_is_wrong():
+    match, truth = answered([0, 5, 0, 3, 4, 5, 6], [0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3])
+    run = run_on_frames(match, truth)
+    picture = draw_pairs(run)["pairs"]
+    figure, axes = picture.plot
+    assert [spines(row) for row in axes] == [[plots.WRONG] * 2] * 2 + [[plots.RIGHT] * 2] * 4
+    titles = [axis.get_title(loc="left") for axis in axes[0]]
+    assert titles == ["query 1", "reported 5", "right 1"]
+    assert "wrong, probability 0.80" in texts(figure)
+    assert "Of 7 answers by one image 2 are wrong, 2 of them accepted." in picture.caption
+    assert "green: the least sure" in picture.caption
+    untold = draw_pairs(run._replace(truth=None))["pairs"]
+    assert [spines(row) for row in untold.plot[1]] == [[plots.GREY] * 2] * 6
+    assert untold.plot[1][0][1].get_title(loc="left") == "reported 6"
+    nowhere = truth._replace(positives=truth.positives.clone().index_fill_(0, torch.tensor(1), -1))
+    shown = draw_pairs(run._replace(truth=nowhere))["pairs"].plot[1][0]
+    assert shown[2].get_title(loc="left") == "right: none"
+
+
+def test_where_a_drive_answers_its_wrong_single_images_are_shown():
+    single, truth = answered([0, 5, 2, 3, 0, 5], [0.9, 0.8, 0.7, 0.6, 0.5, 0.4])
+    drive = replace(single, index=torch.arange(6))
+    run = run_on_frames(drive, truth, judged=single, smoother=PlaceSmoother())
+    picture = draw_pairs(run)["pairs"]
+    assert [spines(row)[0] for row in picture.plot[1]] == [plots.WRONG] * 2 + [plots.RIGHT] * 4
+    assert "Of 6 answers by one image 2 are wrong. Red" in picture.caption
+    (crosses,) = crosses_of(run)
+    assert list(zip(*crosses.get_data(), strict=True)) == [(1, 5), (4, 0)]
+    assert crosses.get_label() == "2 wrong by one image"
+    assert to_hex(crosses.get_color()) == plots.WRONG
+    assert not crosses_of(run._replace(smoother=None))
+
+
+def drawn_coverage(run):
+    return draw_pictures(run, {})["coverage"].plot[1]
+
+
+def crosses_of(run):
+    return [line for line in drawn_coverage(run).lines if line.get_marker() == "x"]
+
+
+def test_wrong_answers_are_drawn_last_and_larger():
+    match, truth = answered([0, 5, 2, 3, 0, 5], [0.9, 0.8, 0.2, 0.6, 0.3, 0.4])
+    lines = drawn_coverage(run_on_frames(match, truth)).lines
+    assert [line.get_label() for line in lines] == [
+        *("2 right, not accepted", "2 right, accepted", "1 wrong, not accepted", "1 wrong, accepted")
+    ]
+    assert [to_hex(line.get_color()) for line in lines[2:]] == [plots.PALE_WRONG, plots.WRONG]
+    assert lines[2].get_markersize() > lines[1].get_markersize()
 
 
 def test_scores_are_scaled_and_the_best_of_each_block_is_shown():

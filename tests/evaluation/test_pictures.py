@@ -94,7 +94,7 @@ OTHER = nn.Sequential(nn.AvgPool2d(2), nn.Flatten())
     [
         ("pr", {"truth": None}),
         ("", {"truth": GroundTruth(RIGHT, NUMBERS % 3 > 0, RIGHT - 5)}),  # some are unknown
-        ("pr", {"truth": NOTHING}),
+        ("pairs pr", {"truth": NOTHING}),
         ("", {"model": model_of(window=120)}),  # one chunk
         ("examples pairs features", {"of": HOG()}),  # ready features
         ("features", {"model": model_of(features=OTHER)}),

@@ -11,7 +11,7 @@ from drawn import texts
 
 from dejavu_torch.evaluation.contenders import COLOURS, Contender
 from dejavu_torch.evaluation.curves import PRCurve, Scores
-from dejavu_torch.evaluation.plots import DARK, GREY, LAYERS, RIGHT, WRONG
+from dejavu_torch.evaluation.plots import DARK, GREY, LAYERS, PALE_RIGHT, PALE_WRONG, RIGHT, WRONG
 from dejavu_torch.evaluation.score_plots import (
     Stored,
     draw_curves,
@@ -94,7 +94,12 @@ def oklab(colour, sight):
 @pytest.mark.parametrize("sight", SIGHT)
 @pytest.mark.parametrize(
     "together",
-    [list(COLOURS.values())[:10], [RIGHT, WRONG, DARK], [RIGHT, WRONG, GREY], [*LAYERS, COLOURS["map"]]],
+    [
+        list(COLOURS.values())[:10],
+        [RIGHT, WRONG, DARK],
+        [RIGHT, WRONG, PALE_RIGHT, PALE_WRONG, GREY],
+        [*LAYERS, COLOURS["map"]],
+    ],
 )
 def test_colours_that_share_a_picture_differ_for_the_colour_blind(together, sight):
     for one, other in combinations(together, 2):

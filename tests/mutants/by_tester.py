@@ -998,4 +998,25 @@ MUTANTS = [
         "lines[..., 0] += means[:, :1] * math.sqrt(length)",
         ("tests/test_grown_areas.py::-k its_own_mean",),
     ),
+    Mutant(
+        "A report shows the surest wrong answers first.",
+        "dejavu_torch/evaluation/match_plots.py",
+        "sure[mistakes].argsort(descending=True)",
+        "sure[mistakes].argsort()",
+        ("tests/evaluation/test_match_plots.py::-k worst_answers",),
+    ),
+    Mutant(
+        "Neighbours of a shown mistake make room for others.",
+        "dejavu_torch/evaluation/match_plots.py",
+        "(near if close else chosen).append(query)",
+        "chosen.append(query)",
+        ("tests/evaluation/test_match_plots.py::-k neighbours_of_a_mistake",),
+    ),
+    Mutant(
+        "Where a drive answers, a report shows what single images get wrong.",
+        "dejavu_torch/evaluation/localization.py",
+        'self.judged if self.answers == "drive" else self.match',
+        "self.match",
+        ("tests/evaluation/test_match_plots.py::-k a_drive_answers",),
+    ),
 ]
