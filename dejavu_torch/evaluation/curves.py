@@ -160,7 +160,7 @@ def auc_error(match: Match, truth: Truth, tolerance: int, block: int, draws: int
     return float(torch.tensor(areas).std()) if len(areas) > 1 else 0.0
 
 
-def evaluate(match: Match, truth: Truth, tolerance: int) -> Scores:
+def evaluate(match: Match, truth: Truth, tolerance: int = 5) -> Scores:
     """All scores of matches against a truth.
 
     Args:
@@ -168,7 +168,7 @@ def evaluate(match: Match, truth: Truth, tolerance: int) -> Scores:
             (R,Q), has to be flattened.
         truth: in any form of `as_ground_truth`. Queries that are not judged, or that report an ignored place,
             are excluded from precision, recall and the number of queries.
-        tolerance: places, inclusive.
+        tolerance: places, inclusive; by default that of the commands.
 
     Raises:
         InputError: a truth of another length than the matches, a negative tolerance, or no query to judge.
@@ -211,7 +211,7 @@ class Judgement(NamedTuple):
     judged: Tensor
 
 
-def judge(match: Match, truth: Truth, tolerance: int, recalls: Sequence[int] = (1, 5, 10)) -> Judgement:
+def judge(match: Match, truth: Truth, tolerance: int = 5, recalls: Sequence[int] = (1, 5, 10)) -> Judgement:
     """Which queries are right, the recall among their first candidates, and all scores of `evaluate`.
 
     Args:

@@ -20,6 +20,7 @@ from dejavu_torch.evaluation.curves import (
     count_queries,
     curve_of,
     evaluate,
+    judge,
     pr_curve,
     recall_at,
     recall_at_full_precision,
@@ -158,6 +159,7 @@ def test_convention_5_tolerance_is_inclusive_in_every_score():
     assert evaluate(match, truth, 4).recall_at_1 == 0.0
     assert evaluate(match, truth, 5).recall_at_1 == 0.5
     assert evaluate(match, truth, 6).recall_at_1 == 1.0
+    assert evaluate(match, truth) == judge(match, truth).scores == evaluate(match, truth, 5)
     assert curve_of(match, truth, 5).precision.tolist() == [1.0, 0.5]
 
 
