@@ -240,6 +240,15 @@ def test_a_filter_stands_beside_single_queries_in_order_and_changes_nothing_else
     assert all("sequences" not in size for size in ordered["storage"]["map"])
 
 
+def test_single_images_beside_a_drive_have_probabilities():
+    run = compare("sim:aerial?frames=100", "sim:aerial?frames=100&traverse=1").run
+    assert run.answers == "drive"
+    single = run.model.localize_descriptors(run.query_features)
+    torch.testing.assert_close(run.by_one.probability, single.probability)
+    assert run.by_one.probability.min() < 1
+    assert run.by_one.accepted.all()
+
+
 def test_seqslam_s_pixels_stand_beside_a_sequence_of_frames():
     """In frames of noise that repeat after 8, its sequences find what single frames do not."""
     model = template_model(nn.Flatten(), SpectrogramAnalysis(window=64, min_period=4, strongest=1))
