@@ -22,6 +22,7 @@ from dejavu_torch.data.traverse import at_size, resize_like, size_like
 from dejavu_torch.data.turning import Turned, facing_north
 from dejavu_torch.features.descriptor import Descriptor, own_size
 from dejavu_torch.features.extract import features_of
+from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import LabelledFrames
 from dejavu_torch.features.whitening import Whitening
@@ -164,6 +165,17 @@ class DejaVu(nn.Module):
             setattr(self.state, name, value)
         else:
             super().__setattr__(name, value)
+
+    def __repr__(self) -> str:
+        """One line: places, map, and from which features come how many dimensions."""
+        members = self.features.members if isinstance(self.features, Joined) else [self.features]
+        known = ",".join(type(member).__name__ for member in members)
+        known = "ready features" if len(self.frame_shape or ()) == 1 else known
+        if not self.map.places:
+            return f"{type(self).__name__}(no map yet, {known})"
+        kind, size = self.map.kind.rstrip("s"), self.summary().map_bytes / 1e3
+        told = f"{self.map.places} places, {kind} map of {size:.0f} kB, {known} -> {self.map.dimension}"
+        return f"{type(self).__name__}({told})"
 
     def settings(self) -> Facts:
         """The constructor's arguments now: `DejaVu(**model.settings())` is the same model without a map.

@@ -143,6 +143,12 @@ class Traverse(Dataset[Tensor], ABC):
         """The frames of a batch of a DataLoader, read together."""
         return list(self[indices])
 
+    def __repr__(self) -> str:
+        try:
+            return f"{printable(self.name)}: {len(self)} frames {tuple(self.frame_shape)}"
+        except Exception:  # of files that are gone, or none; a debugger still shows it
+            return f"{printable(self.name)}: no frames that can be read"
+
     def __iter__(self) -> Iterator[Tensor]:
         for batch in self.batches():
             yield from batch
@@ -252,7 +258,8 @@ Plan = tuple[FrequencyLayer, ...]
 class Match:
     """Where each query was found (eq. 5) and whether the answer is accepted (eq. 6).
 
-    It unpacks to `index, score, accepted`. Its length, and what `match[i]` and slices select, are queries.
+    It unpacks to `index, score, accepted`. Its length, and what `match[i]` and slices select, are queries. It
+    prints as one line, such as `Match(300 queries, 296 accepted, median probability 0.98)`.
 
     Attributes:
         index: (Q,) int64, the place found, -1 if no place has a finite score; (Q,k) candidates, best first.
@@ -294,7 +301,18 @@ class Match:
         return replace(self.map(lambda column: column[queries]), sequences=sequences)
 
     def __repr__(self) -> str:
-        return f"Match({', '.join(f'{name}={column}' for name, column in self.columns.items())})"
+        """One line; the columns themselves of a single answer, such as `match[3]`."""
+        shape, first = self.index.shape, self
+        if not shape:
+            return f"Match({', '.join(f'{name}={column}' for name, column in self.columns.items())})"
+        told = f"{' x '.join(map(str, shape))} quer{'y' if shape == (1,) else 'ies'}"
+        if len(shape) == 2:
+            told = f"{shape[0]} queries x {shape[1]} candidates"
+            first = self.map(lambda column: column[:, :1])
+        told += f", {int(first.accepted.sum())} accepted"
+        if first.probability is not None and first.probability.numel():
+            told += f", median probability {float(first.probability.nanmedian()):.2f}"
+        return f"Match({told})"
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Match:
         """The same change in every column, but not in `sequences`."""

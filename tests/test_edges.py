@@ -308,6 +308,23 @@ def test_the_length_and_parts_of_a_match_are_queries():
     assert repr(match[1]) == "Match(index=1, score=0.25, accepted=True, probability=0.125)"
 
 
+def test_a_match_prints_as_one_line():
+    index, score = torch.arange(250), torch.rand(250)
+    match = Match(index, score, index >= 10)
+    assert repr(match) == "Match(250 queries, 240 accepted)"
+    assert repr(match[:1]) == "Match(1 query, 0 accepted)"
+    assert repr(match[:0]) == "Match(0 queries, 0 accepted)"
+    sure = dataclasses.replace(match, probability=index.double() / 249)
+    assert repr(sure) == "Match(250 queries, 240 accepted, median probability 0.50)"
+    assert repr(sure[:0]) == "Match(0 queries, 0 accepted)"
+    nan = torch.full((250, 2), torch.nan).double()
+    ranked = sure.map(lambda column: column[:, None].expand(-1, 3))
+    ranked = dataclasses.replace(ranked, probability=torch.cat([sure.probability[:, None], nan], 1))
+    assert repr(ranked) == "Match(250 queries x 3 candidates, 240 accepted, median probability 0.50)"
+    assert repr(ranked[:0]) == "Match(0 queries x 3 candidates, 0 accepted)"
+    assert repr(match.map(lambda column: column.view(2, 5, 25))) == "Match(2 x 5 x 25 queries, 240 accepted)"
+
+
 # torch.func through a whole model
 
 

@@ -104,6 +104,17 @@ def test_tensors_traverses_and_batch_sizes_agree(make):
         torch.testing.assert_close(found.score, expected.score)
 
 
+def test_a_model_prints_as_one_line():
+    assert repr(DejaVu()) == "DejaVu(no map yet, HOG,Distilled)"
+    model = wave_model()
+    assert repr(model) == f"DejaVu(no map yet, {type(model.features).__name__})"
+    size = round(model.learn(waves()).summary().map_bytes / 1e3)
+    assert repr(model) == f"DejaVu(72 places, template map of {size} kB, ready features -> 2)"
+    seen = DejaVu(HOG(), whitening="none").learn(pictures())
+    size = round(seen.summary().map_bytes / 1e3)
+    assert str(seen) == f"DejaVu(72 places, spectral map of {size} kB, HOG -> {seen.map.dimension})"
+
+
 def test_preprocessing_comes_ahead_of_the_features_everywhere(tmp_path):
     frames = torch.rand(40, 3, SIZE, SIZE)
     by_hand = Preprocess("R-B", "patch", patch=5)(frames)

@@ -50,8 +50,9 @@ def best_match(scores: Tensor, threshold: float | None = None) -> Match:
         InputError: not (Q,N) with N >= 1.
 
     Example:
-        >>> best_match(torch.tensor([[3.0, 1.0, 1.0], [2.0, 4.0, 9.0]]), threshold=2.0)
-        Match(index=tensor([1, 0]), score=tensor([1., 2.]), accepted=tensor([ True, False]))
+        >>> match = best_match(torch.tensor([[3.0, 1.0, 1.0], [2.0, 4.0, 9.0]]), threshold=2.0)
+        >>> match.index, match.score, match.accepted
+        (tensor([1, 0]), tensor([1., 2.]), tensor([ True, False]))
     """
     lead = scores.shape[:-1] if isinstance(scores, Tensor) and scores.ndim > 2 else ()
     found = best_candidates(scores.flatten(0, -2) if lead else scores, 1, 0)

@@ -172,6 +172,10 @@ def test_a_traverse_of_ones_own_is_a_length_and_a_reader():
     assert torch.equal(Ramp(40)[3:9], VALUES[3:9])
     assert torch.equal(all_of(Ramp(40), 7), VALUES)
     assert (Ramp(3).names, Ramp(3).times, Ramp(3).places, Ramp(3).frame_shape) == ((), None, None, (1,))
+    assert [repr(Ramp(40)), repr(Ramp(0))] == [
+        "traverse: 40 frames (1,)",
+        "traverse: no frames that can be read",
+    ]
     with refused("traverse holds no frames", "at least one"):
         DejaVu().learn(Ramp(0))
     with refused("0 frames", "at least 1"):

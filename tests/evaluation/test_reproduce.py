@@ -9,6 +9,7 @@ from unittest.mock import create_autospec
 import pytest
 import torch
 from helpers import refused
+from torch import nn
 
 from dejavu_torch.cli import main
 from dejavu_torch.data.arrays import ArrayTraverse
@@ -63,7 +64,7 @@ def test_the_paper_s_settings_are_the_default(monkeypatch):
         with pytest.raises(Asked):
             reproduce(dataset)
         model, expected = asked.call_args.kwargs["model"], paper_model(open_source(f"sim:{dataset}?frames=1"))
-        assert str(model) == str(expected)
+        assert nn.Module.__repr__(model) == nn.Module.__repr__(expected)
         assert (model.velocity is None) == (dataset == "aerial")
         assert [reference.name for reference in asked.call_args.args] == [
             open_source(f"sim:{dataset}?seed=0{traverse}").name for traverse in ("", "&traverse=1")

@@ -1019,4 +1019,25 @@ MUTANTS = [
         "self.match",
         ("tests/evaluation/test_match_plots.py::-k a_drive_answers",),
     ),
+    Mutant(
+        "The median probability of candidates is that of the first ones.",
+        "dejavu_torch/types.py",
+        "first = self.map(lambda column: column[:, :1])",
+        "pass",
+        ("tests/test_edges.py::-k prints_as_one_line",),
+    ),
+    Mutant(
+        "A source without frames can be printed.",
+        "dejavu_torch/types.py",
+        "        except Exception:  #",
+        "        except IndexError:  #",
+        ("tests/data/test_traverse.py::-k ones_own",),
+    ),
+    Mutant(
+        "Single images beside a drive have probabilities.",
+        "dejavu_torch/evaluation/compare.py",
+        "Matching(how.sequence, platt=platt) if drive",
+        "Matching(how.sequence) if drive",
+        ("tests/evaluation/test_compare.py::-k single_images_beside",),
+    ),
 ]
