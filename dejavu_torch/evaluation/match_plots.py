@@ -108,17 +108,15 @@ def draw_pairs(run: Localization) -> plots.Pictures:
 def worst_answers(match: Match, judged: Tensor, wrong: Tensor, apart: int) -> list[int]:
     """The queries of `PAIRS` judged answers: the surest wrong ones, then the least sure; while there are
     others, none within `apart` queries of a worse one, as neighbours share a mistake."""
-    known = (match.probability, match.confidence, -match.score)
-    sure = next(one for one in known if one is not None)
+    sure = next(one for one in (match.probability, match.confidence, -match.score) if one is not None)
     mistakes, others = (which.nonzero()[:, 0] for which in (wrong, judged & ~wrong))
     falling, rising = sure[mistakes].argsort(descending=True), sure[others].argsort()
     order: list[int] = torch.cat([mistakes[falling], others[rising]]).tolist()
     chosen: list[int] = []
-    near: list[int] = []
     for query in order:
-        if len(chosen) < PAIRS:
-            close = any(abs(query - other) <= apart for other in chosen)
-            (near if close else chosen).append(query)
+        if len(chosen) < PAIRS and all(abs(query - other) > apart for other in chosen):
+            chosen.append(query)
+    near = [query for query in order if query not in chosen]
     return sorted((chosen + near)[:PAIRS], key=order.index)
 
 

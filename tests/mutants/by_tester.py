@@ -1008,8 +1008,8 @@ MUTANTS = [
     Mutant(
         "Neighbours of a shown mistake make room for others.",
         "dejavu_torch/evaluation/match_plots.py",
-        "(near if close else chosen).append(query)",
-        "chosen.append(query)",
+        "all(abs(query - other) > apart for other in chosen)",
+        "query not in chosen",
         ("tests/evaluation/test_match_plots.py::-k neighbours_of_a_mistake",),
     ),
     Mutant(
