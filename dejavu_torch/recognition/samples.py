@@ -198,7 +198,11 @@ def replaced(found: TopK, queries: Tensor, rest: TopK) -> TopK:
 
 @cache
 def has_int8_products(device: str = "cpu") -> bool:
-    """Whether torch multiplies 8-bit integers fast on this kind of device."""
+    """Whether torch multiplies 8-bit integers fast, and exactly, on this kind of device."""
     if device == "cuda":  # from Turing on; not ROCm
         return torch.version.hip is None and torch.cuda.get_device_capability() >= (7, 5)
-    return device == "cpu" and torch.backends.mkldnn.is_available() and torch.cpu._is_vnni_supported()
+    if device != "cpu" or not (torch.backends.mkldnn.is_available() and torch.cpu._is_vnni_supported()):
+        return False
+    # without VNNI, of which ONEDNN_MAX_CPU_ISA may deprive torch, sums of two products saturate at 16 bits
+    most = torch.full((GROUP * GROUPS_PER_BLOCK, GROUP), LEVELS, dtype=torch.int8, device=device)
+    return bool((torch._int_mm(most, most.T) == GROUP * LEVELS**2).all())

@@ -817,6 +817,13 @@ MUTANTS = [
         ("tests/recognition/test_coarse.py::-k eight_bits_leave",),
     ),
     Mutant(
+        "Products of 8 bits that saturate are not used.",
+        "dejavu_torch/recognition/samples.py",
+        "    return bool((torch._int_mm(most, most.T) == GROUP * LEVELS**2).all())",
+        "    return True",
+        ("tests/recognition/test_coarse.py::-k saturate_are_not_used",),
+    ),
+    Mutant(
         "As many groups are scored as candidates may suppress.",
         "dejavu_torch/recognition/samples.py",
         "topk_groups(best, max(REFINED, count))",

@@ -93,16 +93,21 @@ def test_a_short_map_is_compared_with_whole(settings, stage, int8, monkeypatch):
 
 
 def test_a_query_of_which_eight_bits_leave_no_best_place_is_scanned():
-    """Of a standing camera: there are more places as good as the best than are looked at."""
+    """Of a standing camera: more places than are looked at are worse than the best by less than 8 bits tell,
+    but by more than rounding."""
+    draw = torch.Generator().manual_seed(0)
     still = walk(400, 24, 0, 0.9).repeat_interleave(torch.where(torch.arange(400) == 200, 600, 1), 0)
-    learned = SpectralMapper(None, 0.01)(still + 1e-4 * torch.randn(still.shape))
-    search, queries, wanted = searcher(learned), torch.cat([still[500:501], torch.zeros(1, 24)]), [(1, 0)]
+    learned = SpectralMapper(None, 0.01)(still + 0.03 * torch.randn(still.shape, generator=draw))
+    search, shown, wanted = searcher(learned), torch.arange(250, 800, 60), [(1, 0)]
+    rows = torch.cat([learned.decode(chunk) for chunk in range(len(learned.chunks))])[shown]
+    best = learned.scores(rows).topk(2, largest=False).values
+    assert float((best[:, 1] - best[:, 0]).min()) > 2e-4
     assert isinstance(search, RowSearch)
-    score, place = search(queries, wanted)
-    expected = best_candidates(learned.scores(queries), 1, 0)
+    score, place = search(torch.cat([rows, torch.zeros(1, 24)]), wanted)
     found = best_candidates(score, 1, 0, place)
-    assert torch.equal(found.index, expected.index)
-    torch.testing.assert_close(found.score, expected.score)
+    assert found.index[:, 0].tolist() == [*shown.tolist(), 0]  # all are as far from a query of zeros
+    expected = torch.tensor([0.0] * len(shown) + [1])
+    torch.testing.assert_close(found.score[:, 0], expected, rtol=0, atol=1e-4)
     assert not search(torch.full((1, 24), math.nan), wanted)[0].isfinite().any()
 
 
@@ -159,6 +164,37 @@ def test_a_query_that_is_like_no_place_is_scanned():
     score, place = search(queries, [(1, 0)])
     expected = best_candidates(learned.scores(queries), 1, 0)
     assert torch.equal(best_candidates(score, 1, 0, place).index, expected.index)
+
+
+@pytest.mark.parametrize("int8", [False, True])
+def test_products_of_whole_numbers_are_exact(int8, monkeypatch):
+    """Also those of the largest, of which two together need more than 16 bits."""
+    if not int8:
+        monkeypatch.setattr(samples, "has_int8_products", lambda *_: False)
+    signs = torch.randint(2, (1024, 24), generator=torch.Generator().manual_seed(0)) * 2 - 1
+    signs[0], signs[1] = 1, -1
+    rows = (samples.LEVELS * signs).to(torch.int8)
+    for count in (1, 40):
+        queries = rows[:count]
+        found = torch.cat([*samples.products_of(rows, queries)])
+        assert torch.equal(found.long(), rows.long() @ queries.T.long())
+
+
+def test_products_that_saturate_are_not_used(monkeypatch):
+    """As those of kernels without VNNI, which torch may take on a processor with it."""
+
+    def exact(rows, others):
+        return rows.int() @ others.int()
+
+    def saturating(rows, others):
+        lifted, others = rows.int() + 128, others.int()
+        pairs = (lifted[:, :, None] * others).unflatten(1, (-1, 2)).sum(2).clamp(-(2**15), 2**15 - 1)
+        return (pairs.sum(1) - 128 * others.sum(0)).int()
+
+    monkeypatch.setattr(torch.cpu, "_is_vnni_supported", lambda: True)
+    for products, there in ((exact, torch.backends.mkldnn.is_available()), (saturating, False)):
+        monkeypatch.setattr(torch, "_int_mm", products)
+        assert samples.has_int8_products.__wrapped__() == there
 
 
 def test_products_are_the_same_without_those_of_integers(monkeypatch):
