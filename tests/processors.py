@@ -2,7 +2,7 @@
 
 Libraries choose their kernels by the processor, and divide sums by the threads, so that another machine
 rounds otherwise. All processors that this one can imitate, or those named, run with one and with two threads.
-Exit status 1: a test failed somewhere.
+With `--part` they run a part that takes half a minute. Exit status 1: a test failed somewhere.
 """
 
 from __future__ import annotations
@@ -19,13 +19,19 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.spread import THREADS, environment_of, imitable
+from benchmarks.spread import PROCESSORS, THREADS, environment_of, imitable
 
 TESTS = Path(__file__).parent
 FIGURES = "test_readme_figures.py"  # of the whole demo, which takes minutes: once, on this processor
 WHOLE = ("test_golden.py", FIGURES)
 # a sixth of the time, for what one machine computes twice
 ALIKE = ("test_notebooks.py", "test_several_processes.py")
+# what finds places and what scores them, where rounding decides first; the other files of these folders,
+# of calibration and of large maps, take as long as all of these
+PART = {
+    "recognition": "centring coarse drive evidence filter matcher motion search select sequence smoother",
+    "maps": "codec distance file l1 scores spectral spectral_map spectrum template_map templates weights",
+}
 CLOSE = re.compile(r"approx|allclose|assert_close|[ar]tol\b|close\(")
 
 
@@ -65,13 +71,23 @@ def pytest_collection_modifyitems(config, items):
     items[:] = [item for item in items if (item.path, item.originalname) in tests]
 
 
-def run(processor, threads, more):
-    """Runs the chosen tests as one processor."""
-    words = ["-n", str(os.cpu_count()), "--dist", "loadfile", "--tb", "line", "-m", "", "-rfE", *more]
+def part():
+    """The files of the part. All quick tests in them run: exact results hold on any processor, too."""
+    named = ((folder, name) for folder, names in PART.items() for name in names.split())
+    return [str(TESTS / folder / f"test_{name}.py") for folder, name in named]
+
+
+def run(processor, threads, more, only_part=False):
+    """Runs the chosen tests, or the part, as one processor."""
+    words = ["-n", str(os.cpu_count()), "--dist", "loadfile", "--tb", "line", "-rfE"]
     once = (processor, threads) == ("this", 1)
-    files = sorted({str(path) for path, _ in chosen() if once or path.name != FIGURES})
+    if only_part:
+        words += ["-m", "not slow and not figures", *more, *part()]
+    else:
+        files = sorted({str(path) for path, _ in chosen() if once or path.name != FIGURES})
+        words += ["-p", "tests.processors", "-m", "", *more, *files]
     return subprocess.run(
-        [sys.executable, "-m", "pytest", "-p", "tests.processors", *words, *files],
+        [sys.executable, "-m", "pytest", *words],
         cwd=TESTS.parent,
         env=os.environ | environment_of(processor, threads) | {"DEJAVU_TEST_THREADS": str(threads)},
         capture_output=True,
@@ -84,20 +100,23 @@ def main():
     parser = argparse.ArgumentParser(prog="python -m tests.processors", description=__doc__.splitlines()[0])
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"some of {', '.join(imitable())}")
     parser.add_argument("--threads", type=int, nargs="+", default=THREADS, help="1 and 2 unless given")
+    parser.add_argument("--part", action="store_true", help="only some quick tests, for half a minute")
     parser.add_argument("--list", action="store_true", help="print the tests, and run none")
     options = parser.parse_args(given.split())
     if options.list:
-        print(*(f"{path}::{name}" for path, name in chosen()), sep="\n")
+        print(*(part() if options.part else (f"{path}::{name}" for path, name in chosen())), sep="\n")
         return 0
-    if unknown := set(options.names) - set(imitable()):
-        parser.error(
-            f"{', '.join(unknown)}: expected some of {', '.join(imitable())}, whose kernels run here"
-        )
+    here = imitable()
+    if options.part and options.names and set(options.names) <= PROCESSORS.keys() - set(here):
+        print(f"{', '.join(options.names)}: skipped, kernels that do not run here")
+        return 0
+    if unknown := set(options.names) - set(here):
+        parser.error(f"{', '.join(unknown)}: expected some of {', '.join(here)}, whose kernels run here")
     own = torch.backends.cpu.get_cpu_capability().lower()  # which is this one
-    failed, names = False, options.names or [name for name in imitable() if name != own]
+    failed, names = False, options.names or [name for name in here if name != own]
     for processor, threads in product(names, options.threads):
         began = time.monotonic()
-        done = run(processor, threads, more.split())
+        done = run(processor, threads, more.split(), options.part)
         lines = (done.stdout.strip() or done.stderr.strip() or "nothing was printed").splitlines()
         took = f"{time.monotonic() - began:.0f} s"
         print(f"{processor}, {threads} thread{'s' * (threads > 1)}: {lines[-1]} ({took})")
