@@ -23,8 +23,8 @@ from dejavu_torch.features.extract import in_mode
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.maps.spectral_map import SpectralMap, scores_of
 from dejavu_torch.model import DejaVu, require_map
-from dejavu_torch.recognition.calibration import MARGIN
-from dejavu_torch.recognition.calibration import TOLERANCE as TOLERANCE_OF_MARGIN
+from dejavu_torch.recognition.calibration import POWER
+from dejavu_torch.recognition.calibration import TOLERANCE as BEYOND
 from dejavu_torch.recognition.centring import running_mean
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.sequence import SequenceMatcher
@@ -242,7 +242,9 @@ def _facts(model: DejaVu, sequence: SequenceModel | None, centre: bool) -> Facts
         facts |= {"inputs": {name: ["batch", *sizes]}, "outputs": {"scores": ["batch", places]}}
         threshold, platt = model.threshold, model.matching(None).platt
         if platt is not None:  # for `confidence_of`
-            facts["calibration"] = {**platt._asdict(), "margin": MARGIN, "tolerance": TOLERANCE_OF_MARGIN}
+            how = {"power": POWER} if platt.margin is None else {"margin": platt.margin}
+            most = {"slope": platt.slope, "offset": platt.offset, "most": platt.most}
+            facts["calibration"] = most | how | {"tolerance": BEYOND}
             precision = model.acceptance().precision
             facts |= {} if precision is None else {"precision": precision}
     else:

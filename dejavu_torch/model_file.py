@@ -40,7 +40,7 @@ from dejavu_torch.memory import in_float32
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
-from dejavu_torch.recognition.calibration import Calibration, Platt
+from dejavu_torch.recognition.calibration import MARGIN, Calibration, Platt
 from dejavu_torch.text import one_line
 from dejavu_torch.types import Facts, InputError, Training, Traverse, expect
 from dejavu_torch.version import __version__
@@ -254,8 +254,11 @@ def state_from_json(values: Facts, frames: int | None = None) -> ModelState:
     )
 
 
-def _platt(slope: float, offset: float, most: Sequence[Sequence[float]] = ()) -> Platt:
-    return Platt(slope, offset, tuple((upper, limit) for upper, limit in most))
+def _platt(
+    slope: float, offset: float, most: Sequence[Sequence[float]] = (), margin: float | None = MARGIN
+) -> Platt:
+    """A scaling from a file; those of older versions do not name the margin."""
+    return Platt(slope, offset, tuple((upper, limit) for upper, limit in most), margin)
 
 
 def contents(model: Model) -> tuple[dict[str, Tensor], Facts]:

@@ -268,8 +268,8 @@ class Match:
             but for a whole drive.
         route: int64, the index in `map.routes` of the place's route, -1 without a place; None if the map is
             not merged.
-        confidence: float, how much worse the best place over 5 places away is, in the unit of the scores; NaN
-            for all but the first candidate. None if it was not computed.
+        confidence: float, at most 0: -score / other^.75, of the best place over 5 places away; NaN for all
+            but the first candidate. None if it was not computed.
         heading: float, degrees from north, of the turned copy of the query that was found there, NaN without
             a place; None unless several headings were tried.
         sequences: by T, matches (Q,) of the same queries in sequences, a filter or a smoother, for reports;

@@ -22,6 +22,7 @@ def test_evaluate_writes_a_report_and_says_what_was_judged(tmp_path, capsys):
     assert "3 of the queries are in the truth" in out
     assert "2 of the queries have a right place" in out
     report = report_of(tmp_path / "out")
+    assert "auc_by_confidence" in report  # by the column of the file
     assert (report["queries"], report["judged"], report["unknown"], report["with_answer"]) == (84, 3, 81, 2)
     page = (tmp_path / "out" / "index.html").read_text()
     assert "<pre>dejavu evaluate" in page

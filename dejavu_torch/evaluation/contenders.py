@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from dataclasses import replace
 from types import MappingProxyType
 from typing import NamedTuple
 
 from torch import Tensor
 
 from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth, counted
-from dejavu_torch.evaluation.curves import PRCurve, Scores, curve_of, evaluate
+from dejavu_torch.evaluation.curves import PRCurve, Scores, area, by_confidence, curve_of, evaluate
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.types import Facts, Match, SequenceModel, Together
@@ -109,11 +107,10 @@ def contend(
     if truth is None or not counted(match.index, as_ground_truth(truth), tolerance).any():
         return Contender(name, None, bytes, k, fixed=fixed)
     scores, curve = evaluate(match, truth, tolerance), curve_of(match, truth, tolerance)
-    sequences, by_confidence = evaluate_each(match.sequences, truth, tolerance), None
+    sequences, sure = evaluate_each(match.sequences, truth, tolerance), None
     if match.confidence is not None:
-        sure = replace(match, score=(-match.confidence).masked_fill(match.index < 0, math.inf))
-        by_confidence = evaluate(sure, truth, tolerance).auc
-    return Contender(name, scores, bytes, k, curve, fixed, sequences, by_confidence)
+        sure = area(curve_of(by_confidence(match), truth, tolerance))
+    return Contender(name, scores, bytes, k, curve, fixed, sequences, sure)
 
 
 def evaluate_each(

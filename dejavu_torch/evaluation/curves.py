@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal, NamedTuple
 
 import torch
@@ -40,6 +41,7 @@ class Scores(NamedTuple):
     The areas begin at the curve's first point: n right answers of different scores have 1 - 1/n, and of equal
     scores 0. `average_precision` does not depend on n: it is that of scikit-learn for whether the answers are
     right, 1 if all right answers have better scores than all wrong ones; it does not say how many are right.
+    `recall_at_99_precision` orders the answers by `Match.confidence`, where it is known, all others by score.
     """
 
     auc: float
@@ -49,6 +51,7 @@ class Scores(NamedTuple):
     precision_at_100_recall: float
     recall_at_1: float
     average_precision: float
+    recall_at_99_precision: float
 
 
 def pr_curve(
@@ -106,10 +109,19 @@ def average_precision(curve: PRCurve) -> float:
     return float((curve.precision * gains).sum() / gains.sum()) if bool(gains.any()) else 0.0
 
 
-def recall_at_full_precision(curve: PRCurve) -> float:
-    """The largest recall at which every report is right."""
-    perfect = curve.recall[curve.precision == 1]
-    return float(perfect.max()) if len(perfect) else 0.0
+def recall_at_precision(curve: PRCurve, precision: float = 1.0) -> float:
+    """The largest recall at which this share of the reports is right."""
+    reached = curve.recall[curve.precision >= precision]
+    return float(reached.max()) if len(reached) else 0.0
+
+
+def by_confidence(match: Match) -> Match:
+    """The same answers, the most confident first: with scores that fall with their confidence; unchanged if
+    that is unknown."""
+    if match.confidence is None:
+        return match
+    nothing = (match.index < 0) | ~match.score.isfinite()
+    return replace(match, score=(-match.confidence).masked_fill(nothing, torch.inf))
 
 
 def threshold_of_full_precision(curve: PRCurve) -> float | None:
@@ -185,14 +197,16 @@ def evaluate(match: Match, truth: Truth, tolerance: int = 5) -> Scores:
     match, right, answerable = _judged(match, truth, tolerance)
     every = pr_curve(match.score, right, answerable, "all")
     reported = pr_curve(match.score, right, answerable, "reported")
+    surest = pr_curve(by_confidence(match).score, right, answerable, "all")
     return Scores(
         area(every),
         area(reported),
-        recall_at_full_precision(every),
-        recall_at_full_precision(reported),
+        recall_at_precision(every),
+        recall_at_precision(reported),
         int(right.sum()) / max(1, int((match.index >= 0).sum())),
         int(right.sum()) / max(1, int(answerable.sum())),
         average_precision(every),
+        recall_at_precision(surest, 0.99),
     )
 
 

@@ -25,7 +25,7 @@ from dejavu_torch.types import InputError, Match
 log = logging.getLogger("dejavu_torch")
 
 NUMBERS, NAMES = ("query", "place", "score", "accepted"), ("query_name", "place_name")
-EXPECTED = "columns query,place,score and optionally accepted, probability, rank and route"
+EXPECTED = "columns query,place,score and optionally accepted, probability, confidence, rank, route"
 ELSEWHERE = -2  # the place of an answer on another route
 _ACCEPTED = {"1": True, "true": True, "0": False, "false": False}
 
@@ -160,8 +160,9 @@ def read_matches(path: Path, route: str | None = None, repeats: bool = False) ->
             with `repeats`. place: number of the reported reference frame, -1 for none. score: lower is
             better, inf for none.
             accepted: 1 or 0; without this column every match with a finite score is. probability: of being
-            right. rank: the lines of a query are its candidates, ranks 1 to K in this order, with the same K
-            for all queries; the first is its match, and only its probability is used.
+            right. confidence: higher is surer; used if all have one. rank: the lines of a query are its
+            candidates, ranks 1 to K in this order, with the same K for all queries; the first is its match,
+            and only its probability and confidence are used.
             route: the route of the place.
         route: the route whose places can be right; needed if the file has that column.
         repeats: whether a query may be there several times, as resampled footage shows a frame.
@@ -209,15 +210,17 @@ def read_matches(path: Path, route: str | None = None, repeats: bool = False) ->
         if len(places) != len(ranked[0]):
             found = f"query {one.query} has {len(places)} ranks"
             raise InputError(f"{path}: {found}; expected {len(ranked[0])}, as query {answers[0].query} has")
-    queries, _, index, scores, accepted, probability = zip(*answers, strict=True)
+    queries, _, index, scores, accepted, probability, sure = zip(*answers, strict=True)
     match = Match(torch.tensor(index), torch.tensor(scores, dtype=torch.float64), torch.tensor(accepted))
+    if None not in sure:
+        match = replace(match, confidence=torch.tensor(sure, dtype=torch.float64))
     if "probability" in cells:
         match = replace(match, probability=torch.tensor(probability, dtype=torch.float64))
     return Matches(torch.tensor(queries), match, torch.tensor(ranked))
 
 
 class _Answer(NamedTuple):
-    """A row; by default one that reports nothing. Only rank 1 has a probability."""
+    """A row; by default one that reports nothing. Only rank 1 has a probability and a confidence."""
 
     query: int
     rank: int
@@ -225,6 +228,7 @@ class _Answer(NamedTuple):
     score: float = math.inf
     accepted: bool = False
     probability: float = 0.0
+    confidence: float | None = -math.inf
 
 
 def _answer(where: str, cells: dict[str, str]) -> _Answer:
@@ -247,7 +251,7 @@ def _answer(where: str, cells: dict[str, str]) -> _Answer:
     if probability is None or not 0 <= probability <= 1:
         seen = f"probability is {cells['probability']!r}"
         raise InputError(f"{where}: {seen}; expected a number from 0 to 1")
-    return _Answer(query, rank, place, score, accepted, probability)
+    return _Answer(query, rank, place, score, accepted, probability, as_number(cells.get("confidence", "")))
 
 
 def _rows(path: Path) -> Iterator[tuple[str, dict[str, str]]]:

@@ -18,7 +18,9 @@ from dejavu_torch.recognition.smoother import Drive, PlaceSmoother
 from dejavu_torch.types import InputError, Match, SequenceModel, expect
 
 TOLERANCE = 5  # places within which an answer is right
-MARGIN = 2.0  # weight of the margin beside the score itself
+POWER = 0.75  # of the best score elsewhere in a confidence, chosen by `python -m benchmarks order`
+SAME = 1e-6  # two places whose scores are both below it equal the query, and nothing tells them apart
+MARGIN = 2.0  # weight of the margin beside the score itself in a track, and in confidences of older files
 NATS_PER_DEVIATION = 3.0  # weight in a filter's confidence of how far single queries stand out
 MIN_WRONG = 20  # wrong answers to expect of a visit that shows fewer, as they occur in clusters
 DECAY = 0.9  # of a track's running mean, per query
@@ -31,11 +33,13 @@ AGAIN, SURE = 0.05, 0.9  # more places than this, with look-alikes as sure as th
 
 class Platt(NamedTuple):
     """p = 1 / (1 + exp(-(slope * confidence + offset))), but at most p_k for confidences up to c_k, where
-    `most` is ((c_1, p_1), ..): what `look_alikes` allow."""
+    `most` is ((c_1, p_1), ..): what `look_alikes` allow. margin: of a file of an older version, see
+    `confidence`."""
 
     slope: float
     offset: float
     most: tuple[tuple[float, float], ...] = ()
+    margin: float | None = None
 
     def probability(self, confidence: Tensor) -> Tensor:
         """(Q,) -> (Q,) float64 on the CPU, 0 for a confidence of -inf."""
@@ -119,21 +123,35 @@ def look_alikes(platt: Platt, right: Tensor, own: Tensor, others: Tensor) -> Pla
         found = sum(float((known.cpu() >= upper).double().mean()) for known in (right, own)) / 2
         limit = found / (found + k / len(others))
         if limit < float(platt.probability(others.new_tensor([upper]))):
-            most.append((round(upper, 3), round(limit, 3)))
+            most.append((float(f"{upper:.6g}"), round(limit, 3)))
     return platt._replace(most=tuple(most))
 
 
-def confidence_of(scores: Tensor, area: Area | None = None) -> Tensor:
-    """Confidence in the best place of each query, (Q,N) -> (Q,): -score + `MARGIN` x margin, or -inf if no
-    place is found. The margin is the difference to the best score beyond `TOLERANCE` places."""
-    return confidence(best_candidates(scores, min(2, scores.shape[1]), TOLERANCE, area=area))
+def best_pair(scores: Tensor, area: Area | None = None, places: Tensor | None = None) -> Match:
+    """The two best places of each query that are more than `TOLERANCE` apart, (Q,N) -> (Q,2)."""
+    return best_candidates(scores, min(2, scores.shape[1]), TOLERANCE, places, area)
 
 
-def confidence(candidates: Match) -> Tensor:
-    """`confidence_of` from the two best places of each query (Q,2), with suppression radius `TOLERANCE`."""
-    best, second = candidates.score[:, 0], candidates.score[:, -1]
-    margin = torch.where(second.isfinite(), second - best, 0)
-    return torch.where(best.isfinite(), MARGIN * margin - best, -math.inf)
+def confidence_of(scores: Tensor, area: Area | None = None, margin: float | None = None) -> Tensor:
+    """`confidence` in the best place of each query, (Q,N) -> (Q,)."""
+    return confidence(best_pair(scores, area), margin)
+
+
+def confidence(pair: Match, margin: float | None = None) -> Tensor:
+    """Confidence in the better of two places that are more than `TOLERANCE` apart, (Q,2) -> (Q,): -s1 / s2^p
+    for their scores and p = `POWER`; at most 0, -inf if no place is found. With p = 1 it would be the ratio
+    of Lowe's test (2004), with p = 0 the score itself. The unit of scores does not matter to the order.
+
+    Args:
+        margin: the weight w in w (s2 - s1) - s1, which calibrations of older files were fitted to.
+    """
+    best, second = pair.score[:, 0], pair.score[:, -1]
+    second = torch.where(second.isfinite(), second, best)
+    if margin is None:  # a cosine distance may be rounded to less than 0
+        sure = torch.where(second > SAME, -best.clamp(min=0) / second.clamp(min=SAME) ** POWER, -1)
+    else:
+        sure = margin * (second - best) - best
+    return torch.where(best.isfinite(), sure, -math.inf)
 
 
 class Track:

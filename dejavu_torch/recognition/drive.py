@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dejavu_torch.memory import in_one_thread
-from dejavu_torch.recognition.calibration import TOLERANCE, Platt, confidence_of
+from dejavu_torch.recognition.calibration import Platt, best_pair, confidence, confidence_of
 from dejavu_torch.recognition.evidence import Spacing, spacing_of
 from dejavu_torch.recognition.filter import near_scores
 from dejavu_torch.recognition.flight import place_flight
@@ -41,7 +41,7 @@ class Shown(NamedTuple):
 
     match: Match
     absent: Tensor  # probability of being off the map
-    margin: Tensor  # to the best place elsewhere
+    confidence: Tensor  # in the best place
     probability: Tensor
     own: Tensor  # the score of the answer by its query alone
 
@@ -118,14 +118,16 @@ def answer_drives(drives: Sequence[DriveQuery], progress: bool = False) -> list[
         on the CPU.
     """
     shown: list[list[Shown]] = [[] for _ in drives]
-    queries = sum(len(asked.descriptors) for asked in drives)
+    several = len(drives) > 1  # of which each takes about as long
+    count = len(drives) if several else sum(len(asked.descriptors) for asked in drives)
     sizes = [one.rows(torch.arange(min(1, len(one.descriptors)))).shape[1] for one in drives]
     large = any(is_large(len(one.descriptors), size) for one, size in zip(drives, sizes, strict=True))
     one_thread = in_one_thread(math.inf if large else 2 * sum(sizes))
-    with one_thread, progress_of("smoothing", queries, progress, "query") as update:
-        for i, seen in _seen(drives, sizes, progress):
+    unit = "drive" if several else "query"
+    with one_thread, progress_of("smoothing", count, progress, unit) as update:
+        for i, seen in _seen(drives, sizes, progress, update if several else lambda _: None):
             shown[i].append(_shown(drives[i], seen))
-            update(len(seen.scores))
+            update(0 if several else len(seen.scores))
     return [_joined(asked, parts[::-1]) for asked, parts in zip(drives, shown, strict=True)]
 
 
@@ -141,7 +143,7 @@ def _shown(asked: DriveQuery, seen: Seen) -> Shown:
         near = near_in_plane(mass, SHARP, area, weighted=True).clamp(min=torch.finfo(mass.dtype).tiny)
         ranked = (-near.log()).masked_fill(~scores.isfinite(), math.inf)
     columns = None if known is None else known.expand_as(ranked)
-    pair = best_candidates(ranked, min(2, ranked.shape[1]), TOLERANCE, columns, area)
+    sure = confidence(best_pair(ranked, area, columns))
     match = best_candidates(ranked, asked.k, asked.radius, columns, area)
     at = match.index[:, :1].clamp(min=0)
     if known is not None:
@@ -151,11 +153,10 @@ def _shown(asked: DriveQuery, seen: Seen) -> Shown:
     else:
         probability = near_in_plane(mass, within, area).gather(1, at)[:, 0]
     if not asked.answers and asked.platt is not None:
-        by_itself = asked.platt.probability(confidence_of(scores, area))
+        by_itself = asked.platt.probability(confidence_of(scores, area, asked.platt.margin))
         probability = by_itself if queries == 1 else torch.minimum(probability, by_itself)
     probability = probability.masked_fill(match.index[:, 0] < 0, 0)
-    margin = pair.score[:, -1] - pair.score[:, 0] if pair.index.shape[1] > 1 else pair.score[:, 0] * math.nan
-    return Shown(match, 1 - mass.sum(1), margin, probability, scores.gather(1, at)[:, 0])
+    return Shown(match, 1 - mass.sum(1), sure, probability, scores.gather(1, at)[:, 0])
 
 
 def _joined(asked: DriveQuery, parts: list[Shown]) -> Answers:
@@ -166,16 +167,22 @@ def _joined(asked: DriveQuery, parts: list[Shown]) -> Answers:
         match = Match(empty.long(), empty, empty.bool(), empty.double(), confidence=empty)
         return Answers(match, torch.zeros(0).double())
     match = Match.joined(part.match for part in parts)
-    absent, margin, probability, own = (torch.cat(column) for column in [*zip(*parts, strict=True)][1:])
+    absent, sure, probability, own = (torch.cat(column) for column in [*zip(*parts, strict=True)][1:])
     if asked.answers:
-        match = replace(match, score=match.score + doubt(own)[:, None])
+        doubts = doubt(own)
+        match, sure = replace(match, score=match.score + doubts[:, None]), sure - doubts
     match = replace(match, score=match.score.to(own.dtype))
-    confidence = first_of(margin.to(own.dtype), k)
-    return Answers(replace(match, probability=first_of(probability, k), confidence=confidence), absent)
+    confidences = first_of(sure.to(own.dtype), k)
+    return Answers(replace(match, probability=first_of(probability, k), confidence=confidences), absent)
 
 
-def _seen(drives: Sequence[DriveQuery], sizes: Sequence[int], progress: bool) -> Iterator[tuple[int, Seen]]:
-    """Fit the smoothers to drives on so many places; then the numbers of the drives with what is seen."""
+def _seen(
+    drives: Sequence[DriveQuery], sizes: Sequence[int], progress: bool, fitted_one: Callable[[int], object]
+) -> Iterator[tuple[int, Seen]]:
+    """Fit the smoothers to drives on so many places; then the numbers of the drives with what is seen.
+
+    fitted_one: called with 1 for each drive, when its smoother is fitted.
+    """
     spacings: dict[int, Spacing] = {}  # of descriptors that several drives share
     fitted: dict[tuple[int, Layout, int], list[tuple[int, Drive]]] = {}
     for i, (asked, places) in enumerate(zip(drives, sizes, strict=True)):
@@ -184,14 +191,17 @@ def _seen(drives: Sequence[DriveQuery], sizes: Sequence[int], progress: bool) ->
             near = spacing_of(check_descriptors(descriptors))
             mass = place_flight(smoother, rows, len(descriptors), smoother.area, near)
             own = rows if asked.answers else asked.single or rows
+            fitted_one(1)
             yield i, Seen(mass.double(), own(torch.arange(len(descriptors))).cpu())
             continue
         if is_large(len(descriptors), places):
+            fitted_one(1)
             yield from ((i, seen) for seen in _of_windows(asked, places, progress))
             continue
         spacing = spacings.get(id(descriptors))
         spacing = spacings[id(descriptors)] = spacing_of(descriptors) if spacing is None else spacing
         smoother.fit(rows, descriptors, starts, spacing)
+        fitted_one(1)
         kind = len(descriptors), smoother.layout(places, starts), len(smoother.move_logits)
         fitted.setdefault(kind, []).append((i, smoother.drive(rows, descriptors, spacing)))
     for (queries, layout, _), alike in fitted.items():

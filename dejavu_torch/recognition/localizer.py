@@ -14,7 +14,7 @@ from torch import Tensor
 from dejavu_torch.area import Area
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.memory import in_one_thread
-from dejavu_torch.recognition.calibration import TOLERANCE, Platt, Track
+from dejavu_torch.recognition.calibration import TOLERANCE, Platt, Track, best_pair
 from dejavu_torch.recognition.calibration import confidence as confidence_of_pair
 from dejavu_torch.recognition.drive import DriveQuery, first_of, localize_drive
 from dejavu_torch.recognition.filter import PlaceFilter
@@ -275,13 +275,10 @@ class Localizer:
             confidence: for the calibration; None is that of single queries.
         """
         platt, k = self.matching.platt, match.index.shape[1]
-        margin = (
-            pair.score[:, -1] - pair.score[:, 0] if pair.index.shape[1] > 1 else pair.score[:, 0] * math.nan
-        )
-        match = replace(match, confidence=first_of(margin, k))
+        match = replace(match, confidence=first_of(confidence_of_pair(pair), k))
         if platt is not None:
-            probability = platt.probability(confidence_of_pair(pair) if confidence is None else confidence)
-            match = replace(match, probability=first_of(probability, k))
+            known = confidence_of_pair(pair, platt.margin) if confidence is None else confidence
+            match = replace(match, probability=first_of(platt.probability(known), k))
         return self._accepted(match)
 
     def _accepted(self, match: Match, acceptance: Acceptance | None = None) -> Match:
@@ -345,8 +342,3 @@ def copies_of(numbers: Tensor, copies: int) -> Tensor:
 def best_copies(scores: Tensor, copies: int) -> Tensor:
     """The best score of each place over all copies of a query, (B x copies, N) -> (B,N)."""
     return scores if copies == 1 else scores.view(-1, copies, scores.shape[1]).amin(1)
-
-
-def best_pair(scores: Tensor, area: Area | None = None) -> Match:
-    """The two best places of each query that are more than `TOLERANCE` apart, (B,N) -> (B,2)."""
-    return best_candidates(scores, min(2, scores.shape[1]), TOLERANCE, area=area)

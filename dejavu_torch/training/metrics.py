@@ -8,7 +8,7 @@ from torchmetrics import Metric
 from torchmetrics.utilities.data import dim_zero_cat
 
 from dejavu_torch.data.ground_truth import GroundTruth, Truth, scored_and_right
-from dejavu_torch.evaluation.curves import Scores, check_truth, evaluate
+from dejavu_torch.evaluation.curves import Scores, by_confidence, check_truth, evaluate
 from dejavu_torch.types import Match, expect
 
 
@@ -22,7 +22,7 @@ class PlaceRecognition(Metric):
         batch to batch. compute() -> float64 scalars, the fields of `Scores` by name.
 
     Convention: queries that `evaluate` excludes (not judged, or reporting an ignored place) are excluded
-        here. Without any query, for example before the first update, every figure is NaN. The state is three
+        here. Without any query, for example before the first update, every figure is NaN. The state is four
         numbers per query, on the device of the metric.
 
     Raises:
@@ -63,9 +63,8 @@ class PlaceRecognition(Metric):
         kept, good = scored_and_right(index, truth, self.tolerance)
         answerable = (truth.positives >= 0).any(1)
         # the same queries on a map of two places: the reported place is 0, and the right one is 0 or 1
-        rows = torch.stack(
-            [score, (index >= 0).double() - 1, torch.where(answerable, (~good).double(), -1)], 1
-        )
+        placed, sure = (index >= 0).double() - 1, by_confidence(match).score.detach().cpu()
+        rows = torch.stack([score, placed, torch.where(answerable, (~good).double(), -1), sure], 1)
         self.rows.append(rows[kept].flatten().to(self.device))
 
     def compute(self) -> dict[str, Tensor]:
@@ -73,8 +72,8 @@ class PlaceRecognition(Metric):
         figures = Scores(*[float("nan")] * len(Scores._fields))
         rows = dim_zero_cat(self.rows).cpu() if len(self.rows) else torch.zeros(0)
         if len(rows):
-            score, found, right = rows.view(-1, 3).T
-            match = Match(found.long(), score, found >= 0)
+            score, found, right, sure = rows.view(-1, 4).T
+            match = Match(found.long(), score, found >= 0, confidence=-sure)
             figures = evaluate(match, right.long()[:, None], tolerance=0)
         values = torch.tensor(figures, dtype=torch.float64, device=self.device)
         return dict(zip(Scores._fields, values, strict=True))

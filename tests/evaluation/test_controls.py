@@ -45,7 +45,7 @@ def test_convention_8_the_null_of_a_repeating_route_finds_no_layers():
     assert recall(ours) > 0.9
     assert null.index.tolist() == [-1] * 432
     assert not null.accepted.any()
-    assert evaluate(null, torch.arange(432)[:, None], 5) == (0.0,) * 7
+    assert evaluate(null, torch.arange(432)[:, None], 5) == (0.0,) * 8
 
 
 def test_convention_8_the_null_of_the_paper_is_at_chance():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from typing import Literal
 
@@ -23,7 +24,7 @@ from dejavu_torch.evaluation.curves import (
     judge,
     pr_curve,
     recall_at,
-    recall_at_full_precision,
+    recall_at_precision,
     threshold_of_full_precision,
 )
 from dejavu_torch.types import Match
@@ -81,7 +82,9 @@ def test_every_distinct_score_is_a_threshold(queries, recall):
     curve, expected = pr_curve(*columns(queries), recall), literal_curve(queries, recall)
     assert flat(points_of(curve)) == pytest.approx(flat(expected))
     assert area(curve) == pytest.approx(literal_area(expected))
-    assert recall_at_full_precision(curve) == max((r for p, r, _ in expected if p == 1), default=0.0)
+    for precision in (1, 0.75):
+        reached = [r for p, r, _ in expected if p >= precision]
+        assert recall_at_precision(curve, precision) == max(reached, default=0.0)
 
 
 @BOTH
@@ -148,10 +151,25 @@ def test_judge_equals_literal_loops(rows, tolerance):
         precision_at_100_recall=right / max(1, sum(score < INF for score, _, _ in queries)),
         recall_at_1=right / max(1, sum(a for _, _, a in queries)),
         average_precision=literal_average_precision(every),
+        recall_at_99_precision=max((r for p, r, _ in every if p >= 0.99), default=0.0),
     )
     assert evaluate(match, torch.tensor([truth for _, _, truth in rows]), tolerance) == pytest.approx(
         expected
     )
+
+
+@given(PLACED, st.integers(0, 3), st.data())
+def test_recall_at_99_precision_is_in_the_order_of_confidence(rows, tolerance, data):
+    scores = [score for score, _, _ in rows]
+    sure = data.draw(st.lists(st.sampled_from([0.0, 1.0, 2.0, 3.0]), min_size=len(rows), max_size=len(rows)))
+    places, truth = [index for _, index, _ in rows], torch.tensor([truth for _, _, truth in rows])
+    match = replace(match_of(places, scores), confidence=torch.tensor(sure))
+    silent = [index < 0 or score == INF for index, score in zip(places, scores, strict=True)]
+    by_score = [INF if nothing else -one for one, nothing in zip(sure, silent, strict=True)]
+    found = evaluate(match, truth, tolerance)
+    expected = evaluate(match_of(places, by_score), truth, tolerance)
+    assert found.recall_at_99_precision == expected.recall_at_99_precision
+    assert found.auc == evaluate(match_of(places, scores), truth, tolerance).auc
 
 
 def test_convention_5_tolerance_is_inclusive_in_every_score():

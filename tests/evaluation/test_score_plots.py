@@ -21,7 +21,7 @@ from dejavu_torch.evaluation.score_plots import (
 
 def contender(name, auc, points=4):
     curve = PRCurve(*torch.rand(3, points, dtype=torch.float64))
-    return Contender(name, Scores(auc, *torch.rand(6).tolist()), curve=curve)
+    return Contender(name, Scores(auc, *torch.rand(7).tolist()), curve=curve)
 
 
 def rgb(colour):
@@ -48,7 +48,7 @@ def points(*pairs):
 
 def test_the_storage_picture_shows_the_points_and_what_the_null_takes():
     storage = {"map": points((1, 0.5), (2, 0.8)), "null": points((4, 0.5), (16, 0.6)), "interpolated": []}
-    whole = Contender("all of them", Scores(0.9, 0.9, 0.1, 0.1, 0.9, 0.9, 0.9), 100, 1)
+    whole = Contender("all of them", Scores(0.9, 0.9, 0.1, 0.1, 0.9, 0.9, 0.9, 0.9), 100, 1)
     picture = draw_storage({"uncompressed": whole}, storage, "2 frames")["storage"]
     figure, axis = picture.plot
     lines = {line.get_label(): line for line in axis.lines}

@@ -18,6 +18,7 @@ from dejavu_torch.data.source import as_traverse
 from dejavu_torch.evaluation.rejection import calibration_error
 from dejavu_torch.features.views import LabelledFrames, augmented_segments
 from dejavu_torch.model import HIGHEST
+from dejavu_torch.model_file import state_to_json
 from dejavu_torch.recognition.calibration import (
     Calibration,
     Platt,
@@ -88,14 +89,23 @@ def test_no_right_answer_is_refused_and_no_answer_has_no_probability():
 # evidence
 
 
-def test_single_evidence_is_the_margin_beyond_the_tolerance_and_the_score():
+def test_single_evidence_is_the_score_beside_the_best_beyond_the_tolerance():
     scores = torch.full((3, 30), 9.0)
     # best at 11, 4 lies 5 after it: the next is 9
     scores[0, 10:17] = torch.tensor([1.0, 0, 0, 0, 0, 2.0, 4.0])
     scores[1, 3], scores[1, 20] = 1.0, 3.0
     scores[2] = INF
-    assert confidence_of(scores).tolist() == [2 * 9 - 0, 2 * 2 - 1, -INF]
-    assert confidence_of(torch.tensor([[2.0]])).tolist() == [-2]  # nothing to compare with
+    assert confidence_of(scores).tolist() == pytest.approx([0, -1 / 3**0.75, -INF])
+    assert confidence_of(scores, margin=2.0).tolist() == [2 * 9 - 0, 2 * 2 - 1, -INF]
+    assert confidence_of(torch.tensor([[2.0]])).tolist() == pytest.approx([-(2**0.25)])  # with itself
+    assert confidence_of(torch.tensor([[-1e-7, *[0.5] * 9]])).tolist() == [0]  # rounded to less than 0
+    assert confidence_of(torch.tensor([[-1e-7, *[0.0] * 9]])).tolist() == [-1]  # two equal the query
+
+
+@pytest.mark.parametrize("unit", [0.01, 300.0])
+def test_the_order_of_confidence_does_not_depend_on_the_unit_of_scores(unit):
+    scores = torch.rand(40, 30, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(confidence_of(unit * scores).argsort(), confidence_of(scores).argsort())
 
 
 def test_a_track_remembers_how_its_answers_stood_out():
@@ -130,7 +140,8 @@ def test_calibrating_looks_for_places_that_are_there_and_that_are_not():
     assert float(away.mean()) < 0.1
     known = places.where(places % 2 == 0, -1)  # what is not known does not count
     half = calibrated(Watched(40), [(scores, known)])
-    assert half.single == calibrated(Watched(40), [(scores[::2], places[::2])]).single
+    other = calibrated(Watched(40), [(scores[::2], places[::2])]).single
+    assert half.single[:2] == pytest.approx(other[:2], rel=1e-5)
     visit = calibrated(Watched(40), [(scores, places)], another_visit=True)  # none was wrong
     assert float(visit.single.probability(confidence_of(scores)).mean()) > float(there.mean())
     with refused("none of 80 answers"):
@@ -190,6 +201,20 @@ def test_limits_are_kept_in_files(tmp_path):
         assert DejaVu.load(tmp_path / "a.safetensors").calibration == model.calibration
 
 
+def test_a_calibration_of_an_older_file_keeps_the_weight_it_was_fitted_to():
+    """Files that do not name the margin have twice it: their probabilities stay as they were."""
+    model = DejaVu(whitening="none", mapper=SpectralMapper(12.0)).learn(torch.randn(60, 6))
+    model.calibration = Calibration(Platt(2.0, 0.5, (), 2.0), None)
+    older = state_to_json(model.state)
+    assert older["calibration"]["single"].pop("margin") == 2.0
+    queries = torch.randn(30, 6)
+    before = model.localize(queries).probability
+    model.set_extra_state(older)
+    assert torch.equal(model.localize(queries).probability, before)
+    expected = Platt(2.0, 0.5).probability(confidence_of(model(queries), margin=2.0))
+    torch.testing.assert_close(before, expected, rtol=0, atol=1e-4)
+
+
 def test_a_floor_that_was_never_learned_is_known_by_look_alikes(data_dir):
     """Three floors of one plan are learned; a fourth looks like them."""
     floors, queries = (
@@ -199,7 +224,7 @@ def test_a_floor_that_was_never_learned_is_known_by_look_alikes(data_dir):
     right = (match.index - torch.arange(400)).abs() <= 1
     right[300:] = False
     # the copies that calibrate are rounded otherwise on other machines, which moves a few answers
-    assert float(right[match.accepted].double().mean()) >= 0.93
+    assert float(right[match.accepted].double().mean()) >= 0.9
     assert int((right & match.accepted).sum()) >= 250
 
 
@@ -364,6 +389,6 @@ def test_an_export_tells_how_to_get_probabilities(model, tmp_path, monkeypatch):
         scores = model(queries)
     best, index = scores.min(1)
     beyond = (torch.arange(160) - index[:, None]).abs() > facts["tolerance"]
-    margin = scores.masked_fill(~beyond, INF).amin(1) - best
-    told = torch.sigmoid(facts["slope"] * (facts["margin"] * margin - best) + facts["offset"]).double()
+    sure = -best / scores.masked_fill(~beyond, INF).amin(1) ** facts["power"]
+    told = torch.sigmoid(facts["slope"] * sure + facts["offset"]).double()
     torch.testing.assert_close(told, model.localize(queries).probability, atol=1e-3, rtol=0)

@@ -44,7 +44,8 @@ def test_an_answer_has_the_most_mass_around_it():
         mass = posterior[t, max(0, place - 3) : place + 4].sum().item()
         assert match.probability[t].item() == pytest.approx(mass, abs=1e-5)
         beyond = [one for i, one in enumerate(ranked[t].tolist()) if abs(i - place) > 5]
-        assert match.confidence[t].item() == pytest.approx(min(beyond) - ranked[t, place].item(), abs=1e-3)
+        stands_out = -max(0, ranked[t, place].item()) / min(beyond) ** 0.75 - doubt(own)[t].item()
+        assert match.confidence[t].item() == pytest.approx(stands_out, abs=1e-3)
     assert ((-match.score[:, 0]).exp() <= match.probability[:, 0] + 1e-6).all()
 
 
@@ -64,21 +65,21 @@ def test_candidates_are_apart_and_the_first_is_the_answer():
 
 
 def test_what_is_no_drive_is_answered_by_single_queries():
-    scores, smoother = noise(80, 100), PlaceSmoother(within=5)
-    match, alone = localized(scores, smoother, platt=PLATT), localized(scores, PlaceSmoother(within=5))
+    scores, smoother, platt = 5 + noise(80, 100), PlaceSmoother(within=5), Platt(10.0, 14.0)
+    match, alone = localized(scores, smoother, platt=platt), localized(scores, PlaceSmoother(within=5))
     assert not smoother.is_drive
     assert torch.equal(match.index[:, 0], scores.argmin(1))
     assert torch.equal(match.score[:, 0], scores.amin(1))
     assert alone.probability is not None
     assert match.probability is not None
-    single = PLATT.probability(confidence_of(scores))
+    single = platt.probability(confidence_of(scores))
     assert torch.allclose(match.probability[:, 0], torch.minimum(alone.probability[:, 0], single))
     assert single.max() > 0.9 > 0.5 > match.probability.max()
     best = scores.gather(1, match.index)
     far = (torch.arange(100) - match.index).abs() > 5
     second = scores.masked_fill(~far, math.inf).amin(1)
     assert match.confidence is not None
-    assert torch.allclose(match.confidence[:, 0], second - best[:, 0])
+    assert torch.allclose(match.confidence[:, 0], -best[:, 0].clamp(min=0) / second.clamp(min=1e-38) ** 0.75)
 
 
 @pytest.mark.parametrize("drives", [True, False])
@@ -214,7 +215,9 @@ def test_few_queries_and_places_have_answers():
     alone = localized(scores[:, :1], PlaceSmoother(), platt=PLATT)
     assert alone.index.unique().tolist() == [0]
     assert alone.confidence is not None
-    assert alone.confidence.isnan().all()
+    own = alone.score[:, 0]  # compared with itself
+    expected = torch.where(own > 1e-6, -(own.clamp(min=0) ** 0.25), -1.0)
+    assert torch.allclose(alone.confidence[:, 0], expected)
 
 
 @pytest.mark.parametrize("clear", [3.0, 0.0])
