@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -12,9 +13,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from dejavu_torch.area import Area
+from dejavu_torch.area import Area, distance
 from dejavu_torch.evaluation.controls import leave_out_match, null_map, with_mapper
-from dejavu_torch.evaluation.quantiser import product_quantised
+from dejavu_torch.evaluation.quantiser import CENTROIDS, product_quantised
 from dejavu_torch.features.descriptor import is_ready
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.pixels import PatchPixels
@@ -38,6 +39,8 @@ if TYPE_CHECKING:  # training needs the HOG baselines without matplotlib
 log = logging.getLogger("dejavu_torch")
 
 BLOCK_DISTANCES = 2**22  # of Q x N, computed at a time
+ASKED = 1000  # frames, at most, that a stride is chosen by
+SAME_SIZE = 1.02  # times the bytes that a quantiser may take
 
 
 class Baseline(NamedTuple):
@@ -77,19 +80,24 @@ def nearest_frames(
         Match of (Q,). Single queries find stored frames only, sequences also frames between these.
     """
     parts = query.split(whole(BLOCK_DISTANCES // len(reference), matching.copies))
-    batches = with_progress(parts, "baselines", progress)
-    matcher, (stored, nearest) = Localizer(None, matching, area=area), stored_frames(len(reference), k, area)
-    match = Match.joined(map(matcher.match, map(scores_of_stored(reference, k, metric, area), batches)))
+    matcher, stored = Localizer(None, matching, area=area), stored_frames(len(reference), k, area)[0]
+    single = matching.sequence is None or matcher.own == 1
+    alone = Localizer(None, matching._replace(sequence=None, also={}), area=area)
+    score, found = scores_of_stored(reference, k, metric, area), []
+    for scores in map(score, with_progress(parts, "baselines", progress)):
+        match = matcher.match(scores)
+        if k > 1 and (single or 1 in match.sequences):  # else another place would be the same stored frame
+            one = alone.match(of_stored(scores, stored))
+            sequences = {T: one if T == 1 else several for T, several in match.sequences.items()}
+            match = replace(one if single else match, sequences=sequences)
+        found.append(match)
+    return replace(Match.joined(found), probability=None)
 
-    def stored_frame(frame: Tensor) -> Tensor:
-        return torch.where(frame >= 0, stored[nearest[frame]], -1)
 
-    sequences = dict(match.sequences)
-    if 1 in sequences:
-        sequences[1] = sequences[1].renumbered(stored_frame)
-    if matching.sequence is None or matcher.own == 1:  # single queries
-        match = replace(match, index=stored_frame(match.index))
-    return replace(match, probability=None, sequences=sequences)
+def of_stored(scores: Tensor, stored: Tensor) -> Tensor:
+    """Scores (B,N), +inf but at the places that are stored, (n,)."""
+    between = torch.ones(scores.shape[1], dtype=torch.bool).index_fill(0, stored, False)
+    return scores.masked_fill(between.to(scores.device), math.inf)
 
 
 def scores_of_stored(
@@ -144,6 +152,63 @@ def fair_stride(frames: int, dimension: int, itemsize: int, map_bytes: int, tole
     return max(fair, default=1)
 
 
+class Quantised(NamedTuple):
+    """Every k-th frame, coded by a product quantiser.
+
+    restored: (N,K) descriptors, those of the stored frames as they are decoded. k: the stride. bytes: of all
+    codes. codebooks: their bytes. share: of the frames that are found by the mean of their neighbours.
+    """
+
+    restored: Tensor
+    k: int
+    bytes: int
+    codebooks: int
+    share: float
+
+
+def quantised_every_kth(
+    descriptors: Tensor,
+    each: float,
+    tolerance: int,
+    area: Area | None = None,
+    seed: int = 0,
+    centroids: int = CENTROIDS,
+    training: Tensor | None = None,
+) -> Quantised:
+    """Every k-th frame with k times the bytes: of the k up to 2 x tolerance + 1 the one that finds most
+    frames by the mean of their two neighbours, the smallest of the best. The queries have no say in it.
+
+    Args:
+        descriptors: (N,K). each: bytes per frame, of the codes. tolerance: in frames.
+        area: of the frames, if they are of one: every k-th is stored in rows and in columns.
+        seed, centroids, training: see `product_quantised`.
+    """
+    frames, width = descriptors.shape
+    middle = torch.arange(frames)[1:-1]
+    if area is not None:
+        middle = middle[area.distance(middle - 1, middle + 1) == 2]
+    middle = middle[torch.linspace(0, len(middle) - 1, min(ASKED, len(middle))).round().long()]
+    asked, bits = (descriptors[middle - 1] + descriptors[middle + 1]) / 2, math.log2(centroids)
+    best: Quantised | None = None
+    fits = SAME_SIZE * each * frames
+    for k in range(1, 2 * tolerance + 2):
+        stored = stored_frames(frames, k, area)[0]
+        codes = min(width, max(1, int(8 * fits / len(stored) / bits)))
+        size = math.ceil(codes * bits * len(stored) / 8)
+        if size > fits and (best is not None or k <= 2 * tolerance):  # one is taken in any case
+            continue
+        decoded, books = product_quantised(descriptors[stored], codes, seed, centroids, training)
+        index = stored[(normalize(asked) @ normalize(decoded).T).argmax(1).cpu()]
+        share = float((distance(index, middle, area) <= tolerance).double().mean())
+        if best is None or share > best.share:
+            best, kept = Quantised(descriptors, k, size, books, share), (stored, decoded)
+        if share == 1:  # no larger stride finds more
+            break
+    assert best is not None
+    stored, decoded = kept
+    return best._replace(restored=descriptors.index_copy(0, stored.to(descriptors.device), decoded))
+
+
 def baselines_of(
     run: Localization, seed: int = 0, leave_out: int | None = None, progress: bool = False
 ) -> dict[str, Baseline]:
@@ -174,16 +239,16 @@ def baselines_of(
 
     size, own = partial(stride_bytes, frames, dimension, area=area), reference.element_size()
     if spectral:
-        short, code = as_int8(reference), min(dimension, max(1, round(summary.route_bytes / frames)))
-        name, strided = "its descriptors", f"{every(coarsest, one)}, int8"
-        found = _in_one_byte(run, one, progress) if code > 1 else {}
+        short, name, strided = as_int8(reference), "its descriptors", f"{every(coarsest, one)}, int8"
+        found = _in_one_byte(run, one, progress) if summary.route_bytes >= 1.5 * frames else {}
         found["uncompressed"] = nearest(f"{name}, {every(1, one)}, float", reference, 1, size(4, 1))
         if is_ready(run.reference):
-            found = _as_given(run, code, seed, one, progress) | found
+            found = _as_given(run, summary.route_bytes / frames, seed, one, progress) | found
         else:
-            quantised, codebooks = product_quantised(reference, code, seed)
-            quantiser = f"{name}, product quantiser, {code} B"
-            found["product_quantiser"] = nearest(quantiser, quantised, 1, frames * code, more=codebooks)
+            coded = quantised_every_kth(reference, summary.route_bytes / frames, coarsest // 2, area, seed)
+            restored, k, taken, books, _ = coded
+            quantiser = f"{name}, {every(k, one)}, product quantiser"
+            found["product_quantiser"] = nearest(quantiser, restored, k, taken, k, books)
         found["stride"] = nearest(f"{name}, {strided}", short, coarsest, size(1, coarsest), coarsest)
         if area is None:  # along a route
             between, spaced, keys = interpolated(short, summary.route_bytes)
@@ -233,26 +298,24 @@ def _in_one_byte(run: Localization, one: str, progress: bool) -> dict[str, Basel
     return {"one_byte": Baseline(f"this map in 1 byte per {one}", match, fixed + route, None, fixed, asked)}
 
 
-def _as_given(run: Localization, code: int, seed: int, one: str, progress: bool) -> dict[str, Baseline]:
-    """Descriptors of another program as they are, by cosine: all of them, and in `code` bytes each."""
+def _as_given(run: Localization, each: float, seed: int, one: str, progress: bool) -> dict[str, Baseline]:
+    """Descriptors of another program as they are, by cosine: all of them, and in `each` bytes per frame."""
     plain = DejaVu(whitening="none", batch_size=run.model.batch_size)
     stored, queries = (plain.descriptor.all_of(one, progress) for one in (run.reference, run.query))
-    stored, code = normalize(stored.float()), min(code, stored.shape[1])
-    quantised, codebooks = product_quantised(stored, code, seed)
+    stored = normalize(stored.float())
+    restored, k, taken, books, _ = quantised_every_kth(stored, each, run.coarsest // 2, seed=seed)
 
-    def baseline(name: str, rows: Tensor, bytes: int, fixed: int = 0) -> Baseline:
-        match = nearest_frames(rows, queries, 1, "cosine", progress, run.matching)
+    def baseline(name: str, rows: Tensor, bytes: int, k: int = 1, fixed: int = 0) -> Baseline:
+        match = nearest_frames(rows, queries, k, "cosine", progress, run.matching)
         asked = None
         if run.beside is not None:
-            score = scores_of_stored(rows, 1, "cosine")
+            score = scores_of_stored(rows, k, "cosine")
             asked = drive_query(queries, run.beside, score, area=run.model.map.area)
-        return Baseline(f"your descriptors, {name}", match, bytes + fixed, 1, fixed, asked)
+        return Baseline(f"your descriptors, {every(k, one)}{name}", match, bytes + fixed, k, fixed, asked)
 
     return {
-        "exact": baseline(f"exact cosine, {every(1, one)}", stored, stored.nbytes),
-        "product_quantiser": baseline(
-            f"product quantiser, {code} B", quantised, code * len(stored), codebooks
-        ),
+        "exact": baseline(", exact cosine", stored, stored.nbytes),
+        "product_quantiser": baseline(", product quantiser", restored, taken, k, books),
     }
 
 

@@ -11,23 +11,29 @@ TRAINED = 256 * CENTROIDS  # descriptors that centroids are learned from, at mos
 BLOCK = 2**22  # distances computed at a time
 
 
-def product_quantised(descriptors: Tensor, parts: int, seed: int = 0) -> tuple[Tensor, int]:
-    """Descriptors as a product quantiser restores them: a byte for each of several parts of their numbers.
+def product_quantised(
+    descriptors: Tensor,
+    parts: int,
+    seed: int = 0,
+    centroids: int = CENTROIDS,
+    training: Tensor | None = None,
+) -> tuple[Tensor, int]:
+    """Descriptors as a product quantiser restores them: a code for each of several parts of their numbers.
 
     Args:
-        descriptors: (N,K). parts: bytes of a descriptor, at most K.
+        descriptors: (N,K). parts: codes of a descriptor, at most K; with 256 centroids, bytes.
+        centroids: of a part, at most. training: (n,K) that they are learned from; None is the descriptors.
 
     Returns:
         (N,K), and the bytes of all codebooks in float32.
     """
-    draw = torch.Generator().manual_seed(seed)
+    draw, training = torch.Generator().manual_seed(seed), descriptors if training is None else training
     restored, size = torch.empty_like(descriptors), 0
-    chosen = torch.randperm(len(descriptors), generator=draw)[:TRAINED].to(descriptors.device)
+    chosen = training[torch.randperm(len(training), generator=draw)[:TRAINED].to(training.device)]
     for numbers in torch.arange(descriptors.shape[1]).tensor_split(min(parts, descriptors.shape[1])):
-        part = descriptors[:, numbers]
-        centroids = k_means(part[chosen], min(CENTROIDS, len(part)), draw)
-        restored[:, numbers] = centroids[_nearest(part, centroids)]
-        size += 4 * centroids.numel()
+        book = k_means(chosen[:, numbers], min(centroids, len(chosen)), draw)
+        restored[:, numbers] = book[_nearest(descriptors[:, numbers], book)]
+        size += 4 * book.numel()
     return restored, size
 
 

@@ -7,7 +7,15 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dejavu_torch.evaluation.baselines import every, fair_stride, nearest_frames
+from dejavu_torch.area import Area
+from dejavu_torch.evaluation.baselines import (
+    every,
+    fair_stride,
+    nearest_frames,
+    quantised_every_kth,
+    stored_frames,
+)
+from dejavu_torch.evaluation.quantiser import product_quantised
 from dejavu_torch.recognition.localizer import Matching
 from dejavu_torch.recognition.sequence import SequenceMatcher
 
@@ -80,6 +88,74 @@ def test_convention_8_the_stride_is_at_most_twice_the_tolerance():
     strides = {(0, 5): 10, (4000, 5): 10, (4001, 5): 9, (20000, 5): 2, (40000, 5): 1, (40001, 5): 1}
     strides |= {(0, 1): 2, (0, 0): 1}
     assert {given: fair_stride(1000, 10, 4, *given) for given in strides} == strides
+
+
+def literal_stride(rows, each, tolerance):
+    """The stride whose quantised frames find most frames by the mean of their neighbours, one at a time."""
+    found = {}
+    for k in range(1, 2 * tolerance + 2):
+        kept = torch.arange(0, len(rows), k)
+        codes = max(1, int(1.02 * each * len(rows) / len(kept)))
+        if codes * len(kept) <= 1.02 * each * len(rows):
+            stored, right = product_quantised(rows[kept], min(codes, rows.shape[1]))[0], 0
+            for i in range(1, len(rows) - 1):
+                asked = (rows[i - 1] + rows[i + 1]) / 2
+                place = int(kept[int(torch.cosine_similarity(asked[None], stored).argmax())])
+                right += abs(place - i) <= tolerance
+            found[k] = right
+    return max(found, key=lambda k: (found[k], -k))
+
+
+@pytest.mark.parametrize("each", [0.3, 1.0, 5.0])
+def test_a_product_quantiser_of_every_kth_frame(each):
+    """Chosen on the reference alone; of noise that changes slowly, fewer frames in more bytes are found."""
+    rows = torch.randn(300, 12, generator=torch.Generator().manual_seed(0)).cumsum(0)
+    rows = torch.nn.functional.normalize(rows - rows.mean(0))
+    rows[100:160] = rows[100]  # it stands: most of these are not found, whatever the stride
+    found = quantised_every_kth(rows, each, 3)
+    assert found.k == literal_stride(rows, each, 3)
+    stored = torch.arange(0, 300, found.k)
+    codes = min(12, int(1.02 * each * 300 / len(stored)))
+    assert found.bytes == codes * len(stored) <= 1.02 * each * 300
+    decoded, books = product_quantised(rows[stored], codes)
+    assert torch.equal(found.restored[stored], decoded)
+    assert found.codebooks == books
+    assert quantised_every_kth(rows, 5.0, 0).k == 1  # each frame is asked for
+    few = quantised_every_kth(rows, each, 3, centroids=16)
+    assert few.codebooks == 4 * 16 * 12
+    assert few.bytes <= 1.02 * each * 300 + 1
+
+
+@pytest.mark.parametrize("k", [1, 4, 7, 11])
+def test_the_best_place_elsewhere_is_another_stored_frame(k):
+    """Whatever the stride, the confidence of a single answer compares two stored frames."""
+    reference, query = torch.rand(60, 4), torch.rand(30, 4)
+    match = nearest_frames(reference, query, k)
+    stored = torch.arange(0, 60, k)
+    distances = torch.cdist(query, reference[stored], p=1)
+    for q, row in enumerate(distances):
+        best = int(row.argmin())
+        elsewhere = row[(stored - stored[best]).abs() > 5].min()
+        assert match.index[q] == stored[best]
+        assert match.confidence[q] == pytest.approx(float(-row[best] / elsewhere**0.75), rel=1e-4)
+
+
+def test_a_product_quantiser_of_an_area_skips_rows_and_columns():
+    area = Area(9, 12)
+    rows = torch.randn(area.places, 16, generator=torch.Generator().manual_seed(0))
+    found = quantised_every_kth(rows, 1.0, 1, area)
+    stored = len(stored_frames(area.places, found.k, area)[0])
+    assert stored == -(-9 // found.k) * -(-12 // found.k)
+    assert found.bytes % stored == 0
+
+
+def test_codebooks_of_another_route_are_learned_there():
+    draw = torch.Generator().manual_seed(0)
+    rows, other = torch.randn(80, 8, generator=draw), torch.randn(60, 8, generator=draw)
+    decoded, _ = product_quantised(rows, 2, training=other)
+    for part in (slice(0, 4), slice(4, 8)):  # of so few, each is a centroid
+        nearest = torch.cdist(rows[:, part], other[:, part]).argmin(1)
+        torch.testing.assert_close(decoded[:, part], other[nearest][:, part])
 
 
 def test_strides_in_words():
