@@ -106,7 +106,8 @@ def _short_work(request):
             Image.new("L", (1, 1)).save(one, "png")
             patch.setattr("dejavu_torch.evaluation.report.as_png", lambda picture: one.getvalue())
         if request.path.stem in UNDRAWN:  # nobody looks at the pictures of these comparisons
-            patch.setattr("dejavu_torch.evaluation.compare.draw_pictures", lambda *_: {})
+            for drawn in ("draw_pictures", "draw_compared"):
+                patch.setattr(f"dejavu_torch.evaluation.compare.{drawn}", lambda *_: {})
         if request.path.stem in FEW_VIEWS:
             patch.setattr("dejavu_torch.features.whitening.VIEWS", 1)
             patch.setattr("dejavu_torch.features.whitening.VIEWS_PER_COMPONENT", 1)

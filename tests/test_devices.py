@@ -218,7 +218,7 @@ def test_a_gpu_finds_what_the_cpu_finds(kind, device, frames):
 @pytest.mark.parametrize("mapper", ["templates", "spectral"])
 def test_a_comparison_runs_on_a_gpu(mapper, device, visits, tmp_path, monkeypatch):
     """With calibration, baselines and nulls; the map is then saved, and loaded to the device."""
-    for drawn in ("draw_pictures", "draw_reliability"):  # from a model on the CPU
+    for drawn in ("draw_pictures", "draw_compared", "draw_reliability"):  # from a model on the CPU
         monkeypatch.setattr(f"dejavu_torch.evaluation.compare.{drawn}", lambda *_: {})
     chosen = LEARNED["templates"] if mapper == "templates" else SpectralMapper()
     compared = compare(*visits, "0", small(mapper=chosen).to(device), ordered=True, top=2)

@@ -381,6 +381,7 @@ class EvaluationOptions:
         top: write this many places per query, no two within the tolerance
         distractors: footage of other places, or several, '[A,B]': how much of it is wrongly accepted?
         storage_curve: also evaluate maps of other sizes; this doubles the time
+        drives: matched as whole drives too: few contenders (float and control), or all
     """
 
     truth: str | None = None
@@ -390,6 +391,7 @@ class EvaluationOptions:
     top: int | None = None
     distractors: list[str] | str | None = None
     storage_curve: bool = False
+    drives: Literal["few", "all"] = "few"
 
     def off_map(self, traverses: Collection[Traverse]) -> list[Traverse]:
         """The distractors, none of which may be one of the traverses."""

@@ -6,7 +6,7 @@ import webbrowser
 from collections.abc import Sequence
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from dejavu_torch.cli import options
 from dejavu_torch.cli.commands import (
@@ -43,6 +43,7 @@ def run_demo(
     verbose: bool = False,
     seed: int = 0,
     second: list[str] | str | None = None,
+    drives: Literal["few", "all"] = "few",
     model: DejaVu,
     command: str,
 ) -> None:
@@ -55,6 +56,7 @@ def run_demo(
         verbose: print all scores, as compare does
         seed: seed of the whitening and the controls, and of the simulated road
         second: another visit to the road, to learn which changes to ignore, or several, '[A,B]'
+        drives: contenders that are also matched as a whole drive, see compare
     """
     from dejavu_torch.evaluation.compare import compare
     from dejavu_torch.evaluation.reproduce import paper_model
@@ -73,8 +75,14 @@ def run_demo(
     same = recipe_of(model.mapper) == recipe_of(paper.mapper)
     others = {} if same else {"paper": ("the paper to the letter", paper)}
     settings: Facts = {"seed": seed, "second": views, "others": others, "progress": True}
+    title = f"dejavu demo: two {what}"
+
+    def on_found(found: Comparison) -> None:
+        _publish_found(found, out, title, command, verbose=verbose)
+
+    settings |= {"drives": drives, "on_found": on_found}
     result = compare(reference, query, model=model, storage_curve=True, **settings)
-    _publish(result, out, f"dejavu demo: two {what}", command, verbose=verbose, show=open)
+    _publish(result, out, title, command, verbose=verbose, show=open)
     print_localize(out / "map.safetensors", model, command, localized, "or try")
     print_next("compare", "MORNING", "EVENING")
 
@@ -140,6 +148,8 @@ def run_compare(
         learning.check_calibrated(model, first, map, judging.distractors)
     learning.seed_whitening(model)
     first, views, known = learning.with_views(model, first, queries)
+    on, asked = short_name(reference), None if query is None else short_name(query)
+    title = f"loops within {on}" if asked is None else f"{asked} found on {on}"
     result = compare(
         first,
         None if query is None else queries,
@@ -159,11 +169,11 @@ def run_compare(
         centre=None if ordering.centre is None else ordering.centre == "mean",
         loops=loops,
         headings=headings,
+        drives=judging.drives,
+        on_found=lambda found: _publish_found(found, out, title, command, map, judging.top),
         progress=True,
     )
-    on, asked = short_name(reference), None if query is None else short_name(query)
-    title = f"loops within {on}" if asked is None else f"{asked} found on {on}"
-    _publish(result, out, title, command, map, judging.top, show=open)
+    _publish(result, out, title, command, show=open)
 
 
 def _check_loops(
@@ -203,7 +213,7 @@ def run_evaluate(
     """Score a csv of matches from any method: scores, curve, coverage.
 
     Args:
-        matches: csv of query,place,score[,accepted][,probability][,rank][,route]
+        matches: csv of query,place,score[,accepted][,probability][,confidence][,rank][,route]
         truth: right places, as in `dejavu compare`
         out: folder for report and pictures
         tolerance: count an answer as right if it is at most this many frames off
@@ -301,41 +311,54 @@ def _check_report_folder(
             check_not_read(out / name, *sources, *files)
 
 
-def _publish(
-    result: Comparison,
+def _publish_found(
+    found: Comparison,
     out: Path,
     title: str,
     command: str,
     given: Path | None = None,
     top: int | None = None,
     verbose: bool = True,
-    show: bool = False,
 ) -> None:
-    """Write map, matches and report of a comparison, and print its scores.
+    """Write map, matches and a page of what was found, before it is compared, and print it.
 
     Args:
         given: file of the map, unless it was learned.
         top: candidates of each query to write; None writes the matches.
-        verbose: print all of them, not only what was found. show: open the report.
+        verbose: also print the map.
     """
     from dejavu_torch.evaluation.report import found_lines, report_folder, write_report
 
-    run, kept = result.run, out / "map.safetensors"
-    _print_contradiction(result.report)
+    run, kept = found.run, out / "map.safetensors"
+    _print_contradiction(found.report)
     if verbose:
         _print_run(run)
     match = run.match
     if top is not None:
-        match = result.candidates.map(lambda column: column[:, :top].flatten())
+        match = found.candidates.map(lambda column: column[:, :top].flatten())
     with report_folder(out) as folder:
         if given is None or given.resolve() != kept.resolve():
             run.model.save(folder / kept.name)
         write_matches(folder / "matches.csv", [match], run.query, run.model, top)
-        write_report(folder, result.report, result.pictures, title, command, str(run.model.summary()))
+        plan = str(run.model.summary())
+        write_report(folder, found.report, found.pictures, title, command, plan, complete=False)
+    if lines := found_lines(found.report):
+        print("\n".join(lines), end="\n\n", flush=True)
+
+
+def _publish(
+    result: Comparison, out: Path, title: str, command: str, verbose: bool = True, show: bool = False
+) -> None:
+    """Write the complete report of a comparison, and print its scores: all of them, or a short table."""
+    from dejavu_torch.evaluation.report import compared_lines, report_folder, write_report
+
+    plan = str(result.run.model.summary())
+    with report_folder(out) as folder:
+        write_report(folder, result.report, result.pictures, title, command, plan)
     if verbose:
         _print_scores(result.report, out)
     else:
-        print("\n".join(found_lines(result.report)))
+        print("\n".join(compared_lines(result.report)))
         say(f"the page with pictures: {out / 'index.html'}")
     if show and not webbrowser.open((out / "index.html").absolute().as_uri()):
         say(f"there is no browser here; the report is {(out / 'index.html').absolute()}")

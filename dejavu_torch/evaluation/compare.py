@@ -6,7 +6,7 @@ import copy
 import logging
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -32,9 +32,9 @@ from dejavu_torch.data.turning import Turned, facing_north
 from dejavu_torch.evaluation.baselines import Baseline, baselines_of, with_drives
 from dejavu_torch.evaluation.contenders import Contender, contend, models_beside
 from dejavu_torch.evaluation.evaluate import RANKS
-from dejavu_torch.evaluation.facts import facts_of, match_facts, metric_facts
+from dejavu_torch.evaluation.facts import facts_of, match_facts, metric_facts, peak_memory
 from dejavu_torch.evaluation.localization import NOTHING, Localization
-from dejavu_torch.evaluation.pictures import draw_pictures
+from dejavu_torch.evaluation.pictures import draw_compared, draw_pictures
 from dejavu_torch.evaluation.plots import Pictures
 from dejavu_torch.evaluation.rejection import draw_reliability
 from dejavu_torch.evaluation.report import Report, as_html
@@ -59,6 +59,7 @@ SAMPLED = 256  # reference frames that a given map is checked with
 NEAR = 10  # places within which the map should find them, at least
 # scores up to which ordered queries are also filtered and smoothed by default, on a route and over an area
 MAX_FILTERED, MAX_FLOWN = 2**25, 2**23
+DRIVEN = ("uncompressed", "null")  # contenders that are also matched as a whole drive
 
 Seconds = dict[str, float]  # that each stage took
 OtherModels = Mapping[str, tuple[str, DejaVu]]  # their names and models, by their keys in report.json
@@ -103,6 +104,8 @@ def compare(
     ordered: bool | None = None,
     loops: int | None = None,
     headings: int = 1,
+    drives: Literal["few", "all"] = "few",
+    on_found: Callable[[Comparison], object] | None = None,
     progress: bool = False,
 ) -> Comparison:
     """Learn the reference, localize the queries on it, and compare with other ways to store the route.
@@ -132,10 +135,12 @@ def compare(
         storage_curve: also code a spectral map at several sizes, see `coded_at_sizes`:
             the report gets `storage` and its picture. Needs a ground truth.
         ordered: whether the queries are consecutive. If so, the report also has the scores of a filter and
-            of a smoother, on the map and on all baselines. None: as their source says.
+            of a smoother, see `drives`. None: as their source says.
         loops: also the query is the reference: find where it comes back to places of this many places before,
             see `DejaVu.loops`. The baselines are asked for the same.
         headings: on the map of an area, see `DejaVu.localize`; of all contenders.
+        drives: contenders that are also matched as a whole drive: the map, its float and the control, or all.
+        on_found: called with the map's own answers, before they are compared with anything.
         progress: show progress bars on a terminal.
 
     Raises:
@@ -195,20 +200,23 @@ def compare(
             truth=known, reference_features=places.cpu(), query_features=run.query_features.cpu()
         )
         ours = run.contend("this map", run.judged.renumbered(model.map.table.scored), model)
-        contenders = _other_contenders(run, others or {}, leave_out, seed, progress)
+        facts = {
+            **facts_of(run, seconds),
+            **match_facts(run, found, truth, interpolate, off_map),
+            "centred": centring,
+            **({"headings": headings} if headings > 1 else {}),
+            **metric_facts(run, truth),
+            **({"second": second.placed_facts()} if second is not None and second.placed else {}),
+        }
+        pictures = draw_pictures(run, {"map": ours}) | draw_reliability(run.scored, known, tolerance)
+        if on_found is not None:
+            on_found(Comparison(Report(ours, {}, facts), pictures, run, candidates))
+        contenders = _other_contenders(run, others or {}, leave_out, drives == "all", seed, progress)
     coded = model.map if ours.scores is not None and isinstance(model.map, SpectralMap) else None
     storage = coded_at_sizes(run, seed=seed, progress=progress) if storage_curve and coded else None
-    pictures = draw_pictures(run, {"map": ours, **contenders}, storage)
-    pictures |= draw_reliability(run.scored, known, tolerance)
-    facts = {
-        **facts_of(run, seconds),
-        **match_facts(run, found, truth, interpolate, off_map),
-        "centred": centring,
-        **({"headings": headings} if headings > 1 else {}),
-        **metric_facts(run, truth),
-        **({"second": second.placed_facts()} if second is not None and second.placed else {}),
-        **{name: dict(picture.numbers) for name, picture in pictures.items() if picture.numbers},
-    }
+    pictures = pictures | draw_compared(run, {"map": ours, **contenders}, storage)
+    facts = facts | peak_memory()
+    facts |= {name: dict(picture.numbers) for name, picture in pictures.items() if picture.numbers}
     if coded is not None and len(coded.chunks) == 1:
         facts["noise_over_map"] = noise_over_map(coded, run.reference_features, seed)
     return Comparison(Report(ours, contenders, facts), pictures, run, candidates)
@@ -412,9 +420,9 @@ def _smoothed(
 
 
 def _other_contenders(
-    run: Localization, others: OtherModels, leave_out: int | None, seed: int, progress: bool
+    run: Localization, others: OtherModels, leave_out: int | None, drives: bool, seed: int, progress: bool
 ) -> dict[str, Contender]:
-    """The baselines, null controls and further models, scored."""
+    """The baselines, null controls and further models, scored; `drives`: all of them as whole drives too."""
     table, judged = run.model.map.table, run.truth is not None
     itself = table.scored(torch.arange(table.places))[:, None]  # of the places as queries
     found = baselines_of(run, seed, leave_out, progress) if judged or leave_out is not None else {}
@@ -425,6 +433,8 @@ def _other_contenders(
         beside = copy.deepcopy(run.beside)
         asked = None if beside is None else other.localizer(SINGLE).drive_query(queries, beside)
         found[key] = Baseline(name, match, size.map_bytes, None, size.fixed_bytes, asked)
+    if not drives:
+        found = {key: one if key in DRIVEN else one._replace(asked=None) for key, one in found.items()}
     contenders = {}
     for key, (name, match, bytes, k, fixed, _) in with_drives(found, progress).items():
         truth, match = itself if key == "leave_out" else run.truth, match.renumbered(table.scored)

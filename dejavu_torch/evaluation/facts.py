@@ -73,7 +73,7 @@ def _run_facts(run: Localization, seconds: Mapping[str, float]) -> Facts:
         **({} if run.has_frames else {"ready": True}),
         "reference": reference.name,
         "query": query.name,
-        **_peak_memory(),
+        **peak_memory(),
         **_gap_facts(run),
     }
     if run.smoother is not None:
@@ -154,7 +154,7 @@ def _gap_facts(run: Localization) -> Facts:
     return facts
 
 
-def _peak_memory() -> Facts:
+def peak_memory() -> Facts:
     """The bytes that the process has held at most, where the system tells."""
     try:
         import resource

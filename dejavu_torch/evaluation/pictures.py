@@ -25,13 +25,9 @@ from dejavu_torch.memory import in_float32
 
 
 @in_float32()  # as the numbers that are drawn
-def draw_pictures(
-    run: Localization,
-    contenders: Mapping[str, Contender],
-    storage: Mapping[str, Sequence[Stored]] | None = None,
-) -> Pictures:
+def draw_pictures(run: Localization, contenders: Mapping[str, Contender]) -> Pictures:
     """All pictures that can be drawn; some need ground truth, frames or layers."""
-    place_map, tolerance, storage = run.model.map, run.within, storage or {}
+    place_map = run.model.map
     pictures = draw_examples(run) | draw_pairs(run)
     if place_map.area is not None:
         pictures |= draw_area(run) | draw_heat(run)
@@ -40,13 +36,22 @@ def draw_pictures(
         by_one = run.by_one if run.answers == "drive" else None
         pictures |= draw_coverage(run.scored, run.truth, run.tolerance, *seen, by_one)
         pictures |= draw_scores(run) | draw_posterior(run)
-    pictures |= draw_curves(contenders, tolerance)
-    pictures |= draw_storage(contenders, storage, tolerance)
-    pictures |= draw_sequences(contenders, storage.get("map", ()), place_map.places, tolerance)
-    pictures |= draw_motion(run)
+    pictures |= draw_compared(run, contenders) | draw_motion(run)
     if isinstance(place_map, TemplateMap):
         pictures |= draw_template_map(run, place_map)
     return pictures
+
+
+@in_float32()
+def draw_compared(
+    run: Localization,
+    contenders: Mapping[str, Contender],
+    storage: Mapping[str, Sequence[Stored]] | None = None,
+) -> Pictures:
+    """The pictures of all contenders together."""
+    places, storage = run.model.map.places, storage or {}
+    pictures = draw_curves(contenders, run.within) | draw_storage(contenders, storage, run.within)
+    return pictures | draw_sequences(contenders, storage.get("map", ()), places, run.within)
 
 
 def paper_pictures(run: Localization) -> Pictures:

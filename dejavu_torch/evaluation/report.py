@@ -35,9 +35,10 @@ SHORT = ("map", "one_byte", "stride", "product_quantiser", "hog", "null")  # row
 FULL = 0.99  # share of a drive from which a control tells nothing
 HEADING = 11  # letters in a line of a heading
 
-_MAIN = {"auc": "AUC", "recall_at_1": "recall@1", "recall_at_100_precision": "R@100P"}
+_MAIN = {"auc": "AUC", "recall_at_1": "recall@1", "recall_at_99_precision": "R@99P"}
 _WAYS: dict[Together, str] = {1: "AUC, one image", "filter": "as it drives", "smoother": "whole drive"}
 _MORE = {
+    "recall_at_100_precision": "R@100P",
     "precision_at_100_recall": "P@100R",
     "auc_reported": "AUC rep.",
     "recall_at_100_precision_reported": "R@100P rep.",
@@ -118,46 +119,58 @@ def _in_bytes(route: float) -> str:
 
 
 def found_lines(report: Report) -> list[str]:
-    """What was found, of what size, and a short table beside other ways to store the route."""
+    """What was found, and of what size; empty without ground truth."""
     facts, ours, frames = report.facts, report.ours, report.facts["frames"]
-    one = facts["unit"].rstrip("s")
-    drive, single = ours.by_length.get("smoother"), ours.by_length.get(1)
-    found = drive or single or ours.scores
-    assert found is not None
-    assert single is not None or ours.scores is not None
-    by_image = (single or ours.scores or found).recall_at_1
-    count, accepted, right = facts["with_answer"], facts["accepted"], facts["accepted_right"]
+    if ours.scores is None:
+        return []
+    drive, count = ours.sequences.get("smoother"), facts["with_answer"]
+    accepted, right = facts["accepted"], facts["accepted_right"]
     taken = [
         f"{what} {number} frames in {facts[seconds]:.1f} s ({1e3 * facts[seconds] / number:.1f} ms each)"
         for what, number, seconds in (
             ("learned", frames, "seconds_learn"),
             ("searched", facts["queries"], "seconds_localize"),
         )
+        if facts[seconds]
     ]
-    tolerance = f"{facts['tolerance']} {one}{'s' * (facts['tolerance'] != 1)}"
-    ways = f" by the whole drive, {round(by_image * count)} by one image" if drive else ""
-    lines = [
+    answered = drive if drive and facts["answers"] == "drive" else ours.scores
+    unit = facts["unit"].rstrip("s")
+    tolerance = f"{facts['tolerance']} {unit}{'s' * (facts['tolerance'] != 1)}"
+    by_image = f" by the whole drive, {round(ours.scores.recall_at_1 * count)} by one image"
+    size = f"{ours.fixed / 1e3:.0f} kB + {(ours.route_bytes or 0) / frames:.1f} bytes per {_one(facts)}"
+    return [
         ", ".join(taken),
-        f"FOUND {round(found.recall_at_1 * count)} of {count} within {tolerance}{ways}",
+        f"FOUND {round(answered.recall_at_1 * count)} of {count} within {tolerance}"
+        + by_image * (answered is not ours.scores),
         f"accepted and right {right}, accepted and wrong {accepted - right}, "
         f"not accepted {facts.get('judged', facts['queries']) - accepted}",
-        f"map file: {ours.fixed / 1e3:.0f} kB + {(ours.route_bytes or 0) / frames:.1f} bytes per {one}",
-        "",
+        f"map file: {size}",
     ]
-    rows = [["found by", "one image", *(["whole drive"] if drive else []), f"bytes per {one}"]]
+
+
+def compared_lines(report: Report) -> list[str]:
+    """A short table of the map beside other ways to store the route."""
+    frames, drive = report.facts["frames"], report.ours.sequences.get("smoother")
+    headings = ["one image", "at 99 % precision", *(["whole drive"] if drive else [])]
+    rows = [["found by", *headings, f"bytes per {_one(report.facts)}"]]
     for key in SHORT:
         if (contender := report.shown().get(key)) is None or contender.scores is None:
             continue
-        shares = [contender.by_length.get(way) for way in ((1, "smoother") if drive else (1,))]
-        shares[0] = shares[0] or contender.scores
-        cells = ["" if share is None else f"{share.recall_at_1:.1%}" for share in shares]
+        single, whole = contender.by_length.get(1, contender.scores), contender.sequences.get("smoother")
+        shares = [single.recall_at_1, single.recall_at_99_precision, whole and whole.recall_at_1]
+        cells = ["" if share is None else f"{share:.1%}" for share in shares[: len(headings)]]
         size = "" if contender.route_bytes is None else f"{contender.route_bytes / frames:.1f}"
         rows.append([contender.name, *cells, size])
-    lines += text_table(rows).splitlines()
-    control = report.contenders["null"].by_length.get("smoother") if "null" in report.contenders else None
+    lines = text_table(rows).splitlines()
+    control = report.contenders["null"].sequences.get("smoother") if "null" in report.contenders else None
     if drive and control and control.recall_at_1 >= FULL * drive.recall_at_1:
         lines.append("Matched as a whole drive, even the control is found: compare 'one image' and bytes.")
     return lines
+
+
+def _one(facts: Mapping[str, Any]) -> str:
+    """The word for a place."""
+    return "window" if "area" in facts else str(facts["unit"]).rstrip("s")
 
 
 def sequence_table(report: Report) -> list[list[str]]:
@@ -247,14 +260,22 @@ def as_html(report: Report, pictures: Pictures) -> str:
 
 
 def report_folder(path: Path) -> AbstractContextManager[Path]:
-    """`whole_folder` for a report, without pictures of an earlier one; an InputError if not writable."""
-    return whole_folder(path, [f"{name}.png" for name in PICTURES])
+    """`whole_folder` for a report, without figures and pictures of an earlier one; an InputError if not
+    writable."""
+    return whole_folder(path, ["report.json", *(f"{name}.png" for name in PICTURES)])
 
 
 def write_report(
-    folder: Path, report: Report, pictures: Pictures, title: str, command: str, plan: str | None = None
+    folder: Path,
+    report: Report,
+    pictures: Pictures,
+    title: str,
+    command: str,
+    plan: str | None = None,
+    complete: bool = True,
 ) -> None:
-    """Write report.json, a PNG for each picture, and index.html, which contains all of these."""
+    """Write report.json, unless it is not `complete`, a PNG for each picture, and index.html, which contains
+    all of these."""
     facts, shown, embedded = report.facts, report.shown(), {}
     for name, picture in pictures.items():
         data = as_png(picture)
@@ -282,9 +303,11 @@ def write_report(
         more_pictures=[shown for name, shown in embedded.items() if name in FOLDED],
         plan=plan,
         made_by=f"{printable(command)}\ndejavu_torch {facts['version']}, torch {facts['torch']}",
+        pending=not complete,
     )
-    text = json.dumps(report.as_json(), indent=1) + "\n"
-    (folder / "report.json").write_text(text, encoding="utf-8")
+    if complete:
+        text = json.dumps(report.as_json(), indent=1) + "\n"
+        (folder / "report.json").write_text(text, encoding="utf-8")
 
 
 def write_index(

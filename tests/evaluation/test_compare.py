@@ -19,7 +19,7 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.evaluation.compare import compare
 from dejavu_torch.evaluation.controls import null_control
 from dejavu_torch.evaluation.curves import evaluate
-from dejavu_torch.evaluation.pictures import draw_pictures
+from dejavu_torch.evaluation.pictures import draw_compared, draw_pictures
 from dejavu_torch.evaluation.report import score_table, sequence_table
 from dejavu_torch.features.descriptor import Descriptor
 from dejavu_torch.features.pixels import PatchPixels
@@ -51,7 +51,8 @@ def model():
 @pytest.fixture
 def _drawn(monkeypatch):
     """Pictures, and the facts that they tell, for the tests that look at them."""
-    monkeypatch.setattr("dejavu_torch.evaluation.compare.draw_pictures", draw_pictures)
+    for draw in (draw_pictures, draw_compared):
+        monkeypatch.setattr(f"dejavu_torch.evaluation.compare.{draw.__name__}", draw)
 
 
 @pytest.mark.usefixtures("_drawn")
@@ -215,8 +216,8 @@ def test_sequences_of_every_contender(kind):
 def test_a_filter_stands_beside_single_queries_in_order_and_changes_nothing_else():
     pair, model = (ArrayTraverse(passing(1)), ArrayTraverse(passing(2))), DejaVu(whitening="none")
 
-    def report(ordered, storage=False):
-        settings = {"tolerance": 1, "ordered": ordered, "storage_curve": storage}
+    def report(ordered, storage=False, drives="all"):
+        settings = {"tolerance": 1, "ordered": ordered, "storage_curve": storage, "drives": drives}
         result = compare(*pair, "0", model, sequence=None, centre=False, **settings).report
         ways = ["AUC, one image", "as it drives", "whole drive"]
         assert (score_table(result)[0][1:4] == ways) == bool(ordered)
@@ -235,6 +236,14 @@ def test_a_filter_stands_beside_single_queries_in_order_and_changes_nothing_else
         assert {name: other[name] for name in one if name.startswith(("auc", "recall"))} == {
             name: one[name] for name in one if name.startswith(("auc", "recall"))
         }
+    few = report(True, drives="few")
+    driven = {
+        key
+        for key, entry in few.items()
+        if isinstance(entry, dict) and "smoother" in entry.get("sequences", ())
+    }
+    assert driven == {"uncompressed", "null"}
+    assert "smoother" in few["sequences"]
     areas = [single["auc"], *(ordered["sequences"][way]["auc"] for way in ("filter", "smoother"))]
     assert areas[0] + 0.1 < areas[1] < areas[2]
     assert all("sequences" not in size for size in ordered["storage"]["map"])

@@ -9,10 +9,12 @@ from contextlib import redirect_stdout
 import pytest
 from PIL import Image
 
+import dejavu_torch
 from dejavu_torch.cli import main, reports
 from dejavu_torch.data.source import open_source
 from dejavu_torch.evaluation import reproduce
 from dejavu_torch.evaluation.reproduce import paper_model
+from dejavu_torch.types import InputError
 
 FRAMES = 256
 PICTURES = ("examples", "pairs", "coverage", "scores", "pr", "storage", "sequences", "reliability")
@@ -44,6 +46,26 @@ def test_it_prints_what_was_found_in_few_lines(demo):
         assert f"{100 * report[key]['recall_at_1']:.1f}%" in "\n".join(lines)
     for other in ("Whitening", "DejaVu("):  # settings are on the page
         assert other not in "\n".join(lines)
+
+
+def test_the_own_result_is_there_before_it_is_compared(demo, tmp_path, monkeypatch):
+    """Map, matches and page at FOUND, and no report.json, not even that of a run before."""
+    out, seen = tmp_path / "out", {}
+    out.mkdir()
+    (out / "report.json").write_text("{}")
+
+    def compared(*_):
+        seen.update({file.name: file.read_bytes() for file in out.iterdir()})
+        raise InputError("stopped while comparing")
+
+    monkeypatch.setattr("dejavu_torch.evaluation.compare.baselines_of", compared)
+    words = ["demo:road?stop=60", "demo:road?traverse=1&stop=60", "--bytes", "8", "--out", str(out)]
+    with pytest.raises(SystemExit):
+        main(["compare", *words])
+    assert {"index.html", "map.safetensors", "matches.csv", "pairs.png", "pr.png"} <= seen.keys()
+    assert "report.json" not in seen
+    assert {file.name: file.read_bytes() for file in out.iterdir()} == seen
+    assert dejavu_torch.DejaVu.load(out / "map.safetensors").map.places == 60
 
 
 def test_pictures_show_something(demo):

@@ -13,6 +13,7 @@ from dejavu_torch.evaluation.plots import Picture, canvas
 from dejavu_torch.evaluation.report import (
     PICTURES,
     Report,
+    compared_lines,
     found_lines,
     report_folder,
     score_table,
@@ -25,7 +26,7 @@ from dejavu_torch.evaluation.report import (
 )
 from dejavu_torch.types import Match
 
-SCORES = Scores(0.5, 0.6, 0.1, 0.2, 0.7, 0.75, 0.8)
+SCORES = Scores(0.5, 0.6, 0.1, 0.2, 0.7, 0.75, 0.8, 0.3)
 FACTS = {"queries": 20, "tolerance": 3, "recall_definition": "TP / all", "version": "1", "torch": "2"}
 
 
@@ -61,8 +62,8 @@ def test_a_curve_that_starts_late_has_a_star_and_the_star_is_explained(equal, la
 
 def test_the_table_has_bytes_where_the_places_are_known():
     one = report({"frames": 32}, null=Contender("null", SCORES))
-    main, more = ["AUC", "recall@1", "R@100P"], ["P@100R", "AUC rep.", "R@100P rep."]
-    few, many = ["0.500", "0.750", "0.100"], ["0.700", "0.600", "0.200"]
+    main, more = ["AUC", "recall@1", "R@99P"], ["R@100P", "P@100R", "AUC rep.", "R@100P rep."]
+    few, many = ["0.500", "0.750", "0.300"], ["0.100", "0.700", "0.600", "0.200"]
     sizes = ["bytes", "bytes per place", "route bytes per place"]
     assert score_table(one, every=True) == [
         ["", *main, *more, *sizes],
@@ -91,22 +92,35 @@ def drive_report(control=0.5, **facts):
     null = Contender("control", SCORES, sequences={"smoother": SCORES._replace(recall_at_1=control)})
     small = Contender("this map in 1 byte", SCORES, 120, fixed=40, sequences=whole)
     facts = {"queries": 4, "seconds_learn": 0.8, "seconds_localize": 0.4} | facts
-    facts = {"with_answer": 4, "accepted": 3, "accepted_right": 2, "unit": "frames", **facts}
+    facts = {
+        "with_answer": 4,
+        "accepted": 3,
+        "accepted_right": 2,
+        "unit": "frames",
+        "answers": "drive",
+        **facts,
+    }
     return report(STORED | facts, one_byte=small, null=null)._replace(ours=ours)
 
 
 def test_what_was_found_in_a_few_lines():
-    lines = found_lines(drive_report(tolerance=1, frames=80))
-    assert lines[:4] == [
+    assert found_lines(drive_report(tolerance=1, frames=80)) == [
         "learned 80 frames in 0.8 s (10.0 ms each), searched 4 frames in 0.4 s (100.0 ms each)",
         "FOUND 4 of 4 within 1 frame by the whole drive, 3 by one image",
         "accepted and right 2, accepted and wrong 1, not accepted 1",
         "map file: 0 kB + 5.0 bytes per frame",
     ]
-    rows = [line.split("  ")[0] for line in lines[5:]]
+    given = drive_report(tolerance=1, frames=80, seconds_learn=0)
+    assert found_lines(given)[0] == "searched 4 frames in 0.4 s (100.0 ms each)"
+    assert found_lines(given._replace(ours=Contender("this map", None))) == []
+
+
+def test_what_other_ways_find_in_a_short_table():
+    lines = compared_lines(drive_report(tolerance=1, frames=80))
+    rows = [line.split("  ")[0] for line in lines]
     assert rows == ["", "found by", "this map", "this map in 1 byte", "control"]
-    assert lines[7].split()[2:] == ["75.0%", "100.0%", "5.0"]
-    assert "control is found" in found_lines(drive_report(control=1.0))[-1]
+    assert lines[2].split()[2:] == ["75.0%", "30.0%", "100.0%", "5.0"]
+    assert "control is found" in compared_lines(drive_report(control=1.0))[-1]
 
 
 def test_one_image_alone_has_no_column_of_drives():
@@ -114,7 +128,7 @@ def test_one_image_alone_has_no_column_of_drives():
     one = one._replace(ours=one.ours._replace(sequences={}), contenders={})
     lines = found_lines(one)
     assert lines[1].endswith("frames")
-    assert "whole drive" not in "".join(lines)
+    assert "whole drive" not in "".join([*lines, *compared_lines(one)])
 
 
 def test_areas_of_sequences_in_a_table_below_the_scores(tmp_path):
