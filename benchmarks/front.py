@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,65 +15,85 @@ from torch import Tensor
 from benchmarks.measure import Row, write_bench
 from dejavu_torch import DejaVu, PlaceSmoother, SpectralMapper, Whitening, open_source
 from dejavu_torch.data.ground_truth import is_right
-from dejavu_torch.evaluation.baselines import as_int8, scores_of_stored
+from dejavu_torch.evaluation.baselines import (
+    as_int8,
+    of_stored,
+    quantised_every_kth,
+    scores_of_stored,
+    stored_frames,
+    stride_bytes,
+)
 from dejavu_torch.evaluation.contenders import COLOURS
 from dejavu_torch.evaluation.controls import shuffled, with_mapper
+from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.plots import Plot, legend, show_frame
-from dejavu_torch.evaluation.quantiser import product_quantised
 from dejavu_torch.recognition.drive import localize_drives
-from dejavu_torch.recognition.localizer import Scoring, drive_query
-from dejavu_torch.recognition.select import best_match
+from dejavu_torch.recognition.localizer import Localizer, Scoring, drive_query
+from dejavu_torch.types import Match
 
 ROAD = ("demo:road?traverse=0", "demo:road?traverse=1")
+OTHER = "sim:aerial?seed={seed}&size=96"  # another route, to learn codebooks on
 SEEDS = (1, 2, 3)  # of the whitening, the order of the control and the codebooks; settings were chosen on 0
-BYTES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  # per place, of maps and controls
-CODES = (1, 2, 4, 8, 16)  # of a product quantiser
+BYTES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  # per place
+FEW = (16, 64)  # centroids of codebooks that are counted per place
 SHOWN_MAP = 5  # bytes per place, at most, of the map whose answers are shown: the largest of these
 STRIDE, TOLERANCE = 10, 5
 SHOWN = (420, 1500)  # queries of the picture, besides the hardest
-COLUMNS = ("bytes_per_place", "one_image", "whole_drive")
-FAISS = "faiss_product_quantiser"  # not drawn: its recall should be that of ours
-WAYS = {"map": "this map", "product_quantiser": "product quantiser", "null": "shuffled frames"}
+COLUMNS = ("bytes_per_place", "one_image", "at_99_precision", "whole_drive")
+WAYS = {"map": "this map", "product_quantiser": "product quantiser, every k-th", "null": "shuffled frames"}
+ACCOUNTS = {  # of the codebooks
+    "product_quantiser_free": "the same, codebooks of another route",
+    "product_quantiser_small": "the same, few centroids, counted",
+}
 POINTS = {"uncompressed": "float32, every frame", "stride": "int8, every 10th frame"}
 
 
 class Way(NamedTuple):
-    """A way to store the descriptors: its key, bytes per place, and the scores that it gives."""
+    """A way to store the descriptors: its key, the bytes per place that it may take, those that it takes, the
+    scores that it gives, the stride of the frames that it stores, and bytes that do not grow with the route,
+    besides those of the whitening."""
 
     key: str
+    room: float
     bytes: float
     score: Scoring
+    k: int = 1
+    fixed: int = 0
+
+    def match(self, queries: Tensor, places: int) -> Match:
+        """The places of single images, of stored frames only."""
+        matcher, stored = Localizer(), stored_frames(places, self.k)[0]
+        scores = map(self.score, queries.split(512))
+        return Match.joined(matcher.match(of_stored(part, stored)) for part in scores)
 
 
-def ways_of(model: DejaVu, places: Tensor, seed: int) -> Iterator[Way]:
-    """All ways to store descriptors (N,K)."""
-    order, mixed = shuffled(places, seed)
+def ways_of(model: DejaVu, places: Tensor, other: Tensor, seed: int) -> Iterator[Way]:
+    """All ways to store descriptors (N,K); `other`: descriptors of another route."""
+    (count, width), (order, mixed) = places.shape, shuffled(places, seed)
     for size in BYTES:
         for key, rows in (("map", places), ("null", mixed)):
             small = with_mapper(model, SpectralMapper(size))
             small.learn_features(rows)
-            taken = small.summary().route_bytes / len(places)
+            taken = small.summary().route_bytes / count
             score = small.map.scores if key == "map" else small.scores_in(order)
-            yield Way(key, taken, score)
-    for code in CODES:
-        restored, _ = product_quantised(places, code, seed)
-        yield Way("product_quantiser", code, scores_of_stored(restored, 1, "cosine"))
-        if places.shape[1] % code == 0:
-            yield Way(FAISS, code, scores_of_stored(by_faiss(places, code, seed), 1, "cosine"))
-    width = places.shape[1]
-    yield Way("uncompressed", 4.0 * width, scores_of_stored(places, 1, "cosine"))
-    yield Way("stride", width / STRIDE, scores_of_stored(as_int8(places), STRIDE, "cosine"))
-
-
-def by_faiss(places: Tensor, code: int, seed: int) -> Tensor:
-    """Descriptors (N,K) as the product quantiser of faiss restores them, which needs equal parts."""
-    import faiss
-
-    quantiser: Any = faiss.ProductQuantizer(places.shape[1], code, 8)
-    quantiser.cp.seed, quantiser.cp.min_points_per_centroid = seed, 1
-    rows = places.float().numpy()
-    quantiser.train(rows)
-    return torch.from_numpy(quantiser.decode(quantiser.compute_codes(rows)))
+            yield Way(key, size, taken, score)
+        fitted = partial(quantised_every_kth, places, tolerance=TOLERANCE, seed=seed)
+        few = [
+            fitted(room, centroids=one)
+            for one in FEW
+            if (room := size - 4 * one * width / count) > 0 and 4 * one <= count
+        ]
+        found = {"product_quantiser": fitted(size), "product_quantiser_free": fitted(size, training=other)}
+        if few:  # the better one on the route itself
+            found["product_quantiser_small"] = max(few, key=lambda one: one.share)
+        for key, one in found.items():
+            counted = key == "product_quantiser_small"
+            taken = (one.bytes + one.codebooks * counted) / count
+            score = scores_of_stored(one.restored, one.k, "cosine")
+            yield Way(key, size, taken, score, one.k, one.codebooks * (key == "product_quantiser"))
+    yield Way("uncompressed", 4.0 * width, 4.0 * width, scores_of_stored(places, 1, "cosine"))
+    keys = stride_bytes(count, width, 1, STRIDE) / count
+    yield Way("stride", keys, keys, scores_of_stored(as_int8(places), STRIDE, "cosine"), STRIDE)
 
 
 @torch.no_grad()
@@ -83,21 +104,24 @@ def measured(seed: int) -> tuple[list[Row], Tensor, Tensor]:
     model = DejaVu(whitening=Whitening(seed=seed))
     places = model.descriptor.learn(first, None)
     queries = model.descriptor.all_of(second)
+    other = model.descriptor.all_of(open_source(OTHER.format(seed=seed)))
     truth, rows = torch.arange(len(queries))[:, None], []
-    ways = [*ways_of(model, places, seed)]
-    asked = [drive_query(queries, PlaceSmoother(within=TOLERANCE), way.score) for way in ways]
+    ways = [*ways_of(model, places, other, seed)]
+    driven = [way for way in ways if way.key not in ACCOUNTS]
+    asked = [drive_query(queries, PlaceSmoother(within=TOLERANCE), way.score) for way in driven]
+    drives = dict(zip(map(id, driven), localize_drives(asked), strict=True))
     answers = hard = torch.empty(0)
-    for way, drive in zip(ways, localize_drives(asked), strict=True):
-        single = best_match(way.score(queries))
-        found = [single.index, drive.index[:, 0]]
-        if way.key == "stride":  # of equal scores, the place that is stored
-            found[0] = STRIDE * ((found[0] + STRIDE // 2) // STRIDE)
-        right = [is_right(index, truth, TOLERANCE) for index in found]
-        one, whole = (float(each.double().mean()) for each in right)
-        size = {"seed": seed, "contender": way.key, "bytes_per_place": way.bytes}
-        rows.append(size | {"one_image": one, "whole_drive": whole})
-        if way.key == "map" and way.bytes < SHOWN_MAP:
-            answers, hard = single.index, single.score.masked_fill(~right[0], -torch.inf)
+    for way in ways:
+        single, drive = way.match(queries, len(places)), drives.get(id(way))
+        scores, right = evaluate(single, truth, TOLERANCE), is_right(single.index, truth, TOLERANCE)
+        row = {"seed": seed, "contender": way.key, "bytes_per_place": way.room, "taken": way.bytes}
+        row |= {"k": way.k, "with_codebooks": way.bytes + way.fixed / len(places), "auc": scores.auc}
+        row |= {"one_image": scores.recall_at_1, "at_99_precision": scores.recall_at_99_precision}
+        if drive is not None:
+            row["whole_drive"] = evaluate(drive, truth, TOLERANCE).recall_at_1
+        rows.append(row)
+        if way.key == "map" and way.room < SHOWN_MAP:
+            answers, hard = single.index, single.score.masked_fill(~right, -torch.inf)
     return rows, answers, hard
 
 
@@ -117,9 +141,10 @@ def summarised(rows: list[Row], figures: Sequence[str] = COLUMNS[1:]) -> list[Ro
 
 
 def plot_front(rows: list[Row], answers: Tensor, hardest: int) -> Plot:
-    """Three queries with the places found for them, beside recall over bytes."""
-    figure = Figure(figsize=(9, 3.3), layout="constrained", dpi=160)
-    parts: Any = figure.subfigures(1, 2, width_ratios=(1, 1.7))
+    """Three queries with the places found for them, beside recall over bytes: of all answers, and of the most
+    confident ones of which 99 % are right."""
+    figure = Figure(figsize=(10, 3.3), layout="constrained", dpi=160)
+    parts: Any = figure.subfigures(1, 2, width_ratios=(1, 2.4))
     left, right = parts
     frames = left.subplots(2, 3)
     first, second = map(open_source, ROAD)
@@ -128,40 +153,49 @@ def plot_front(rows: list[Row], answers: Tensor, hardest: int) -> Plot:
             frames[0, column], second[query], f"hardest: {query}" if query == hardest else f"query {query}"
         )
         show_frame(frames[1, column], first[int(answers[query])], f"found: {int(answers[query])}")
-    axis = right.subplots()
+    axes = right.subplots(1, 2)
     for key, name in (WAYS | POINTS).items():
         points = sorted(
-            (r["bytes_per_place"], r["one_image"], r["whole_drive"]) for r in rows if r["contender"] == key
+            (r["bytes_per_place"], *map(r.get, COLUMNS[1:])) for r in rows if r["contender"] == key
         )
-        size, one, whole = zip(*points, strict=True)
+        size, one, sure, whole = zip(*points, strict=True)
         style = {"color": COLOURS[key], "markersize": 4}
-        axis.plot(size, one, "o-", label=name, **style)
-        axis.plot(size, whole, "s--", fillstyle="none", **style)
-    axis.plot([], [], "ok-", label="one image", markersize=4)
-    axis.plot([], [], "sk--", label="whole drive", fillstyle="none", markersize=4)
-    axis.set_xscale("log")
-    axis.set_xticks([0.25, 1, 4, 16, 64, 512], ["¼", "1", "4", "16", "64", "512"])
-    axis.minorticks_off()
-    axis.set(xlabel="bytes per place, beside fixed ones", ylabel="found within 5 frames", ylim=(0, 1.03))
-    axis.spines[["top", "right"]].set_visible(False)
-    legend(axis, loc="lower right")
-    return figure, axis
+        axes[0].plot(size, one, "o-", label=name, **style)
+        axes[0].plot(size, whole, "s--", fillstyle="none", **style)
+        axes[1].plot(size, sure, "o-", **style)
+    axes[0].plot([], [], "ok-", label="one image", markersize=4)
+    axes[0].plot([], [], "sk--", label="whole drive", fillstyle="none", markersize=4)
+    for axis, what in zip(axes, ("found within 5 frames", "one image: found, 99 % right"), strict=True):
+        axis.set_xscale("log")
+        axis.set_xticks([0.25, 1, 4, 16, 64, 512], ["¼", "1", "4", "16", "64", "512"])
+        axis.minorticks_off()
+        axis.set(xlabel="bytes per place, beside fixed ones", ylabel=what, ylim=(0, 1.03))
+        axis.spines[["top", "right"]].set_visible(False)
+    legend(axes[0], loc="lower right")
+    return figure, axes
 
 
 def run_front(*, out: Path) -> list[str]:
-    """Recall over bytes on the real road of the demo: map, product quantiser, float and shuffled frames.
+    """Recall over bytes on the real road of the demo: map, product quantiser of every k-th frame, shuffled
+    frames.
 
     Args:
         out: folder for bench.json and bench.png
     """
     found = [measured(seed) for seed in SEEDS]
-    means, (_, answers, hard) = summarised([row for rows, *_ in found for row in rows]), found[0]
+    each = [row for rows, *_ in found for row in rows]
+    means, (_, answers, hard) = summarised(each, (*COLUMNS[1:], "taken", "with_codebooks")), found[0]
     picture = plot_front(means, answers, int(hard.argmax()))
-    write_bench(out, means, picture, seeds=list(SEEDS), tolerance=TOLERANCE)
-    lines = [f"{'':<20}{'bytes':>8}{'one image':>12}{'whole drive':>13}"]
+    quantised = [row for row in each if row["contender"] in (*ACCOUNTS, "product_quantiser")]
+    strides = [
+        {name: row[name] for name in ("contender", "bytes_per_place", "seed", "k")} for row in quantised
+    ]
+    write_bench(out, means, picture, seeds=list(SEEDS), tolerance=TOLERANCE, strides=strides)
+    lines = [f"{'':<38}{'bytes':>8}{'+ codebooks':>12}{'one image':>11}{'at 99 %':>11}{'whole drive':>13}"]
     for row in means:
-        name = (WAYS | POINTS | {FAISS: "the same by faiss"})[row["contender"]]
-        lines.append(
-            f"{name:<20}{row['bytes_per_place']:>8}{row['one_image']:>12.3f}{row['whole_drive']:>13.3f}"
-        )
+        name = (WAYS | ACCOUNTS | POINTS)[row["contender"]]
+        whole = f"{row['whole_drive']:>13.3f}" if "whole_drive" in row else ""
+        sizes = f"{row['bytes_per_place']:>8}{row['with_codebooks']:>12.2f}"
+        shares = f"{row['one_image']:>11.3f}{row['at_99_precision']:>11.3f}{whole}"
+        lines.append(f"{name:<38}{sizes}{shares}")
     return [*lines, f"means of {len(SEEDS)} seeds"]

@@ -263,11 +263,20 @@ def write_bench(out: Path, rows: Sequence[Row], picture: Plot | None = None, **f
 
     bench.json also has the versions and settings that the figures depend on.
     """
+    with whole_folder(out) as folder:
+        text = json.dumps({"rows": rows} | facts | programs(), indent=1)
+        (folder / "bench.json").write_text(text + "\n", encoding="utf-8")
+        if picture is not None:
+            picture[0].savefig(folder / "bench.png")
+
+
+def programs() -> dict[str, Any]:
+    """The versions and settings that figures depend on."""
     versions: dict[str, str | None] = {"dejavu_torch": dejavu_torch.__version__}
     for package in COMPARED:
         with suppress(PackageNotFoundError):
             versions[package] = version(package)
-    programs = {
+    return {
         "threads": torch.get_num_threads(),
         "l1_backend": l1_backend(),
         "cpu_capability": torch.backends.cpu.get_cpu_capability(),
@@ -277,11 +286,6 @@ def write_bench(out: Path, rows: Sequence[Row], picture: Plot | None = None, **f
         "machine": f"{os.cpu_count()} cores, {platform.machine()}",
         "commit": commit(),
     }
-    with whole_folder(out) as folder:
-        text = json.dumps({"rows": rows} | facts | programs, indent=1)
-        (folder / "bench.json").write_text(text + "\n", encoding="utf-8")
-        if picture is not None:
-            picture[0].savefig(folder / "bench.png")
 
 
 @cache

@@ -15,7 +15,11 @@ from dejavu_torch.evaluation.plots import Plot, legend, set_title
 
 Points = list[tuple[float, float]]  # route bytes per place, recall@1; without bytes, a single one is a level
 WAYS = {
-    **{"map": "this map", "null": "its frames shuffled", "product_quantiser": "product quantiser"},
+    **{
+        "map": "this map",
+        "null": "its frames shuffled",
+        "product_quantiser": "quantiser, every k-th",
+    },
     **{"uncompressed": "float32", "hog": "HOG"},
 }
 

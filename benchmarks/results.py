@@ -81,9 +81,9 @@ IN_ORDER = (  # a route of each kind, long enough for sequences of 21
 SEEDED = ("default",)  # run with all seeds, the others with the first
 SECOND = "railway, second half"
 WAYS = {  # options of `dejavu compare`; {default} and {visits} are folders of maps
-    "default": "--storage_curve",
+    "default": "--storage_curve --drives all",
     "HOG": "--features HOG --calibration none",
-    "drive": "--map {default}/{footage}/map.safetensors --ordered",
+    "drive": "--map {default}/{footage}/map.safetensors --ordered --drives all",
     "filter": "--map {default}/{footage}/map.safetensors --match filter",
     "sequence": "--map {default}/{footage}/map.safetensors --match sequence:21",
     "visits": "--whitening {visits}/first.safetensors --match sequence:21 --storage_curve",
@@ -124,9 +124,21 @@ def slug(name: str) -> str:
 
 def kept(report: dict[str, Any]) -> Row:
     """The figures of a report for the map, its curve, and everything it is compared with."""
-    figures = ("auc", "recall_at_1", "recall_at_100_precision", "route_bytes", "bytes", "sequences")
+    figures = (
+        *("auc", "auc_by_confidence", "recall_at_1", "recall_at_99_precision", "recall_at_100_precision"),
+        *("route_bytes", "bytes", "k", "sequences"),
+    )
     own = (
-        *("frames", "fixed_bytes", "route_bytes_per_place", "noise_over_map", "storage", "rejection"),
+        *(
+            "frames",
+            "seconds_learn",
+            "seconds_localize",
+            "fixed_bytes",
+            "route_bytes_per_place",
+            "noise_over_map",
+            "storage",
+            "rejection",
+        ),
         *("answers", "drive", "accepted", "accepted_right", "with_answer"),
     )
     rivals = {

@@ -1,7 +1,7 @@
 """Write the tables of docs and of benchmarks/results: `python -m benchmarks.tables [NAME=bench.json ...]`.
 
-They come from json files in benchmarks/results, where a given file is first stored as NAME.json. Tables are
-between `<!-- table: NAME -->` and `<!-- end of table -->`.
+They come from json files in benchmarks/results, where a given file, also a report.json, is first stored as
+NAME.json. Tables are between `<!-- table: NAME -->` and `<!-- end of table -->`, in README as well.
 """
 
 from __future__ import annotations
@@ -18,16 +18,21 @@ from typing import Any
 
 from benchmarks.alike import CAPPED, CHECKED, PRECISIONS, SINGLE, UNCAPPED
 from benchmarks.areas import NAMES as AREA_WAYS
+from benchmarks.files import NAMES as FILES
 from benchmarks.headings import NAMES as HEADING_WAYS
-from benchmarks.measure import Row
-from benchmarks.results import FOOTAGE, rounded
+from benchmarks.measure import Row, programs
+from benchmarks.order import gains
+from benchmarks.results import FOOTAGE, kept, rounded
 from benchmarks.storage import SHOWN, best, by, families, missed
 from benchmarks.storage_drives import drive_table
 from benchmarks.teaching import COPIES, PLACED, REFINED, TOLD
 from benchmarks.terrain import NAMES as TERRAIN_WAYS
+from dejavu_torch.evaluation.baselines import every
 from dejavu_torch.evaluation.contenders import LENGTHS
+from dejavu_torch.recognition.calibration import POWER
 
 FOLDER, DOCS = Path(__file__).parent / "results", Path(__file__).parents[1] / "docs"
+README = DOCS.parent / "README.md"
 MARKED = re.compile(r"(<!-- table: ([\w ,:]+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
 LOST = ("routes", "storage city", "storage road2", "made drives", "trainings")  # what `losses` reads
 JUMPS = "stretches of 5 to 15"
@@ -41,7 +46,9 @@ CODES = {  # rows of codes of the same kind
 
 
 def stored(bench: dict[str, Any]) -> dict[str, Any]:
-    """A bench.json without unknown values and what no table shows."""
+    """A bench.json without unknown values and what no table shows; a report.json becomes one of a row."""
+    if "rows" not in bench:
+        bench = {"rows": [kept(bench)], **programs()}
     left_out = ("equal_auc", "exponents", "seconds", "ratio_to_ours", "missed_over_best")
     rows = [{k: v for k, v in row.items() if v is not None and k not in left_out} for row in bench["rows"]]
     for row in rows:
@@ -118,7 +125,7 @@ def leaderboard() -> str:
     ways = {
         "**map**": "",
         "in 1 B": "one_byte",
-        "product quantiser": "product_quantiser",
+        "product quantiser, every k-th": "product_quantiser",
         "float": "uncompressed",
         "HOG": "hog",
         "shuffled": "null",
@@ -140,6 +147,93 @@ def leaderboard() -> str:
         pairs = zip(means[:-1:2], means[1::2], strict=True)
         rows.append([name, *(shown(*pair) for pair in pairs), size(means[-1] or 0)])
     return markdown([["route", *ways, "bytes"], *rows])
+
+
+def sure() -> str:
+    """The share of queries that one image finds while 99 % of what is accepted is right."""
+    ways = ("", "one_byte", "product_quantiser", "uncompressed", "hog", "null")
+    names = ("**map**", "in 1 B", "product quantiser, every k-th", "float", "HOG", "shuffled")
+
+    def figures(row: Row) -> list[float | None]:
+        own = ((row.get(way, {}) if way else row) for way in ways)
+        return [one.get("recall_at_99_precision") for one in own]
+
+    rows = [
+        [name, *("" if share is None else f"{100 * share:.0f}" for share in means)]
+        for name, means in by_seeds(reports("default"), figures)
+    ]
+    return markdown([["route", *names], *rows])
+
+
+def demo() -> str:
+    """What `dejavu demo --drives all` finds."""
+    (report,) = read("demo")["rows"]
+    stride = every(report["product_quantiser"]["k"], "frame")
+    names = {
+        "": "**this map**",
+        "one_byte": "this map in 1 byte per frame",
+        "product_quantiser": f"its descriptors, {stride}, product quantiser",
+        "stride": "its descriptors, every 10th frame, int8",
+        "uncompressed": "its descriptors, every frame, float",
+        "hog": "HOG, every frame",
+        "null": "control: shuffled frames, as many bytes",
+    }
+    table = [["stored", "one image", "at 99 % precision", "whole drive", "bytes per frame"]]
+    for key, name in names.items():
+        of = report[key] if key else report
+        shares = of["recall_at_1"], of["recall_at_99_precision"], of["sequences"]["smoother"]["recall_at_1"]
+        each = of.get("route_bytes", report["route_bytes"]) / report["frames"]
+        form = f"{each:.1f}" if each < 100 else f"{each:,.0f}".replace(",", " ")
+        table.append([name, *(f"{100 * share:.1f} %" for share in shares), form])
+    return markdown(table)
+
+
+def front() -> str:
+    """What one image finds on the road of the demo by bytes per place, the range of the seeds in per cent."""
+    shown = {0.25: "¼ byte per place", 0.5: "½", 1.0: "1", 2.0: "2", 4.0: "4"}
+    ways = {"map": "**this map**", "product_quantiser": "product quantiser, codebooks free"}
+    ways |= {"product_quantiser_free": "the same, codebooks of another route"}
+    known = {(row["contender"], row["bytes_per_place"]): row for row in read("front")["rows"]}
+    table = [["one image", *shown.values()]]
+    for key, what in (("one_image", "found"), ("at_99_precision", "at 99 % precision")):
+        for way, name in ways.items():
+            spans = (known[way, each][f"{key}_span"] for each in shown)
+            table.append(
+                [f"{name}: {what}", *(f"{100 * low:.1f} to {100 * high:.1f}" for low, high in spans)]
+            )
+    return markdown(table)
+
+
+def sizes() -> str:
+    """What a file weighs, all counted, and what is found of single images."""
+    table = [["places", *(f"{name}: kB" for name in FILES.values()), "found, in this order"]]
+    for places, rows in groupby(read("files")["rows"], lambda row: row["places"]):
+        own = {row["contender"]: row for row in rows}
+        kilobytes = (f"{own[name]['bytes'] / 1e3:,.0f}".replace(",", " ") for name in FILES)
+        found = " / ".join(f"{100 * own[name]['recall_at_1']:.0f}" for name in FILES) + " %"
+        what = {"road": "", "simulated": ", simulated", "made": ", made descriptors"}[own["map"]["route"]]
+        table.append([f"{places:,}".replace(",", " ") + what, *kilobytes, found])
+    return markdown(table)
+
+
+def order() -> str:
+    """What each order of single answers gains over that of their scores."""
+    table = [["order, gain over the score", "AUC", "worst route", "recall at 99 % precision", "worst route"]]
+    for row in gains(read("order")["rows"]):
+        keys = ("auc", "worst_auc", "recall_at_99_precision", "worst_recall_at_99_precision")
+        table.append([f"{row['case']}: {row['contender']}", *(f"{row[key]:+.3f}" for key in keys)])
+    return markdown(table)
+
+
+def ordered() -> str:
+    """The routes by score, and by the confidence."""
+    table = [["AUC / recall at 99 % precision", "half", "by score", "by confidence"]]
+    for case, rows in groupby(read("order")["rows"], lambda row: row["case"]):
+        own = {row["contender"]: row for row in rows}
+        pair = [own[name] for name in ("score", f"score / elsewhere^{POWER:g}")]
+        cells = (f"{area(row['auc'])} / {area(row['recall_at_99_precision'])}" for row in pair)
+        table.append([f"`{case}`" if case.startswith("sim:") else case, pair[0]["half"], *cells])
+    return markdown(table)
 
 
 def losses() -> str:
@@ -465,7 +559,8 @@ def trainings() -> str:
 
 
 TABLES: dict[str, Callable[[], str]] = {
-    **{"leaderboard": leaderboard, "losses": losses, "routes": routes},
+    **{"leaderboard": leaderboard, "sure": sure, "losses": losses, "routes": routes},
+    **{"demo": demo, "front": front, "files": sizes, "order": order, "ordered": ordered},
     **{"descriptors": descriptors, "sequences": sequences},
     **{"rejection": rejection, "filtered": filtered, "drives": drives, "driven": driven},
     **{"trainings": trainings, "made drives": made_drives, "storage drives": storage_drives},
@@ -488,7 +583,7 @@ def made(name: str) -> str:
     """A table, and what it was measured with."""
     if name == "losses":
         return f"{losses()}\n*{', '.join(file_of(source).name for source in LOST)}.*\n"
-    source = name if file_of(name).exists() else "routes"
+    source = name if file_of(name).exists() else "order" if name == "ordered" else "routes"
     facts = read(source)
     said = ", ".join(str(facts[key]) for key in ("commit", "date", "machine") if key in facts)
     return f"{TABLES[name]()}\n*{file_of(source).name}: {said}.*\n"
@@ -504,7 +599,7 @@ def main(given: Sequence[str]) -> None:
         bench = stored(json.loads(Path(path).read_text(encoding="utf-8")))
         rows = ",\n".join(json.dumps(row) for row in bench.pop("rows"))  # a line each
         file_of(name).write_text(f'{json.dumps(bench)[:-1]}, "rows": [\n{rows}\n]}}\n', encoding="utf-8")
-    for page in (*DOCS.rglob("*.md"), *FOLDER.glob("*.md")):
+    for page in (README, *DOCS.rglob("*.md"), *FOLDER.glob("*.md")):
         page.write_text(filled(page.read_text(encoding="utf-8")), encoding="utf-8")
 
 

@@ -77,6 +77,7 @@ def test_tables_stand_where_they_are_marked_and_seeds_are_means(tmp_path, monkey
     (tmp_path / "results").mkdir()
     monkeypatch.setattr(tables, "FOLDER", tmp_path / "results")
     monkeypatch.setattr(tables, "DOCS", tmp_path)
+    monkeypatch.setattr(tables, "README", tmp_path / "page.md")
     page = tmp_path / "page.md"
     page.write_text("A\n<!-- table: routes -->\nold\n<!-- end of table -->\nB\n")
     (tmp_path / "bench.json").write_text(json.dumps({"rows": rows(), "commit": "abc", "equal_auc": 1}))
@@ -103,7 +104,7 @@ def test_the_pictures_of_results_are_of_what_is_kept():
         ]
     for way in ("uncompressed", "hog"):
         assert panels["city 1"][way] == [(0.0, city[way]["recall_at_1"])]
-    assert len(panels["road of the demo"]["product_quantiser"]) == 5
+    assert len(panels["road of the demo"]["product_quantiser"]) == 6
     drawn = pictures.plot_recalls(panels)[1]
     assert [axis.get_title("left") for axis in drawn.flat[: len(panels)]] == [*panels]
     grown = pictures.growth()
@@ -111,7 +112,7 @@ def test_the_pictures_of_results_are_of_what_is_kept():
     assert [places for places, _ in grown["recall@1"]["dejavu 4 B"]] == [10**4, 10**5, 10**6]
 
 
-PAGES = sorted([*tables.DOCS.rglob("*.md"), *tables.FOLDER.glob("*.md")])
+PAGES = sorted([tables.README, *tables.DOCS.rglob("*.md"), *tables.FOLDER.glob("*.md")])
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)

@@ -10,7 +10,19 @@ import torch
 from command_line import benchmark, benchmark_fails
 from torch.nn.functional import normalize
 
-from benchmarks import alike, chunks, front, live, spread, tables, teaching, train, visits
+from benchmarks import (
+    alike,
+    chunks,
+    files,
+    front,
+    live,
+    order,
+    spread,
+    tables,
+    teaching,
+    train,
+    visits,
+)
 from benchmarks.alike import CAPPED, CHECKED, SINGLE, UNCAPPED
 from benchmarks.teaching import COPIES, PLACED, REFINED, TASKS, TOLD, Task, right_of, run_teaching
 from benchmarks.train import Rung
@@ -23,6 +35,7 @@ from dejavu_torch.evaluation.paper_tables import PUBLISHED
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.views import LabelledFrames
+from dejavu_torch.recognition.calibration import POWER
 
 
 def rows_of(out):
@@ -44,14 +57,48 @@ def films(tmp_path, monkeypatch):
 def test_front(tmp_path, monkeypatch):
     """Of a short road: a row for each way and size, and a picture with three pairs."""
     monkeypatch.setattr(front, "ROAD", tuple(f"demo:road?traverse={i}&stop=90" for i in (0, 1)))
-    for name, value in (("SEEDS", (1,)), ("BYTES", (2.0, 4.0)), ("CODES", (2,)), ("SHOWN", (20, 60))):
+    other = f"{front.OTHER}&frames=90"
+    for name, value in (("SEEDS", (1,)), ("BYTES", (2.0, 120.0)), ("OTHER", other), ("SHOWN", (20, 60))):
         monkeypatch.setattr(front, name, value)
     benchmark("front", "--out", tmp_path)
     rows = rows_of(tmp_path)
-    assert {row["contender"] for row in rows} - {front.FAISS} == {*front.WAYS, *front.POINTS}
+    assert {row["contender"] for row in rows} == {*front.WAYS, *front.ACCOUNTS, *front.POINTS}
     assert min(row["one_image"] for row in rows if row["contender"] == "uncompressed") > 0.9
-    assert all(0 <= row[f"{way}_span"][0] <= row[way] for row in rows for way in front.COLUMNS[1:])
+    for row in rows:
+        ways = front.COLUMNS[1:-1] if row["contender"] in front.ACCOUNTS else front.COLUMNS[1:]
+        assert all(0 <= row[f"{way}_span"][0] <= row[way] for way in ways)
     assert (tmp_path / "bench.png").stat().st_size > 10_000
+
+
+def test_order(films, monkeypatch, capsys):
+    """A row for each route and order; by score is what the others gain over."""
+    road = Route("{data}/road.npy", "{data}/drive.npy", 5, "{data}/truth.csv")
+    for name in ("CHOSEN", "REPORTED"):
+        monkeypatch.setattr(order, name, {f"{name} road": road})
+    monkeypatch.setattr(order, "HALVES", {"chosen on": order.CHOSEN, "reported": order.REPORTED})
+    benchmark("order", films, "--out", films / "out")
+    rows = rows_of(films / "out")
+    assert len(rows) == 2 * 9
+    assert min(row["auc"] for row in rows) > 0.5
+    assert all(row["auc"] == 0 for row in order.gains(rows) if row["contender"] == "score")
+    assert "reported: score / elsewhere^0.75" in capsys.readouterr().out
+    assert POWER in order.POWERS
+
+
+def test_files(tmp_path, monkeypatch):
+    """Each of the routes with everything that its file needs."""
+    monkeypatch.setattr(files, "ROUTES", {60: files.ROAD, 80: files.SIMULATED, 400: files.MADE})
+    for name, value in (("QUERIES", 20), ("LIKE", 80)):
+        monkeypatch.setattr(files, name, value)
+    benchmark("files", "--out", tmp_path)
+    rows = rows_of(tmp_path)
+    assert [row["contender"] for row in rows] == 3 * [*files.NAMES]
+    for row in rows:
+        assert row["recall_at_1"] > 0.5
+    assert rows[1]["codebook_bytes"] > 0 == rows[0]["codebook_bytes"]
+    model = DejaVu().learn(files.SOURCES[files.ROAD].format(places=60, traverse=0))
+    model.save(tmp_path / "map.safetensors")
+    assert rows[0]["bytes"] == pytest.approx((tmp_path / "map.safetensors").stat().st_size, rel=0.01)
 
 
 def test_alike(films, monkeypatch):
