@@ -159,8 +159,9 @@ def sure() -> str:
         return [one.get("recall_at_99_precision") for one in own]
 
     rows = [
-        [name, *("" if share is None else f"{100 * share:.0f}" for share in means)]
+        [name, *(f"{100 * share:.0f}" for share in means if share is not None)]
         for name, means in by_seeds(reports("default"), figures)
+        if None not in means
     ]
     return markdown([["route", *names], *rows])
 
@@ -182,6 +183,7 @@ def demo() -> str:
     for key, name in names.items():
         of = report[key] if key else report
         shares = of["recall_at_1"], of["recall_at_99_precision"], of["sequences"]["smoother"]["recall_at_1"]
+        shares = tuple(round(one * report["with_answer"]) / report["with_answer"] for one in shares)
         each = of.get("route_bytes", report["route_bytes"]) / report["frames"]
         form = f"{each:.1f}" if each < 100 else f"{each:,.0f}".replace(",", " ")
         table.append([name, *(f"{100 * share:.1f} %" for share in shares), form])
@@ -205,14 +207,13 @@ def front() -> str:
 
 
 def sizes() -> str:
-    """What a file weighs, all counted, and what is found of single images."""
-    table = [["places", *(f"{name}: kB" for name in FILES.values()), "found, in this order"]]
+    """What a file weighs, all counted."""
+    table = [["places", *(f"{name}: kB" for name in FILES.values())]]
     for places, rows in groupby(read("files")["rows"], lambda row: row["places"]):
         own = {row["contender"]: row for row in rows}
         kilobytes = (f"{own[name]['bytes'] / 1e3:,.0f}".replace(",", " ") for name in FILES)
-        found = " / ".join(f"{100 * own[name]['recall_at_1']:.0f}" for name in FILES) + " %"
         what = {"road": "", "simulated": ", simulated", "made": ", made descriptors"}[own["map"]["route"]]
-        table.append([f"{places:,}".replace(",", " ") + what, *kilobytes, found])
+        table.append([f"{places:,}".replace(",", " ") + what, *kilobytes])
     return markdown(table)
 
 

@@ -65,7 +65,7 @@ def test_the_kept_report_is_what_the_demo_finds(report):
     for key in ("", "one_byte", "stride", "product_quantiser", "uncompressed", "hog", "null"):
         found, kept = (of[key] if key else of for of in (report, told))
         assert found["recall_at_1"] == pytest.approx(kept["recall_at_1"], abs=0.01), key
-        assert found["recall_at_99_precision"] == pytest.approx(kept["recall_at_99_precision"], abs=0.03), key
+        assert found["recall_at_99_precision"] == pytest.approx(kept["recall_at_99_precision"], abs=0.06), key
         smoothed = [of["sequences"]["smoother"]["recall_at_1"] for of in (found, kept)]
         assert smoothed[0] == pytest.approx(smoothed[1], abs=0.01), key
         if "route_bytes" in kept:
