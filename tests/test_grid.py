@@ -323,7 +323,7 @@ def test_a_flight_over_a_later_picture_needs_no_truth(tmp_path):
     here, there = coordinates_of([open_source(reference), flight], "pixels")
     assert here.shape[1] == there.shape[1] == 2
     # rivals and controls fly over the area, too
-    report = compare(reference, flight, model=model, tolerance=10).report.as_json()
+    report = compare(reference, flight, model=model, tolerance=10, drives="all").report.as_json()
     for rival in (report, report["uncompressed"], report["hog"]):
         for way in ("filter", "smoother"):
             assert rival["sequences"][way]["recall_at_1"] > 0.9

@@ -32,7 +32,8 @@ PAGES = {
     str(path.relative_to(ROOT)): path.read_text()
     for path in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), *sorted(MEASURED.glob("*.md"))]
 }
-LONGEST = {"README.md": 800, "docs/results/index.md": 700}  # words; 900 elsewhere
+# words; 900 elsewhere
+LONGEST = {"README.md": 800, "docs/results/index.md": 700, "docs/reference/files.md": 1000}
 OF_OTHER_TOOLS = {"--save_descriptors"}
 FENCED = re.compile(r"(<!-- not run: [^>]+-->\n+)?^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 BLOCKS = {

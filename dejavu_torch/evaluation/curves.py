@@ -120,8 +120,7 @@ def by_confidence(match: Match) -> Match:
     that is unknown."""
     if match.confidence is None:
         return match
-    nothing = (match.index < 0) | ~match.score.isfinite()
-    return replace(match, score=(-match.confidence).masked_fill(nothing, torch.inf))
+    return replace(match, score=(-match.confidence).masked_fill(~match.score.isfinite(), torch.inf))
 
 
 def threshold_of_full_precision(curve: PRCurve) -> float | None:

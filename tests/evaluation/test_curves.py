@@ -164,8 +164,7 @@ def test_recall_at_99_precision_is_in_the_order_of_confidence(rows, tolerance, d
     sure = data.draw(st.lists(st.sampled_from([0.0, 1.0, 2.0, 3.0]), min_size=len(rows), max_size=len(rows)))
     places, truth = [index for _, index, _ in rows], torch.tensor([truth for _, _, truth in rows])
     match = replace(match_of(places, scores), confidence=torch.tensor(sure))
-    silent = [index < 0 or score == INF for index, score in zip(places, scores, strict=True)]
-    by_score = [INF if nothing else -one for one, nothing in zip(sure, silent, strict=True)]
+    by_score = [INF if score == INF else -one for one, score in zip(sure, scores, strict=True)]
     found = evaluate(match, truth, tolerance)
     expected = evaluate(match_of(places, by_score), truth, tolerance)
     assert found.recall_at_99_precision == expected.recall_at_99_precision

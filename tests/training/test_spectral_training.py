@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -116,7 +117,8 @@ def test_a_second_traverse_tells_what_a_visit_changes(tmp_path, caplog, alone):
     trainer(tmp_path, kept).fit(spectral(), data_of(**given))
     assert warned(caplog) == []
     model = DejaVu.load(tmp_path / "map.safetensors")
-    expected = evaluate(model.localize(noisy), torch.arange(FRAMES)[:, None], tolerance=2)._asdict()
+    found = replace(model.localize(noisy), confidence=None)  # a training orders answers by their scores
+    expected = evaluate(found, torch.arange(FRAMES)[:, None], tolerance=2)._asdict()
     task, data = spectral(), data_of(**given, query=noisy, truth="0")
     (figures,) = trainer(tmp_path).test(task, data, ckpt_path=last, verbose=False)
     assert torch.equal(levels(task.dejavu), levels(model))
