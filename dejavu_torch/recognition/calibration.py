@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -14,8 +14,10 @@ from dejavu_torch.area import Area, around, distance
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.recognition.filter import PlaceFilter, moments_of
 from dejavu_torch.recognition.select import best_candidates, best_match
-from dejavu_torch.recognition.smoother import Drive, PlaceSmoother
 from dejavu_torch.types import InputError, Match, SequenceModel, expect
+
+if TYPE_CHECKING:
+    from dejavu_torch.recognition.smoother import Drive, PlaceSmoother
 
 TOLERANCE = 5  # places within which an answer is right
 POWER = 0.75  # of the best score elsewhere in a confidence, chosen by `python -m benchmarks order`

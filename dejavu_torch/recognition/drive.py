@@ -28,6 +28,7 @@ from dejavu_torch.recognition.smoother import (
     check_descriptors,
     normalised,
 )
+from dejavu_torch.recognition.taken import singly
 from dejavu_torch.text import progress_of
 from dejavu_torch.types import Match
 
@@ -55,6 +56,8 @@ class DriveQuery(NamedTuple):
         platt: the calibration of single queries, if there is one.
         single: as `rows`, of queries that are no drive, which are not centred; None is as `rows`.
         tiles: the scores of `rows` for large maps; None makes them of rows.
+        null: as `rows`, of `flipped` queries, for a seed; without it their order alone tells whether they are
+            a drive.
         checks: the drive only checks the answers of single queries: it lowers their probability. Where ground
             repeats, as lane dashes do, a drive alone finds loops that are none.
     """
@@ -69,11 +72,19 @@ class DriveQuery(NamedTuple):
     single: Rows | None = None
     tiles: Tiles | None = None
     checks: bool = False
+    null: Callable[..., Tensor] | None = None
 
     @property
     def answers(self) -> bool:
         """Whether the drive answers, once the smoother is fitted."""
         return self.smoother.is_drive and not self.checks
+
+    def ask_singly(self) -> None:
+        """Leave it to the smoother only what single images find as well."""
+        if self.null is not None and len(self.descriptors):
+            known, area = self.smoother, self.smoother.area
+            known.singly = singly(self.rows, self.null, len(self.descriptors), area, self.radius)
+            known.is_drive &= known.singly.stands_out
 
 
 class Seen(NamedTuple):
@@ -190,6 +201,7 @@ def _seen(
         if smoother.area is not None:
             near = spacing_of(check_descriptors(descriptors))
             mass = place_flight(smoother, rows, len(descriptors), smoother.area, near)
+            asked.ask_singly()
             own = rows if asked.answers else asked.single or rows
             fitted_one(1)
             yield i, Seen(mass.double(), own(torch.arange(len(descriptors))).cpu())
@@ -201,6 +213,7 @@ def _seen(
         spacing = spacings.get(id(descriptors))
         spacing = spacings[id(descriptors)] = spacing_of(descriptors) if spacing is None else spacing
         smoother.fit(rows, descriptors, starts, spacing)
+        asked.ask_singly()
         fitted_one(1)
         kind = len(descriptors), smoother.layout(places, starts), len(smoother.move_logits)
         fitted.setdefault(kind, []).append((i, smoother.drive(rows, descriptors, spacing)))
@@ -218,10 +231,12 @@ def _seen(
 
 def _of_windows(asked: DriveQuery, places: int, progress: bool) -> Iterator[Seen]:
     """What is seen of a drive on a large map."""
-    rows, descriptors, smoother, k, radius, starts, _, single, tiles, _ = asked
+    rows, descriptors, smoother, k, radius, starts, _, single, tiles, *_ = asked
     tiles, single = tiles or Tiles(lambda numbers: iter([(0, rows(numbers))]), places), single or rows
     settings = places, smoother, starts, max(2, k), radius, progress
-    for first, posterior, scores, known in LargeDrive(tiles, descriptors, *settings):
+    drive = LargeDrive(tiles, descriptors, *settings)
+    asked.ask_singly()
+    for first, posterior, scores, known in drive:
         mass = _mass(posterior)
         if asked.answers:
             yield Seen(mass, scores, known)

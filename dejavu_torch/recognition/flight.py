@@ -18,7 +18,6 @@ from dejavu_torch.recognition.evidence import RankTable, Spacing, Standardised, 
 from dejavu_torch.recognition.motion import MIN_PROBABILITY, logits
 from dejavu_torch.recognition.plane import Steps, as_plane, boxes, by_place, rings
 from dejavu_torch.recognition.smoother import (
-    DRIVE,
     MOVE_SHARE,
     RADIUS,
     ROUNDS,
@@ -27,6 +26,7 @@ from dejavu_torch.recognition.smoother import (
     log_likelihood,
     tempering_of,
 )
+from dejavu_torch.recognition.taken import moves_along
 
 # of which the fit starts: among so many windows a right one has to stand out more than along a route
 SEPARATION, SPREAD = 3.0, 2.0  # standard deviations of scores; windows that a step goes in each direction
@@ -83,7 +83,7 @@ def place_flight(smoother: PlaceSmoother, rows: Rows, queries: int, area: Area, 
         kernel = kernel / kernel.sum()
     swept = _sweep(smoother, area, std, weight, spacing.still, table.values, separation, kernel)
     smoother.separation, smoother.log_likelihood = separation, swept.log
-    smoother.is_drive = swept.log >= DRIVE
+    smoother.is_drive = moves_along(swept.log, swept.log)  # jumps are not learned
     moves = torch.zeros(reach + 1).index_add_(0, rings(reach).flatten(), kernel.flatten())
     smoother.move_logits.copy_(logits(*moves.tolist()))
     return by_place(swept.mass, area)

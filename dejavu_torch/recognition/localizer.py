@@ -24,6 +24,7 @@ from dejavu_torch.recognition.search import SCORES_AT_ONCE, NmsSpec, Scan, Searc
 from dejavu_torch.recognition.select import Acceptance, accept, best_candidates, best_match
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.recognition.smoother import PlaceSmoother, Rows
+from dejavu_torch.recognition.taken import flipped
 from dejavu_torch.text import with_progress
 from dejavu_torch.types import Match, SequenceModel, Together
 
@@ -214,8 +215,13 @@ class Localizer:
         single, settings = None, (matching.k or 1, matching.radius, self.route_starts, matching.platt)
         if matching.apart is not None:
             return DriveQuery(loops, descriptors, smoother, *settings, checks=True)
+
+        def null(numbers: Tensor, seed: int) -> Tensor:
+            return best_copies(score(flipped(descriptors[copies_of(numbers, copies)], seed)), copies)
+
         single = None if matching.plain is None else rows(matching.plain)
-        return DriveQuery(rows(descriptors), descriptors[::copies], smoother, *settings, single, tiles)
+        some = descriptors[::copies]
+        return DriveQuery(rows(descriptors), some, smoother, *settings, single, tiles, null=null)
 
     @torch.no_grad()
     def skip(self, queries: int) -> None:
@@ -313,13 +319,14 @@ def drive_query(
     score: Scoring,
     plain: Tensor | None = None,
     area: Area | None = None,
+    stride: int = 1,
 ) -> DriveQuery:
     """Queries (Q,K) as a drive with scores of any kind, for a smoother like this one; see `Matching`.
 
     Args:
-        area: of the places; None along a route.
+        area: of the places; None along a route. stride: of the frames that the scores are of.
     """
-    matching = Matching(plain=plain, removed=smoother.removed)
+    matching = Matching(plain=plain, removed=smoother.removed, radius=stride)
     return Localizer(None, matching, area=area).drive_query(queries, copy.deepcopy(smoother), score)
 
 

@@ -32,6 +32,7 @@ from dejavu_torch.recognition.motion import (
     checked_rates,
     logits,
 )
+from dejavu_torch.recognition.taken import Singly, moves_along
 from dejavu_torch.types import Facts, InputError, SequenceModel, expect
 
 MOVES = (0.2, 0.5, 0.2, 0.05, 0.02, 0.015, 0.015)
@@ -50,12 +51,9 @@ SURE, SLOW_CHANGES = 2.5, 7.0
 FITTED, STRETCH, STRETCHES = 1000, 100, 10  # queries that are fitted to at most, in a stretch, and stretches
 LEAST, SAMPLED = 20, 2**21  # queries that are fitted to at least, and their scores at most otherwise
 CORRELATED = 4  # correlation times in a stretch, at least
-DRIVE = 10.0  # nats by which a drive beats being off the map throughout
-OTHER_DRIVE, PER_QUERY = 30.0, 0.1  # likewise at another speed, in all and per query,
-ALIKE = 0.2  # of the drive's nats: where places elsewhere explain as much, these places only look alike,
-REPEATED = 0.8  # and where they explain as much, they show the same
-FOUND = 0.05  # mass of a place that is found
-CLEARLY = 5.0  # and times as many as at one place a query
+# nats above being off the map by which another speed is taken, in all and per query, and times as many as at
+# one place a query
+OTHER_SPEED, PER_QUERY, CLEARLY = 30.0, 0.1, 5.0
 WHOLE = "a smoother has to know the whole drive; expected a PlaceFilter, or a SequenceMatcher"
 BLOCK = 2**20  # numbers of a block of queries and states, which stays in the cache
 HELD = 2**25  # of all of them, up to which they are kept for the way back
@@ -100,14 +98,14 @@ class Sample(NamedTuple):
 class Fit(NamedTuple):
     """What expectation-maximisation found.
 
-    log: nats by which the model beats being off the map. second: likewise, without the places found.
+    log: nats by which the model beats being off the map. held: likewise, with jumps as rare as the prior's.
     """
 
     rates: Rates
     separation: float
     values: Tensor  # of the rank table
     log: float
-    second: float
+    held: float
 
 
 class PlaceSmoother(SequenceModel):
@@ -187,6 +185,8 @@ class PlaceSmoother(SequenceModel):
         self.area: Area | None = None  # of that map's places, see `place_flight`
         self.removed = 1.0  # share of each place's mean score that is removed
         self.log_likelihood: float | None = None  # nats above being off the map throughout, as fitted
+        self.nats_per_query = 0.0  # likewise, with rare jumps, as if queries did not depend on each other
+        self.singly: Singly | None = None  # what single images say, if they were asked
         self.correlation = 1.0  # tau of these queries
         self.is_drive = True  # whether the queries that were fitted to are a drive of the map
         self.prior, self.rate_prior, self.first_separation = moves, (jump, leave, enter), float(separation)
@@ -348,7 +348,7 @@ class PlaceSmoother(SequenceModel):
             known = check_scores(scores, descriptors)
             scores, descriptors = rows_of(known), spoken(known) if descriptors is None else descriptors
         descriptors = check_descriptors(descriptors)
-        self.is_drive, self.log_likelihood = False, None
+        self.is_drive, self.log_likelihood, self.singly = False, None, None
         if not len(descriptors):
             return self
         spacing = spacing or spacing_of(descriptors)
@@ -369,16 +369,15 @@ class PlaceSmoother(SequenceModel):
         """As `fit`, from stretches of the drive and the ranks of all their scores."""
         self.correlation, self.tempering = spacing.correlation, tempering_of(spacing)
         moving = float(sum((~sample.still).sum() for sample in samples))
+        different = float(sum(sample.weight.sum() for sample in samples))
         best = self._fitted(samples, ranks, self.prior, moving)
-        if best.log < max(OTHER_DRIVE, PER_QUERY * moving) and self.prior == MOVES:
+        if best.log < max(OTHER_SPEED, PER_QUERY * moving) and self.prior == MOVES:
             others = (self._fitted(samples, ranks, start, moving) for start in (SLOW, FAST))
             other = max(others, key=lambda one: one.log)
-            different = float(sum(sample.weight.sum() for sample in samples))
-            least = max(OTHER_DRIVE, PER_QUERY * different, CLEARLY * best.log)
+            least = max(OTHER_SPEED, PER_QUERY * different, CLEARLY * best.log)
             best = other if other.log >= least else best
-        # elsewhere explains a drive no better than being off the map, unless it shows the same places
-        alike = max(DRIVE, ALIKE * best.log) <= best.second < REPEATED * best.log
-        self.is_drive, self.log_likelihood = best.log >= DRIVE and not alike, best.log
+        self.is_drive, self.log_likelihood = moves_along(best.log, best.held), best.log
+        self.nats_per_query = self.tempering * best.held / max(1.0, different)
         if best.separation >= SURE and spacing.correlation >= SLOW_CHANGES * spacing.detrended:
             self.tempering = spacing.detrended
         self.separation, self.values = best.separation, best.values
@@ -421,18 +420,20 @@ class PlaceSmoother(SequenceModel):
             separation = max(MIN_SEPARATION, float(sums[0] / sums[1].clamp(min=MIN_PROBABILITY)))
             total = Counts(*(torch.stack(kind).sum(0) for kind in zip(*counts, strict=True)))
             rates = updated_rates(total, prior * (MOVE_SHARE * moved), self.rate_prior)
-        values, log, second = table.values, 0.0, 0.0
+        rare = rates._replace(jump=prior.new_tensor(self.rate_prior[0]))
+        nats = (self._nats(samples, table.values, separation, one) for one in (rates, rare))
+        return Fit(rates, separation, table.values, *nats)
+
+    def _nats(self, samples: Sequence[Sample], values: Tensor, separation: float, rates: Rates) -> float:
+        """By how much the model beats being off the map."""
+        total = 0.0
         for sample in samples:
-            motion, masks = Motion(sample.layout, rates), []
-            for block in self.explained(sample, values, separation, motion):
-                log += float(block.log.sum())
-                found = near_mass(self.folded(block.posterior)[..., :-1], RADIUS) > FOUND
-                masks.append(near_mass(found.float(), RADIUS) == 0)
-            likelihood = self._likelihood(sample, values, separation, torch.cat(masks[::-1], -2))
-            numbers = range(0, sample.weight.shape[-1], masks[-1].shape[-2])
-            parts = forward(motion, likelihood, numbers, sample.still)
-            second += float(sum(part.log.sum() for part in parts))
-        return Fit(rates, separation, values, log, second)
+            *lead, queries = sample.weight.shape
+            size = max(1, BLOCK // (math.prod(lead) * (2 * sample.layout.places + 1)))
+            likelihood = self._likelihood(sample, values, separation)
+            parts = forward(Motion(sample.layout, rates), likelihood, range(0, queries, size), sample.still)
+            total += float(sum(part.log.sum() for part in parts))
+        return total
 
     def explained(
         self, sample: Sample, values: Tensor, separation: float, motion: Motion, size: int | None = None
@@ -443,17 +444,12 @@ class PlaceSmoother(SequenceModel):
             size = max(1, BLOCK // (math.prod(lead) * (2 * sample.layout.places + 1)))
         yield from sweep(motion, self._likelihood(sample, values, separation), queries, sample.still, size)
 
-    def _likelihood(
-        self, sample: Sample, values: Tensor, separation: float, elsewhere: Tensor | None = None
-    ) -> Likelihood:
-        """The likelihoods of a sample; `elsewhere` (..., L, N): only those places may be likely."""
+    def _likelihood(self, sample: Sample, values: Tensor, separation: float) -> Likelihood:
+        """The likelihoods of a sample."""
 
         def likelihood(first: int, last: int) -> Tensor:
             std, weight, *_ = sample.part(first, last)
             log = log_likelihood(values, std, weight, separation, self.tempering)
-            if elsewhere is not None:
-                unlikely = log.clamp(max=-(separation**2) / 2 / self.tempering)
-                log = torch.where(elsewhere[..., first:last, :], log, unlikely)
             return self.wide(log.exp(), 1.0)
 
         return likelihood
@@ -462,9 +458,12 @@ class PlaceSmoother(SequenceModel):
     def settled(self) -> Facts:
         """What the smoother settled on, for a report."""
         _, jump, leave = self.rate_logits.softmax(0).tolist()
+        singly = {} if self.singly is None else self.singly._asdict()
         return {
             "is_drive": self.is_drive,
             "log_likelihood": self.log_likelihood,
+            "nats_per_query": self.nats_per_query,
+            **singly,
             "moves": self.move_logits.softmax(0).tolist(),
             "jump": jump,
             "leave": leave,

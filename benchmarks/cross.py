@@ -1,0 +1,291 @@
+"""`benchmarks cross`: the map of every route asked by a drive over every route."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from benchmarks.areas import RADIUS, STRIDE, flight
+from benchmarks.drives import AS_IT_WAS, HALF, Known, asked, drives_of
+from benchmarks.measure import Row, truth_of, write_bench
+from benchmarks.trainings import ROAD
+from dejavu_torch.data.demo import open_area
+from dejavu_torch.data.ground_truth import GroundTruth, all_judged
+from dejavu_torch.data.source import open_source
+from dejavu_torch.data.traverse import Part, Traverse, fitted
+from dejavu_torch.evaluation.curves import evaluate
+from dejavu_torch.evaluation.rejection import calibration_error, judged
+from dejavu_torch.evaluation.report import text_table
+from dejavu_torch.growth import calibrate_if_possible, merge
+from dejavu_torch.model import DejaVu
+from dejavu_torch.recognition.filter import PlaceFilter
+from dejavu_torch.recognition.smoother import PlaceSmoother
+from dejavu_torch.teaching import in_its_light
+from dejavu_torch.types import InputError
+
+ASKED = 400  # queries of a drive over another route, from its middle
+SHARES = (0.5, 0.9, 0.99)
+FEW = 20  # answers, of fewer of which no share of right ones is told
+FIRST, BETWEEN = "its first half", "stretches of 5 to 40, others between"
+CUTS = (
+    *(AS_IT_WAS, "a third of the speed", "three times the speed", "reversed", "there and back"),
+    *(BETWEEN, HALF),
+)
+WAYS = ("drive", "filter", "one")
+OWN, SHARED, REPEATED, KIND, OTHER = (
+    *("own", "shares ground", "the road's other half", "another route of the kind", "another kind"),
+)
+
+
+class Footage(NamedTuple):
+    """Two traverses; {data} is the folder of the footage.
+
+    truth: as of `find_ground_truth`; None: frame i shows place i, or what the sources tell. ground, kind:
+    footage of one ground shares places, and of one kind looks alike. features: those with the same name can
+    be asked on each other's maps. part: which half of its places is the route.
+    """
+
+    reference: str
+    query: str
+    tolerance: int
+    truth: str | None
+    ground: str
+    kind: str
+    features: str = "images"
+    part: int | None = None
+
+
+def filmed(name: str, tolerance: int, ground: str, kind: str) -> Footage:
+    first, second, truth = (f"{{data}}/{name}/{file}" for file in ("reference.npy", "query.npy", "truth.csv"))
+    return Footage(first, second, tolerance, truth, ground, kind)
+
+
+def halves(name: str, tolerance: int, truth: str | None = "truth.csv") -> dict[str, Footage]:
+    """The two halves of a route of features, which no other route has."""
+    one = filmed(name, tolerance, name, name)._replace(truth=truth and f"{{data}}/{name}/{truth}")
+    parts = (one._replace(features=name, ground=f"{name}, {i}", part=i) for i in (0, 1))
+    return dict(zip((f"{name}, first half", f"{name}, second half"), parts, strict=True))
+
+
+def road(part: str) -> Footage:
+    first, second = (ROAD.format(i, part).format(data="{data}") for i in (1, 2))
+    return Footage(first, second, 5, None, f"road{part}", "road from above")
+
+
+def railway(part: str) -> Footage:
+    first, second = (f"{{data}}/nordland/{season}?{part}" for season in ("summer", "winter"))
+    return Footage(first, second, 1, "0", f"railway {part}", "railway")
+
+
+def simulated(kind: str, seed: int) -> Footage:
+    first, second = (f"sim:{kind}?seed={seed}&traverse={i}&stop=1000" for i in (0, 1))
+    return Footage(first, second, 5, None, f"sim:{kind}, {seed}", f"sim:{kind}")
+
+
+FOOTAGE = {
+    "road, first half": road("&stop=1348"),
+    "road, second half": road("&start=1348"),
+    "railway, first half": railway("stop=900"),
+    "railway, second half": railway("start=900"),
+    **{f"city {i}": filmed(f"robotcar/{t}", 2, "city", "city") for i, t in enumerate(("t1", "t2", "t5"), 1)},
+    "laps": filmed("donkey_lap", 10, "mat", "mat"),
+    "corridor": Footage(
+        "{data}/corridor/ref",
+        "{data}/corridor/query",
+        0,
+        "{data}/corridor/truth.csv",
+        "corridor",
+        "corridor",
+    ),
+    "corridor laps": filmed("corridor_laps", 0, "corridor laps", "corridor"),
+    "floors": filmed("floors_rejection", 1, "floors", "corridor"),
+    **{
+        f"sim:{kind}, seed {seed}": simulated(kind, seed)
+        for kind in ("aerial", "outdoor", "underground")
+        for seed in (1, 2)
+    },
+    **halves("gardens_night_hdc", 1, None),
+    **halves("wifi_mall", 0),
+    **halves("magnetic_laps", 5),
+    **halves("lidar_fhw", 1),
+}
+
+AREA, MERGED = "an area", "a merged map"
+PARTS_OF_MERGED = ("city 1", "laps")
+MAPS = (*FOOTAGE, AREA, MERGED)
+
+
+class Board(NamedTuple):
+    """A map, the routes that it shows, and the drive over its own ground: descriptors (Q,K) and truth."""
+
+    model: DejaVu
+    shows: tuple[str, ...]
+    queries: Tensor
+    truth: GroundTruth
+    tolerance: int
+
+
+def run_cross(data: Path, *, out: Path, maps: Sequence[str] = (), seed: int = 0) -> list[str]:
+    """The map of every route asked by a drive over every route: which are taken for a drive of the map?
+
+    Args:
+        data: folder of the footage, as for the tests
+        out: folder for bench.json
+        maps: names of those that are asked; all if not given
+        seed: of the stretches in random order
+    """
+    if unknown := [name for name in maps if name not in MAPS]:
+        raise InputError(f"{unknown[0]!r} is no map; expected one of {', '.join(map(repr, MAPS))}")
+    rows: list[Row] = []
+    for name in tqdm(maps or MAPS, "maps", disable=None, leave=False):
+        rows += bench_cross(name, data, seed)
+        write_bench(out, rows, seed=seed)  # as soon as a map is finished
+    return [text_table(summary(rows)), "drives over other ground and over the map's own"]
+
+
+def bench_cross(name: str, data: Path, seed: int = 0) -> Iterator[Row]:
+    """A row for each drive on a map.
+
+    Yields:
+        relation: of the drive and the map; further, see `facts_of`.
+    """
+    board = board_of(name, data)
+    foreign = dict(asked_of(board, data))
+    beside = next(queries for other, queries in foreign.items() if related(board, other) == OTHER)
+    known = Known(board.model, board.queries, board.truth, board.tolerance, beside)
+    cuts = drives_of(len(board.queries), beside, seed)
+    cuts = {cut: cuts[cut] for cut in CUTS} | {FIRST: torch.arange(len(board.queries) // 2)}
+    for cut, numbers in cuts.items():
+        assert numbers is not None
+        row: Row = {"case": name, "contender": name, "cut": cut, "relation": OWN}
+        yield row | facts_of(board, *asked(known, numbers))
+    for other, queries in foreign.items():
+        row = {"case": name, "contender": other, "cut": "", "relation": related(board, other)}
+        yield row | facts_of(board, queries)
+
+
+def board_of(name: str, data: Path) -> Board:
+    """A map with all default settings, of one route, of two, or of an area."""
+    model = DejaVu()
+    if name == AREA:
+        first, second = open_area(0, stride=STRIDE), open_area(1, stride=1)
+        model.learn(first)
+        path = second.area.place_at(flight(second.area, torch.Generator().manual_seed(0)))
+        where = second.area.coordinates(path)
+        places = first.area.place_near(where)[:, None]
+        queries = model.descriptor.all_of(Part(second, path)).float()
+        return Board(model, (name,), queries, all_judged(places), round(RADIUS / STRIDE))
+    routes = PARTS_OF_MERGED if name == MERGED else (name,)
+    footage = FOOTAGE[routes[0]]
+    reference, query = (opened(one, data) for one in (footage.reference, footage.query))
+    truth = truth_of(reference, query, footage.truth and footage.truth.format(data=data))
+    if footage.part is not None:
+        half = len(reference) // 2
+        start, stop = ((0, half), (half, len(reference)))[footage.part]
+        reference = Part(reference, range(start, stop))
+        shown = truth.positives
+        inside = (shown >= start) & (shown < stop)
+        some = inside.any(1).nonzero()[:, 0]
+        query = Part(query, some)
+        truth = all_judged(torch.where(inside, shown - start, -1)[some])
+    model.learn(reference)
+    calibrate_if_possible(model, reference)
+    if name == MERGED:
+        other = copy.deepcopy(model)
+        added = fitted(opened(FOOTAGE[routes[1]].reference, data), reference.frame_shape)
+        other.learn_features(other.descriptor.all_of(added), added)
+        model = merge([model, other], routes)
+    return Board(model, routes, model.descriptor.all_of(query).float(), truth, footage.tolerance)
+
+
+def opened(source: str, data: Path) -> Traverse:
+    return open_source(source.format(data=data))
+
+
+def asked_of(board: Board, data: Path) -> Iterator[tuple[str, Tensor]]:
+    """Queries over the ground of all other routes that the map can be asked by, from their middle."""
+    own = FOOTAGE.get(board.shows[0])
+    for name, footage in FOOTAGE.items():
+        if name in board.shows or footage.features != (own.features if own else "images"):
+            continue
+        query = opened(footage.query, data)
+        some = torch.arange(len(query))
+        if footage.part is not None:
+            reference = opened(footage.reference, data)
+            shown = truth_of(reference, query, footage.truth and footage.truth.format(data=data)).positives
+            half = len(reference) // 2
+            inside = (shown >= half) == bool(footage.part)
+            some = some[((shown < 0) | inside).all(1) & (shown >= 0).any(1)]
+        first = max(0, len(some) - ASKED) // 2
+        shape = board.model.frame_shape
+        moved = query if shape is None else fitted(query, shape)
+        yield name, board.model.descriptor.all_of(Part(moved, some[first : first + ASKED])).float()
+
+
+def related(board: Board, drive: str) -> str:
+    """How a drive over other ground is related to a map."""
+    asked_, shown = FOOTAGE[drive], [FOOTAGE[one] for one in board.shows if one in FOOTAGE]
+    if any(one.ground == asked_.ground for one in shown):
+        return SHARED
+    if any(one.kind == asked_.kind for one in shown):
+        return REPEATED if asked_.kind == "road from above" else KIND
+    return OTHER
+
+
+def facts_of(board: Board, queries: Tensor, truth: GroundTruth | None = None) -> dict[str, Any]:
+    """The figures of a drive.
+
+    Returns:
+        taken: whether the smoother took it for a drive of the map. drive_above, filter_above, one_above:
+        shares of answers with at least each of `SHARES`. Of drives over the map's own ground also drive_right
+        and so on, the share of right ones of these, None for fewer than `FEW`; drive_auc; drive_error, of the
+        probabilities.
+    """
+    model, tolerance = board.model, board.tolerance
+    moved, smoother = in_its_light(model, queries), PlaceSmoother(within=max(1, tolerance))
+    drive = model.localize_descriptors(
+        moved, model.matching(smoother)._replace(radius=tolerance, plain=queries)
+    )
+    found: dict[str, Any] = {"queries": len(queries), "taken": smoother.is_drive}
+    found |= {key: value for key, value in smoother.settled().items() if isinstance(value, float)}
+    ways = {"drive": drive}
+    if model.calibration is not None:
+        ways["one"] = model.localize_descriptors(moved, model.matching()._replace(radius=tolerance))
+        if model.calibration.filter is not None:
+            ways["filter"] = model.localize_descriptors(queries, model.matching(PlaceFilter()))
+    for way, match in ways.items():
+        assert match.probability is not None
+        probability = match.probability
+        found[f"{way}_above"] = [float((probability >= share).double().mean()) for share in SHARES]
+        if truth is None:
+            continue
+        known, right = judged(match, truth, max(1, tolerance))
+        kept = [right[known >= share] for share in SHARES]
+        found[f"{way}_right"] = [float(one.double().mean()) if len(one) >= FEW else None for one in kept]
+        found[f"{way}_error"] = calibration_error(known, right)
+        found[f"{way}_auc"] = evaluate(match, truth, tolerance).auc
+    return found
+
+
+def summary(rows: Sequence[Row]) -> list[list[str]]:
+    """What is taken for a drive of each map, and the largest shares accepted of drives over other ground."""
+
+    def worst(some: Sequence[Row], way: str) -> str:
+        found = [row[f"{way}_above"] for row in some if f"{way}_above" in row]
+        return " ".join(f"{max(column):.2f}" for column in zip(*found, strict=True)) if found else ""
+
+    head = ["map", "own taken", *(f"{kind}: taken" for kind in (REPEATED, KIND, OTHER))]
+    lines = [[*head, *(f"worst {way}, p > .5 .9 .99" for way in WAYS)]]
+    for case in dict.fromkeys(row["case"] for row in rows):
+        own = [row for row in rows if row["case"] == case]
+        groups = [[row for row in own if row["relation"] == kind] for kind in (OWN, REPEATED, KIND, OTHER)]
+        taken = (f"{sum(row['taken'] for row in some)} of {len(some)}" if some else "" for some in groups)
+        foreign = [row for some in groups[1:] for row in some]
+        lines.append([case, *taken, *(worst(foreign, way) for way in WAYS)])
+    return lines
