@@ -301,9 +301,7 @@ def _calibrated(
                 calibrate_if_possible(model, reference, views, progress=progress, reach=reach)
             if model.calibration is None:
                 model.calibration = held
-                line = (
-                    "probabilities are of being within %d places, as of the map; here one is right within %d"
-                )
+                line = "the map gives probabilities of being within %d places; here one is right within %d"
                 log.warning(line, TOLERANCE, reach)
         yield
     finally:

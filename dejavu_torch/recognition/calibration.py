@@ -204,7 +204,7 @@ def calibrated(
             the probability of single queries, see `look_alikes`.
         reach: places within which an answer is right.
     """
-    area, around_own = place_map.area, 2 * max(reach, TOLERANCE)
+    area, around_own = place_map.area, min(2 * max(reach, TOLERANCE), place_map.places)
     answers: tuple[list[tuple[Tensor, ...]], ...] = [], []  # of single queries, of a filter
     for descriptors, places in segments:
         scores = torch.cat([place_map.scores(part) for part in descriptors.split(64)])
