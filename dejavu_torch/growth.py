@@ -277,13 +277,14 @@ def calibrate_if_possible(
     views: LabelledFrames | None = None,
     places: Tensor | None = None,
     progress: bool = False,
+    reach: int = 5,
 ) -> None:
     """As `DejaVu.calibrate`; without views, only a map that is not calibrated and can be."""
     if views is not None:
-        model.calibrate(reference, views, progress=progress)
+        model.calibrate(reference, views, progress=progress, reach=reach)
     elif model.calibration is None and len(reference.frame_shape) == 3 and model.map.summary().covered:
         try:
-            model.calibrate(reference, None, places, progress)
+            model.calibrate(reference, None, places, progress, reach)
         except InputError as error:
             log.warning("the map is not calibrated: %s", error)
 

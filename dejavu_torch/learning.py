@@ -38,7 +38,7 @@ from dejavu_torch.maps.spectral_map import Chunk, SpectralMap
 from dejavu_torch.maps.spectrum import Transform
 from dejavu_torch.memory import concatenate, in_one_thread
 from dejavu_torch.motion.resampling import ResampledTraverse
-from dejavu_torch.recognition.calibration import Calibration, calibrated
+from dejavu_torch.recognition.calibration import TOLERANCE, Calibration, calibrated
 from dejavu_torch.recognition.centring import learn_turned
 from dejavu_torch.text import progress_of
 from dejavu_torch.types import Facts, InputError, Traverse, expect
@@ -321,6 +321,7 @@ def calibration_of(
     views: LabelledFrames | None = None,
     places: Tensor | None = None,
     progress: bool = False,
+    reach: int = TOLERANCE,
 ) -> Calibration:
     """See `DejaVu.calibrate`."""
     places = torch.arange(place_map.places) if places is None else places
@@ -350,7 +351,7 @@ def calibration_of(
         rows = descriptor.batches(Part(reference, drawn), progress, "calibrating")
         own = (concatenate(rows), places[drawn]) if len(drawn) else None
     try:
-        return calibrated(place_map, parts, another, own)
+        return calibrated(place_map, parts, another, own, reach)
     except InputError as error:
         raise InputError(f"calibrating by {name}: {error}") from error
 

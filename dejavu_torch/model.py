@@ -333,6 +333,7 @@ class DejaVu(nn.Module):
         views: LabelledFrames | None = None,
         places: Tensor | None = None,
         progress: bool = False,
+        reach: int = 5,
     ) -> DejaVu:
         """Learn the probability that an answer is right from its confidence, for `Match.probability`.
 
@@ -343,7 +344,7 @@ class DejaVu(nn.Module):
                 Frames without a place are ignored, and very many frames are sampled.
             places: (n,) int64, the place of each frame of the reference, -1 for none; None is place i for
                 frame i.
-            progress: see `learn`.
+            progress: see `learn`. reach: places within which an answer is right, inclusive.
 
         Returns:
             self, with `self.calibration`.
@@ -363,7 +364,8 @@ class DejaVu(nn.Module):
         route = None
         if reference is not None and views is None:
             route = self.at_map_size(as_traverse(reference), self.frame_shape or ())
-        self.calibration = learning.calibration_of(self.descriptor, self.map, route, views, places, progress)
+        known = route, views, places, progress, reach
+        self.calibration = learning.calibration_of(self.descriptor, self.map, *known)
         return self
 
     def forward(self, queries: Tensor) -> Tensor:

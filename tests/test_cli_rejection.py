@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
+import torch.nn.functional as F
 from command_line import fails, report_of, run
 
 from dejavu_torch import DejaVu
@@ -33,6 +35,57 @@ def test_compare_reports_what_is_accepted_on_and_off_the_map(tmp_path):
     assert report_of(tmp_path / "none")["accepted"] == 0
     again = report_of(tmp_path / "again")
     assert (again["accepted"], again["accepted_right"]) == (report["accepted"], report["accepted_right"])
+
+
+def visit(folder, name, seed, laps=1):
+    """A drive over 160 places a metre apart, which neighbours resemble; a source with its coordinates."""
+    noise, drawn = torch.Generator().manual_seed(seed), torch.Generator().manual_seed(0)
+    places = F.conv1d(torch.randn(24, 1, 184, generator=drawn), torch.hann_window(25)[None, None])[:, 0].T
+    rows = F.normalize(places, dim=1).repeat(laps, 1)
+    rows = F.normalize(rows + 0.2 * torch.randn(rows.shape, generator=noise), dim=1)
+    np.save(folder / f"{name}.npy", rows.numpy())
+    (folder / f"{name}.csv").write_text("x,y\n" + "\n".join(f"{i % 160},0" for i in range(len(rows))))
+    return f"{folder / name}.npy?coordinates={folder / name}.csv"
+
+
+@pytest.mark.parametrize("loops", [False, True], ids=["coordinates", "loops"])
+def test_the_docs_commands_at_tolerance_0_accept_what_is_right(tmp_path, loops):
+    first = visit(tmp_path, "morning", 1, laps=1 + loops)
+    words = ("--loops", "50") if loops else (visit(tmp_path, "evening", 2),)
+    words = (first, *words, "--truth", "metres:4", "--tolerance", "0", "--ordered", "--whitening", "none")
+    run("compare", *words, "--out", tmp_path / "report")
+    report = report_of(tmp_path / "report")
+    assert report["with_answer"] == 160
+    found = report["recall_at_1"] * 160
+    assert found > 110
+    assert 0.9 * found <= report["accepted_right"]
+    assert 0.95 * report["accepted"] <= report["accepted_right"]
+
+
+def test_a_reach_other_than_that_of_the_map(tmp_path, capsys, caplog):
+    out = tmp_path / "near"
+    run("compare", ROUTE, AGAIN, "--match", "single", "--out", out)
+    run("compare", ROUTE, AGAIN, "--match", "single", "--tolerance", "1", "--out", tmp_path / "one")
+    # what the files hold is for 5
+    near, one = (DejaVu.load(folder / "map.safetensors").calibration for folder in (out, tmp_path / "one"))
+    assert near == one
+    near, one = (np.genfromtxt(f / "matches.csv", delimiter=",", names=True) for f in (out, tmp_path / "one"))
+    assert (near["score"] == one["score"]).all()
+    assert near["probability"].sum() > one["probability"].sum()
+    capsys.readouterr()
+    run("localize", out / "map.safetensors", AGAIN, "--out", tmp_path / "m.csv")
+    assert "of being within 5 places" in capsys.readouterr().out
+    rows = np.random.default_rng(0).random((64, 8), np.float32)
+    for name in "abc":
+        np.save(tmp_path / f"{name}.npy", rows + 0.01 * rows[::-1])
+    map = tmp_path / "d.safetensors"
+    run("learn", tmp_path / "a.npy", "--map", map, "--calibration", tmp_path / "b.npy")
+    for command in ("compare a.npy c.npy --map d.safetensors", "evaluate near/matches.csv"):
+        words = [tmp_path / word if "." in word else word for word in command.split()]
+        caplog.clear()
+        run(*words, "--truth", "0", "--tolerance", "2", "--out", tmp_path / "out")
+        assert "of being within 5 places" in caplog.text
+        assert "right within 2" in caplog.text
 
 
 def test_no_calibration_where_none_is_wanted_or_can_be(tmp_path, capsys):

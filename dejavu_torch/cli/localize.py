@@ -131,7 +131,8 @@ def run_localize(
     say(f"{total} queries, {accepted} accepted; written to {out}")
     if counts:
         steps = next_steps(matcher is not None, chosen.given)
-        say(describe_probable(counts, total) + (f"; next: {'; '.join(steps)}" if steps else ""))
+        probable = f"{describe_probable(counts, total)}, of being within {SUPPRESSION} places"
+        say(probable + (f"; next: {'; '.join(steps)}" if steps else ""))
     _print_evaluate(out, model, map, source if query.coordinates is not None else "SOURCE")
 
 

@@ -36,7 +36,7 @@ from dejavu_torch.evaluation.facts import facts_of, match_facts, metric_facts, p
 from dejavu_torch.evaluation.localization import NOTHING, Localization
 from dejavu_torch.evaluation.pictures import draw_compared, draw_pictures
 from dejavu_torch.evaluation.plots import Pictures
-from dejavu_torch.evaluation.rejection import draw_reliability
+from dejavu_torch.evaluation.rejection import draw_reliability, reach_of
 from dejavu_torch.evaluation.report import Report, as_html
 from dejavu_torch.evaluation.storage import coded_at_sizes, noise_over_map
 from dejavu_torch.features.descriptor import is_ready
@@ -47,7 +47,9 @@ from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import DejaVu, check_apart, check_queries, features_per_frame
 from dejavu_torch.motion.resampling import ground_truth_of, resampled, source_of
+from dejavu_torch.recognition.calibration import TOLERANCE
 from dejavu_torch.recognition.centring import centred, set_apart
+from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.localizer import SINGLE, Matching
 from dejavu_torch.recognition.select import check_candidates
 from dejavu_torch.recognition.smoother import PlaceSmoother
@@ -124,13 +126,15 @@ def compare(
         second: see `DejaVu.learn`; another traverse than the query.
         others: further models that learn the same reference, by their keys in report.json, with their names
             in tables. They need a ground truth, and none of them resamples.
-        sequence: how the answers are found, see `DejaVu.localize`. With a filter or a `SequenceMatcher` the
-            scores at top level are those of its answers, else of single queries.
+        sequence: how the answers are found, see `DejaVu.localize`; within how many places, says `reach_of`.
+            With a filter or a `SequenceMatcher` the scores at top level are those of its answers, else of
+            single queries.
         centre: whether the single queries and those of a smoother are centred, see `centred`; None does it
             for at least 50 queries that are in order.
         top: candidates of each query.
         calibration: see `DejaVu.calibrate`; another traverse than the query. None calibrates a newly learned
-            map with changed frames of the reference, "none" does not.
+            map with changed frames of the reference, "none" does not. For another reach than 5 this is done
+            again, for the report only.
         distractors: routes that are not on the map, to see how many of their frames are accepted.
         storage_curve: also code a spectral map at several sizes, see `coded_at_sizes`:
             the report gets `storage` and its picture. Needs a ground truth.
@@ -163,9 +167,7 @@ def compare(
     query = north if headings == 1 else query
     truth, near, tolerance, within, radius = _reach(truth, query, reference.area, tolerance)
     in_order = source_of(query).ordered if ordered is None else ordered
-    smoother, causal = _ways(sequence, in_order and len(query) > 1, within)
-    if smoother is not None and reference.area is not None:
-        smoother.within = within
+    smoother, causal = _ways(sequence, in_order and len(query) > 1)
     if causal is not None:
         causal.check(None, len(reference))
     # without a given truth, each place would be its own answer
@@ -179,23 +181,28 @@ def compare(
             places = _learned(model, reference, second, tolerance, progress)
             if isinstance(calibration, LabelledFrames) or (calibration is None and not has_map):
                 calibrate_if_possible(model, reference, calibration, progress=progress)
-        with timed(seconds, "localize"):
-            # without truth they have no scores
-            beside = in_order and known is not None and not itself and headings == 1
-            sizes = (len(query), model.map.places, within)
-            also, alike = _beside(causal, beside, ordered is not None, *sizes, reference.area)
-            centring = in_order and model.centres(len(query)) if centre is None else centre
-            matching = Matching(causal, also, apart=loops, copies=headings)
-            run = _described(model, reference, query, places, centring, tolerance, matching, progress)
-            run = run._replace(radius=radius)
-            run, found = _localized(run, smoother is not None, top, progress)
-            run, candidates = _smoothed(run, found, smoother, alike, progress)
-        off_map = _match_distractors(model, off, smoother or causal, centring, headings, progress)
-
-        model.cpu()
         if known is not None:
             known = ground_truth_in_places(known, model.map.place_of)
             known = of_loops(known, torch.arange(len(query)), loops) if loops is not None else known
+        reach = reach_of(within, known, near is not None or radius > 0)
+        for one in (smoother, causal):
+            if isinstance(one, PlaceSmoother | PlaceFilter):
+                one.within = reach
+        with _calibrated(model, reach, reference, calibration, progress):
+            with timed(seconds, "localize"):
+                # without truth they have no scores
+                beside = in_order and known is not None and not itself and headings == 1
+                sizes = (len(query), model.map.places, reach)
+                also, alike = _beside(causal, beside, ordered is not None, *sizes, reference.area)
+                centring = in_order and model.centres(len(query)) if centre is None else centre
+                matching = Matching(causal, also, apart=loops, copies=headings)
+                run = _described(model, reference, query, places, centring, tolerance, matching, progress)
+                run = run._replace(radius=radius)
+                run, found = _localized(run, smoother is not None, top, progress)
+                run, candidates = _smoothed(run, found, smoother, alike, progress)
+            off_map = _match_distractors(model, off, smoother or causal, centring, headings, progress)
+
+        model.cpu()
         run = run._replace(
             truth=known, reference_features=places.cpu(), query_features=run.query_features.cpu()
         )
@@ -227,12 +234,12 @@ def _reach(
 ) -> tuple[Truth | None, Near | None, int, int, float]:
     """The truth, in an area by coordinates if none is given; the same if it is by distance; the tolerance of
     places; within how many of them, and which distance, an answer is right."""
-    if area is None:
-        return truth, None, tolerance, tolerance, float(tolerance)
-    if truth is None and query.coordinates is not None:
+    if area is not None and truth is None and query.coordinates is not None:
         truth = f"{'metres' if area.unit == 'm' else 'pixels'}:{tolerance}"
     parsed = None if truth is None else check_ground_truth(truth)
     near = parsed if isinstance(parsed, Near) else None
+    if area is None:
+        return truth, near, tolerance, tolerance, float(tolerance)
     if near is not None:
         check_unit(near, area)
     radius = float(tolerance) if near is None else near.radius
@@ -269,12 +276,36 @@ def _check_loops(loops: int, alone: bool, sequence: object) -> None:
 
 
 def _ways(
-    sequence: SequenceModel | Literal["auto"] | None, drive: bool, tolerance: int
+    sequence: SequenceModel | Literal["auto"] | None, drive: bool
 ) -> tuple[PlaceSmoother | None, SequenceModel | None]:
     """The smoother, or else the other sequence model that answers; "auto" is a smoother for a drive."""
     if isinstance(sequence, str):
-        sequence = PlaceSmoother(within=tolerance) if drive else None
+        sequence = PlaceSmoother() if drive else None
     return (sequence, None) if isinstance(sequence, PlaceSmoother) else (None, sequence)
+
+
+@contextmanager
+def _calibrated(
+    model: DejaVu,
+    reach: int,
+    reference: Traverse,
+    views: LabelledFrames | Literal["none"] | None,
+    progress: bool,
+) -> Iterator[None]:
+    """Within the block a calibrated model is calibrated for a reach, if there is what to do it by."""
+    held = model.calibration
+    try:
+        if held is not None and reach != TOLERANCE:
+            model.calibration = None
+            if not isinstance(views, str):
+                calibrate_if_possible(model, reference, views, progress=progress, reach=reach)
+            if model.calibration is None:
+                model.calibration = held
+                line = "the map gives probabilities of being within %d places; here one is right within %d"
+                log.warning(line, TOLERANCE, reach)
+        yield
+    finally:
+        model.calibration = held
 
 
 def _beside(

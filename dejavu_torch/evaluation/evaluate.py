@@ -35,12 +35,13 @@ from dejavu_torch.evaluation.contenders import contend
 from dejavu_torch.evaluation.match_plots import draw_coverage
 from dejavu_torch.evaluation.matches import ELSEWHERE, read_matches
 from dejavu_torch.evaluation.plots import Pictures
-from dejavu_torch.evaluation.rejection import draw_reliability, rejection_facts
+from dejavu_torch.evaluation.rejection import draw_reliability, reach_of, rejection_facts
 from dejavu_torch.evaluation.report import Report
 from dejavu_torch.evaluation.score_plots import draw_curves
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.model_file import read_place_map
+from dejavu_torch.recognition.calibration import TOLERANCE
 from dejavu_torch.text import plain_number, printable
 from dejavu_torch.types import Coordinates, Facts, InputError, Match, Traverse, expect
 from dejavu_torch.version import __version__
@@ -138,6 +139,10 @@ def evaluate_file(
         highest = max(int(table.max()) for table in (candidates, known.positives) if table.numel())
         candidates = candidates.masked_fill(elsewhere, max(places or 0, 1 + highest) + tolerance)
     match = replace(match, index=candidates[:, 0])
+    reach = reach_of(tolerance, known, isinstance(parsed, Near))
+    if match.probability is not None and reach != TOLERANCE:
+        line = "`localize` writes probabilities of being within %d places; here an answer is right within %d"
+        log.warning(line, TOLERANCE, reach)
     described = describe_ground_truth(truth, interpolate, carried)
     facts = evaluation_facts(match, candidates, known, tolerance, positions, described) | alone
     if near is not None and area is not None:

@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from dejavu_torch.data.ground_truth import GroundTruth, scored_and_right
@@ -15,10 +16,33 @@ from dejavu_torch.evaluation.activation import share
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.plots import DARK, GREY, RIGHT, Pictures, canvas, picture
 from dejavu_torch.memory import in_float32
+from dejavu_torch.recognition.calibration import TOLERANCE
 from dejavu_torch.types import Facts, Match
 
 ASKED = (0.5, 0.8, 0.9, 0.95, 0.99)  # precisions in a report
 BINS = 10
+
+
+def reach_of(tolerance: int, truth: GroundTruth | None, near: bool = False) -> int:
+    """The places around an answer within which a probability is that of a right place.
+
+    Args:
+        tolerance: in places; above 0 it is the reach.
+        truth: in places, None if unknown. At tolerance 0 the reach is half the longest stretch of consecutive
+            right places, in the median over queries, rounded up; without stretches `TOLERANCE`.
+        near: the truth is by distance, which reaches a place at least.
+
+    Example:
+        >>> from dejavu_torch.data.ground_truth import all_judged
+        >>> reach_of(0, all_judged(torch.tensor([[3, 4, 5, 90], [6, 7, 8, 9], [-1, -1, -1, -1]])))
+        1
+    """
+    if tolerance or truth is None or not bool((truth.positives >= 0).any()):
+        return tolerance or TOLERANCE
+    places = truth.positives[(truth.positives >= 0).any(1)].sort(1).values
+    begins = F.pad((places.diff(dim=1) > 1) | (places[:, :-1] < 0), (1, 0), value=True)
+    stretch = (places - places.where(begins, -1).cummax(1).values).amax(1)
+    return math.ceil(stretch.median() / 2) or (1 if near else TOLERANCE)
 
 
 def rejection_facts(

@@ -19,7 +19,7 @@ from dejavu_torch.types import InputError, Match, SequenceModel, expect
 if TYPE_CHECKING:
     from dejavu_torch.recognition.smoother import Drive, PlaceSmoother
 
-TOLERANCE = 5  # places within which an answer is right
+TOLERANCE = 5  # places within which an answer is right, as files of maps hold it
 POWER = 0.75  # of the best score elsewhere in a confidence, chosen by `python -m benchmarks order`
 SAME = 1e-6  # two places whose scores are both below it equal the query, and nothing tells them apart
 MARGIN = 2.0  # weight of the margin beside the score itself in a track, and in confidences of older files
@@ -193,6 +193,7 @@ def calibrated(
     segments: Iterable[tuple[Tensor, Tensor]],
     another_visit: bool = False,
     own: tuple[Tensor, Tensor] | None = None,
+    reach: int = TOLERANCE,
 ) -> Calibration:
     """Fit on queries with known places, once as they are and once without the scores near these places. The
     latter stand for queries off the map, whose answers are all wrong.
@@ -203,19 +204,20 @@ def calibrated(
             The answers off the map then weigh, in total, only `MIN_WRONG` minus the number of these.
         own: descriptors (n,K) of the map's own frames, and their places: what look like them elsewhere limits
             the probability of single queries, see `look_alikes`.
+        reach: places within which an answer is right.
     """
-    area = place_map.area
+    area, around_own = place_map.area, min(2 * max(reach, TOLERANCE), place_map.places)
     answers: tuple[list[tuple[Tensor, ...]], ...] = [], []  # of single queries, of a filter
     for descriptors, places in segments:
         scores = torch.cat([place_map.scores(part) for part in descriptors.split(64)])
         places = places.to(scores.device)
-        off_map = scores.scatter(1, _window(places, 2 * TOLERANCE, scores, area), math.inf)
+        off_map = scores.scatter(1, _window(places, around_own, scores, area), math.inf)
         for single, on_map in ((scores, True), (off_map, False)):
-            filtered = PlaceFilter().over(area)(single)
+            filtered = PlaceFilter(within=reach).over(area)(single)
             pairs = (single, confidence_of(single, area)), (filtered, Track(area)(filtered, single))
             for rows, (scored, confidences) in zip(answers, pairs, strict=True):
                 index = best_match(scored).index
-                near = distance(index.clamp(min=0), places.clamp(min=0), area) <= TOLERANCE
+                near = distance(index.clamp(min=0), places.clamp(min=0), area) <= reach
                 right = near & (index >= 0) & (places >= 0) & on_map
                 columns = confidences, right, torch.full_like(right, on_map)
                 rows.append(tuple(column.cpu()[places.cpu() >= 0] for column in columns))
@@ -230,12 +232,12 @@ def calibrated(
         if own is not None and len(platts) == 1 and platts[0] is not None:
             known = torch.where(right, confidences, -math.inf)[on_the_map]
             scores = torch.cat([place_map.scores(part) for part in own[0].split(64)])
-            places, reach = own[1].to(scores.device), min(STRETCH, place_map.places // 4)
+            places, apart = own[1].to(scores.device), min(STRETCH, place_map.places // 4)
             if area is None:
-                near = places[:, None] + torch.arange(-reach, reach + 1, device=scores.device)
+                near = places[:, None] + torch.arange(-apart, apart + 1, device=scores.device)
                 near = near.remainder(place_map.places)  # a route may end where it begins
             else:
-                near = area.around(places, round(reach**0.5))
+                near = area.around(places, round(apart**0.5))
             pair = (confidence_of(one, area).cpu() for one in (scores, scores.scatter(1, near, math.inf)))
             platts[0] = look_alikes(platts[0], known, *pair)
     return Calibration(*platts)

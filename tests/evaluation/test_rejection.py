@@ -6,11 +6,12 @@ import pytest
 import torch
 from helpers import refused
 
-from dejavu_torch.data.ground_truth import as_ground_truth
+from dejavu_torch.data.ground_truth import all_judged, as_ground_truth, near_truth
 from dejavu_torch.data.source import as_traverse
 from dejavu_torch.data.traverse import Fitted
 from dejavu_torch.evaluation.rejection import (
     draw_reliability,
+    reach_of,
     rejection_facts,
     rejection_table,
 )
@@ -44,6 +45,22 @@ def test_the_figures_of_a_rejection():
         "0.667",
         ["accepted of 4 frames of sea", "0.5000", "0.2500", "0.2500", "0.2500", "0.2500"],
     )
+
+
+def test_convention_13_the_reach_is_the_tolerance_else_what_the_truth_shows():
+    metres = torch.arange(100.0)[:, None]
+    near = all_judged(near_truth(metres, metres[::3] + 0.2, radius=4))  # 8 places
+    for tolerance in (1, 5, 40):
+        assert reach_of(tolerance, near, near=True) == reach_of(tolerance, None) == tolerance
+    assert reach_of(0, near, near=True) == reach_of(0, near) == 4
+    twice = torch.cat([metres, metres])  # a second lap is another stretch
+    assert reach_of(0, all_judged(near_truth(twice, metres + 0.2, radius=4))) == 4
+    sparse = all_judged(near_truth(10 * metres, 10 * metres, radius=4))
+    assert reach_of(0, sparse, near=True) == 1
+    assert reach_of(0, sparse) == reach_of(0, TRUTH) == reach_of(0, None) == 5
+    listed = as_ground_truth([[7, 8, 6, 8, 30], [], [2, 1, 3], [0, 1]])  # in any order, one named twice
+    assert reach_of(0, listed) == 1
+    assert reach_of(0, as_ground_truth([[], []])) == reach_of(0, all_judged(torch.zeros(0, 0).long())) == 5
 
 
 def test_without_probabilities_or_truth_there_is_less_to_tell():

@@ -144,6 +144,12 @@ def test_calibrating_looks_for_places_that_are_there_and_that_are_not():
     assert half.single[:2] == pytest.approx(other[:2], rel=1e-5)
     visit = calibrated(Watched(40), [(scores, places)], another_visit=True)  # none was wrong
     assert float(visit.single.probability(confidence_of(scores)).mean()) > float(there.mean())
+    beside = [(scores, (places + 3) % 40)]  # right within 3 and 5 places, not within 2
+    assert calibrated(Watched(40), beside, reach=3).single[:2] == calibrated(Watched(40), beside).single[:2]
+    everywhere = calibrated(Watched(40), beside, reach=10**9).single
+    assert float(everywhere.probability(confidence_of(scores)).min()) > 0.9
+    with refused("answers is right"):
+        calibrated(Watched(40), [(scores[3:30], places[3:30] + 3)], reach=2)
     with refused("none of 80 answers"):
         calibrated(Watched(40), [(scores, (places + 20) % 40)])
     with refused("no queries"):
