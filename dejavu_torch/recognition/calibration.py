@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -14,10 +14,8 @@ from dejavu_torch.area import Area, around, distance
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.recognition.filter import PlaceFilter, moments_of
 from dejavu_torch.recognition.select import best_candidates, best_match
+from dejavu_torch.recognition.smoother import Drive, PlaceSmoother
 from dejavu_torch.types import InputError, Match, SequenceModel, expect
-
-if TYPE_CHECKING:
-    from dejavu_torch.recognition.smoother import Drive, PlaceSmoother
 
 TOLERANCE = 5  # places within which an answer is right, as files of maps hold it
 POWER = 0.75  # of the best score elsewhere in a confidence, chosen by `python -m benchmarks order`
@@ -129,9 +127,11 @@ def look_alikes(platt: Platt, right: Tensor, own: Tensor, others: Tensor) -> Pla
     return platt._replace(most=tuple(most))
 
 
-def best_pair(scores: Tensor, area: Area | None = None, places: Tensor | None = None) -> Match:
-    """The two best places of each query that are more than `TOLERANCE` apart, (Q,N) -> (Q,2)."""
-    return best_candidates(scores, min(2, scores.shape[1]), TOLERANCE, places, area)
+def best_pair(
+    scores: Tensor, area: Area | None = None, places: Tensor | None = None, apart: int = TOLERANCE
+) -> Match:
+    """The two best places of each query that are more than `TOLERANCE` apart, or more, (Q,N) -> (Q,2)."""
+    return best_candidates(scores, min(2, scores.shape[1]), max(TOLERANCE, apart), places, area)
 
 
 def confidence_of(scores: Tensor, area: Area | None = None, margin: float | None = None) -> Tensor:

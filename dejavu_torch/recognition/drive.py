@@ -28,7 +28,7 @@ from dejavu_torch.recognition.smoother import (
     check_descriptors,
     normalised,
 )
-from dejavu_torch.recognition.taken import singly
+from dejavu_torch.recognition.taken import doubted, singly
 from dejavu_torch.text import progress_of
 from dejavu_torch.types import Match
 
@@ -72,7 +72,7 @@ class DriveQuery(NamedTuple):
     single: Rows | None = None
     tiles: Tiles | None = None
     checks: bool = False
-    null: Callable[..., Tensor] | None = None
+    null: Callable[[Tensor, int], Tensor] | None = None
 
     @property
     def answers(self) -> bool:
@@ -82,8 +82,9 @@ class DriveQuery(NamedTuple):
     def ask_singly(self) -> None:
         """Leave it to the smoother only what single images find as well."""
         if self.null is not None and len(self.descriptors):
-            known, area = self.smoother, self.smoother.area
-            known.singly = singly(self.rows, self.null, len(self.descriptors), area, self.radius)
+            known, apart = self.smoother, self.radius
+            sure = lambda scores: confidence(best_pair(scores, known.area, apart=apart))  # noqa: E731
+            known.singly = singly(self.rows, self.null, len(self.descriptors), sure)
             known.is_drive &= known.singly.stands_out
 
 
@@ -165,6 +166,8 @@ def _shown(asked: DriveQuery, seen: Seen) -> Shown:
         probability = near_in_plane(mass, within, area).gather(1, at)[:, 0]
     if not asked.answers and asked.platt is not None:
         by_itself = asked.platt.probability(confidence_of(scores, area, asked.platt.margin))
+        if smoother.singly is not None:
+            by_itself = doubted(by_itself, smoother.singly.odds)
         probability = by_itself if queries == 1 else torch.minimum(probability, by_itself)
     probability = probability.masked_fill(match.index[:, 0] < 0, 0)
     return Shown(match, 1 - mass.sum(1), sure, probability, scores.gather(1, at)[:, 0])

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from dejavu_torch.area import Area
 from dejavu_torch.maps.place_map import PlaceMap
+from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.memory import in_one_thread
-from dejavu_torch.recognition.calibration import TOLERANCE, Platt, Track, best_pair
+from dejavu_torch.recognition.calibration import TOLERANCE, Platt, Track, best_pair, confidence_of
 from dejavu_torch.recognition.calibration import confidence as confidence_of_pair
 from dejavu_torch.recognition.drive import DriveQuery, first_of, localize_drive
 from dejavu_torch.recognition.filter import PlaceFilter
@@ -24,7 +25,7 @@ from dejavu_torch.recognition.search import SCORES_AT_ONCE, NmsSpec, Scan, Searc
 from dejavu_torch.recognition.select import Acceptance, accept, best_candidates, best_match
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.recognition.smoother import PlaceSmoother, Rows
-from dejavu_torch.recognition.taken import flipped
+from dejavu_torch.recognition.taken import EVERY, Running, doubted, flipped
 from dejavu_torch.text import with_progress
 from dejavu_torch.types import Match, SequenceModel, Together
 
@@ -96,6 +97,7 @@ class Localizer:
             sequence = sequence.over(self.area)
         matching = matching._replace(sequence=sequence, also=in_area)
         self.place_map, self.matching, self.track = place_map, matching, Track(self.area)
+        self.running = Running()  # what single images say so far
         self.searcher = Scan(place_map) if searcher is None and place_map is not None else searcher
         self.own: Together = sequence.length if isinstance(sequence, SequenceMatcher) else "filter"
         self.models: dict[Together, SequenceModel] = {**matching.also}
@@ -124,16 +126,36 @@ class Localizer:
         if searches:
             match = Match.joined(self._search(part, wanted) for part in moved)
         else:
-            match = Match.joined(self.match(place_map.scores(part)) for part in moved)
+            match = Match.joined(self.match(place_map.scores(part), self._mirrored(part)) for part in moved)
         # blank frames find nothing by themselves
         if matching.sequence is None and getattr(place_map, "metric", "") == "cosine":
             shows = descriptors[:: matching.copies].any(1).cpu()
             match = replace(match, accepted=match.accepted & shows.view(-1, *[1] * (match.accepted.ndim - 1)))
         return match
 
+    def _mirrored(self, descriptors: Tensor) -> Tensor | None:
+        """Confidences in some of the queries, mirrored, (B,), NaN for the others, if a filter's answers get
+        probabilities."""
+        matching, place_map = self.matching, self.place_map
+        if not isinstance(matching.sequence, PlaceFilter) or matching.platt is None:
+            return None
+        if not isinstance(place_map, SpectralMap) or matching.copies > 1:
+            return None
+        found = descriptors.new_full((len(descriptors),), math.nan)
+        some = slice(-self.running.queries % EVERY, None, EVERY)
+        if len(descriptors[some]):
+            scores = place_map.scores(flipped(descriptors[some], mean=place_map.mean))
+            found[some] = confidence_of(scores, self.area)
+        return found
+
     @torch.no_grad()
-    def match(self, scores: Tensor) -> Match:
-        """Match the next queries by their scores: (B,N), or (B x copies, N) -> (B,), or (B,k)."""
+    def match(self, scores: Tensor, mirrored: Tensor | None = None) -> Match:
+        """Match the next queries by their scores: (B,N), or (B x copies, N) -> (B,), or (B,k); mirrored: see
+        `_mirrored`."""
+        if mirrored is not None:
+            odds = self.running(confidence_of(scores, self.area), mirrored)
+            match = self.match(scores)
+            return self._doubted(match, odds[len(odds) - len(match.index) :])
         turn, copies = None, self.matching.copies
         if copies > 1:
             scores, turn = scores.view(-1, copies, scores.shape[1]).min(1)
@@ -237,7 +259,16 @@ class Localizer:
         places = 1 if self.place_map is None else self.place_map.places
         if not isinstance(self.matching.sequence, PlaceFilter) or not self.states:
             return self.match(torch.zeros(0, places))
-        return self._in_sequence(self.states["filter"].new_zeros(0, places), last=True)
+        match = self._in_sequence(self.states["filter"].new_zeros(0, places), last=True)
+        return match if match.probability is None else self._doubted(match, torch.tensor(self.running.odds))
+
+    def _doubted(self, match: Match, odds: Tensor) -> Match:
+        """Answers of a filter with the odds that the queries so far are over the map's ground."""
+        assert match.probability is not None
+        odds = odds.view(-1, *[1] * (match.probability.ndim - 1))
+        probability, precision = doubted(match.probability, odds), self.matching.acceptance.precision
+        accepted = match.accepted if precision is None else match.accepted & (probability >= precision)
+        return replace(match, probability=probability, accepted=accepted)
 
     @property
     def posterior(self) -> Tensor | None:

@@ -7,31 +7,29 @@ of jumps explains little once jumps are as rare as a drive's.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import replace
-from functools import partial
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from dejavu_torch.area import Area
-from dejavu_torch.recognition.calibration import TOLERANCE, confidence
-from dejavu_torch.recognition.select import best_candidates
-from dejavu_torch.types import Match
-
 ASKED = 256  # queries of a drive that are asked singly, at most
-DRAWS = 2  # of signs
+DRAWN = 512  # queries that show nothing, at least, for the upper tenth to be the same each time
+EVERY = 4  # of a filter's queries, the one that is asked mirrored as well
 UPPER = 0.1  # share of the queries that have to be sure: the others may be off the map
-STANDS_OUT = 0.17  # of `python -m benchmarks cross --choose`
+STANDS_OUT = 0.21  # of `python -m benchmarks cross`
 NATS = 10.0  # by which a drive beats being off the map throughout
 ALONG = 0.5  # share of the nats that rare jumps have to leave: else jumps explain the drive, and nothing else
 AT_ONCE = 2**24  # scores
+BINS, PER_E, LEAST = 2048, 64, -16.0  # of a histogram of logarithms, in each factor e, and where it begins
+
+Score = Callable[[Tensor], Tensor]  # numbers of queries (B,) -> scores (B,N)
 
 
 class Singly(NamedTuple):
     """How sure the surest tenth of a drive's single images is, and of queries that show no place: means of
-    their confidences in scores over the null's typical one, at most 0. queries: how many were asked."""
+    their confidences, at most 0, in any unit. queries: how many were asked."""
 
     shown: float
     null: float
@@ -40,19 +38,34 @@ class Singly(NamedTuple):
     @property
     def stands_out(self) -> bool:
         """Whether single images find the map."""
-        return self.shown - self.null >= STANDS_OUT
+        return self.shown >= (1 - STANDS_OUT) * self.null
+
+    @property
+    def odds(self) -> float:
+        """By which the odds of an answer change: if single images do not find the map, less than a tenth of
+        them are on it, while a calibration takes half of its queries to be."""
+        return 1.0 if self.stands_out else UPPER / (1 - UPPER)
 
 
-def flipped(queries: Tensor, seed: int = 0) -> Tensor:
-    """Queries that show no place but vary as these do: about their mean, dimensions of all are mirrored at
-    random, (B,K) -> (B,K). The order of queries, their lengths and how alike they are stay.
+def doubted(probability: Tensor, odds: Tensor | float) -> Tensor:
+    """Probabilities whose odds change by a factor."""
+    return odds * probability / (1 + (odds - 1) * probability)
+
+
+def flipped(queries: Tensor, seed: int = 0, mean: Tensor | None = None) -> Tensor:
+    """Queries that show no place but vary as these do: about a mean, dimensions of all are mirrored at
+    random, (B,K) -> (B,K). The order of queries and how alike they are stay.
+
+    Args:
+        mean: (K,); None is that of the queries.
 
     Example:
         >>> queries = torch.rand(4, 3)
         >>> torch.allclose(torch.cdist(flipped(queries), flipped(queries)), torch.cdist(queries, queries))
         True
     """
-    draw, mean = torch.Generator().manual_seed(seed), queries.mean(0)
+    mean = queries.mean(0) if mean is None else mean.to(queries)
+    draw = torch.Generator().manual_seed(seed)
     sign = 2 * torch.randint(0, 2, (queries.shape[1],), generator=draw) - 1
     return (queries - mean) * sign.to(queries) + mean
 
@@ -63,35 +76,57 @@ def upper(confidences: Tensor) -> float:
 
 
 @torch.no_grad()
-def singly(
-    rows: Callable[[Tensor], Tensor],
-    null: Callable[..., Tensor],
-    queries: int,
-    area: Area | None = None,
-    apart: int = TOLERANCE,
-) -> Singly:
+def singly(own: Score, null: Callable[[Tensor, int], Tensor], queries: int, sure: Score) -> Singly:
     """What single images of a drive say, each of all places: no order and no preselection has a part in it.
 
     Args:
-        rows: numbers of queries (B,) -> their scores (B,N). null: the same of `flipped` ones, for a `seed`.
-        apart: places between the two best, at least.
+        own: numbers of queries (B,) -> their scores (B,N). null: the same of `flipped` ones, for a seed.
+        sure: scores (B,N) -> the confidence of each query, (B,).
     """
     numbers = torch.linspace(0, queries - 1, min(ASKED, queries)).round().long()
-    size = max(1, AT_ONCE // rows(numbers[:1]).shape[1])
+    parts = numbers.split(max(1, AT_ONCE // own(numbers[:1]).shape[1]))
 
-    def pairs(score: Callable[[Tensor], Tensor]) -> Match:
+    def confidences(score: Score) -> Tensor:
+        found = (score(part).cpu().float() for part in parts)
+        return torch.cat([sure(scores.masked_fill(scores.isnan(), torch.inf)) for scores in found])
+
+    draws = range(-(-DRAWN // len(numbers)))
+    others = torch.cat([confidences(lambda part, seed=seed: null(part, seed)) for seed in draws])
+    return Singly(upper(confidences(own)), upper(others), len(numbers))
+
+
+class Running:
+    """`Singly.odds` of the queries so far, from histograms of a fixed size."""
+
+    def __init__(self) -> None:
+        self.counts = torch.zeros(2, BINS)  # by -log(-confidence), of the queries and of those mirrored
+        self.odds, self.queries = 1.0, 0
+
+    def __call__(self, own: Tensor, mirrored: Tensor) -> Tensor:
+        """The odds at each of the next queries, (B,) float64.
+
+        Args:
+            own, mirrored: confidences in the queries and in some of them mirrored, (B,), NaN for the others.
+        """
         found = []
-        for part in numbers.split(size):
-            scores = score(part).cpu().float()
-            scores, most = scores.masked_fill(scores.isnan(), torch.inf), min(2, scores.shape[1])
-            found.append(best_candidates(scores, most, max(TOLERANCE, apart), None, area))
-        return Match.joined(found)
+        for pair in torch.stack([own, mirrored], 1).cpu().double().tolist():
+            for counts, confidence in zip(self.counts, pair, strict=True):
+                if confidence > -math.inf:  # nor NaN
+                    place = PER_E * (math.log(max(-confidence, 1e-30)) - LEAST)
+                    counts[int(min(max(place, 0), BINS - 1))] += 1
+            self.queries += 1
+            if self.counts.any(1).all():
+                shown, null = map(self._upper, self.counts)
+                self.odds = Singly(shown, null, self.queries).odds
+            found.append(self.odds)
+        return torch.tensor(found, dtype=torch.float64)
 
-    own, others = pairs(rows), Match.joined(pairs(partial(null, seed=seed)) for seed in range(DRAWS))
-    known = others.score[others.score.isfinite()]
-    unit = max(float(known.median()), torch.finfo().tiny) if len(known) else 1.0
-    shown, none = (upper(confidence(replace(one, score=one.score / unit))) for one in (own, others))
-    return Singly(shown, none, len(numbers))
+    @staticmethod
+    def _upper(counts: Tensor) -> float:
+        """As `upper`, of a histogram."""
+        wanted = float((UPPER * counts.sum()).round().clamp(min=1))
+        taken = counts.cumsum(0).clamp(max=wanted).diff(prepend=counts.new_zeros(1))
+        return -float(taken @ ((torch.arange(BINS) + 0.5) / PER_E + LEAST).exp()) / wanted
 
 
 def moves_along(nats: float, held: float) -> bool:
