@@ -45,8 +45,10 @@ ROUTES: dict[str, tuple[Route, str | None]] = {
     "corridor": (Route("{data}/corridor/ref", CORRIDOR, 0, "{data}/corridor/truth.csv"), FLOORS),
     "railway, first half": (railway("stop=900"), WINTER + "start=900"),
     "railway, second half": (railway("start=900"), WINTER + "stop=900"),
+    "corridor laps": (drive("corridor_laps", 0), FLOORS),
     "magnetometer": (drive("magnetic_laps", 5), None),
     "lidar": (drive("lidar_fhw", 1), None),
+    "walks": (drive("wifi_mall", 0), None),
     "floors": (drive("floors_rejection", 1), CORRIDOR),
     "gardens": (Route(GARDENS.format("reference"), GARDENS.format("query"), 1, "0"), None),
 }

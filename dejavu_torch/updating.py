@@ -22,6 +22,7 @@ from dejavu_torch.recognition.calibration import TOLERANCE
 from dejavu_torch.recognition.drive import Answers, DriveQuery, answer_drives
 from dejavu_torch.recognition.evidence import spacing_of
 from dejavu_torch.recognition.smoother import PlaceSmoother
+from dejavu_torch.recognition.taken import flipped
 from dejavu_torch.teaching import FEWEST, SHARE, SURE, Refinement, described, in_its_light, refined_by
 from dejavu_torch.types import Match, Traverse
 
@@ -202,13 +203,14 @@ def _answered(
     for first, last in stored:
         silent[first:last] = True
 
-    def rows(numbers: Tensor) -> Tensor:
-        scores = place_map.scores(queries[numbers.to(queries.device)])
+    def rows(numbers: Tensor, seed: int | None = None) -> Tensor:
+        asked = queries[numbers.to(queries.device)]
+        scores = place_map.scores(asked if seed is None else flipped(asked, seed))
         return torch.where(silent[numbers, None].to(scores.device), 0, scores)
 
     smoother = PlaceSmoother()
     smoother.map_links = place_map.connections
-    asked = DriveQuery(rows, queries, smoother, route_starts=place_map.route_starts)
+    asked = DriveQuery(rows, queries, smoother, route_starts=place_map.route_starts, null=rows)
     (answers,) = answer_drives([asked], progress)
     return answers, smoother
 

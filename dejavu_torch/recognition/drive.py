@@ -72,7 +72,7 @@ class DriveQuery(NamedTuple):
     single: Rows | None = None
     tiles: Tiles | None = None
     checks: bool = False
-    null: Callable[[Tensor, int], Tensor] | None = None
+    null: Callable[..., Tensor] | None = None
 
     @property
     def answers(self) -> bool:

@@ -461,6 +461,7 @@ class PlaceSmoother(SequenceModel):
         singly = {} if self.singly is None else self.singly._asdict()
         return {
             "is_drive": self.is_drive,
+            "taken": self.is_drive,
             "log_likelihood": self.log_likelihood,
             "nats_per_query": self.nats_per_query,
             **singly,

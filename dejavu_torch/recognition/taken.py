@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -76,11 +77,11 @@ def upper(confidences: Tensor) -> float:
 
 
 @torch.no_grad()
-def singly(own: Score, null: Callable[[Tensor, int], Tensor], queries: int, sure: Score) -> Singly:
+def singly(own: Score, null: Callable[..., Tensor], queries: int, sure: Score) -> Singly:
     """What single images of a drive say, each of all places: no order and no preselection has a part in it.
 
     Args:
-        own: numbers of queries (B,) -> their scores (B,N). null: the same of `flipped` ones, for a seed.
+        own: numbers of queries (B,) -> their scores (B,N). null: the same of `flipped` ones, for a `seed`.
         sure: scores (B,N) -> the confidence of each query, (B,).
     """
     numbers = torch.linspace(0, queries - 1, min(ASKED, queries)).round().long()
@@ -90,8 +91,8 @@ def singly(own: Score, null: Callable[[Tensor, int], Tensor], queries: int, sure
         found = (score(part).cpu().float() for part in parts)
         return torch.cat([sure(scores.masked_fill(scores.isnan(), torch.inf)) for scores in found])
 
-    draws = range(-(-DRAWN // len(numbers)))
-    others = torch.cat([confidences(lambda part, seed=seed: null(part, seed)) for seed in draws])
+    draws = range(math.ceil(DRAWN / len(numbers)))
+    others = torch.cat([confidences(partial(null, seed=seed)) for seed in draws])
     return Singly(upper(confidences(own)), upper(others), len(numbers))
 
 
