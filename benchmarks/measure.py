@@ -251,7 +251,9 @@ def truth_of(
     Raises:
         InputError: there is no ground truth.
     """
-    truth = ground_truth_of(given, reference, query, aligned=True)
+    truth = ground_truth_of(given, reference, query)
+    if truth is None and len(reference) == len(query):
+        truth = ground_truth_of("0", reference, query)
     if truth is None:
         seen = f"{reference.name} has {len(reference)} frames and {query.name} {len(query)}"
         raise InputError(f"{seen}; expected as many, frame i being place i")

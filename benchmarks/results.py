@@ -89,7 +89,7 @@ WAYS = {  # options of `dejavu compare`; {default} and {visits} are folders of m
     "visits": "--whitening {visits}/first.safetensors --match sequence:21 --storage_curve",
 }
 VISITS = (
-    "learn {data}/nordland/summer?stop=900 --second {data}/nordland/winter?stop=900 "
+    "learn {data}/nordland/summer?stop=900 --second {data}/nordland/winter?stop=900 --second_truth 0 "
     "--map {visits}/first.safetensors"
 )
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from tqdm import tqdm
 
-from benchmarks.measure import Row, done_once, write_bench
+from benchmarks.measure import Row, done_once, truth_of, write_bench
 from benchmarks.plots import OURS, plot_areas
 from benchmarks.train import spread
 from dejavu_torch.data.source import open_source
@@ -22,7 +22,6 @@ from dejavu_torch.evaluation.report import text_table
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.model import DejaVu
-from dejavu_torch.motion.resampling import ground_truth_of
 from dejavu_torch.types import InputError, Match
 
 SEEDS = (0, 1, 2)
@@ -102,10 +101,9 @@ class Judge:
     def __init__(self, name: str, route: Route) -> None:
         self.name, self.tolerance = name, route.tolerance
         self.reference, self.query = open_source(route.reference), open_source(route.query)
-        self.truth = ground_truth_of(route.truth, self.reference, self.query, aligned=True)
+        self.truth = truth_of(self.reference, self.query, route.truth)
 
     def row(self, contender: str, found: Match, seed: int | None = None, size: float | None = None) -> Row:
-        assert self.truth is not None  # of all routes above
         scores = evaluate(found, self.truth, self.tolerance)
         row = {"case": self.name, "contender": contender, "seed": seed, "tolerance": self.tolerance}
         return row | {"auc": scores.auc, "recall_at_1": scores.recall_at_1, "route_bytes_per_place": size}

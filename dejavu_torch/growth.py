@@ -14,7 +14,7 @@ from torch import Tensor
 
 from dejavu_torch import learning
 from dejavu_torch.area import Area, agree
-from dejavu_torch.data.ground_truth import find_ground_truth
+from dejavu_torch.data.ground_truth import find_ground_truth, names_agree
 from dejavu_torch.data.positions import positions_behind
 from dejavu_torch.data.source import Source, as_traverse
 from dejavu_torch.data.traverse import chained
@@ -26,7 +26,7 @@ from dejavu_torch.maps.spectral_map import LARGEST, Chunk, SpectralMap
 from dejavu_torch.model import DejaVu, features_per_frame, require_map
 from dejavu_torch.model_file import ModelState, Recipe, difference, recipe_of, run_key, weights_of
 from dejavu_torch.motion.resampling import ResampledTraverse, source_of
-from dejavu_torch.teaching import LEAST, place_drives
+from dejavu_torch.teaching import FEWEST, LEAST, calibrate_by, place_drives
 from dejavu_torch.types import InputError, Traverse, expect
 
 log = logging.getLogger("dejavu_torch")
@@ -181,30 +181,64 @@ def average(model: DejaVu, visits: LabelledFrames, progress: bool = False) -> in
 
 
 def associate(
-    model: DejaVu, reference: Traverse | None, second: Traverse, truth: str | None = None
+    model: DejaVu,
+    reference: Traverse | None,
+    second: Traverse,
+    truth: str | None = None,
+    progress: bool = False,
+    option: str = "--average_truth",
 ) -> LabelledFrames:
     """The place of each frame of another traverse, on a reference or on a map; resampled like it.
 
     Args:
         reference: the result of `DejaVu.resample`; None is the model's map, of one route.
         truth: the reference frames of each frame, see `find_ground_truth`; None is the nearest window in an
-            area, if the traverse has coordinates, else place i for frame i of a traverse of the same length.
-            The first counts if there are several; frames without one get -1.
+            area, if the traverse has coordinates, else place i for frame i where both `are_aligned` by more
+            than a counter, else where a smoother places it on a map of the reference, or the model's. The
+            first counts if there are several; frames without one get -1.
+        option: of the truth, for messages.
 
     Raises:
-        InputError: nothing says which places it shows, or it shows none.
+        InputError: it shows no place, or nothing says which, and a smoother cannot place it: fewer than 30
+            frames, or too few sure ones, as of frames in no order.
     """
-    second, places, seen = _known_places(model, reference, second, truth)
-    if places is None:
-        raise InputError(f"{seen}; expected the same number, frame i at place i, or a truth for its places")
-    return LabelledFrames(second, places)
+    second, places = _known_places(model, reference, second, truth, option)
+    if places is not None:
+        return LabelledFrames(second, places)
+    if reference is None:
+        _check_compatible(model, second)
+    else:
+        model.descriptor.check_sizes(reference, second)
+    views = place_drives(model, reference, [(second, None)], progress, most=1)
+    _check_placed(second, views.places, option)
+    return views
+
+
+def visit_to_calibrate(
+    model: DejaVu, reference: Traverse | None, visit: Traverse, truth: str | None = None
+) -> LabelledFrames | Traverse:
+    """As `associate`, but where a smoother has to place the visit, that is left to the map it calibrates."""
+    option = "--calibration_truth"
+    visit, places = _known_places(model, reference, visit, truth, option)
+    area = model.map.area if reference is None else reference.area
+    expect(places is not None or area is None, _placeable(option), f"{visit.name} shows an area, not a route")
+    return visit if places is None else LabelledFrames(visit, places)
+
+
+def _placeable(option: str) -> str:
+    return f"at least {LEAST} frames in order along the route, or {option}, such as 0 if frame i is place i"
+
+
+def _check_placed(drive: Traverse, places: Tensor, option: str) -> None:
+    seen = f"of {drive.name}, fewer than {FEWEST} frames, or a tenth, can be placed surely"
+    expect((places >= 0).any(), _placeable(option), seen)
 
 
 def _known_places(
-    model: DejaVu, reference: Traverse | None, second: Traverse, truth: str | None
-) -> tuple[Traverse, Tensor | None, str]:
-    """As `associate`: the traverse at the map's steps and its places; None where nothing says them, with what
-    was seen."""
+    model: DejaVu, reference: Traverse | None, second: Traverse, truth: str | None, option: str
+) -> tuple[Traverse, Tensor | None]:
+    """As `associate`: the traverse at the map's steps and its places; None where nothing says them, and a
+    smoother has to."""
     if reference is None:
         place_map, shape, step = one_route(model, "average visits into"), model.frame_shape, model.step
         table, area, name, source = place_map.table, place_map.area, "the map", None
@@ -217,7 +251,7 @@ def _known_places(
     frames = len(second)
     numbers = second.frame if isinstance(second, ResampledTraverse) else frames
     ground_truth = find_ground_truth(
-        truth, source, source_of(second), table.frames, numbers, resampled=step is not None, aligned=True
+        truth, source, source_of(second), table.frames, numbers, resampled=step is not None, counters=False
     )
     shown = source_of(second).coordinates
     if truth is None and area is not None and area.frame and shown is not None and not shown.degrees:
@@ -226,13 +260,14 @@ def _known_places(
         places = area.place_near(shown.values[:, :2])
     elif ground_truth is not None:
         places = table.place_of(ground_truth.positives[:, 0])
-    elif reference is None and step is None and table.frames == frames:
+    elif reference is None and step is None and names_agree(model.frame_names, second, counters=False):
         places = torch.arange(frames)
     else:
-        seen = f"{second.name} has {frames} frames and {name} {table.frames}"
-        return second, None, seen + (" at even steps" if step is not None else "")
+        seen = f"nothing says which places of {name} the {frames} frames of {second.name} show"
+        expect(frames >= LEAST, _placeable(option), seen)
+        return second, None
     expect((places >= 0).any(), "some", f"no frame of {second.name} shows a place of {name}")
-    return second, places, ""
+    return second, places
 
 
 def second_traverse(
@@ -243,14 +278,11 @@ def second_traverse(
     progress: bool = False,
 ) -> LabelledFrames:
     """As `associate`, for one or more traverses that whitening learns from, with one truth or one for each;
-    several are a list of `Traverse`.
-
-    Where nothing says which places one shows, its frames have to be in order: a smoother places them on a map
-    of the reference, see `teaching.place_drives`.
+    several are a list of `Traverse`. A smoother places them twice, see `teaching.place_drives`; nothing is
+    learned from one that it cannot place, unless that is as long as the reference: it may be aligned.
 
     Raises:
-        InputError: no whitening that learns, another number of truths, other frame sizes, fewer than 30
-            frames to place, or as `associate`.
+        InputError: no whitening that learns, another number of truths, other frame sizes, or as `associate`.
     """
     several = isinstance(second, list | tuple) and all(isinstance(one, Traverse) for one in second)
     reference, visits = as_traverse(reference), [*second] if several else [as_traverse(second)]  # type: ignore[misc]
@@ -259,28 +291,36 @@ def second_traverse(
     truths *= len(visits) if len(truths) == 1 else 1
     seen = f"{len(visits)} further traverses and {len(truths)} truths"
     expect(len(truths) == len(visits), "one for each, or one for all", seen)
-    views = [_known_places(model, reference, *pair) for pair in zip(visits, truths, strict=True)]
-    drives = [(drive, places) for drive, places, _ in views]
-    known = [places for places in (places for _, places in drives) if places is not None]
+    option, pairs = "--second_truth", zip(visits, truths, strict=True)
+    drives = [_known_places(model, reference, *pair, option) for pair in pairs]
+    known = [places for _, places in drives if places is not None]
     if len(known) == len(drives):
         return LabelledFrames(chained([drive for drive, _ in drives]), torch.cat(known))
-    for drive, places, seen in views:
-        expected = f"as many, frame i at place i, a truth for its places, or at least {LEAST} frames in order"
-        expect(places is not None or len(drive) >= LEAST, expected, seen)
     model.descriptor.check_sizes(reference, *(drive for drive, _ in drives))
-    return place_drives(model, reference, drives, progress)
+    views = place_drives(model, reference, drives, progress)
+    for (drive, places), found in zip(
+        drives, views.places.split([len(one) for one, _ in drives]), strict=True
+    ):
+        if places is None and len(drive) == len(reference):
+            _check_placed(drive, found, option)
+    return views
 
 
 def calibrate_if_possible(
     model: DejaVu,
     reference: Traverse,
-    views: LabelledFrames | None = None,
+    views: LabelledFrames | Traverse | None = None,
     places: Tensor | None = None,
     progress: bool = False,
     reach: int = 5,
 ) -> None:
-    """As `DejaVu.calibrate`; without views, only a map that is not calibrated and can be."""
-    if views is not None:
+    """As `DejaVu.calibrate`, also by a visit whose places nobody told; without views, only a map that is not
+    calibrated and can be."""
+    if isinstance(views, Traverse):
+        found = calibrate_by(model, views, progress)
+        _check_placed(views, found.places, "--calibration_truth")
+        log.warning(*found.placed_lines("the other {} calibrate, too"))
+    elif views is not None:
         model.calibrate(reference, views, progress=progress, reach=reach)
     elif model.calibration is None and len(reference.frame_shape) == 3 and model.map.summary().covered:
         try:

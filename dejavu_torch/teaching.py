@@ -50,23 +50,26 @@ def place_drive(model: DejaVu, descriptors: Tensor) -> Tensor:
 
 def place_drives(
     model: DejaVu,
-    reference: Traverse,
+    reference: Traverse | None,
     drives: Sequence[tuple[Traverse, Tensor | None]],
     progress: bool = False,
+    most: int = ROUNDS,
 ) -> LabelledFrames:
     """Place drives on a map of the reference, learned from augmented copies, and once more on one that the
     drives have taught.
 
     Args:
-        model: its settings. drives: in order, each with the place of each frame if it is known.
+        model: its settings. reference: None is the model's own map, which learns nothing.
+        drives: in order, each with the place of each frame if it is known. most: rounds of placing.
     """
     frames, lengths = chained([drive for drive, _ in drives]), [len(drive) for drive, _ in drives]
     which = torch.arange(len(drives)).repeat_interleave(torch.tensor(lengths))
     names = {i: drive.name for i, (drive, known) in enumerate(drives) if known is None}
     scratch, views = copy.deepcopy(model), None
     with scratch.descriptor.remembering():
-        for rounds in range(1, ROUNDS + 1):
-            scratch.learn(reference, progress, views)
+        for rounds in range(1, most + 1):
+            if reference is not None:
+                scratch.learn(reference, progress, views)
             parts = scratch.descriptor.all_of(frames, progress).split(lengths)
             pairs = zip(parts, drives, strict=True)
             found = [place_drive(scratch, part) if known is None else known for part, (_, known) in pairs]
@@ -177,6 +180,19 @@ def refined_by(model: DejaVu, descriptors: Tensor) -> Refinement:
             scores = (part.scores(rows) for part, own in asked for rows in own.split(_at_once(place_map)))
             model.calibration = _calibration(model.map, queries, places, scores)
     return Refinement(len(sure), count, gain, error, accepted)
+
+
+@torch.no_grad()
+def calibrate_by(model: DejaVu, drive: Traverse, progress: bool = False) -> LabelledFrames:
+    """Calibrate a map by all frames of a drive whose places nobody told, not only those that are placed; not
+    if none is. Returns where they are."""
+    descriptors = model.descriptor.all_of(drive, progress).float().to(model.map.device)
+    places = place_drive(model, descriptors)
+    if (places >= 0).any():
+        scores = (model.map.scores(rows) for rows in descriptors.split(_at_once(model.map)))
+        model.calibration = _calibration(model.map, in_its_light(model, descriptors), places, scores)
+    placed = Placed(torch.zeros(len(places), dtype=torch.int64), {0: drive.name}, SURE, 1)
+    return LabelledFrames(drive, places.cpu(), placed)
 
 
 def _calibration(

@@ -123,15 +123,16 @@ def test_a_second_traverse_is_averaged_in_before_coding(folder, tmp_path, capsys
 def test_a_visit_is_averaged_into_a_map_that_is_there(folder, tmp_path, capsys):
     first, out = folder / "first.safetensors", tmp_path / "m.safetensors"
     before = first.read_bytes()
-    run("learn", "--append", first, "--average", f"{FIRST}&traverse=1", "--map", out)
+    visit = "--average", f"{FIRST}&traverse=1", "--average_truth", "0"
+    run("learn", "--append", first, *visit, "--map", out)
     told = capsys.readouterr().out
     assert f"64 of the 64 places of {first}: averaged and coded again at the same step" in told
     assert "mean of 2 visits" in told
     model = DejaVu.load(out)
     assert (model.map.places, model.map.visits.tolist()) == (64, [[64, 2]])
     assert model.calibration is not None
-    another = ("--calibration", f"{FIRST}&traverse=2", "--precision", ".9")
-    run("learn", "--append", first, "--average", f"{FIRST}&traverse=1", "--map", out, *another)
+    another = ("--calibration", f"{FIRST}&traverse=2", "--calibration_truth", "0", "--precision", ".9")
+    run("learn", "--append", first, *visit, "--map", out, *another)
     assert DejaVu.load(out).precision == 0.9
     assert first.read_bytes() == before
     visit = "--average", f"{NEXT}&traverse=1", "--average_truth", "0"
@@ -139,7 +140,9 @@ def test_a_visit_is_averaged_into_a_map_that_is_there(folder, tmp_path, capsys):
     assert DejaVu.load(out).map.visits.tolist() == [[64, 1], [64, 2]]
     whole = tmp_path / "whole.safetensors"
     run("learn", folder / "d.npy", "--map", whole, "--calibration", "none", "--whitening", "none")
-    run("learn", "--append", whole, "--average", folder / "d.npy")  # a map of one chunk can be averaged
+    run(
+        "learn", "--append", whole, "--average", folder / "d.npy", "--average_truth", "0"
+    )  # a map of one chunk can be averaged
     assert DejaVu.load(whole).map.visits.tolist() == [[96, 2]]
 
 

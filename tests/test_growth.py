@@ -457,17 +457,21 @@ def test_a_visit_is_averaged_into_a_map():
 
 def test_which_places_a_visit_shows(tmp_path):
     model, again = learned(walk(100)), ArrayTraverse(walk(100, seed=1), "again")
-    few = ArrayTraverse(walk(30), "few")
+    few = ArrayTraverse(walk(29), "few")
+    assert associate(model, None, again, "0").places.tolist() == list(range(100))
+    with refused("of again, fewer than 60 frames", "--average_truth, such as 0"):  # not by length
+        associate(model, None, again)
+    again.names = model.frame_names = [f"@{i * i}.png" for i in range(100)]
     assert associate(model, None, again).places.tolist() == list(range(100))
-    assert associate(model, None, few, "80").places.tolist() == [*range(80, 100), *[-1] * 10]
+    assert associate(model, None, few, "80").places.tolist() == [*range(80, 100), *[-1] * 9]
     (tmp_path / "t.csv").write_text("query,place\n0,7\n3,9\n")
     assert associate(model, None, few, str(tmp_path / "t.csv")).places[:5].tolist() == [7, -1, -1, 9, -1]
-    with refused("few has 30 frames", "the map 100", "truth"):
+    with refused("29 frames of few", "the map", "--average_truth"):
         associate(model, None, few)
     route = ArrayTraverse(footage(REFERENCE), "route")
     moved = on_ground(route.values)
-    with refused("at even steps"):
-        associate(moved, None, route)
+    placed = associate(moved, None, route).places
+    assert (placed - torch.arange(101))[placed >= 0].abs().max() <= 1
     views = associate(moved, None, route, "0")
     assert (views.places - torch.arange(101)).abs().max() <= 1
     assert average(moved, views) == len(views.places.unique())

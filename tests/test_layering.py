@@ -37,7 +37,7 @@ ARROWS = {
     "model_file model growth",
     "export": "text version types data features maps recognition model",
     "training": "lazy text types memory resize data features periods maps recognition "
-    "motion model_file model evaluation",
+    "motion model_file model growth evaluation",
     "cli": "area text types data features periods maps recognition motion learning model_file model "
     "growth teaching updating cluster live export evaluation training",
 }

@@ -249,7 +249,7 @@ def test_large_frames_are_reduced_and_queries_follow(tmp_path, caplog):
         for frames in (large, large[..., ::2, ::2], nn.functional.interpolate(small, scale_factor=3)):
             assert known.localize(frames).index.tolist() == [*range(24)]
             assert known(frames).argmin(1).tolist() == [*range(24)]
-    views = associate(model, ArrayTraverse(large), ArrayTraverse(large))
+    views = associate(model, ArrayTraverse(large), ArrayTraverse(large), "0")
     assert views.traverse.frame_shape == (1, 80, 160)
     caplog.clear()
     for frames in large[:3]:

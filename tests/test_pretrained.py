@@ -31,7 +31,7 @@ def test_nordland_beside_hog(data_dir, network):
     seasons = [data_dir / "nordland" / name for name in ("summer", "winter")]
     summer, winter = (open_source(f"{one}?stop=900") for one in seasons)
     both = DejaVu(net, Whitening(numbers=192))
-    both.learn(summer, second=second_traverse(both, summer, winter))
+    both.learn(summer, second=second_traverse(both, summer, winter, "0"))
     summer, winter = (open_source(f"{one}?start=900&stop=1800") for one in seasons)
     places, queries = both.descriptor.all_of(summer), both.descriptor.all_of(winter)
     nearest = (queries @ places.T).argmax(1)

@@ -83,10 +83,10 @@ def test_views_of_a_second_traverse(reference, second):
     assert (views.places - torch.arange(FRAMES)).abs().max() <= 2  # by the positions that both carry
     assert second_traverse(model, reference, second, "190").places.tolist() == [*range(190, 200), *[-1] * 190]
     plain = ArrayTraverse(torch.rand(FRAMES, 1, 9, 9), "plain"), ArrayTraverse(torch.rand(9, 1, 9, 9), "few")
-    assert second_traverse(model, plain[0], plain[0]).places.tolist() == list(range(FRAMES))
-    again = second_traverse(model, plain[0][:], plain[0][:])  # tensors, as `learn` takes them
+    assert second_traverse(model, plain[0], plain[0], "0").places.tolist() == list(range(FRAMES))
+    again = second_traverse(model, plain[0][:], plain[0][:], "0")  # tensors, as `learn` takes them
     assert again.places.tolist() == list(range(FRAMES))
-    with refused("few has 9 frames", "plain 200", "a truth for its places"):
+    with refused("plain", "9 frames of few", "--second_truth"):
         second_traverse(model, *plain)
     with refused("no whitening", "few"):
         second_traverse(DejaVu(whitening="none"), *plain, "0")

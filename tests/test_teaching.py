@@ -23,7 +23,14 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.export import export_onnx, run_session, session_of
 from dejavu_torch.features.views import LabelledFrames
 from dejavu_torch.features.whitening import LIGHT, VISIT, Visits
-from dejavu_torch.growth import append, merge, second_traverse
+from dejavu_torch.growth import (
+    append,
+    associate,
+    calibrate_if_possible,
+    merge,
+    second_traverse,
+    visit_to_calibrate,
+)
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.recognition.coarse import CoarseSearch, SamplingPlan
 from dejavu_torch.teaching import FEWEST, ROUNDS, SURE, place_drive, refine
@@ -85,7 +92,8 @@ def test_frames_are_placed_without_truth_and_teach(road, drive, placed):
     assert ((placed.places - torch.arange(FIRST, LAST))[sure].abs() <= 3).float().mean() > 0.98
     assert 1 <= placed.placed.rounds <= ROUNDS
     count = int(sure.sum())
-    assert [*placed.placed_lines()] == [f"{count} of 120 frames of drive placed; {120 - count} left out"]
+    line = f"{count} of 120 frames of drive placed, at place = 1.00 frame + 20; {120 - count} left out"
+    assert [*placed.placed_lines()] == [line]
     facts = {"placed": count, "of": 120, "probability": SURE, "rounds": placed.placed.rounds}
     assert placed.placed_facts() == facts
     taught, untaught = fresh().learn(road, second=placed), fresh().learn(road)
@@ -120,6 +128,45 @@ def test_drives_with_and_without_truth_teach_together(road, drive, placed):
     assert views.placed_facts() is not None
     assert views.placed_facts()["of"] == 120
     assert len(list(views.placed_lines())) == 1
+
+
+def numbered(first, traverse):
+    """As many frames of a flight, from a first one on, in files that merely count them."""
+    source = open_source(f"sim:aerial?frames={FRAMES + 60}&traverse={traverse}")
+    some = ArrayTraverse(
+        next(iter(source.batches(FRAMES + 60)))[first : first + FRAMES, ..., ::2, ::2], "visit"
+    )
+    some.names = [f"frame_{i:05}.png" for i in range(FRAMES)]
+    return some
+
+
+@pytest.mark.parametrize("start", [0, 5, 40])
+def test_a_visit_as_long_as_the_reference_is_placed_wherever_it_starts(start):
+    again = numbered(start, 1)
+    for views in (second_traverse(fresh(), numbered(0, 0), again), associate(fresh(), numbered(0, 0), again)):
+        sure = views.places >= 0
+        assert sure.float().mean() > 0.6
+        assert ((views.places - torch.arange(FRAMES) - start)[sure].abs() <= 5).float().mean() > 0.98
+        (line,) = views.placed_lines()
+        assert line.startswith(f"{int(sure.sum())} of 160 frames of visit placed, at place = 1.00 frame + ")
+        assert abs(int(line.split(";")[0].split()[-1]) - start) <= 1
+
+
+@pytest.mark.parametrize("start", [0, 40])
+def test_a_visit_calibrates_by_all_of_its_frames_wherever_it_starts(start, caplog):
+    road, again = numbered(0, 0), numbered(start, 1)
+    model, told = fresh().learn(road), fresh().learn(road)
+    visit = visit_to_calibrate(model, road, again)
+    assert visit is again
+    calibrate_if_possible(model, road, visit)
+    assert "calibrate, too" in caplog.text
+    calibrate_if_possible(told, road, visit_to_calibrate(told, road, again, str(start)))
+    query = frames_of(2)
+    found = [one.localize(query, sequence=None, centre=False) for one in (model, told)]
+    right = float(((found[0].index - torch.arange(FRAMES)).abs() <= 5).float().mean())
+    for match in found:
+        assert match.probability is not None
+        assert abs(float(match.probability.mean()) - right) < 0.2
 
 
 def test_a_frame_of_a_drive_counts_as_so_many_copies():
@@ -170,8 +217,17 @@ def test_the_light_of_a_drive_is_no_change(monkeypatch):
 
 def test_what_cannot_be_placed_is_refused(road):
     few = ArrayTraverse(frames_of(1)[:29], "few")
-    with refused("few has 29 frames and road 160", "a truth for its places", "at least 30 frames in order"):
+    with refused("road", "29 frames of few", "at least 30 frames in order", "--second_truth, such as 0"):
         second_traverse(fresh(), road, few)
+    noise = ArrayTraverse(torch.rand(FRAMES, 3, 32, 32), "noise")  # as long as the reference
+    with refused("noise, fewer than 60", "in order", "--second_truth, such as 0"):
+        second_traverse(fresh(), road, noise)
+    with refused("noise, fewer than 60", "in order", "--average_truth, such as 0"):
+        associate(fresh(), road, noise)
+    with refused("29 frames of few", "--calibration_truth, such as 0"):
+        visit_to_calibrate(fresh(), road, few)
+    with refused("noise, fewer than 60", "--calibration_truth, such as 0"):
+        calibrate_if_possible(fresh().learn(road), road, noise)
     with refused("no whitening", "few"):
         second_traverse(DejaVu(whitening="none"), road, few)
     with refused("features per frame", "the same number"):
@@ -187,7 +243,10 @@ def test_a_report_and_the_command_tell_how_many_frames_teach(road, drive, tmp_pa
     words = "--second", tmp_path / "drive.npy", "--calibration", "none", "--whitening.views", "2"
     run("compare", *pair, *words, "--out", tmp_path / "report")
     second, out = report_of(tmp_path / "report")["second"], capsys.readouterr().out
-    assert f"{second['placed']} of 120 frames of {tmp_path / 'drive.npy'} placed; " in out
+    line = (
+        f"{second['placed']} of 120 frames of {tmp_path / 'drive.npy'} placed, at place = 1.00 frame + 20; "
+    )
+    assert line in out
     assert second["of"] == 120
     assert second["placed"] > 60
     assert second["probability"] == SURE

@@ -27,6 +27,7 @@ from dejavu_torch.data.source import check_not_read, open_source
 from dejavu_torch.data.traverse import chained, kept
 from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.views import SAMPLE as SHORT
+from dejavu_torch.features.views import LabelledFrames
 from dejavu_torch.learning import Checkpoint, MapTasks
 from dejavu_torch.maps.place_map import Mapper
 from dejavu_torch.maps.spectral import SpectralMapper
@@ -108,7 +109,8 @@ def run_learn(
         elif append is not None:
             growth.append(model, traverse, True, checkpoint, map_tasks, visits)
             places = torch.arange(start, model.map.places)
-            known = known and known._replace(places=known.places + torch.where(known.places >= 0, start, 0))
+            if isinstance(known, LabelledFrames):
+                known = known._replace(places=known.places + torch.where(known.places >= 0, start, 0))
             done = f"{len(places)} places appended to the {start} of {append}; written to {map}"
         elif visits is not None:
             growth.learn_mean(model, traverse, visits, True, views, checkpoint, map_tasks)

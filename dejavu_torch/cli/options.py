@@ -284,7 +284,7 @@ class LearningOptions:
 
     def with_views(
         self, model: DejaVu, reference: Reference, query: Traverse | None = None
-    ) -> tuple[Reference, LabelledFrames | None, LabelledFrames | None]:
+    ) -> tuple[Reference, LabelledFrames | None, LabelledFrames | Traverse | None]:
         """The reference, if there is one, what its whitening learns from, and what calibrates its map, or the
         model's; all are opened and compared before one of them is measured."""
         named = None if self.calibration in UNREAD else self.calibration
@@ -311,7 +311,7 @@ class LearningOptions:
                 model.descriptor.check_sizes(reference, other)
         if other is None:
             return reference, views, None
-        return reference, views, growth.associate(model, reference, other, self.calibration_truth)
+        return reference, views, growth.visit_to_calibrate(model, reference, other, self.calibration_truth)
 
     def check_calibrated(
         self, model: DejaVu, traverse: Traverse, map: Path | None = None, distractors: object = None
@@ -364,7 +364,10 @@ class GrowthOptions:
 
     def visits(self, model: DejaVu, reference: Traverse | None) -> LabelledFrames:
         """The traverse to average, and which places of the reference or the map it shows."""
-        return growth.associate(model, reference, open_source(str(self.average)), self.average_truth)
+        views = growth.associate(model, reference, open_source(str(self.average)), self.average_truth, True)
+        for line in views.placed_lines():
+            print(line)
+        return views
 
 
 @dataclass

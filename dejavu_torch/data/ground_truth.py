@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import logging
+import operator
+import re
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from decimal import Decimal
+from itertools import pairwise
 from numbers import Real
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias, TypeGuard
@@ -34,6 +38,7 @@ EXPECTED = (
     "in image names"
 )
 FORMS = "integer places (Q,) or (Q,R), or a boolean matrix (Q,N)"
+NUMBER = re.compile(r"[0-9]+(?:\.[0-9]+)?")  # in a name
 BYTES_PER_PLACE = 32  # of a table of right places, including temporaries
 
 
@@ -269,7 +274,7 @@ def find_ground_truth(
     queries: int | Tensor,
     interpolate: bool = False,
     resampled: bool = False,
-    aligned: bool = False,
+    counters: bool = True,
 ) -> GroundTruth | None:
     """Read a ground truth, or derive it from the sources, in frames of the reference.
 
@@ -296,7 +301,7 @@ def find_ground_truth(
         interpolate: interpolate the place of a query between two listed in the .csv, rounded.
         resampled: whether queries and places are resampled by distance. A listed frame that is not a query
             then applies to the nearest query, unless that is listed too.
-        aligned: take any two traverses of equal length as aligned.
+        counters: see `are_aligned`; a warning tells if nothing else says so.
 
     Convention 11: a ground truth counts frames of the sources; see `ground_truth_in_places`. The tolerance
         of the scores, inclusive, is added to it.
@@ -315,9 +320,12 @@ def find_ground_truth(
         if reference.places is not None and query.places is not None:
             return all_judged(position_truth(reference.places, _rows_of(query.places, numbers)))
         same_length = not resampled and len(query) == frames
-        if same_length and (aligned or are_aligned(reference, query)):
-            return all_judged(offset_truth(numbers, frames))
-        return None
+        if not same_length or not are_aligned(reference, query, counters):
+            return None
+        if not are_aligned(reference, query, counters=False):
+            pair = reference.name, query.name
+            log.warning("%s and %s count their frames alike: frame i is taken to show place i", *pair)
+        return all_judged(offset_truth(numbers, frames))
     parsed = check_ground_truth(truth, interpolate)
     if isinstance(parsed, GroundTruth):
         count = len(numbers) if all_frames else None if query is None else len(query)
@@ -375,17 +383,36 @@ def _rows_of(table: Tensor, numbers: Tensor) -> Tensor:
     return table[numbers]
 
 
-def are_aligned(reference: Traverse, query: Traverse) -> bool:
+def are_aligned(reference: Traverse, query: Traverse, counters: bool = True) -> bool:
     """Whether frame i of both traverses, of equal length, is known to show the same place.
 
-    True for the same cuts of two long images, and for equal and unique names of all frames. Times of video
-    frames are not names: any two recordings share them.
+    True for the same cuts of two long images, equal coordinates, and names that agree, see `names_agree`.
     """
     if reference.cut is not None:
         return reference.cut == query.cut
-    names = reference.names
-    unique = reference.times is None and bool(names) and all(names) and len({*names}) == len(names)
-    return unique and [*names] == [*query.names]
+    ours, theirs = reference.coordinates, query.coordinates
+    if ours and theirs and ours[1:] == theirs[1:] and torch.equal(ours.values, theirs.values):
+        return True
+    return reference.times is None and names_agree(reference.names, query, counters)
+
+
+def names_agree(names: Sequence[str], query: Traverse, counters: bool = True) -> bool:
+    """Whether the frames of a query have these unique names. Times of video frames are not names: any two
+    recordings share them. Nor are mere counters unless `counters`: any two exports share them."""
+    unique = query.times is None and bool(names) and all(names) and len({*names}) == len(names)
+    return unique and [*names] == [*query.names] and (counters or not merely_count(names))
+
+
+def merely_count(names: Sequence[str]) -> bool:
+    """Whether names differ only in evenly spaced numbers.
+
+    Example:
+        >>> merely_count(["frame_09.png", "frame_10.png"]), merely_count(["0.1", "0.25", "0.3"])
+        (True, False)
+    """
+    numbers = sorted([*map(Decimal, NUMBER.findall(name))] for name in names)
+    steps = {tuple(map(operator.sub, after, before)) for before, after in pairwise(numbers)}
+    return len({NUMBER.sub("0", name) for name in names}) == 1 and len(steps) <= 1
 
 
 def describe_ground_truth(truth: Truth | None, interpolate: bool = False, positions: bool = False) -> str:

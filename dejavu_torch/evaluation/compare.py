@@ -100,7 +100,7 @@ def compare(
     sequence: SequenceModel | Literal["auto"] | None = "auto",
     centre: bool | None = None,
     top: int = 1,
-    calibration: LabelledFrames | Literal["none"] | None = None,
+    calibration: LabelledFrames | Traverse | Literal["none"] | None = None,
     distractors: Sequence[Traverse] = (),
     storage_curve: bool = False,
     ordered: bool | None = None,
@@ -179,7 +179,7 @@ def compare(
     with model.descriptor.setting_aside(*rivals):
         with timed(seconds, "describe" if has_map else "learn"):
             places = _learned(model, reference, second, tolerance, progress)
-            if isinstance(calibration, LabelledFrames) or (calibration is None and not has_map):
+            if calibration != "none" and not (calibration is None and has_map):
                 calibrate_if_possible(model, reference, calibration, progress=progress)
         if known is not None:
             known = ground_truth_in_places(known, model.map.place_of)

@@ -25,6 +25,7 @@ SEGMENT, EVERY = 20, 10  # frames of a segment; every 10th segment is used
 STRONGER = 1.5  # factor on the strengths for whitening, which has seen the frames themselves
 FEWEST, MOST = 600, 1200  # frames of all segments together
 MAX_COPIES = 2  # frames of all segments, relative to the frames of a short route
+FITTED = 200  # frames that a line is fitted to
 LEAST, SCORES = 240, 2**27  # frames of a long route at least; their scores at all places at most
 
 
@@ -109,13 +110,15 @@ class LabelledFrames(NamedTuple):
         places = torch.where(self.places >= 0, number.to(self.places.device)[self.places], -1)
         return self._replace(places=places)
 
-    def placed_lines(self) -> Iterator[str]:
-        """What is said of each drive that a smoother has placed."""
+    def placed_lines(self, others: str = "{} left out") -> Iterator[str]:
+        """What is said of each drive that a smoother has placed, and of the number of its other frames."""
         drive, names, *_ = self.placed or (self.places, {})
         for i, name in names.items():
-            own = self.places[drive == i] >= 0
-            left = f"{int((~own).sum())} left out" if own.any() else "nothing is learned from it"
-            yield f"{int(own.sum())} of {len(own)} frames of {name} placed; {left}"
+            places = self.places[drive == i]
+            count = int((places >= 0).sum())
+            left = others.format(len(places) - count)
+            left = f", at {line_of(places)}; {left}" if count else "; nothing is learned from it"
+            yield f"{count} of {len(places)} frames of {name} placed{left}"
 
     @property
     def drives(self) -> int:
@@ -130,6 +133,23 @@ class LabelledFrames(NamedTuple):
         own = self.places[torch.isin(self.placed.drive, torch.tensor([*self.placed.names]))]
         found = {"placed": int((own >= 0).sum()), "of": len(own)}
         return {**found, "probability": self.placed.probability, "rounds": self.placed.rounds}
+
+
+def line_of(places: Tensor) -> str:
+    """The line that most frames lie on, by medians of slopes (of Theil and Sen) and of offsets.
+
+    Shape: places (n,) of frames, -1 for frames without one; at least two have one.
+
+    Example:
+        >>> line_of(torch.tensor([40, -1, 42, 9, 44]))
+        'place = 1.00 frame + 40'
+    """
+    frame = (places >= 0).nonzero()[:, 0]
+    some = frame[torch.linspace(0, len(frame) - 1, min(len(frame), FITTED)).long()]
+    one, two = torch.combinations(some).T
+    slope = round(float(((places[two] - places[one]) / (two - one)).median()), 2)
+    offset = round(float((places[frame] - slope * frame).median()))
+    return f"place = {slope:.2f} frame {'-' if offset < 0 else '+'} {abs(offset)}"
 
 
 def evenly_spaced(frames: int, length: int, count: int) -> Tensor:

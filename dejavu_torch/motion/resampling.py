@@ -94,10 +94,10 @@ def ground_truth_of(
     reference: Traverse,
     query: Traverse,
     interpolate: bool = False,
-    aligned: bool = False,
+    counters: bool = True,
 ) -> GroundTruth | None:
     """`find_ground_truth` for traverses that may be resampled, in frames of the reference's source."""
     moved = isinstance(reference, ResampledTraverse)
     numbers = query.frame if isinstance(query, ResampledTraverse) else len(query)
     sources = source_of(reference), source_of(query)
-    return find_ground_truth(truth, *sources, len(sources[0]), numbers, interpolate, moved, aligned)
+    return find_ground_truth(truth, *sources, len(sources[0]), numbers, interpolate, moved, counters)

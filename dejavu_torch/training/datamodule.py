@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Iterable, Iterator
 from functools import partial
@@ -21,11 +22,15 @@ from dejavu_torch.data.source import as_traverse, routes_of
 from dejavu_torch.data.traverse import runs as runs_of
 from dejavu_torch.features.augmentation import Augmentation
 from dejavu_torch.features.views import SEGMENT
+from dejavu_torch.growth import associate
 from dejavu_torch.memory import check_room, concatenate, free_memory
+from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, resampled
 from dejavu_torch.resize import resize_frames
 from dejavu_torch.types import InputError, Traverse, expect
+
+log = logging.getLogger("dejavu_torch")
 
 Given: TypeAlias = str | Any  # a path, on the command line; or what `as_traverse` takes, or several
 READ_BATCH = 64  # frames
@@ -132,7 +137,7 @@ class RouteData(LightningDataModule):
         query: the traverse that `test` localizes. `fit` evaluates the final map on it if there is no
             validation.
         second_truth, validation_truth, truth: the places of these three, as --truth of `dejavu compare`. For
-            a second traverse as long as the reference, None also means that frame i is place i.
+            a second traverse of unknown places None means where a smoother places it, on a map of HOG.
         tolerance: places within which one is right, inclusive.
         batch_size: frames of a batch.
         clip: consecutive frames in a batch, which get the same augmentation; 1 draws each frame by itself.
@@ -346,10 +351,13 @@ class RouteData(LightningDataModule):
         values = self._stored(traverse)
         if values.shape[1:] != reference.shape[1:]:
             raise _shape_error(traverse.name, tuple(values.shape[1:]), tuple(reference.shape[1:]))
-        aligned = name == "second"  # by definition of the same places
-        known = ground_truth_of(self.truths[name][i], route, traverse, aligned=aligned)
+        option = "data.truth" if name == "query" else f"data.{name}_truth"
+        known = ground_truth_of(self.truths[name][i], route, traverse, counters=name != "second")
+        if known is None and name == "second" and len(route.frame_shape) == 3:
+            views = associate(DejaVu(), route, traverse, option=option)
+            log.warning(*views.placed_lines())
+            return values, as_ground_truth(views.places)
         if known is None:
-            option = "data.truth" if name == "query" else f"data.{name}_truth"
             seen = f"no truth for {traverse.name}: {len(values)} frames, {len(reference)} places"
             raise InputError(f"{seen}; expected {option}, such as 0 if frame i is place i")
         if isinstance(route, ResampledTraverse):

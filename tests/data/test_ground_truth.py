@@ -19,11 +19,13 @@ from dejavu_torch import memory
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import (
     GroundTruth,
+    are_aligned,
     check_ground_truth,
     counted,
     find_ground_truth,
     ground_truth_in_places,
     is_right,
+    merely_count,
     near_truth,
     offset_truth,
     padded,
@@ -32,6 +34,7 @@ from dejavu_torch.data.ground_truth import (
 from dejavu_torch.data.positions import look_up
 from dejavu_torch.data.strip import SlidingWindow
 from dejavu_torch.data.traverse import frame_range
+from dejavu_torch.types import Coordinates
 
 POSITIONS = st.lists(st.integers(-20, 20), min_size=1, max_size=12)
 
@@ -214,9 +217,42 @@ def test_as_many_frames_are_the_same_places_where_they_say_so(reference, query, 
     frames, queries = len(reference), len(query)
     assert queries == frames
     found = find_ground_truth(None, reference, query, frames, queries)
-    named = known(None, reference, query, frames, queries, aligned=True)  # by a user
-    assert named.positives[:, 0].tolist() == list(range(frames))
-    assert found is None if not says else torch.equal(found.positives, named.positives)
+    assert found is None if not says else found.positives[:, 0].tolist() == list(range(frames))
+
+
+def at(points, frame=""):
+    traverse = route(3)
+    traverse.coordinates = Coordinates(torch.tensor(points, dtype=torch.float64), frame=frame)
+    return traverse
+
+
+COUNTERS = (
+    *(["00001.png", "00002.png", "00003.png"], ["1.jpg", "10.jpg", "19.jpg"], ["a-9", "a-8", "a-7"]),
+    *(["day3_0-of-9", "day3_3-of-9", "day3_6-of-9"], ["0.0", "0.5", "1.0"], ["1", "3", "2"]),
+)
+STAMPS = (["17.03.png", "17.10.png", "17.14.png"], ["1.png", "2.png", "4.png"], ["gate", "hall", "yard"])
+STAMPS += (["a1.png", "b2.png", "c3.png"], ["1_5", "2_6", "3_9"])
+
+
+@pytest.mark.parametrize(("names", "count"), [*((c, True) for c in COUNTERS), *((s, False) for s in STAMPS)])
+def test_names_that_merely_count_align_no_visit_that_teaches(names, count, caplog):
+    pair = Named(names), Named(names)
+    assert merely_count(names) == count
+    assert are_aligned(*pair)
+    assert are_aligned(*pair, counters=False) == (not count)
+    found = find_ground_truth(None, *pair, 3, 3, counters=False)
+    assert (found is None) == count
+    assert not caplog.records
+    assert known(None, *pair, 3, 3).positives[:, 0].tolist() == [0, 1, 2]
+    assert ("count their frames alike" in caplog.text) == count
+
+
+def test_equal_coordinates_align_two_visits():
+    points = [[0.0, 1], [2, 3], [4, 5]]
+    assert are_aligned(at(points), at(points), counters=False)
+    assert not are_aligned(at(points), at([*points[:2], [4, 6]]))
+    assert not are_aligned(at(points, "EPSG:32632"), at(points, "pixels"))
+    assert not are_aligned(at(points), route(3))
 
 
 def test_numbered_queries_get_their_own_rows():

@@ -12,6 +12,7 @@ from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dejavu_torch import open_source
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth
 from dejavu_torch.features.augmentation import Augmentation
@@ -46,6 +47,18 @@ def test_every_frame_is_drawn_once_an_epoch_with_the_places_it_shows(tmp_path):
             seen.setdefault(round(float(frame[0, 0, 0]) * 255), []).append([p for p in right if p >= 0])
     second = [[5], [], [7, 9, 11], [], [], [], [], []]
     assert seen == {i: [[i]] for i in range(24)} | {100 + i: [right] for i, right in enumerate(second)}
+
+
+def test_a_second_traverse_is_placed_by_what_it_shows_not_by_its_length(caplog):
+    road, again = (open_source(f"sim:aerial?frames=200&traverse={i}") for i in (0, 1))
+    data = RouteData(ArrayTraverse(road[:160], "road"), second=ArrayTraverse(again[40:], "again"))
+    data.setup("fit")
+    places = data.sets["second"].truth.positives[:, 0]
+    sure, shown = places >= 0, torch.arange(160) + 40
+    assert sure.float().mean() > 0.6
+    on = sure & (shown < 160)
+    assert ((places - shown)[on].abs() <= 5).float().mean() > 0.98
+    assert f"{int(sure.sum())} of 160 frames of again placed, at place = 1.00 frame + " in caplog.text
 
 
 def test_what_is_judged_and_ignored_reaches_the_metric(tmp_path):
@@ -184,6 +197,10 @@ class Mixed(ArrayTraverse):
         ({"stage": "test"}, ("nothing to test on", "data.query")),
         ({"second": numbered(24, 100, side=9)}, ("(1, 9, 9)", "(1, 8, 8)", "same channels", "data.resize")),
         ({"second": numbered(24, 100), "second_truth": "nix"}, ("truth 'nix'", "offset")),
+        (
+            {"second": numbered(24, 100)},
+            ("24 frames of from 100", "data.second_truth, such as 0"),
+        ),
         ({"second": "nowhere"}, ("nowhere is not there",)),
         ({"second": Mixed(torch.rand(24, 1, 4, 4))}, ("(1, 4, 4) and of (1, 4, 5)", "data.resize")),
         ({"second": ArrayTraverse(torch.full((24, 1, 8, 8), torch.nan))}, ("the array holds NaN",)),
