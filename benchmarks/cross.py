@@ -249,9 +249,7 @@ def facts_of(board: Board, queries: Tensor, truth: GroundTruth | None = None) ->
     """
     model, tolerance = board.model, board.tolerance
     moved, smoother = in_its_light(model, queries), PlaceSmoother(within=max(1, tolerance))
-    drive = model.localize_descriptors(
-        moved, model.matching(smoother)._replace(radius=tolerance, plain=queries)
-    )
+    drive = model.localize_descriptors(moved, model.matching(smoother)._replace(radius=tolerance))
     found: dict[str, Any] = {"queries": len(queries), "taken": smoother.is_drive}
     found |= {key: value for key, value in smoother.settled().items() if isinstance(value, float)}
     ways = {"drive": drive}

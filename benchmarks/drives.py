@@ -195,7 +195,7 @@ def facts_of(known: Known, numbers: Tensor) -> dict[str, Any]:
     moved = in_its_light(model, queries)
     smoother = PlaceSmoother(within=tolerance)
     single = model.matching()._replace(radius=tolerance)
-    together = model.matching(smoother)._replace(radius=tolerance, plain=queries)
+    together = model.matching(smoother)._replace(radius=tolerance)
     plain, one = (model.localize_descriptors(some, single) for some in (queries, moved))
     whole = model.localize_descriptors(moved, together)
     assert whole.probability is not None

@@ -126,7 +126,7 @@ def bench_features(name: str, route: Route, seed: int, ways: Ways = FEATURES) ->
         model.learn_features(rows, reference)
         queries = model.descriptor.all_of(query)
         moved = in_its_light(model, queries)
-        smoother = model.matching(PlaceSmoother(within=tolerance))._replace(radius=tolerance, plain=queries)
+        smoother = model.matching(PlaceSmoother(within=tolerance))._replace(radius=tolerance)
         matches = {
             "auc_one": model.localize_descriptors(moved),
             "auc": model.localize_descriptors(moved, smoother),

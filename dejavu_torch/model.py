@@ -536,7 +536,6 @@ class DejaVu(nn.Module):
         if turned:
             descriptors = set_apart(self.map, descriptors)
         elif self.centres(len(descriptors)) if centre is None else centre:
-            matching = matching._replace(plain=descriptors)
             descriptors = centred(self.map, descriptors)
         yield self.localize_descriptors(descriptors, matching, progress=progress)
 

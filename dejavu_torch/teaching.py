@@ -41,7 +41,7 @@ def place_drive(model: DejaVu, descriptors: Tensor) -> Tensor:
     """The place of each frame of a drive, as sure as `SURE`, by the drive as a whole: (Q,K) -> (Q,) int64, -1
     for the others. All are -1 if it is no drive of the map, or too few of its frames are sure."""
     smoother, queries = PlaceSmoother(), in_its_light(model, descriptors)
-    match = model.localize_descriptors(queries, model.matching(smoother)._replace(plain=descriptors))
+    match = model.localize_descriptors(queries, model.matching(smoother))
     assert match.probability is not None
     places = torch.where(match.probability >= SURE, match.index, -1)
     few = int((places >= 0).sum()) < max(FEWEST, SHARE * len(places))

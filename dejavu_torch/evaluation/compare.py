@@ -289,7 +289,7 @@ def _calibrated(
     model: DejaVu,
     reach: int,
     reference: Traverse,
-    views: LabelledFrames | Literal["none"] | None,
+    views: LabelledFrames | Traverse | Literal["none"] | None,
     progress: bool,
 ) -> Iterator[None]:
     """Within the block a calibrated model is calibrated for a reach, if there is what to do it by."""
@@ -297,7 +297,7 @@ def _calibrated(
     try:
         if held is not None and reach != TOLERANCE:
             model.calibration = None
-            if not isinstance(views, str):
+            if not isinstance(views, str | Traverse):  # a visit says how sure it is within 5
                 calibrate_if_possible(model, reference, views, progress=progress, reach=reach)
             if model.calibration is None:
                 model.calibration = held
@@ -436,7 +436,7 @@ def _smoothed(
     if whole is None:
         return run, found
     own = model.matching(whole) if apart is None else model.loop_matching(apart, whole)
-    own = own._replace(k=found.index.shape[1], radius=run.tolerance, plain=run.causal_features)
+    own = own._replace(k=found.index.shape[1], radius=run.tolerance)
     own = own._replace(copies=run.matching.copies)
     drive = model.localize_descriptors(run.query_features, own, progress=progress)
     best = drive.map(lambda column: column[:, 0])
@@ -511,7 +511,7 @@ def _match_distractors(
         if isinstance(asked, Turned):
             queries = set_apart(model.map, queries)
         elif centring and (sequence is None or whole):
-            matching, queries = matching._replace(plain=queries), centred(model.map, queries)
+            queries = centred(model.map, queries)
         match = model.localize_descriptors(queries, matching)
         assert match.probability is not None
         probabilities[other.name] = match.probability

@@ -97,7 +97,7 @@ class Localization(NamedTuple):
         if self.beside is None:
             return None
         area = self.model.map.area
-        return drive_query(self.query_features, self.beside, score, self.causal_features, area, stride)
+        return drive_query(self.query_features, self.beside, score, area, stride)
 
     @property
     def coarsest(self) -> int:

@@ -54,7 +54,6 @@ class DriveQuery(NamedTuple):
         rows: scores of queries by their numbers, (B,) -> (B,N). descriptors: (Q,K) of all queries.
         k: candidates. radius: suppression radius in places.
         platt: the calibration of single queries, if there is one.
-        single: as `rows`, of queries that are no drive, which are not centred; None is as `rows`.
         tiles: the scores of `rows` for large maps; None makes them of rows.
         null: as `rows`, of `flipped` queries, for a seed; without it their order alone tells whether they are
             a drive.
@@ -69,7 +68,6 @@ class DriveQuery(NamedTuple):
     radius: int = 5
     route_starts: Sequence[int] = (0,)
     platt: Platt | None = None
-    single: Rows | None = None
     tiles: Tiles | None = None
     checks: bool = False
     null: Callable[..., Tensor] | None = None
@@ -79,12 +77,12 @@ class DriveQuery(NamedTuple):
         """Whether the drive answers, once the smoother is fitted."""
         return self.smoother.is_drive and not self.checks
 
-    def ask_singly(self) -> None:
+    def ask_singly(self, spacing: Spacing) -> None:
         """Leave it to the smoother only what single images find as well."""
         if self.null is not None and len(self.descriptors):
             known, apart = self.smoother, self.radius
             sure = lambda scores: confidence(best_pair(scores, known.area, apart=apart))  # noqa: E731
-            known.singly = singly(self.rows, self.null, len(self.descriptors), sure)
+            known.singly = singly(self.rows, self.null, spacing.weight.cpu(), sure)
             known.is_drive &= known.singly.stands_out
 
 
@@ -204,10 +202,9 @@ def _seen(
         if smoother.area is not None:
             near = spacing_of(check_descriptors(descriptors))
             mass = place_flight(smoother, rows, len(descriptors), smoother.area, near)
-            asked.ask_singly()
-            own = rows if asked.answers else asked.single or rows
+            asked.ask_singly(near)
             fitted_one(1)
-            yield i, Seen(mass.double(), own(torch.arange(len(descriptors))).cpu())
+            yield i, Seen(mass.double(), rows(torch.arange(len(descriptors))).cpu())
             continue
         if is_large(len(descriptors), places):
             fitted_one(1)
@@ -216,7 +213,7 @@ def _seen(
         spacing = spacings.get(id(descriptors))
         spacing = spacings[id(descriptors)] = spacing_of(descriptors) if spacing is None else spacing
         smoother.fit(rows, descriptors, starts, spacing)
-        asked.ask_singly()
+        asked.ask_singly(spacing)
         fitted_one(1)
         kind = len(descriptors), smoother.layout(places, starts), len(smoother.move_logits)
         fitted.setdefault(kind, []).append((i, smoother.drive(rows, descriptors, spacing)))
@@ -228,17 +225,16 @@ def _seen(
             numbers = torch.arange(block.first, block.first + block.log.shape[-1])
             for (i, drive), posterior in zip(alike, block.posterior, strict=True):
                 asked = drives[i]
-                rows = drive.rows if asked.answers else asked.single or drive.rows
-                yield i, Seen(_mass(posterior), rows(numbers).cpu())
+                yield i, Seen(_mass(posterior), drive.rows(numbers).cpu())
 
 
 def _of_windows(asked: DriveQuery, places: int, progress: bool) -> Iterator[Seen]:
     """What is seen of a drive on a large map."""
-    rows, descriptors, smoother, k, radius, starts, _, single, tiles, *_ = asked
-    tiles, single = tiles or Tiles(lambda numbers: iter([(0, rows(numbers))]), places), single or rows
+    rows, descriptors, smoother, k, radius, starts, _, tiles, *_ = asked
+    tiles = tiles or Tiles(lambda numbers: iter([(0, rows(numbers))]), places)
     settings = places, smoother, starts, max(2, k), radius, progress
     drive = LargeDrive(tiles, descriptors, *settings)
-    asked.ask_singly()
+    asked.ask_singly(drive.spacing)
     for first, posterior, scores, known in drive:
         mass = _mass(posterior)
         if asked.answers:
@@ -246,7 +242,7 @@ def _of_windows(asked: DriveQuery, places: int, progress: bool) -> Iterator[Seen
             continue
         for part in reversed(torch.arange(len(mass)).split(max(1, TILE // places))):
             whole = mass.new_zeros(len(part), places).index_copy(1, known, mass[part])
-            yield Seen(whole, single(first + part).cpu())
+            yield Seen(whole, rows(first + part).cpu())
 
 
 def _kept(rows: Rows, every: bool) -> Rows:

@@ -83,7 +83,8 @@ def place_flight(smoother: PlaceSmoother, rows: Rows, queries: int, area: Area, 
         kernel = kernel / kernel.sum()
     swept = _sweep(smoother, area, std, weight, spacing.still, table.values, separation, kernel)
     smoother.separation, smoother.log_likelihood = separation, swept.log
-    smoother.is_drive = moves_along(swept.log, swept.log)  # jumps are not learned
+    smoother.nats_per_query = smoother.tempering * swept.log / max(1.0, float(weight.sum()))
+    smoother.is_drive = moves_along(swept.log, smoother.nats_per_query)  # jumps are not learned
     moves = torch.zeros(reach + 1).index_add_(0, rings(reach).flatten(), kernel.flatten())
     smoother.move_logits.copy_(logits(*moves.tolist()))
     return by_place(swept.mass, area)

@@ -42,7 +42,6 @@ class Matching(NamedTuple):
 
     sequence: SequenceModel | PlaceSmoother | None = None  # None matches each query by itself
     also: Mapping[Together, SequenceModel] = {}  # further ways, see `Match.sequences`; never changed
-    plain: Tensor | None = None  # the queries as they are, if those of a smoother are centred
     k: int | None = None  # candidates per query; None gives matches (Q,)
     radius: int = 0  # suppression radius in places
     acceptance: Acceptance = Acceptance()
@@ -234,16 +233,15 @@ class Localizer:
             blank = ~descriptors[numbers].any(1, keepdim=True)  # such frames find nothing
             return found.masked_fill(blank.to(found.device), math.inf)
 
-        single, settings = None, (matching.k or 1, matching.radius, self.route_starts, matching.platt)
+        settings = (matching.k or 1, matching.radius, self.route_starts, matching.platt)
         if matching.apart is not None:
             return DriveQuery(loops, descriptors, smoother, *settings, checks=True)
 
         def null(numbers: Tensor, seed: int) -> Tensor:
             return best_copies(score(flipped(descriptors[copies_of(numbers, copies)], seed)), copies)
 
-        single = None if matching.plain is None else rows(matching.plain)
         some = descriptors[::copies]
-        return DriveQuery(rows(descriptors), some, smoother, *settings, single, tiles, null=null)
+        return DriveQuery(rows(descriptors), some, smoother, *settings, tiles, null=null)
 
     @torch.no_grad()
     def skip(self, queries: int) -> None:
@@ -348,7 +346,6 @@ def drive_query(
     queries: Tensor,
     smoother: PlaceSmoother,
     score: Scoring,
-    plain: Tensor | None = None,
     area: Area | None = None,
     stride: int = 1,
 ) -> DriveQuery:
@@ -357,7 +354,7 @@ def drive_query(
     Args:
         area: of the places; None along a route. stride: of the frames that the scores are of.
     """
-    matching = Matching(plain=plain, removed=smoother.removed, radius=stride)
+    matching = Matching(removed=smoother.removed, radius=stride)
     return Localizer(None, matching, area=area).drive_query(queries, copy.deepcopy(smoother), score)
 
 

@@ -98,7 +98,8 @@ class Sample(NamedTuple):
 class Fit(NamedTuple):
     """What expectation-maximisation found.
 
-    log: nats by which the model beats being off the map. held: likewise, with jumps as rare as the prior's.
+    log: nats by which the model beats being off the map. held: likewise, with jumps, and ways off the
+    map, as rare as by the prior.
     """
 
     rates: Rates
@@ -376,8 +377,8 @@ class PlaceSmoother(SequenceModel):
             other = max(others, key=lambda one: one.log)
             least = max(OTHER_SPEED, PER_QUERY * different, CLEARLY * best.log)
             best = other if other.log >= least else best
-        self.is_drive, self.log_likelihood = moves_along(best.log, best.held), best.log
         self.nats_per_query = self.tempering * best.held / max(1.0, different)
+        self.is_drive, self.log_likelihood = moves_along(best.held, self.nats_per_query), best.log
         if best.separation >= SURE and spacing.correlation >= SLOW_CHANGES * spacing.detrended:
             self.tempering = spacing.detrended
         self.separation, self.values = best.separation, best.values
@@ -420,7 +421,8 @@ class PlaceSmoother(SequenceModel):
             separation = max(MIN_SEPARATION, float(sums[0] / sums[1].clamp(min=MIN_PROBABILITY)))
             total = Counts(*(torch.stack(kind).sum(0) for kind in zip(*counts, strict=True)))
             rates = updated_rates(total, prior * (MOVE_SHARE * moved), self.rate_prior)
-        rare = rates._replace(jump=prior.new_tensor(self.rate_prior[0]))
+        jump, leave, _ = self.rate_prior
+        rare = rates._replace(jump=prior.new_tensor(jump), leave=prior.new_tensor(leave))
         nats = (self._nats(samples, table.values, separation, one) for one in (rates, rare))
         return Fit(rates, separation, table.values, *nats)
 

@@ -2,7 +2,7 @@
 
 Queries and maps are smooth, so a drive over other ground finds a path on any map if it may stand still, jump
 and wander. Its single images, however, are no more sure of a place than queries that show nothing, and a path
-of jumps explains little once jumps are as rare as a drive's.
+of jumps explains little once jumps have to be rare.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ EVERY = 4  # of a filter's queries, the one that is asked mirrored as well
 UPPER = 0.1  # share of the queries that have to be sure: the others may be off the map
 STANDS_OUT = 0.21  # of `python -m benchmarks cross`
 NATS = 10.0  # by which a drive beats being off the map throughout
-ALONG = 0.5  # share of the nats that rare jumps have to leave: else jumps explain the drive, and nothing else
+PER_QUERY = 0.23  # likewise, for each query that is independent: with less, one image finds more
 AT_ONCE = 2**24  # scores
 BINS, PER_E, LEAST = 2048, 64, -16.0  # of a histogram of logarithms, in each factor e, and where it begins
 
@@ -77,14 +77,16 @@ def upper(confidences: Tensor) -> float:
 
 
 @torch.no_grad()
-def singly(own: Score, null: Callable[..., Tensor], queries: int, sure: Score) -> Singly:
+def singly(own: Score, null: Callable[..., Tensor], weight: Tensor, sure: Score) -> Singly:
     """What single images of a drive say, each of all places: no order and no preselection has a part in it.
 
     Args:
         own: numbers of queries (B,) -> their scores (B,N). null: the same of `flipped` ones, for a `seed`.
-        sure: scores (B,N) -> the confidence of each query, (B,).
+        weight: (Q,) of the queries, so that a stop counts once. sure: scores (B,N) -> their confidences (B,).
     """
-    numbers = torch.linspace(0, queries - 1, min(ASKED, queries)).round().long()
+    total = weight.double().cumsum(0)
+    asked = torch.linspace(0, float(total[-1]), min(ASKED, math.ceil(total[-1])) + 1)[:-1]
+    numbers = torch.searchsorted(total, asked.double(), right=True).clamp(max=len(total) - 1)
     parts = numbers.split(max(1, AT_ONCE // own(numbers[:1]).shape[1]))
 
     def confidences(score: Score) -> Tensor:
@@ -130,11 +132,7 @@ class Running:
         return -float(taken @ ((torch.arange(BINS) + 0.5) / PER_E + LEAST).exp()) / wanted
 
 
-def moves_along(nats: float, held: float) -> bool:
-    """Whether the order of queries makes a drive.
-
-    Args:
-        nats: by which the fitted motion beats being off the map throughout. held: the same with jumps as rare
-            as those of a drive.
-    """
-    return held >= max(NATS, ALONG * nats)
+def moves_along(nats: float, per_query: float) -> bool:
+    """Whether the order of queries makes a drive: by so many nats does its motion, with rare jumps, beat
+    being off the map throughout, in all and for each query."""
+    return nats >= NATS and per_query >= PER_QUERY

@@ -724,13 +724,6 @@ MUTANTS = [
         ("tests/recognition/test_drive.py::-k nearly_sure",),
     ),
     Mutant(
-        "Queries that are no drive are answered as they are, not centred.",
-        "dejavu_torch/recognition/drive.py",
-        "asked.single or drive.rows",
-        "drive.rows",
-        ("tests/recognition/test_drive.py::-k as_they_are",),
-    ),
-    Mutant(
         "Drives that are smoothed together each move at their own rates.",
         "dejavu_torch/recognition/smoother.py",
         "Rates(*map(torch.stack, zip(*rates, strict=True)))",
