@@ -26,18 +26,19 @@ from dejavu_torch.growth import calibrate_if_possible, merge
 from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.smoother import PlaceSmoother
+from dejavu_torch.recognition.taken import NATS, PER_QUERY
 from dejavu_torch.teaching import in_its_light
 from dejavu_torch.types import InputError
 
 ASKED = 400  # queries of a drive over another route, from its middle
 SHARES = (0.5, 0.9, 0.99)
 FEW = 20  # answers, of fewer of which no share of right ones is told
-FIRST, BETWEEN = "its first half", "stretches of 5 to 40, others between"
 CUTS = (
     *(AS_IT_WAS, "a third of the speed", "three times the speed", "reversed", "there and back"),
-    *(BETWEEN, HALF),
+    *("stretches of 5 to 40, others between", HALF),
 )
 WAYS = ("drive", "filter", "one")
+CHOSEN = ("road", "railway", "city", "sim:aerial")  # begin the names of footage that `--choose` looks at
 OWN, SHARED, REPEATED, KIND, OTHER = (
     *("own", "shares ground", "the road's other half", "another route of the kind", "another kind"),
 )
@@ -131,7 +132,9 @@ class Board(NamedTuple):
     tolerance: int
 
 
-def run_cross(data: Path, *, out: Path, maps: Sequence[str] = (), seed: int = 0) -> list[str]:
+def run_cross(
+    data: Path, *, out: Path, maps: Sequence[str] = (), seed: int = 0, choose: bool = False
+) -> list[str]:
     """The map of every route asked by a drive over every route: which are taken for a drive of the map?
 
     Args:
@@ -139,6 +142,8 @@ def run_cross(data: Path, *, out: Path, maps: Sequence[str] = (), seed: int = 0)
         out: folder for bench.json
         maps: names of those that are asked; all if not given
         seed: of the stretches in random order
+        choose: print where a drive is best told from others by its single images, on some of the footage, for
+            `recognition.taken.STANDS_OUT`
     """
     if unknown := [name for name in maps if name not in MAPS]:
         raise InputError(f"{unknown[0]!r} is no map; expected one of {', '.join(map(repr, MAPS))}")
@@ -146,7 +151,27 @@ def run_cross(data: Path, *, out: Path, maps: Sequence[str] = (), seed: int = 0)
     for name in tqdm(maps or MAPS, "maps", disable=None, leave=False):
         rows += bench_cross(name, data, seed)
         write_bench(out, rows, seed=seed)  # as soon as a map is finished
-    return [text_table(summary(rows)), "drives over other ground and over the map's own"]
+    found = [chosen(rows)] if choose else []
+    return [text_table(summary(rows)), *found, "drives over other ground and over the map's own"]
+
+
+def chosen(rows: Sequence[Row]) -> str:
+    """Between what drives are told from others, on the footage of `CHOSEN` and on all other."""
+    lines = []
+    for name, wanted in (("chosen on", True), ("reported", False)):
+        some = [
+            row
+            for row in rows
+            if row["log_likelihood"] >= NATS and row["nats_per_query"] >= PER_QUERY
+            if row["case"].startswith(CHOSEN) == wanted == row["contender"].startswith(CHOSEN)
+        ]
+        own, foreign = (
+            [1 - row["shown"] / row["null"] for row in some if (row["relation"] in (OWN, SHARED)) == mine]
+            for mine in (True, False)
+        )
+        low, high = max(foreign, default=0.0), min(own, default=1.0)
+        lines.append(f"{name}: others up to {low:.3f}, own from {high:.3f}, between {(low + high) / 2:.3f}")
+    return "\n".join(lines)
 
 
 def bench_cross(name: str, data: Path, seed: int = 0) -> Iterator[Row]:
@@ -159,10 +184,14 @@ def bench_cross(name: str, data: Path, seed: int = 0) -> Iterator[Row]:
     foreign = dict(asked_of(board, data))
     beside = next(queries for other, queries in foreign.items() if related(board, other) == OTHER)
     known = Known(board.model, board.queries, board.truth, board.tolerance, beside)
-    cuts = drives_of(len(board.queries), beside, seed)
-    cuts = {cut: cuts[cut] for cut in CUTS} | {FIRST: torch.arange(len(board.queries) // 2)}
-    for cut, numbers in cuts.items():
+    count, whole = min(ASKED, len(board.queries)), torch.arange(len(board.queries))
+    first = (len(whole) - count) // 2
+    for cut, numbers in drives_of(count, beside, seed).items():
+        if cut not in CUTS:
+            continue
         assert numbers is not None
+        numbers = torch.where(numbers >= 0, numbers + first, numbers)
+        numbers = whole if cut == AS_IT_WAS else numbers
         row: Row = {"case": name, "contender": name, "cut": cut, "relation": OWN}
         yield row | facts_of(board, *asked(known, numbers))
     for other, queries in foreign.items():

@@ -187,6 +187,7 @@ class PlaceSmoother(SequenceModel):
         self.removed = 1.0  # share of each place's mean score that is removed
         self.log_likelihood: float | None = None  # nats above being off the map throughout, as fitted
         self.nats_per_query = 0.0  # likewise, with rare jumps, as if queries did not depend on each other
+        self.jumps = 0.0  # nats that learned jumps add, in place of rare ones
         self.singly: Singly | None = None  # what single images say, if they were asked
         self.correlation = 1.0  # tau of these queries
         self.is_drive = True  # whether the queries that were fitted to are a drive of the map
@@ -379,6 +380,7 @@ class PlaceSmoother(SequenceModel):
             best = other if other.log >= least else best
         self.nats_per_query = self.tempering * best.held / max(1.0, different)
         self.is_drive, self.log_likelihood = moves_along(best.held, self.nats_per_query), best.log
+        self.jumps = best.log - best.held
         if best.separation >= SURE and spacing.correlation >= SLOW_CHANGES * spacing.detrended:
             self.tempering = spacing.detrended
         self.separation, self.values = best.separation, best.values
@@ -466,6 +468,7 @@ class PlaceSmoother(SequenceModel):
             "taken": self.is_drive,
             "log_likelihood": self.log_likelihood,
             "nats_per_query": self.nats_per_query,
+            "jumps": self.jumps,
             **singly,
             "moves": self.move_logits.softmax(0).tolist(),
             "jump": jump,

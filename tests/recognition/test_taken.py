@@ -1,0 +1,134 @@
+"""Whether queries are a drive of a map: what single images say, and what their order says."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dejavu_torch import DejaVu, PlaceFilter, PlaceSmoother
+from dejavu_torch.recognition import taken
+from dejavu_torch.recognition.calibration import Platt
+from dejavu_torch.recognition.taken import Running, Singly, doubted, flipped, moves_along, singly, upper
+
+
+def walk(frames, seed, size=24, step=0.3):
+    """Descriptors that change slowly, of length 1."""
+    draw = torch.Generator().manual_seed(seed)
+    rows = torch.empty(frames, size)
+    at = torch.randn(size, generator=draw)
+    for i in range(frames):
+        at = math.sqrt(1 - step**2) * at + step * torch.randn(size, generator=draw)
+        rows[i] = at
+    return torch.nn.functional.normalize(rows, dim=1)
+
+
+def seen_again(rows, seed, noise=0.1):
+    draw = torch.Generator().manual_seed(seed)
+    return torch.nn.functional.normalize(rows + noise * torch.randn(rows.shape, generator=draw), dim=1)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return DejaVu(whitening="none").learn(walk(400, 0))
+
+
+def asked(model, queries):
+    """A smoother that was asked where the queries are, and its match."""
+    smoother = PlaceSmoother()
+    return smoother, model.localize_descriptors(queries, model.matching(smoother))
+
+
+def test_mirrored_queries_are_as_alike_as_they_were_and_have_the_same_mean():
+    rows = walk(50, 1)
+    other = flipped(rows, 3)
+    assert torch.allclose(torch.cdist(other, other), torch.cdist(rows, rows), atol=1e-3)
+    assert torch.allclose(other.mean(0), rows.mean(0), atol=1e-6)
+    assert not torch.allclose(other, rows, atol=0.1)
+    assert torch.equal(other, flipped(rows, 3))
+    assert not torch.equal(other, flipped(rows, 4))
+    about = flipped(rows[:1], 3, mean=torch.zeros(24))
+    assert torch.equal(about.abs(), rows[:1].abs())
+
+
+def test_the_upper_tenth_is_that_of_all_queries_asked():
+    own = -torch.arange(1.0, 101)  # the confidence of each query
+    found = singly(
+        lambda n: own[n, None], lambda n, seed: -10 - own[n, None] * 0, torch.ones(100), lambda s: s[:, 0]
+    )
+    assert found == Singly(-5.5, -10.0, 100)
+    assert upper(own[:4]) == -1.0  # at least one
+
+
+def test_a_stop_counts_once():
+    own = torch.cat([torch.full((900,), -1.0), torch.full((99,), -9.0)])
+    weight = torch.cat([torch.full((900,), 1 / 1024), torch.ones(99)])  # which add up exactly
+    found = singly(lambda n: own[n, None], lambda n, seed: -10 - own[n, None] * 0, weight, lambda s: s[:, 0])
+    assert found.queries == 100
+    assert found.shown == pytest.approx((-1 - 9 * 9) / 10)
+
+
+@given(st.floats(0, 1), st.floats(0.01, 100))
+def test_odds_change_by_a_factor(probability, odds):
+    p = float(doubted(torch.tensor(probability, dtype=torch.float64), odds))
+    assert p * (1 - probability) == pytest.approx(odds * probability * (1 - p), abs=1e-9)
+
+
+def test_images_that_find_the_map_are_not_doubted():
+    assert Singly(-0.5, -0.9, 100).odds == 1
+    assert Singly(-0.8, -0.9, 100).odds == pytest.approx(1 / 9)
+
+
+def test_motion_has_to_pay_for_its_jumps():
+    assert moves_along(100.0, 1.0)
+    assert not moves_along(5.0, 1.0)  # in all
+    assert not moves_along(100.0, 0.1)  # for each query
+
+
+def test_a_running_number_is_that_of_all_so_far_in_any_batches():
+    draw = torch.Generator().manual_seed(0)
+    own, null = (-torch.rand(2, 300, generator=draw)).double()
+    null = torch.where(torch.arange(300) % 4 == 0, null * 1.5, math.nan)
+    running, parts = Running(), Running()
+    at_once = running(own, null)
+    assert torch.equal(
+        at_once, torch.cat([parts(own[a:b], null[a:b]) for a, b in ((0, 1), (1, 90), (90, 300))])
+    )
+    for n in (1, 57, 300):
+        known = null[:n][~null[:n].isnan()]
+        expected = Singly(upper(own[:n]), upper(known), n)
+        assert float(at_once[n - 1]) == expected.odds
+    assert Running()(own[:3], torch.full((3,), math.nan)).tolist() == [1, 1, 1]  # nothing to compare with
+
+
+def test_other_ground_is_no_drive_although_its_frames_are_in_order(model):
+    own, match = asked(model, seen_again(walk(400, 0)[50:350], 5))
+    assert own.is_drive
+    assert (match.index - torch.arange(50, 350)).abs().max() <= 5
+    for seed in range(1, 6):
+        other, match = asked(model, walk(300, seed))
+        assert not other.is_drive
+        assert other.singly is not None
+        assert not other.singly.stands_out
+        assert other.settled()["taken"] is False
+        assert float((match.probability >= 0.5).double().mean()) <= 0.02
+
+
+def test_a_part_over_the_map_is_a_drive(model):
+    part = torch.cat([seen_again(walk(400, 0)[100:200], 5), walk(200, 9)])
+    smoother, match = asked(model, part)
+    assert smoother.is_drive
+    assert (match.probability[:100] >= 0.5).double().mean() > 0.9
+    assert (match.probability[110:] >= 0.5).double().mean() < 0.1
+
+
+def test_a_filter_doubts_while_single_images_do_not_find_the_map(model, monkeypatch):
+    platt = Platt(1.0, 0.0)
+    matching = model.matching(PlaceFilter())._replace(platt=platt)
+    drives = [walk(300, 2), seen_again(walk(400, 0)[50:350], 5)]
+    other, own = (model.localize_descriptors(one, matching).probability for one in drives)
+    monkeypatch.setattr(taken, "STANDS_OUT", -math.inf)  # any image will do
+    trusted, same = (model.localize_descriptors(one, matching).probability for one in drives)
+    assert torch.equal(own, same)
+    assert torch.allclose(other[30:], doubted(trusted[30:], 1 / 9))
