@@ -16,7 +16,7 @@ from benchmarks.drives import AS_IT_WAS, HALF, Known, asked, drives_of
 from benchmarks.measure import Row, truth_of, write_bench
 from benchmarks.trainings import ROAD
 from dejavu_torch.data.demo import open_area
-from dejavu_torch.data.ground_truth import GroundTruth, all_judged
+from dejavu_torch.data.ground_truth import GroundTruth, all_judged, widened
 from dejavu_torch.data.source import open_source
 from dejavu_torch.data.traverse import Part, Traverse, fitted
 from dejavu_torch.evaluation.curves import evaluate
@@ -182,14 +182,15 @@ def bench_cross(name: str, data: Path, seed: int = 0) -> Iterator[Row]:
     """
     board = board_of(name, data)
     foreign = dict(asked_of(board, data))
-    beside = next(queries for other, queries in foreign.items() if related(board, other) == OTHER)
+    beside = next((rows for other, rows in foreign.items() if related(board, other) == OTHER), None)
     known = Known(board.model, board.queries, board.truth, board.tolerance, beside)
     count, whole = min(ASKED, len(board.queries)), torch.arange(len(board.queries))
     first = (len(whole) - count) // 2
     for cut, numbers in drives_of(count, beside, seed).items():
         if cut not in CUTS:
             continue
-        assert numbers is not None
+        if numbers is None:  # no other footage has such features
+            continue
         numbers = torch.where(numbers >= 0, numbers + first, numbers)
         numbers = whole if cut == AS_IT_WAS else numbers
         row: Row = {"case": name, "contender": name, "cut": cut, "relation": OWN}
@@ -209,7 +210,9 @@ def board_of(name: str, data: Path) -> Board:
         where = second.area.coordinates(path)
         places = first.area.place_near(where)[:, None]
         queries = model.descriptor.all_of(Part(second, path)).float()
-        return Board(model, (name,), queries, all_judged(places), round(RADIUS / STRIDE))
+        radius = round(RADIUS / STRIDE)
+        truth = widened(all_judged(places), first.area, radius)
+        return Board(model, (name,), queries, truth, radius)
     routes = PARTS_OF_MERGED if name == MERGED else (name,)
     footage = FOOTAGE[routes[0]]
     reference, query = (opened(one, data) for one in (footage.reference, footage.query))
@@ -282,6 +285,7 @@ def facts_of(board: Board, queries: Tensor, truth: GroundTruth | None = None) ->
     found: dict[str, Any] = {"queries": len(queries), "taken": smoother.is_drive}
     found |= {key: value for key, value in smoother.settled().items() if isinstance(value, float)}
     ways = {"drive": drive}
+    within = max(1, tolerance) if model.map.area is None else 0  # the truth has all windows of an area
     if model.calibration is not None:
         ways["one"] = model.localize_descriptors(moved, model.matching()._replace(radius=tolerance))
         if model.calibration.filter is not None:
@@ -292,11 +296,11 @@ def facts_of(board: Board, queries: Tensor, truth: GroundTruth | None = None) ->
         found[f"{way}_above"] = [float((probability >= share).double().mean()) for share in SHARES]
         if truth is None:
             continue
-        known, right = judged(match, truth, max(1, tolerance))
+        known, right = judged(match, truth, within)
         kept = [right[known >= share] for share in SHARES]
         found[f"{way}_right"] = [float(one.double().mean()) if len(one) >= FEW else None for one in kept]
         found[f"{way}_error"] = calibration_error(known, right)
-        found[f"{way}_auc"] = evaluate(match, truth, tolerance).auc
+        found[f"{way}_auc"] = evaluate(match, truth, within).auc
     return found
 
 

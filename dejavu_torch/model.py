@@ -583,7 +583,10 @@ class DejaVu(nn.Module):
         accepts = self.acceptance(sequence)
         removed = REMOVED if self.descriptor.keeps_lengths else 1.0
         ways = search or "auto"
-        return Matching(sequence, acceptance=accepts, platt=platt, search=ways, removed=removed)
+        single = self.calibration and self.calibration.single
+        return Matching(
+            sequence, acceptance=accepts, platt=platt, single=single, search=ways, removed=removed
+        )
 
     def acceptance(self, sequence: SequenceModel | None = None) -> Acceptance:
         """Which answers are accepted, for single queries or for a sequence (convention 4).

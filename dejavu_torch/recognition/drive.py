@@ -164,9 +164,9 @@ def _shown(asked: DriveQuery, seen: Seen) -> Shown:
         probability = near_in_plane(mass, within, area).gather(1, at)[:, 0]
     if not asked.answers and asked.platt is not None:
         by_itself = asked.platt.probability(confidence_of(scores, area, asked.platt.margin))
-        if smoother.singly is not None:
-            by_itself = doubted(by_itself, smoother.singly.odds)
         probability = by_itself if queries == 1 else torch.minimum(probability, by_itself)
+    if not asked.answers and smoother.singly is not None:
+        probability = doubted(probability, smoother.singly.odds)
     probability = probability.masked_fill(match.index[:, 0] < 0, 0)
     return Shown(match, 1 - mass.sum(1), sure, probability, scores.gather(1, at)[:, 0])
 

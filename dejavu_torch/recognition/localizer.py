@@ -46,6 +46,7 @@ class Matching(NamedTuple):
     radius: int = 0  # suppression radius in places
     acceptance: Acceptance = Acceptance()
     platt: Platt | None = None  # gives probabilities; for a smoother, that of single queries
+    single: Platt | None = None  # that of single queries, beside a filter's
     callback: Callable[[Tensor], None] | None = None  # receives the final scores (B,N)
     search: Search = "auto"  # of single queries, see `DejaVu.localize`
     removed: float = 1.0  # of each place's mean score, by a smoother
@@ -97,6 +98,9 @@ class Localizer:
         matching = matching._replace(sequence=sequence, also=in_area)
         self.place_map, self.matching, self.track = place_map, matching, Track(self.area)
         self.running = Running()  # what single images say so far
+        self.alone = torch.empty(
+            0
+        ).double()  # probabilities of single queries that a filter has yet to answer
         self.searcher = Scan(place_map) if searcher is None and place_map is not None else searcher
         self.own: Together = sequence.length if isinstance(sequence, SequenceMatcher) else "filter"
         self.models: dict[Together, SequenceModel] = {**matching.also}
@@ -153,6 +157,9 @@ class Localizer:
         `_mirrored`."""
         if mirrored is not None:
             odds = self.running(confidence_of(scores, self.area), mirrored)
+            platt = self.matching.single or Platt(0.0, math.inf)
+            alone = platt.probability(confidence_of(scores, self.area, platt.margin))
+            self.alone = torch.cat([self.alone, alone])
             match = self.match(scores)
             return self._doubted(match, odds[len(odds) - len(match.index) :])
         turn, copies = None, self.matching.copies
@@ -261,10 +268,13 @@ class Localizer:
         return match if match.probability is None else self._doubted(match, torch.tensor(self.running.odds))
 
     def _doubted(self, match: Match, odds: Tensor) -> Match:
-        """Answers of a filter with the odds that the queries so far are over the map's ground."""
+        """Answers of a filter with the odds that the queries so far are over the map's ground; where they
+        change, an answer is no surer than its query alone."""
         assert match.probability is not None
-        odds = odds.view(-1, *[1] * (match.probability.ndim - 1))
-        probability, precision = doubted(match.probability, odds), self.matching.acceptance.precision
+        count, shape = len(match.index), (-1, *[1] * (match.probability.ndim - 1))
+        own, self.alone, odds = self.alone[:count].view(shape), self.alone[count:], odds.view(shape)
+        least = torch.where(odds < 1, torch.minimum(match.probability, own), match.probability)
+        probability, precision = doubted(least, odds), self.matching.acceptance.precision
         accepted = match.accepted if precision is None else match.accepted & (probability >= precision)
         return replace(match, probability=probability, accepted=accepted)
 

@@ -125,15 +125,6 @@ def test_answers_that_are_nearly_sure_have_different_scores():
     assert len(match.score.unique()) > 60
 
 
-def test_what_is_no_drive_is_answered_by_single_queries():
-    scores, descriptors = noise(60, 80, seed=1), noise(60, 16, seed=8)
-    match = localize_drive(DriveQuery(smoothing.rows_of(scores), descriptors, PlaceSmoother()))
-    assert torch.equal(match.index[:, 0], scores.argmin(1))
-    drive = smoothing.rows_of(shown(80, range(60)))
-    match = localize_drive(DriveQuery(drive, descriptors, PlaceSmoother()))
-    assert (match.index[:, 0] - torch.arange(60)).abs().max() <= 1
-
-
 def test_drives_are_matched_together_as_each_by_itself():
     path, descriptors = [*range(5, 65)], noise(60, 16, seed=8)
     scores = [shown(80, path), shown(80, path[::-1]), noise(60, 80, seed=1), shown(90, path)]

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from dejavu_torch import DejaVu, PlaceFilter, PlaceSmoother
 from dejavu_torch.recognition import taken
 from dejavu_torch.recognition.calibration import Platt
+from dejavu_torch.recognition.localizer import Localizer
 from dejavu_torch.recognition.taken import Running, Singly, doubted, flipped, moves_along, singly, upper
 
 
@@ -132,3 +133,12 @@ def test_a_filter_doubts_while_single_images_do_not_find_the_map(model, monkeypa
     trusted, same = (model.localize_descriptors(one, matching).probability for one in drives)
     assert torch.equal(own, same)
     assert torch.allclose(other[30:], doubted(trusted[30:], 1 / 9))
+    alone = Platt(2.0, 1.0)
+    monkeypatch.undo()
+    capped = model.localize_descriptors(drives[0], matching._replace(single=alone)).probability
+    single = model.localize_descriptors(drives[0], model.matching()._replace(platt=alone)).probability
+    assert torch.allclose(capped[30:], doubted(torch.minimum(trusted, single)[30:], 1 / 9), atol=1e-5)
+    parts = Localizer(model.map, matching._replace(sequence=PlaceFilter(lag=7), single=alone))
+    late = torch.cat([parts(part).probability for part in drives[0].split(50)] + [parts.finish().probability])
+    assert len(late) == 300
+    assert bool((late[30:] <= doubted(single[30:], 1 / 9) + 1e-4).all())
