@@ -247,8 +247,10 @@ class Localizer:
         def null(numbers: Tensor, seed: int) -> Tensor:
             return best_copies(score(flipped(descriptors[copies_of(numbers, copies)], seed)), copies)
 
-        some = descriptors[::copies]
-        return DriveQuery(rows(descriptors), some, smoother, *settings, tiles, null=null)
+        # templates repeat along the route, so that no place is better than all elsewhere
+        told = place_map is None or isinstance(place_map, SpectralMap)
+        own = DriveQuery(rows(descriptors), descriptors[::copies], smoother, *settings, tiles)
+        return own._replace(null=null if told else None)
 
     @torch.no_grad()
     def skip(self, queries: int) -> None:
@@ -265,7 +267,7 @@ class Localizer:
         if not isinstance(self.matching.sequence, PlaceFilter) or not self.states:
             return self.match(torch.zeros(0, places))
         match = self._in_sequence(self.states["filter"].new_zeros(0, places), last=True)
-        return match if match.probability is None else self._doubted(match, torch.tensor(self.running.odds))
+        return self._doubted(match, torch.tensor(self.running.odds)) if len(self.alone) else match
 
     def _doubted(self, match: Match, odds: Tensor) -> Match:
         """Answers of a filter with the odds that the queries so far are over the map's ground; where they

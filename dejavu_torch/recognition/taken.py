@@ -8,6 +8,7 @@ of jumps explains little once jumps have to be rare.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
@@ -23,7 +24,8 @@ STANDS_OUT = 0.21  # of `python -m benchmarks cross`
 NATS = 10.0  # by which a drive beats being off the map throughout
 PER_QUERY = 0.23  # likewise, for each query that is independent: with less, one image finds more
 AT_ONCE = 2**24  # scores
-BINS, PER_E, LEAST = 2048, 64, -16.0  # of a histogram of logarithms, in each factor e, and where it begins
+SUREST = 1e-6  # of a confidence below 0, for its logarithm
+PER_E = 64  # bins of a histogram of logarithms in each factor e
 
 Score = Callable[[Tensor], Tensor]  # numbers of queries (B,) -> scores (B,N)
 
@@ -99,10 +101,10 @@ def singly(own: Score, null: Callable[..., Tensor], weight: Tensor, sure: Score)
 
 
 class Running:
-    """`Singly.odds` of the queries so far, from histograms of a fixed size."""
+    """`Singly.odds` of the queries so far, from histograms, which do not grow with them."""
 
     def __init__(self) -> None:
-        self.counts = torch.zeros(2, BINS)  # by -log(-confidence), of the queries and of those mirrored
+        self.counts = Counter[int](), Counter[int]()  # by -log(-confidence), of queries and of mirrored ones
         self.odds, self.queries = 1.0, 0
 
     def __call__(self, own: Tensor, mirrored: Tensor) -> Tensor:
@@ -115,21 +117,25 @@ class Running:
         for pair in torch.stack([own, mirrored], 1).cpu().double().tolist():
             for counts, confidence in zip(self.counts, pair, strict=True):
                 if confidence > -math.inf:  # nor NaN
-                    place = PER_E * (math.log(max(-confidence, 1e-30)) - LEAST)
-                    counts[int(min(max(place, 0), BINS - 1))] += 1
+                    counts[round(PER_E * math.log(max(-confidence, SUREST)))] += 1
             self.queries += 1
-            if self.counts.any(1).all():
+            if all(self.counts):
                 shown, null = map(self._upper, self.counts)
                 self.odds = Singly(shown, null, self.queries).odds
             found.append(self.odds)
         return torch.tensor(found, dtype=torch.float64)
 
     @staticmethod
-    def _upper(counts: Tensor) -> float:
+    def _upper(counts: Counter[int]) -> float:
         """As `upper`, of a histogram."""
-        wanted = float((UPPER * counts.sum()).round().clamp(min=1))
-        taken = counts.cumsum(0).clamp(max=wanted).diff(prepend=counts.new_zeros(1))
-        return -float(taken @ ((torch.arange(BINS) + 0.5) / PER_E + LEAST).exp()) / wanted
+        wanted, total = max(1, round(UPPER * counts.total())), 0.0
+        left = wanted
+        for place in sorted(counts):
+            taken = min(left, counts[place])
+            total, left = total - taken * math.exp(place / PER_E), left - taken
+            if not left:
+                break
+        return total / wanted
 
 
 def moves_along(nats: float, per_query: float) -> bool:
