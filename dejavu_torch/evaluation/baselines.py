@@ -237,7 +237,7 @@ def baselines_of(
         match = run.match_by(
             lambda *how: nearest_frames(stored, how[0], stride, metric, progress, how[1], area)
         )
-        asked = run.drive_query(scores_of_stored(stored, stride, metric, area), stride)
+        asked = run.drive_query(scores_of_stored(stored, stride, metric, area))
         return Baseline(name, match, bytes + fixed + more, k, fixed + more, asked)
 
     size, own = partial(stride_bytes, frames, dimension, area=area), reference.element_size()
@@ -313,7 +313,7 @@ def _as_given(run: Localization, each: float, seed: int, one: str, progress: boo
         asked = None
         if run.beside is not None:
             score = scores_of_stored(rows, k, "cosine")
-            asked = drive_query(queries, run.beside, score, area=run.model.map.area, stride=k)
+            asked = drive_query(queries, run.beside, score, area=run.model.map.area)
         return Baseline(f"your descriptors, {every(k, one)}{name}", match, bytes + fixed, k, fixed, asked)
 
     return {
@@ -452,7 +452,7 @@ def _described_baselines(
     def baseline(name: str, k: int) -> Baseline:
         match = nearest_frames(stored, queries, k, "l1", progress, matching, area)
         score = scores_of_stored(stored, k, area=area)
-        asked = None if smoother is None else drive_query(queries, smoother, score, area=area, stride=k)
+        asked = None if smoother is None else drive_query(queries, smoother, score, area=area)
         return Baseline(name, match, size(k), k, asked=asked)
 
     return {key: baseline(name, k) for key, (name, k) in names.items()}

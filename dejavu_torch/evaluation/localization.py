@@ -91,13 +91,12 @@ class Localization(NamedTuple):
             return found
         return replace(match(self.query_features, matching._replace(also={})), sequences=found.sequences)
 
-    def drive_query(self, score: Scoring, stride: int = 1) -> DriveQuery | None:
-        """The queries as a drive with the scores of another map, or of every `stride`-th frame, if a smoother
-        is compared."""
+    def drive_query(self, score: Scoring) -> DriveQuery | None:
+        """The queries as a drive with the scores of another map, if a smoother is compared."""
         if self.beside is None:
             return None
         area = self.model.map.area
-        return drive_query(self.query_features, self.beside, score, area, stride)
+        return drive_query(self.query_features, self.beside, score, area)
 
     @property
     def coarsest(self) -> int:

@@ -395,6 +395,15 @@ class SpectralMap(PlaceMap):
         return (weight / weight.sum()) @ self.means.float()
 
     @property
+    def fidelity(self) -> float:
+        """The share of descriptors of length 1, about their mean, that the code keeps; 1 by other metrics."""
+        if self.metric != "cosine" or not self.places:
+            return 1.0
+        common = float(self.staged(self.mean[None]).square().sum())
+        known = self.norms[self.norms.isfinite()].double().square()
+        return (float(known.mean()) - common) / max(1 - common, MIN_NORM) if len(known) else 1.0
+
+    @property
     def step(self) -> float:
         """Of the last chunk, and of the next."""
         return float(self.steps[-1]) if len(self.steps) else self._step

@@ -56,7 +56,7 @@ class DriveQuery(NamedTuple):
         platt: the calibration of single queries, if there is one.
         tiles: the scores of `rows` for large maps; None makes them of rows.
         null: as `rows`, of `flipped` queries, for a seed; without it their order alone tells whether they are
-            a drive.
+            a drive, by at least so many nats for each query.
         checks: the drive only checks the answers of single queries: it lowers their probability. Where ground
             repeats, as lane dashes do, a drive alone finds loops that are none.
     """
@@ -71,6 +71,7 @@ class DriveQuery(NamedTuple):
     tiles: Tiles | None = None
     checks: bool = False
     null: Callable[..., Tensor] | None = None
+    least: float = 0.0
 
     @property
     def answers(self) -> bool:
@@ -78,11 +79,13 @@ class DriveQuery(NamedTuple):
         return self.smoother.is_drive and not self.checks
 
     def ask_singly(self, spacing: Spacing) -> None:
-        """Leave it to the smoother only what single images find as well."""
+        """Leave to the smoother only what single images find as well."""
+        self.smoother.is_drive &= self.smoother.nats_per_query >= self.least
         if self.null is not None and len(self.descriptors):
             known, apart = self.smoother, self.radius
             sure = lambda scores: confidence(best_pair(scores, known.area, apart=apart))  # noqa: E731
-            known.singly = singly(self.rows, self.null, spacing.weight.cpu(), sure)
+            found = singly(self.rows, self.null, spacing.weight.cpu(), sure)
+            known.singly = found._replace(nats=known.nats_per_query)
             known.is_drive &= known.singly.stands_out
 
 

@@ -25,7 +25,7 @@ from dejavu_torch.recognition.search import SCORES_AT_ONCE, NmsSpec, Scan, Searc
 from dejavu_torch.recognition.select import Acceptance, accept, best_candidates, best_match
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.recognition.smoother import PlaceSmoother, Rows
-from dejavu_torch.recognition.taken import EVERY, Running, doubted, flipped
+from dejavu_torch.recognition.taken import ALONE, EVERY, FAITHFUL, Running, doubted, flipped
 from dejavu_torch.text import with_progress
 from dejavu_torch.types import Match, SequenceModel, Together
 
@@ -142,7 +142,7 @@ class Localizer:
         matching, place_map = self.matching, self.place_map
         if not isinstance(matching.sequence, PlaceFilter) or matching.platt is None:
             return None
-        if not isinstance(place_map, SpectralMap) or matching.copies > 1:
+        if not isinstance(place_map, SpectralMap) or matching.copies > 1 or place_map.fidelity < FAITHFUL:
             return None
         found = descriptors.new_full((len(descriptors),), math.nan)
         some = slice(-self.running.queries % EVERY, None, EVERY)
@@ -247,10 +247,10 @@ class Localizer:
         def null(numbers: Tensor, seed: int) -> Tensor:
             return best_copies(score(flipped(descriptors[copies_of(numbers, copies)], seed)), copies)
 
-        # templates repeat along the route, so that no place is better than all elsewhere
-        told = place_map is None or isinstance(place_map, SpectralMap)
         own = DriveQuery(rows(descriptors), descriptors[::copies], smoother, *settings, tiles)
-        return own._replace(null=null if told else None)
+        if tiles is None or not isinstance(place_map, SpectralMap):  # templates repeat along the route
+            return own
+        return own._replace(null=null) if place_map.fidelity >= FAITHFUL else own._replace(least=ALONE)
 
     @torch.no_grad()
     def skip(self, queries: int) -> None:
@@ -359,14 +359,13 @@ def drive_query(
     smoother: PlaceSmoother,
     score: Scoring,
     area: Area | None = None,
-    stride: int = 1,
 ) -> DriveQuery:
     """Queries (Q,K) as a drive with scores of any kind, for a smoother like this one; see `Matching`.
 
     Args:
-        area: of the places; None along a route. stride: of the frames that the scores are of.
+        area: of the places; None along a route.
     """
-    matching = Matching(removed=smoother.removed, radius=stride)
+    matching = Matching(removed=smoother.removed)
     return Localizer(None, matching, area=area).drive_query(queries, copy.deepcopy(smoother), score)
 
 

@@ -20,7 +20,11 @@ ASKED = 256  # queries of a drive that are asked singly, at most
 DRAWN = 512  # queries that show nothing, at least, for the upper tenth to be the same each time
 EVERY = 4  # of a filter's queries, the one that is asked mirrored as well
 UPPER = 0.1  # share of the queries that have to be sure: the others may be off the map
-STANDS_OUT = 0.21  # of `python -m benchmarks cross`
+# of `python -m benchmarks cross`: by what share of the null's level the surest tenth is surer; the second one
+# will do if the motion alone shows so many nats for each query
+STANDS_OUT, A_LITTLE, PLAINLY = 0.21, 0.1, 3.0
+FAITHFUL = 0.7  # of the descriptors are kept: the code of a map that keeps less hides what single images tell
+ALONE = 0.55  # nats for each query that its motion alone has to show there
 NATS = 10.0  # by which a drive beats being off the map throughout
 PER_QUERY = 0.23  # likewise, for each query that is independent: with less, one image finds more
 AT_ONCE = 2**24  # scores
@@ -32,16 +36,18 @@ Score = Callable[[Tensor], Tensor]  # numbers of queries (B,) -> scores (B,N)
 
 class Singly(NamedTuple):
     """How sure the surest tenth of a drive's single images is, and of queries that show no place: means of
-    their confidences, at most 0, in any unit. queries: how many were asked."""
+    their confidences, at most 0, in any unit. queries: how many were asked. nats: for each, of their motion.
+    """
 
     shown: float
     null: float
     queries: int
+    nats: float = 0.0
 
     @property
     def stands_out(self) -> bool:
         """Whether single images find the map."""
-        return self.shown >= (1 - STANDS_OUT) * self.null
+        return self.shown >= (1 - (A_LITTLE if self.nats >= PLAINLY else STANDS_OUT)) * self.null
 
     @property
     def odds(self) -> float:

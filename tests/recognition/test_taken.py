@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dejavu_torch import DejaVu, PlaceFilter, PlaceSmoother
+from dejavu_torch import DejaVu, PlaceFilter, PlaceSmoother, SpectralMapper
 from dejavu_torch.recognition import taken
 from dejavu_torch.recognition.calibration import Platt
 from dejavu_torch.recognition.localizer import Localizer
@@ -142,3 +142,25 @@ def test_a_filter_doubts_while_single_images_do_not_find_the_map(model, monkeypa
     late = torch.cat([parts(part).probability for part in drives[0].split(50)] + [parts.finish().probability])
     assert len(late) == 300
     assert bool((late[30:] <= doubted(single[30:], 1 / 9) + 1e-4).all())
+
+
+def test_a_coarse_map_is_asked_by_motion_alone():
+    """Its single images find little, and the drive finds nearly all."""
+    rows = walk(400, 0, size=64)
+    model = DejaVu(None, "none", SpectralMapper(1.0)).learn(rows)
+    assert model.map.fidelity < 0.7 < DejaVu(whitening="none").learn(rows).map.fidelity
+    smoother, match = asked(model, seen_again(rows[50:350], 5, noise=0.2))
+    assert smoother.is_drive
+    assert smoother.singly is None
+    assert ((match.index - torch.arange(50, 350)).abs() <= 5).double().mean() > 0.95
+    assert not asked(model, walk(300, 3, size=64))[0].is_drive
+
+
+def test_a_drive_whose_motion_is_plain_needs_less_of_its_images():
+    assert not Singly(-0.8, -0.95, 100, 2.9).stands_out
+    assert Singly(-0.8, -0.95, 100, 3.1).stands_out
+    assert not Singly(-0.9, -0.95, 100, 10.0).stands_out
+    model, rows = DejaVu(whitening="none"), walk(400, 0, size=64)
+    smoother, match = asked(model.learn(rows), seen_again(rows[50:350], 5, noise=0.2))
+    assert smoother.is_drive
+    assert ((match.index - torch.arange(50, 350)).abs() <= 5).double().mean() > 0.95
