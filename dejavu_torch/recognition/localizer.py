@@ -34,6 +34,7 @@ CACHED = 2**20  # scores processed at a time: they stay in the cache
 SHORT = 2**15  # places of which all scores are kept: selecting the lowest of so few takes longer
 MAX_SHARE = 1 / 16  # of a block's places; selecting more of the lowest scores is slower than keeping all
 PLACES_PER_NUMBER = 64  # a coarse search holds at most one number of a query per this many places
+OF_MAP = 10  # queries that the map's own mean counts as, about which queries are mirrored
 PER_BEST = 16  # held for each of a query's lowest scores, while two lists are merged
 
 
@@ -97,7 +98,11 @@ class Localizer:
             sequence = sequence.over(self.area)
         matching = matching._replace(sequence=sequence, also=in_area)
         self.place_map, self.matching, self.track = place_map, matching, Track(self.area)
-        self.running = Running()  # what single images say so far
+        self.running = Running()  # what single images say so far, beside mirrored ones, if these are asked
+        self.total: Tensor | None = None  # of the queries so far
+        asks = isinstance(sequence, PlaceFilter) and matching.platt is not None and matching.copies == 1
+        if asks and isinstance(place_map, SpectralMap) and place_map.fidelity >= FAITHFUL:
+            self.total = torch.zeros(place_map.dimension)
         self.alone = torch.empty(
             0
         ).double()  # probabilities of single queries that a filter has yet to answer
@@ -139,15 +144,17 @@ class Localizer:
     def _mirrored(self, descriptors: Tensor) -> Tensor | None:
         """Confidences in some of the queries, mirrored, (B,), NaN for the others, if a filter's answers get
         probabilities."""
-        matching, place_map = self.matching, self.place_map
-        if not isinstance(matching.sequence, PlaceFilter) or matching.platt is None:
+        place_map = self.place_map
+        if self.total is None:
             return None
-        if not isinstance(place_map, SpectralMap) or matching.copies > 1 or place_map.fidelity < FAITHFUL:
-            return None
+        assert isinstance(place_map, SpectralMap)
+        seen = torch.arange(1, len(descriptors) + 1).to(descriptors)[:, None] + self.running.queries
+        sums = self.total.to(descriptors) + descriptors.cumsum(0)
+        means, self.total = (sums + OF_MAP * place_map.mean.to(sums)) / (seen + OF_MAP), sums[-1]
         found = descriptors.new_full((len(descriptors),), math.nan)
         some = slice(-self.running.queries % EVERY, None, EVERY)
         if len(descriptors[some]):
-            scores = place_map.scores(flipped(descriptors[some], mean=place_map.mean))
+            scores = place_map.scores(flipped(descriptors[some], mean=means[some]))
             found[some] = confidence_of(scores, self.area)
         return found
 

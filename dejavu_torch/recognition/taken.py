@@ -66,7 +66,7 @@ def flipped(queries: Tensor, seed: int = 0, mean: Tensor | None = None) -> Tenso
     random, (B,K) -> (B,K). The order of queries and how alike they are stay.
 
     Args:
-        mean: (K,); None is that of the queries.
+        mean: (K,), or (B,K) for each query; None is that of the queries.
 
     Example:
         >>> queries = torch.rand(4, 3)
