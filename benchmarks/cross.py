@@ -18,7 +18,7 @@ from benchmarks.trainings import ROAD
 from dejavu_torch.data.demo import open_area
 from dejavu_torch.data.ground_truth import GroundTruth, all_judged, widened
 from dejavu_torch.data.source import open_source
-from dejavu_torch.data.traverse import Part, Traverse, fitted
+from dejavu_torch.data.traverse import Part, fitted
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.rejection import calibration_error, judged
 from dejavu_torch.evaluation.report import text_table
@@ -28,7 +28,7 @@ from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.recognition.taken import NATS, PER_QUERY
 from dejavu_torch.teaching import in_its_light
-from dejavu_torch.types import InputError
+from dejavu_torch.types import InputError, Traverse
 
 ASKED = 400  # queries of a drive over another route, from its middle
 SHARES = (0.5, 0.9, 0.99)

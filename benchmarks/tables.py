@@ -18,6 +18,7 @@ from typing import Any
 
 from benchmarks.alike import CAPPED, CHECKED, PRECISIONS, SINGLE, UNCAPPED
 from benchmarks.areas import NAMES as AREA_WAYS
+from benchmarks.cross import summary
 from benchmarks.files import NAMES as FILES
 from benchmarks.headings import NAMES as HEADING_WAYS
 from benchmarks.measure import Row, programs
@@ -382,6 +383,11 @@ def made_drives() -> str:
     return f"{markdown(means)}\n{markdown(areas)}"
 
 
+def cross() -> str:
+    """What is taken for a drive of each map, and the largest shares accepted of drives over other ground."""
+    return markdown(summary([row | {"skipped": row.get("skipped")} for row in read("cross")["rows"]]))
+
+
 def large_drives() -> str:
     """Time and memory of drives on large maps, and what they find."""
     table = [["queries, places, B per place", "one image", "whole drive", "at all places", "s", "MB"]]
@@ -565,6 +571,7 @@ TABLES: dict[str, Callable[[], str]] = {
     **{"descriptors": descriptors, "sequences": sequences},
     **{"rejection": rejection, "filtered": filtered, "drives": drives, "driven": driven},
     **{"trainings": trainings, "made drives": made_drives, "storage drives": storage_drives},
+    "cross": cross,
     **{
         "areas": areas,
         "headings": headings,

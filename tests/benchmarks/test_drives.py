@@ -10,7 +10,7 @@ import torch
 from command_line import benchmark
 from torch.nn.functional import normalize
 
-from benchmarks import drives, large_drives, storage_drives, tables
+from benchmarks import cross, drives, large_drives, storage_drives, tables
 from benchmarks.drives import AS_IT_WAS, ELSEWHERE, HALF, NO_OTHER, bench_drives, drives_of
 from benchmarks.storage_drives import ANSWERS, Asked, bench_storage_drives, both_sides, drive_table
 from benchmarks.trainings import Route
@@ -106,3 +106,44 @@ def test_stores_are_asked_three_ways_from_the_same_scores(monkeypatch):
     ours = next(row for row in table if row[0] == "walk: **dejavu**")
     areas = [found["dejavu 1", answer]["auc"] for answer in ANSWERS]
     assert ours[3] == " ".join(f"{area:.3f}".removeprefix("0") for area in areas)
+
+
+def test_drives_over_other_ground_are_told_by_map():
+    """The worst of others, what is taken, and the threshold between."""
+
+    def row(contender, relation, taken, above, shown):
+        facts = {"shown": shown, "null": -1.0, "log_likelihood": 50.0, "nats_per_query": 2.0}
+        return facts | {
+            "case": "city 1",
+            "contender": contender,
+            "relation": relation,
+            "taken": taken,
+            "drive_above": above,
+        }
+
+    rows = [
+        row("city 1", cross.OWN, True, [1, 1, 1], -0.5),
+        row("city 1", cross.OWN, False, [0, 0, 0], -0.6),
+        row("railway, first half", cross.OTHER, False, [0.1, 0.02, 0], -0.9),
+        row("city 9", cross.KIND, True, [0.05, 0.03, 0], -0.8),
+    ]
+    head, line = cross.summary(rows)
+    assert dict(zip(head, line, strict=True)) == {
+        "map": "city 1",
+        "own taken": "1 of 2",
+        f"{cross.REPEATED}: taken": "",
+        f"{cross.KIND}: taken": "1 of 1",
+        f"{cross.OTHER}: taken": "0 of 1",
+        "worst drive, p > .5 .9 .99": "0.10 0.03 0.00",
+        "worst filter, p > .5 .9 .99": "",
+        "worst one, p > .5 .9 .99": "",
+    }
+    assert cross.chosen(rows).startswith("chosen on: others up to 0.200, own from 0.400, between 0.300")
+
+
+def test_what_shares_ground_is_no_other_route():
+    board = cross.Board(None, ("city 1",), torch.empty(0), None, 2)
+    assert cross.related(board, "city 2") == cross.SHARED
+    assert cross.related(board, "laps") == cross.OTHER
+    assert cross.related(board._replace(shows=("road, first half",)), "road, second half") == cross.REPEATED
+    assert cross.related(board._replace(shows=("railway, first half",)), "railway, second half") == cross.KIND

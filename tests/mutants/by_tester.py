@@ -717,6 +717,27 @@ MUTANTS = [
         ("tests/recognition/test_smoother.py::-k another_speed",),
     ),
     Mutant(
+        "Queries are a drive only if single images find the map.",
+        "dejavu_torch/recognition/drive.py",
+        "known.is_drive &= known.singly.stands_out",
+        "pass",
+        ("tests/recognition/test_taken.py::-k other_ground",),
+    ),
+    Mutant(
+        "A stop counts once where single images are asked.",
+        "dejavu_torch/recognition/taken.py",
+        "total = weight.double().cumsum(0)",
+        "total = torch.ones_like(weight).double().cumsum(0)",
+        ("tests/recognition/test_taken.py::-k stop_counts_once",),
+    ),
+    Mutant(
+        "A coarse map is asked by motion alone.",
+        "dejavu_torch/recognition/localizer.py",
+        "own._replace(null=null) if place_map.fidelity >= FAITHFUL else own._replace(least=ALONE)",
+        "own._replace(null=null)",
+        ("tests/recognition/test_taken.py::-k coarse_map",),
+    ),
+    Mutant(
         "Answers of a drive that are nearly sure differ.",
         "dejavu_torch/recognition/drive.py",
         "posterior.cpu().double()",
@@ -957,7 +978,7 @@ MUTANTS = [
     Mutant(
         "A flight is a flight over an area only if it explains its images.",
         "dejavu_torch/recognition/flight.py",
-        "smoother.is_drive = swept.log >= DRIVE",
+        "smoother.is_drive = moves_along(swept.log, smoother.nats_per_query)",
         "smoother.is_drive = True",
         ("tests/test_area.py::-k flight_is_found",),
     ),
