@@ -103,9 +103,8 @@ class Localizer:
         asks = isinstance(sequence, PlaceFilter) and matching.platt is not None and matching.copies == 1
         if asks and isinstance(place_map, SpectralMap) and place_map.fidelity >= FAITHFUL:
             self.total = torch.zeros(place_map.dimension)
-        self.alone = torch.empty(
-            0
-        ).double()  # probabilities of single queries that a filter has yet to answer
+        # probabilities, each by itself, of queries that a filter has yet to answer
+        self.alone = torch.empty(0, dtype=torch.float64)
         self.searcher = Scan(place_map) if searcher is None and place_map is not None else searcher
         self.own: Together = sequence.length if isinstance(sequence, SequenceMatcher) else "filter"
         self.models: dict[Together, SequenceModel] = {**matching.also}
