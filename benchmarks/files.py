@@ -15,13 +15,7 @@ from benchmarks.measure import Column, Row, table, write_bench
 from dejavu_torch.data.ground_truth import is_right
 from dejavu_torch.data.source import open_source
 from dejavu_torch.data.traverse import Part
-from dejavu_torch.evaluation.baselines import (
-    Quantised,
-    as_int8,
-    nearest_frames,
-    quantised_every_kth,
-    stride_bytes,
-)
+from dejavu_torch.evaluation.baselines import as_int8, nearest_frames, quantised_every_kth, stride_bytes
 from dejavu_torch.model import DejaVu
 from dejavu_torch.types import InputError
 
@@ -54,24 +48,22 @@ class Seen(NamedTuple):
 
 
 def described(kind: str, count: int) -> Seen:
-    """A route of so many places, and frames of a second traverse, at random: every tenth place would be one
-    that a stride stores."""
-    shown = torch.randperm(count, generator=torch.Generator().manual_seed(0))[:QUERIES].sort().values
+    """A route of so many places, and frames of a second traverse, evenly along it."""
     if kind == MADE:
         like = described(SIMULATED, LIKE)
         route = MadeRoute(likeness(like.places, like.queries, like.shown), count)
+        shown = torch.arange(QUERIES) * (count // QUERIES)
         return Seen(route[:], route.seen_again(shown), shown, like.whitening)
     first, second = (open_source(SOURCES[kind].format(places=count, traverse=i)) for i in (0, 1))
-    model = DejaVu()
-    places = model.descriptor.learn(first, None, True)
+    model, step = DejaVu(), max(1, count // QUERIES)
+    places, shown = model.descriptor.learn(first, None, True), torch.arange(0, count, step)
     model.learn_features(places, first)
-    queries = model.descriptor.all_of(Part(second, shown), True)
+    queries = model.descriptor.all_of(Part(second, range(0, count, step)), True)
     return Seen(places.float(), queries.float(), shown, model.summary().fixed_bytes)
 
 
 def bench_files(kind: str, count: int) -> Iterator[Row]:
-    """A row for each way to store a route at the rate of its map. The quantiser has the stride that finds
-    most queries, to its favour.
+    """A row for each way to store a route at the rate of its map.
 
     Yields:
         bytes: of the file, all counted. bytes_per_place: those that grow. whitening_bytes, codebook_bytes:
@@ -80,25 +72,21 @@ def bench_files(kind: str, count: int) -> Iterator[Row]:
     places, queries, shown, whitening = described(kind, count)
     model = DejaVu(whitening="none").learn(places)
     route = model.summary().route_bytes
-
-    def share(index: Tensor) -> float:
-        return float(is_right(index, shown[:, None], TOLERANCE).double().mean())
-
-    def coded(k: int) -> tuple[Tensor, Quantised]:
-        one = quantised_every_kth(places, route / count, TOLERANCE, strides=[k])
-        return nearest_frames(one.restored, queries, k, "cosine").index, one
-
-    index, best = max(map(coded, range(1, 2 * TOLERANCE + 2)), key=lambda one: share(one[0]))
+    coded = quantised_every_kth(places, route / count, TOLERANCE)
     keys = stride_bytes(count, places.shape[1], 1, STRIDE)
     stores = {
         "map": (model.localize_descriptors(queries).index, route, 0, 1),
-        "product_quantiser": (index, best.bytes, best.codebooks, best.k),
+        "product_quantiser": (
+            *(nearest_frames(coded.restored, queries, coded.k, "cosine").index, coded.bytes),
+            *(coded.codebooks, coded.k),
+        ),
         "stride": (nearest_frames(as_int8(places), queries, STRIDE, "cosine").index, keys, 0, STRIDE),
     }
     for name, (index, growing, codebooks, k) in stores.items():
+        found = float(is_right(index, shown[:, None], TOLERANCE).double().mean())
         row: Row = {"case": f"{count} places, {kind}", "contender": name, "places": count, "route": kind}
         row |= {"bytes": whitening + codebooks + growing, "bytes_per_place": growing / count, "k": k}
-        yield row | {"whitening_bytes": whitening, "codebook_bytes": codebooks, "recall_at_1": share(index)}
+        yield row | {"whitening_bytes": whitening, "codebook_bytes": codebooks, "recall_at_1": found}
 
 
 def run_files(*, out: Path, places: Sequence[int] = ()) -> list[str]:

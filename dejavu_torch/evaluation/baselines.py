@@ -174,7 +174,6 @@ def quantised_every_kth(
     seed: int = 0,
     centroids: int = CENTROIDS,
     training: Tensor | None = None,
-    strides: Sequence[int] = (),
 ) -> Quantised:
     """Every k-th frame with k times the bytes: of the k up to 2 x tolerance + 1 the one that finds most
     frames by the mean of their two neighbours, the smallest of the best. The queries have no say in it.
@@ -183,7 +182,6 @@ def quantised_every_kth(
         descriptors: (N,K). each: bytes per frame, of the codes. tolerance: in frames.
         area: of the frames, if they are of one: every k-th is stored in rows and in columns.
         seed, centroids, training: see `product_quantised`.
-        strides: other k, in ascending order.
     """
     frames, width = descriptors.shape
     middle = torch.arange(frames)[1:-1]
@@ -193,12 +191,11 @@ def quantised_every_kth(
     asked, bits = (descriptors[middle - 1] + descriptors[middle + 1]) / 2, math.log2(centroids)
     best: Quantised | None = None
     fits = SAME_SIZE * each * frames
-    strides = strides or range(1, 2 * tolerance + 2)
-    for k in strides:
+    for k in range(1, 2 * tolerance + 2):
         stored = stored_frames(frames, k, area)[0]
         codes = min(width, max(1, int(8 * fits / len(stored) / bits)))
         size = math.ceil(codes * bits * len(stored) / 8)
-        if size > fits and (best is not None or k != strides[-1]):  # one is taken in any case
+        if size > fits and (best is not None or k <= 2 * tolerance):  # one is taken in any case
             continue
         decoded, books = product_quantised(descriptors[stored], codes, seed, centroids, training)
         index = stored[(normalize(asked) @ normalize(decoded).T).argmax(1).cpu()]
