@@ -54,7 +54,7 @@ def trained(case, device, folder):
     running = trainer(folder, steps, max_steps=6, devices=1, **where)
     torch.manual_seed(1)
     with pretend() if device == DEVICE.type else nullcontext():
-        running.fit(task, data_of(second=footage(0.1), augmentation=still()))
+        running.fit(task, data_of(second=footage(0.1), second_truth="0", augmentation=still()))
     return steps.figures, DejaVu.load(folder / "map.safetensors", task.dejavu.features)
 
 
