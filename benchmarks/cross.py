@@ -213,7 +213,7 @@ def board_of(name: str, data: Path) -> Board:
         radius = round(RADIUS / STRIDE)
         truth = widened(all_judged(places), first.area, radius)
         return Board(model, (name,), queries, truth, radius)
-    routes = PARTS_OF_MERGED if name == MERGED else (name,)
+    routes: tuple[str, ...] = PARTS_OF_MERGED if name == MERGED else (name,)
     footage = FOOTAGE[routes[0]]
     reference, query = (opened(one, data) for one in (footage.reference, footage.query))
     truth = truth_of(reference, query, footage.truth and footage.truth.format(data=data))
