@@ -187,9 +187,7 @@ def bench_cross(name: str, data: Path, seed: int = 0) -> Iterator[Row]:
     count, whole = min(ASKED, len(board.queries)), torch.arange(len(board.queries))
     first = (len(whole) - count) // 2
     for cut, numbers in drives_of(count, beside, seed).items():
-        if cut not in CUTS:
-            continue
-        if numbers is None:  # no other footage has such features
+        if cut not in CUTS or numbers is None:  # no other footage has some features
             continue
         numbers = torch.where(numbers >= 0, numbers + first, numbers)
         numbers = whole if cut == AS_IT_WAS else numbers

@@ -22,7 +22,7 @@ from dejavu_torch.recognition.calibration import TOLERANCE
 from dejavu_torch.recognition.drive import Answers, DriveQuery, answer_drives
 from dejavu_torch.recognition.evidence import spacing_of
 from dejavu_torch.recognition.smoother import PlaceSmoother
-from dejavu_torch.recognition.taken import flipped
+from dejavu_torch.recognition.taken import ALONE, FAITHFUL, flipped
 from dejavu_torch.teaching import FEWEST, SHARE, SURE, Refinement, described, in_its_light, refined_by
 from dejavu_torch.types import Match, Traverse
 
@@ -210,7 +210,9 @@ def _answered(
 
     smoother = PlaceSmoother()
     smoother.map_links = place_map.connections
-    asked = DriveQuery(rows, queries, smoother, route_starts=place_map.route_starts, null=rows)
+    asked = DriveQuery(rows, queries, smoother, route_starts=place_map.route_starts)
+    faithful = isinstance(place_map, SpectralMap) and place_map.fidelity >= FAITHFUL
+    asked = asked._replace(null=rows) if faithful else asked._replace(least=ALONE)
     (answers,) = answer_drives([asked], progress)
     return answers, smoother
 
