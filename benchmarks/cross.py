@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,29 +17,39 @@ from benchmarks.drives import AS_IT_WAS, HALF, Known, asked, drives_of
 from benchmarks.measure import Row, truth_of, write_bench
 from benchmarks.trainings import ROAD
 from dejavu_torch.data.demo import open_area
+from dejavu_torch.data.grid import Grid
 from dejavu_torch.data.ground_truth import GroundTruth, all_judged, widened
+from dejavu_torch.data.simulate.terrain import open_terrain
 from dejavu_torch.data.source import open_source
 from dejavu_torch.data.traverse import Part, fitted
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.rejection import calibration_error, judged
 from dejavu_torch.evaluation.report import text_table
 from dejavu_torch.growth import calibrate_if_possible, merge
+from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.smoother import PlaceSmoother
-from dejavu_torch.recognition.taken import NATS, PER_QUERY
+from dejavu_torch.recognition.taken import NATS, PER_QUERY, STANDS_OUT
 from dejavu_torch.teaching import in_its_light
 from dejavu_torch.types import InputError, Traverse
 
 ASKED = 400  # queries of a drive over another route, from its middle
 SHARES = (0.5, 0.9, 0.99)
+HALF_AS_LONG = "half as long"
 FEW = 20  # answers, of fewer of which no share of right ones is told
 CUTS = (
-    *(AS_IT_WAS, "a third of the speed", "three times the speed", "reversed", "there and back"),
+    *(AS_IT_WAS, HALF_AS_LONG, "a third of the speed", "three times the speed", "reversed", "there and back"),
     *("stretches of 5 to 40, others between", HALF),
 )
 WAYS = ("drive", "filter", "one")
-CHOSEN = ("road", "railway", "city", "sim:aerial")  # begin the names of footage that `--choose` looks at
+CHOSEN = (
+    "road",
+    "railway",
+    "city",
+    "sim:aerial",
+    "area",
+)  # begin the names of footage that `--choose` looks at
 OWN, SHARED, REPEATED, KIND, OTHER = (
     *("own", "shares ground", "the road's other half", "another route of the kind", "another kind"),
 )
@@ -89,6 +100,9 @@ def simulated(kind: str, seed: int) -> Footage:
     return Footage(first, second, 5, None, f"sim:{kind}, {seed}", f"sim:{kind}")
 
 
+LAPS = [f"{{data}}/rc_car_laps/frames?start={start}&stop={stop}" for start, stop in ((194, 590), (590, 982))]
+# seen once: every other frame is asked by those between
+MOTORWAY = "{data}/highway/solidWhiteRight.mp4?width=160&stop=220&step=2&start="
 FOOTAGE = {
     "road, first half": road("&stop=1348"),
     "road, second half": road("&start=1348"),
@@ -96,6 +110,8 @@ FOOTAGE = {
     "railway, second half": railway("start=900"),
     **{f"city {i}": filmed(f"robotcar/{t}", 2, "city", "city") for i, t in enumerate(("t1", "t2", "t5"), 1)},
     "laps": filmed("donkey_lap", 10, "mat", "mat"),
+    "laps of another car": Footage(*LAPS, 20, None, "mat", "mat"),
+    "motorway": Footage(MOTORWAY + "0", MOTORWAY + "1", 5, None, "motorway", "motorway"),
     "corridor": Footage(
         "{data}/corridor/ref",
         "{data}/corridor/query",
@@ -117,9 +133,18 @@ FOOTAGE = {
     **halves("lidar_fhw", 1),
 }
 
-AREA, MERGED = "an area", "a merged map"
+METRES = 80  # of simulated ground
+# windows of a flight at a stride
+AREAS: dict[str, Callable[[int, int], Grid]] = {
+    "area of the road, first half": lambda flight, stride: open_area(flight, stride=stride, columns="0:1396"),
+    "area of the road, second half": lambda flight, stride: open_area(
+        flight, stride=stride, columns="1396:2792"
+    ),
+    "simulated ground": lambda flight, stride: open_terrain(1, flight, METRES, stride=stride),
+}
+MERGED = "a merged map"
 PARTS_OF_MERGED = ("city 1", "laps")
-MAPS = (*FOOTAGE, AREA, MERGED)
+MAPS = (*FOOTAGE, *AREAS, MERGED)
 
 
 class Board(NamedTuple):
@@ -133,7 +158,13 @@ class Board(NamedTuple):
 
 
 def run_cross(
-    data: Path, *, out: Path, maps: Sequence[str] = (), seed: int = 0, choose: bool = False
+    data: Path,
+    *,
+    out: Path,
+    maps: Sequence[str] = (),
+    seed: int = 0,
+    choose: bool = False,
+    rate: float | None = None,
 ) -> list[str]:
     """The map of every route asked by a drive over every route: which are taken for a drive of the map?
 
@@ -142,51 +173,67 @@ def run_cross(
         out: folder for bench.json
         maps: names of those that are asked; all if not given
         seed: of the stretches in random order
-        choose: print where a drive is best told from others by its single images, on some of the footage, for
-            `recognition.taken.STANDS_OUT`
+        choose: print where a drive is best told from others by its single images and by its motion, on some
+            of the footage, for `STANDS_OUT`, `PER_QUERY` and `ALONE` of `recognition.taken`
+        rate: bytes per place of the maps' lines, instead of the default
     """
     if unknown := [name for name in maps if name not in MAPS]:
         raise InputError(f"{unknown[0]!r} is no map; expected one of {', '.join(map(repr, MAPS))}")
     rows: list[Row] = []
     for name in tqdm(maps or MAPS, "maps", disable=None, leave=False):
-        rows += bench_cross(name, data, seed)
+        rows += bench_cross(name, data, seed, rate)
         write_bench(out, rows, seed=seed)  # as soon as a map is finished
     found = [chosen(rows)] if choose else []
     return [text_table(summary(rows)), *found, "drives over other ground and over the map's own"]
 
 
 def chosen(rows: Sequence[Row]) -> str:
-    """Between what drives are told from others, on the footage of `CHOSEN` and on all other."""
+    """Between what drives are told from others, on the footage of `CHOSEN` and on all other: by their single
+    images, where the motion makes a drive, and the other way round; and by the motion alone."""
+
+    def surer(row: Row) -> float:
+        return 1 - float(row["shown"]) / float(row["null"])
+
+    def per_query(row: Row) -> float:
+        return float(row["nats_per_query"]) if row["log_likelihood"] >= NATS else 0.0
+
+    ways: dict[str, tuple[Callable[[Row], float], Callable[[Row], bool]]] = {
+        "surer by": (surer, lambda row: per_query(row) >= PER_QUERY),
+        "nats": (per_query, lambda row: surer(row) >= STANDS_OUT),
+        "nats alone": (per_query, lambda row: True),
+    }
     lines = []
-    for name, wanted in (("chosen on", True), ("reported", False)):
-        some = [
-            row
-            for row in rows
-            if row["log_likelihood"] >= NATS and row["nats_per_query"] >= PER_QUERY
-            if row["case"].startswith(CHOSEN) == wanted == row["contender"].startswith(CHOSEN)
-        ]
-        own, foreign = (
-            [1 - row["shown"] / row["null"] for row in some if (row["relation"] in (OWN, SHARED)) == mine]
-            for mine in (True, False)
-        )
-        low, high = max(foreign, default=0.0), min(own, default=1.0)
-        lines.append(f"{name}: others up to {low:.3f}, own from {high:.3f}, between {(low + high) / 2:.3f}")
+    for (way, (value, told)), wanted, flights in product(ways.items(), (True, False), (False, True)):
+        some = [row for row in rows if (row["case"] in AREAS) == flights and told(row)]
+        some = [row for row in some if row["case"].startswith(CHOSEN) == wanted]
+        some = [row for row in some if row["contender"].startswith(CHOSEN) == wanted]
+        if not some:
+            continue
+        own = [value(row) for row in some if row["relation"] in (OWN, SHARED)]
+        low = max((value(row) for row in some if row["relation"] not in (OWN, SHARED)), default=0.0)
+        over = [one for one in own if one > low]
+        found = f"others up to {low:.3f}, {len(over)} of {len(own)} own ones above"
+        between = f", from {min(over):.3f}, between {(low + min(over)) / 2:.3f}" if over else ""
+        where = f"{'chosen on' if wanted else 'reported'}{', areas' if flights else ''}"
+        lines.append(f"{way}, {where}: {found}{between}")
     return "\n".join(lines)
 
 
-def bench_cross(name: str, data: Path, seed: int = 0) -> Iterator[Row]:
+def bench_cross(name: str, data: Path, seed: int = 0, rate: float | None = None) -> Iterator[Row]:
     """A row for each drive on a map.
 
     Yields:
         relation: of the drive and the map; further, see `facts_of`.
     """
-    board = board_of(name, data)
+    board = board_of(name, data, rate)
     foreign = dict(asked_of(board, data))
     beside = next((rows for other, rows in foreign.items() if related(board, other) == OTHER), None)
     known = Known(board.model, board.queries, board.truth, board.tolerance, beside)
     count, whole = min(ASKED, len(board.queries)), torch.arange(len(board.queries))
     first = (len(whole) - count) // 2
-    for cut, numbers in drives_of(count, beside, seed).items():
+    drives = drives_of(count, beside, seed)
+    drives |= {HALF_AS_LONG: torch.arange(count // 2)}
+    for cut, numbers in drives.items():
         if cut not in CUTS or numbers is None:  # no other footage has some features
             continue
         numbers = torch.where(numbers >= 0, numbers + first, numbers)
@@ -198,19 +245,23 @@ def bench_cross(name: str, data: Path, seed: int = 0) -> Iterator[Row]:
         yield row | facts_of(board, queries)
 
 
-def board_of(name: str, data: Path) -> Board:
+def flown(name: str) -> tuple[Grid, Grid, Tensor]:
+    """The reference of an area, and a flight over it: windows at each pixel, and the numbers of some."""
+    first, second = AREAS[name](0, STRIDE), AREAS[name](1, 1)
+    path = flight(second.area, torch.Generator().manual_seed(0))
+    return first, second, second.area.place_at(path)
+
+
+def board_of(name: str, data: Path, rate: float | None = None) -> Board:
     """A map with all default settings, of one route, of two, or of an area."""
-    model = DejaVu()
-    if name == AREA:
-        first, second = open_area(0, stride=STRIDE), open_area(1, stride=1)
+    model = DejaVu(mapper=SpectralMapper(rate))
+    if name in AREAS:
+        first, second, path = flown(name)
         model.learn(first)
-        path = second.area.place_at(flight(second.area, torch.Generator().manual_seed(0)))
-        where = second.area.coordinates(path)
-        places = first.area.place_near(where)[:, None]
-        queries = model.descriptor.all_of(Part(second, path)).float()
+        places = first.area.place_near(second.area.coordinates(path))[:, None]
         radius = round(RADIUS / STRIDE)
         truth = widened(all_judged(places), first.area, radius)
-        return Board(model, (name,), queries, truth, radius)
+        return Board(model, (name,), model.descriptor.all_of(Part(second, path)).float(), truth, radius)
     routes: tuple[str, ...] = PARTS_OF_MERGED if name == MERGED else (name,)
     footage = FOOTAGE[routes[0]]
     reference, query = (opened(one, data) for one in (footage.reference, footage.query))
@@ -252,14 +303,23 @@ def asked_of(board: Board, data: Path) -> Iterator[tuple[str, Tensor]]:
             half = len(reference) // 2
             inside = (shown >= half) == bool(footage.part)
             some = some[((shown < 0) | inside).all(1) & (shown >= 0).any(1)]
-        first = max(0, len(some) - ASKED) // 2
+        most = ASKED if own else ASKED // 2  # flights take longer
+        first = max(0, len(some) - most) // 2
         shape = board.model.frame_shape
         moved = query if shape is None else fitted(query, shape)
-        yield name, board.model.descriptor.all_of(Part(moved, some[first : first + ASKED])).float()
+        yield name, board.model.descriptor.all_of(Part(moved, some[first : first + most])).float()
+    for name in AREAS if board.shows[0] in AREAS else ():
+        if name not in board.shows:
+            _, second, path = flown(name)
+            yield name, board.model.descriptor.all_of(Part(second, path)).float()
 
 
 def related(board: Board, drive: str) -> str:
     """How a drive over other ground is related to a map."""
+    if drive in AREAS:
+        return OTHER if "simulated ground" in (drive, *board.shows) else REPEATED
+    if drive.startswith("road") and board.shows[0].startswith("area"):  # one road, cut otherwise
+        return SHARED if drive.split(", ")[1] == board.shows[0].split(", ")[1] else REPEATED
     asked_, shown = FOOTAGE[drive], [FOOTAGE[one] for one in board.shows if one in FOOTAGE]
     if any(one.ground == asked_.ground for one in shown):
         return SHARED

@@ -28,7 +28,7 @@ from dejavu_torch.recognition.smoother import (
     check_descriptors,
     normalised,
 )
-from dejavu_torch.recognition.taken import doubted, singly
+from dejavu_torch.recognition.taken import OF_AREA, STANDS_OUT, UPPER, doubted, singly
 from dejavu_torch.text import progress_of
 from dejavu_torch.types import Match
 
@@ -85,7 +85,8 @@ class DriveQuery(NamedTuple):
             known, apart = self.smoother, self.radius
             sure = lambda scores: confidence(best_pair(scores, known.area, apart=apart))  # noqa: E731
             found = singly(self.rows, self.null, spacing.weight.cpu(), sure)
-            known.singly = found._replace(nats=known.nats_per_query)
+            least = STANDS_OUT if known.area is None else OF_AREA
+            known.singly = found._replace(nats=known.nats_per_query, least=least)
             known.is_drive &= known.singly.stands_out
 
 
@@ -170,6 +171,8 @@ def _shown(asked: DriveQuery, seen: Seen) -> Shown:
         probability = by_itself if queries == 1 else torch.minimum(probability, by_itself)
     if not asked.answers and smoother.singly is not None:
         probability = doubted(probability, smoother.singly.odds)
+        if asked.platt is None and not smoother.singly.stands_out:
+            probability = probability.clamp(max=UPPER)  # of so few at most is a single image right
     probability = probability.masked_fill(match.index[:, 0] < 0, 0)
     return Shown(match, 1 - mass.sum(1), sure, probability, scores.gather(1, at)[:, 0])
 

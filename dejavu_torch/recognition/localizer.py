@@ -25,7 +25,16 @@ from dejavu_torch.recognition.search import SCORES_AT_ONCE, NmsSpec, Scan, Searc
 from dejavu_torch.recognition.select import Acceptance, accept, best_candidates, best_match
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.recognition.smoother import PlaceSmoother, Rows
-from dejavu_torch.recognition.taken import ALONE, EVERY, FAITHFUL, Running, doubted, flipped
+from dejavu_torch.recognition.taken import (
+    ALONE,
+    EVERY,
+    FAITHFUL,
+    OF_AREA,
+    STANDS_OUT,
+    Running,
+    doubted,
+    flipped,
+)
 from dejavu_torch.text import with_progress
 from dejavu_torch.types import Match, SequenceModel, Together
 
@@ -98,7 +107,9 @@ class Localizer:
             sequence = sequence.over(self.area)
         matching = matching._replace(sequence=sequence, also=in_area)
         self.place_map, self.matching, self.track = place_map, matching, Track(self.area)
-        self.running = Running()  # what single images say so far, beside mirrored ones, if these are asked
+        self.running = Running(
+            STANDS_OUT if self.area is None else OF_AREA
+        )  # what single images say so far, beside mirrored ones, if these are asked
         self.total: Tensor | None = None  # of the queries so far
         asks = isinstance(sequence, PlaceFilter) and matching.platt is not None and matching.copies == 1
         if asks and isinstance(place_map, SpectralMap) and place_map.fidelity >= FAITHFUL:

@@ -463,7 +463,7 @@ class PlaceSmoother(SequenceModel):
         """What the smoother settled on, for a report."""
         _, jump, leave = self.rate_logits.softmax(0).tolist()
         singly = {} if self.singly is None else self.singly._asdict()
-        singly.pop("nats", None)
+        singly = {key: value for key, value in singly.items() if key not in ("nats", "least")}
         return {
             "is_drive": self.is_drive,
             "taken": self.is_drive,

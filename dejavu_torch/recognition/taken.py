@@ -23,6 +23,7 @@ UPPER = 0.1  # share of the queries that have to be sure: the others may be off 
 # of `python -m benchmarks cross`: by what share of the null's level the surest tenth is surer; the second one
 # will do if the motion alone shows so many nats for each query
 STANDS_OUT, A_LITTLE, PLAINLY = 0.21, 0.1, 3.0
+OF_AREA = 0.34  # in place of `STANDS_OUT`: over a plane a path may turn anywhere, so its motion tells less
 FAITHFUL = 0.7  # of the descriptors are kept: the code of a map that keeps less hides what single images tell
 ALONE = 0.55  # nats for each query that its motion alone has to show there
 NATS = 10.0  # by which a drive beats being off the map throughout
@@ -37,17 +38,19 @@ Score = Callable[[Tensor], Tensor]  # numbers of queries (B,) -> scores (B,N)
 class Singly(NamedTuple):
     """How sure the surest tenth of a drive's single images is, and of queries that show no place: means of
     their confidences, at most 0, in any unit. queries: how many were asked. nats: for each, of their motion.
+    least: by what share the surest tenth has to be surer.
     """
 
     shown: float
     null: float
     queries: int
     nats: float = 0.0
+    least: float = STANDS_OUT
 
     @property
     def stands_out(self) -> bool:
         """Whether single images find the map."""
-        return self.shown >= (1 - (A_LITTLE if self.nats >= PLAINLY else STANDS_OUT)) * self.null
+        return self.shown >= (1 - (A_LITTLE if self.nats >= PLAINLY else self.least)) * self.null
 
     @property
     def odds(self) -> float:
@@ -109,7 +112,8 @@ def singly(own: Score, null: Callable[..., Tensor], weight: Tensor, sure: Score)
 class Running:
     """`Singly.odds` of the queries so far, from histograms, which do not grow with them."""
 
-    def __init__(self) -> None:
+    def __init__(self, least: float = STANDS_OUT) -> None:
+        self.least = least
         self.counts = Counter[int](), Counter[int]()  # by -log(-confidence), of queries and of mirrored ones
         self.odds, self.queries = 1.0, 0
 
@@ -127,7 +131,7 @@ class Running:
             self.queries += 1
             if all(self.counts):
                 shown, null = map(self._upper, self.counts)
-                self.odds = Singly(shown, null, self.queries).odds
+                self.odds = Singly(shown, null, self.queries, least=self.least).odds
             found.append(self.odds)
         return torch.tensor(found, dtype=torch.float64)
 

@@ -138,7 +138,9 @@ def test_drives_over_other_ground_are_told_by_map():
         "worst filter, p > .5 .9 .99": "",
         "worst one, p > .5 .9 .99": "",
     }
-    assert cross.chosen(rows).startswith("chosen on: others up to 0.200, own from 0.400, between 0.300")
+    assert cross.chosen(rows).startswith(
+        "surer by, chosen on: others up to 0.200, 2 of 2 own ones above, from 0.400, between 0.300"
+    )
 
 
 def test_what_shares_ground_is_no_other_route():

@@ -11,7 +11,16 @@ from dejavu_torch import DejaVu, PlaceFilter, PlaceSmoother, SpectralMapper
 from dejavu_torch.recognition import taken
 from dejavu_torch.recognition.calibration import Platt
 from dejavu_torch.recognition.localizer import Localizer
-from dejavu_torch.recognition.taken import Running, Singly, doubted, flipped, moves_along, singly, upper
+from dejavu_torch.recognition.taken import (
+    OF_AREA,
+    Running,
+    Singly,
+    doubted,
+    flipped,
+    moves_along,
+    singly,
+    upper,
+)
 
 
 def walk(frames, seed, size=24, step=0.3):
@@ -129,7 +138,7 @@ def test_a_filter_doubts_while_single_images_do_not_find_the_map(model, monkeypa
     matching = model.matching(PlaceFilter())._replace(platt=platt)
     drives = [walk(300, 2), seen_again(walk(400, 0)[50:350], 5)]
     other, own = (model.localize_descriptors(one, matching).probability for one in drives)
-    monkeypatch.setattr(taken, "STANDS_OUT", -math.inf)  # any image will do
+    monkeypatch.setattr(taken.Singly, "stands_out", True)  # any image will do
     trusted, same = (model.localize_descriptors(one, matching).probability for one in drives)
     assert torch.equal(own, same)
     assert torch.allclose(other[30:], doubted(trusted[30:], 1 / 9))
@@ -160,6 +169,8 @@ def test_a_drive_whose_motion_is_plain_needs_less_of_its_images():
     assert not Singly(-0.8, -0.95, 100, 2.9).stands_out
     assert Singly(-0.8, -0.95, 100, 3.1).stands_out
     assert not Singly(-0.9, -0.95, 100, 10.0).stands_out
+    assert not Singly(-0.7, -0.95, 100, least=OF_AREA).stands_out  # over a plane
+    assert Singly(-0.5, -0.95, 100, least=OF_AREA).stands_out
     model, rows = DejaVu(whitening="none"), walk(400, 0, size=64)
     smoother, match = asked(model.learn(rows), seen_again(rows[50:350], 5, noise=0.2))
     assert smoother.is_drive
