@@ -100,7 +100,7 @@ def simulated(kind: str, seed: int) -> Footage:
     return Footage(first, second, 5, None, f"sim:{kind}, {seed}", f"sim:{kind}")
 
 
-LAPS = [f"{{data}}/rc_car_laps/frames?start={start}&stop={stop}" for start, stop in ((194, 590), (590, 982))]
+LAPS = "{data}/rc_car_laps/frames?start="
 # seen once: every other frame is asked by those between
 MOTORWAY = "{data}/highway/solidWhiteRight.mp4?width=160&stop=220&step=2&start="
 FOOTAGE = {
@@ -110,7 +110,7 @@ FOOTAGE = {
     "railway, second half": railway("start=900"),
     **{f"city {i}": filmed(f"robotcar/{t}", 2, "city", "city") for i, t in enumerate(("t1", "t2", "t5"), 1)},
     "laps": filmed("donkey_lap", 10, "mat", "mat"),
-    "laps of another car": Footage(*LAPS, 20, None, "mat", "mat"),
+    "laps of another car": Footage(LAPS + "194&stop=590", LAPS + "590&stop=982", 20, None, "mat", "mat"),
     "motorway": Footage(MOTORWAY + "0", MOTORWAY + "1", 5, None, "motorway", "motorway"),
     "corridor": Footage(
         "{data}/corridor/ref",

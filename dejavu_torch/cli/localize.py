@@ -28,6 +28,7 @@ from dejavu_torch.evaluation.answers import describe_probable, next_steps, proba
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.ground_plane import check_corners
 from dejavu_torch.motion.resampling import source_of
+from dejavu_torch.recognition.calibration import TOLERANCE
 from dejavu_torch.recognition.select import check_candidates
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.types import InputError, Match, Traverse, expect
@@ -131,7 +132,7 @@ def run_localize(
     say(f"{total} queries, {accepted} accepted; written to {out}")
     if counts:
         steps = next_steps(matcher is not None, chosen.given)
-        probable = f"{describe_probable(counts, total)}, of being within {SUPPRESSION} places"
+        probable = f"{describe_probable(counts, total)}, of being within {TOLERANCE} places"
         say(probable + (f"; next: {'; '.join(steps)}" if steps else ""))
     _print_evaluate(out, model, map, source if query.coordinates is not None else "SOURCE")
 
