@@ -1,4 +1,4 @@
-"""The goldens of tests/golden: seven small runs, simulated frames, and the options of every command.
+"""The goldens of tests/golden: thirteen small runs, simulated frames, and the options of every command.
 
 `python -m tests.golden` writes them anew, see CONTRIBUTING.md.
 """
@@ -28,10 +28,11 @@ def test_report_is_the_golden_one(ran):
     name, out = ran
     report, golden = runs.report_of(out), runs.golden_report(name)
     assert set(runs.keys(report)) == set(runs.keys(golden))
-    found = list(runs.differences(report, golden, golden["queries"]))
+    found = list(runs.differences(report, golden, golden["queries"], rounded=name in runs.ROUNDED))
     assert not found, "\n".join(found)
-    size = (out / "map.safetensors").stat().st_size
-    assert size == report["map_bytes"] <= runs.MORE * golden["map_bytes"]
+    if "map_bytes" in golden:
+        size = (out / "map.safetensors").stat().st_size
+        assert size == report["map_bytes"] <= runs.MORE * golden["map_bytes"]
 
 
 def test_matches_are_those_of_the_golden_run(ran):
@@ -43,15 +44,16 @@ def test_matches_are_those_of_the_golden_run(ran):
     first = [row.get("rank", "1") == "1" for row in golden]
     for column in ("place", "accepted", "place_name"):
         same = [one[column] == other[column] for one, other in zip(seen, golden, strict=True)]
-        assert np.mean(same) >= runs.SAME, f"{column} differs"
-        assert np.mean(np.array(same)[first]) >= runs.SAME, f"{column} differs"
+        least = 0.9 if name in runs.ROUNDED else runs.SAME
+        assert np.mean(same) >= least, f"{column} differs"
+        assert np.mean(np.array(same)[first]) >= least, f"{column} differs"
     for column in ("score", "probability"):
         told = [one.get(column, "") != "" for one in golden]
         assert [one.get(column, "") != "" for one in seen] == told
         values = [[float(row.get(column) or "0") for row in rows] for rows in (seen, golden)]
         # where another place of the same score is best, that of the next candidate is another
         same = [one["place"] == other["place"] for one, other in zip(seen, golden, strict=True)]
-        close = {"rtol": runs.SCORE, "atol": runs.SCORE}
+        close = {"rtol": runs.SCORE, "atol": 0.3 if name in runs.ROUNDED else runs.SCORE}
         np.testing.assert_allclose(*(np.array(one)[same] for one in values), **close)
 
 
