@@ -110,7 +110,7 @@ FOOTAGE = {
     "railway, second half": railway("start=900"),
     **{f"city {i}": filmed(f"robotcar/{t}", 2, "city", "city") for i, t in enumerate(("t1", "t2", "t5"), 1)},
     "laps": filmed("donkey_lap", 10, "mat", "mat"),
-    "laps of another car": Footage(LAPS + "194&stop=590", LAPS + "590&stop=982", 20, None, "mat", "mat"),
+    "laps of another car": Footage(LAPS + "194&stop=590", LAPS + "590&stop=986", 20, None, "mat", "mat"),
     "motorway": Footage(MOTORWAY + "0", MOTORWAY + "1", 5, None, "motorway", "motorway"),
     "corridor": Footage(
         "{data}/corridor/ref",

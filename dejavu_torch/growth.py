@@ -26,7 +26,7 @@ from dejavu_torch.maps.spectral_map import LARGEST, Chunk, SpectralMap
 from dejavu_torch.model import DejaVu, features_per_frame, require_map
 from dejavu_torch.model_file import ModelState, Recipe, difference, recipe_of, run_key, weights_of
 from dejavu_torch.motion.resampling import ResampledTraverse, source_of
-from dejavu_torch.teaching import FEWEST, LEAST, calibrate_by, place_drives
+from dejavu_torch.teaching import FEWEST, calibrate_by, place_drives
 from dejavu_torch.types import InputError, Traverse, expect
 
 log = logging.getLogger("dejavu_torch")
@@ -199,7 +199,7 @@ def associate(
         option: of the truth, for messages.
 
     Raises:
-        InputError: it shows no place, or nothing says which, and a smoother cannot place it: fewer than 30
+        InputError: it shows no place, or nothing says which, and a smoother cannot place it: fewer than 60
             frames, or too few sure ones, as of frames in no order.
     """
     second, places = _known_places(model, reference, second, truth, option)
@@ -226,7 +226,7 @@ def visit_to_calibrate(
 
 
 def _placeable(option: str) -> str:
-    return f"at least {LEAST} frames in order along the route, or {option}, such as 0 if frame i is place i"
+    return f"at least {FEWEST} frames in order along the route, or {option}, such as 0 if frame i is place i"
 
 
 def _check_placed(drive: Traverse, places: Tensor, option: str) -> None:
@@ -264,7 +264,7 @@ def _known_places(
         places = torch.arange(frames)
     else:
         seen = f"nothing says which places of {name} the {frames} frames of {second.name} show"
-        expect(frames >= LEAST, _placeable(option), seen)
+        expect(frames >= FEWEST, _placeable(option), seen)
         return second, None
     expect((places >= 0).any(), "some", f"no frame of {second.name} shows a place of {name}")
     return second, places

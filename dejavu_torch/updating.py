@@ -22,7 +22,7 @@ from dejavu_torch.recognition.calibration import TOLERANCE
 from dejavu_torch.recognition.drive import Answers, DriveQuery, answer_drives
 from dejavu_torch.recognition.evidence import spacing_of
 from dejavu_torch.recognition.smoother import PlaceSmoother
-from dejavu_torch.recognition.taken import ALONE, FAITHFUL, flipped
+from dejavu_torch.recognition.taken import ALONE, FAITHFUL, flipped, middle
 from dejavu_torch.teaching import FEWEST, SHARE, SURE, Refinement, described, in_its_light, refined_by
 from dejavu_torch.types import Match, Traverse
 
@@ -205,7 +205,10 @@ def _answered(
 
     def rows(numbers: Tensor, seed: int | None = None) -> Tensor:
         asked = queries[numbers.to(queries.device)]
-        scores = place_map.scores(asked if seed is None else flipped(asked, seed))
+        if seed is not None:
+            assert isinstance(place_map, SpectralMap)
+            asked = flipped(asked, seed, middle(queries.sum(0), len(queries), place_map.mean))
+        scores = place_map.scores(asked)
         return torch.where(silent[numbers, None].to(scores.device), 0, scores)
 
     smoother = PlaceSmoother()

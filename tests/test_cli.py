@@ -370,11 +370,11 @@ WRONG = {  # a line of words behind `dejavu`, and what its one line holds
     "learn a.npy --map m --config nowhere.yaml": ("nowhere.yaml is not there", "paper", "train_road"),
     "learn a.npy --map m --config": ("--config", "expected one argument"),
     "learn a.npy --map m --conf paper": ("--conf",),  # options are not guessed from their beginnings
-    "learn a.npy --map m.safetensors --second c.npy": ("6 frames", "30 frames in order", "--second_truth"),
-    "learn a.npy --map m.safetensors --average c.npy": ("6 frames", "30 frames in order", "--average_truth"),
+    "learn a.npy --map m.safetensors --second c.npy": ("6 frames", "60 frames in order", "--second_truth"),
+    "learn a.npy --map m.safetensors --average c.npy": ("6 frames", "60 frames in order", "--average_truth"),
     "learn a.npy --map m.safetensors --calibration c.npy": (
         "6 frames",
-        "30 frames in order",
+        "60 frames in order",
         "--calibration_truth",
     ),
     "learn nowhere --map m.safetensors": ("nowhere is not there", "expected"),

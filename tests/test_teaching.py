@@ -217,7 +217,7 @@ def test_the_light_of_a_drive_is_no_change(monkeypatch):
 
 def test_what_cannot_be_placed_is_refused(road):
     few = ArrayTraverse(frames_of(1)[:29], "few")
-    with refused("road", "29 frames of few", "at least 30 frames in order", "--second_truth, such as 0"):
+    with refused("road", "29 frames of few", "at least 60 frames in order", "--second_truth, such as 0"):
         second_traverse(fresh(), road, few)
     noise = ArrayTraverse(torch.rand(FRAMES, 3, 32, 32), "noise")  # as long as the reference
     with refused("noise, fewer than 60", "in order", "--second_truth, such as 0"):
@@ -231,7 +231,7 @@ def test_what_cannot_be_placed_is_refused(road):
     with refused("no whitening", "few"):
         second_traverse(DejaVu(whitening="none"), road, few)
     with refused("features per frame", "the same number"):
-        second_traverse(fresh(), road, ArrayTraverse(torch.rand(40, 3, 30, 48), "wide"))
+        second_traverse(fresh(), road, ArrayTraverse(torch.rand(70, 3, 30, 48), "wide"))
 
 
 def test_a_report_and_the_command_tell_how_many_frames_teach(road, drive, tmp_path, capsys):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import operator
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from decimal import Decimal
@@ -404,15 +405,19 @@ def names_agree(names: Sequence[str], query: Traverse, counters: bool = True) ->
 
 
 def merely_count(names: Sequence[str]) -> bool:
-    """Whether names differ only in evenly spaced numbers.
+    """Whether names differ only in numbers that are evenly spaced, but for one in ten.
 
     Example:
         >>> merely_count(["frame_09.png", "frame_10.png"]), merely_count(["0.1", "0.25", "0.3"])
         (True, False)
     """
-    numbers = sorted([*map(Decimal, NUMBER.findall(name))] for name in names)
-    steps = {tuple(map(operator.sub, after, before)) for before, after in pairwise(numbers)}
-    return len({NUMBER.sub("0", name) for name in names}) == 1 and len(steps) <= 1
+    alike: dict[str, list[list[Decimal]]] = {}
+    for name in names:
+        alike.setdefault(NUMBER.sub("0", name), []).append([*map(Decimal, NUMBER.findall(name))])
+    pairs = (pair for numbers in alike.values() for pair in pairwise(sorted(numbers)))
+    steps = Counter(tuple(map(operator.sub, after, before)) for before, after in pairs)
+    breaks = len(names) - 1 - max(steps.values(), default=0)
+    return breaks <= len(names) // 10
 
 
 def describe_ground_truth(truth: Truth | None, interpolate: bool = False, positions: bool = False) -> str:

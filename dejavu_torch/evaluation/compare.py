@@ -185,6 +185,7 @@ def compare(
             known = ground_truth_in_places(known, model.map.place_of)
             known = of_loops(known, torch.arange(len(query)), loops) if loops is not None else known
         reach = reach_of(within, known, near is not None or radius > 0)
+        smoother, causal = copy.deepcopy((smoother, causal))  # the caller keeps his reach
         for one in (smoother, causal):
             if isinstance(one, PlaceSmoother | PlaceFilter):
                 one.within = reach

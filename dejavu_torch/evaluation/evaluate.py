@@ -141,7 +141,9 @@ def evaluate_file(
     match = replace(match, index=candidates[:, 0])
     reach = reach_of(tolerance, known, isinstance(parsed, Near))
     if match.probability is not None and reach != TOLERANCE:
-        line = "`localize` writes probabilities of being within %d places; here an answer is right within %d"
+        line = (
+            "probabilities that `localize` writes are of being within %d places; here one is right within %d"
+        )
         log.warning(line, TOLERANCE, reach)
     described = describe_ground_truth(truth, interpolate, carried)
     facts = evaluation_facts(match, candidates, known, tolerance, positions, described) | alone

@@ -26,6 +26,7 @@ from dejavu_torch.memory import is_readable
 from dejavu_torch.types import Facts, InputError, expect
 
 SpectralMetric = Literal["cosine", "l2"]
+AGREE = 0.5  # of what differs between places, between two visits to one
 MIN_NORM = 1e-6  # of the RMS norm in a chunk, or of the mean's norm: shorter descriptors count as 0
 STRONGEST = 10  # periods in a summary
 LARGEST = 2**31 - 1  # places of a map, or its coefficients, for int32
@@ -396,12 +397,17 @@ class SpectralMap(PlaceMap):
 
     @property
     def fidelity(self) -> float:
-        """The share of descriptors of length 1, about their mean, that the code keeps; 1 by other metrics."""
+        """The share of descriptors of length 1, about the mean of their route, that the code keeps; 1 by
+        other metrics. Visits agree by about `AGREE`, by which their mean is shorter."""
         if self.metric != "cosine" or not self.places:
             return 1.0
-        common = float(self.staged(self.mean[None]).square().sum())
+        sizes = torch.tensor([route.places for route in self.routes] or [self.places]).double()
+        length = self.staged(self.means.float()).square().sum(1).double().cpu()
+        common = float((length * sizes).sum() / sizes.sum()) if len(length) else 0.0
         known = self.norms[self.norms.isfinite()].double().square()
-        return (float(known.mean()) - common) / max(1 - common, MIN_NORM) if len(known) else 1.0
+        visits = float(self.visit_counts.double().mean())
+        whole = (1 - common) * (1 + (visits - 1) * AGREE) / visits
+        return (float(known.mean()) - common) / max(whole, MIN_NORM) if len(known) else 1.0
 
     @property
     def step(self) -> float:

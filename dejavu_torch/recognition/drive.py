@@ -28,7 +28,7 @@ from dejavu_torch.recognition.smoother import (
     check_descriptors,
     normalised,
 )
-from dejavu_torch.recognition.taken import OF_AREA, STANDS_OUT, UPPER, doubted, singly
+from dejavu_torch.recognition.taken import ALONE, FEW, OF_AREA, STANDS_OUT, UPPER, doubted, singly
 from dejavu_torch.text import progress_of
 from dejavu_torch.types import Match
 
@@ -80,8 +80,11 @@ class DriveQuery(NamedTuple):
 
     def ask_singly(self, spacing: Spacing) -> None:
         """Leave to the smoother only what single images find as well."""
-        self.smoother.is_drive &= self.smoother.nats_per_query >= self.least
-        if self.null is not None and len(self.descriptors):
+        few = float(spacing.weight.sum()) < FEW
+        self.smoother.is_drive &= self.smoother.nats_per_query >= (
+            max(self.least, ALONE) if few else self.least
+        )
+        if self.null is not None and not few:
             known, apart = self.smoother, self.radius
             sure = lambda scores: confidence(best_pair(scores, known.area, apart=apart))  # noqa: E731
             found = singly(self.rows, self.null, spacing.weight.cpu(), sure)

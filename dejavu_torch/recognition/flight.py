@@ -57,6 +57,7 @@ def place_flight(smoother: PlaceSmoother, rows: Rows, queries: int, area: Area, 
     """
     cells = area.rows * area.columns
     check_room(BYTES * queries * cells, f"a drive of {queries} images over {cells} rows x columns")
+    smoother.forget()
     scores = rows(torch.arange(queries)).float().cpu()
     weight = spacing.weight.to(scores)
     means = smoother.removed * place_means(scores, weight)

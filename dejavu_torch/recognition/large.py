@@ -236,6 +236,7 @@ class LargeDrive:
         return {i: min(pair) for i, *pair in zip(chosen, most, lengths, strict=True)}
 
     def _fit(self, ranks: RankTable) -> None:
+        self.smoother.forget()
         samples = []
         for i, length in self._fitted().items():
             window = self.windows[i]

@@ -27,6 +27,7 @@ from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.recognition.smoother import PlaceSmoother, Rows
 from dejavu_torch.recognition.taken import (
     ALONE,
+    AT_FIRST,
     EVERY,
     FAITHFUL,
     OF_AREA,
@@ -34,6 +35,7 @@ from dejavu_torch.recognition.taken import (
     Running,
     doubted,
     flipped,
+    middle,
 )
 from dejavu_torch.text import with_progress
 from dejavu_torch.types import Match, SequenceModel, Together
@@ -43,7 +45,6 @@ CACHED = 2**20  # scores processed at a time: they stay in the cache
 SHORT = 2**15  # places of which all scores are kept: selecting the lowest of so few takes longer
 MAX_SHARE = 1 / 16  # of a block's places; selecting more of the lowest scores is slower than keeping all
 PLACES_PER_NUMBER = 64  # a coarse search holds at most one number of a query per this many places
-OF_MAP = 10  # queries that the map's own mean counts as, about which queries are mirrored
 PER_BEST = 16  # held for each of a query's lowest scores, while two lists are merged
 
 
@@ -158,14 +159,15 @@ class Localizer:
         if self.total is None:
             return None
         assert isinstance(place_map, SpectralMap)
-        seen = torch.arange(1, len(descriptors) + 1).to(descriptors)[:, None] + self.running.queries
-        sums = self.total.to(descriptors) + descriptors.cumsum(0)
-        means, self.total = (sums + OF_MAP * place_map.mean.to(sums)) / (seen + OF_MAP), sums[-1]
+        numbers = torch.arange(len(descriptors)) + self.running.queries
+        sums = self.total.to(descriptors) + descriptors.nan_to_num(0).cumsum(0)
+        means = middle(sums, 1 + numbers.to(sums)[:, None], place_map.mean)
         found = descriptors.new_full((len(descriptors),), math.nan)
-        some = slice(-self.running.queries % EVERY, None, EVERY)
-        if len(descriptors[some]):
+        some = (numbers < AT_FIRST) | (numbers % EVERY == 0)
+        if bool(some.any()):
             scores = place_map.scores(flipped(descriptors[some], mean=means[some]))
             found[some] = confidence_of(scores, self.area)
+        self.total = sums[-1]
         return found
 
     @torch.no_grad()
@@ -262,7 +264,9 @@ class Localizer:
             return DriveQuery(loops, descriptors, smoother, *settings, checks=True)
 
         def null(numbers: Tensor, seed: int) -> Tensor:
-            return best_copies(score(flipped(descriptors[copies_of(numbers, copies)], seed)), copies)
+            assert isinstance(place_map, SpectralMap)
+            mean = middle(descriptors.sum(0), len(descriptors), place_map.mean)
+            return best_copies(score(flipped(descriptors[copies_of(numbers, copies)], seed, mean)), copies)
 
         own = DriveQuery(rows(descriptors), descriptors[::copies], smoother, *settings, tiles)
         if tiles is None or not isinstance(place_map, SpectralMap):  # templates repeat along the route

@@ -350,7 +350,7 @@ class PlaceSmoother(SequenceModel):
             known = check_scores(scores, descriptors)
             scores, descriptors = rows_of(known), spoken(known) if descriptors is None else descriptors
         descriptors = check_descriptors(descriptors)
-        self.is_drive, self.log_likelihood, self.singly = False, None, None
+        self.forget()
         if not len(descriptors):
             return self
         spacing = spacing or spacing_of(descriptors)
@@ -365,6 +365,11 @@ class PlaceSmoother(SequenceModel):
         ranks.add(std.z, std.only((weight[picked] * std.speaks)[..., None].expand_as(std.z), 0))
         layout = self.layout(places, route_starts)
         return self.learn([Sample(std, weight[picked], still[picked], layout)], ranks, spacing)
+
+    def forget(self) -> None:
+        """What an earlier drive told."""
+        self.is_drive, self.log_likelihood, self.singly = False, None, None
+        self.nats_per_query = self.jumps = 0.0
 
     @torch.no_grad()
     def learn(self, samples: Sequence[Sample], ranks: RankTable, spacing: Spacing) -> Self:

@@ -16,9 +16,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+OF_MAP = 10  # queries that the map's own mean counts as, about which queries are mirrored
+FEW = 10  # queries of a drive: of fewer, single images tell nothing, and more is asked of their motion
 ASKED = 256  # queries of a drive that are asked singly, at most
 DRAWN = 512  # queries that show nothing, at least, for the upper tenth to be the same each time
-EVERY = 4  # of a filter's queries, the one that is asked mirrored as well
+AT_FIRST, EVERY = 40, 4  # of a filter's queries, those that are asked mirrored as well: the first, then some
 UPPER = 0.1  # share of the queries that have to be sure: the others may be off the map
 # of `python -m benchmarks cross`: by what share of the null's level the surest tenth is surer; the second one
 # will do if the motion alone shows so many nats for each query
@@ -62,6 +64,11 @@ class Singly(NamedTuple):
 def doubted(probability: Tensor, odds: Tensor | float) -> Tensor:
     """Probabilities whose odds change by a factor."""
     return odds * probability / (1 + (odds - 1) * probability)
+
+
+def middle(total: Tensor, count: Tensor | int, of_map: Tensor) -> Tensor:
+    """About what queries are mirrored: their mean, of a sum (...,K), drawn to that of the map, (K,)."""
+    return (total + OF_MAP * of_map.to(total)) / (count + OF_MAP)
 
 
 def flipped(queries: Tensor, seed: int = 0, mean: Tensor | None = None) -> Tensor:

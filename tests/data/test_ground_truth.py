@@ -247,6 +247,18 @@ def test_names_that_merely_count_align_no_visit_that_teaches(names, count, caplo
     assert ("count their frames alike" in caplog.text) == count
 
 
+def test_counters_with_a_carry_or_a_gap_are_no_proof():
+    """Of minutes and seconds, of two folders, and with one frame left out; times of a camera are one."""
+    carried = [f"{i // 60:02}-{i % 60:02}.png" for i in range(20, 120)]
+    folders = [f"{part}/{i:04}.png" for part in "ab" for i in range(50)]
+    assert merely_count(carried)
+    assert merely_count(folders)
+    assert merely_count([f"{i}.png" for i in range(60) if i != 20])
+    stamps = torch.rand(100, generator=torch.Generator().manual_seed(0)).cumsum(0)
+    assert not merely_count([f"{stamp:.3f}.png" for stamp in stamps.tolist()])
+    assert not merely_count([f"room {name}" for name in "abcdefghijklm"])
+
+
 def test_equal_coordinates_align_two_visits():
     points = [[0.0, 1], [2, 3], [4, 5]]
     assert are_aligned(at(points), at(points), counters=False)
