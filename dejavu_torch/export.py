@@ -116,7 +116,7 @@ class Graph(nn.Module):
 
     def forward(self, frames: Tensor, *states: Tensor) -> Tensor | tuple[Tensor, ...]:
         after: list[Tensor] = []
-        shows = None
+        shows = None if "features" in self.parts else (frames.abs().amax(1) > 0)[:, None]
         for name, part in self.parts.items():
             if isinstance(part, Preprocess) and part.blank > 0:
                 shows = part.shows(frames)[:, None]
@@ -196,7 +196,8 @@ def export_onnx(
             free = {0: "batch"} if sequence is None else {}
             free |= {2: "height", 3: "width"} if noise.ndim == 4 else {}
             written = _serialised(_program(graph, inputs, names, free), facts)
-            difference = _difference(written, graph, noise, facts)
+            exact = model if sequence is None and not centre else graph
+            difference = _difference(written, exact, noise, facts)
         except Exception as error:  # of any type, from torch, onnx or onnxruntime
             raise _refusal(graph, noise, error) from error
     seen = f"the exported scores differ from torch's by {difference:.2g} on noise"
@@ -329,10 +330,10 @@ def _serialised(program: torch.onnx.ONNXProgram, facts: Facts) -> bytes:
     return written
 
 
-def _difference(written: bytes, graph: Graph, frames: Tensor, facts: Facts) -> float:
-    """The largest difference of onnxruntime's scores to torch's, relative above 1."""
+def _difference(written: bytes, graph: nn.Module, frames: Tensor, facts: Facts) -> float:
+    """The largest difference of onnxruntime's scores to those of a module, relative above 1."""
     states, rows = [state.to(frames.device) for state in _first_states(facts)], []
-    for part in frames.split(len(frames) if graph.sequence is None else 1):
+    for part in frames.split(1 if states else len(frames)):
         found = graph(part, *states)
         scores, *states = found if states else [found]
         rows.append(scores)

@@ -26,6 +26,7 @@ from dejavu_torch.maps.spectral_map import LARGEST, Chunk, SpectralMap
 from dejavu_torch.model import DejaVu, features_per_frame, require_map
 from dejavu_torch.model_file import ModelState, Recipe, difference, recipe_of, run_key, weights_of
 from dejavu_torch.motion.resampling import ResampledTraverse, source_of
+from dejavu_torch.recognition.calibration import strictest
 from dejavu_torch.teaching import FEWEST, calibrate_by, place_drives
 from dejavu_torch.types import InputError, Traverse, expect
 
@@ -354,7 +355,9 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
 
     Returns:
         A model whose `map.routes` are the routes, each with the scores of its own map. A threshold is kept if
-        all have the same. Calibration and precision, which hold for one route, are dropped with a warning.
+        all have the same, a precision likewise. If all are calibrated, the scalings are kept that give lower
+        probabilities, since on each route an answer has to be as sure as on the least plain one. What is
+        dropped is told in a warning.
 
     Raises:
         InputError: fewer than two models, one without a spectral map, or models that differ in what makes
@@ -382,10 +385,12 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
         for wanted, part in maps:
             parts[free_name(wanted, parts)] = part
     _check_count(sum(part.places for part in parts.values()), first.step is not None)
-    thresholds = {model.threshold for model in models}
+    thresholds, precisions = ({getattr(one, name) for one in models} for name in ("threshold", "precision"))
+    calibration = strictest([model.calibration for model in models])
+    precision = first.precision if calibration is not None and len(precisions) == 1 else None
     merged = DejaVu(
         **first.settings()
-        | {"weight_bits": 32, "precision": None}
+        | {"weight_bits": 32, "precision": precision}
         | {"threshold": first.threshold if len(thresholds) == 1 else None}
     )
     merged.weight_bits = first.weight_bits
@@ -395,11 +400,11 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
     merged.state = ModelState(first.frame_shape, first.step, trained, names)
     dropped = [
         *["thresholds"] * (len(thresholds) > 1),
-        *["calibration"] * any(model.calibration is not None for model in models),
-        *["precision"] * any(model.precision is not None for model in models),
+        *["calibration"] * (calibration is None and any(model.calibration for model in models)),
+        *["precision"] * (precision is None and any(model.precision is not None for model in models)),
     ]
     if dropped:
-        log.warning("the merged map has no %s: each holds for one route only", ", ".join(dropped))
+        log.warning("the merged map has no %s: not all routes have the same, or any", ", ".join(dropped))
     place_map = SpectralMap.merged([*parts.values()], [*parts])
     starts = accumulate(model.map.places for model in models)
     links = [
@@ -407,7 +412,27 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
         for model, start in zip(models, [0, *starts], strict=False)
         for one, two, share in model.map.connections
     ]
-    return merged.replace_map(place_map.linked(links) if links else place_map)
+    merged.replace_map(place_map.linked(links) if links else place_map)
+    merged.calibration = calibration
+    return merged
+
+
+def only_route(model: DejaVu, name: str) -> DejaVu:
+    """Let a model know one route of its merged map alone, so that all answers are places of it; returns it.
+
+    Raises:
+        InputError: no merged map, or no route of this name.
+    """
+    place_map, calibration, names = model.map, model.calibration, model.frame_names
+    if not isinstance(place_map, SpectralMap) or not place_map.routes:
+        raise InputError(f"route {name!r} of a map of one route; expected one of `dejavu merge`")
+    part = place_map.part(name)
+    before = [route.name for route in place_map.routes].index(name)
+    first = sum(route.frames for route in place_map.routes[:before])
+    model.replace_map(part)
+    model.calibration = calibration
+    model.state.frame_names = names[first : first + place_map.routes[before].frames]
+    return model
 
 
 def free_name(name: str, taken: Container[str]) -> str:

@@ -455,6 +455,7 @@ class DejaVu(nn.Module):
             InputError: another traverse than the map's, or `apart` out of range.
         """
         require_map(self)
+        check_loops_along(self.map.area)
         traverse = self.at_map_size(as_traverse(traverse), self.frame_shape or ())
         if self.step is not None:
             traverse = self.resample(traverse, self.step, progress, self.frame_shape)
@@ -550,12 +551,13 @@ class DejaVu(nn.Module):
         apart: int = 5,
         sequence: SequenceModel | Literal["auto"] | None = "auto",
         search: Search | None = None,
+        centre: bool | None = None,
         headings: int = 1,
     ) -> Match:
         """The k best places of each query; the first is that of `localize`.
 
         Args:
-            queries, sequence, search, headings: see `localize`.
+            queries, sequence, search, centre, headings: see `localize`.
             k: from 1 to the number of places.
             apart: suppression radius in places, at least 0: any two candidates of a query differ by more.
 
@@ -569,7 +571,7 @@ class DejaVu(nn.Module):
             >>> DejaVu().learn(wave).candidates(wave[20:22], k=3).index[:, 0]
             tensor([20, 21])
         """
-        return Match.joined(self.matches(queries, False, sequence, search, k, apart, headings=headings))
+        return Match.joined(self.matches(queries, False, sequence, search, k, apart, centre, headings))
 
     def matching(self, sequence: SequenceModel | None = None, search: Search | None = None) -> Matching:
         """How queries are matched, with probabilities if the map is calibrated for it. Raises InputError if a
@@ -677,6 +679,11 @@ def features_per_frame(model: DejaVu) -> int:
     """D, the number of features per frame that the map was learned from."""
     whitening = model.descriptor.whitening
     return sum(whitening.sizes) if whitening is not None and whitening.learned else model.map.dimension
+
+
+def check_loops_along(area: Area | None) -> None:
+    """Refuse loops over an area, whose numbers of places say nothing of when they were passed."""
+    expect(area is None, "a route", "loops on the map of an area")
 
 
 def check_apart(apart: int, places: int) -> None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
+from command_line import rows_of, run
 from footage import REFERENCE, SIDE, camera, footage
 from helpers import long_from, refused, streamed, template_model
 from hypothesis import given
@@ -26,7 +28,7 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.positions import count_places, positions_behind, shown_frames
 from dejavu_torch.features.views import LabelledFrames
 from dejavu_torch.features.whitening import Whitening
-from dejavu_torch.growth import append, associate, average, learn_mean, merge
+from dejavu_torch.growth import append, associate, average, learn_mean, merge, only_route
 from dejavu_torch.maps.file import read_map
 from dejavu_torch.maps.frame_table import FrameTable, Route
 from dejavu_torch.maps.spectral import encode_chunk
@@ -338,6 +340,40 @@ def test_what_is_of_single_routes_is_not_kept_and_told(caplog):
     assert (merged.calibration, merged.precision, merged.threshold) == (None, None, None)
     assert "no thresholds, calibration, precision" in caplog.text
     assert models[1].precision == 0.9
+
+
+def test_a_merged_map_is_as_strict_as_its_strictest_part():
+    models = routes("a", "b", "c")
+    for model, offset in zip(models, (6.0, 2.0, 4.0), strict=True):
+        model.calibration = Calibration(Platt(8.0, offset), Platt(0.5, -offset))
+        model.precision = 0.9
+    merged = merge(models, ["a", "b", "c"])
+    assert merged.calibration == Calibration(Platt(8.0, 2.0), Platt(0.5, -6.0))
+    assert merged.precision == 0.9
+    models[1].calibration = Calibration(Platt(8.0, 2.0), None)
+    assert merge(models, ["a", "b", "c"]).calibration == Calibration(Platt(8.0, 2.0), None)
+
+
+def test_one_route_of_a_merged_map_answers_alone(tmp_path):
+    models = routes("a", "b")
+    for model in models:
+        model.calibration = Calibration(Platt(8.0, 6.0), None)
+    merge(models, ["a", "b"]).save(tmp_path / "both.safetensors")
+    alone = only_route(DejaVu.load(tmp_path / "both.safetensors"), "b")
+    queries = walk(130, seed=1) + 1
+    assert torch.equal(alone.localize(queries, sequence=None).index, models[1].localize(queries, None).index)
+    assert (alone.frame_names[0], len(alone.frame_names), alone.map.routes) == ("b_0000.png", 130, ())
+    assert alone.calibration == models[0].calibration
+    np.save(tmp_path / "q.npy", queries.numpy())
+    words = "localize", tmp_path / "both.safetensors", tmp_path / "q.npy", "--out", tmp_path / "m.csv"
+    run(*words, "--match", "single", "--route", "b")
+    rows = rows_of(tmp_path / "m.csv")
+    assert "route" not in rows[0]
+    assert [int(row["place"]) for row in rows] == alone.localize(queries, sequence=None).index.tolist()
+    with refused("no route 'd'", "a, b"):
+        only_route(DejaVu.load(tmp_path / "both.safetensors"), "d")
+    with refused("route 'b' of a map of one route", "dejavu merge"):
+        only_route(models[0], "b")
 
 
 def test_maps_that_cannot_be_merged():

@@ -211,6 +211,12 @@ def test_what_cannot_be_turned_is_refused(model, ground, images):
         model.localize(rows, headings=4)
     with refused("loops 3 and headings 4; expected one of them"):
         compare(ground, None, loops=3, headings=4)
+    with refused("loops on the map of an area; expected a route"):
+        model.loops(ground)
+    with refused("loops on the map of an area; expected a route"):
+        compare(ground, None, loops=3)
+    with refused("a storage curve and headings 4; expected one of them"):
+        compare(ground, images, headings=4, storage_curve=True)
 
 
 def test_commands_try_headings(tmp_path, model, ground, images, capsys):

@@ -93,6 +93,17 @@ def test_a_file_says_what_it_is(flights, tmp_path):
             torch.testing.assert_close(run_session(session, frames), model(frames), rtol=0, atol=1e-4)
 
 
+def test_features_that_show_nothing_score_as_in_torch(tmp_path):
+    """Whitening would make a place of them."""
+    rows = torch.randn(200, 12, generator=torch.Generator().manual_seed(0)).cumsum(0) + 3
+    model = DejaVu(whitening=Whitening(8)).learn(rows)
+    export_onnx(model, tmp_path / "map.onnx")
+    queries = torch.cat([rows[20:22], torch.zeros(1, 12)])
+    found = run_session(session_of(str(tmp_path / "map.onnx")), queries)
+    torch.testing.assert_close(found, model(queries), rtol=0, atol=1e-4)
+    assert not model.localize(queries, sequence=None).accepted[2]
+
+
 @pytest.mark.parametrize(
     "settings",
     [{"metric": "l2", "temperature": 0.1}, {"metric": "cosine"}, {"metric": "l1", "reduction": "sum"}],

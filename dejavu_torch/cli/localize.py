@@ -25,6 +25,7 @@ from dejavu_torch.data.output import check_output_file
 from dejavu_torch.data.source import check_not_read, open_source
 from dejavu_torch.data.traverse import Whole
 from dejavu_torch.evaluation.answers import describe_probable, next_steps, probable_counts
+from dejavu_torch.growth import only_route
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.ground_plane import check_corners
 from dejavu_torch.motion.resampling import source_of
@@ -45,6 +46,7 @@ def run_localize(
     top: int | None = None,
     loops: int | None = None,
     headings: int = 1,
+    route: str | None = None,
     pairs: Path | None = None,
     corners: list[list[float]] | None = None,
     sequences: options.Sequences,
@@ -67,6 +69,7 @@ def run_localize(
             before each frame, and all after it
         headings: on the map of an area, try this many headings of each image, evenly over 360 degrees, such
             as 24, which takes 24 times as long
+        route: find places of this route of a merged map alone
         pairs: also write lines `query_name place_name` for hloc and COLMAP, one per place
         corners: where this camera sees the patch of ground that the map's --velocity.corners describe
         cluster: divide the map among Ray workers, as in `dejavu learn`; for single queries only
@@ -82,6 +85,8 @@ def run_localize(
         options.refuse_with(f"--cluster {cluster}", match=matcher not in (None, "auto") and sequences.way)
         matcher = None
     model = loading.model(map)
+    if route is not None:
+        only_route(model, route)
     searching.of(model)
     if corners is not None:
         why = "--as_is measures no ground" if loading.as_is else f"{map} was learned without --velocity"
@@ -194,6 +199,7 @@ def run_live(
     acceptance: options.Acceptance,
     page: int | None = None,
     reference: str | None = None,
+    route: str | None = None,
     realtime: bool = False,
     timeout: float = 10.0,
     loading: options.Loading,
@@ -210,6 +216,7 @@ def run_live(
         page: show frame, reference frame and posterior at http://127.0.0.1:PORT; 8765 if no port is given, 0
             for any free port. A file then plays in real time, and the page stays until Ctrl-C
         reference: the source that the map was learned from, for the pictures of the page
+        route: find places of this route of a merged map alone
         realtime: play a video in real time, and drop frames that arrive too fast
         timeout: seconds without a frame after which a camera, address or pipe has stalled
     """
@@ -223,6 +230,8 @@ def run_live(
     assert not isinstance(matcher, str)  # the default is the filter
     acceptance.check(matcher)
     model = loading.model(map)
+    if route is not None:
+        only_route(model, route)
     searching.of(model)
     acceptance.of(model)
     model.matching(matcher)

@@ -117,7 +117,7 @@ class ImageFolder(Traverse):
         image = read_image(file, max(self.width, self.height))
         if self._channels is None:
             self._channels = len(image)
-            if file.name != self.names[0]:
+            if file != self.path / self.names[0]:
                 with suppress(InputError):  # it is told where it is asked for
                     self._channels = len(read_image(self.path / self.names[0], 1))
         if len(image) != self._channels:
@@ -129,7 +129,7 @@ class ImageFolder(Traverse):
             image = resize_frames(image[None], size)[0].clamp(0, 1)
         channels, height, width = image.shape
         shape = f"{height} x {width} pixels of {channels} channel{'s' * (channels > 1)}"
-        self._first = self._first or (file.name, shape, original)
+        self._first = self._first or (file.relative_to(self.path).as_posix(), shape, original)
         name, expected, first = self._first
         expect(shape == expected, f"{expected} like {name}", f"{file} is {shape}")
         if self.same_aspect and is_stretched(original, first):

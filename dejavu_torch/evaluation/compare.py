@@ -45,7 +45,7 @@ from dejavu_torch.growth import calibrate_if_possible
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.template_map import TemplateMapper
-from dejavu_torch.model import DejaVu, check_apart, check_queries, features_per_frame
+from dejavu_torch.model import DejaVu, check_apart, check_loops_along, check_queries, features_per_frame
 from dejavu_torch.motion.resampling import ground_truth_of, resampled, source_of
 from dejavu_torch.recognition.calibration import TOLERANCE
 from dejavu_torch.recognition.centring import centred, set_apart
@@ -158,9 +158,11 @@ def compare(
         alone = query is None and leave_out is None and not (distractors or storage_curve or top != 1)
         _check_loops(loops, alone, sequence)
         reference, centre = as_traverse(reference), False  # the mean is that of the map
+        check_loops_along(reference.area)
     elif query is None:
         raise InputError("there is no query; expected a second visit, or loops within the reference")
     query = reference if query is None else query
+    _check_storage(model, storage_curve, headings)
     reference, query, off = _prepared(model, reference, query, distractors, seconds, progress, loops)
     check_candidates(top, tolerance, len(reference))
     north = facing_north(query, reference.area, headings)  # pictures show images, not their copies
@@ -172,6 +174,7 @@ def compare(
         causal.check(None, len(reference))
     # without a given truth, each place would be its own answer
     known = None if itself and truth is None else ground_truth_of(truth, reference, query, interpolate)
+    expect(known is not None or not storage_curve, "a truth", "there is none to judge a storage curve by")
     if reference.area is not None and known is not None and near is None:
         known = widened(known, reference.area, within)
 
@@ -267,6 +270,14 @@ def _check_settings(
     check_candidates(top, tolerance)
 
 
+def _check_storage(model: DejaVu, storage_curve: bool, headings: int) -> None:
+    """Refuse a storage curve of what is not coded at several sizes."""
+    if storage_curve:
+        expect(headings == 1, "one of them", f"a storage curve and headings {headings}")
+        coded = isinstance(model.map if model.map.places else model.mapper, SpectralMap | SpectralMapper)
+        expect(coded, "a SpectralMapper", "a storage curve of templates")
+
+
 def _check_loops(loops: int, alone: bool, sequence: object) -> None:
     """Refuse what a drive by itself has no use for."""
     if not alone:
@@ -350,7 +361,7 @@ def _prepared(
             raise InputError(f"{other.name} has frames; expected ready features, as of {reference.name}")
     off = [other if is_ready(other) else fitted(other, reference.frame_shape) for other in off]
     features = model.descriptor.check_sizes(reference, query, *off)
-    reference, query = kept(reference), kept(query)
+    reference, query = (one if source_of(one) is not one else kept(one) for one in (reference, query))
     even = partial(resampled, odometry=model.velocity, batch_size=model.batch_size, progress=progress)
     with timed(seconds, "describe" if has_map else "learn"):
         reference = even(reference, step=model.step if has_map else None)

@@ -118,6 +118,10 @@ class LiveLocalizer:
     @torch.no_grad()
     def due(self, frame: Tensor | np.ndarray, left_out: int = 0) -> list[LiveMatch]:
         """The answers that a frame completes: its own, or that of the frame `lag` before, if there is one."""
+        with self._localizer.alone_asked():
+            return self._due(frame, left_out)
+
+    def _due(self, frame: Tensor | np.ndarray, left_out: int) -> list[LiveMatch]:
         start, mean = time.perf_counter(), self._mean
         batch = as_batch(frame, self.model.map.device)
         with in_one_thread(batch.numel() if self._small else math.inf):

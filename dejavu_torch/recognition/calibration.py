@@ -63,6 +63,20 @@ class Calibration(NamedTuple):
         return self.filter if isinstance(sequence, PlaceFilter) else None
 
 
+def strictest(known: Sequence[Calibration | None]) -> Calibration | None:
+    """Of the calibrations of several routes, the scalings that give the lower probabilities; None if one
+    route has none."""
+
+    def strict(column: Sequence[Platt | None], low: float, high: float) -> Platt | None:
+        some, grid = [platt for platt in column if platt is not None], torch.linspace(low, high, 101)
+        lowest = min(some, key=lambda platt: float(platt.probability(grid).mean()), default=None)
+        return lowest if len(some) == len(column) else None
+
+    single, filtered = zip(*(one or Calibration() for one in known), strict=True)
+    found = Calibration(strict(single, -1, 0), strict(filtered, -14, 40))
+    return found if any(found) else None
+
+
 def fit(confidence: Tensor, right: Tensor, weight: Tensor | None = None) -> Platt:
     """Maximum-likelihood slope and offset.
 

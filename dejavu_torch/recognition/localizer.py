@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Mapping
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -38,7 +40,7 @@ from dejavu_torch.recognition.taken import (
     middle,
 )
 from dejavu_torch.text import with_progress
-from dejavu_torch.types import Match, SequenceModel, Together
+from dejavu_torch.types import Match, SequenceModel, Together, expect
 
 ROWS = 4096  # descriptors on the device at a time
 CACHED = 2**20  # scores processed at a time: they stay in the cache
@@ -108,9 +110,9 @@ class Localizer:
             sequence = sequence.over(self.area)
         matching = matching._replace(sequence=sequence, also=in_area)
         self.place_map, self.matching, self.track = place_map, matching, Track(self.area)
-        self.running = Running(
-            STANDS_OUT if self.area is None else OF_AREA
-        )  # what single images say so far, beside mirrored ones, if these are asked
+        # what single images say so far, beside mirrored ones, if these are asked
+        self.running = Running(STANDS_OUT if self.area is None else OF_AREA)
+        self.lock = threading.RLock()
         self.total: Tensor | None = None  # of the queries so far
         asks = isinstance(sequence, PlaceFilter) and matching.platt is not None and matching.copies == 1
         if asks and isinstance(place_map, SpectralMap) and place_map.fidelity >= FAITHFUL:
@@ -126,8 +128,21 @@ class Localizer:
         self.matched = 0  # queries so far
         self.route_starts = (0,) if place_map is None else place_map.route_starts
 
-    @torch.no_grad()
     def __call__(self, descriptors: Tensor, progress: bool = False) -> Match:
+        with self.alone_asked():
+            return self._answered(descriptors, progress)
+
+    @contextmanager
+    def alone_asked(self) -> Iterator[None]:
+        """Refuse a second thread meanwhile: answers depend on the queries before, in their order."""
+        expect(self.lock.acquire(blocking=False), "one for each camera", "two threads ask one localizer")
+        try:
+            yield
+        finally:
+            self.lock.release()
+
+    @torch.no_grad()
+    def _answered(self, descriptors: Tensor, progress: bool) -> Match:
         place_map, matching = self.place_map, self.matching
         assert place_map is not None
         places = place_map.places

@@ -267,6 +267,17 @@ def test_photos_by_when_they_were_taken(tmp_path, caplog):
     assert caplog.messages == [line]
 
 
+def test_of_images_of_one_name_the_first_one_tells_the_channels(tmp_path):
+    for folder, mode in (("a", "RGB"), ("b", "L")):
+        (tmp_path / folder).mkdir()
+        Image.new(mode, (8, 8)).save(tmp_path / folder / "1.png")
+    Image.new("RGB", (8, 8)).save(tmp_path / "1.png")
+    assert ImageFolder(tmp_path, recursive=True).names == ["1.png", "a/1.png", "b/1.png"]
+    for first in (0, 1, 2):
+        folder = ImageFolder(tmp_path, recursive=True)
+        assert folder.read([first]).shape == (1, 3, 8, 8)
+
+
 def test_some_images_and_those_in_folders_inside(tmp_path, caplog):
     for name in ("cam0", "cam1", ".thumbs"):
         (tmp_path / name).mkdir()

@@ -97,3 +97,11 @@ def test_what_has_no_curve_is_refused(result):
         coded_at_sizes(result.run._replace(truth=None))
     with refused("'templates'", "spectral"):
         coded_at_sizes(result.run._replace(model=template_model().learn(route(0))))
+
+
+def test_what_has_no_storage_curve_is_refused():
+    pair = [ArrayTraverse(route(visit), f"visit {visit}") for visit in (0, 1)]
+    with refused("none to judge a storage curve by", "a truth"):
+        compare(*pair, storage_curve=True)
+    with refused("a storage curve of templates", "SpectralMapper"):
+        compare(*pair, "0", model=template_model(), storage_curve=True)

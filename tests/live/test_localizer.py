@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -229,3 +230,14 @@ def test_a_map_of_even_steps_takes_frames_as_they_are_or_none():
     model.velocity = None
     match = LiveLocalizer(model, None)(footage(QUERY)[0])
     assert match.frame == int(model.map.frame_of(torch.tensor(match.place)))
+
+
+def test_two_threads_that_ask_one_localizer_are_refused(monkeypatch):
+    """Its answers depend on the frames before, in their order."""
+    model = DejaVu(whitening="none").learn(torch.rand(60, 1, 32, 32))
+    localizer, frame = LiveLocalizer(model), torch.rand(1, 32, 32)
+    with localizer._localizer.alone_asked(), ThreadPoolExecutor(1) as pool:
+        with refused("two threads ask one localizer", "one for each camera"):
+            pool.submit(localizer, frame).result()
+        localizer(frame)  # the thread that holds it goes on
+    localizer(frame)

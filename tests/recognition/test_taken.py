@@ -8,6 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dejavu_torch import DejaVu, PlaceFilter, PlaceSmoother, SpectralMapper
+from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.features.views import LabelledFrames
+from dejavu_torch.growth import learn_mean
 from dejavu_torch.recognition import taken
 from dejavu_torch.recognition.calibration import Platt
 from dejavu_torch.recognition.localizer import Localizer
@@ -88,6 +91,25 @@ def test_odds_change_by_a_factor(probability, odds):
 def test_images_that_find_the_map_are_not_doubted():
     assert Singly(-0.5, -0.9, 100).odds == 1
     assert Singly(-0.8, -0.9, 100).odds == pytest.approx(1 / 9)
+
+
+@pytest.mark.parametrize("queries", [1, 3, 9])
+def test_of_few_queries_single_images_tell_nothing(model, queries):
+    """They would be mirrored about themselves."""
+    smoother, match = asked(model, seen_again(walk(400, 0)[100 : 100 + queries], 5))
+    assert smoother.singly is None
+    assert ((match.index - torch.arange(100, 100 + queries)).abs() <= 5).all()
+
+
+def test_an_average_of_visits_is_a_faithful_map():
+    """It is shorter than what one visit shows, not coarser."""
+    rows = walk(400, 0)
+    visits = LabelledFrames(ArrayTraverse(seen_again(rows, 5, noise=0.3)), torch.arange(400))
+    averaged = learn_mean(DejaVu(whitening="none"), rows, visits)
+    assert averaged.map.fidelity >= 0.7
+    other, _ = asked(averaged, walk(300, 3))
+    assert other.singly is not None
+    assert not other.is_drive
 
 
 def test_motion_has_to_pay_for_its_jumps():
