@@ -95,3 +95,18 @@ def test_a_bare_velocity_is_understood(folder, tmp_path):
     command = ["learn", f"{folder}/reference.npy", "--map", f"{tmp_path}/m.safetensors", "--velocity"]
     main([*command, *OPTIONS])
     assert DejaVu.load(tmp_path / "m.safetensors").step == STEP
+
+
+def test_a_second_visit_does_not_resample_the_reference_again(folder, tmp_path):
+    truth = f"{folder}/truth.csv"
+    words = ["compare", f"{folder}/reference.npy", f"{folder}/query.npy", *STEPS, "--features", "HOG"]
+    words += ["--truth", truth, "--ordered", "--whitening.numbers", "16", "--match", "single"]
+    main([*words, "--out", f"{tmp_path}/alone"])
+    alone = report_of(tmp_path / "alone")
+    np.save(tmp_path / "again.npy", (255 * footage(QUERY, 0.03)[:, 0]).byte().numpy())
+    for name in ("second", "calibration"):
+        more = [f"--{name}", f"{tmp_path}/again.npy", f"--{name}_truth", truth]
+        main([*words, *more, "--out", f"{tmp_path}/{name}"])
+        report = report_of(tmp_path / name)
+        assert (report["frames"], report["queries"]) == (alone["frames"], alone["queries"])
+        assert report["recall_at_1"] >= alone["recall_at_1"] - 0.05
