@@ -29,7 +29,7 @@ ARROWS = {
     "model_file": "text version types memory data features periods maps recognition motion",
     "model": "area text types resize data features maps recognition motion learning model_file",
     "teaching": "types memory data features maps recognition model",
-    "growth": "area types data features maps motion learning model_file model teaching",
+    "growth": "area types data features maps motion recognition learning model_file model teaching",
     "updating": "types data maps motion recognition model teaching growth",
     "cluster": "text types maps recognition",
     "live": "types memory data features recognition model",
