@@ -249,6 +249,12 @@ class TrainCLI(LightningCLI):
             for callback in self.trainer.callbacks:  # type: ignore[attr-defined]
                 if isinstance(callback, MapExport):
                     print_written(callback, self.datamodule, self.words)
+            tried = self.config_init[self.subcommand]["trainer"]["fast_dev_run"]
+            if tried and self.trainer.is_global_zero and self.trainer.global_step:
+                done = (
+                    f"fast_dev_run: {self.trainer.global_step} steps and a validation of as many batches went"
+                )
+                print(f"{done} through; nothing was written")
             last = self._last_checkpoint() if self.trainer.is_global_zero else None
             if self.trainer.interrupted and last is not None and not failed:
                 print_next("train", *self.words, "--ckpt_path", last, lead="to go on")
@@ -290,13 +296,20 @@ class TrainCLI(LightningCLI):
             return
         checkpoint = self.config_init[self.subcommand]["ckpt_path"]
         written = Path(self.trainer.default_root_dir) / self._written
-        print(f"figures of {checkpoint}")
+        print(f"figures of {checkpoint}{self._limited()}")
         if written.is_file():
             print_what_next(written, self.datamodule, self.model.dejavu, self.words)
         else:
             print_next("train", "export", *self.words[1:], "--ckpt_path", checkpoint)
 
     after_test = after_validate
+
+    def _limited(self) -> str:
+        """What part of the queries the figures are of, if not of all."""
+        stage = "test" if self.subcommand == "test" else "val"
+        limit = self.config_init[self.subcommand]["trainer"][f"limit_{stage}_batches"]
+        whole = limit is None or (isinstance(limit, float) and limit == 1)
+        return "" if whole else f", of a part of the queries (trainer.limit_{stage}_batches is {limit:g})"
 
     @property
     def _written(self) -> str:

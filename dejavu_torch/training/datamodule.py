@@ -103,6 +103,8 @@ class Clips(DistributedSampler[list[int]]):
         self.runs, self.clip = runs, clip
         # the same in all processes, whose other random numbers differ
         self.generator = torch.Generator().manual_seed(torch.initial_seed() % 2**63)
+        self.began = self.generator.get_state()  # before the latest epoch was drawn
+        self.passed = 0  # batches of it that a training had seen when it stopped
         self.total = sum(len(run) // clip for run in runs)
         self.clips = min(batch_size // clip, self.total) // processes  # of a process's part of a batch
         seen = f"there are {self.total} clips of {clip} frames and {processes} processes"
@@ -111,15 +113,22 @@ class Clips(DistributedSampler[list[int]]):
     def __len__(self) -> int:
         return self.total // (self.clips * self.num_replicas)
 
+    def resume(self, began: Tensor, seen: int) -> None:
+        """Go on after so many batches of an epoch, or with the next one."""
+        self.generator.set_state(began.cpu())
+        if seen >= len(self):
+            list(self)
+        self.passed = seen % len(self)
+
     def __iter__(self) -> Iterator[list[int]]:
-        starts = []
+        self.began, passed, self.passed, starts = self.generator.get_state(), self.passed, 0, []
         for run in self.runs:
             offset = int(torch.randint(len(run) % self.clip + 1, (), generator=self.generator))
             starts.append(run.start + offset + torch.arange(len(run) // self.clip) * self.clip)
         order = torch.cat(starts)[torch.randperm(self.total, generator=self.generator)]
         frames = order[:, None] + torch.arange(self.clip)
         batches = frames.split(self.clips * self.num_replicas)[: len(self)]  # complete ones only
-        return iter([batch.split(self.clips)[self.rank].flatten().tolist() for batch in batches])
+        return iter([batch.split(self.clips)[self.rank].flatten().tolist() for batch in batches[passed:]])
 
 
 class RouteData(LightningDataModule):
@@ -213,6 +222,9 @@ class RouteData(LightningDataModule):
         self.tolerance, self.batch_size, self.clip = tolerance, batch_size, clip
         self.resize = None if resize is None else (int(resize[0]), int(resize[1]))
         self.augmentation = Augmentation() if augmentation is None else augmentation
+        self.seen = 0  # batches of the epoch that a training has seen
+        self._clips: Clips | None = None
+        self._stopped: dict[str, Any] | None = None  # of the checkpoint that is resumed
         self.velocity, self.held_out = velocity, held_out
         self.routes: list[Traverse] = []  # at even steps if `velocity` is given
         self.sets: dict[str, StoredFrames] = {}
@@ -369,7 +381,27 @@ class RouteData(LightningDataModule):
         if self.trainer is not None:
             for one in self.sets.values():
                 one.move(self.trainer.strategy.root_device)
-        return self.training_batches(*self._processes)
+        loader = self.training_batches(*self._processes)
+        self._clips = cast(Clips, loader.sampler)
+        if self._stopped is not None:
+            self._clips.resume(self._stopped["clips"], self._stopped["seen"])
+        return loader
+
+    def state_dict(self) -> dict[str, Any]:
+        """Where a training stops: its random numbers, and the batches of the epoch that it has seen."""
+        if self._clips is None:
+            return {}
+        return {"random": torch.get_rng_state(), "clips": self._clips.began, "seen": self.seen}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Let the next training go on from there; an older checkpoint says nothing."""
+        self._stopped = state_dict or None
+
+    def go_on(self) -> None:
+        """Set the random numbers of a training that is resumed."""
+        if self._stopped is not None:
+            torch.set_rng_state(self._stopped["random"].cpu())
+            self._stopped = None
 
     @property
     def _processes(self) -> tuple[int, int]:

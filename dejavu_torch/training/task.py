@@ -264,13 +264,15 @@ class RouteTask(pl.LightningModule):
         return max(1, round(int(self.trainer.estimated_stepping_batches) / 10))
 
     def on_train_start(self) -> None:
-        """Let each process draw augmentation and noise of its own."""
+        """Let each process draw augmentation and noise of its own, from where a training stopped."""
         self._check_places()
+        self.data.go_on()
         if self.trainer.world_size > 1:
-            torch.manual_seed(torch.initial_seed() + self.global_rank)
+            torch.manual_seed(torch.initial_seed() + self.global_rank + 1009 * self.global_step)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """The weighted sum of the losses of a batch."""
+        self.data.seen = batch_idx + 1
         total, parts, left_out = self.losses(batch)
         parts = {name: part.detach() for name, part in parts.items()}
         if not total.isfinite():

@@ -10,6 +10,7 @@ from command_line import fails
 from helpers import refused
 from pytorch_lightning import Callback
 from pytorch_lightning.callbacks import ModelCheckpoint
+from safetensors.torch import load_file
 from small_training import (
     FRAMES,
     Stop,
@@ -64,6 +65,25 @@ def test_a_resumed_run_takes_the_steps_that_are_left(tmp_path, parts, kind):
     model = DejaVu.load(tmp_path / "map.safetensors")
     assert model.trained is not None
     assert (model.trained.steps, model.map.places) == (STEPS, FRAMES)
+
+
+@pytest.mark.parametrize("stopped", [3, 4, 5])
+@pytest.mark.parametrize("kind", ["templates", "spectral"])
+def test_a_run_that_stops_and_goes_on_is_as_one_that_does_not(tmp_path, kind, stopped):
+    """It draws the batches and augmentations that are left: in the middle of an epoch, and at its end."""
+    maps = []
+    for folder, ends in (("whole", (STEPS,)), ("parts", (stopped, STEPS))):
+        torch.manual_seed(3)
+        checkpoint = None
+        for end in ends:
+            task, data, stop = KINDS[kind](), data_of(), tmp_path / f"{end}.ckpt"
+            running = trainer(tmp_path / folder, Stop(end, stop), max_steps=STEPS)
+            running.fit(task, data, ckpt_path=checkpoint)
+            checkpoint = stop
+            torch.manual_seed(3)  # as of a new process
+        maps.append(load_file(tmp_path / folder / "map.safetensors"))
+    assert maps[0].keys() == maps[1].keys()
+    assert all(torch.equal(maps[0][name], maps[1][name]) for name in maps[0])
 
 
 # refusals ------------------------------------------------------------------------------------------------

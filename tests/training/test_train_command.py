@@ -62,6 +62,15 @@ def test_test_and_validate_take_the_last_checkpoint(folder, capsys):
         assert {row[0]: float(row[1]) for row in rows} == pytest.approx(expected, abs=1e-6)
 
 
+def test_a_trial_and_a_part_of_the_queries_are_told(folder, capsys):
+    train("fit", "--trainer.fast_dev_run=2")
+    assert "fast_dev_run: 2 steps and a validation of as many batches went through" in capsys.readouterr().out
+    given = "--data.query=two.npy", "--data.truth=0", "--data.batch_size=8", "--trainer.limit_test_batches=2"
+    train("test", *given)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-2].endswith(".ckpt, of a part of the queries (trainer.limit_test_batches is 2)")
+
+
 def test_a_source_alone_is_enough(tmp_path, monkeypatch):
     """Steps, validations and checkpoints have defaults; here but a few steps are taken."""
     monkeypatch.chdir(tmp_path)
