@@ -128,7 +128,8 @@ def answer_drives(drives: Sequence[DriveQuery], progress: bool = False) -> list[
     smoothed in one pass, which takes hardly longer than that of a single one.
 
     Of queries that are no drive of the map, the answers are those of single queries, and a probability is the
-    lower one of the single query and the smoother; of one query alone it is its own.
+    lower one of the single query and the smoother; of one query alone, or where single queries find the map
+    plainly, it is their own.
 
     Returns:
         For each a Match of (Q,k), with probability and confidence, all accepted that have a finite score;
@@ -171,7 +172,8 @@ def _shown(asked: DriveQuery, seen: Seen) -> Shown:
         probability = near_in_plane(mass, within, area).gather(1, at)[:, 0]
     if not asked.answers and asked.platt is not None:
         by_itself = asked.platt.probability(confidence_of(scores, area, asked.platt.margin))
-        probability = by_itself if queries == 1 else torch.minimum(probability, by_itself)
+        trusted = queries == 1 or (smoother.singly is not None and smoother.singly.enough)
+        probability = by_itself if trusted else torch.minimum(probability, by_itself)
     if not asked.answers and smoother.singly is not None:
         probability = doubted(probability, smoother.singly.odds)
         if asked.platt is None and not smoother.singly.stands_out:

@@ -25,6 +25,7 @@ UPPER = 0.1  # share of the queries that have to be sure: the others may be off 
 # of `python -m benchmarks cross`: by what share of the null's level the surest tenth is surer; the second one
 # will do if the motion alone shows so many nats for each query
 STANDS_OUT, A_LITTLE, PLAINLY = 0.21, 0.1, 3.0
+BY_THEMSELVES = 0.4  # likewise: of 417 drives over other ground one has more than .2, and it has .37
 OF_AREA = 0.34  # in place of `STANDS_OUT`: over a plane a path may turn anywhere, so its motion tells less
 FAITHFUL = 0.7  # of the descriptors are kept: the code of a map that keeps less hides what single images tell
 ALONE = 0.55  # nats for each query that its motion alone has to show there
@@ -53,6 +54,12 @@ class Singly(NamedTuple):
     def stands_out(self) -> bool:
         """Whether single images find the map."""
         return self.shown >= (1 - (A_LITTLE if self.nats >= PLAINLY else self.least)) * self.null
+
+    @property
+    def enough(self) -> bool:
+        """Whether single images find the map so plainly that they need no motion, as of a drive whose other
+        half is off the map."""
+        return self.shown >= (1 - BY_THEMSELVES) * self.null
 
     @property
     def odds(self) -> float:

@@ -93,6 +93,23 @@ def test_images_that_find_the_map_are_not_doubted():
     assert Singly(-0.8, -0.9, 100).odds == pytest.approx(1 / 9)
 
 
+def test_single_images_that_find_the_map_plainly_need_no_motion(model):
+    """Every other one is off the map, so that no path explains them."""
+    platt = Platt(10.0, 7.0)
+    draw = torch.Generator().manual_seed(4)
+    own = seen_again(walk(400, 0)[torch.randperm(400, generator=draw)[:100]], 5)
+    mixed = torch.stack([own, walk(100, 9)[torch.randperm(100, generator=draw)]], 1).flatten(0, 1)
+    smoother = PlaceSmoother()
+    match = model.localize_descriptors(mixed, model.matching(smoother)._replace(platt=platt))
+    assert not smoother.is_drive
+    assert smoother.singly is not None
+    assert smoother.singly.enough
+    single = model.localize_descriptors(mixed, model.matching()._replace(platt=platt))
+    assert torch.allclose(match.probability, single.probability, atol=1e-3)
+    assert not Singly(-0.7, -0.95, 100).enough
+    assert Singly(-0.5, -0.95, 100).enough
+
+
 @pytest.mark.parametrize("queries", [1, 3, 9])
 def test_of_few_queries_single_images_tell_nothing(model, queries):
     """They would be mirrored about themselves."""
