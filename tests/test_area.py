@@ -368,7 +368,7 @@ def flown(step):
 def test_a_flight_is_found_where_single_images_are_not():
     model, own, truth = flown(step=0.05)
     area, draw = model.map.area, torch.Generator().manual_seed(1)
-    queries = own[truth] + 0.25 * torch.randn(90, own.shape[1], generator=draw)
+    queries = own[truth] + 0.22 * torch.randn(90, own.shape[1], generator=draw)
 
     def near(match):
         return float((distance(match.index.clamp(min=0), truth, area) <= 2).double().mean())
