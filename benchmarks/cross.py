@@ -174,7 +174,7 @@ def run_cross(
         maps: names of those that are asked; all if not given
         seed: of the stretches in random order
         choose: print where a drive is best told from others by its single images and by its motion, on some
-            of the footage, for `STANDS_OUT`, `PER_QUERY` and `ALONE` of `recognition.taken`
+            of the footage, for the constants of `recognition.taken`
         rate: bytes per place of the maps' lines, instead of the default
     """
     if unknown := [name for name in maps if name not in MAPS]:
@@ -201,6 +201,7 @@ def chosen(rows: Sequence[Row]) -> str:
         "surer by": (surer, lambda row: per_query(row) >= PER_QUERY),
         "nats": (per_query, lambda row: surer(row) >= STANDS_OUT),
         "nats alone": (per_query, lambda row: True),
+        "surer alone": (surer, lambda row: True),
     }
     lines = []
     for (way, (value, told)), wanted, flights in product(ways.items(), (True, False), (False, True)):

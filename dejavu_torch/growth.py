@@ -404,7 +404,9 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
         *["precision"] * (precision is None and any(model.precision is not None for model in models)),
     ]
     if dropped:
-        log.warning("the merged map has no %s: not all routes have the same, or any", ", ".join(dropped))
+        log.warning(
+            "the merged map has no %s: the routes differ in that, or one has none", ", ".join(dropped)
+        )
     place_map = SpectralMap.merged([*parts.values()], [*parts])
     starts = accumulate(model.map.places for model in models)
     links = [

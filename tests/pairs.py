@@ -62,8 +62,8 @@ Shares = tuple[float, float]  # of queries that are found, and that are accepted
 class Subject(NamedTuple):
     """What is learned: its sources, further words, and commands that make the map from it.
 
-    second, drive, more: other visits, and new ground. far: how far the answers are from the right ones, in
-    units of which `NEAR` are right. asked: words of all commands that ask. truth: for `compare`.
+    second, drive, more: other visits, and new ground. truth: of the visits. asked: words of all commands
+    that ask. then: commands after learning.
     """
 
     sources: tuple[str, ...]
@@ -73,7 +73,6 @@ class Subject(NamedTuple):
     drive: str
     more: str
     truth: str = "0"
-    offset: int = 0
     asked: tuple[str, ...] = ()
     then: tuple[tuple[str, ...], ...] = ()
 
@@ -94,7 +93,7 @@ SUBJECTS = {
     ),
     "loops": Subject(
         *(("{made}/twice.npy",), FEW, "{made}/twice.npy", "{made}/thrice.npy", "{made}/thrice.npy"),
-        *(seen(2, 0, "?stop=60"), "{made}/twice.csv", 0, ("--loops", "40", "--ordered")),
+        *(seen(2, 0, "?stop=60"), "{made}/twice.csv", ("--loops", "40", "--ordered")),
     ),
     "merged": ROUTE._replace(
         then=(
@@ -114,7 +113,7 @@ SUBJECTS = {
     )._replace(asked=("--ordered",)),
     "even steps": Subject(
         *(("{made}/reference.npy",), (*STEPS, *FEW), "{made}/query.npy", "{made}/again.npy"),
-        *("{made}/again.npy", "{made}/more_frames.npy", "{made}/truth.csv", 0, ("--ordered",)),
+        *("{made}/again.npy", "{made}/more_frames.npy", "{made}/truth.csv", ("--ordered",)),
     ),
     "templates": ROUTE._replace(
         words=("--config", "local_maxima", "--mapper.periods.window", "128"),
@@ -286,7 +285,7 @@ class Table:
             if action.query is not None:
                 query = action.query(query, self.made)
         marks["query"] = query.format(made=self.made)
-        asked = [*dict.fromkeys(words(subject.asked))] if len(subject.asked) == 1 else words(subject.asked)
+        asked = words(subject.asked)
         for action in done:
             asked += [word for word in words(action.ask) if word != "--ordered" or word not in asked]
         commands = {action.command for action in done} - {"localize"}

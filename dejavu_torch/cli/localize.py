@@ -25,7 +25,6 @@ from dejavu_torch.data.output import check_output_file
 from dejavu_torch.data.source import check_not_read, open_source
 from dejavu_torch.data.traverse import Whole
 from dejavu_torch.evaluation.answers import describe_probable, next_steps, probable_counts
-from dejavu_torch.growth import only_route
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.ground_plane import check_corners
 from dejavu_torch.motion.resampling import source_of
@@ -84,9 +83,7 @@ def run_localize(
         check_cluster(cluster, loading.device)
         options.refuse_with(f"--cluster {cluster}", match=matcher not in (None, "auto") and sequences.way)
         matcher = None
-    model = loading.model(map)
-    if route is not None:
-        only_route(model, route)
+    model = loading.model(map, route)
     searching.of(model)
     if corners is not None:
         why = "--as_is measures no ground" if loading.as_is else f"{map} was learned without --velocity"
@@ -229,9 +226,7 @@ def run_live(
     matcher = sequences.matcher(SUPPRESSION, acceptance.threshold)
     assert not isinstance(matcher, str)  # the default is the filter
     acceptance.check(matcher)
-    model = loading.model(map)
-    if route is not None:
-        only_route(model, route)
+    model = loading.model(map, route)
     searching.of(model)
     acceptance.of(model)
     model.matching(matcher)

@@ -197,9 +197,10 @@ class Loading:
     device: str = "cpu"
     features: nn.Module | None = None
 
-    def model(self, path: Path) -> DejaVu:
-        """The model of a map file, on the device."""
+    def model(self, path: Path, route: str | None = None) -> DejaVu:
+        """The model of a map file, or of one route of it, on the device."""
         model = load_map(path, self.features).to(device_of(self.device))
+        model = model if route is None else growth.only_route(model, route)
         model.velocity = None if self.as_is else model.velocity
         return model
 

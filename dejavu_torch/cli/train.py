@@ -251,10 +251,8 @@ class TrainCLI(LightningCLI):
                     print_written(callback, self.datamodule, self.words)
             tried = self.config_init[self.subcommand]["trainer"]["fast_dev_run"]
             if tried and self.trainer.is_global_zero and self.trainer.global_step:
-                done = (
-                    f"fast_dev_run: {self.trainer.global_step} steps and a validation of as many batches went"
-                )
-                print(f"{done} through; nothing was written")
+                steps = self.trainer.global_step
+                print(f"fast_dev_run: {steps} steps and {steps} batches of validation; nothing was written")
             last = self._last_checkpoint() if self.trainer.is_global_zero else None
             if self.trainer.interrupted and last is not None and not failed:
                 print_next("train", *self.words, "--ckpt_path", last, lead="to go on")

@@ -64,7 +64,7 @@ def test_test_and_validate_take_the_last_checkpoint(folder, capsys):
 
 def test_a_trial_and_a_part_of_the_queries_are_told(folder, capsys):
     train("fit", "--trainer.fast_dev_run=2")
-    assert "fast_dev_run: 2 steps and a validation of as many batches went through" in capsys.readouterr().out
+    assert "fast_dev_run: 2 steps and 2 batches of validation; nothing was written" in capsys.readouterr().out
     given = "--data.query=two.npy", "--data.truth=0", "--data.batch_size=8", "--trainer.limit_test_batches=2"
     train("test", *given)
     lines = capsys.readouterr().out.splitlines()
