@@ -348,6 +348,7 @@ def test_compare_judges_the_map_of_a_file(trained_map, capsys):
 WRONG = {  # a line of words behind `dejavu`, and what its one line holds
     "dance": ("dance", "localize"),
     "bench scale --out r --places 8": ("python -m benchmarks", "clone"),
+    "compare a b --tolerance 5m --out o": ("--tolerance is 5m", "metres", "--truth metres:5"),
     "demo --seed x": ("--seed is x", "expected int"),
     "learn a.npy --map m --threshold high": ("--threshold is high", "expected float"),
     "learn a.npy --map m --weight_bits 4": ("--weight_bits is 4", "[8, 32]"),

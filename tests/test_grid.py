@@ -23,12 +23,15 @@ import dejavu_torch.data.picture as pictures
 import dejavu_torch.memory as memory
 from dejavu_torch import DejaVu, SpectralMapper, compare, open_source
 from dejavu_torch.area import Ground
-from dejavu_torch.data.coordinates import coordinates_of
+from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.data.coordinates import coordinates_of, read_coordinates
 from dejavu_torch.data.flight import Flight
 from dejavu_torch.data.grid import Grid
+from dejavu_torch.data.ground_truth import find_ground_truth
 from dejavu_torch.data.picture import Picture, read_picture
 from dejavu_torch.data.source import check_not_read
 from dejavu_torch.resize import resize_frames
+from dejavu_torch.types import Coordinates
 
 UTM = "EPSG:32632"
 ROAD = Path(folder.__file__).parent / "road"
@@ -123,20 +126,49 @@ def test_coordinates_are_those_of_the_map(geotiff, turned):
     assert grid.coordinates.values[place].tolist() == pytest.approx([x, y], abs=1e-3)
 
 
-@pytest.mark.parametrize("crs", ["EPSG:4326", "EPSG:3857", "EPSG:900913", "EPSG:3395", "EPSG:25832"])
-def test_other_coordinates_become_metres_on_the_ground(geotiff, crs):
+@pytest.mark.parametrize(
+    ("crs", "steps"),
+    [
+        ("EPSG:4326", (1e-5, 0, 0, -1e-5)),
+        ("EPSG:4326", (7e-6, 5e-6, 7e-6, -5e-6)),
+        ("EPSG:3857", (1.5, 0, 0, -1.5)),
+        ("EPSG:3395", (1.5, 0, 0, 1.5)),
+        ("EPSG:25833", (1, 0, 0, -0.5)),
+        ("EPSG:25833", (1, 0.3, 0.3, -1.0)),
+        ("EPSG:25833", (0.8, 0.6, 0.6, -0.8)),
+    ],
+)
+@pytest.mark.parametrize("bands", [1, 3])
+def test_windows_are_squares_of_metres_on_the_ground(geotiff, crs, steps, bands):
+    from rasterio import Affine
     from rasterio.warp import transform
 
-    metre = {"EPSG:4326": 1e-5, "EPSG:25832": 1.0}.get(crs, 1.5)
+    def shade(x, y):  # of the ground, by metres of UTM
+        return 128 + 60 * np.sin((x - 400_000) / 7) + 60 * np.cos((y - 5_300_000) / 11)
+
     (x,), (y,) = transform("EPSG:32633", crs, [400_000], [5_300_000])
+    across, down, height, width = *steps[::2], 100, 140
+    place = Affine(across, down, x, *steps[1::2], y)
+    columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    seen = transform(crs, "EPSG:32633", *(one.ravel() for one in place @ (columns, rows)))
+    pixels = shade(*map(np.array, seen)).reshape(1, height, width).round().astype(np.uint8)
     grid = open_source(
-        f"grid:{geotiff(ground(100, 140), crs=crs, at=(x, y), size=metre)}?window=20&stride=20"
+        f"grid:{geotiff(pixels.repeat(bands, 0), crs=crs, transform=place)}?window=20&stride=10"
     )
-    frame = crs if crs == "EPSG:25832" else "EPSG:32633"
-    assert grid.coordinates.frame == frame
-    known = transform(crs, frame, [x + (20 * 4 + 10) * metre], [y - (20 * 3 + 10) * metre])
-    place = int(grid.area.place_at(torch.tensor([3, 4])))
-    assert grid.coordinates.values[place].tolist() == pytest.approx([one[0] for one in known], abs=0.01)
+    right, first = np.array(grid.area.right), torch.tensor(grid.area.first)
+    assert np.hypot(*right) == pytest.approx(np.hypot(*grid.area.down), rel=0.01)
+    assert abs(right @ grid.area.down) < 0.01 * (right @ right)
+    assert grid.area.frame == (crs if crs == "EPSG:25833" else "EPSG:32633")
+    whole = grid.picture[:, 0 : grid.picture.shape[1], 0 : grid.picture.shape[2]]
+    line = torch.tensor(np.mgrid[: whole.shape[1], : whole.shape[2]][::-1].copy(), dtype=torch.float64) - 9.5
+    along = torch.tensor([grid.area.right, grid.area.down], dtype=torch.float64) / 10
+    at = line.permute(1, 2, 0) @ along + first
+    inside = whole[0] > 0
+    inside[[0, -1]] = inside[:, [0, -1]] = False  # where the file ends
+    off = (whole[0].double() - torch.from_numpy(shade(*at.numpy().transpose(2, 0, 1)))).abs()[inside]
+    assert len(off) > 3000
+    assert len(whole) == bands
+    assert float(off.quantile(0.99)) < 4
 
 
 def test_two_geotiffs_are_compared_in_metres(geotiff):
@@ -150,6 +182,14 @@ def test_two_geotiffs_are_compared_in_metres(geotiff):
     report = found.report.as_json()
     assert report["recall_at_1"] > 0.8
     assert report["unit"] == "metres"
+    assert "shift" not in report
+    values = query.coordinates.values
+    for x, y in ((-12.0, 12.0), (14.0, 0.0)):  # corners, and others' coordinates
+        query.coordinates = Coordinates(values + torch.tensor([x, y]), frame=UTM)
+        told = compare(reference, query, tolerance=3, model=found.run.model).report
+        assert (told.facts["shift"]["x"], told.facts["shift"]["y"]) == pytest.approx((-x, -y), abs=3)
+        assert "the answers contradict the truth" in repr(told)
+    query.coordinates = Coordinates(values, frame=UTM)
     told = repr(found.run.model.summary())
     assert "an area of 10 x 11 windows" in told
     periods = told.split("strongest periods ")[1].split("\n")[0].split(", ")
@@ -255,9 +295,29 @@ def test_without_rasterio_coordinates_are_pixels(geotiff, monkeypatch, caplog):
     assert "pip install 'dejavu_torch[geo]'" in record.getMessage()
 
 
-def test_a_map_projection_that_bends_is_refused(geotiff):
-    with refused("a.tif", "EPSG:4326", "bend by", "gdalwarp -t_srs EPSG:32632"):
-        open_source(f"grid:{geotiff(ground(70, 80), crs='EPSG:4326', at=(5, 52), size=0.1)}?window=32")
+def test_what_cannot_be_reprojected_is_refused(geotiff):
+    from rasterio import open as opened
+
+    path = geotiff(ground(70, 80)[:1], crs="EPSG:4326", at=(5, 52), size=1e-5, photometric="PALETTE")
+    with opened(path, "r+") as file:
+        file.write_colormap(1, {value: (value, 0, 0, 255) for value in range(256)})
+    with refused("a.tif", "palette", "gdalwarp -t_srs EPSG:32631"):
+        open_source(f"grid:{path}?window=32")
+
+
+def test_latitudes_are_those_of_the_map(geotiff, tmp_path):
+    grid = open_source(f"grid:{geotiff(ground(100, 140), at=(500_000, 5_300_000))}?window=20&stride=20")
+    (tmp_path / "photos.csv").write_text("lat,lon\n47.85,9.0005\nnan,nan\n")
+    own = ArrayTraverse(torch.zeros(2, 20, 20, dtype=torch.uint8))
+    own.coordinates, _ = read_coordinates(tmp_path / "photos.csv", own)
+    stored, asked = coordinates_of([grid, own], "metres")
+    assert asked[0].tolist() == pytest.approx([500_037.4, 5_299_628.6], abs=0.1)  # 9 degrees east are 500 km
+    assert asked[1].isnan().all()
+    assert torch.equal(stored, grid.coordinates.values)
+    swapped = own.coordinates._replace(values=asked.flip(1), degrees=False)
+    own.coordinates = swapped
+    with refused("6.79e+06 m from that of", "a.tif", UTM, "or lat,lon"):
+        find_ground_truth("metres:5", grid, own, len(grid), 2)
 
 
 @pytest.mark.parametrize(

@@ -9,11 +9,19 @@ from dejavu_torch.model_file import REGISTRY
 from dejavu_torch.text import one_line
 from dejavu_torch.types import InputError
 
+UNITS = {
+    "--tolerance": ", of frames; in an area, of its metres or pixels; or --truth metres:5 by coordinates"
+}
 LONGEST = 300  # characters of a message; longer ones are cut
 
 
 class UsageError(InputError):
     """A command line or config file that the commands do not understand."""
+
+
+UNITS = {
+    "--tolerance": ", of frames; in an area, of its metres or pixels; or --truth metres:5 by coordinates"
+}
 
 
 def causes(error: BaseException | None) -> Iterator[BaseException]:
@@ -84,5 +92,5 @@ def _of_a_value(option: str, text: str) -> str:
     value = re.match(r"Expected an? (.*)\. Got value: (.*)", text, re.DOTALL)
     if value:
         none = "null, or " if value[2].lower() == "none" else ""
-        return f"{option} is {value[2]}; expected {none}{value[1]}"
+        return f"{option} is {value[2]}; expected {none}{value[1]}{UNITS.get(option, '')}"
     return f"{option} {text}" if text.startswith("is ") else f"{option}: {text}"

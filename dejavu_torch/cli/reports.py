@@ -382,8 +382,8 @@ def _print_run(run: Localization) -> None:
 
 def _print_contradiction(report: Report) -> None:
     """Say first if the answers contradict the ground truth."""
-    if report.ours.scores is not None and "line" in report.facts:
-        say(describe_line(report.facts, True))
+    if report.ours.scores is not None and (line := describe_line(report.facts, True)):
+        say(line)
 
 
 def _print_scores(report: Report, out: Path) -> None:

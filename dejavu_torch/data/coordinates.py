@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.files import as_number, read_rows
+from dejavu_torch.data.geotiff import from_degrees
 from dejavu_torch.types import Coordinates, InputError, Traverse, expect
 
 log = logging.getLogger("dejavu_torch")
@@ -32,6 +33,7 @@ EXPECTED = (
 PAIRS = ("x", "y"), ("lat", "lon"), ("latitude", "longitude"), ("easting", "northing")  # columns
 TIMES = "time", "timestamp"
 UNITS = (1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3)  # times above are in nano-, micro- or milliseconds
+OF_MAPS = re.compile(r"EPSG:|.*\[")  # coordinate systems, by number or as text; not pixels
 GAP = 1.0  # seconds between two rows within which no frame has coordinates
 
 
@@ -40,6 +42,11 @@ class Near(NamedTuple):
 
     kind: Kind
     radius: float
+
+    @property
+    def unit(self) -> str:
+        """ "px" or "m"."""
+        return "px" if self.kind == "pixels" else "m"
 
 
 class Fix(NamedTuple):
@@ -53,7 +60,8 @@ class Fix(NamedTuple):
 
 def coordinates_of(traverses: Sequence[Traverse], kind: Kind) -> list[Tensor]:
     """Coordinates of traverses in one frame, (N,2) or (N,3) float64 metres each, NaN for frames without. They
-    are those that the traverses carry, for "metres" and "pixels", if one does, else those in names.
+    are those that the traverses carry, for "metres" and "pixels", if one does, else those in names. Degrees
+    are converted to the coordinate system of the other traverse, if it is that of a map.
 
     Raises:
         InputError: as `named_coordinates`; only some traverses that carry some, or of different kinds or
@@ -68,6 +76,8 @@ def coordinates_of(traverses: Sequence[Traverse], kind: Kind) -> list[Tensor]:
             seen = f"{other} has coordinates and {traverse.name} none"
             raise InputError(f"{seen}; expected 'SOURCE?coordinates=FILE' for both")
     known = [own for own in carried if own is not None]
+    if frame := next((own.frame for own in known if OF_MAPS.match(own.frame)), ""):
+        known = [Coordinates(from_degrees(own.values, frame)) if own.degrees else own for own in known]
     expect(len({own.degrees for own in known}) < 2, "one kind", "coordinates in metres and in degrees")
     if known[0].degrees:
         return in_metres([own.values for own in known])
@@ -221,13 +231,13 @@ def named_coordinates(traverses: Sequence[Traverse], kind: Kind) -> list[Tensor]
 
 
 def in_metres(tables: Sequence[Tensor]) -> list[Tensor]:
-    """Latitudes and longitudes (N,2) in degrees as metres north and east of their mean, (N,2) each.
+    """Latitudes and longitudes (N,2) in degrees as metres east and north of their mean, (N,2) each.
 
     Source: radii of curvature of the WGS84 ellipsoid. Within 50 km of the mean lengths are right to 1 %.
 
     Example:
         >>> (one,) = in_metres([torch.tensor([[48.0, 11.0], [48.001, 11.0]], dtype=torch.float64)])
-        >>> round(float(one[1, 0] - one[0, 0]), 1)
+        >>> round(float(one[1, 1] - one[0, 1]), 1)
         111.2
     """
     every = torch.cat([*tables])
@@ -241,7 +251,7 @@ def in_metres(tables: Sequence[Tensor]) -> list[Tensor]:
     along = MAJOR * (1 - ECCENTRICITY**2) / flat**1.5  # radius of a meridian
     across = MAJOR / math.sqrt(flat) * math.cos(latitude)
     scale = torch.tensor([along, across], dtype=torch.float64)
-    return [(one - centre).deg2rad() * scale for one in wrapped]
+    return [((one - centre).deg2rad() * scale).fliplr() for one in wrapped]
 
 
 def _fixes(traverse: Traverse, kind: Kind) -> list[Fix]:

@@ -7,9 +7,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from dejavu_torch.area import Ground
@@ -18,10 +19,12 @@ from dejavu_torch.data.folder import as_bytes
 from dejavu_torch.types import Facts, expect
 
 UNREAD, EXPECTED = "cannot be read as a TIFF", "a GeoTIFF of grey, RGB or more bands"
-DEGREES, STRETCHED = "EPSG:4326", 0.01  # by how much metres of a map may differ from those on the ground
+DEGREES = "EPSG:4326"
+STRETCHED = 0.01  # by how much the sides of a pixel may differ from each other, and from metres on the ground
+EDGES, ROUNDING = 21, 1e-3  # points along a side that bound a file elsewhere; pixels
 KIND = "IMAGE_STRUCTURE"
+Points: TypeAlias = "np.ndarray[Any, np.dtype[np.float64]]"  # (N,2)
 CACHE = 2**28  # bytes of decoded blocks that GDAL keeps
-BENT = 1.0  # metres, or pixels if these are larger, by which rows may differ from a straight line
 
 
 def has_rasterio() -> bool:
@@ -40,20 +43,35 @@ class GeoTiff:
         shape: (C,H,W). ground: where they lie; None without coordinates. plain: whether its pixels are values
             of grey or colours, not single bits, or numbers of a palette.
 
-    Convention: the first three bands are colours; of fewer, the first is grey.
+    Convention: the first three bands are colours; of fewer, the first is grey. Pixels with coordinates are
+        squares whose sides are metres on the ground, as a camera sees them. A file of others is reprojected
+        while it is read, to the UTM zone of its middle, or, if it is in metres already, to its own system.
 
     Raises:
-        InputError: no TIFF, or coordinates that no plane fits; while reading, values outside [0, 1].
+        InputError: no TIFF, or one to be reprojected that is not `plain`; while reading, values outside
+            [0, 1].
     """
 
     def __init__(self, path: Path) -> None:
-        self.path, self._file, self._owner = path, None, 0
+        self.path, self._file, self._owner, self._system = path, None, 0, ""
         with self._opened() as file:
             self.bands = [1, 2, 3] if file.count >= 3 else [1]
-            self.shape = len(self.bands), file.height, file.width
             kind = {*file.tags(ns=KIND), *file.tags(1, ns=KIND), file.colorinterp[0].name}
             self.plain = kind.isdisjoint({"NBITS", "MINISWHITE", "palette"})
-            self.ground = None if file.crs is None or file.transform.is_identity else _ground(path, file)
+            placed = file.crs is not None and not file.transform.is_identity
+            system = _system_of_squares(file) if placed else ""
+        if system:
+            seen = f"{path} has a palette, or bits, and pixels that are not square metres"
+            expect(
+                self.plain, f"colours, as by gdal_translate -expand rgb and gdalwarp -t_srs {system}", seen
+            )
+            self._file, self._system = None, system
+        with self._opened() as file:
+            self.shape, at = (len(self.bands), file.height, file.width), file.transform
+            ground = Ground(
+                (at.c, at.f), (at.a, at.d), (at.b, at.e), "m", _name_of(file.crs) if placed else ""
+            )
+            self.ground = ground if placed else None
 
     def __getstate__(self) -> Facts:
         return self.__dict__ | {"_file": None}
@@ -65,7 +83,8 @@ class GeoTiff:
         with reading(self.path, UNREAD, EXPECTED), rasterio.Env(GDAL_CACHEMAX=CACHE):
             try:
                 if self._file is None or self._owner != os.getpid():
-                    self._file = rasterio.open(self.path.absolute(), driver="GTiff")
+                    file = rasterio.open(self.path.absolute(), driver="GTiff")
+                    self._file = _reprojected(file, self._system) if self._system else file
                     self._owner = os.getpid()
                 yield self._file
             except rasterio.errors.RasterioIOError as error:
@@ -78,24 +97,68 @@ class GeoTiff:
             return as_bytes(self.path, np.where(seen, file.read(self.bands, **part), 0))
 
 
-def _ground(path: Path, file: Any) -> Ground:
-    """The coordinates of the file, if they are metres on the ground; else those of its zone of UTM."""
-    crs, corner, code = file.crs, file.transform, file.crs.to_epsg()
-    convert = import_module("rasterio.warp").transform
-    at = np.array([(x * file.width, y * file.height) for x in (0, 0.5, 1) for y in (0, 0.5, 1)])
-    points = at @ [[corner.a, corner.d], [corner.b, corner.e]] + [corner.c, corner.f]
-    (longitude,), (latitude,) = convert(crs, DEGREES, *points[4:5].T.tolist())
+def from_degrees(values: Tensor, system: str) -> Tensor:
+    """Latitudes and longitudes (N,2) as x and y (N,2) in a coordinate system, float64; NaN stays."""
+    expect(has_rasterio(), "pip install 'dejavu_torch[geo]'", f"degrees to be converted to {system}")
+    known, found = ~values.isnan().any(1), torch.full_like(values, torch.nan)
+    found[known] = torch.from_numpy(_converted(DEGREES, system, values[known].fliplr().numpy()))
+    return found
+
+
+def _converted(one: Any, other: Any, points: Points) -> Points:
+    """Points (N,2) of one coordinate system in another; degrees as longitude and latitude."""
+    x, y = import_module("rasterio.warp").transform(one, other, *points.T.tolist())
+    return np.column_stack([x, y])
+
+
+def _name_of(crs: Any) -> str:
+    code = crs.to_epsg()
+    return f"EPSG:{code}" if code else str(crs.to_wkt())
+
+
+def _at(file: Any, pixels: Points) -> Points:
+    """Coordinates of pixels (N,2), column and row, in the file's own system."""
+    corner = file.transform
+    steps = np.array([(corner.a, corner.d), (corner.b, corner.e)])
+    placed: Points = pixels @ steps + np.array([corner.c, corner.f])
+    return placed
+
+
+def _middle(file: Any) -> Points:
+    """The middle of a file, and those one column and one row behind it, (3,2), in its own system."""
+    middle = np.array([file.width, file.height]) / 2
+    return _at(file, middle + np.array([(0, 0), (1, 0), (0, 1)]))
+
+
+def _system_of_squares(file: Any) -> str:
+    """The coordinate system in which the pixels of a file become squares of metres; "" if they are that."""
+    crs, points = file.crs, _middle(file)
+    longitude, latitude = _converted(crs, DEGREES, points)[0]
     zone = f"EPSG:{32601 + 100 * (latitude < 0) + int((longitude + 180) // 6) % 60}"
-    known = np.array(convert(crs, zone, *points.T.tolist())).T
-    known, origin, terms = known - known[4], known[4], np.column_stack([at, np.ones(len(at))])
-    fit = np.linalg.lstsq(terms, known, rcond=None)[0]
-    longer = np.hypot(*fit[:2].T) / np.hypot([corner.a, corner.b], [corner.d, corner.e])
+    steps, seen = (np.diff(at[[0, 1, 0, 2]], axis=0)[::2] for at in (points, _converted(crs, zone, points)))
+    told = np.hypot(*steps.T)
     metres = crs.is_projected and crs.linear_units_factor[1] == 1
-    if metres and (np.abs(longer - 1) <= STRETCHED).all():
-        frame = f"EPSG:{code}" if code else crs.to_wkt()
-        return Ground((corner.c, corner.f), (corner.a, corner.d), (corner.b, corner.e), "m", frame)
-    bent = np.abs(terms @ fit - known).max()
-    seen = f"{path} has coordinates of {f'EPSG:{code}' if code else 'a system'} that bend by {bent:.3g} m"
-    expect(bent <= max(BENT, np.hypot(*fit[0])), f"metres, as by gdalwarp -t_srs {zone}", seen)
-    right, down, first = ((float(x), float(y)) for x, y in (*fit[:2], fit[2] + origin))
-    return Ground(first, right, down, "m", zone)
+    if not metres or not np.allclose(np.hypot(*seen.T) / told, 1, 0, STRETCHED):
+        return zone
+    across, down = steps / told[:, None]
+    square = abs(told[0] / told[1] - 1) <= STRETCHED and abs(across @ down) <= STRETCHED
+    return "" if square else _name_of(crs)
+
+
+def _reprojected(file: Any, system: str) -> Any:
+    """A file as it would be in a coordinate system, bilinear: north up, transparent beside it, in squares of
+    the shorter side of the pixels in its middle."""
+    rasterio, enums = import_module("rasterio"), import_module("rasterio.enums")
+    middle, *ends = _converted(file.crs, system, _middle(file))
+    side = float(np.hypot(*(np.array(ends) - middle).T).min())
+    parts = np.linspace(0, 1, EDGES)
+    every = np.stack(np.meshgrid(parts * file.width, parts * file.height), -1).reshape(-1, 2)
+    seen = _converted(file.crs, system, _at(file, every))
+    (left, bottom), (right, top) = seen.min(0), seen.max(0)
+    width, height = np.ceil(np.array([right - left, top - bottom]) / side - ROUNDING).astype(int).tolist()
+    place = rasterio.Affine.translation(left, top) @ rasterio.Affine.scale(side, -side)
+    told = {flag for flags in file.mask_flag_enums for flag in flags}
+    options = {"crs": system, "transform": place, "width": width, "height": height}
+    if told.isdisjoint({enums.MaskFlags.alpha, enums.MaskFlags.nodata}):
+        options["add_alpha"] = True
+    return import_module("rasterio.vrt").WarpedVRT(file, resampling=enums.Resampling.bilinear, **options)

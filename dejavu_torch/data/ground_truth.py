@@ -21,7 +21,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from dejavu_torch.area import Area
 from dejavu_torch.data.coordinates import FORMS as COORDINATES
-from dejavu_torch.data.coordinates import Near, coordinates_of
+from dejavu_torch.data.coordinates import OF_MAPS, Near, coordinates_of
 from dejavu_torch.data.files import LARGEST, as_number, check_regular
 from dejavu_torch.data.truth_files import places_of_queries, read_csv, read_json, read_matrices
 from dejavu_torch.memory import check_room
@@ -192,7 +192,7 @@ def near_truth(reference: Tensor, query: Tensor, radius: float) -> Tensor:
 def check_unit(near: Near, area: Area) -> None:
     """Refuse a distance in pixels for an area in metres, and the reverse."""
     seen = f"truth {near.kind}:{near.radius:g}, and coordinates of the area in {area.frame or area.unit}"
-    expect((near.kind == "pixels") == (area.unit == "px"), "the same unit", seen)
+    expect(near.unit == area.unit, "the same unit", seen)
 
 
 def widened(truth: GroundTruth, area: Area, radius: int) -> GroundTruth:
@@ -342,6 +342,8 @@ def find_ground_truth(
         asked = _rows_of(asked, numbers)
         ground_truth = all_judged(near_truth(stored, asked, parsed.radius))
         ground_truth = ground_truth._replace(judged=~asked.isnan().any(1))
+        if not (ground_truth.positives >= 0).any():
+            _refuse_distant(stored, asked, parsed, reference)
     elif parsed.suffix.lower() == ".npz":
         hard, *soft = read_matrices(parsed, numbers, frames, all_frames)
         ground_truth = all_judged(padded(row.nonzero()[:, 0] for row in hard))
@@ -365,6 +367,16 @@ def find_ground_truth(
     last = "" if frames is None else f" to {frames - 1 - int(numbers.min())}"
     expected = f"an offset from {-int(numbers.max())}{last}"
     raise InputError(f"no query has a right answer with truth {parsed}; expected {expected}")
+
+
+def _refuse_distant(stored: Tensor, asked: Tensor, near: Near, reference: Traverse) -> None:
+    """Tell how far coordinates (N,K) and (Q,K) lie apart, none of which are near each other."""
+    one, other = (table[~table.isnan().any(1)].median(0).values for table in (stored, asked))
+    frame = "" if reference.coordinates is None else reference.coordinates.frame
+    words, apart = describe_ground_truth(f"{near.kind}:{near.radius:g}"), float((one - other).norm())
+    seen = f"no query has a right answer {words}: their middle is {apart:.3g} {near.unit} from"
+    wanted = f"coordinates in {frame}, or lat,lon" if OF_MAPS.match(frame) else "coordinates in one system"
+    raise InputError(f"{seen} that of {reference.name}; expected {wanted}, or a larger distance")
 
 
 def _warn_of_many(truth: GroundTruth, frames: int | None) -> None:
@@ -432,8 +444,7 @@ def describe_ground_truth(truth: Truth | None, interpolate: bool = False, positi
         return "place = query" + (f" {'-' if parsed < 0 else '+'} {abs(parsed)}" if parsed else "")
     if isinstance(parsed, Near):
         where = "" if parsed.kind in ("metres", "pixels") else " in image names"
-        unit = "px" if parsed.kind == "pixels" else "m"
-        return f"within {parsed.radius:g} {unit} by the coordinates{where}"
+        return f"within {parsed.radius:g} {parsed.unit} by the coordinates{where}"
     return f"{truth}, interpolated" if interpolate else str(truth)
 
 

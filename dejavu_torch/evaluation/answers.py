@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from dejavu_torch.data.coordinates import Near
 from dejavu_torch.recognition.select import PROBABLE
 from dejavu_torch.types import Facts, Match
 
@@ -17,6 +19,7 @@ MIN_ANSWERS = 10  # that a line needs,
 MIN_SHARE = 0.2  # and as a share of all queries: consecutive queries may share a confident mistake
 MIN_WIDTH = 5  # frames to each side of a line
 OVER_CHANCE = 2  # times as many answers near a line as with places and queries paired at random
+SHIFTED = 1000  # answers of which a shift is told
 
 
 class Line(NamedTuple):
@@ -35,6 +38,21 @@ class Line(NamedTuple):
         sign = "-" if self.offset < 0 else "+"
         line = f"place = query {sign} {abs(self.offset)}" if self.offset else "place = query"
         return f"most confident answers ({self.answers} of {self.confident}) lie at {line}"
+
+
+class Shift(NamedTuple):
+    """How far, in metres or pixels, `answers` of the `confident` answers lie from the coordinates of their
+    queries, all in one direction."""
+
+    x: float
+    y: float
+    unit: str
+    answers: int
+    confident: int
+
+    def __str__(self) -> str:
+        x, y = (f"{'-' if by < 0 else '+'} {abs(by):.3g} {self.unit}" for by in self[:2])
+        return f"most confident answers ({self.answers} of {self.confident}) lie at x {x}, y {y}"
 
 
 def probable_counts(match: Match) -> dict[str, int]:
@@ -103,6 +121,42 @@ def line_of(places: Tensor, queries: Tensor, within: int, min_answers: float = M
     return Line(offset, near, n) if significant else None
 
 
+def shift_of(found: Tensor, asked: Tensor, within: float, unit: str) -> Shift | None:
+    """The shift near which more than half of the answers lie; None if there is none, or none above `within`.
+
+    Shape: coordinates of answers and of their queries, (n,2) float64 each; at most `SHIFTED` are used.
+
+    Convention: as `line_of`; within the distance is near.
+
+    Example:
+        >>> asked = torch.rand(40, 2).double() * 100
+        >>> shift_of(asked + torch.tensor([30.0, 0.0]), asked, 2.0, "m")
+        Shift(x=30.0, y=0.0, unit='m', answers=40, confident=40)
+    """
+    if len(found) < MIN_ANSWERS:
+        return None
+    some = torch.linspace(0, len(found) - 1, min(SHIFTED, len(found))).round().long()
+    found, asked = found[some].double(), asked[some].double()
+    shifts = found - asked
+    densest = shifts[int((torch.cdist(shifts, shifts) <= within).sum(1).argmax())]
+    near = (shifts - densest).norm(dim=1) <= within
+    x, y = shifts[near].median(0).values.tolist()
+    by_chance = float((torch.cdist(found - densest, asked) <= within).sum()) / len(found)
+    answers = int(near.sum())
+    plain = answers > max(len(found) / 2, OVER_CHANCE * by_chance) and math.hypot(x, y) > within
+    return Shift(round(x, 3), round(y, 3), unit, answers, len(found)) if plain else None
+
+
+def shift_facts(near: Near, match: Match, found: Tensor, asked: Tensor) -> Facts:
+    """The entry `shift` of report.json, of answers found at coordinates (Q,K) where queries were taken at
+    (Q,K), if most of the confident ones lie in one direction from them."""
+    found, asked = found[:, :2], asked[:, :2]
+    sure = confident(match) & (match.index >= 0) & (found - asked).isfinite().all(1)
+    enough = int(sure.sum()) >= MIN_SHARE * len(found)
+    shift = shift_of(found[sure], asked[sure], near.radius, near.unit) if enough else None
+    return {} if shift is None else {"shift": shift._asdict()}
+
+
 def answer_facts(
     match: Match, queries: Tensor, tolerance: int, scored: bool, offset: int | None = None
 ) -> Facts:
@@ -123,7 +177,11 @@ def answer_facts(
 
 
 def describe_line(facts: Mapping[str, Any], scored: bool) -> str:
-    """The line of `answer_facts` in words; "" without one."""
+    """The line of `answer_facts`, or the shift of `metric_facts`, in words; "" without one."""
+    if "shift" in facts:
+        shift = f"{Shift(**facts['shift'])} of the coordinates of their queries"
+        hint = "are these the middles of the images, in the coordinates of the map?"
+        return f"the answers contradict the truth ({facts['truth']}): {shift}; {hint}"
     if "line" not in facts:
         return ""
     line = Line(**facts["line"])

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from dejavu_torch.area import Area, same_windows
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.coordinates import Near
+from dejavu_torch.data.coordinates import Near, coordinates_of
 from dejavu_torch.data.ground_truth import (
     GroundTruth,
     check_ground_truth,
@@ -30,7 +30,7 @@ from dejavu_torch.data.ground_truth import (
 )
 from dejavu_torch.data.positions import unit_of
 from dejavu_torch.evaluation import curves
-from dejavu_torch.evaluation.answers import answer_facts
+from dejavu_torch.evaluation.answers import answer_facts, shift_facts
 from dejavu_torch.evaluation.contenders import contend
 from dejavu_torch.evaluation.match_plots import draw_coverage
 from dejavu_torch.evaluation.matches import ELSEWHERE, read_matches
@@ -149,6 +149,9 @@ def evaluate_file(
     facts = evaluation_facts(match, candidates, known, tolerance, positions, described) | alone
     if near is not None and area is not None:
         facts |= {"tolerance": plain_number(near.radius), "unit": "pixels" if area.unit == "px" else "metres"}
+    if near is not None and reference is not None and query is not None:
+        stored, asked = coordinates_of([reference, query], near.kind)
+        facts |= shift_facts(near, here, stored[here.index], asked[queries])
     accepted = facts["accepted"]
     facts["accepted_precision"] = facts["accepted_right"] / accepted if accepted else None
     facts |= {"matches": str(matches), "places": places}

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dejavu_torch.data.coordinates import Near, coordinates_of
 from dejavu_torch.data.ground_truth import Truth, check_ground_truth, describe_ground_truth, offset_of
-from dejavu_torch.evaluation.answers import answer_facts
+from dejavu_torch.evaluation.answers import answer_facts, shift_facts
 from dejavu_torch.evaluation.curves import auc_error
 from dejavu_torch.evaluation.evaluate import evaluation_facts
 from dejavu_torch.evaluation.localization import Localization
@@ -113,14 +113,16 @@ def match_facts(
 
 def metric_facts(run: Localization, truth: Truth | None) -> Facts:
     """The entry `error_metres` or `error_pixels` of report.json: quantiles of the distances between queries
-    and the places reported for them, where the truth is by coordinates. In an area also `recall_within`, the
+    and the places reported for them, where the truth is by coordinates; and `shift`, see `Shift`, if most of
+    the confident answers lie in one direction from it. In an area also `recall_within`, the
     share of the queries with coordinates within 1, 2 and 5 metres, or windows."""
     parsed = None if truth is None else check_ground_truth(truth)
     if not isinstance(parsed, Near):
         return {}
     stored, asked = coordinates_of([source_of(run.reference), source_of(run.query)], parsed.kind)
     index = run.match.index
-    distance = (asked[run.query_frames] - stored[run.model.map.frame_of(index)]).norm(dim=1)
+    asked, found = asked[run.query_frames], stored[run.model.map.frame_of(index)]
+    distance = (asked - found).norm(dim=1)
     known = distance.isfinite() & (index >= 0)
     if run.truth is not None and run.matching.apart is not None:
         known &= (run.truth.positives >= 0).any(1)  # most places are no loop
@@ -132,9 +134,11 @@ def metric_facts(run: Localization, truth: Truth | None) -> Facts:
     shares: Facts = {}
     if (area := run.model.map.area) is not None:
         each = 1.0 if area.unit == "m" else math.hypot(*area.right)
-        asked_of, found = asked[run.query_frames].isfinite().all(1), distance.masked_fill(~known, math.inf)
-        near = {f"{each * n:g}": float((found[asked_of] <= each * n).double().mean()) for n in WINDOWS}
+        asked_of, far = asked.isfinite().all(1), distance.masked_fill(~known, math.inf)
+        near = {f"{each * n:g}": float((far[asked_of] <= each * n).double().mean()) for n in WINDOWS}
         shares = {"recall_within": near} if asked_of.any() else {}
+    if run.matching.apart is None:
+        shares |= shift_facts(parsed, run.match, found, asked)
     return {f"error_{parsed.kind if parsed.kind == 'pixels' else 'metres'}": facts} | shares
 
 

@@ -7,11 +7,14 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dejavu_torch.data.coordinates import Near
 from dejavu_torch.evaluation.answers import (
     answer_facts,
     confident,
     describe_line,
     line_of,
+    shift_facts,
+    shift_of,
 )
 from dejavu_torch.types import Match
 
@@ -91,3 +94,42 @@ def test_queries_that_run_backwards_are_told():
     assert facts["line"] == {"offset": 80, "answers": 60, "confident": 60, "backwards": True}
     assert "run backwards" in describe_line(facts, False)
     assert "place = 80 - query" in describe_line(facts, False)
+
+
+@given(st.floats(-50, 50), st.floats(-50, 50), st.integers(0, 40), st.integers(0, 2**16))
+def test_most_answers_in_one_direction_tell_how_far(x, y, wrong, seed):
+    noise = torch.Generator().manual_seed(seed)
+    asked = 200 * torch.rand(100, 2, generator=noise, dtype=torch.float64)
+    found = asked + torch.tensor([x, y]) + torch.rand(100, 2, generator=noise) - 0.5
+    found[:wrong] = 200 * torch.rand(wrong, 2, generator=noise, dtype=torch.float64)
+    shift = shift_of(found, asked, 2.0, "m")
+    if x**2 + y**2 > 3**2:
+        assert shift is not None
+        assert (shift.x, shift.y) == (pytest.approx(x, abs=0.5), pytest.approx(y, abs=0.5))
+        assert shift.answers >= 100 - wrong
+    elif x**2 + y**2 < 1:
+        assert shift is None
+
+
+@pytest.mark.parametrize("case", ["anywhere", "one place", "two directions", "a small area"])
+def test_no_direction_no_shift(case):
+    asked = 100 * torch.rand(100, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    found = {
+        "anywhere": asked.roll(31, 0),
+        "one place": torch.full_like(asked, 50),
+        "two directions": asked + torch.tensor([[20.0, 0.0], [0.0, 20.0]]).repeat(50, 1),
+        "a small area": asked / 25 + 10 * torch.tensor([0.3, 0.3]),
+    }[case]
+    assert shift_of(found, asked / 25 if case == "a small area" else asked, 2.5, "m") is None
+
+
+@pytest.mark.parametrize(("kind", "unit"), [("metres", "m"), ("pixels", "px"), ("utm", "m")])
+def test_a_shift_is_told(kind, unit):
+    asked = torch.rand(60, 3, dtype=torch.float64) * 100
+    asked[55:] = torch.nan
+    match = answers(torch.where(torch.arange(60) < 40, torch.arange(60), -1))
+    facts = shift_facts(Near(kind, 5.0), match, asked + torch.tensor([-4.0, 30.0, 99.0]), asked)
+    told = describe_line(facts | {"truth": "within 5 m"}, True)
+    assert f"lie at x - 4 {unit}, y + 30 {unit}" in told
+    assert "contradict the truth (within 5 m)" in told
+    assert not shift_facts(Near(kind, 5.0), match, asked + 1, asked)
